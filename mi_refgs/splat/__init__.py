@@ -1,0 +1,28 @@
+"""Surfels to screen: project footprints, list them by tile, blend any number of channels front to back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.splat.blend import Blended, blend
+from mi_refgs.splat.camera import Camera
+from mi_refgs.splat.footprint import Footprints, project
+from mi_refgs.splat.tiles import TileLists, list_by_tile
+from mi_refgs.surfels.table import Surfels
+
+__all__ = ["Blended", "Camera", "Footprints", "TileLists", "blend", "list_by_tile", "project", "splat"]
+
+
+def splat(surfels: Surfels, features: list[Any], camera: Camera, shift: Any = None) -> Blended:
+    """Splat per-surfel features (K × mi.Float (N,)) to maps of width·height pixels; see `blend` for what is differentiable.
+
+    `shift` is an optional zero mi.Point2f (N,) that receives the gradient of a screen translation, in pixels.
+    """
+    if surfels.count == 0:
+        blank = [dr.zeros(mi.Float, camera.width * camera.height) for _ in range(len(features) + 3)]
+        return Blended(blank[3:], *blank[:3])
+    footprints = project(surfels, camera, shift)
+    return blend(footprints, features, list_by_tile(footprints, camera), camera)

@@ -1,0 +1,192 @@
+"""The screen footprint of a surfel: ray-plane intersection in pixel offsets, with the 2D low-pass.
+
+A surfel has centre p, unit tangents t_u, t_v, normal n (camera frame) and standard deviations s_u, s_v. The ray through a
+pixel at offset δ from the projected centre meets its plane at depth z and tangent coordinates (u, v), in units of s:
+
+    1/z = k + c·δ        u = z a·δ        v = z b·δ                                               [2DGS, eq. 8-10]
+
+with, per axis, c = n/(p·n)/f, a = (t_u - (p·t_u) n/(p·n))/(s_u f), b likewise, k = 1/p_z. Offsets from the centre, not
+pixel coordinates, enter: the two large terms that cancel in the textbook form are gone, so float32 holds. Opacity is
+
+    α = min(α_max, o exp(-ρ/2)),   ρ = min(u² + v², 2 |δ|²)                                       [2DGS, eq. 11]
+
+and the sample lies at depth z, or at the centre's depth where the low-pass is the smaller (there the intersection may be
+anywhere along the ray).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN, EDGE_ON_COSINE, LOW_PASS_INV_VARIANCE
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.table import Surfels
+
+GEOMETRY_COLUMNS = 10  # a.x a.y b.x b.y c.x c.y k centre.x centre.y opacity
+
+
+@dataclass(frozen=True)
+class Footprints:
+    """N footprints: differentiable columns, and the detached pixel rectangles outside which they vanish."""
+
+    columns: list[Any]  # GEOMETRY_COLUMNS × mi.Float (N,), in the order of the comment above
+    depth: Any  # mi.Float (N,), detached: camera z of the centre, the sort key
+    first: tuple[Any, Any]  # mi.Int32 (N,): first covered pixel column and row
+    last: tuple[Any, Any]  # mi.Int32 (N,): last covered pixel column and row, below `first` if nothing is covered
+
+
+def project(surfels: Surfels, camera: Camera, shift: Any = None) -> Footprints:
+    """Footprints of all surfels in a camera.
+
+    `shift` is an optional mi.Point2f (N,) in pixels added to the centres: zero-valued, it receives the gradient
+    with respect to a screen translation of each surfel, which densification reads.
+
+    Culled (they cover no pixel, and get zero gradient): centre not beyond the near plane, edge-on by
+    EDGE_ON_COSINE, opacity below ALPHA_MIN, non-finite. The rectangles carry no derivative.
+    """
+    p = camera.to_camera(surfels.position())
+    t_u, t_v, n = (camera.rotation @ t for t in surfels.frame())
+    s = surfels.scale()
+    opacity = surfels.opacity()
+
+    pn = dr.dot(p, n)
+    visible = dr.detach(
+        (p.z > camera.near)
+        & (dr.abs(pn) > EDGE_ON_COSINE * dr.norm(p))
+        & (opacity >= ALPHA_MIN)
+        & dr.isfinite(dr.sum(p) + pn + opacity + s.x + s.y)
+    )
+    # Divide by harmless numbers where culled: a masked Inf would still poison the adjoint.
+    pn = dr.select(visible, pn, 1)
+    z = dr.select(visible, p.z, 1)
+    s = dr.select(visible, s, 1)
+
+    focal = mi.Vector2f(camera.fx, camera.fy)
+    c = n / pn
+    a = (t_u - dr.dot(p, t_u) * c) / s.x
+    b = (t_v - dr.dot(p, t_v) * c) / s.y
+    slope = mi.Vector2f(p.x, p.y) / z
+    centre = focal * slope + mi.Vector2f(camera.cx, camera.cy)
+    if shift is not None:
+        centre += mi.Vector2f(shift)
+    columns = [a.x / focal.x, a.y / focal.y, b.x / focal.x, b.y / focal.y, c.x / focal.x, c.y / focal.y]
+    columns += [dr.rcp(z), centre.x, centre.y, opacity]
+    columns = [dr.select(visible, column, 0) for column in columns]
+
+    with dr.suspend_grad():
+        low, high = _extent(t_u, t_v, s, slope, z, opacity, focal)
+        first, last = [], []
+        for axis, size in enumerate((camera.width, camera.height)):
+            # Clamped as floats first: a rectangle far outside must not overflow an integer.
+            begin = dr.ceil(dr.clip(centre[axis] + low[axis], -1, size + 1) - 0.5)
+            end = dr.floor(dr.clip(centre[axis] + high[axis], -1, size + 1) - 0.5)
+            first.append(dr.select(visible, mi.Int32(dr.maximum(begin, 0)), 1))
+            last.append(dr.select(visible, mi.Int32(dr.minimum(end, size - 1)), 0))
+        return Footprints(columns, dr.detach(z), (first[0], first[1]), (last[0], last[1]))
+
+
+def _extent(t_u: Any, t_v: Any, s: Any, slope: Any, z: Any, opacity: Any, focal: Any) -> tuple[Any, Any]:
+    """Rectangle around the centre, in pixels, that holds every pixel with α ≥ ALPHA_MIN.
+
+    The contour u² + v² = r², r² = 2 ln(o/α_min), projects to a conic; its bounds per axis follow from the tangent
+    lines of the dual conic [2DGS, appendix A, with r for 3 and the origin at the projected centre]. A contour that
+    reaches behind the camera has no bounds: such a surfel is listed everywhere.
+    """
+    r2 = dr.maximum(2 * dr.log(dr.maximum(opacity, ALPHA_MIN) / ALPHA_MIN), 0)
+    depth_u, depth_v = s.x * t_u.z, s.y * t_v.z
+    denominator = r2 * (dr.square(depth_u) + dr.square(depth_v)) - dr.square(z)
+    bounded = denominator < -1e-4 * dr.square(z)  # float32 margin: the bounds diverge at 0
+    f = r2 / dr.select(bounded, denominator, -1)
+    low_pass = dr.sqrt(r2 / LOW_PASS_INV_VARIANCE)
+    low, high = [], []
+    for axis in range(2):
+        x_u = s.x * focal[axis] * (t_u[axis] - slope[axis] * t_u.z)
+        x_v = s.y * focal[axis] * (t_v[axis] - slope[axis] * t_v.z)
+        middle = f * (x_u * depth_u + x_v * depth_v)
+        half = dr.sqrt(dr.maximum(dr.square(middle) - f * (dr.square(x_u) + dr.square(x_v)), 0))
+        half = half * 1.0001 + 1e-3  # rounding of the contour itself, in pixels
+        low.append(dr.select(bounded, dr.minimum(middle - half, -low_pass), -dr.inf))
+        high.append(dr.select(bounded, dr.maximum(middle + half, low_pass), dr.inf))
+    return mi.Vector2f(*low), mi.Vector2f(*high)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One footprint at one pixel, with the intermediate values that its derivatives reuse."""
+
+    alpha: Any  # after the clamp
+    z: Any  # depth of the sample
+    valid: Any  # contributes: α ≥ ALPHA_MIN and beyond the near plane
+    gaussian: Any  # exp(-ρ/2)
+    clamped: Any  # α_max was reached: no derivative
+    low_pass: Any  # the 2D filter decides
+    delta: Any  # pixel offset from the centre
+    u: Any
+    v: Any
+
+
+def evaluate(row: Any, pixel: Any, near: Any) -> Sample:
+    """Evaluate footprint rows at pixel centres. `row[0:10]` are the geometry columns."""
+    delta = mi.Vector2f(pixel.x - row[7], pixel.y - row[8])
+    inverse_depth = row[6] + row[4] * delta.x + row[5] * delta.y
+    in_front = inverse_depth > 0
+    z = dr.rcp(dr.select(in_front, inverse_depth, 1))
+    u = z * (row[0] * delta.x + row[1] * delta.y)
+    v = z * (row[2] * delta.x + row[3] * delta.y)
+    rho_plane = dr.square(u) + dr.square(v)
+    rho_screen = LOW_PASS_INV_VARIANCE * dr.squared_norm(delta)
+    low_pass = ~in_front | (rho_screen < rho_plane)
+    gaussian = dr.exp(-0.5 * dr.select(low_pass, rho_screen, rho_plane))
+    alpha = row[9] * gaussian
+    clamped = alpha > ALPHA_MAX
+    alpha = dr.select(clamped, ALPHA_MAX, alpha)
+    z = dr.select(low_pass, dr.rcp(row[6]), z)
+    valid = (alpha >= ALPHA_MIN) & (z > near)
+    return Sample(alpha, z, valid, gaussian, clamped, low_pass, delta, u, v)
+
+
+def evaluate_backward(row: Any, sample: Sample, δalpha: Any, δz: Any) -> list[Any]:
+    """Adjoint of `evaluate`: adjoints of α and z to those of the ten geometry columns."""
+    plane = ~sample.low_pass
+    delta, u, v, z = sample.delta, sample.u, sample.v, sample.z
+    # α = o gaussian, unless clamped;  gaussian = exp(-ρ/2)
+    δalpha = dr.select(sample.clamped, 0, δalpha)
+    δopacity = δalpha * sample.gaussian
+    δrho = -0.5 * δalpha * sample.alpha
+    # ρ = u² + v²
+    δu = dr.select(plane, 2 * u * δrho, 0)
+    δv = dr.select(plane, 2 * v * δrho, 0)
+    # u = z a·δ,  v = z b·δ  (u δu = z (a·δ) δu)
+    δa, δb = δu * z, δv * z
+    δinverse_depth = -z * (z * δz + u * δu + v * δv)  # z = 1/(k + c·δ), or 1/k under the low-pass
+    δc = dr.select(plane, δinverse_depth, 0)
+    # δ = pixel - centre enters a·δ, b·δ, c·δ and ρ = 2 |δ|²
+    screen = dr.select(plane, 0, 2 * LOW_PASS_INV_VARIANCE * δrho)
+    δdelta_x = δa * row[0] + δb * row[2] + δc * row[4] + screen * delta.x
+    δdelta_y = δa * row[1] + δb * row[3] + δc * row[5] + screen * delta.y
+    return [
+        δa * delta.x, δa * delta.y, δb * delta.x, δb * delta.y, δc * delta.x, δc * delta.y,
+        δinverse_depth, -δdelta_x, -δdelta_y, δopacity,
+    ]  # fmt: skip
+
+
+def evaluate_forward(row: Any, sample: Sample, drow: Any) -> tuple[Any, Any]:
+    """Tangent of `evaluate`: tangents of the ten geometry columns to those of α and z."""
+    plane = ~sample.low_pass
+    delta, u, v, z = sample.delta, sample.u, sample.v, sample.z
+    ddelta_x, ddelta_y = -drow[7], -drow[8]
+    dinverse_depth = drow[6] + dr.select(
+        plane, drow[4] * delta.x + drow[5] * delta.y + row[4] * ddelta_x + row[5] * ddelta_y, 0
+    )
+    dz = -dr.square(z) * dinverse_depth
+    du = z * (drow[0] * delta.x + drow[1] * delta.y + row[0] * ddelta_x + row[1] * ddelta_y) - u * z * dinverse_depth
+    dv = z * (drow[2] * delta.x + drow[3] * delta.y + row[2] * ddelta_x + row[3] * ddelta_y) - v * z * dinverse_depth
+    drho = dr.select(
+        plane, 2 * (u * du + v * dv), 2 * LOW_PASS_INV_VARIANCE * (delta.x * ddelta_x + delta.y * ddelta_y)
+    )
+    dalpha = drow[9] * sample.gaussian - 0.5 * sample.alpha * drho
+    return dr.select(sample.clamped, 0, dalpha), dz

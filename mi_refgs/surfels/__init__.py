@@ -1,0 +1,1 @@
+"""The surfel table: named raw channels, their activations, initial values and the PLY file."""

@@ -1,0 +1,238 @@
+"""The table of surfels: named raw channels, and what they mean after the activation.
+
+Letters: N surfels, D columns of a channel, q quaternion (x, y, z, w), t_u t_v n columns of its rotation matrix.
+A surfel is the point p(u, v) = position + s_u u t_u + s_v v t_v with normal n = t_u × t_v   [2DGS, Huang et al. 2024, §4.1].
+
+Named rules for degenerate rows (each keeps values and gradients finite for every finite input):
+  zero quaternion   every |component| < QUATERNION_FLOOR: the identity rotation, with gradient 0
+  scale limit       the log scale is clamped to ±LOG_SCALE_LIMIT, with gradient 0 beyond
+  logit limit       logits are clamped to ±LOGIT_LIMIT, where the sigmoid is 0 or 1 in float32, with gradient 0 beyond
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.errors import InputError
+
+# Raw columns per channel, in table order; 0 stands for 3 (degree + 1)² spherical-harmonic columns, column = 3 coef + rgb.
+CHANNELS: dict[str, int] = {
+    "position": 3,
+    "rotation": 4,
+    "scale": 2,
+    "opacity": 1,
+    "radiance_sh": 0,
+    "albedo": 3,
+    "metallic": 1,
+    "roughness": 1,
+    "indirect_sh": 0,
+}
+# The channels without which nothing can be splatted.
+GEOMETRY = ("position", "rotation", "scale", "opacity")
+# Highest spherical-harmonic degree that the 3DGS family stores; shade.sh evaluates no more.
+MAX_SH_DEGREE = 3
+# Below this largest |component| 1/|q| would overflow float32.
+QUATERNION_FLOOR = 1e-30
+# e^±16 = 1e-7 … 9e6 scene units: its fourth power, which the ray-surfel intersection needs, still fits float32.
+LOG_SCALE_LIMIT = 16.0
+# 1 / (1 + e^-40) is 1 in float32, and e^40 squared still fits float32 (the derivative needs it).
+LOGIT_LIMIT = 40.0
+
+
+def sh_columns(degree: int) -> int:
+    """Number of raw columns of a spherical-harmonic channel of this degree."""
+    return 3 * (degree + 1) ** 2
+
+
+def sigmoid(x: Any) -> Any:
+    """Logistic sigmoid of a Dr.Jit array, finite with a finite gradient for every finite x (logit limit)."""
+    if dr.width(x) == 0:  # Dr.Jit refuses arithmetic between an empty array and a literal
+        return x
+    return dr.rcp(1.0 + dr.exp(-dr.clip(x, -LOGIT_LIMIT, LOGIT_LIMIT)))
+
+
+class Surfels:
+    """N surfels as named raw channels, each an `mi.TensorXf` of shape (N, D) that may be a leaf of the AD graph.
+
+    `raw` maps channel names to tensors in the order of CHANNELS; a channel that a scene does not use is absent and costs
+    nothing. Accessors return activated values as Dr.Jit arrays of width N; gradients flow to the raw tensors in both modes.
+    """
+
+    raw: dict[str, Any]
+
+    def __init__(self, raw: Mapping[str, Any]) -> None:
+        """Adopt raw tensors of shape (N, D); raises InputError for unknown names or shapes that do not fit."""
+        unknown = [name for name in raw if name not in CHANNELS]
+        if unknown:
+            raise InputError(f"surfels: {unknown[0]}: unknown channel; use one of {', '.join(CHANNELS)}")
+        self.raw = {name: raw[name] for name in CHANNELS if name in raw}
+        self._check_shapes()
+
+    @staticmethod
+    def from_numpy(arrays: Mapping[str, np.ndarray]) -> Surfels:
+        """Build a table from raw float arrays of shape (N, D), or (N,) for a one-column channel."""
+        raw = {}
+        for name, values in arrays.items():
+            table = np.asarray(values, dtype=np.float32)
+            table = table[:, None] if table.ndim == 1 else table
+            raw[name] = mi.TensorXf(np.ascontiguousarray(table))
+        return Surfels(raw)
+
+    def to_numpy(self) -> dict[str, np.ndarray]:
+        """Raw channels as float32 arrays of shape (N, D)."""
+        return {name: np.asarray(tensor.numpy()).reshape(tensor.shape) for name, tensor in self.raw.items()}
+
+    # ---------------- shape ----------------
+
+    @property
+    def count(self) -> int:
+        """Number of surfels N."""
+        return int(next(iter(self.raw.values())).shape[0]) if self.raw else 0
+
+    def has(self, name: str) -> bool:
+        """Whether the channel is present."""
+        return name in self.raw
+
+    def sh_degree(self, name: str = "radiance_sh") -> int:
+        """Spherical-harmonic degree of `radiance_sh` or `indirect_sh`, from its number of columns."""
+        return math.isqrt(int(self.raw[name].shape[1]) // 3) - 1
+
+    def _check_shapes(self) -> None:
+        rows = self.count
+        for name, tensor in self.raw.items():
+            shape = tuple(tensor.shape)
+            if len(shape) != 2 or shape[0] != rows:
+                raise InputError(f"surfels: {name}: shape {shape}, expected ({rows}, D); give every channel one row per surfel")
+            width = CHANNELS[name]
+            allowed = (width,) if width else tuple(sh_columns(degree) for degree in range(MAX_SH_DEGREE + 1))
+            if shape[1] not in allowed:
+                choices = " or ".join(str(columns) for columns in allowed)
+                raise InputError(f"surfels: {name}: {shape[1]} columns, expected {choices}; fix the array's shape")
+
+    def validate(self) -> None:
+        """Raise InputError when a geometry channel is missing, a shape does not fit, or a value is NaN or infinite."""
+        for name in GEOMETRY:
+            if name not in self.raw:
+                raise InputError(f"surfels: {name}: the channel is missing; add it, nothing can be splatted without it")
+        self._check_shapes()
+        for name, tensor in self.raw.items():
+            bad = int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0
+            if bad:
+                raise InputError(f"surfels: {name}: {bad} values are NaN or infinite; remove those surfels")
+
+    # ---------------- raw columns ----------------
+
+    def columns(self, name: str) -> list[Any]:
+        """Raw columns of a channel as D `mi.Float` of width N, under AD.
+
+        Each entry is read once per column, so the adjoint is a plain (not atomic) read-modify-write.
+        """
+        tensor = self.raw[name]
+        rows, width = (int(size) for size in tensor.shape)
+        if rows == 0:
+            return [mi.Float() for _ in range(width)]
+        index = dr.arange(mi.UInt32, rows) * width
+        return [
+            dr.gather(mi.Float, tensor.array, index + column, mode=dr.ReduceMode.NoConflicts) for column in range(width)
+        ]
+
+    # ---------------- activated values ----------------
+
+    def position(self) -> Any:
+        """World positions (mi.Point3f), scene units."""
+        return mi.Point3f(*self.columns("position"))
+
+    def rotation(self) -> Any:
+        """Unit quaternions (mi.Quaternion4f); a zero quaternion reads as the identity, with gradient 0."""
+        if self.count == 0:
+            return dr.zeros(mi.Quaternion4f, 0)
+        x, y, z, w = self.columns("rotation")
+        largest = dr.detach(dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), dr.maximum(dr.abs(z), dr.abs(w))))
+        valid = largest >= QUATERNION_FLOOR
+        # Dividing by the largest component first keeps |q|² in range for every finite q; normalising undoes it.
+        shrink = dr.rcp(dr.select(valid, largest, 1.0))
+        x, y, z = (dr.select(valid, part * shrink, 0.0) for part in (x, y, z))
+        w = dr.select(valid, w * shrink, 1.0)
+        inverse_norm = dr.rsqrt(x * x + y * y + z * z + w * w)
+        return mi.Quaternion4f(x * inverse_norm, y * inverse_norm, z * inverse_norm, w * inverse_norm)
+
+    def scale(self) -> Any:
+        """Standard deviations (s_u, s_v) along t_u and t_v (mi.Vector2f), scene units."""
+        if self.count == 0:
+            return dr.zeros(mi.Vector2f, 0)
+        u, v = (dr.exp(dr.clip(column, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)) for column in self.columns("scale"))
+        return mi.Vector2f(u, v)
+
+    def opacity(self) -> Any:
+        """Opacities in [0, 1] (mi.Float)."""
+        return sigmoid(self.columns("opacity")[0])
+
+    def albedo(self) -> Any:
+        """Albedo in [0, 1] (mi.Color3f), linear."""
+        return mi.Color3f(*(sigmoid(column) for column in self.columns("albedo")))
+
+    def metallic(self) -> Any:
+        """Metallic weight in [0, 1] (mi.Float)."""
+        return sigmoid(self.columns("metallic")[0])
+
+    def roughness(self) -> Any:
+        """Perceptual roughness r in [0, 1] (mi.Float); GGX α = r²."""
+        return sigmoid(self.columns("roughness")[0])
+
+    def radiance_sh(self) -> list[Any]:
+        """Coefficients (mi.Color3f) of the radiance channel; the colour is max(0, 0.5 + Σ c_k Y_k)."""
+        return self._coefficients("radiance_sh")
+
+    def indirect_sh(self) -> list[Any]:
+        """Coefficients (mi.Color3f) of the indirect channel; the colour is max(0, Σ c_k Y_k), without an offset."""
+        return self._coefficients("indirect_sh")
+
+    def _coefficients(self, name: str) -> list[Any]:
+        columns = self.columns(name)
+        return [mi.Color3f(*columns[start : start + 3]) for start in range(0, len(columns), 3)]
+
+    def frame(self) -> tuple[Any, Any, Any]:
+        """World tangents and normal (t_u, t_v, n), the columns of the rotation matrix (three mi.Vector3f).
+
+        n is not yet turned towards a camera.
+        """
+        if self.count == 0:
+            return dr.zeros(mi.Vector3f, 0), dr.zeros(mi.Vector3f, 0), dr.zeros(mi.Vector3f, 0)
+        q = self.rotation()
+        x, y, z, w = q.x, q.y, q.z, q.w
+        t_u = mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w))
+        t_v = mi.Vector3f(2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w))
+        n = mi.Vector3f(2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
+        return t_u, t_v, n
+
+    # ---------------- rows ----------------
+
+    def gather(self, parent: Any) -> Surfels:
+        """Copy rows: row i of the result is row parent[i] (mi.UInt32), detached from the AD graph."""
+        return Surfels({name: gather_rows(tensor, parent) for name, tensor in self.raw.items()})
+
+    def detach(self) -> Surfels:
+        """The same values, detached from the AD graph."""
+        return Surfels({name: dr.detach(tensor) for name, tensor in self.raw.items()})
+
+    def enable_grad(self) -> None:
+        """Make every raw tensor a leaf of the AD graph."""
+        dr.enable_grad(list(self.raw.values()))
+
+
+def gather_rows(tensor: Any, parent: Any) -> Any:
+    """Rows parent (mi.UInt32, width M) of an (N, D) tensor as a detached, evaluated (M, D) tensor."""
+    rows, width = len(parent), int(tensor.shape[1])
+    if rows == 0:
+        return dr.zeros(mi.TensorXf, (0, width))
+    entry = dr.arange(mi.UInt32, rows * width)
+    source = dr.gather(mi.UInt32, mi.UInt32(parent), entry // width) * width + entry % width
+    values = dr.gather(mi.Float, dr.detach(tensor.array), source)
+    dr.eval(values)
+    return mi.TensorXf(values, shape=(rows, width))

@@ -1,0 +1,319 @@
+"""The splatter against its float64 oracle: images, gradients of every parameter class, laws, and mutants."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.reference import splat as oracle
+from mi_refgs.splat import Camera, splat
+from mi_refgs.surfels.table import Surfels
+
+blend_module = importlib.import_module("mi_refgs.splat.blend")
+IMAGE_TOLERANCE = 1e-4  # the product's promise; observed 2e-6 … 3e-5
+GRADIENT_TOLERANCE = 1e-3  # relative L2; observed 1e-5 … 3e-4 (float32 of the smallest surfels)
+PARAMETERS = ("position", "rotation", "scale", "opacity", "features")
+
+
+@dataclass(frozen=True)
+class Scene:
+    raw: dict[str, np.ndarray]
+    features: np.ndarray
+    camera: oracle.PinholeCamera
+
+    def fast_camera(self) -> Camera:
+        c = self.camera
+        return Camera.look(c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.to_world, c.near)
+
+    def surfels(self) -> Surfels:
+        return Surfels.from_numpy(self.raw)
+
+    def columns(self) -> list:
+        return [mi.Float(np.ascontiguousarray(f.astype(np.float32))) for f in self.features.T]
+
+
+def look_at(origin: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """World-from-camera in Mitsuba's frame (+z forward, +x left, +y up)."""
+    forward = (target - origin) / np.linalg.norm(target - origin)
+    left = np.cross([0.1, 0.2, 1.0], forward)
+    left /= np.linalg.norm(left)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([left, np.cross(forward, left), forward], axis=1)
+    matrix[:3, 3] = origin
+    return matrix
+
+
+def make_scene(seed: int) -> Scene:
+    """1 to 500 surfels, with sub-pixel, edge-on, overlapping, opaque and behind-the-camera ones among them."""
+    rng = np.random.default_rng(seed)
+    count = round(500 ** (seed / 19))
+    width, height = int(rng.integers(13, 40)), int(rng.integers(13, 40))  # rarely multiples of the tile
+    origin = 4 * rng.normal(size=3) / 1.7
+    to_world = look_at(origin, 0.2 * rng.normal(size=3))
+    position = rng.normal(size=(count, 3)) * 0.6
+    scale = np.log(rng.uniform(0.02, 0.5, size=(count, 2)))
+    opacity = rng.normal(size=(count, 1)) * 2
+    rotation = rng.normal(size=(count, 4))
+    kind = np.arange(count) % 10
+    scale[kind == 3] = np.log(0.002)  # sub-pixel: the low-pass decides
+    opacity[kind == 4] = 6.0  # beyond the clamp at α_max
+    position[kind == 5] = origin - to_world[:3, 2] * rng.uniform(0.5, 3, size=(np.sum(kind == 5), 1))  # behind
+    position[kind == 6] = position[(kind == 6).nonzero()[0] - 1] + 1e-2  # overlapping, nearly equal depth
+    for i in (kind == 7).nonzero()[0]:  # nearly edge-on: normal almost across the view direction
+        view = position[i] - origin
+        normal = np.cross(view, rng.normal(size=3))
+        normal = normal / np.linalg.norm(normal) + 0.03 * view / np.linalg.norm(view)
+        rotation[i] = quaternion_to(normal / np.linalg.norm(normal))
+    focal = width / rng.uniform(0.6, 1.2)
+    camera = oracle.PinholeCamera(
+        width, height, -focal, -focal * rng.uniform(0.9, 1.1), width * rng.uniform(0.3, 0.7),
+        height * rng.uniform(0.3, 0.7), to_world,
+    )  # fmt: skip
+    raw = {"position": position, "rotation": rotation, "scale": scale, "opacity": opacity}
+    # Round once, so that both sides see the same float32 numbers.
+    raw = {name: values.astype(np.float32).astype(np.float64) for name, values in raw.items()}
+    return Scene(raw, rng.uniform(size=(count, 4)).astype(np.float32).astype(np.float64), camera)
+
+
+def quaternion_to(normal: np.ndarray) -> np.ndarray:
+    """A quaternion (x, y, z, w) whose rotation takes +z to `normal`."""
+    axis = np.cross([0, 0, 1.0], normal)
+    return np.array([*axis, 1 + normal[2]]) + 1e-9
+
+
+def fast_maps(scene: Scene):
+    return splat(scene.surfels(), scene.columns(), scene.fast_camera())
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_image_matches_oracle(seed):
+    scene = make_scene(seed)
+    expected = oracle.splat(scene.raw, scene.features, scene.camera)
+    got = fast_maps(scene)
+    shape = (scene.camera.height, scene.camera.width)
+    keep = ~expected.band
+    assert keep.mean() > 0.4
+    for k in range(4):
+        assert np.abs(got.features[k].numpy().reshape(shape) - expected.features[..., k])[keep].max() <= IMAGE_TOLERANCE
+    assert np.abs(got.alpha.numpy().reshape(shape) - expected.alpha)[keep].max() <= IMAGE_TOLERANCE
+    depth_scale = np.abs(scene.raw["position"]).max() + 5
+    assert np.abs(got.depth.numpy().reshape(shape) - expected.depth)[keep].max() <= IMAGE_TOLERANCE * depth_scale
+    median = np.abs(got.median_depth.numpy().reshape(shape) - expected.median_depth)[keep]
+    assert median.max() <= IMAGE_TOLERANCE * depth_scale
+
+
+def loss_weights(scene: Scene, seed: int) -> np.ndarray:
+    """Random weight for each pixel and map, zero in the declared band (2 % wide, so that no difference step meets it)."""
+    band = oracle.splat(scene.raw, scene.features, scene.camera, band=2e-2).band
+    weights = np.random.default_rng(seed + 100).normal(size=(*band.shape, 6))
+    return np.where(band[..., None], 0, weights).astype(np.float32).astype(np.float64)
+
+
+def oracle_loss(raw: dict[str, np.ndarray], features: np.ndarray, scene: Scene, weights: np.ndarray) -> float:
+    maps = oracle.splat(raw, features, scene.camera)
+    return float(np.sum(weights * np.concatenate([maps.features, maps.depth[..., None], maps.alpha[..., None]], -1)))
+
+
+def fast_loss(scene: Scene, surfels: Surfels, features: list, weights: np.ndarray):
+    maps = splat(surfels, features, scene.fast_camera())
+    loss = mi.Float(0)
+    for k, image in enumerate([*maps.features, maps.depth, maps.alpha]):
+        loss += dr.sum(image * mi.Float(np.ascontiguousarray(weights[..., k].ravel().astype(np.float32))))
+    return loss
+
+
+def fast_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
+    surfels, features = scene.surfels(), scene.columns()
+    dr.enable_grad(surfels.raw, features)
+    dr.backward(fast_loss(scene, surfels, features, weights))
+    gradients = {name: dr.grad(surfels.raw[name]).numpy() for name in scene.raw}
+    gradients["features"] = np.stack([dr.grad(f).numpy() for f in features], axis=1)
+    return gradients
+
+
+def finite_differences(scene: Scene, weights: np.ndarray, rows: np.ndarray) -> dict[str, np.ndarray]:
+    step = 1e-6
+    result = {}
+    for name, values in {**scene.raw, "features": scene.features}.items():
+        gradient = np.zeros((len(rows), values.shape[1]))
+        for r, row in enumerate(rows):
+            for column in range(values.shape[1]):
+                sides = []
+                for sign in (1, -1):
+                    moved = values.copy()
+                    moved[row, column] += sign * step
+                    if name == "features":
+                        sides.append(oracle_loss(scene.raw, moved, scene, weights))
+                    else:
+                        sides.append(oracle_loss({**scene.raw, name: moved}, scene.features, scene, weights))
+                gradient[r, column] = (sides[0] - sides[1]) / (2 * step)
+        result[name] = gradient
+    return result
+
+
+def gradient_errors(got: dict[str, np.ndarray], expected: dict[str, np.ndarray], rows: np.ndarray) -> dict[str, float]:
+    """Relative L2 error per parameter class."""
+    errors = {}
+    for name in PARAMETERS:
+        scale = np.linalg.norm(expected[name])
+        errors[name] = float(np.linalg.norm(got[name][rows] - expected[name]) / max(scale, 1e-12)) if scale > 1e-9 else 0.0
+        assert np.all(np.isfinite(got[name])), name
+    return errors
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_gradients_match_finite_differences(seed):
+    scene = make_scene(seed)
+    weights = loss_weights(scene, seed)
+    count = len(scene.features)
+    rows = np.random.default_rng(seed).permutation(count)[:10]
+    expected = finite_differences(scene, weights, rows)
+    got = fast_gradients(scene, weights)
+    errors = gradient_errors(got, expected, rows)
+    assert max(errors.values()) <= GRADIENT_TOLERANCE, errors
+    for name in PARAMETERS:  # none missing: a non-zero derivative never comes back as zero
+        strong = np.abs(expected[name]).max(axis=1) > 1e-3 * max(np.abs(expected[name]).max(), 1e-9)
+        assert np.all(np.abs(got[name][rows]).max(axis=1)[strong] > 0), name
+
+
+@pytest.mark.parametrize("seed", [3, 9, 14])
+def test_forward_mode_is_the_transpose_of_reverse(seed):
+    """⟨∇loss, v⟩ from reverse mode equals the directional derivative from forward mode, for random v."""
+    scene = make_scene(seed)
+    weights = loss_weights(scene, seed)
+    rng = np.random.default_rng(seed)
+    direction = {name: rng.normal(size=values.shape) for name, values in scene.raw.items()}
+    direction["features"] = rng.normal(size=scene.features.shape)
+    reverse = fast_gradients(scene, weights)
+    surfels, features = scene.surfels(), scene.columns()
+    dr.enable_grad(surfels.raw, features)
+    for name in scene.raw:
+        dr.set_grad(surfels.raw[name], mi.TensorXf(direction[name].astype(np.float32)))
+    for k, column in enumerate(features):
+        dr.set_grad(column, mi.Float(np.ascontiguousarray(direction["features"][:, k].astype(np.float32))))
+    forward = dr.forward_to(fast_loss(scene, surfels, features, weights), flags=dr.ADFlag.Default)[0]
+    for name in PARAMETERS:
+        assert np.any(reverse[name]), name
+    expected = sum(np.sum(reverse[name] * direction[name]) for name in PARAMETERS)
+    size = np.sqrt(sum(np.sum((reverse[name] * direction[name]) ** 2) for name in PARAMETERS))
+    assert abs(forward - expected) <= 1e-3 * size
+
+
+def test_shift_receives_the_screen_translation_gradient():
+    """The optional shift gets d loss / d centre: compare to moving the principal point under a single surfel."""
+    scene = make_scene(0)
+    weights = loss_weights(scene, 0)
+    shift = mi.Point2f(dr.zeros(mi.Float, 1), dr.zeros(mi.Float, 1))
+    dr.enable_grad(shift)
+    maps = splat(scene.surfels(), scene.columns(), scene.fast_camera(), shift)
+    image = mi.Float(np.ascontiguousarray(weights[..., 5].ravel().astype(np.float32)))
+    dr.backward(dr.sum(maps.alpha * image))
+    step, sides = 1e-5, []
+    for sign in (1, -1):
+        moved = oracle.PinholeCamera(**{**scene.camera.__dict__, "cx": scene.camera.cx + sign * step})
+        sides.append(np.sum(weights[..., 5] * oracle.splat(scene.raw, scene.features, moved).alpha))
+    # Moving the principal point leaves a, b, c of this surfel alone, as the shift does.
+    assert dr.grad(shift).x[0] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3)
+
+
+def _drop_behind(monkeypatch):
+    original = blend_module.evaluate_backward
+    monkeypatch.setattr(
+        blend_module, "evaluate_backward", lambda row, s, δa, δz: original(row, s, δa * (1 - s.alpha), δz)
+    )
+
+
+def _drop_depth(monkeypatch):
+    original = blend_module.evaluate_backward
+    monkeypatch.setattr(blend_module, "evaluate_backward", lambda row, s, δa, δz: original(row, s, δa, 0 * δz))
+
+
+def _scale_column(index):
+    def mutate(monkeypatch):
+        original = blend_module.evaluate_backward
+
+        def mutant(row, s, δa, δz):
+            columns = original(row, s, δa, δz)
+            columns[index] = columns[index] * 1.1
+            return columns
+
+        monkeypatch.setattr(blend_module, "evaluate_backward", mutant)
+
+    return mutate
+
+
+@pytest.fixture(scope="module")
+def mutant_case():
+    scene = make_scene(8)
+    weights = loss_weights(scene, 8)
+    rows = np.arange(len(scene.features))
+    return scene, weights, rows, finite_differences(scene, weights, rows)
+
+
+@pytest.mark.parametrize(
+    "mutate", [_drop_behind, _drop_depth, *(_scale_column(i) for i in range(10))], ids=lambda f: f.__qualname__
+)
+def test_mutants_of_the_adjoint_are_caught(mutate, monkeypatch, mutant_case):
+    """The gradient check must fail for each of these planted errors; otherwise it proves nothing."""
+    scene, weights, rows, expected = mutant_case
+    assert max(gradient_errors(fast_gradients(scene, weights), expected, rows).values()) <= GRADIENT_TOLERANCE
+    mutate(monkeypatch)
+    assert max(gradient_errors(fast_gradients(scene, weights), expected, rows).values()) > GRADIENT_TOLERANCE
+
+
+def test_order_of_the_table_is_irrelevant_and_culled_surfels_change_nothing():
+    scene = make_scene(12)
+    base = fast_maps(scene)
+    permutation = np.random.default_rng(0).permutation(len(scene.features))
+    permuted = Scene({k: v[permutation] for k, v in scene.raw.items()}, scene.features[permutation], scene.camera)
+    behind = {k: v.copy() for k, v in scene.raw.items()}
+    behind["position"] = behind["position"] * 0 + scene.camera.to_world[:3, 3] - scene.camera.to_world[:3, 2]
+    extended = Scene(
+        {k: np.concatenate([v, behind[k]]) for k, v in scene.raw.items()},
+        np.concatenate([scene.features, scene.features]),
+        scene.camera,
+    )
+    for other in (permuted, extended):
+        got = fast_maps(other)
+        for a, b in zip([*got.features, got.depth, got.alpha], [*base.features, base.depth, base.alpha], strict=True):
+            assert np.abs(a.numpy() - b.numpy()).max() <= 1e-6
+
+
+@pytest.mark.parametrize("values", ["zero_scale", "huge_scale", "zero_quaternion", "saturated_opacity", "at_camera", "none"])
+def test_degenerate_surfels_stay_finite(values):
+    scene = make_scene(6)
+    raw = {k: v.copy() for k, v in scene.raw.items()}
+    if values == "zero_scale":
+        raw["scale"][:] = -1e4
+    elif values == "huge_scale":
+        raw["scale"][:] = 1e4
+    elif values == "zero_quaternion":
+        raw["rotation"][:] = 0
+    elif values == "saturated_opacity":
+        raw["opacity"][:] = 1e4
+    elif values == "at_camera":
+        raw["position"][:] = scene.camera.to_world[:3, 3]
+    else:
+        raw = {k: v[:0] for k, v in raw.items()}
+    degenerate = Scene(raw, scene.features[: len(raw["position"])], scene.camera)
+    maps = fast_maps(degenerate)
+    for image in [*maps.features, maps.depth, maps.alpha, maps.median_depth]:
+        assert np.all(np.isfinite(image.numpy()))
+    if values != "none":
+        for gradient in fast_gradients(degenerate, np.ones((scene.camera.height, scene.camera.width, 6))).values():
+            assert np.all(np.isfinite(gradient))
+
+
+def test_second_view_compiles_nothing():
+    scene = make_scene(15)
+    weights = loss_weights(scene, 15)
+    moved = Scene(scene.raw, scene.features, oracle.PinholeCamera(**{**scene.camera.__dict__, "cx": 9.0, "fx": -30.0}))
+    fast_gradients(scene, weights)
+    misses = dr.detail.launch_stats()[2]
+    fast_gradients(moved, weights)
+    assert dr.detail.launch_stats()[2] == misses
