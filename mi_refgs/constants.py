@@ -37,3 +37,7 @@ TILE = 4
 
 NORM_FLOOR = 1e-20
 """Squared length below which a vector has no direction; the caller then takes a named fallback."""
+
+COVERAGE_FLOOR = 1e-3
+"""Accumulated alpha below which a pixel counts as empty: material maps are divided by alpha, and a quarter of an 8-bit
+step of coverage shows nothing worth dividing by."""

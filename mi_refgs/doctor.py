@@ -1,0 +1,152 @@
+"""What `refgs doctor` says: the parts of this installation, what is wrong, and the command that mends it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from mi_refgs import __version__, llvm
+
+PROBE_TIMEOUT = 60.0
+"""Seconds that the trial kernel may take before the machine counts as unusable; it takes about half."""
+
+EXTRAS = {"lpips": "lpips", "flip": "flip-evaluator"}
+"""Distribution that each optional extra of pyproject.toml brings for the metric of the same name."""
+
+# A process of its own, because an LLVM that cannot compile this kernel aborts instead of raising. The width
+# of the vectors is read off the kernel, since Dr.Jit does not tell it.
+_PROBE = """
+import re, mi_refgs, drjit as dr, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+dr.set_flag(dr.JitFlag.KernelHistory, True)
+x = dr.minimum(dr.arange(mi.Float, 64), dr.opaque(mi.Float, 2))
+dr.eval(x)
+assert x[63] == 2
+code = "".join(kernel["ir"].getvalue() for kernel in dr.kernel_history() if "ir" in kernel)
+print(max(map(int, re.findall(r"<(\\d+) x float>", code)), default=1))
+"""
+
+
+@dataclass(frozen=True)
+class Report:
+    """State of the installation; a version is None where the part is missing."""
+
+    mi_refgs: str
+    python: str
+    platform: str
+    mitsuba: str | None
+    drjit: str | None
+    llvm_version: str | None
+    llvm_path: str | None
+    cuda: bool
+    threads: int
+    simd_width: int | None
+    kernel_cache: str
+    extras: dict[str, str | None]
+    problems: tuple[llvm.Problem, ...]
+
+    @property
+    def usable(self) -> bool:
+        """Whether the main job can run here."""
+        return not self.problems
+
+    def to_dict(self) -> dict[str, object]:
+        """The report as what `refgs doctor --json` prints."""
+        return {"usable": self.usable, **asdict(self)}
+
+    def to_json(self) -> str:
+        """`to_dict` as one JSON object."""
+        return json.dumps(self.to_dict())
+
+    def to_text(self) -> str:
+        """The report for people, one part a line, problems last."""
+        found = {
+            "mi_refgs": self.mi_refgs,
+            "Python": f"{self.python} on {self.platform}",
+            "Mitsuba": self.mitsuba or "missing",
+            "Dr.Jit": self.drjit or "missing",
+            "LLVM": f"{self.llvm_version} ({self.llvm_path})" if self.llvm_version else "missing",
+            "CUDA": "available" if self.cuda else "not available (not needed)",
+            "threads": str(self.threads),
+            "SIMD width": f"{self.simd_width} floats" if self.simd_width else "unknown",
+            "kernel cache": self.kernel_cache,
+        }
+        for name, version in self.extras.items():
+            found[name] = version or f'not installed (optional: pip install "mi_refgs[{name}]")'
+        lines = [f"{name:<13}{value}" for name, value in found.items()]
+        if self.usable:
+            lines.append("Everything that is needed is here.")
+        for problem in self.problems:
+            lines.append(f"PROBLEM: {problem.what}\n  type:  {problem.remedy}")
+        return "\n".join(lines)
+
+
+def examine() -> Report:
+    """Look at the installation; runs one small kernel in a process of its own (about half a second)."""
+    import drjit as dr
+
+    problems: list[llvm.Problem] = []
+    cuda = bool(dr.has_backend(dr.JitBackend.CUDA))
+    version = dr.detail.llvm_version()
+    width = None
+    llvm_problem = llvm.problem()
+    if llvm_problem is None:
+        width, failure = _probe()
+        if failure:
+            what = f"a trial kernel failed under LLVM {version[0]}: {failure}"
+            problems.append(llvm.Problem(what, llvm.REMEDY))
+    elif not cuda:
+        problems.append(llvm_problem)
+    return Report(
+        mi_refgs=__version__,
+        python=platform.python_version(),
+        platform=f"{platform.system()} {platform.machine()}",
+        mitsuba=_version("mitsuba"),
+        drjit=_version("drjit"),
+        llvm_version=".".join(str(part) for part in version) if version[0] > 0 else None,
+        llvm_path=_loaded_library(),
+        cuda=cuda,
+        threads=int(dr.thread_count()),
+        simd_width=width,
+        kernel_cache=os.environ.get("DRJIT_CACHE_DIR", str(Path.home() / ".drjit")),
+        extras={name: _version(distribution) for name, distribution in EXTRAS.items()},
+        problems=tuple(problems),
+    )
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _loaded_library() -> str | None:
+    """File of the libLLVM in this process: from the process map where there is one, else the one named."""
+    maps = Path("/proc/self/maps")
+    if maps.exists():
+        found = re.findall(r"/\S*libLLVM[^\s/]*", maps.read_text())
+        named = os.path.realpath(os.environ.get(llvm.ENVIRONMENT_VARIABLE, ""))
+        return named if named in found else next(iter(found), None)
+    return os.environ.get(llvm.ENVIRONMENT_VARIABLE)
+
+
+def _probe() -> tuple[int | None, str | None]:
+    """SIMD width in floats (None: unknown) and failure (None: none) of one kernel in a fresh process."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=PROBE_TIMEOUT, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return None, f"it took longer than {PROBE_TIMEOUT:.0f} s"
+    if done.returncode == 0:
+        return int(done.stdout), None
+    last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    return None, f"exit status {done.returncode}, {last}"

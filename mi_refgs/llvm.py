@@ -1,0 +1,165 @@
+"""Finds a libLLVM that Dr.Jit can use, before Dr.Jit loads one by itself.
+
+Dr.Jit opens libLLVM while it is imported: the file named by DRJIT_LIBLLVM_PATH, else whatever `libLLVM.so`
+points to, else the highest version in the system's library folder. It accepts LLVM 15 and 16, but aborts the
+process with "LLVM ERROR" at the first kernel that takes a minimum, because those cannot compile
+`llvm.minimum` on x86-64. So the newest usable library is chosen here and named in DRJIT_LIBLLVM_PATH, and
+what Dr.Jit then loaded is checked again.
+
+Only the standard library is imported at the top: `python -P mi_refgs/llvm.py` prints the library that would
+be used, or what is wrong, and exits with 0 or 1; the set-up script calls it before anything is installed.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import re
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+MINIMUM_MAJOR = 17
+"""Oldest LLVM whose x86-64 back end compiles llvm.minimum and maximum (llvm-project issues 53353, 67301)."""
+
+ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
+
+_INSTALL = "brew install llvm" if sys.platform == "darwin" else "apt-get install libllvm19"
+_IS_USER = sys.platform == "linux" and os.geteuid() != 0
+
+REMEDY = f"sudo {_INSTALL}" if _IS_USER else _INSTALL
+"""The one command that installs a usable library."""
+
+
+def search_folders() -> list[Path]:
+    """Folders that may hold a libLLVM for this machine's architecture, in no order of preference."""
+    patterns = [
+        f"/usr/lib/{platform.machine()}-linux-gnu",  # Debian; other *-linux-gnu are foreign architectures
+        "/usr/lib64",
+        "/usr/lib64/llvm*/lib64",  # Fedora's older releases beside the newest
+        "/usr/lib",
+        "/usr/lib/llvm-*/lib",
+        "/usr/local/lib",
+        "/opt/homebrew/opt/llvm*/lib",
+        "/usr/local/opt/llvm*/lib",
+    ]
+    found = [folder for pattern in patterns for folder in sorted(Path("/").glob(pattern.lstrip("/")))]
+    prefixes = [os.environ.get("CONDA_PREFIX"), sys.prefix]
+    return found + [Path(prefix) / "lib" for prefix in prefixes if prefix]
+
+
+def named_version(path: Path) -> tuple[int, ...] | None:
+    """Version that a library's file name states, as (19, 1) for `libLLVM.so.19.1`; None when it states none.
+
+    A symbolic link is resolved first, because `libLLVM.so` may point to any version; a Homebrew library has
+    its version only in its folder's name.
+    """
+    resolved = Path(os.path.realpath(path))
+    for candidate in (resolved, path):
+        match = re.match(r"libLLVM(?:-|\.so\.|\.)(\d+(?:\.\d+)*)", candidate.name)
+        if match is None:
+            match = re.search(r"/llvm(?:[-@/]|)(\d+(?:\.\d+)*)/", str(candidate))
+        if match is not None:
+            return tuple(int(part) for part in match[1].split("."))
+    return None
+
+
+def loaded_version(path: Path) -> tuple[int, ...] | None:
+    """Version that the library itself reports; None when it cannot be loaded here or is older than 16."""
+    try:
+        get_version = ctypes.CDLL(str(path)).LLVMGetVersion
+    except (OSError, AttributeError):
+        return None
+    parts = [ctypes.c_uint() for _ in range(3)]
+    get_version(*(ctypes.byref(part) for part in parts))
+    return tuple(part.value for part in parts)
+
+
+def find_library(folders: Iterable[Path] | None = None) -> Path | None:
+    """Newest loadable libLLVM of at least `MINIMUM_MAJOR` in `folders` (the system's by default), or None."""
+    candidates: dict[Path, tuple[int, ...]] = {}
+    for folder in search_folders() if folders is None else folders:
+        for path in [*folder.glob("libLLVM*.so*"), *folder.glob("libLLVM*.dylib")]:
+            version = named_version(path)
+            if version is not None and version[0] >= MINIMUM_MAJOR:
+                candidates.setdefault(Path(os.path.realpath(path)), version)
+    for path in sorted(candidates, key=lambda path: candidates[path], reverse=True):
+        loaded = loaded_version(path)
+        if loaded is not None and loaded[0] >= MINIMUM_MAJOR:
+            return path
+    return None
+
+
+def select() -> None:
+    """Name the library for Dr.Jit to load, unless the user named one or Dr.Jit is already loaded."""
+    if "drjit" in sys.modules or os.environ.get(ENVIRONMENT_VARIABLE):
+        return
+    library = find_library()
+    if library is not None:
+        os.environ[ENVIRONMENT_VARIABLE] = str(library)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Why the LLVM of this process cannot be used, and what to do about it."""
+
+    what: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.remedy}"
+
+
+def problem() -> Problem | None:
+    """What is wrong with the LLVM that Dr.Jit loaded; None when it is usable.
+
+    Imports Dr.Jit, which is what loads the library, but runs no kernel.
+    """
+    import drjit as dr
+
+    version = dr.detail.llvm_version() if dr.has_backend(dr.JitBackend.LLVM) else None
+    if version is not None and version[0] >= MINIMUM_MAJOR:
+        return None
+    return diagnose(version, os.environ.get(ENVIRONMENT_VARIABLE))
+
+
+def diagnose(version: tuple[int, ...] | None, chosen: str | None) -> Problem:
+    """Words for an unusable LLVM of `version` (None: not loaded), in the file that the user chose, if any."""
+    usable = find_library()
+    needed = f"LLVM {MINIMUM_MAJOR} or newer is needed"
+    if chosen:
+        version = version or named_version(Path(chosen))
+        if version is not None and version[0] < MINIMUM_MAJOR:
+            what = f"is LLVM {version[0]}"
+        elif os.sep in chosen and not Path(chosen).exists():
+            what = "does not exist"
+        else:
+            what = "cannot be loaded"
+        unset = f"unset {ENVIRONMENT_VARIABLE}"
+        return Problem(
+            f"{ENVIRONMENT_VARIABLE}={chosen} {what}, but {needed}",
+            unset if usable else f"{REMEDY} && {unset}",
+        )
+    if version is not None:
+        what = f"Dr.Jit loaded LLVM {version[0]}, but {needed}"
+    else:
+        what = f"Dr.Jit found no usable libLLVM, but {needed}"
+    if usable is None:
+        return Problem(what, REMEDY)
+    return Problem(what, f"import mi_refgs before mitsuba and drjit, or set {ENVIRONMENT_VARIABLE}={usable}")
+
+
+def _main() -> int:
+    """Print the library that would be used, or what is wrong; see the module."""
+    chosen = os.environ.get(ENVIRONMENT_VARIABLE)
+    library = Path(chosen) if chosen else find_library()
+    version = loaded_version(library) if library is not None else None
+    usable = version is not None and version[0] >= MINIMUM_MAJOR
+    print(library if usable else diagnose(version, chosen))
+    return 0 if usable else 1
+
+
+if __name__ == "__main__":
+    sys.exit(_main())

@@ -1,0 +1,128 @@
+"""A signed distance field's surface as a clean triangle mesh, and its PLY file."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from skimage import measure
+
+from mi_refgs.errors import InputError
+from mi_refgs.occlusion.tsdf import TSDF
+
+COMPONENT_KEEP = 0.1
+"""Area, relative to the largest connected component, from which a component is an object and not a floater.
+The released Ref-Gaussian code keeps the largest component only, which loses one of two objects that mirror
+each other."""
+
+ZERO_NUDGE = 1e-3
+"""Distances closer to 0 than this (truncation units; 1/200 voxel) are moved away from it: a corner exactly on
+the surface makes triangles without area."""
+
+HEADER_BYTES = 4096
+"""A PLY header of a mesh is a few hundred bytes."""
+
+VOXEL_COMMENT = "voxel_size"
+"""Key of the PLY comment that holds the voxel the mesh was extracted with."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles whose (v1 - v0) × (v2 - v0) points outward; without faces it is valid and occludes
+    nothing."""
+
+    vertices: np.ndarray  # (V, 3) float32, world
+    faces: np.ndarray  # (F, 3) uint32
+    voxel: float  # resolution of the surface, scene units: visibility offsets scale with it
+
+    @staticmethod
+    def empty(voxel: float = 1.0) -> Mesh:
+        """The mesh of an empty volume."""
+        return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), voxel)
+
+
+def extract_mesh(tsdf: TSDF) -> Mesh:
+    """Zero level set of the field by marching cubes (Lewiner et al. 2003), without floaters.
+
+    The surface has no degenerate triangles and is closed: what touches the border of the volume gets a lid
+    there. Components of less than COMPONENT_KEEP of the largest one's area are dropped. No derivative."""
+    # One layer of free space all around closes surfaces that the box cuts.
+    volume = np.pad(np.asarray(tsdf.volume, dtype=np.float32), 1, constant_values=1.0)
+    volume = np.where(np.abs(volume) < ZERO_NUDGE, np.copysign(np.float32(ZERO_NUDGE), volume), volume)
+    if not volume.min() < 0:
+        return Mesh.empty(tsdf.voxel)
+    # "descent": the field falls towards the object, and faces then wind outward.
+    grid, faces, _, _ = measure.marching_cubes(volume, 0.0, gradient_direction="descent")
+    vertices = np.asarray(tsdf.origin) + (grid.astype(np.float64) - 1) * tsdf.voxel
+    return clean(vertices, faces, tsdf.voxel)
+
+
+def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float) -> Mesh:
+    """Mesh of the large closed components, without triangles of no area and vertices that nothing refers to.
+
+    Walls of inner cavities go too: no ray that starts on the outside meets them.
+    """
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.update_faces(mesh.area_faces > 0)
+    if not len(mesh.faces):
+        return Mesh.empty(voxel)
+    label = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
+    area = np.bincount(label, weights=mesh.area_faces)
+    corners = mesh.triangles - mesh.vertices.mean(axis=0)
+    volume = np.bincount(label, weights=np.linalg.det(corners))
+    keep = (area >= COMPONENT_KEEP * area[volume > 0].max(initial=0)) & (volume > 0)
+    mesh.update_faces(keep[label])
+    mesh.remove_unreferenced_vertices()
+    return Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32), voxel)
+
+
+def write_mesh(path: Path | str, mesh: Mesh) -> None:
+    """Write a binary PLY, voxel size in a comment; atomic: a kill leaves the old file or the new one."""
+    path = Path(path)
+    data: Any = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply")
+    first, second, rest = data.split(b"\n", 2)
+    comment = f"comment {VOXEL_COMMENT} {float(mesh.voxel)!r}".encode()
+    temporary = path.with_name(path.name + ".part")
+    try:
+        temporary.write_bytes(b"\n".join((first, second, comment, rest)))
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: mesh: cannot be written ({error.strerror}); choose a writable folder"
+        ) from error
+
+
+def read_mesh(path: Path | str) -> Mesh:
+    """Read a triangle mesh (any format of trimesh).
+
+    The voxel size comes from the comment of `write_mesh`; for other files it is the median edge length.
+    Raises InputError if the file is missing or holds no mesh.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: mesh: no such file; give the mesh.ply of a run")
+    with path.open("rb") as file:
+        header = file.read(HEADER_BYTES).split(b"end_header")[0].decode("ascii", "replace")
+    noted = [
+        line.split()[2:3] for line in header.splitlines() if line.startswith(f"comment {VOXEL_COMMENT} ")
+    ]
+    try:
+        voxel = float(noted[0][0]) if noted else None
+        if voxel is not None and "\nelement face 0\n" in header:
+            return Mesh.empty(voxel)
+        mesh: Any = trimesh.load(path, force="mesh", process=False)
+        if voxel is None:
+            voxel = float(np.median(mesh.edges_unique_length)) if len(mesh.faces) else 1.0
+    except Exception as error:  # trimesh raises whatever its parsers meet
+        raise InputError(
+            f"{path}: mesh: not a readable triangle mesh; write it again as PLY or OBJ"
+        ) from error
+    if not (voxel > 0 and np.isfinite(voxel) and np.isfinite(mesh.vertices).all()):
+        raise InputError(
+            f"{path}: mesh: vertices or {VOXEL_COMMENT} not finite and positive; extract the mesh again"
+        )
+    return Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32), voxel)

@@ -1,0 +1,214 @@
+"""Depth maps of many views, fused into one truncated signed distance field over a box.
+
+The sign is positive in free space. A voxel's state follows from what the views say about it:
+
+=======================================  ===================================================================
+in front of, or just behind, a surface   running mean of (depth - z), truncated
+in front of the background               +1 if `carve` is set (else no vote in the mean); never "inside"
+only further behind surfaces             -1: the inside that no view reaches; no wall behind the surface
+in no view's image                       +1: nothing is known to be there
+=======================================  ===================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.splat.camera import Camera
+
+ALPHA_SOLID = 0.5
+"""Opacity from which a pixel has a surface: half coverage puts a box filter's silhouette where it is."""
+
+TRUNCATION_VOXELS = 5.0
+"""Truncation of the signed distance, in voxels. [Ref-Gaussian's released extraction; 2DGS, §6]"""
+
+UNSEEN_VOTE = 0.1
+"""A voxel counts as inside while it has at most this many sightings for each view that has a surface before
+it, so that pixels which leak through thin places drill no tunnels; a cavity must be seen by 9 % of the views
+to stay open. Measured on splats with thin places: part of the surface that is false, 12 % at 0.03, 0.5 % at
+0.15."""
+
+RESOLUTION_MAX = 1023
+"""Voxels along one axis: three coordinates share one 32-bit word."""
+
+BOX_QUANTILE = 0.02
+"""Part of the points on each side, per axis, that may be floaters when the fusion box is found."""
+
+BOX_REACH = 0.25
+"""The box may grow beyond those quantiles by this part of their distance: thin ends hold few points."""
+
+BOX_MARGIN = 0.05
+"""Free space around the points, as part of the longest side: room for the truncation from 128 voxels up."""
+
+
+@dataclass(frozen=True)
+class TSDF:
+    """Signed distance at the corners of a regular grid, in truncations, positive in free space."""
+
+    volume: np.ndarray  # (nx, ny, nz) float32 in [-1, 1]
+    origin: np.ndarray  # (3,) float64, world position of volume[0, 0, 0]
+    voxel: float  # grid spacing, scene units
+
+
+def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Box (lo, hi) with a margin around the (N, 3) world points but for a few per cent of floaters.
+
+    Points that are not finite are ignored. Raises InputError if none is left.
+    """
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        raise InputError(
+            "surfels: position: no finite point to bound; the fit has diverged or pruned every surfel"
+        )
+    lo, hi = np.quantile(points, (BOX_QUANTILE, 1 - BOX_QUANTILE), axis=0)
+    reach = BOX_REACH * (hi - lo)
+    lo, hi = np.maximum(lo - reach, points.min(axis=0)), np.minimum(hi + reach, points.max(axis=0))
+    # The floor keeps a box around a single point: relative to its position, as float32 sees it.
+    margin = max(BOX_MARGIN * float((hi - lo).max()), 1e-3 * float(np.abs(points).max()), 1e-6)
+    return lo - margin, hi + margin
+
+
+def fuse(
+    depths: Iterable[Any],
+    alphas: Iterable[Any],
+    cameras: Iterable[Camera],
+    bounds: tuple[np.ndarray, np.ndarray],
+    resolution: int,
+    *,
+    carve: bool = True,
+) -> TSDF:
+    """Fuse depth maps into a signed distance field over `bounds`.
+
+    `resolution` is the number of voxels along the longest side. Each depth (expected camera z, scene units;
+    not premultiplied) and alpha is a `mi.Float` or `mi.TensorXf` of height·width values in raster order. The
+    three iterables are read once, in step: pass generators and only one view is in memory. Depth where alpha
+    < ALPHA_SOLID is ignored. `carve`: such pixels show free space (set it where the data's alpha means
+    something). Detached; every view runs the same compiled kernel.
+
+    Curless and Levoy 1996 (weighted running mean); weight falling behind the surface as in Bylow et al. 2013,
+    so that the far side of thin parts is pushed away less. Raises InputError for an empty box or a resolution
+    that does not fit.
+    """
+    lo, hi = (np.asarray(b, dtype=np.float64) for b in bounds)
+    extent = hi - lo
+    if not (np.all(np.isfinite(extent)) and np.all(extent > 0)):
+        raise InputError(f"tsdf: bounds: box from {lo} to {hi} has no volume; give lo < hi on every axis")
+    if not 2 <= resolution <= RESOLUTION_MAX:
+        raise InputError(f"tsdf: resolution: {resolution} is outside 2..{RESOLUTION_MAX}; choose 64 to 256")
+    voxel = float(extent.max()) / resolution
+    shape = np.ceil(extent / voxel - 1e-6).astype(int) + 1
+    with dr.suspend_grad():
+        grid = _Grid(shape, lo, voxel)
+        for depth, alpha, camera in zip(depths, alphas, cameras, strict=True):
+            grid.integrate(_flat(depth, camera), _flat(alpha, camera), camera, carve)
+        return TSDF(grid.volume().reshape(shape), lo, voxel)
+
+
+def _flat(image: Any, camera: Camera) -> Any:
+    values = image.array if isinstance(image, mi.TensorXf) else mi.Float(image)
+    if dr.width(values) != camera.width * camera.height:
+        raise ValueError(f"{dr.width(values)} values for an image of {camera.width}x{camera.height} pixels")
+    return values
+
+
+class _Grid:
+    """The accumulators of one fusion."""
+
+    def __init__(self, shape: np.ndarray, lo: np.ndarray, voxel: float) -> None:
+        count = int(np.prod(shape))
+        flat = dr.arange(mi.UInt32, count)
+        yz = flat % dr.opaque(mi.UInt32, int(shape[1] * shape[2]))
+        x, y = (
+            flat // dr.opaque(mi.UInt32, int(shape[1] * shape[2])),
+            yz // dr.opaque(mi.UInt32, int(shape[2])),
+        )
+        # Integer division is slow and would run for every view: keep the three coordinates, 10 bits each.
+        self.corner = x | (y << 10) | ((yz % dr.opaque(mi.UInt32, int(shape[2]))) << 20)
+        self.lo = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in lo))
+        self.voxel = dr.opaque(mi.Float, voxel)
+        self.total = dr.zeros(mi.Float, count)
+        self.weight = dr.zeros(mi.Float, count)
+        self.seen = dr.zeros(mi.Float, count)
+        self.behind = dr.zeros(mi.Float, count)
+        dr.eval(self.corner, self.total, self.weight, self.seen, self.behind)
+
+    def integrate(self, depth: Any, alpha: Any, camera: Camera, carve: bool) -> None:
+        """Add one view."""
+        width, height = dr.opaque(mi.Int32, camera.width), dr.opaque(mi.Int32, camera.height)
+        # Surface depth, or 0 for background; NaN and infinite depths are background too.
+        surface = dr.select((alpha >= ALPHA_SOLID) & (depth > camera.near) & dr.isfinite(depth), depth, 0)
+        dr.eval(surface)
+
+        corner = mi.Point3f(self.corner & 1023, (self.corner >> 10) & 1023, self.corner >> 20)
+        point = camera.to_camera(corner * self.voxel + self.lo)
+        in_front = point.z > camera.near
+        inv_z = dr.rcp(dr.select(in_front, point.z, 1))
+        # Relative to the centre of pixel (0, 0), where its texel sits.
+        px = point.x * inv_z * camera.fx + camera.cx - 0.5
+        py = point.y * inv_z * camera.fy + camera.cy - 0.5
+        in_image = (
+            in_front
+            & (px >= -0.5)
+            & (py >= -0.5)
+            & (px < mi.Float(width) - 0.5)
+            & (py < mi.Float(height) - 0.5)
+        )
+        near, same_surface, background = _sample(surface, px, py, width, height, self.voxel, in_image)
+
+        trunc = TRUNCATION_VOXELS * self.voxel
+        distance = near - point.z
+        hit = in_image & same_surface
+        banded = hit & (distance > -trunc)
+        # Full weight down to one voxel behind the surface, then falling to 0 at the truncation.
+        weight = dr.clip((distance + trunc) / (trunc - self.voxel), 0, 1)
+        weight = dr.select(banded, weight, 0)
+        empty = dr.select(in_image & background, mi.Float(1), 0)
+        self.seen += weight + empty
+        self.behind += dr.select(hit & ~banded, mi.Float(1), 0)
+        if carve:
+            weight += empty
+            distance = dr.select(background, trunc, distance)
+        self.weight += weight
+        self.total += dr.select(weight > 0, weight * dr.minimum(distance / trunc, 1), 0)
+        dr.eval(self.total, self.weight, self.seen, self.behind)
+
+    def volume(self) -> np.ndarray:
+        """Signed distance of every voxel, flat float32."""
+        inside = (self.behind > 0) & (self.seen <= UNSEEN_VOTE * self.behind)
+        observed = self.weight > 0
+        mean = self.total / dr.select(observed, self.weight, 1)
+        value = dr.select(inside, -1, dr.select(observed, mean, 1))
+        return np.array(value, dtype=np.float32)
+
+
+def _sample(
+    surface: Any, px: Any, py: Any, width: Any, height: Any, voxel: Any, active: Any
+) -> tuple[Any, Any, Any]:
+    """Depth at a pixel position, whether it is a surface, and whether it is certainly background.
+
+    Bilinear where the four texels lie on one surface (they differ by less than the truncation); else the
+    nearest texel, because a mean across a depth edge lies on no surface. A silhouette pixel is neither
+    surface nor background unless its nearest texel is solid: carving with half-covered pixels would eat the
+    object's rim."""
+    fx, fy = dr.floor(px), dr.floor(py)
+    wx, wy = px - fx, py - fy
+    x0, y0 = mi.Int32(fx), mi.Int32(fy)
+    taps = []
+    for dy in (0, 1):
+        row = dr.clip(y0 + dy, 0, height - 1) * width
+        taps += [dr.gather(mi.Float, surface, row + dr.clip(x0 + dx, 0, width - 1), active) for dx in (0, 1)]
+    least = dr.minimum(dr.minimum(taps[0], taps[1]), dr.minimum(taps[2], taps[3]))
+    most = dr.maximum(dr.maximum(taps[0], taps[1]), dr.maximum(taps[2], taps[3]))
+    smooth = (least > 0) & (most - least < TRUNCATION_VOXELS * voxel)
+    bilinear = dr.lerp(dr.lerp(taps[0], taps[1], wx), dr.lerp(taps[2], taps[3], wx), wy)
+    right, lower = wx >= 0.5, wy >= 0.5
+    nearest = dr.select(lower, dr.select(right, taps[3], taps[2]), dr.select(right, taps[1], taps[0]))
+    return dr.select(smooth, bilinear, nearest), nearest > 0, most == 0

@@ -1,0 +1,74 @@
+"""The Mitsuba plugins, and how they follow Mitsuba from variant to variant.
+
+Mitsuba has one set of base classes for each variant, so a plugin class must be defined anew after every
+switch. A plugin therefore lives in a module of its own that defines the class and registers it, both at
+module scope:
+
+    class RefGSIntegrator(mi.SamplingIntegrator):
+        def __init__(self, props):
+            require_supported_variant("refgs")
+            super().__init__(props)
+            ...
+
+    mi.register_integrator("refgs", RefGSIntegrator)
+
+and that is imported, or reloaded, each time the variant changes: by `load` below, which `import mi_refgs`
+connects to Mitsuba's variant callback, and from Mitsuba 3.10 on also by Mitsuba itself, through the entry
+point in pyproject.toml. Being loaded twice is harmless: the second registration replaces the first. Such a
+module must not be imported before a variant is set, and nothing else may import classes from it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import Any
+
+import mitsuba as mi
+
+from mi_refgs.errors import InputError
+
+PLUGINS = {"refgs": ("register_integrator", "mi_refgs.plugins.integrator")}
+"""For each plugin name, the Mitsuba function that registers it and the module that defines it."""
+
+
+def is_supported(variant: str | None) -> bool:
+    """Whether the plugins can run under this variant: they need arrays with derivatives and RGB colour."""
+    return variant is not None and variant.endswith("_ad_rgb")
+
+
+def require_supported_variant(plugin: str) -> None:
+    """Refuse to make `plugin` under a variant that it cannot run under.
+
+    Raises:
+        InputError: naming the variant and what to call instead.
+    """
+    variant = mi.variant()
+    if not is_supported(variant):
+        raise InputError(
+            f"{plugin}: variant: '{variant}' is not supported; "
+            "call mi.set_variant('llvm_ad_rgb') or mi.set_variant('cuda_ad_rgb') first"
+        )
+
+
+def load() -> None:
+    """Define and register all plugins for the variant that is set.
+
+    Under an unsupported variant each name is registered with a function that says so, instead of Mitsuba's
+    `plugin not found`.
+    """
+    supported = is_supported(mi.variant())
+    for plugin, (register, module) in PLUGINS.items():
+        if not supported:
+            getattr(mi, register)(plugin, _refusal(plugin))
+        elif module in sys.modules:
+            importlib.reload(sys.modules[module])
+        else:
+            importlib.import_module(module)
+
+
+def _refusal(plugin: str) -> Any:
+    def refuse(props: Any) -> None:
+        require_supported_variant(plugin)
+
+    return refuse

@@ -1,0 +1,84 @@
+"""Arbitrary output variables (AOVs): parsing Mitsuba's `name:type` lists, channel names, values.
+
+No Mitsuba class is defined here, so that this module need not be reloaded when the variant changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.constants import COVERAGE_FLOOR, NORM_FLOOR
+from mi_refgs.errors import InputError
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.splat.camera import Camera
+
+# Suffixes as Mitsuba's own `aov` integrator gives them; `Bitmap.split` makes a greyscale layer of a lone Y.
+SUFFIXES = {
+    "albedo": "RGB",
+    "metallic": "Y",
+    "roughness": "Y",
+    "normal": "XYZ",
+    "depth": "T",
+    "alpha": "Y",
+    "visibility": "Y",
+    "diffuse": "RGB",
+    "specular": "RGB",
+    "indirect": "RGB",
+}
+MATERIALS = ("albedo", "metallic", "roughness")
+
+
+@dataclass(frozen=True)
+class AOV:
+    """One requested variable: its layer name in the image, and one of SUFFIXES."""
+
+    name: str
+    type: str
+
+    def channels(self) -> list[str]:
+        """Channel names, such as `n.X`, `n.Y`, `n.Z`."""
+        return [f"{self.name}.{suffix}" for suffix in SUFFIXES[self.type]]
+
+
+def parse_aovs(text: str) -> list[AOV]:
+    """Parse a comma-separated list of `name:type`; raises InputError for a malformed pair, unknown type or repeated name."""
+    aovs: list[AOV] = []
+    for pair in filter(None, (part.strip() for part in text.split(","))):
+        name, colon, kind = (part.strip() for part in pair.partition(":"))
+        if not colon or not name:
+            raise InputError(f"refgs: aovs: '{pair}' is not a <name>:<type> pair; write for example 'nn:normal'")
+        if kind not in SUFFIXES:
+            raise InputError(f"refgs: aovs: unknown type '{kind}'; use one of {', '.join(SUFFIXES)}")
+        if any(name == other.name for other in aovs):
+            raise InputError(f"refgs: aovs: the name '{name}' occurs twice; rename one of them")
+        aovs.append(AOV(name, kind))
+    return aovs
+
+
+def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Any]:
+    """The channels (mi.Float) of one type, as wide as the frame or 1.
+
+    Materials and the unit normal are those of what is seen, 0 where nothing is; depth is the distance along the ray from
+    the near plane, as Mitsuba's `depth` is; the three terms are premultiplied by alpha and sum to the image over black.
+    """
+    seen = frame.alpha > COVERAGE_FLOOR
+    if kind in MATERIALS:
+        value = frame.maps[kind]
+        return [*value] if kind == "albedo" else [value]
+    if kind == "normal":
+        length2 = dr.squared_norm(frame.normal)
+        valid = seen & (length2 > NORM_FLOOR)
+        unit = frame.normal * dr.rsqrt(dr.select(valid, length2, 1))
+        return [*dr.select(valid, unit, 0)]
+    if kind == "depth":
+        distance = (frame.depth - camera.near) * dr.norm(camera.rays())
+        return [dr.select(seen, distance, 0)]
+    if kind == "alpha":
+        return [frame.alpha]
+    if kind == "visibility":
+        return [dr.select(seen, frame.maps.get("visibility", mi.Float(1)), 0)]
+    return [*getattr(frame.terms, kind)]

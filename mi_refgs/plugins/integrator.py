@@ -1,0 +1,1 @@
+"""The `refgs` integrator (being written)."""

@@ -1,0 +1,125 @@
+"""Losses, depth normals and Adam in float64, pixel by pixel: what `fit.losses`, `fit.ssim` and `fit.optim` must equal.
+
+Images are (H, W, 3), planes (H, W); row first. No helper is shared with the fast path.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+
+def srgb(linear: float) -> float:
+    """sRGB encoding of one value (IEC 61966-2-1), unbounded above."""
+    return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
+
+
+def display_image(radiance: np.ndarray, alpha: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
+    """A srgb(L / A) + (1 - A) background; the background alone where A < 1e-6."""
+    out = np.empty_like(radiance)
+    for index in np.ndindex(radiance.shape):
+        a = alpha[index[:2]]
+        shown = a * srgb(radiance[index] / a) if a >= 1e-6 else 0.0
+        out[index] = shown + (1 - a) * background[index[2]]
+    return out
+
+
+def l1(image: np.ndarray, target: np.ndarray, clipped: np.ndarray | None = None) -> float:
+    """Mean absolute difference; where `clipped`, an image above the target is no error."""
+    total = 0.0
+    for index in np.ndindex(image.shape):
+        if clipped is None or not (clipped[index] and image[index] > target[index]):
+            total += abs(image[index] - target[index])
+    return total / image.size
+
+
+def ssim(image: np.ndarray, target: np.ndarray) -> float:
+    """Mean SSIM: 11×11 Gaussian window with σ = 1.5, zeros outside the image, C1 = 1e-4, C2 = 9e-4."""
+    height, width, channels = image.shape
+    weights = np.array([math.exp(-((k - 5) ** 2) / (2 * 1.5**2)) for k in range(11)])
+    window = np.outer(weights, weights) / weights.sum() ** 2
+    x_padded, y_padded = (np.pad(array, ((5, 5), (5, 5), (0, 0))) for array in (image, target))
+    total = 0.0
+    for row, column, channel in np.ndindex(height, width, channels):
+        x = x_padded[row : row + 11, column : column + 11, channel]
+        y = y_padded[row : row + 11, column : column + 11, channel]
+        μx, μy = np.sum(window * x), np.sum(window * y)
+        σx2, σy2 = np.sum(window * x * x) - μx**2, np.sum(window * y * y) - μy**2
+        σxy = np.sum(window * x * y) - μx * μy
+        total += (2 * μx * μy + 1e-4) * (2 * σxy + 9e-4) / ((μx**2 + μy**2 + 1e-4) * (σx2 + σy2 + 9e-4))
+    return float(total / image.size)
+
+
+def alpha_loss(alpha: np.ndarray, target: np.ndarray, kind: str) -> float:
+    """Mean absolute difference ("l1") or cross-entropy of 1e-4 + (1 - 2e-4) A ("bce")."""
+    total = 0.0
+    for index in np.ndindex(alpha.shape):
+        a, t = float(alpha[index]), float(target[index])
+        squeezed = 1e-4 + (1 - 2e-4) * a
+        entropy = -t * math.log(squeezed) - (1 - t) * math.log(1 - squeezed)
+        total += abs(a - t) if kind == "l1" else entropy
+    return total / alpha.size
+
+
+def normals_from_depth(
+    depth: np.ndarray, alpha: np.ndarray, fx: float, fy: float, cx: float, cy: float, world_from_camera: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """World normals (H, W, 3) of a camera-depth map and their validity (H, W), by central differences."""
+    height, width = depth.shape
+    normals, valid = np.zeros((height, width, 3)), np.zeros((height, width), dtype=bool)
+
+    def point(row: int, column: int) -> np.ndarray:
+        return depth[row, column] * np.array([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, 1.0])
+
+    for row in range(1, height - 1):
+        for column in range(1, width - 1):
+            cross = [(row, column), (row, column - 1), (row, column + 1), (row - 1, column), (row + 1, column)]
+            if min(alpha[place] for place in cross) < 1 / 255:
+                continue
+            normal = np.cross(
+                point(row, column + 1) - point(row, column - 1), point(row + 1, column) - point(row - 1, column)
+            )
+            if np.dot(normal, normal) <= 1e-20:
+                continue
+            normal = -normal if np.dot(normal, point(row, column)) > 0 else normal
+            normals[row, column] = world_from_camera @ (normal / np.linalg.norm(normal))
+            valid[row, column] = True
+    return normals, valid
+
+
+def normal_consistency(normal: np.ndarray, depth_normal: np.ndarray, valid: np.ndarray, weight: np.ndarray) -> float:
+    """Mean over all pixels of A (A - N · n_d) where n_d is valid; `weight` is the constant A."""
+    total = 0.0
+    for index in np.ndindex(valid.shape):
+        if valid[index]:
+            total += weight[index] * (weight[index] - np.dot(normal[index], depth_normal[index]))
+    return float(total / valid.size)
+
+
+def normal_smoothness(normal: np.ndarray, image: np.ndarray) -> float:
+    """Mean over pixels of Σ_axis ‖∂N‖ exp(-‖∂I‖), ‖·‖ the mean absolute value of three planes."""
+    height, width, _ = normal.shape
+    kernel = np.array([[-1, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 8
+    padded = [np.pad(array, ((1, 1), (1, 1), (0, 0)), mode="edge") for array in (normal, image)]
+    total = 0.0
+    for row, column in np.ndindex(height, width):
+        for stencil in (kernel, kernel.T):
+            bend, edge = (
+                np.mean(np.abs(np.tensordot(stencil, p[row : row + 3, column : column + 3]))) for p in padded
+            )
+            total += bend * math.exp(-edge)
+    return float(total / (height * width))
+
+
+def adam(
+    parameter: np.ndarray, gradients: list[np.ndarray], rates: list[np.ndarray | float], epsilon: float = 1e-15
+) -> np.ndarray:
+    """Adam in the form of its Algorithm 1 (bias-corrected moments); ε is scaled as in the efficient order of §2."""
+    θ, m, v = parameter.astype(np.float64), np.zeros(parameter.shape), np.zeros(parameter.shape)
+    for t, (g, rate) in enumerate(zip(gradients, rates, strict=True), start=1):
+        m = 0.9 * m + 0.1 * g
+        v = 0.999 * v + 0.001 * g**2
+        corrected_m, corrected_v = m / (1 - 0.9**t), v / (1 - 0.999**t)
+        θ = θ - rate * corrected_m / (np.sqrt(corrected_v) + epsilon / math.sqrt(1 - 0.999**t))
+    return θ

@@ -1,0 +1,144 @@
+"""Float64 specification of depth fusion and of visibility: shapes given by their distance, traced in NumPy.
+
+A shape is a function from (N, 3) points to (N,) exact or underestimated signed distances, positive outside.
+Cameras are (to_world, focal, size): rigid (4, 4), Mitsuba camera frame; pixels; square image, principal point
+at its centre."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+Shape = Callable[[np.ndarray], np.ndarray]
+
+HIT_DISTANCE = 1e-5
+"""A ray this close to a shape of unit size has hit it."""
+
+TRACE_STEPS = 200
+TRACE_FAR = 20.0
+
+
+def sphere(centre: tuple[float, float, float], radius: float) -> Shape:
+    """Ball."""
+    return lambda p: np.linalg.norm(p - np.array(centre), axis=-1) - radius
+
+
+def torus(major: float, minor: float) -> Shape:
+    """Ring around the z axis."""
+    return lambda p: np.hypot(np.hypot(p[..., 0], p[..., 1]) - major, p[..., 2]) - minor
+
+
+def box(centre: tuple[float, float, float], half: tuple[float, float, float]) -> Shape:
+    """Axis-aligned box."""
+
+    def distance(p: np.ndarray) -> np.ndarray:
+        q = np.abs(p - np.array(centre)) - np.array(half)
+        return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
+
+    return distance
+
+
+def union(*shapes: Shape) -> Shape:
+    """All of the shapes."""
+    return lambda p: np.min([shape(p) for shape in shapes], axis=0)
+
+
+def normal(shape: Shape, points: np.ndarray, step: float = 1e-5) -> np.ndarray:
+    """Unit outward normals by central differences."""
+    gradient = np.stack([shape(points + step * e) - shape(points - step * e) for e in np.eye(3)], axis=-1)
+    return gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
+
+
+def look_at(origin: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """World from camera, +z towards the target, +x left, +y up (world z, unless looking along it)."""
+    forward = (target - origin) / np.linalg.norm(target - origin)
+    up = np.array([0.0, 0, 1]) if abs(forward[2]) < 0.95 else np.array([0.0, 1, 0])
+    left = np.cross(up, forward)
+    left /= np.linalg.norm(left)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([left, np.cross(forward, left), forward, origin], axis=1)
+    return matrix
+
+
+def trace(shape: Shape, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Distance to the shape along unit directions by sphere tracing, infinite for a miss."""
+    t, result = np.zeros(len(origin)), np.full(len(origin), np.inf)
+    active = np.arange(len(origin))
+    for _ in range(TRACE_STEPS):
+        distance = shape(origin[active] + t[active, None] * direction[active])
+        hit = np.abs(distance) < HIT_DISTANCE
+        result[active[hit]] = t[active[hit]]
+        t[active] += distance
+        active = active[~hit & (t[active] < TRACE_FAR)]
+    return result
+
+
+def depth_map(shape: Shape, to_world: np.ndarray, focal: float, size: int) -> np.ndarray:
+    """(size, size) camera z of the shape through the pixel centres, 0 for background."""
+    j, i = np.mgrid[:size, :size] + 0.5
+    local = np.stack([(size / 2 - i) / focal, (size / 2 - j) / focal, np.ones_like(i)], axis=-1).reshape(
+        -1, 3
+    )
+    length = np.linalg.norm(local, axis=1)
+    direction = (local / length[:, None]) @ to_world[:3, :3].T
+    t = trace(shape, np.broadcast_to(to_world[:3, 3], direction.shape), direction)
+    return np.where(np.isfinite(t), t / length, 0).reshape(size, size)
+
+
+def visible(shape: Shape, points: np.ndarray, direction: np.ndarray, clearance: float) -> np.ndarray:
+    """Whether rays from `points` on the shape leave it, starting `clearance` off the surface along its
+    normal."""
+    return ~np.isfinite(trace(shape, points + clearance * normal(shape, points), direction))
+
+
+def fuse_point(
+    point: np.ndarray,
+    depths: list[np.ndarray],
+    views: list[tuple[np.ndarray, float, int]],
+    voxel: float,
+    *,
+    carve: bool,
+    truncation_voxels: float,
+    unseen_vote: float,
+) -> float:
+    """Fused signed distance of one point, in truncations: the table at the top of `occlusion.tsdf`, word by
+    word."""
+    truncation = truncation_voxels * voxel
+    total = weight = sightings = covered = 0.0
+    for depth, (to_world, focal, size) in zip(depths, views, strict=True):
+        x, y, z = to_world[:3, :3].T @ (point - to_world[:3, 3])
+        if z <= 0:
+            continue
+        u, v = size / 2 - focal * x / z - 0.5, size / 2 - focal * y / z - 0.5
+        if not (-0.5 <= u < size - 0.5 and -0.5 <= v < size - 0.5):
+            continue
+        u0, v0 = int(np.floor(u)), int(np.floor(v))
+        du, dv = u - u0, v - v0
+        texels = [
+            [depth[min(max(r, 0), size - 1), min(max(c, 0), size - 1)] for c in (u0, u0 + 1)]
+            for r in (v0, v0 + 1)
+        ]
+        tap = np.array(texels)
+        if (tap == 0).all():  # background for certain
+            sightings += 1
+            if carve:
+                weight += 1
+                total += 1
+            continue
+        surface = tap[int(dv >= 0.5), int(du >= 0.5)]
+        if surface == 0:  # half-covered pixel
+            continue
+        if tap.min() > 0 and np.ptp(tap) < truncation:
+            surface = np.array([1 - dv, dv]) @ tap @ np.array([1 - du, du])
+        distance = surface - z
+        if distance <= -truncation:
+            covered += 1
+            continue
+        w = min(1.0, (distance + truncation) / (truncation - voxel))
+        sightings += w
+        weight += w
+        total += w * min(1.0, distance / truncation)
+    if covered and sightings <= unseen_vote * covered:
+        return -1.0
+    return total / weight if weight else 1.0

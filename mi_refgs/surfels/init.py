@@ -1,0 +1,252 @@
+"""Initial surfels: from points, from the visual hull of alpha masks, or at random.
+
+World positions in scene units; cameras in Mitsuba's frame (+z forward, +x left, +y up), hence signed focal lengths.
+`bounds` is a (2, 3) array: the lowest and highest corner of a box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mi_refgs.errors import InputError
+from mi_refgs.surfels.table import CHANNELS, GEOMETRY, MAX_SH_DEGREE, Surfels, sh_columns
+
+# Y_0 = 1 / (2 √π): a DC coefficient c shows as the colour 0.5 + Y_0 c. [3DGS]
+SH_DC = 0.28209479177387814
+# Squared distance to the neighbours, scene units²: keeps the log scale of doubled points finite. [2DGS]
+SQUARED_DISTANCE_FLOOR = 1e-7
+# Neighbours whose mean squared distance gives the scale. [3DGS]
+NEIGHBOURS = 3
+# Uniform jitter of the initial albedo around its mean: breaks ties between surfels. [Ref-Gaussian]
+ALBEDO_JITTER = 0.025
+# Voxels per edge of the visual hull's grid: at 200² a voxel of the cube that the views span is two pixels wide.
+HULL_RESOLUTION = 96
+# Mask level that bounds the hull, and the level below which a voxel is given up at once (the mask is blurred).
+HULL_LEVEL = 0.5
+HULL_CARVED = 0.05
+# Views that vote for a point's colour: a median needs no more, and memory grows with points times views.
+COLOUR_VIEWS = 32
+# Singular value of the mean of (I - d dᵀ), 0 for parallel view axes, below which those axes have no common point.
+FOCUS_CONDITION = 1e-3
+
+
+@dataclass(frozen=True)
+class View:
+    """One training view, in NumPy."""
+
+    fx: float  # pixels, signed
+    fy: float  # pixels, signed
+    cx: float  # pixels
+    cy: float  # pixels
+    to_world: np.ndarray  # (4, 4) world from camera, rigid
+    alpha: np.ndarray  # (H, W) in [0, 1]
+    colour: np.ndarray | None = None  # (H, W, 3) linear, not premultiplied
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Array indices (row, column) of world points (N, 3), where a pixel centre is an integer, and if they are seen."""
+        to_world = np.asarray(self.to_world, dtype=np.float64)
+        local = (points - to_world[:3, 3]) @ to_world[:3, :3]
+        depth = np.where(local[:, 2] > 0, local[:, 2], np.inf)
+        column = self.fx * local[:, 0] / depth + self.cx - 0.5
+        row = self.fy * local[:, 1] / depth + self.cy - 0.5
+        height, width = self.alpha.shape
+        seen = (local[:, 2] > 0) & (abs(column - (width - 1) / 2) <= width / 2) & (abs(row - (height - 1) / 2) <= height / 2)
+        return row, column, seen
+
+
+# ---------------- points ----------------
+
+
+def camera_bounds(views: Sequence[View]) -> np.ndarray:
+    """A cube around the point all cameras look at, as wide as the widest view there: (2, 3).
+
+    Raises InputError if the view axes have no common point (one view, or parallel ones).
+    """
+    origins = np.array([view.to_world[:3, 3] for view in views], dtype=np.float64).reshape(-1, 3)
+    axes = np.array([view.to_world[:3, 2] for view in views], dtype=np.float64).reshape(-1, 3)
+    # The point nearest to all axes: Σ (I - d dᵀ)(p - o) = 0.
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    system = projectors.mean(axis=0) if len(views) else np.zeros((3, 3))
+    if np.linalg.svd(system, compute_uv=False)[-1] < FOCUS_CONDITION:
+        raise InputError("views: cameras: they do not look at one point from several sides; give the bounds of the scene")
+    focus = np.linalg.solve(system, np.einsum("nij,nj->i", projectors, origins) / len(views))
+    distance = np.linalg.norm(origins - focus, axis=1)
+    reach = [max(v.alpha.shape[1] / abs(v.fx), v.alpha.shape[0] / abs(v.fy)) / 2 for v in views]
+    half = min(float(np.max(distance * reach)), float(distance.max()))
+    return np.stack([focus - half, focus + half])
+
+
+def random_points(count: int, bounds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Points (count, 3) uniform in the box, for data without alpha."""
+    low, high = np.asarray(bounds, dtype=np.float64)
+    return rng.uniform(low, high, (count, 3))
+
+
+def visual_hull_points(
+    views: Sequence[View], count: int, bounds: np.ndarray, rng: np.random.Generator, resolution: int = HULL_RESOLUTION
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (count, 3) uniform on the surface of the visual hull, and its outward unit normals (count, 3).
+
+    The hull is the set of points inside every mask (alpha > 0.5, blurred by half a voxel); where a view does not see a
+    point it says nothing. Surface by marching cubes (scikit-image) on the smallest mask value over the views.
+    Raises InputError if nothing is inside every mask.
+    """
+    from skimage.measure import marching_cubes
+
+    low, high = np.asarray(bounds, dtype=np.float64)
+    voxel = (high - low) / resolution
+    centres = np.stack(np.meshgrid(*[np.arange(resolution)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = np.ones(resolution**3, dtype=np.float32)
+    alive = np.arange(resolution**3)
+    middle = (low + high) / 2
+    for view in views:
+        points = low + (centres[alive] + 0.5) * voxel
+        row, column, seen = view.project(points)
+        distance = max(float(np.linalg.norm(middle - view.to_world[:3, 3])), 1e-6)
+        blur = 0.5 * float(voxel.max()) * abs(view.fx) / distance
+        mask = gaussian_filter(np.asarray(view.alpha, dtype=np.float32), blur, mode="nearest")
+        value = map_coordinates(mask, np.stack([row[seen], column[seen]]), order=1, mode="nearest")
+        inside[alive[seen]] = np.minimum(inside[alive[seen]], value)
+        dead = inside[alive] < HULL_CARVED
+        inside[alive[dead]] = 0
+        alive = alive[~dead]
+    field = np.pad(inside.reshape((resolution,) * 3), 1)
+    if not np.any(field > HULL_LEVEL):
+        raise InputError("views: alpha: no point of the scene is inside every mask; check cameras and masks, or do not use alpha")
+
+    vertices, faces, _, _ = marching_cubes(field, HULL_LEVEL)
+    corners = vertices[faces].astype(np.float64)
+    area = np.linalg.norm(np.cross(*(((corners[:, i] - corners[:, 0]) * voxel) for i in (1, 2))), axis=1)
+    face = rng.choice(len(faces), count, p=area / area.sum())
+    # Uniform in a triangle: fold the unit square along its diagonal.
+    first, second = rng.random((2, count))
+    fold = first + second > 1
+    first, second = np.where(fold, 1 - first, first), np.where(fold, 1 - second, second)
+    a, b, c = (corners[face, i] for i in range(3))
+    grid = a + first[:, None] * (b - a) + second[:, None] * (c - a)
+    smooth = gaussian_filter(field, 1.0)
+    slope = [map_coordinates(part, grid.T, order=1) for part in np.gradient(smooth)]
+    normals = -np.stack(slope, axis=-1) / voxel
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+    # The field is padded by one voxel, and its sample 0 lies half a voxel inside the box.
+    return low + (grid - 0.5) * voxel, normals
+
+
+def mean_colours(points: np.ndarray, views: Sequence[View], normals: np.ndarray | None = None) -> np.ndarray:
+    """Median linear colour (N, 3) of the points over the views that show them with alpha > 0.5; 0.5 if none does.
+
+    With `normals`, only views in front of a point vote. There is no occlusion test: the median of many views forgives
+    it. At most 32 views, evenly chosen, are read.
+    """
+    chosen = [view for view in views if view.colour is not None]
+    chosen = [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, COLOUR_VIEWS).astype(int))] if chosen else []
+    if not chosen or not len(points):
+        return np.full((len(points), 3), 0.5)
+    samples = np.full((len(chosen), len(points), 3), np.nan, dtype=np.float32)
+    for sample, view in zip(samples, chosen, strict=True):
+        row, column, seen = view.project(points)
+        if normals is not None:
+            seen = seen & (np.sum(normals * (view.to_world[:3, 3] - points), axis=1) > 0)
+        at = np.rint([row[seen], column[seen]]).astype(int)
+        row_index, column_index = np.clip(at, 0, np.array(view.alpha.shape)[:, None] - 1)
+        colour = np.asarray(view.colour)[row_index, column_index]
+        opaque = view.alpha[row_index, column_index] > 0.5
+        sample[np.flatnonzero(seen)[opaque]] = colour[opaque]
+    ordered = np.sort(samples, axis=0)  # NaN last
+    number = np.count_nonzero(~np.isnan(ordered[..., 0]), axis=0)
+    middle = ordered[np.maximum(number - 1, 0) // 2, np.arange(len(points))]
+    return np.where(number[:, None] > 0, middle, 0.5).astype(np.float64)
+
+
+# ---------------- surfels ----------------
+
+
+def from_points(
+    points: np.ndarray,  # (N, 3) world
+    normals: np.ndarray | None = None,  # (N, 3) any length
+    colours: np.ndarray | None = None,  # (N, 3) linear radiance
+    *,
+    rng: np.random.Generator,
+    channels: Sequence[str] = tuple(CHANNELS),
+    sh_degree: int = 0,
+    indirect_degree: int | None = None,
+    opacity: float = 0.1,
+    metallic: float = 0.01,
+    roughness: float = 0.1,
+    albedo: float = 0.5,
+    scale_factor: float = 1.0,
+) -> Surfels:
+    """One surfel per point: scale from its 3 nearest neighbours, normal as given or uniform at random, raw values.
+
+    The tangents are turned at random about the normal. `colours` fill the DC of radiance_sh (grey 0.5 by default); the
+    indirect coefficients start at exactly 0. Initial values as in the released Ref-Gaussian, but rotations are uniform
+    over SO(3), not over positive components. Raises InputError for wrong shapes, NaN or unknown channels.
+    """
+    points = _check("points", points, np.shape(points)[:1])
+    unknown = [name for name in channels if name not in CHANNELS]
+    if unknown or not 0 <= sh_degree <= MAX_SH_DEGREE:
+        wrong = f"channels: {unknown[0]}: unknown" if unknown else f"sh_degree: {sh_degree}: not in 0..{MAX_SH_DEGREE}"
+        raise InputError(f"surfels: {wrong}; use channels of {', '.join(CHANNELS)} and a degree of 0..{MAX_SH_DEGREE}")
+    count = len(points)
+    log_scale = np.log(neighbour_scale(points) * scale_factor)
+    raw: dict[str, np.ndarray] = {
+        "position": points,
+        "rotation": quaternions(None if normals is None else _check("normals", normals, (count,)), count, rng),
+        "scale": np.repeat(log_scale[:, None], 2, axis=1),
+        "opacity": np.full((count, 1), logit(opacity)),
+        "radiance_sh": np.zeros((count, sh_columns(sh_degree))),
+        "albedo": logit(np.clip(albedo + rng.uniform(-ALBEDO_JITTER, ALBEDO_JITTER, (count, 3)), 0.001, 0.999)),
+        "metallic": np.full((count, 1), logit(metallic)),
+        "roughness": np.full((count, 1), logit(roughness)),
+        "indirect_sh": np.zeros((count, sh_columns(sh_degree if indirect_degree is None else indirect_degree))),
+    }
+    if colours is not None:
+        raw["radiance_sh"][:, :3] = (_check("colours", colours, (count,)) - 0.5) / SH_DC
+    return Surfels.from_numpy({name: raw[name] for name in CHANNELS if name in GEOMETRY or name in channels})
+
+
+def neighbour_scale(points: np.ndarray) -> np.ndarray:
+    """Root mean squared distance (N,) of each point to its 3 nearest neighbours, at least √1e-7."""
+    wanted = min(NEIGHBOURS, len(points) - 1)
+    if wanted < 1:
+        return np.full(len(points), np.sqrt(SQUARED_DISTANCE_FLOOR))
+    distance, _ = cKDTree(points).query(points, k=wanted + 1)
+    return np.sqrt(np.maximum(np.mean(distance[:, 1:] ** 2, axis=1), SQUARED_DISTANCE_FLOOR))
+
+
+def quaternions(normals: np.ndarray | None, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Unit quaternions (count, 4), x y z w, whose third axis is the normal; uniform over SO(3) without normals."""
+    free = rng.normal(size=(count, 4))
+    free /= np.linalg.norm(free, axis=1, keepdims=True)
+    if normals is None or count == 0:
+        return free
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    n = np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+    tangent = np.cross(n, free[:, :3])
+    short = np.linalg.norm(tangent, axis=1) < 1e-6
+    tangent[short] = np.cross(n[short], np.eye(3)[np.argmin(np.abs(n[short]), axis=1)])
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    return Rotation.from_matrix(np.stack([tangent, np.cross(n, tangent), n], axis=-1)).as_quat()
+
+
+def logit(value: float | np.ndarray) -> np.ndarray:
+    """Inverse of the logistic sigmoid, for values in (0, 1)."""
+    value = np.asarray(value, dtype=np.float64)
+    return np.log(value) - np.log1p(-value)
+
+
+def _check(name: str, values: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (*rows, 3):
+        raise InputError(f"surfels: {name}: shape {array.shape}, expected {(*rows, 3)}; give one row of three per point")
+    bad = int(np.count_nonzero(~np.isfinite(array)))
+    if bad:
+        raise InputError(f"surfels: {name}: {bad} values are NaN or infinite; remove those points")
+    return array

@@ -1,0 +1,198 @@
+"""Surfels in PLY files, with the property names and raw encodings of 2DGS, so that other viewers read what they know.
+
+    x y z                          position                     nx ny nz        zeros, as 2DGS writes them; ignored
+    f_dc_0..2, f_rest_*            radiance_sh                  opacity         logit
+    scale_0 scale_1                log scale                    rot_0..3        quaternion, w first
+    albedo_0..2 metallic roughness logits                       ind_dc_0..2, ind_rest_*   indirect_sh
+
+Everything is raw (before the activation). Spherical harmonics are channel-major: the DC of r, g, b, then every other
+coefficient of r, of g, of b. The table's own column order is 3 coefficient + rgb.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.surfels.table import MAX_SH_DEGREE, Surfels, sh_columns
+
+# A header of ours has 124 lines at most; more than this without its end is no PLY header.
+MAX_HEADER_LINES = 1000
+# Property groups of the channels that are not spherical harmonics. The quaternion's x, y, z, w are rot_1, 2, 3, 0.
+PROPERTIES: dict[str, tuple[str, ...]] = {
+    "position": ("x", "y", "z"),
+    "rotation": ("rot_1", "rot_2", "rot_3", "rot_0"),
+    "scale": ("scale_0", "scale_1"),
+    "opacity": ("opacity",),
+    "albedo": ("albedo_0", "albedo_1", "albedo_2"),
+    "metallic": ("metallic",),
+    "roughness": ("roughness",),
+}
+REQUIRED = ("position", "rotation", "scale", "opacity")
+# Prefix of the properties of a spherical-harmonic channel.
+SH_PREFIX = {"radiance_sh": "f", "indirect_sh": "ind"}
+TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
+    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
+}
+
+
+# ---------------- reading ----------------
+
+
+def read_ply(path: str | Path) -> Surfels:
+    """Read surfels from a binary or ASCII PLY file; unknown properties are ignored, absent groups give absent channels.
+
+    Raises InputError, naming file, property and remedy, if the file is missing, truncated or no PLY, if it holds 3D
+    Gaussians, if x y z, opacity, scale_0/1 or rot_0..3 or part of another group is missing, or if a value is not finite.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            vertices = _read_vertices(path, file)
+    except OSError as error:
+        raise InputError(f"{path}: file: cannot be read ({error.strerror}); check the path") from error
+
+    names = vertices.dtype.names or ()
+    if "scale_2" in names:
+        raise InputError(f"{path}: scale_2: the file holds 3D Gaussians; export surfels (2DGS) with two scales instead")
+    arrays = {}
+    for channel, properties in PROPERTIES.items():
+        if channel in REQUIRED or any(name in names for name in properties):
+            arrays[channel] = _columns(path, vertices, properties)
+    for channel in SH_PREFIX:
+        if any(name.startswith(f"{SH_PREFIX[channel]}_") for name in names):
+            degree = _sh_degree(path, names, SH_PREFIX[channel])
+            arrays[channel] = _columns(path, vertices, _sh_properties(channel, degree))
+    return Surfels.from_numpy(arrays)
+
+
+def _read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
+    """The `vertex` element as a structured array."""
+    if file.readline().strip() != b"ply":
+        raise InputError(f"{path}: header: not a PLY file; give the surfels.ply of a run or a 2DGS point_cloud.ply")
+    order, count, fields, in_vertex, skipped = "", -1, [], False, 0
+    for _ in range(MAX_HEADER_LINES):
+        words = file.readline().decode("ascii", errors="replace").split()
+        if words[:1] == ["format"] and len(words) > 1:
+            order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "a"}.get(words[1], "")
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+            in_vertex = words[1] == "vertex"
+            if in_vertex:
+                count = int(words[2])
+            elif count < 0:
+                skipped += int(words[2])
+        elif words[:1] == ["property"] and in_vertex:
+            if len(words) != 3 or words[1] not in TYPES:
+                raise InputError(f"{path}: {words[-1]}: not a number property; export the vertices without lists")
+            fields.append((words[2], TYPES[words[1]]))
+        elif words == ["end_header"]:
+            break
+    else:
+        raise InputError(f"{path}: header: no end_header; the file is truncated, export it again")
+    if not order or count < 0 or not fields or skipped:
+        raise InputError(f"{path}: header: no format or no leading vertex element; export it again as a surfel PLY")
+    if len({name for name, _ in fields}) < len(fields):
+        raise InputError(f"{path}: header: a vertex property occurs twice; export it again")
+
+    if order == "a":
+        values = _read_ascii(path, file, count, len(fields))
+        dtype = np.dtype([(name, "f8") for name, _ in fields])
+        return np.ascontiguousarray(values).view(dtype).reshape(count)
+    dtype = np.dtype([(name, order + code) for name, code in fields])
+    data = file.read(count * dtype.itemsize)
+    if len(data) < count * dtype.itemsize:
+        found = len(data) // dtype.itemsize
+        raise InputError(f"{path}: vertex: {found} of {count} rows; the file is truncated, copy or export it again")
+    return np.frombuffer(data, dtype=dtype)
+
+
+def _read_ascii(path: Path, file: BinaryIO, count: int, width: int) -> np.ndarray:
+    values = np.empty((count, width))
+    for row in range(count):
+        words = file.readline().split()
+        try:
+            values[row] = [float(word) for word in words]
+        except ValueError as error:
+            raise InputError(f"{path}: vertex: row {row} is broken or missing; copy or export the file again") from error
+    return values
+
+
+def _columns(path: Path, vertices: np.ndarray, properties: tuple[str, ...]) -> np.ndarray:
+    """The named properties as an (N, D) float32 array, all present and finite."""
+    table = np.empty((len(vertices), len(properties)), dtype=np.float32)
+    for column, name in enumerate(properties):
+        if name not in (vertices.dtype.names or ()):
+            raise InputError(f"{path}: {name}: the property is missing; export the file again with all of "
+                             f"{', '.join(sorted(properties))}")  # fmt: skip
+        # A double beyond float32 becomes infinite here and is reported below.
+        with np.errstate(over="ignore"):
+            table[:, column] = vertices[name]
+        bad = int(np.count_nonzero(~np.isfinite(table[:, column])))
+        if bad:
+            raise InputError(f"{path}: {name}: {bad} values are NaN or infinite; remove those surfels or export it again")
+    return table
+
+
+def _sh_degree(path: Path, names: tuple[str, ...], prefix: str) -> int:
+    rest = sum(name.startswith(f"{prefix}_rest_") for name in names)
+    for degree in range(MAX_SH_DEGREE + 1):
+        if rest == sh_columns(degree) - 3:
+            return degree
+    raise InputError(f"{path}: {prefix}_rest_*: {rest} properties; use 0, 9, 24 or 45 (degrees 0 to {MAX_SH_DEGREE})")
+
+
+def _sh_properties(channel: str, degree: int) -> tuple[str, ...]:
+    """Property names in the table's column order (3 coefficient + rgb)."""
+    prefix, others = SH_PREFIX[channel], (degree + 1) ** 2 - 1
+    rest = tuple(f"{prefix}_rest_{rgb * others + k}" for k in range(others) for rgb in range(3))
+    return (*(f"{prefix}_dc_{rgb}" for rgb in range(3)), *rest)
+
+
+# ---------------- writing ----------------
+
+
+def write_ply(path: str | Path, surfels: Surfels) -> None:
+    """Write surfels as binary little-endian float32 PLY, atomically: readers see the old file or the whole new one.
+
+    Reading it back gives the same bits. Raises InputError if a value is not finite or the path cannot be written.
+    """
+    surfels.validate()
+    values: dict[str, np.ndarray] = {}
+    for channel, table in surfels.to_numpy().items():
+        sh = channel in SH_PREFIX
+        properties = _sh_properties(channel, surfels.sh_degree(channel)) if sh else PROPERTIES[channel]
+        values |= {name: table[:, column] for column, name in enumerate(properties)}
+    names = _file_order(values)
+    rows = np.zeros(surfels.count, dtype=[(name, "<f4") for name in names])
+    for name, column in values.items():
+        rows[name] = column
+    properties_text = "".join(f"property float {name}\n" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {surfels.count}\n{properties_text}end_header\n"
+
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(header.encode("ascii") + rows.tobytes())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path}: output: cannot be written ({error.strerror}); choose a writable folder") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _file_order(values: dict[str, np.ndarray]) -> list[str]:
+    """2DGS's order: position, normal, spherical harmonics by number, opacity, scale, rotation; then ours."""
+
+    def numbered(prefix: str) -> list[str]:
+        return sorted((name for name in values if name.startswith(prefix)), key=lambda name: int(name.split("_")[-1]))
+
+    order = ["x", "y", "z", "nx", "ny", "nz", *numbered("f_dc_"), *numbered("f_rest_"), "opacity"]
+    order += [*numbered("scale_"), *numbered("rot_"), *numbered("albedo_")]
+    order += [name for name in ("metallic", "roughness") if name in values]
+    return order + numbered("ind_dc_") + numbered("ind_rest_")

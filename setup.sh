@@ -1,0 +1,84 @@
+#!/usr/bin/env bash
+# Sets up mi_refgs in .venv beside this file, then runs what is asked for. Run it as often as you like.
+#
+#   bash setup.sh         set up only
+#   bash setup.sh demo    set up, then run the main job on an embedded example (writes runs/demo)
+#   bash setup.sh test    set up with the development tools, then run every check
+#
+# Needs Python 3.11 or newer; PYTHON=... names another one than python3. Missing system packages (python3-venv,
+# libllvm19) are installed when this runs as root or sudo asks for no password; else the line to type is printed.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")"
+
+mode=${1:-}
+case "$mode" in
+    "" | demo) extras="" ;;
+    test) extras="[dev]" ;;
+    *) echo "usage: bash setup.sh [demo|test]" >&2; exit 2 ;;
+esac
+
+fail() { echo "setup.sh: $*" >&2; exit 1; }
+
+# Installs Debian packages, or says how to.
+install_packages() {
+    local sudo=""
+    if [ "$(id -u)" -ne 0 ]; then sudo="sudo"; fi
+    if ! command -v apt-get > /dev/null || { [ -n "$sudo" ] && ! sudo -n true 2> /dev/null; }; then
+        fail "$* is missing; type: ${sudo:+$sudo }apt-get install $*"
+    fi
+    echo "setup.sh: installing $*"
+    export DEBIAN_FRONTEND=noninteractive
+    $sudo apt-get update -qq
+    $sudo apt-get install -y -qq "$@" > /dev/null || fail "could not install $*; type: ${sudo:+$sudo }apt-get install $*"
+}
+
+# ---------- Python ----------
+python=""
+for candidate in "${PYTHON:-python3}" python3.13 python3.12 python3.11; do
+    if "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2> /dev/null; then
+        python=$candidate
+        break
+    fi
+done
+[ -n "$python" ] || fail "Python 3.11 or newer is missing; type: apt-get install python3"
+
+# ---------- LLVM, which Dr.Jit compiles its kernels with ----------
+if ! found=$("$python" -P mi_refgs/llvm.py); then
+    if [ -n "${DRJIT_LIBLLVM_PATH:-}" ] || [ "$(uname)" != "Linux" ]; then fail "$found"; fi
+    install_packages libllvm19
+    found=$("$python" -P mi_refgs/llvm.py) || fail "$found"
+fi
+
+# ---------- Packages ----------
+# The stamp says what .venv was made for and what it holds; a set-up with the development tools serves every mode.
+made_for="$("$python" -VV | tr '\n' ' ') in $PWD"
+holds=$(cksum < pyproject.toml)
+stamp=.venv/set-up
+was=$(cat "$stamp" 2> /dev/null || true)
+if [ "$was" != "$made_for: $holds [dev]" ] && [ "$was" != "$made_for: $holds $extras" ]; then
+    "$python" -c 'import ensurepip, venv' 2> /dev/null || install_packages python3-venv
+    rm -f "$stamp"
+    echo "setup.sh: installing into .venv (a few minutes the first time)"
+    case "$was" in
+        "$made_for: "*) ;;
+        *) "$python" -m venv --clear .venv ;;
+    esac
+    .venv/bin/python -m pip install -qq --disable-pip-version-check -e ".$extras"
+    .venv/bin/python -c 'import mi_refgs'
+    echo "$made_for: $holds $extras" > "$stamp"
+fi
+
+# ---------- What is asked for ----------
+case "$mode" in
+    "") .venv/bin/refgs doctor ;;
+    demo) .venv/bin/refgs demo -o runs/demo ;;
+    test)
+        failed=""
+        .venv/bin/ruff check . || failed+=" ruff-check"
+        .venv/bin/ruff format --check . || failed+=" ruff-format"
+        .venv/bin/mypy || failed+=" mypy"
+        .venv/bin/python -m pytest -q || failed+=" pytest"
+        [ -z "$failed" ] || fail "failed:$failed"
+        echo "setup.sh: all checks passed"
+        ;;
+esac

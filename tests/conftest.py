@@ -1,0 +1,55 @@
+"""Every test starts under llvm_ad_rgb with Dr.Jit's defaults, and leaves nothing behind for the next one."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+
+import mi_refgs  # noqa: F401  (first: it chooses the libLLVM that Dr.Jit loads)
+
+# isort: split
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    if dr.has_backend(dr.JitBackend.CUDA):
+        return
+    for item in items:
+        if item.get_closest_marker("cuda"):
+            item.add_marker(pytest.mark.skip(reason="no CUDA device"))
+
+
+@pytest.fixture(autouse=True)
+def llvm_ad_rgb() -> Iterator[None]:
+    """Set the variant; afterwards wait for kernels, restore the flags, and return the memory of the test.
+
+    Compiled kernels and registered objects stay: module-scoped fixtures hold scenes, and recompiling costs
+    most of a test's time.
+    """
+    mi.set_variant("llvm_ad_rgb")
+    yield
+    gc.collect()
+    if mi.variant() != "scalar_rgb":
+        dr.sync_thread()
+    dr.kernel_history_clear()
+    dr.flush_malloc_cache()
+    dr.set_flag(dr.JitFlag.Default, True)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Random numbers that are the same in every run."""
+    return np.random.default_rng(20261121)
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Run Dr.Jit on one thread: floating-point sums by scatter are then bitwise the same in every run."""
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    yield
+    dr.sync_thread()
+    dr.set_thread_count(threads)

@@ -1,0 +1,68 @@
+"""`refgs doctor`'s report, on this machine and for installations that lack something."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+
+import pytest
+
+from mi_refgs import doctor, llvm
+
+
+@pytest.fixture(scope="module")
+def report() -> doctor.Report:
+    return doctor.examine()
+
+
+def test_this_machine_is_usable(report: doctor.Report) -> None:
+    assert report.problems == ()
+    assert report.usable
+    assert report.llvm_version is not None and int(report.llvm_version.split(".")[0]) >= llvm.MINIMUM_MAJOR
+    assert report.simd_width in (1, 4, 8, 16)
+    assert report.threads >= 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a process map")
+def test_the_library_is_named(report: doctor.Report) -> None:
+    assert report.llvm_path is not None and "libLLVM" in report.llvm_path
+
+
+def test_json_is_one_object_with_every_field(report: doctor.Report) -> None:
+    loaded = json.loads(report.to_json())
+    assert loaded["usable"] is True
+    assert set(loaded) == {"usable"} | {field.name for field in dataclasses.fields(report)}
+
+
+def test_text_states_each_problem_with_its_remedy(report: doctor.Report) -> None:
+    broken = dataclasses.replace(
+        report,
+        llvm_version=None,
+        llvm_path=None,
+        problems=(llvm.Problem("no LLVM was found", "install one"),),
+    )
+    assert not broken.usable
+    text = broken.to_text()
+    assert "no LLVM was found" in text and "install one" in text
+    assert "Everything that is needed is here" not in text
+
+
+def test_unusable_llvm_is_a_problem_without_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    trouble = llvm.Problem("no LLVM was found", "install one")
+    monkeypatch.setattr(llvm, "problem", lambda: trouble)
+    report = doctor.examine()
+    assert report.problems == (() if report.cuda else (trouble,))
+
+
+def test_a_failing_kernel_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_PROBE", "import os; os.abort()")
+    report = doctor.examine()
+    assert not report.usable
+    assert "trial kernel failed" in report.problems[0].what
+
+
+def test_a_hanging_kernel_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_PROBE", "import time; time.sleep(60)")
+    monkeypatch.setattr(doctor, "PROBE_TIMEOUT", 0.2)
+    assert "took longer" in doctor.examine().problems[0].what

@@ -1,0 +1,218 @@
+"""The rules that keep the package in layers, read off its syntax trees and tried on planted breaches."""
+
+from __future__ import annotations
+
+import ast
+import tomllib
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = "mi_refgs"
+
+LAYERS: dict[str, set[str]] = {
+    "errors": set(),
+    "constants": set(),
+    "llvm": set(),
+    "resources": {"errors"},
+    "surfels": {"constants", "errors"},
+    "splat": {"surfels", "constants", "errors"},
+    "shade": {"splat.camera", "surfels", "constants", "errors"},
+    "occlusion": {"splat.camera", "surfels", "constants", "errors"},
+    "render": {"shade", "occlusion", "splat", "surfels", "constants", "errors"},
+    "fit": {"render", "shade", "occlusion", "splat", "surfels", "resources", "constants", "errors", ""},
+    "plugins": {"fit", "render", "shade", "occlusion", "splat", "surfels", "constants", "errors"},
+    "doctor": {"llvm", "errors", ""},
+    "cli": {
+        "fit",
+        "render",
+        "shade",
+        "occlusion",
+        "splat",
+        "surfels",
+        "resources",
+        "constants",
+        "errors",
+        "llvm",
+    }
+    | {"doctor", ""},
+    "reference": {"constants"},
+    "": {"llvm", "plugins"},
+}
+"""What each part of the package may import besides itself; "" is the package's own `__init__`.
+
+Downwards only. `splat.camera` is the one thing that shade and occlusion share with splat.
+"""
+
+MANY_LINES = 300
+"""A longer file probably holds two concepts; a warning, no failure."""
+
+
+def module_name(path: Path) -> str:
+    """Dotted name below the package: "" for its `__init__`, "splat.tiles", "splat" for splat's `__init__`."""
+    parts = list(path.relative_to(ROOT / PACKAGE).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def sources() -> dict[str, str]:
+    """Module name → source of every file of the package."""
+    return {module_name(path): path.read_text() for path in sorted((ROOT / PACKAGE).rglob("*.py"))}
+
+
+PACKAGES = {module_name(path) for path in (ROOT / PACKAGE).rglob("__init__.py")}
+
+
+def imports(module: str, source: str) -> Iterator[str]:
+    """Names below the package that `source` imports: "" for the package itself, "splat.camera", …"""
+    package = module if module in PACKAGES else module.rpartition(".")[0]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            parent = node.module or ""
+            if node.level:
+                above = [PACKAGE, *filter(None, package.split("."))]
+                parent = ".".join([*above[: len(above) - node.level + 1], *filter(None, [parent])])
+            names = [f"{parent}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            first, _, rest = name.partition(".")
+            if first == PACKAGE:
+                yield rest
+
+
+def layer_breaches(modules: dict[str, str]) -> list[str]:
+    """Imports that `LAYERS` does not allow."""
+    known = set(LAYERS) - {""}
+    found = []
+    for module, source in modules.items():
+        layer = module.partition(".")[0]
+        if layer not in LAYERS:
+            found.append(f"{module}: no layer is declared for it")
+            continue
+        for imported in imports(module, source):
+            target = imported.partition(".")[0]
+            target = target if target in known else ""  # `from mi_refgs import __version__`
+            allowed = LAYERS[layer]
+            if target != layer and not any(imported == name or target == name for name in allowed):
+                dotted = [name for name in allowed if "." in name]
+                if not any(imported.startswith(f"{name}.") for name in dotted):
+                    found.append(f"{module}: imports {imported or PACKAGE}")
+    return found
+
+
+def imported_packages(source: str) -> set[str]:
+    """First names of everything that `source` imports absolutely."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            found.add((node.module or "").partition(".")[0])
+    return found
+
+
+def strings_outside_docstrings(source: str) -> set[str]:
+    """String constants of `source` that are values: bare strings document, and may cite a method by name."""
+    tree = ast.parse(source)
+    bare = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    return {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in bare
+    }
+
+
+def variant_names() -> set[str]:
+    """What the variants are called: their files' names, and the names that they give themselves."""
+    names = set()
+    for path in (ROOT / "variants").glob("*.toml"):
+        about = tomllib.loads(path.read_text()).get("about", {})
+        names |= {path.stem} | ({about["name"]} if "name" in about else set())
+    return names
+
+
+# ---------- The rules ----------
+
+
+def test_imports_point_down() -> None:
+    assert layer_breaches(sources()) == []
+
+
+def test_only_the_configuration_opens_toml() -> None:
+    readers = {
+        module for module, source in sources().items() if {"tomllib", "toml"} & imported_packages(source)
+    }
+    assert readers <= {"fit.config"}
+
+
+def test_the_reference_is_plain_numpy() -> None:
+    for module, source in sources().items():
+        if module.partition(".")[0] == "reference":
+            assert not {"drjit", "mitsuba"} & imported_packages(source), module
+
+
+def test_no_code_knows_a_variant_by_name() -> None:
+    """A method is data: nothing under the package may compare with, or choose, a variant's name."""
+    names = variant_names()
+    for module, source in sources().items():
+        assert not names & strings_outside_docstrings(source), module
+
+
+@pytest.mark.filterwarnings("always")
+def test_files_are_short() -> None:
+    for module, source in sources().items():
+        lines = source.count("\n")
+        if lines > MANY_LINES:
+            warnings.warn(f"{module} has {lines} lines: does it hold two concepts?", stacklevel=1)
+
+
+# ---------- The rules hold what they say ----------
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("splat.tiles", "from mi_refgs.render import pipeline"),
+        ("splat.tiles", "import mi_refgs.fit.train"),
+        ("splat.tiles", "def f():\n    from mi_refgs.shade.brdf import split_sum"),
+        ("shade.brdf", "from mi_refgs.splat.tiles import list_by_tile"),
+        ("shade.brdf", "from mi_refgs.occlusion.visibility import Occluder"),
+        ("shade.brdf", "from ..splat import tiles"),
+        ("splat", "from ..render import pipeline"),
+        ("surfels.table", "from mi_refgs.reference import splat"),
+        ("cli", "from mi_refgs.plugins import load"),
+        ("plugins.integrator", "from mi_refgs.cli import main"),
+        ("constants", "import mi_refgs"),
+        ("novelty", "import numpy"),
+    ],
+)
+def test_a_planted_import_is_found(module: str, source: str) -> None:
+    assert layer_breaches({module: source})
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("shade.brdf", "from mi_refgs.splat.camera import Camera"),
+        ("shade.brdf", "from ..splat.camera import Camera"),
+        ("shade.brdf", "from .sh import sh_basis\nfrom mi_refgs.errors import InputError"),
+        ("splat", "from .blend import blend"),
+        ("doctor", "from mi_refgs import __version__, llvm"),
+        ("render.pipeline", "from mi_refgs import splat\nimport numpy as np"),
+    ],
+)
+def test_a_permitted_import_is_not(module: str, source: str) -> None:
+    assert layer_breaches({module: source}) == []
+
+
+def test_a_planted_name_is_found() -> None:
+    source = (
+        '"""Cites two_d."""\ndef f(x):\n    """Cites two_d."""\n    return x == "two_d" or f"{x} no two_d"\n'
+    )
+    assert strings_outside_docstrings(source) == {"two_d", " no two_d"}
+    assert strings_outside_docstrings('"""two_d"""\nWIDTH = 3\n"""two_d"""') == set()
