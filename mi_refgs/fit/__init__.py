@@ -1,0 +1,1 @@
+"""Fitting: data sets, losses, optimiser, adaptive control, training loop, metrics."""

@@ -1,0 +1,196 @@
+"""One frame of a transforms file: its picture, its camera, its ground-truth maps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.fit.images import box_downscale, read_exr_image, read_png
+
+if TYPE_CHECKING:
+    from mi_refgs.splat.camera import Camera
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
+"""File name endings that `file_path` may carry or leave out, in the order in which they are tried."""
+RIGID_TOLERANCE = 1e-3
+"""Largest deviation of RᵀR from the identity: matrices in text files carry about 1e-6."""
+MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
+"""OpenGL's camera looks along −z with +x right, Mitsuba's along +z with +x left."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One picture and its camera."""
+
+    name: str
+    width: int  # pixels
+    height: int  # pixels
+    fx: float  # focal length, pixels, positive
+    fy: float
+    cx: float  # principal point, pixels from the left edge; the centre is width / 2
+    cy: float
+    to_world: np.ndarray  # (4, 4) float64, rigid, from Mitsuba's camera frame: +z forward, +x left, +y up
+    image: np.ndarray  # (H, W, 3) float32 target, composited onto the background
+    alpha: np.ndarray | None  # (H, W) float32
+    normal: np.ndarray | None  # (H, W, 3) float32, world space, 0 off the object
+    depth: np.ndarray | None  # (H, W) float32 along the viewing axis, 0 off the object
+    linear: bool  # whether `image` is linear radiance (EXR) or sRGB-encoded (PNG)
+
+    def camera(self, near: float = 0.01) -> Camera:
+        """The splatter's camera; in Mitsuba's frame both of its focal lengths are negative."""
+        from mi_refgs.splat.camera import Camera
+
+        return Camera.look(self.width, self.height, -self.fx, -self.fy, self.cx, self.cy, self.to_world, near)
+
+
+@dataclass(frozen=True)
+class FrameReader:
+    """Turns the frames of one transforms file into views."""
+
+    transforms: Path
+    content: dict[str, Any]
+    downscale: int
+    background: float
+    images: str
+    truth: bool
+
+    def read(self, index: int, frame: Any) -> View:
+        if not isinstance(frame, dict):
+            raise InputError(f"{self.transforms}: frames[{index}]: not an object; give it a file_path")
+        name = frame.get("file_path")
+        if not isinstance(name, str) or not name:
+            raise InputError(f"{self.transforms}: frames[{index}].file_path: missing; name the picture")
+        known = Path(name).suffix.lower() in SUFFIXES  # any other dot is part of the name
+        stem = str(Path(name).with_suffix("") if known else Path(name))
+        to_world = self._to_world(index, frame)
+        premultiplied, alpha, source = self._picture(frame, name, stem)
+        height, width = premultiplied.shape[:2]
+        fx, fy, cx, cy = (x / self.downscale for x in self._intrinsics(index, frame, *source))
+        normal = self._map(index, frame, "normal_path", (height, width, 3))
+        depth = self._map(index, frame, "depth_path", (height, width, 1))
+        if normal is not None:
+            length = np.linalg.norm(normal, axis=-1, keepdims=True)
+            normal = np.where(length > 0, normal / np.maximum(length, 1e-12), 0).astype(np.float32)
+        if alpha is not None:
+            premultiplied += (1 - alpha[..., None]) * np.float32(self.background)
+        return View(
+            name=stem,
+            width=width,
+            height=height,
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            to_world=to_world,
+            image=premultiplied,
+            alpha=alpha,
+            normal=normal,
+            depth=None if depth is None else depth[..., 0],
+            linear=self.images == "exr",
+        )
+
+    def _picture(
+        self, frame: dict[str, Any], name: str, stem: str
+    ) -> tuple[np.ndarray, np.ndarray | None, tuple[Path, int, int]]:
+        """Premultiplied colour and alpha at the wanted size, and the file with its own width and height."""
+        folder = self.transforms.parent
+        if self.images == "exr":
+            file = folder / str(frame.get("exr_path", f"{stem}.exr"))
+            pixels = read_exr_image(file)
+            if pixels.shape[-1] < 3:
+                raise InputError(f"{file}: channels: no R, G, B; export a colour picture")
+        else:
+            candidates = [folder / f"{stem}{suffix}" for suffix in SUFFIXES[:-1]]
+            file = folder / name
+            if not file.is_file():
+                file = next((c for c in candidates if c.is_file()), candidates[0])
+            if file.suffix.lower() == ".exr":
+                raise InputError(f"{file}: images: the picture is an EXR file; read this data set as 'exr'")
+            pixels = read_png(file)
+            if pixels.shape[-1] == 4:
+                pixels[..., :3] *= pixels[..., 3:]
+        height, width = pixels.shape[:2]
+        if width % self.downscale or height % self.downscale:
+            raise InputError(
+                f"{file}: downscale: {width} × {height} pixels cannot be divided by {self.downscale}; "
+                "give a divisor of both"
+            )
+        small = box_downscale(pixels, self.downscale)
+        alpha = np.ascontiguousarray(small[..., 3]) if small.shape[-1] == 4 else None
+        return np.ascontiguousarray(small[..., :3]), alpha, (file, width, height)
+
+    def _map(
+        self, index: int, frame: dict[str, Any], key: str, shape: tuple[int, int, int]
+    ) -> np.ndarray | None:
+        """A ground-truth map at the wanted size, each pixel a mean over the surface in its block."""
+        if not self.truth or not frame.get(key):
+            return None
+        file = self.transforms.parent / str(frame[key])
+        pixels = read_exr_image(file)
+        expected = (shape[0] * self.downscale, shape[1] * self.downscale, shape[2])
+        if pixels.shape != expected:
+            raise InputError(
+                f"{file}: frames[{index}].{key}: has shape {pixels.shape} but the picture needs {expected}; "
+                "export both at one size or remove the key"
+            )
+        covered = np.any(pixels != 0, axis=-1, keepdims=True).astype(np.float32)
+        share = box_downscale(covered, self.downscale)
+        mean = box_downscale(pixels, self.downscale) / np.maximum(share, 1e-12)
+        return mean.astype(np.float32)
+
+    def _to_world(self, index: int, frame: dict[str, Any]) -> np.ndarray:
+        field = f"{self.transforms}: frames[{index}].transform_matrix"
+        try:
+            matrix = np.array(frame["transform_matrix"], dtype=np.float64)
+        except (KeyError, TypeError, ValueError):
+            matrix = np.empty(0)
+        if matrix.shape != (4, 4):
+            raise InputError(f"{field}: missing or not 4 × 4 numbers; give the camera-to-world matrix")
+        rotation = matrix[:3, :3]
+        rigid = (
+            np.all(np.isfinite(matrix))
+            and np.abs(rotation.T @ rotation - np.eye(3)).max() < RIGID_TOLERANCE
+            and np.linalg.det(rotation) > 0
+            and np.abs(matrix[3] - [0, 0, 0, 1]).max() < RIGID_TOLERANCE
+        )
+        if not rigid:
+            raise InputError(f"{field}: not a rotation and a translation; remove scale, shear and mirroring")
+        return matrix @ MITSUBA_FROM_OPENGL
+
+    def _intrinsics(
+        self, index: int, frame: dict[str, Any], file: Path, width: int, height: int
+    ) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy in pixels of the picture file."""
+
+        def number(key: str) -> float | None:
+            value = frame.get(key, self.content.get(key))
+            if value is None:
+                return None
+            if type(value) not in (int, float) or not math.isfinite(value) or value <= 0:
+                raise InputError(f"{self.transforms}: {key}: {value!r} is not a positive number; correct it")
+            return float(value)
+
+        for key, size in (("w", width), ("h", height)):
+            wanted = number(key)
+            if wanted is not None and wanted != size:
+                raise InputError(
+                    f"{file}: {key}: the picture is {width} × {height} pixels, but {self.transforms.name} "
+                    f"says {key} = {wanted:g}; restore the picture, or give only camera_angle_x"
+                )
+        focal: list[float | None] = []
+        for length, angle, size in (("fl_x", "camera_angle_x", width), ("fl_y", "camera_angle_y", height)):
+            pixels, radians = number(length), number(angle)
+            if pixels is None and radians is not None:
+                if radians >= math.pi:
+                    raise InputError(f"{self.transforms}: {angle}: {radians:g} is not below π; give radians")
+                pixels = 0.5 * size / math.tan(radians / 2)
+            focal.append(pixels)
+        fx = focal[0]
+        if fx is None:
+            raise InputError(f"{self.transforms}: camera_angle_x: missing; give radians, or fl_x in pixels")
+        return fx, focal[1] or fx, number("cx") or width / 2, number("cy") or height / 2

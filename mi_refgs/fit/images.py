@@ -1,0 +1,152 @@
+"""Image files and the sRGB transfer function in NumPy: 8-bit PNG and float EXR, written whole or not."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+
+SRGB_LINEAR_LIMIT = 0.0031308
+"""Linear value below which the sRGB curve is a straight line (IEC 61966-2-1)."""
+SRGB_ENCODED_LIMIT = 0.04045
+"""The same point after encoding."""
+
+
+def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
+    """sRGB encoding of linear values (IEC 61966-2-1); negatives stay on the line, nothing is clipped."""
+    linear = np.asarray(linear)
+    curve = 1.055 * np.maximum(linear, SRGB_LINEAR_LIMIT) ** (1 / 2.4) - 0.055
+    return np.where(linear <= SRGB_LINEAR_LIMIT, 12.92 * linear, curve).astype(linear.dtype)
+
+
+def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
+    """Inverse of `srgb_from_linear`."""
+    encoded = np.asarray(encoded)
+    curve = ((np.maximum(encoded, SRGB_ENCODED_LIMIT) + 0.055) / 1.055) ** 2.4
+    return np.where(encoded <= SRGB_ENCODED_LIMIT, encoded / 12.92, curve).astype(encoded.dtype)
+
+
+def box_downscale(image: np.ndarray, factor: int) -> np.ndarray:
+    """Mean over factor × factor blocks of an (H, W, C) image; H and W must be multiples of factor."""
+    if factor == 1:
+        return image
+    height, width, channels = image.shape
+    blocks = image.reshape(height // factor, factor, width // factor, factor, channels)
+    return blocks.mean(axis=(1, 3), dtype=np.float64).astype(image.dtype)
+
+
+def read_png(path: str | Path) -> np.ndarray:
+    """8-bit image file (PNG, JPEG) as float32 (H, W, 3 or 4) in [0, 1], still sRGB encoded, alpha straight.
+
+    Raises InputError if the file is missing, unreadable or has more than 8 bits per channel.
+    """
+    from PIL import Image
+
+    path = Path(path)
+    _require_file(path)
+    try:
+        with Image.open(path) as image:
+            if image.mode.startswith(("I", "F")):
+                raise InputError(f"{path}: pixels: more than 8 bits per channel; save it as 8-bit PNG or EXR")
+            transparent = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+            pixels = np.asarray(image.convert("RGBA" if transparent else "RGB"))
+    except InputError:
+        raise
+    except Exception as error:  # Pillow raises half a dozen types for broken files
+        raise InputError(f"{path}: pixels: not a readable image ({error}); export it again") from error
+    return pixels.astype(np.float32) / np.float32(255)
+
+
+def write_png(path: str | Path, image: np.ndarray) -> None:
+    """Write an (H, W, 3 or 4) image, sRGB-encoded values in [0, 1] (clipped), as 8-bit PNG, atomically.
+
+    Raises InputError if the path cannot be written.
+    """
+    from PIL import Image
+
+    pixels = np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)
+    replace_file(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG"))
+
+
+def read_exr(path: str | Path) -> dict[str, np.ndarray]:
+    """All channels of an EXR file's first part by name, float32 (H, W) each.
+
+    Raises InputError if the file is missing, unreadable or holds NaN or infinite values.
+    """
+    import OpenEXR
+
+    path = Path(path)
+    _require_file(path)
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(c.pixels, dtype=np.float32) for name, c in file.channels().items()}
+    except Exception as error:  # the binding raises RuntimeError, TypeError or its own types
+        raise InputError(f"{path}: pixels: not a readable EXR file ({error}); export it again") from error
+    for name, pixels in channels.items():
+        bad = np.argwhere(~np.isfinite(pixels))
+        if len(bad):
+            row, column = bad[0]
+            raise InputError(
+                f"{path}: channel {name}: {len(bad)} NaN or infinite values, the first at row {row}, "
+                f"column {column}; render the image again"
+            )
+    return channels
+
+
+def read_exr_image(path: str | Path) -> np.ndarray:
+    """EXR file as float32 (H, W, C): C = 4 for R, G, B, A, 3 for R, G, B, or X, Y, Z, 1 for a single channel.
+
+    Raises InputError as `read_exr` does, and if the file has none of these sets of channels.
+    """
+    channels = read_exr(path)
+    for names in ("RGBA", "RGB", "XYZ"):
+        if set(names) <= channels.keys():
+            return np.stack([channels[name] for name in names], axis=-1)
+    if len(channels) == 1:
+        return next(iter(channels.values()))[..., None]
+    found = ", ".join(sorted(channels))
+    raise InputError(f"{path}: channels: found {found}; export R, G, B (and A), or X, Y, Z, or one channel")
+
+
+def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, half: bool = False) -> None:
+    """Write an (H, W, C) or (H, W) array as ZIP-compressed float32 (or float16) EXR, atomically.
+
+    `names` holds one letter a channel; by default Y, RGB or RGBA by the number of channels. Raises InputError
+    if the path cannot be written.
+    """
+    import OpenEXR
+
+    image = np.asarray(image)
+    planes = image[..., None] if image.ndim == 2 else image
+    names = names or {1: "Y", 3: "RGB", 4: "RGBA"}[planes.shape[-1]]
+    dtype = np.float16 if half else np.float32
+    channels = {name: np.ascontiguousarray(planes[..., i], dtype=dtype) for i, name in enumerate(names)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    replace_file(path, lambda temporary: OpenEXR.File(header, channels).write(str(temporary)))
+
+
+def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
+    """Let `write(temporary)` make a file beside `path`, then move it there: readers see the old or the new.
+
+    Raises InputError if the folder is missing or cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        write(temporary)
+        os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{path}: output: cannot be written ({error}); choose a writable folder") from error
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def _require_file(path: Path) -> None:
+    if not path.is_file():
+        raise InputError(f"{path}: file: missing; restore it or remove its frame from the transforms file")

@@ -1,0 +1,143 @@
+"""Losses on images given as planes: lists of mi.Float of width H·W in raster order (or a mi.Color3f).
+
+Letters: I rendered image, T target, A accumulated alpha, L linear radiance, N blended normal Σ w n (not unit).
+Every loss is a mi.Float of width 1, zero for a perfect image, and has finite gradients for finite input. Targets, weights
+and masks have no derivative. SSIM is in `fit.ssim`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.fit.images import SRGB_LINEAR_LIMIT
+from mi_refgs.fit.ssim import ssim
+from mi_refgs.render.stencil import neighbours
+
+# An 8-bit target value of 255 stands for everything from here up: the sensor clipped.
+SATURATED = 254.5 / 255.0
+# Alpha below which a pixel is empty: radiance / A has no meaning and the background alone is seen.
+ALPHA_EMPTY = 1e-6
+# Alpha is kept this far from 0 and 1 in the cross-entropy, whose slope is then at most 10⁴ per pixel.
+ENTROPY_MARGIN = 1e-4
+
+
+# ---------------- camera response ----------------
+
+
+def linear_to_srgb(linear: Any) -> Any:
+    """sRGB encoding (IEC 61966-2-1) of a linear plane: straight below 0.0031308, else the power curve, unbounded above 1.
+
+    The slope is finite everywhere (12.92 at 0).
+    """
+    straight = linear <= SRGB_LINEAR_LIMIT
+    curve = 1.055 * dr.power(dr.select(straight, 1.0, linear), 1 / 2.4) - 0.055
+    return dr.select(straight, 12.92 * linear, curve)
+
+
+def display_image(radiance: Iterable[Any], alpha: Any, background: Iterable[Any]) -> list[Any]:
+    """What an 8-bit RGBA picture shows: A srgb(L / A) + (1 - A) background, per plane.
+
+    radiance: linear, premultiplied (L); background: display-encoded floats or planes. Pixels with A < 1e-6 show the
+    background and give radiance no gradient.
+    """
+    seen = alpha >= ALPHA_EMPTY
+    inverse = dr.select(seen, dr.rcp(dr.select(seen, alpha, 1.0)), 0.0)
+    return [
+        alpha * linear_to_srgb(plane * inverse) + (1 - alpha) * behind
+        for plane, behind in zip(radiance, background, strict=True)
+    ]
+
+
+def saturated(target: Iterable[Any]) -> list[Any]:
+    """Masks (mi.Bool planes) where a display-encoded target is clipped: at least 254.5/255."""
+    return [plane >= SATURATED for plane in target]
+
+
+def clip_highlights(render: Iterable[Any], target: Iterable[Any], clipped: Iterable[Any]) -> list[Any]:
+    """The render with every value above a clipped target value replaced by it: no error and no gradient there."""
+    return [
+        dr.select(mask & (plane > goal), dr.detach(goal), plane)
+        for plane, goal, mask in zip(render, target, clipped, strict=True)
+    ]
+
+
+# ---------------- image losses ----------------
+
+
+def l1(render: Iterable[Any], target: Iterable[Any], clipped: Iterable[Any] | None = None) -> Any:
+    """Mean absolute difference over pixels and planes; the slope at equality is 0.
+
+    `clipped` (see `saturated`): where the target is clipped, a brighter render is no error.
+    """
+    render, target = list(render), [dr.detach(plane) for plane in target]
+    if clipped is not None:
+        render = clip_highlights(render, target, clipped)
+    return _mean(sum((_abs(a - b) for a, b in zip(render, target, strict=True)), mi.Float(0))) / len(render)
+
+
+def d_ssim(render: Iterable[Any], target: Iterable[Any], width: int, height: int) -> Any:
+    """1 - SSIM (not halved), as 3DGS weighs it against `l1`."""
+    return 1 - ssim(list(render), list(target), width, height)
+
+
+def alpha_loss(alpha: Any, target: Any, kind: str = "l1") -> Any:
+    """Accumulated alpha against a mask in [0, 1]: kind "l1" (mean absolute difference) or "bce" (cross-entropy)."""
+    target = dr.detach(target)
+    if kind == "l1":
+        return _mean(_abs(alpha - target))
+    if kind != "bce":
+        raise ValueError(f"losses.alpha_loss: kind {kind!r}; use 'l1' or 'bce'")
+    # An affine squeeze, not a clamp: a pixel at exactly 0 that should be 1 keeps its gradient.
+    a = ENTROPY_MARGIN + (1 - 2 * ENTROPY_MARGIN) * alpha
+    return _mean(-target * dr.log(a) - (1 - target) * dr.log(1 - a))
+
+
+# ---------------- geometry losses ----------------
+
+
+def normal_consistency(normal: Any, depth_normal: Any, valid: Any, alpha: Any) -> Any:
+    """Mean over all pixels of A (A - N · n_d), with A detached and only where n_d is valid.
+
+    This is Σ wᵢ (1 - nᵢ · n_d) of 2DGS (eq. 13), weighted by A: its gradient is that of 1 - N · (n_d stopgrad(A)), but
+    empty pixels count zero. normal: N premultiplied; depth_normal: unit (render.depth_normals). Gradients flow to both.
+    """
+    weight = dr.select(valid, dr.detach(alpha), 0.0)
+    return _mean(weight * (weight - dr.dot(mi.Vector3f(normal), mi.Vector3f(depth_normal))))
+
+
+def normal_smoothness(normal: Iterable[Any], image: Iterable[Any], width: int, height: int, weight: Any = None) -> Any:
+    """Edge-aware normal smoothness ‖∇N‖ exp(-‖∇I‖) (Ref-Gaussian §3.3), mean over pixels, sum over the two axes.
+
+    ∇ is Sobel / 8 with the border repeated; ‖·‖ is the mean absolute value over the three planes. `weight` (H·W) masks
+    pixels. Gradients flow to N only.
+    """
+    total = mi.Float(0)
+    normal_slopes = [sobel(plane, width, height) for plane in normal]
+    image_slopes = [sobel(dr.detach(plane), width, height) for plane in image]
+    for axis in (0, 1):
+        bend = sum((_abs(slopes[axis]) for slopes in normal_slopes), mi.Float(0)) / len(normal_slopes)
+        edge = sum((dr.abs(slopes[axis]) for slopes in image_slopes), mi.Float(0)) / len(image_slopes)
+        total += bend * dr.exp(-edge)
+    return _mean(total if weight is None else total * dr.detach(weight))
+
+
+def sobel(plane: Any, width: int, height: int) -> tuple[Any, Any]:
+    """Sobel derivatives (∂x, ∂y) of a plane, divided by 8 (per pixel), the border repeated."""
+    steps = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]
+    at = dict(zip(steps, neighbours(plane, width, height, steps), strict=True))
+    along_x = at[1, -1] - at[-1, -1] + 2 * (at[1, 0] - at[-1, 0]) + at[1, 1] - at[-1, 1]
+    along_y = at[-1, 1] - at[-1, -1] + 2 * (at[0, 1] - at[0, -1]) + at[1, 1] - at[1, -1]
+    return along_x / 8, along_y / 8
+
+
+def _abs(difference: Any) -> Any:
+    """|x| with slope 0 at 0: equal values must not push."""
+    return dr.select(difference == 0, 0.0, dr.abs(difference))
+
+
+def _mean(plane: Any) -> Any:
+    return dr.sum(plane) / dr.width(plane)

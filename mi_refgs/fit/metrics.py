@@ -1,0 +1,173 @@
+"""Measures of quality, in NumPy: images, normals, recovered light.
+
+Images are (H, W, 3) display-encoded floats, clamped to [0, 1] and never quantised; a data set's value is the mean over its
+images. Normals are (H, W, 3) world vectors. Lights are (h, w, 3) linear lat-long radiance in Mitsuba's orientation.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.fit.images import srgb_from_linear
+from mi_refgs.fit.ssim import WINDOW_RADIUS, WINDOW_SIGMA
+
+# What identical images read, dB: JSON has no infinity, and float32 images cannot differ by less.
+PSNR_MAX = 100.0
+# A pixel is foreground where the true alpha is above this.
+FOREGROUND_ALPHA = 0.5
+# The network of LPIPS: the one its authors recommend for comparing images ("forward" scores).
+LPIPS_NETWORK = "alex"
+
+
+# ---------------- images ----------------
+
+
+def psnr(image: np.ndarray, truth: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB over all pixels and channels, background included; at most 100."""
+    image, truth = _pair(image, truth)
+    error = float(np.mean((image - truth) ** 2))
+    return PSNR_MAX if error <= 0 else min(PSNR_MAX, -10 * float(np.log10(error)))
+
+
+def ssim(image: np.ndarray, truth: np.ndarray) -> float:
+    """Structural similarity as `fit.ssim` trains with it, by scikit-image.
+
+    scikit-image reflects at the border and leaves it out of the mean; padding by the window's radius with zeros turns
+    that into the zero padding and the mean over every pixel that 3DGS and Ref-Gaussian report.
+    """
+    from skimage.metrics import structural_similarity
+
+    border = ((WINDOW_RADIUS, WINDOW_RADIUS), (WINDOW_RADIUS, WINDOW_RADIUS), (0, 0))
+    image, truth = (np.pad(array, border) for array in _pair(image, truth))
+    return float(
+        structural_similarity(
+            image,
+            truth,
+            win_size=2 * WINDOW_RADIUS + 1,
+            gaussian_weights=True,
+            sigma=WINDOW_SIGMA,
+            use_sample_covariance=False,
+            data_range=1.0,
+            channel_axis=-1,
+        )
+    )
+
+
+def lpips(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
+    """(LPIPS with AlexNet, ""), or (None, why): without the extra `lpips` or its network's weights."""
+    try:
+        import torch
+
+        network = _lpips_network()
+        with torch.no_grad():
+            tensors = [
+                torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)[None], dtype=np.float32)) * 2 - 1
+                for array in _pair(image, truth)
+            ]
+            return float(network(*tensors)), ""
+    except ImportError:
+        return None, "not installed: pip install 'mi_refgs[lpips]'"
+    except (OSError, RuntimeError) as error:  # the weights are fetched at first use
+        return None, f"cannot run: {error}"
+
+
+@functools.lru_cache(maxsize=1)
+def _lpips_network() -> Any:
+    import lpips as package
+
+    return package.LPIPS(net=LPIPS_NETWORK, verbose=False).eval()
+
+
+def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
+    """(mean LDR FLIP, ""), or (None, why) without the extra `flip`. Viewing distance: the package's default, 67 ppd."""
+    try:
+        import flip_evaluator
+    except ImportError:
+        return None, "not installed: pip install 'mi_refgs[flip]'"
+    image, truth = (np.ascontiguousarray(array, dtype=np.float32) for array in _pair(image, truth))
+    return float(flip_evaluator.evaluate(truth, image, "LDR", applyMagma=False)[1]), ""
+
+
+def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    if np.shape(image) != np.shape(truth):
+        sizes = f"{np.shape(image)} and {np.shape(truth)}"
+        raise InputError(f"metrics: image: shapes {sizes} differ; render at the size of the data set")
+    return np.clip(np.asarray(image, np.float64), 0, 1), np.clip(np.asarray(truth, np.float64), 0, 1)
+
+
+# ---------------- normals ----------------
+
+
+def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> dict[str, float]:
+    """Mean angle in degrees between two normal maps, over the foreground and over the whole image.
+
+    normal: recovered, any length; truth: (H, W, 3), zero where nothing is hit; alpha: true alpha (H, W). Foreground is
+    alpha > 0.5 with a true normal; a missing recovered normal counts 90° there. `normal_mae_deg` is the mean over the
+    foreground; `normal_mae_deg_full` divides the same sum by all pixels, so the background counts as 0° (the number
+    that most papers print). Both are 0 for an image without foreground.
+    """
+    normal, truth = np.asarray(normal, np.float64), np.asarray(truth, np.float64)
+    if normal.shape != truth.shape or normal.shape[:2] != np.shape(alpha):
+        sizes = f"{normal.shape}, {truth.shape}, {np.shape(alpha)}"
+        raise InputError(f"metrics: normal: shapes {sizes} do not fit; render at the size of the data set")
+    foreground = (np.asarray(alpha) > FOREGROUND_ALPHA) & (np.linalg.norm(truth, axis=-1) > 0)
+    # atan2 keeps small angles exact, where acos of a float32 dot product cannot go below 0.03°.
+    cosine = np.sum(normal * truth, axis=-1)
+    sine = np.linalg.norm(np.cross(normal, truth), axis=-1)
+    angle = np.where((cosine == 0) & (sine == 0), 90.0, np.degrees(np.arctan2(sine, cosine)))
+    total = float(np.sum(angle[foreground]))
+    return {
+        "normal_mae_deg": total / max(int(foreground.sum()), 1),
+        "normal_mae_deg_full": total / foreground.size,
+    }
+
+
+# ---------------- light ----------------
+
+
+def environment(light: np.ndarray, truth: np.ndarray, peak: float | None = None) -> dict[str, Any]:
+    """Recovered against true environment after one least-squares scale per channel, weighted by solid angle.
+
+    Photographs fix the light only up to such a scale, which the albedo takes up. Both maps are brought to the recovered
+    one's size by averaging; with `peak`, both are first clipped there (what no clipped photograph could show).
+    Keys: `env_scale` (three numbers), `env_mae` (linear, after the scale), `env_psnr` (dB, after sRGB encoding and
+    clamping to [0, 1]) and `env_correlation` (Pearson, of the same encoded values).
+    """
+    light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
+    for name, array in (("light", light), ("truth", truth)):
+        if array.ndim != 3 or array.shape[2] != 3 or not np.all(np.isfinite(array)):
+            raise InputError(f"metrics: environment {name}: need finite (h, w, 3) values; write the map again")
+    if peak is not None:
+        light, truth = np.minimum(light, peak), np.minimum(truth, peak)
+    truth = _average_to(truth, light.shape[0], light.shape[1])
+    rows = np.sin((np.arange(light.shape[0]) + 0.5) / light.shape[0] * np.pi)
+    weight = np.broadcast_to(rows[:, None, None], light.shape)
+    scale = np.sum(weight * light * truth, axis=(0, 1)) / np.maximum(np.sum(weight * light**2, axis=(0, 1)), 1e-30)
+    fitted = light * scale
+    shown, goal = (np.clip(srgb_from_linear(array), 0, 1) for array in (fitted, truth))
+    error = float(np.average((shown - goal) ** 2, weights=weight))
+    shown, goal = (array - np.average(array, weights=weight) for array in (shown, goal))
+    spread = float(np.sqrt(np.sum(weight * shown**2) * np.sum(weight * goal**2)))
+    return {
+        "env_scale": [float(value) for value in scale],
+        "env_mae": float(np.average(np.abs(fitted - truth), weights=weight)),
+        "env_psnr": PSNR_MAX if error <= 0 else min(PSNR_MAX, -10 * float(np.log10(error))),
+        "env_correlation": float(np.sum(weight * shown * goal)) / spread if spread > 0 else 0.0,
+    }
+
+
+def _average_to(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Resample an (h, w, C) map by area averages (exact box overlaps along each axis; enlarging repeats texels)."""
+    return np.einsum("ih,jw,hwc->ijc", _overlap(height, image.shape[0]), _overlap(width, image.shape[1]), image, optimize=True)
+
+
+def _overlap(target: int, source: int) -> np.ndarray:
+    """Share of each source interval in each target interval, rows summing to 1: (target, source)."""
+    edges, cells = np.linspace(0, 1, target + 1), np.linspace(0, 1, source + 1)
+    low = np.maximum(edges[:-1, None], cells[None, :-1])
+    high = np.minimum(edges[1:, None], cells[None, 1:])
+    return np.maximum(high - low, 0) * target

@@ -1,0 +1,144 @@
+"""Path tracing around a Mitsuba scene: its size, camera poses, one view, the environment."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+SAMPLES_PER_LAUNCH = 1 << 24
+"""Largest number of paths traced at once; the path tracer keeps about 100 bytes for each."""
+SURFACE_SAMPLES = 4096
+"""Points on each shape that measure the scene's size; the farthest is found to about 1 %."""
+ENVIRONMENT_OVERSAMPLING = 4
+"""Directions per texel and axis of the exported environment, so that a small sun keeps its energy."""
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+"""Azimuth between neighbours of a spherical Fibonacci lattice, radians."""
+
+
+def bounding_sphere(scene: Any) -> tuple[np.ndarray, float]:
+    """Centre (3,) of the shapes' bounding box, and the radius around it that holds every surface."""
+    import drjit as dr
+    import mitsuba as mi
+
+    box = scene.bbox()
+    centre = (np.array(box.min, dtype=np.float64) + np.array(box.max, dtype=np.float64)) / 2
+    side = math.isqrt(SURFACE_SAMPLES)
+    x, y = dr.meshgrid(dr.linspace(mi.Float, 0, 1 - 1e-6, side), dr.linspace(mi.Float, 0, 1 - 1e-6, side))
+    radius = 0.0
+    for shape in scene.shapes():
+        if shape.is_mesh():
+            points = np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+        else:
+            points = np.array(shape.sample_position(0.0, mi.Point2f(x, y)).p, dtype=np.float64).T
+        radius = max(radius, float(np.linalg.norm(points - centre, axis=1).max()))
+    return centre, radius
+
+
+def camera_poses(
+    count: int, centre: np.ndarray, distance: float, elevation: tuple[float, float], rng: np.random.Generator
+) -> np.ndarray:
+    """World-from-camera matrices (count, 4, 4) in Mitsuba's frame that look at `centre`, z up.
+
+    A spherical Fibonacci lattice over the band of elevations (degrees): equal areas, turned by a random
+    azimuth and jittered by a third of its spacing.
+    """
+    low, high = (math.sin(math.radians(e)) for e in elevation)
+    jitter = rng.uniform(-1 / 3, 1 / 3, (count, 2))
+    z = low + (high - low) * (np.arange(count) + 0.5 + jitter[:, 0]) / count
+    spacing = math.sqrt(2 * math.pi * (high - low) / count)
+    ring = np.sqrt(1 - z**2)
+    azimuth = rng.uniform(0, 2 * math.pi) + GOLDEN_ANGLE * np.arange(count) + jitter[:, 1] * spacing / ring
+    outward = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
+    left = np.cross([0.0, 0.0, 1.0], -outward)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    up = np.cross(-outward, left)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :] = np.stack([left, up, -outward, centre + distance * outward], axis=2)
+    return poses
+
+
+def environment_image(scene: Any, height: int) -> np.ndarray:
+    """Radiance (height, 2·height, 3) of the scene's environment, each texel a mean over its solid angle.
+
+    Orientation: Mitsuba's `envmap` with an identity `to_world`: row 0 at +y; column 0 at −z, turning to +x.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    rows, columns = height * ENVIRONMENT_OVERSAMPLING, 2 * height * ENVIRONMENT_OVERSAMPLING
+    index = dr.arange(mi.UInt32, rows * columns)
+    phi = (index % columns + 0.5) * (2 * dr.pi / columns)
+    theta = (index // columns + 0.5) * (dr.pi / rows)
+    si = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
+    si.wi = -mi.Vector3f(dr.sin(theta) * dr.sin(phi), dr.cos(theta), -dr.sin(theta) * dr.cos(phi))
+    # A constant emitter answers with one value for all directions.
+    radiance = np.array(scene.environment().eval(si) + dr.zeros(mi.Float, rows * columns))
+    radiance = radiance.T.reshape(rows, columns, 3)
+    weight = np.sin((np.arange(rows) + 0.5) * math.pi / rows).reshape(height, -1, 1, 1, 1)
+    blocks = radiance.reshape(height, ENVIRONMENT_OVERSAMPLING, 2 * height, ENVIRONMENT_OVERSAMPLING, 3)
+    mean = (blocks * weight).sum(axis=(1, 3)) / (weight.sum(axis=(1, 2)) * ENVIRONMENT_OVERSAMPLING)
+    return mean.astype(np.float32)
+
+
+class Tracer:
+    """One sensor that moves from view to view, so that each kernel is compiled once."""
+
+    def __init__(
+        self, scene: Any, *, size: int, fov: float, spp: int, max_depth: int, near: float, far: float
+    ) -> None:
+        import mitsuba as mi
+
+        self.scene, self.size = scene, size
+        self.passes = -(-size * size * spp // SAMPLES_PER_LAUNCH)
+        # The sampler's own grid of strata: it would round up by itself, but warn each time.
+        strata = math.isqrt(-(-spp // self.passes))
+        self.spp = strata * -(-spp // (self.passes * strata))
+        self.integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
+        self.sensor = mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": fov,
+                "near_clip": near,
+                "far_clip": far,
+                "sampler": {"type": "multijitter"},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": size,
+                    "height": size,
+                    "pixel_format": "rgba",
+                    "component_format": "float32",
+                    "rfilter": {"type": "box"},
+                },
+            }
+        )
+        self.params = mi.traverse(self.sensor)
+
+    def trace(self, pose: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Premultiplied linear RGBA, normals (H, W, 3) and depth (H, W) of one view."""
+        import drjit as dr
+        import mitsuba as mi
+
+        self.params["to_world"] = mi.ScalarTransform4f(pose)
+        self.params.update()
+        size = self.size
+        seeds = [seed, *np.random.SeedSequence(seed).generate_state(self.passes)[1:]]
+        image = np.zeros((size, size, 4))
+        with dr.suspend_grad():
+            for s in seeds:
+                part = mi.render(
+                    self.scene, sensor=self.sensor, integrator=self.integrator, spp=self.spp, seed=int(s)
+                )
+                image += np.array(part) / self.passes
+            # Normals and depth are those of the pixel's centre: a mean over an edge belongs to no surface.
+            index = dr.arange(mi.UInt32, size * size)
+            film = mi.Point2f((index % size + 0.5) / size, (index // size + 0.5) / size)
+            ray, _ = self.sensor.sample_ray(0, 0.5, film, mi.Point2f(0.5))
+            si = self.scene.ray_intersect(ray)
+            normal = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
+            # A lamp that the picture hides has no normal either.
+            hit = np.array(si.is_valid()).reshape(size, size) & (image[..., 3] > 0)
+            depth = ((np.array(si.p).T - pose[:3, 3]) @ pose[:3, 2]).reshape(size, size)
+            normal = np.array(normal).T.reshape(size, size, 3)
+        return image, np.where(hit[..., None], normal, 0), np.where(hit, depth, 0)

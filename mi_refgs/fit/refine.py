@@ -1,0 +1,114 @@
+"""Adaptive control of the surfel table: every edit is a new table and the parent of each row.
+
+Runs a few hundred times a fit, never in the step, so it is plain NumPy on the raw channels.
+Letters: s scale, o opacity, extent the size of the camera rig [3DGS §5.2].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_refgs.fit.config import Refine
+from mi_refgs.surfels.table import Surfels
+
+SPLIT_SHRINK = 1.6
+"""A split surfel's two children have its scale divided by this. [3DGS §5.2: φ = 1.6, found by experiment]"""
+
+
+@dataclass(frozen=True)
+class Edited:
+    """A new table; row i descends from row parent[i] of the old one, and is `fresh` if it is a copy of it."""
+
+    surfels: Surfels
+    parent: np.ndarray  # (M,) uint32
+    fresh: np.ndarray  # (M,) bool
+
+
+def logit(p: float | np.ndarray) -> np.ndarray:
+    """Inverse of the sigmoid, float64."""
+    p = np.clip(np.asarray(p, dtype=np.float64), 1e-6, 1 - 1e-6)
+    return np.log(p) - np.log1p(-p)
+
+
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    """Logistic sigmoid without overflow, float64."""
+    return 0.5 * (1 + np.tanh(0.5 * np.asarray(x, dtype=np.float64)))
+
+
+def densify_and_prune(
+    surfels: Surfels, gradient: np.ndarray, extent: float, options: Refine, max_count: int, rng: np.random.Generator
+) -> Edited:
+    """Clone small and split large surfels with a high screen gradient, then drop transparent and oversized ones.
+
+    `gradient` (N,) is the mean length of the screen-translation gradient in NDC units over the views that saw a surfel.
+    At most max_count surfels result: those with the highest gradient grow first.
+    """
+    raw = surfels.to_numpy()
+    count = len(gradient)
+    size = np.exp(raw["scale"]).max(axis=1)
+    keep = (sigmoid(raw["opacity"][:, 0]) >= options.prune_opacity) & (size <= options.prune_extent * extent)
+
+    hot = np.flatnonzero(keep & (gradient >= options.gradient))
+    room = max(max_count - int(keep.sum()), 0)
+    hot = np.sort(hot[np.argsort(-gradient[hot], kind="stable")[:room]])
+    large = size[hot] > options.dense_extent * extent
+    cloned, split = hot[~large], hot[large]
+    keep[split] = False
+
+    parent = np.concatenate([np.flatnonzero(keep), cloned, split, split])
+    fresh = np.arange(len(parent)) >= int(keep.sum())
+    table = {name: values[parent].copy() for name, values in raw.items()}
+    children = slice(len(parent) - 2 * len(split), len(parent))
+    if len(split):
+        table["position"][children] += _tangent_offsets(table, children, rng)
+        table["scale"][children] -= np.float32(np.log(SPLIT_SHRINK))
+    assert len(parent) <= max(max_count, count)
+    return Edited(Surfels.from_numpy(table), parent.astype(np.uint32), fresh)
+
+
+def _tangent_offsets(table: dict[str, np.ndarray], rows: slice, rng: np.random.Generator) -> np.ndarray:
+    """Normal deviates in the tangent plane, with the surfels' own standard deviations."""
+    x, y, z, w = (table["rotation"][rows] / np.linalg.norm(table["rotation"][rows], axis=1, keepdims=True)).T
+    t_u = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], axis=1)
+    t_v = np.stack([2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)], axis=1)
+    local = rng.normal(size=(len(x), 2)) * np.exp(table["scale"][rows])
+    return (local[:, :1] * t_u + local[:, 1:] * t_v).astype(np.float32)
+
+
+def reset_opacity(surfels: Surfels, options: Refine, metallic: float) -> Surfels:
+    """Lower every opacity to at most reset_opacity, and lift every metallic to at least `metallic`.
+
+    What the pictures need grows back; what they do not is pruned. [3DGS §5.2; 3DGS-DR for the metallic]
+    """
+    raw = surfels.to_numpy()
+    raw["opacity"] = np.minimum(raw["opacity"], np.float32(logit(options.reset_opacity)))
+    if "metallic" in raw:
+        raw["metallic"] = np.maximum(raw["metallic"], np.float32(logit(metallic)))
+    return Surfels.from_numpy(raw)
+
+
+def propagate_normals(surfels: Surfels, options: Refine) -> Surfels:
+    """Material-aware normal propagation [Ref-Gaussian §3.4]: make all surfels opaque and enlarge the reflective ones.
+
+    Enlarged opaque surfels cover their neighbours, whose reflections then follow the normals that already explain them.
+    Reflective means metallic and smooth; a rough metal has no sharp reflection to propagate.
+    """
+    raw = surfels.to_numpy()
+    raw["opacity"] = np.maximum(raw["opacity"], np.float32(logit(options.propagate_opacity)))
+    metallic, roughness = sigmoid(raw["metallic"][:, 0]), sigmoid(raw["roughness"][:, 0])
+    reflective = (metallic >= options.propagate_metallic) & (roughness <= options.propagate_roughness)
+    raw["scale"][reflective] += np.float32(np.log(options.propagate_scale))
+    return Surfels.from_numpy(raw)
+
+
+def reset_materials(
+    surfels: Surfels, metallic: float, roughness: float, rng: np.random.Generator
+) -> Surfels:
+    """Albedo, metallic and roughness back to their initial values. [Ref-Gaussian, implementation details]"""
+    raw = surfels.to_numpy()
+    raw["albedo"] = logit(0.5 + rng.uniform(-0.025, 0.025, size=raw["albedo"].shape)).astype(np.float32)
+    raw["metallic"] = np.full_like(raw["metallic"], logit(metallic))
+    raw["roughness"] = np.full_like(raw["roughness"], logit(roughness))
+    return Surfels.from_numpy(raw)

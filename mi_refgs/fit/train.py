@@ -1,0 +1,346 @@
+"""The optimisation loop: stages from the method, one view a step, refinement and mesh extraction on their windows.
+
+A step is a pure function of the state and the iteration number (view order and random draws are derived from the seed
+and the iteration), so a resumed run repeats a straight one: bit for bit with one thread.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.fit import losses, refine
+from mi_refgs.fit.config import Method, Stage
+from mi_refgs.fit.data import Dataset, View
+from mi_refgs.fit.initial import initial_surfels
+from mi_refgs.fit.optim import Adam, Group
+from mi_refgs.fit.record import Run
+from mi_refgs.fit.ssim import ssim
+from mi_refgs.occlusion.mesh import Mesh, extract_mesh
+from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.render.depth_normals import normals_from_depth
+from mi_refgs.render.pipeline import Frame, Shading, render
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.table import Surfels
+
+LIGHT = "light"
+
+
+@dataclass(frozen=True)
+class Target:
+    """A view on the device: camera and planes of H·W values."""
+
+    camera: Camera
+    image: list[Any]  # display-encoded
+    clipped: list[Any] | None  # where an 8-bit target says only "at least this bright"
+    alpha: Any | None
+
+    @staticmethod
+    def of(view: View) -> Target:
+        """Upload a view."""
+        planes = [mi.Float(np.ascontiguousarray(view.image[..., i].ravel())) for i in range(3)]
+        image = [losses.linear_to_srgb(plane) for plane in planes] if view.linear else planes
+        clipped = None if view.linear else losses.saturated(image)
+        alpha = None if view.alpha is None else mi.Float(np.ascontiguousarray(view.alpha.ravel()))
+        target = Target(view.camera(), image, clipped, alpha)
+        dr.eval(target.image, target.clipped, target.alpha)
+        return target
+
+
+def displayed(frame: Frame, background: np.ndarray, linear: bool) -> list[Any]:
+    """What the camera shows of a frame, display-encoded planes.
+
+    Pictures with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it.
+    """
+    behind = [float(x) for x in background]
+    radiance = list(frame.radiance())
+    if not linear:
+        return losses.display_image(radiance, frame.alpha, behind)
+    return [
+        losses.linear_to_srgb(plane + (1 - frame.alpha) * value) for plane, value in zip(radiance, behind, strict=True)
+    ]
+
+
+class Trainer:
+    """The state of a fit and the step that advances it."""
+
+    def __init__(self, method: Method, data: Dataset, run: Run | None = None) -> None:
+        """Set up a fit of `data`, from the newest checkpoint of `run` if it has one."""
+        self.method, self.data, self.run = method, data, run
+        self.extent = data.scene_extent
+        self.targets = [Target.of(view) for view in data.views]
+        self.occluder = Occluder()
+        self.iteration, self.seconds = 0, 0.0
+        self.params: dict[str, Any] = {}
+        state = run.load_checkpoint() if run is not None else None
+        if state is None:
+            self.params |= initial_surfels(method, data, self._rng(0)).raw
+            if method.light is not None:
+                start = EnvironmentLight.constant(method.light.radiance, method.light.height)
+                self.params[LIGHT] = start.raw
+            self.optimiser = Adam(self.params, self._groups())
+            self._clear_statistics()
+        else:
+            self._restore(state)
+        self.loss: Any = None
+        self.error: Any = None
+
+    # ---------------- what others look at ----------------
+
+    @property
+    def surfels(self) -> Surfels:
+        """The table, attached to the leaves that the optimiser owns."""
+        return Surfels({name: tensor for name, tensor in self.params.items() if name != LIGHT})
+
+    @property
+    def light(self) -> EnvironmentLight | None:
+        """The environment, attached likewise."""
+        return EnvironmentLight(self.params[LIGHT]) if LIGHT in self.params else None
+
+    def shading(self, iteration: int | None = None) -> Shading:
+        """How the present (or another) iteration shades."""
+        _, stage = self.method.stage_at(iteration or max(self.iteration, 1))
+        return self._shading(stage)
+
+    def view(self, camera: Camera, material_maps: bool = True) -> Frame:
+        """Render a view of the present state, without derivatives."""
+        with dr.suspend_grad():
+            light = self.light.prefilter() if self.light is not None else None
+            return render(
+                self.surfels,
+                camera,
+                self.shading(),
+                light,
+                self.occluder,
+                sh_degree=self._sh_degree(self.iteration),
+                material_maps=material_maps,
+            )
+
+    # ---------------- the loop ----------------
+
+    def train(self, progress: Callable[[Trainer], None] | None = None) -> None:
+        """Run to the last iteration; on an interrupt, save a checkpoint and pass the interrupt on."""
+        try:
+            while self.iteration < self.method.iterations:
+                begin = time.perf_counter()
+                self.step()
+                if self.iteration % self.method.log_every == 0:
+                    dr.sync_thread()
+                self.seconds += time.perf_counter() - begin
+                if self.run is not None and self.iteration % self.method.log_every == 0:
+                    self.run.log(self.statistics())
+                if self.run is not None and self.iteration % self.method.checkpoint_every == 0:
+                    self.run.save_checkpoint(self.iteration, self.state())
+                if progress is not None:
+                    progress(self)
+        except KeyboardInterrupt:
+            if self.run is not None and self.iteration:
+                self.run.save_checkpoint(self.iteration, self.state())
+            raise
+
+    def step(self) -> None:
+        """One iteration: enter a stage if it begins, one gradient step, then what falls due."""
+        iteration = self.iteration + 1
+        name, stage = self.method.stage_at(iteration)
+        if iteration > 1 and stage.reset_materials and self.method.stage_at(iteration - 1)[0] != name:
+            self._reset_materials(iteration)
+        self._gradient_step(iteration, stage)
+        self.iteration = iteration
+        self._refine(iteration)
+        mesh = self.method.mesh
+        if mesh is not None and stage.at == "pixel" and mesh.extract.due(iteration):
+            self.extract_mesh()
+
+    def statistics(self) -> dict[str, Any]:
+        """One line of the log; waits for the device."""
+        mse = float(self.error[0])
+        return {
+            "iteration": self.iteration,
+            "seconds": round(self.seconds, 3),
+            "stage": self.method.stage_at(self.iteration)[0],
+            "loss": float(self.loss[0]),
+            "psnr": round(-10 * float(np.log10(max(mse, 1e-10))), 3),
+            "surfels": self.surfels.count,
+            "non_finite_gradients": self.optimiser.bad,
+        }
+
+    def extract_mesh(self) -> Mesh:
+        """Fuse the rendered depth of all training views into a mesh and make it the occluder."""
+        surfels = self.surfels.detach()
+        bounds = bounds_from_points(surfels.to_numpy()["position"])
+        plain = Shading(at="surfel", reflectance="radiance")
+        depth_only = Surfels({k: v for k, v in surfels.raw.items() if k in ("position", "rotation", "scale", "opacity")})
+        zeros = np.zeros((surfels.count, 3), np.float32)
+        depth_only.raw["radiance_sh"] = mi.TensorXf(zeros)
+        frames = (render(depth_only, target.camera, plain) for target in self.targets)
+        pairs = [(frame.depth, frame.alpha) for frame in frames]
+        assert self.method.mesh is not None
+        volume = fuse(
+            [depth for depth, _ in pairs],
+            [alpha for _, alpha in pairs],
+            [target.camera for target in self.targets],
+            bounds,
+            self.method.mesh.resolution,
+        )
+        mesh = extract_mesh(volume)
+        self.occluder.update(mesh)
+        return mesh
+
+    # ---------------- one step ----------------
+
+    def _gradient_step(self, iteration: int, stage: Stage) -> None:
+        target = self.targets[self._view_index(iteration)]
+        camera, weights = target.camera, self.method.loss
+        surfels = self.surfels
+        shift = mi.Point2f(dr.opaque(mi.Float, 0, surfels.count), dr.opaque(mi.Float, 0, surfels.count))
+        dr.enable_grad(shift)
+        shading = self._shading(stage)
+        uses_light = shading.reflectance == "split_sum" and self.light is not None
+        frame = render(
+            surfels,
+            camera,
+            shading,
+            self.light.prefilter() if uses_light and self.light is not None else None,
+            self.occluder,
+            sh_degree=self._sh_degree(iteration),
+            shift=shift,
+        )
+        image = displayed(frame, self.data.background, self.data.linear)
+        if target.clipped is not None:
+            image = losses.clip_highlights(image, target.image, target.clipped)
+        loss = (1 - weights.ssim) * losses.l1(image, target.image)
+        if weights.ssim:
+            loss += weights.ssim * (1 - ssim(image, target.image, camera.width, camera.height))
+        if weights.normal and iteration > weights.normal_from:
+            depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, camera)
+            loss += weights.normal * losses.normal_consistency(frame.normal, depth_normal, valid, frame.alpha)
+        if weights.smooth and iteration <= weights.smooth_until:
+            loss += weights.smooth * losses.normal_smoothness(
+                list(frame.normal), target.image, camera.width, camera.height
+            )
+        if weights.alpha and target.alpha is not None:
+            loss += weights.alpha * losses.alpha_loss(frame.alpha, target.alpha)
+        self.loss = dr.detach(loss)
+        error = sum((dr.square(dr.detach(a) - b) for a, b in zip(image, target.image, strict=True)), mi.Float(0))
+        self.error = dr.mean(error) / 3
+        dr.backward(loss)
+
+        if self.method.refine.densify is not None and iteration <= self.method.refine.densify.until:
+            length = dr.norm(dr.grad(shift) * mi.Vector2f(0.5 * camera.width, 0.5 * camera.height))
+            self.gradient_sum += length
+            self.gradient_count += dr.select(length > 0, mi.Float(1), 0)
+            dr.schedule(self.gradient_sum, self.gradient_count)
+        if iteration % self.method.log_every == 0:
+            dr.schedule(self.loss, self.error)
+        self.optimiser.step(iteration - 1)
+
+    def _refine(self, iteration: int) -> None:
+        options, surfels = self.method.refine, self.method.surfels
+        if options.densify is not None and options.densify.due(iteration):
+            mean = self.gradient_sum.numpy() / np.maximum(self.gradient_count.numpy(), 1)
+            edited = refine.densify_and_prune(
+                self.surfels, mean, self.extent, options, surfels.max_count, self._rng(iteration)
+            )
+            self._replace(edited.surfels)
+            names = list(edited.surfels.raw)
+            self.optimiser.gather(mi.UInt32(edited.parent), names, mi.Bool(edited.fresh))
+            self._clear_statistics()
+        if options.reset is not None and options.reset.due(iteration):
+            self._replace(refine.reset_opacity(self.surfels, options, surfels.metallic), cleared=("opacity", "metallic"))
+        elif options.propagate is not None and options.propagate.due(iteration) and "metallic" in self.params:
+            self._replace(refine.propagate_normals(self.surfels, options), cleared=("opacity", "scale"))
+            self.optimiser.set_factor("opacity", 0.0)
+            self.held_until = iteration + options.propagate_hold
+        if iteration >= self.held_until:
+            self.optimiser.set_factor("opacity", 1.0)
+
+    def _reset_materials(self, iteration: int) -> None:
+        options = self.method.surfels
+        edited = refine.reset_materials(self.surfels, options.metallic, options.roughness, self._rng(iteration))
+        self._replace(edited, cleared=("albedo", "metallic", "roughness"))
+
+    def _replace(self, surfels: Surfels, cleared: tuple[str, ...] = ()) -> None:
+        self.params.update(surfels.raw)
+        for name in surfels.raw:
+            dr.enable_grad(self.params[name])
+        for name in cleared:
+            if name in self.params:
+                self.optimiser.reset(name)
+
+    # ---------------- schedule ----------------
+
+    def _shading(self, stage: Stage) -> Shading:
+        return Shading(stage.at, stage.reflectance, stage.diffuse, self.occluder.mesh() is not None)
+
+    def _sh_degree(self, iteration: int) -> int:
+        window = self.method.surfels.sh_raise
+        raised = max(min(iteration, window.until) - window.start, 0) // window.every
+        return min(raised, self.method.surfels.sh_degree)
+
+    def _rng(self, iteration: int) -> np.random.Generator:
+        return np.random.default_rng([self.method.seed, iteration])
+
+    def _view_index(self, iteration: int) -> int:
+        """Sampling without replacement: a fresh permutation of the views every epoch."""
+        epoch, place = divmod(iteration - 1, len(self.targets))
+        return int(np.random.default_rng([self.method.seed, epoch, 1]).permutation(len(self.targets))[place])
+
+    def _groups(self) -> dict[str, Group]:
+        rates, degrees = self.method.rates, {"head": 3, "tail": self.method.rates.sh_rest}
+        steps = int(0.6 * self.method.iterations)  # 30,000 of 50,000 in the paper's code
+        groups = {
+            "position": Group(rates.position * self.extent, rates.position_final * self.extent, steps),
+            "rotation": Group(rates.rotation),
+            "scale": Group(rates.scale),
+            "opacity": Group(rates.opacity),
+            "radiance_sh": Group(rates.radiance_sh, **degrees),
+            "albedo": Group(rates.albedo),
+            "metallic": Group(rates.metallic),
+            "roughness": Group(rates.roughness),
+            "indirect_sh": Group(rates.indirect_sh, **degrees),
+            LIGHT: Group(rates.light),
+        }
+        return {name: group for name, group in groups.items() if name in self.params}
+
+    # ---------------- state ----------------
+
+    def _clear_statistics(self) -> None:
+        count = self.surfels.count
+        self.gradient_sum = dr.opaque(mi.Float, 0, count)
+        self.gradient_count = dr.opaque(mi.Float, 0, count)
+        if not hasattr(self, "held_until"):
+            self.held_until = 0
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that a checkpoint holds."""
+        mesh = self.occluder.mesh()
+        state = {f"params/{name}": tensor.numpy() for name, tensor in self.params.items()}
+        state |= {f"optimiser/{name}": value for name, value in self.optimiser.state_dict().items()}
+        state |= {"gradient_sum": self.gradient_sum.numpy(), "gradient_count": self.gradient_count.numpy()}
+        state |= {"iteration": np.array(self.iteration), "seconds": np.array(self.seconds)}
+        state["held_until"] = np.array(self.held_until)
+        if mesh is not None:
+            state |= {"mesh/vertices": mesh.vertices, "mesh/faces": mesh.faces, "mesh/voxel": np.array(mesh.voxel)}
+        return state
+
+    def _restore(self, state: dict[str, np.ndarray]) -> None:
+        self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
+        self.params |= {
+            key.removeprefix("params/"): mi.TensorXf(value) for key, value in state.items() if key.startswith("params/")
+        }
+        self.optimiser = Adam(self.params, self._groups())
+        self.optimiser.load_state_dict(
+            {key.removeprefix("optimiser/"): value for key, value in state.items() if key.startswith("optimiser/")}
+        )
+        self.gradient_sum, self.gradient_count = mi.Float(state["gradient_sum"]), mi.Float(state["gradient_count"])
+        self.held_until = int(state["held_until"])
+        if "mesh/faces" in state:
+            self.occluder.update(Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"])))

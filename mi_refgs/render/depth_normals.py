@@ -1,0 +1,57 @@
+"""Normals of the surface that a depth map describes.
+
+Letters: D = Σ w z the blended depth, A the accumulated alpha, z = D / A the expected camera depth, X(i, j) the point
+that pixel (i, j) sees at depth z.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.constants import NORM_FLOOR
+from mi_refgs.render.stencil import neighbours
+from mi_refgs.splat.camera import Camera
+
+# Alpha below which a pixel has no depth: D / A would divide rounding errors. One 8-bit step, the splatter's own cut.
+DEPTH_ALPHA_MIN = 1.0 / 255.0
+
+
+def expected_depth(blended: Any, alpha: Any) -> Any:
+    """Expected camera depth z = D / A (scene units), 0 where A < 1/255; gradients flow to D and A and stay finite."""
+    valid = alpha >= DEPTH_ALPHA_MIN
+    return dr.select(valid, blended / dr.select(valid, alpha, 1.0), 0.0)
+
+
+def normals_from_depth(depth: Any, alpha: Any, camera: Camera) -> tuple[Any, Any]:
+    """World normals of a depth map by central differences, facing the camera, and where they are valid.
+
+    depth: (H·W) camera depth z, raster order, scene units; alpha: (H·W), read for validity only, no derivative.
+    Returns (normal: mi.Vector3f unit, or zero where invalid; valid: mi.Bool). Invalid: the one-pixel image border,
+    pixels that or whose four neighbours have A < 1/255, and points in one line. Gradients flow to depth.
+    Source: 2DGS, Huang et al. 2024, eq. 15, with X unprojected through the pixel centres (i + ½, j + ½).
+    """
+    width, height = camera.width, camera.height
+    steps = ((-1, 0), (1, 0), (0, -1), (0, 1))
+    left, right, up, down = neighbours(depth, width, height, steps)
+    pixel = camera.pixel_centres()
+
+    def point(z: Any, dx: int, dy: int) -> Any:
+        return mi.Vector3f((pixel.x + dx - camera.cx) / camera.fx, (pixel.y + dy - camera.cy) / camera.fy, 1) * z
+
+    # Camera-frame axes have signed focal lengths, so the orientation is settled by the view direction below.
+    along_x = point(right, 1, 0) - point(left, -1, 0)
+    along_y = point(down, 0, 1) - point(up, 0, -1)
+    normal = dr.cross(along_x, along_y)
+    towards = dr.dot(normal, point(mi.Float(1), 0, 0)) > 0
+    normal = dr.select(dr.detach(towards), -normal, normal)
+
+    covered = dr.select(dr.detach(alpha) >= DEPTH_ALPHA_MIN, mi.Float(1), mi.Float(0))
+    around = neighbours(covered, width, height, (*steps, (0, 0)))
+    inside = (pixel.x > 1) & (pixel.x < width - 1) & (pixel.y > 1) & (pixel.y < height - 1)
+    length2 = dr.squared_norm(normal)
+    valid = inside & (sum(around[1:], around[0]) > 4.5) & (dr.detach(length2) > NORM_FLOOR)
+    normal = normal * dr.rsqrt(dr.select(valid, length2, 1.0))
+    return dr.select(valid, camera.rotation.T @ normal, 0.0), valid

@@ -1,0 +1,218 @@
+"""Surfels to image, in the two orders that every method is made of.
+
+    shade at surfels:  attributes ─ shade ─► radiance channel ─ blend ─► image
+    shade at pixels:   attributes ─ blend ─► G-buffer ─ shade ─► image
+
+The same `splat` and the same `shade` serve both. Everything is traced by Dr.Jit; the derivatives that are absent on purpose
+are those of `splat.blend`, the visibility, the side to which a normal is turned, and the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.constants import COVERAGE_FLOOR
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.shade.models import ShadingPoints, Terms, reflect, shade
+from mi_refgs.shade.sh import clamp_positive, eval_sh
+from mi_refgs.splat import Blended, Camera, splat
+from mi_refgs.surfels.table import Surfels
+
+
+@dataclass(frozen=True)
+class Shading:
+    """How a method turns surfels into radiance: data, chosen per stage."""
+
+    at: Literal["surfel", "pixel"] = "pixel"  # shade before or after blending
+    reflectance: Literal["radiance", "split_sum"] = "split_sum"  # SH colour alone, or diffuse + GGX specular
+    diffuse: Literal["sh", "irradiance"] = "sh"  # view-dependent SH colour, or albedo × prefiltered light
+    occlusion: bool = False  # trace visibility along the mirror direction, and fill with the indirect channel
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One rendered view: mi arrays of H·W values in raster order.
+
+    Radiance terms are linear and premultiplied by alpha; maps are divided by it and 0 where nothing is seen.
+    """
+
+    alpha: Any  # accumulated opacity
+    depth: Any  # expected camera-z depth, 0 where nothing is seen
+    median_depth: Any  # detached
+    normal: Any  # mi.Vector3f: blended world normal towards the camera, not normalised
+    terms: Terms  # diffuse, specular, indirect
+    maps: dict[str, Any] = field(default_factory=dict)  # albedo, metallic, roughness, visibility where known
+
+    def radiance(self) -> Any:
+        """Sum of the terms (mi.Color3f), linear, premultiplied by alpha, over black."""
+        return self.terms.total()
+
+
+def render(
+    surfels: Surfels,
+    camera: Camera,
+    shading: Shading,
+    light: Any = None,
+    occluder: Occluder | None = None,
+    sh_degree: int | None = None,
+    shift: Any = None,
+    material_maps: bool = False,
+) -> Frame:
+    """Render a view.
+
+    `light` is a `shade.PrefilteredLight`, needed unless `shading.reflectance` is "radiance". `sh_degree` limits the degree of the
+    radiance channel, for coarse-to-fine schedules. `material_maps` asks for albedo, metallic and roughness even where shading does not
+    need them per pixel. `shift`: see `splat.project`.
+    """
+    if shading.at == "surfel":
+        return _shade_at_surfels(surfels, camera, shading, light, sh_degree, shift, material_maps)
+    return _shade_at_pixels(surfels, camera, shading, light, occluder, sh_degree, shift)
+
+
+# ---------------- attributes of surfels ----------------
+
+
+def _facing(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
+    """Unit direction from the camera to each surfel, and its normal turned towards the camera."""
+    offset = mi.Vector3f(surfels.position()) - mi.Vector3f(camera.origin)
+    # A surfel at the camera's own position has no direction; it is culled, so any finite one will do.
+    direction = offset * dr.rsqrt(dr.maximum(dr.squared_norm(offset), 1e-12))
+    normal = surfels.frame()[2]
+    return direction, dr.select(dr.detach(dr.dot(normal, direction)) > 0, -normal, normal)
+
+
+def _radiance(surfels: Surfels, direction: Any, sh_degree: int | None) -> Any:
+    """SH colour max(0, ½ + Σ c Y(direction)) [3DGS, §4]."""
+    coefficients = surfels.radiance_sh()
+    if sh_degree is not None:
+        coefficients = coefficients[: (sh_degree + 1) ** 2]
+    return clamp_positive(eval_sh(coefficients, direction) + 0.5)
+
+
+def _materials(surfels: Surfels) -> list[Any]:
+    return [*surfels.albedo(), surfels.metallic(), surfels.roughness()]
+
+
+# ---------------- the two orders ----------------
+
+
+def _shade_at_surfels(
+    surfels: Surfels,
+    camera: Camera,
+    shading: Shading,
+    light: Any,
+    sh_degree: int | None,
+    shift: Any,
+    material_maps: bool,
+) -> Frame:
+    direction, normal = _facing(surfels, camera)
+    if shading.reflectance == "radiance":
+        zero = dr.zeros(mi.Color3f, dr.width(normal))
+        terms = Terms(_radiance(surfels, direction, sh_degree), None, None)
+        features = [*terms.diffuse]
+    else:
+        points = ShadingPoints(
+            normal=normal,
+            view=-direction,
+            albedo=surfels.albedo(),
+            metallic=surfels.metallic(),
+            roughness=surfels.roughness(),
+            radiance=_radiance(surfels, direction, sh_degree) if shading.diffuse == "sh" else None,
+        )
+        terms = shade(points, light, shading.diffuse)
+        features = [*terms.diffuse, *terms.specular]
+    radiance_features = len(features)
+    features += [*normal]
+    show_materials = material_maps and surfels.has("albedo")
+    if show_materials:
+        features += _materials(surfels)
+    blended = splat(surfels, features, camera, shift)
+
+    maps = blended.features
+    zero = dr.zeros(mi.Color3f, 1)
+    diffuse = mi.Color3f(*maps[0:3])
+    specular = mi.Color3f(*maps[3:6]) if radiance_features == 6 else zero
+    rest = maps[radiance_features:]
+    inverse = _inverse_alpha(blended)
+    return Frame(
+        alpha=blended.alpha,
+        depth=blended.depth * inverse,
+        median_depth=blended.median_depth,
+        normal=mi.Vector3f(*rest[0:3]),
+        terms=Terms(diffuse, specular, zero),
+        maps=_material_maps(rest[3:8], inverse) if show_materials else {},
+    )
+
+
+def _shade_at_pixels(
+    surfels: Surfels,
+    camera: Camera,
+    shading: Shading,
+    light: Any,
+    occluder: Occluder | None,
+    sh_degree: int | None,
+    shift: Any,
+) -> Frame:
+    direction, normal = _facing(surfels, camera)
+    features = [*normal, *_materials(surfels)]
+    if shading.diffuse == "sh":
+        features += [*_radiance(surfels, direction, sh_degree)]
+    indirect_used = shading.occlusion and occluder is not None
+    if indirect_used and surfels.has("indirect_sh"):
+        # The mirror direction of the surfel's centre [Ref-Gaussian, §3.3]; starts at exactly 0 and must train from there.
+        mirrored = reflect(-direction, normal)
+        features += [*clamp_positive(eval_sh(surfels.indirect_sh(), mirrored))]
+    blended = splat(surfels, features, camera, shift)
+
+    inverse = _inverse_alpha(blended)
+    normal = mi.Vector3f(*blended.features[0:3])
+    maps = _material_maps(blended.features[3:8], inverse)
+    rest = [x * inverse for x in blended.features[8:]]
+    radiance = None
+    if shading.diffuse == "sh":
+        radiance, rest = mi.Color3f(*rest[:3]), rest[3:]
+    depth = blended.depth * inverse
+    ray = camera.rays()
+    view = -dr.normalize(ray)
+    visibility = None
+    if indirect_used:
+        assert occluder is not None
+        with dr.suspend_grad():
+            point = mi.Point3f(mi.Vector3f(camera.origin) + dr.detach(depth) * ray)
+            facing = dr.detach(normal)
+            visibility = occluder.visible(point, reflect(view, facing), facing)
+        maps["visibility"] = visibility
+    points = ShadingPoints(
+        normal=normal,
+        view=view,
+        albedo=maps["albedo"],
+        metallic=maps["metallic"],
+        roughness=maps["roughness"],
+        radiance=radiance,
+        visibility=visibility,
+        indirect=mi.Color3f(*rest) if rest else None,
+    )
+    terms = shade(points, light, shading.diffuse)
+    return Frame(
+        alpha=blended.alpha,
+        depth=depth,
+        median_depth=blended.median_depth,
+        normal=normal,
+        terms=Terms(*(term * blended.alpha for term in (terms.diffuse, terms.specular, terms.indirect))),
+        maps=maps,
+    )
+
+
+def _inverse_alpha(blended: Blended) -> Any:
+    """1/A where anything is seen, else 0, with a finite gradient everywhere."""
+    seen = blended.alpha > COVERAGE_FLOOR
+    return dr.select(seen, dr.rcp(dr.select(seen, blended.alpha, 1)), 0)
+
+
+def _material_maps(features: list[Any], inverse: Any) -> dict[str, Any]:
+    albedo = mi.Color3f(*(x * inverse for x in features[0:3]))
+    return {"albedo": albedo, "metallic": features[3] * inverse, "roughness": features[4] * inverse}

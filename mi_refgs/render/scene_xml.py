@@ -1,0 +1,105 @@
+"""The `scene.xml` of a run: what `mi.load_file` needs, after `import mi_refgs`, to render the fitted scene."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.render.pipeline import Shading
+from mi_refgs.splat.camera import Camera
+
+# Mitsuba's perspective sensor has square pixels; float32 focal lengths of one camera agree far better than this.
+SQUARE_PIXEL_TOLERANCE = 1e-4
+
+
+def write_scene_xml(
+    path: str | Path,
+    *,
+    ply: str,
+    envmap: str | None = None,
+    mesh: str | None = None,
+    shading: Shading,
+    camera: Camera,
+    background: Sequence[float] | None = None,
+) -> None:
+    """Write a Mitsuba scene with one `refgs` integrator and one perspective sensor, atomically.
+
+    ply, envmap, mesh: file names relative to the folder of the XML, so that the folder can be moved. background: linear
+    radiance (r, g, b) composited under alpha, or None for a transparent image. The scene has a parameter `spp`, as in
+    `mi.load_file(path, spp=4)`, 1 by default: pixel centres, as in training.
+
+    Raises InputError if the camera is none that Mitsuba has (mirrored, or without square pixels), or if the path cannot
+    be written.
+    """
+    scene = ElementTree.Element("scene", version="3.0.0")
+    scene.append(ElementTree.Comment(" needs `import mi_refgs` before mi.load_file "))
+    _put(scene, "default", "spp", "1")
+    integrator = ElementTree.SubElement(scene, "integrator", type="refgs", id="refgs")
+    _put(integrator, "string", "filename", ply)
+    _put(integrator, "string", "shade_at", shading.at)
+    _put(integrator, "string", "reflectance", shading.reflectance)
+    _put(integrator, "string", "diffuse", shading.diffuse)
+    _put(integrator, "boolean", "occlusion", str(shading.occlusion and mesh is not None).lower())
+    if mesh is not None:
+        _put(integrator, "string", "mesh", mesh)
+    if background is not None:
+        _put(integrator, "rgb", "background", _numbers(background))
+    if envmap is not None:
+        light = ElementTree.SubElement(integrator, "emitter", type="envmap", name="light")
+        _put(light, "string", "filename", envmap)
+    _add_sensor(scene, camera)
+
+    ElementTree.indent(scene, "    ")
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(ElementTree.tostring(scene, encoding="unicode") + "\n", encoding="utf-8")
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path}: output: cannot be written ({error.strerror}); choose a writable folder") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _put(parent: ElementTree.Element, kind: str, name: str, value: str) -> None:
+    ElementTree.SubElement(parent, kind, name=name, value=value)
+
+
+def _numbers(values: Any) -> str:
+    return ", ".join(repr(float(x)) for x in values)
+
+
+def _add_sensor(scene: ElementTree.Element, camera: Camera) -> None:
+    fx, fy, cx, cy, near = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy, camera.near))
+    if not (fx < 0 and fy < 0 and abs(fx - fy) < SQUARE_PIXEL_TOLERANCE * abs(fx)):
+        raise InputError(
+            f"camera: fx, fy: {fx:g} and {fy:g} pixels are no Mitsuba `perspective` sensor, whose pixels are square and not "
+            "mirrored; choose another view"
+        )
+    to_world = np.eye(4)
+    to_world[:3, :3] = np.array(camera.rotation, dtype=np.float64).reshape(3, 3).T
+    to_world[:3, 3] = np.array(camera.origin, dtype=np.float64).ravel()
+
+    sensor = ElementTree.SubElement(scene, "sensor", type="perspective", id="sensor")
+    _put(sensor, "string", "fov_axis", "x")
+    _put(sensor, "float", "fov", repr(math.degrees(2 * math.atan(camera.width / (2 * abs(fx))))))
+    _put(sensor, "float", "near_clip", repr(near))
+    _put(sensor, "float", "principal_point_offset_x", repr(cx / camera.width - 0.5))
+    _put(sensor, "float", "principal_point_offset_y", repr(cy / camera.height - 0.5))
+    transform = ElementTree.SubElement(sensor, "transform", name="to_world")
+    ElementTree.SubElement(transform, "matrix", value=_numbers(to_world.ravel()))
+    sampler = ElementTree.SubElement(sensor, "sampler", type="independent")
+    _put(sampler, "integer", "sample_count", "$spp")
+    film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
+    _put(film, "integer", "width", str(camera.width))
+    _put(film, "integer", "height", str(camera.height))
+    _put(film, "string", "pixel_format", "rgba")
+    _put(film, "string", "component_format", "float32")
+    ElementTree.SubElement(film, "rfilter", type="box")

@@ -1,0 +1,73 @@
+"""Neighbouring pixels of an image plane, with an adjoint that only gathers (no atomics, hence deterministic)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+# A step (dx, dy) in pixels, each -1, 0 or 1.
+Step = tuple[int, int]
+
+
+def neighbours(plane: Any, width: int, height: int, steps: Sequence[Step]) -> list[Any]:
+    """The plane (mi.Float, raster order) shifted by each step: out_k(x, y) = plane(x + dx_k, y + dy_k).
+
+    Pixels outside repeat the border. Steps are (dx, dy) with entries in {-1, 0, 1}.
+    """
+    return list(dr.custom(_Neighbours, plane, width, height, tuple(steps)))
+
+
+class _Neighbours(dr.CustomOp):
+    def eval(self, plane: Any, width: int, height: int, steps: tuple[Step, ...]) -> list[Any]:
+        self.width, self.height, self.steps = width, height, steps
+        return self._shift(plane)
+
+    def _shift(self, plane: Any) -> list[Any]:
+        dr.eval(plane)
+        x, y = _pixel(self.width, self.height)
+        return [
+            dr.gather(mi.Float, plane, _moved(y, dy, self.height) * self.width + _moved(x, dx, self.width))
+            for dx, dy in self.steps
+        ]
+
+    def forward(self) -> None:
+        self.set_grad_out(self._shift(self.grad_in("plane")))
+
+    def backward(self) -> None:
+        """Pixel s was read by the pixels p = s - step and, where the border repeats, by s itself (per axis)."""
+        x, y = _pixel(self.width, self.height)
+        δ_plane = mi.Float(0)
+        δ_out = self.grad_out()
+        dr.eval(δ_out)
+        for (dx, dy), δ in zip(self.steps, δ_out, strict=True):
+            for reader_y, read_y in _readers(y, dy, self.height):
+                for reader_x, read_x in _readers(x, dx, self.width):
+                    δ_plane += dr.gather(mi.Float, δ, reader_y * self.width + reader_x, read_x & read_y)
+        self.set_grad_in("plane", δ_plane)
+
+    def name(self) -> str:
+        return "neighbours"
+
+
+def _pixel(width: int, height: int) -> tuple[Any, Any]:
+    index = dr.arange(mi.UInt32, width * height)
+    return index % width, index // width
+
+
+def _moved(place: Any, step: int, size: int) -> Any:
+    """Place + step along one axis, clamped to the image."""
+    if step > 0:
+        return dr.minimum(place + 1, size - 1)
+    return dr.select(place > 0, place - 1, 0) if step < 0 else place
+
+
+def _readers(place: Any, step: int, size: int) -> list[tuple[Any, Any]]:
+    """Places along one axis that read `place` when moved by step, each with the mask where it does."""
+    if step == 0:
+        return [(place, mi.Bool(True))]
+    border = size - 1 if step > 0 else 0
+    first = 0 if step > 0 else size - 1
+    return [(place - step if step > 0 else place + 1, place != first), (place, place == border)]

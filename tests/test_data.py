@@ -1,0 +1,310 @@
+"""The reader of multi-view data sets: conventions, compositing, intrinsics, what it says about bad input."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_refgs.errors import InputError
+from mi_refgs.fit.data import Dataset, load
+from mi_refgs.fit.images import (
+    box_downscale,
+    linear_from_srgb,
+    read_exr,
+    read_exr_image,
+    read_png,
+    srgb_from_linear,
+    write_exr,
+    write_png,
+)
+
+ANGLE = 0.7  # camera_angle_x, radians
+WIDTH, HEIGHT = 6, 4
+
+
+def pose(azimuth: float) -> np.ndarray:
+    """OpenGL camera-to-world matrix 3 from (0.1, 0.2, 0.3), 20° above the horizon, z up."""
+    focus = np.array([0.1, 0.2, 0.3])
+    low = math.cos(0.35)
+    backward = np.array([math.cos(azimuth) * low, math.sin(azimuth) * low, math.sin(0.35)])
+    right = np.cross([0, 0, 1], backward)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, np.cross(backward, right), backward, focus + 3 * backward], axis=1)
+    return matrix
+
+
+@pytest.fixture
+def folder(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """Eight training and two test views of random RGBA pixels, PNG and EXR."""
+    for split, count in (("train", 8), ("test", 2)):
+        (tmp_path / split).mkdir()
+        frames = []
+        for i in range(count):
+            rgba = rng.random((HEIGHT, WIDTH, 4))
+            write_png(tmp_path / split / f"r_{i}.png", rgba)
+            rgba[..., :3] *= 3 * rgba[..., 3:]
+            write_exr(tmp_path / split / f"r_{i}.exr", rgba)
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose(0.7 * i).tolist()})
+        write(tmp_path, split, {"camera_angle_x": ANGLE, "frames": frames})
+    return tmp_path
+
+
+def read(folder: Path, split: str = "train") -> dict[str, Any]:
+    return json.loads((folder / f"transforms_{split}.json").read_text())
+
+
+def write(folder: Path, split: str, content: Any) -> None:
+    (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+
+
+def test_png_is_composited_as_displayed(folder: Path) -> None:
+    for background, value in (("white", 1), ("black", 0)):
+        data = load(folder, "train", background=background)
+        pixels = np.asarray(Image.open(folder / "train/r_3.png")) / 255
+        expected = pixels[..., 3:] * pixels[..., :3] + (1 - pixels[..., 3:]) * value
+        view = data.views[3]
+        assert (view.name, view.width, view.height, view.linear) == ("train/r_3", WIDTH, HEIGHT, False)
+        assert view.image.dtype == np.float32 and view.alpha is not None
+        np.testing.assert_allclose(view.image, expected, atol=1e-6)
+        np.testing.assert_allclose(view.alpha, pixels[..., 3], atol=1e-6)
+        np.testing.assert_array_equal(data.background, np.full(3, value, np.float32))
+
+
+def test_exr_is_linear_and_premultiplied(folder: Path) -> None:
+    view = load(folder, "train", images="exr").views[2]
+    pixels = read_exr_image(folder / "train/r_2.exr")
+    assert view.linear and view.image.max() > 1
+    np.testing.assert_allclose(view.image, pixels[..., :3] + 1 - pixels[..., 3:], atol=1e-6)
+
+
+def test_picture_without_alpha(folder: Path) -> None:
+    for i in range(8):
+        write_png(folder / f"train/r_{i}.png", read_png(folder / f"train/r_{i}.png")[..., :3])
+    view = load(folder, "train").views[0]
+    assert view.alpha is None
+    np.testing.assert_array_equal(view.image, read_png(folder / "train/r_0.png"))
+
+
+def test_downscale_averages_composited_pixels(folder: Path) -> None:
+    for images in ("png", "exr"):
+        full = load(folder, "train", images=images).views[1]
+        half = load(folder, "train", images=images, downscale=2).views[1]
+        np.testing.assert_allclose(half.image, box_downscale(full.image, 2), atol=1e-6)
+        assert (half.width, half.height) == (WIDTH // 2, HEIGHT // 2)
+        assert half.fx == full.fx / 2 and half.cy == full.cy / 2
+
+
+def test_camera_frame(folder: Path) -> None:
+    """Mitsuba's frame: +z forward, +x left, +y up; what lies right of the axis lands right."""
+    view = load(folder, "train").views[1]
+    opengl = pose(0.7)
+    np.testing.assert_allclose(view.to_world[:3, 2], -opengl[:3, 2])
+    np.testing.assert_allclose(view.to_world[:3, 0], -opengl[:3, 0])
+    np.testing.assert_allclose(view.to_world[:3, [1, 3]], opengl[:3, [1, 3]])
+    camera = view.camera()
+
+    def pixel(point: np.ndarray) -> np.ndarray:
+        import mitsuba as mi
+
+        local = camera.to_camera(mi.Point3f(*(float(x) for x in point)))
+        pixels = [camera.fx * local.x / local.z + camera.cx, camera.fy * local.y / local.z + camera.cy]
+        return np.array([float(p[0]) for p in pixels])
+
+    focus = np.array([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(pixel(focus), [WIDTH / 2, HEIGHT / 2], atol=1e-4)
+    focal = 0.5 * WIDTH / math.tan(ANGLE / 2)
+    step = pixel(focus + 0.3 * opengl[:3, 0] + 0.6 * opengl[:3, 1]) - pixel(focus)
+    np.testing.assert_allclose(step, [0.1 * focal, -0.2 * focal], atol=1e-4)
+
+
+def test_extent_and_focus(folder: Path) -> None:
+    data = load(folder, "train")
+    np.testing.assert_allclose(data.focus, [0.1, 0.2, 0.3], atol=1e-5)
+    origins = np.array([pose(0.7 * i)[:3, 3] for i in range(8)])
+    extent = 1.1 * max(np.linalg.norm(origins - origins.mean(axis=0), axis=1))
+    assert data.scene_extent == pytest.approx(extent)
+    lone = Dataset(folder, "train", data.views[:1], data.background, False, None)
+    assert lone.scene_extent == 1 and np.all(np.isfinite(lone.focus))
+
+
+def test_intrinsics_per_file_and_per_frame(folder: Path) -> None:
+    content = read(folder)
+    del content["camera_angle_x"]
+    content |= {"fl_x": 9.0, "fl_y": 8.0, "cx": 2.5, "cy": 1.5, "w": WIDTH, "h": HEIGHT}
+    content["frames"][1] |= {"fl_x": 10.0, "cx": 3.25}
+    write(folder, "train", content)
+    first, second = load(folder, "train").views[:2]
+    assert (first.fx, first.fy, first.cx, first.cy) == (9, 8, 2.5, 1.5)
+    assert (second.fx, second.fy, second.cx, second.cy) == (10, 8, 3.25, 1.5)
+
+
+def test_holdout_without_a_test_file(folder: Path) -> None:
+    content = read(folder)
+    content["frames"] = content["frames"] + [
+        {**f, "file_path": f["file_path"].replace("train", "test")} for f in content["frames"][:2]
+    ]
+    write(folder, "train", content)
+    (folder / "transforms_test.json").unlink()
+    names = {split: [v.name for v in load(folder, split).views] for split in ("train", "test")}
+    assert names["test"] == ["test/r_0", "train/r_6"]  # sorted: test/r_0, test/r_1, train/r_0 … train/r_7
+    assert len(names["train"]) == 8 and not set(names["train"]) & set(names["test"])
+    (folder / "transforms_train.json").rename(folder / "transforms.json")
+    assert [v.name for v in load(folder, "test").views] == names["test"]
+
+
+def test_extension_may_be_given(folder: Path) -> None:
+    content = read(folder)
+    content["frames"][0]["file_path"] += ".png"
+    content["frames"][1]["file_path"] = "train/take.1"
+    (folder / "train/r_1.png").rename(folder / "train/take.1.png")
+    write(folder, "train", content)
+    views = load(folder, "train").views
+    assert [v.name for v in views[:2]] == ["train/r_0", "train/take.1"]
+    (folder / "train/take.1.exr").write_bytes((folder / "train/r_1.exr").read_bytes())
+    assert load(folder, "train", images="exr").views[1].linear
+
+
+def test_ground_truth_maps(folder: Path, rng: np.random.Generator) -> None:
+    normal = rng.normal(size=(HEIGHT, WIDTH, 3))
+    normal[:2, :3] = 0
+    depth = np.where(np.any(normal != 0, axis=-1), 2.0 + np.arange(WIDTH), 0)
+    write_exr(folder / "n.exr", normal, names="XYZ")
+    write_exr(folder / "d.exr", depth)
+    write_exr(folder / "environment.exr", np.ones((2, 4, 3)))
+    content = read(folder)
+    content["frames"][0] |= {"normal_path": "n.exr", "depth_path": "d.exr"}
+    write(folder, "train", content)
+    data = load(folder, "train", downscale=2)
+    assert data.environment == folder / "environment.exr"
+    view = data.views[0]
+    assert view.normal is not None and view.depth is not None and data.views[1].normal is None
+    np.testing.assert_allclose(np.linalg.norm(view.normal, axis=-1), [[0, 1, 1], [1, 1, 1]], atol=1e-6)
+    # The block half off the object takes the mean of its other half, column 3 alone.
+    np.testing.assert_allclose(view.depth, [[0, 5, 6.5], [2.5, 4.5, 6.5]])
+    assert load(folder, "train", truth=False).views[0].normal is None
+
+
+def edit(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
+    """Damage to the training file's content."""
+
+    def damage(folder: Path) -> None:
+        content = read(folder)
+        change(content)
+        write(folder, "train", content)
+
+    return damage
+
+
+def diagonal(x: float, y: float, z: float) -> list[list[float]]:
+    return np.diag([x, y, z, 1.0]).tolist()
+
+
+def resize(folder: Path) -> None:
+    write_png(folder / "train/r_5.png", np.ones((HEIGHT, WIDTH + 2, 4)))
+
+
+def nan(folder: Path) -> None:
+    broken = np.ones((HEIGHT, WIDTH, 4))
+    broken[1, 2, 0] = np.nan
+    write_exr(folder / "train/r_4.exr", broken)
+
+
+def sixteen_bits(folder: Path) -> None:
+    Image.fromarray(np.full((HEIGHT, WIDTH), 4000, np.uint16)).save(folder / "train/r_0.png")
+
+
+def truncate(folder: Path) -> None:
+    file = folder / "train/r_0.png"
+    file.write_bytes(file.read_bytes()[:60])
+
+
+@pytest.mark.parametrize(
+    ("damage", "options", "words"),
+    [
+        (lambda f: (f / "transforms_train.json").unlink(), {}, ["transforms_train.json", "missing"]),
+        (lambda f: (f / "transforms_train.json").write_text("{"), {}, ["transforms_train.json", "JSON"]),
+        (lambda f: (f / "transforms_train.json").write_bytes(b"\xff\xfe"), {}, ["JSON", "read"]),
+        (lambda f: write(f, "train", [1]), {}, ["JSON", "not an object"]),
+        (edit(lambda c: c.pop("frames")), {}, ["frames", "missing"]),
+        (edit(lambda c: c.update(frames=[])), {}, ["zero training views"]),
+        (edit(lambda c: c.pop("camera_angle_x")), {}, ["camera_angle_x", "fl_x"]),
+        (edit(lambda c: c.update(camera_angle_x="wide")), {}, ["camera_angle_x", "'wide'"]),
+        (edit(lambda c: c.update(camera_angle_x=40)), {}, ["camera_angle_x", "radians"]),
+        (edit(lambda c: c.update(w=800)), {}, ["r_0.png", "w = 800"]),
+        (edit(lambda c: c["frames"].insert(0, 3)), {}, ["frames[0]", "not an object"]),
+        (edit(lambda c: c["frames"][1].pop("file_path")), {}, ["frames[1].file_path"]),
+        (edit(lambda c: c["frames"][1].update(file_path="train/none")), {}, ["none.png", "missing"]),
+        (edit(lambda c: c["frames"][1].pop("transform_matrix")), {}, ["frames[1].transform_matrix", "4 × 4"]),
+        (edit(lambda c: c["frames"][1].update(transform_matrix=[[1, 2], [3]])), {}, ["frames[1]", "4 × 4"]),
+        (edit(lambda c: c["frames"][2].update(transform_matrix=diagonal(1, 1, 2))), {}, ["scale"]),
+        (edit(lambda c: c["frames"][2].update(transform_matrix=diagonal(1, 1, -1))), {}, ["mirror"]),
+        (edit(lambda c: c["frames"][2].update(transform_matrix=diagonal(1, math.nan, 1))), {}, ["rotation"]),
+        (edit(lambda c: c["frames"][0].update(depth_path="train/r_1.exr")), {}, ["[0].depth_path", "size"]),
+        (edit(lambda c: c["frames"][0].update(normal_path="none.exr")), {}, ["none.exr", "missing"]),
+        (truncate, {}, ["r_0.png", "readable"]),
+        (sixteen_bits, {}, ["r_0.png", "8-bit"]),
+        (resize, {}, ["r_5", "one size"]),
+        (nan, {"images": "exr"}, ["r_4.exr", "NaN", "row 1, column 2"]),
+        (lambda f: (f / "train/r_1.exr").write_text("no"), {"images": "exr"}, ["r_1.exr", "EXR"]),
+        (lambda f: None, {"downscale": 4}, ["r_0.png", "downscale", "divisor"]),
+        (lambda f: None, {"downscale": 0}, ["downscale"]),
+        (lambda f: None, {"background": "green"}, ["background", "green"]),
+        (lambda f: None, {"images": "tiff"}, ["images", "tiff"]),
+    ],
+)
+def test_bad_input_names_file_field_and_remedy(
+    folder: Path, damage: Callable[[Path], Any], options: dict[str, Any], words: list[str]
+) -> None:
+    damage(folder)
+    with pytest.raises(InputError) as caught:
+        load(folder, "train", **options)
+    message = str(caught.value)
+    assert message.startswith(str(folder)) and "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def test_missing_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        load(tmp_path / "none", "train")
+
+
+def test_lone_picture_leaves_zero_training_views(folder: Path) -> None:
+    edit(lambda c: c.update(frames=c["frames"][:1]))(folder)
+    (folder / "transforms_test.json").unlink()
+    with pytest.raises(InputError, match="zero training views"):
+        load(folder, "train")
+
+
+def test_srgb_curve() -> None:
+    x = np.linspace(0, 4, 1001)
+    np.testing.assert_allclose(linear_from_srgb(srgb_from_linear(x)), x, atol=1e-9)
+    known = srgb_from_linear(np.array([0.0, 0.0031308, 0.5, 1.0]))
+    np.testing.assert_allclose(known, [0, 0.04045, 0.735357, 1], atol=1e-5)
+    assert np.isfinite(srgb_from_linear(np.array([-1.0]))).all()
+
+
+def test_exr_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
+    image = rng.normal(size=(5, 7, 3)).astype(np.float32)
+    write_exr(tmp_path / "a.exr", image, names="XYZ")
+    np.testing.assert_array_equal(read_exr_image(tmp_path / "a.exr"), image)
+    write_exr(tmp_path / "a.exr", image[..., 0], half=True)
+    np.testing.assert_allclose(read_exr(tmp_path / "a.exr")["Y"], image[..., 0], rtol=1e-3)
+    write_exr(tmp_path / "b.exr", image[..., :2], names="UV")
+    with pytest.raises(InputError, match="channels: found U, V"):
+        read_exr_image(tmp_path / "b.exr")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "b.exr"]
+
+
+def test_unwritable_output(tmp_path: Path) -> None:
+    for write_file, name in ((write_png, "none/a.png"), (write_exr, "none/a.exr")):
+        with pytest.raises(InputError, match=r"none/a.*writable"):
+            write_file(tmp_path / name, np.zeros((2, 2, 3)))

@@ -1,0 +1,260 @@
+"""Path-traced data sets: cameras, pixels, maps and light agree with each other; folders resume."""
+
+from __future__ import annotations
+
+import json
+import math
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.errors import InputError
+from mi_refgs.fit import pathtrace
+from mi_refgs.fit.data import Dataset, load
+from mi_refgs.fit.dataset import generate
+from mi_refgs.fit.images import read_exr_image, srgb_from_linear
+
+SCENES = Path(__file__).parent.parent / "scenes"
+CENTRE, RADIUS = np.array([0.3, -0.2, 0.5]), 0.7
+SIZE = 16
+
+SCENE = f"""<scene version="3.0.0">
+    <emitter type="envmap">
+        <string name="filename" value="{SCENES / "lights" / "studio.exr"}"/>
+        <transform name="to_world"><rotate x="1" angle="90"/><rotate z="1" angle="35"/></transform>
+    </emitter>
+    <shape type="sphere">
+        <point name="center" value="{CENTRE[0]}, {CENTRE[1]}, {CENTRE[2]}"/>
+        <float name="radius" value="{RADIUS}"/>
+        <bsdf type="diffuse"/>
+    </shape>
+</scene>"""
+OPTIONS = {"views": 3, "test_views": 2, "size": SIZE, "spp": 16, "environment_height": 64, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of one sphere, off the origin."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("dataset")
+    (folder / "ball.xml").write_text(SCENE)
+    return generate(folder / "ball.xml", folder / "out", **OPTIONS)
+
+
+@pytest.fixture
+def train(made: Path) -> Dataset:
+    return load(made, "train")
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_depth_and_normals_lie_on_the_sphere(made: Path) -> None:
+    """Through the reader's camera, so that file convention, pixel centres and maps are tested as one."""
+    for split in ("train", "test"):
+        for view in load(made, split).views:
+            assert view.depth is not None and view.normal is not None and view.alpha is not None
+            rays = np.array(view.camera().rays()).T
+            points = view.to_world[:3, 3] + rays * view.depth.reshape(-1, 1)
+            hit = view.depth.ravel() > 0
+            assert 0.6 < hit.mean() < 0.8  # π/4 · 0.95²
+            expected = (points[hit] - CENTRE) / RADIUS
+            np.testing.assert_allclose(np.linalg.norm(expected, axis=1), 1, atol=1e-4)
+            np.testing.assert_allclose(view.normal.reshape(-1, 3)[hit], expected, atol=1e-3)
+            assert not view.normal.reshape(-1, 3)[~hit].any()
+            np.testing.assert_array_equal(view.alpha.ravel()[hit] > 0, True)
+
+
+def test_png_is_the_exr_as_displayed(made: Path, train: Dataset) -> None:
+    radiance = load(made, "train", images="exr", background="black")
+    for shown, linear in zip(train.views, radiance.views, strict=True):
+        assert shown.alpha is not None and linear.alpha is not None
+        alpha = linear.alpha[..., None]
+        colour = np.clip(srgb_from_linear(linear.image / np.maximum(alpha, 1e-8)), 0, 1)
+        np.testing.assert_allclose(shown.image, alpha * colour + 1 - alpha, atol=1.01 / 255)
+        np.testing.assert_allclose(shown.alpha, linear.alpha, atol=0.51 / 255)
+        assert shown.alpha[0, 0] == 0 and shown.alpha[SIZE // 2, SIZE // 2] == 1
+
+
+def test_brightness_is_the_lit_sphere(train: Dataset) -> None:
+    """Radiance of the whole set against an independent estimate, albedo × irradiance / π."""
+    scene = mi.load_string(SCENE)
+    light = pathtrace.environment_image(scene, 16).reshape(-1, 3)
+    row, column = np.divmod(np.arange(16 * 32) + 0.0, 32)
+    theta, phi = np.pi * (row + 0.5) / 16, 2 * np.pi * (column + 0.5) / 32
+    direction = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=1)
+    weight = np.sin(theta) * (np.pi / 16) ** 2
+    for view in load(train.path, "train", images="exr", background="black").views:
+        assert view.normal is not None and view.alpha is not None
+        inside = view.alpha == 1
+        cosine = np.maximum(view.normal[inside] @ direction.T, 0)
+        expected = 0.5 / math.pi * (cosine * weight) @ light
+        assert abs(view.image[inside].mean() / expected.mean() - 1) < 0.03
+
+
+def test_environment_in_mitsuba_orientation(made: Path, train: Dataset) -> None:
+    assert train.environment == made / "environment.exr"
+    copy = mi.load_dict({"type": "scene", "e": {"type": "envmap", "filename": str(train.environment)}})
+    scene = mi.load_string(SCENE)
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    rng = np.random.default_rng(0)
+    directions = np.concatenate([axes, rng.normal(size=(2000, 3))])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    si.wi = -mi.Vector3f(directions.T)
+    seen, truth = (np.array(s.environment().eval(si)).T for s in (copy, scene))
+    # 64 rows average 128: equal but for the edges of the softboxes.
+    difference = np.abs(seen - truth).max(axis=1)
+    assert np.quantile(difference, 0.8) < 0.06
+    # The poles of the copy are a whole row each; the equator's axes are not near an edge.
+    assert difference[[0, 2, 3, 5]].max() < 0.1
+    np.testing.assert_allclose(seen.mean(axis=0), truth.mean(axis=0), rtol=0.03)
+
+
+def test_constant_environment() -> None:
+    colour = {"type": "rgb", "value": [1, 2, 3]}
+    scene = mi.load_dict({"type": "scene", "e": {"type": "constant", "radiance": colour}})
+    image = pathtrace.environment_image(scene, 4)
+    assert image.shape == (4, 8, 3)
+    np.testing.assert_allclose(image, np.broadcast_to([1, 2, 3], image.shape), rtol=1e-5)
+
+
+def test_cameras_are_seeded_and_spread() -> None:
+    def poses(seed: int) -> np.ndarray:
+        return pathtrace.camera_poses(60, CENTRE, 4.0, (-30, 80), np.random.default_rng(seed))
+
+    first = poses(1)
+    np.testing.assert_array_equal(first, poses(1))
+    assert np.abs(first - poses(2)).max() > 0.1
+    outward = (first[:, :3, 3] - CENTRE) / 4
+    np.testing.assert_allclose(outward, -first[:, :3, 2], atol=1e-12)
+    rotation = first[:, :3, :3]
+    np.testing.assert_allclose(rotation.transpose(0, 2, 1) @ rotation - np.eye(3), 0, atol=1e-12)
+    assert np.all(np.linalg.det(rotation) > 0) and np.all(rotation[:, 2, 1] > 0)
+    elevation = np.degrees(np.arcsin(outward[:, 2]))
+    assert -30 < elevation.min() < -25 and 70 < elevation.max() < 80
+    apart = np.degrees(np.arccos(np.clip(outward @ outward.T - 2 * np.eye(60), -1, 1))).min(axis=1)
+    assert apart.min() > 7 and np.median(apart) > 15  # a perfect lattice: 22°
+
+
+def test_unfinished_folder_is_continued(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, before = made.parent / "ball.xml", files(made)
+    traced: list[int] = []
+    trace = pathtrace.Tracer.trace
+
+    def counted(self: pathtrace.Tracer, pose: np.ndarray, seed: int) -> tuple:
+        traced.append(seed)
+        return trace(self, pose, seed)
+
+    monkeypatch.setattr(pathtrace.Tracer, "trace", counted)
+    generate(scene, made, **OPTIONS)
+    assert not traced
+    (made / "train/r_001.png").unlink()
+    (made / "test/r_000_depth.exr").write_bytes(b"cut short")
+    (made / "transforms_train.json").unlink()
+    generate(scene, made, **OPTIONS)
+    assert len(traced) == 2 and files(made) == before
+
+
+def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "ball.xml"
+    scene.write_text(SCENE)
+    tiny = {**OPTIONS, "views": 1, "test_views": 1, "size": 4, "environment_height": 0}
+    out = generate(scene, tmp_path / "out", **{**tiny, "views": 2})
+    with pytest.raises(InputError, match=r"dataset.json: views: .*overwrite"):
+        generate(scene, out, **tiny)
+    scene.write_text(SCENE.replace("0.7", "0.6"))
+    with pytest.raises(InputError, match="scene_sha256"):
+        generate(scene, out, **{**tiny, "views": 2})
+    generate(scene, out, **tiny, overwrite=True)
+    assert not (out / "train/r_001.png").exists() and len(load(out, "train").views) == 1
+    (out / "dataset.json").unlink()
+    with pytest.raises(InputError, match="another data set"):
+        generate(scene, out, **tiny)
+
+
+def test_passes_average(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = mi.load_string(SCENE)
+    pose = pathtrace.camera_poses(1, CENTRE, 3.0, (0, 30), np.random.default_rng(0))[0]
+    options = {"size": 8, "fov": 30, "spp": 64, "max_depth": 3, "near": 0.1, "far": 50}
+    whole = pathtrace.Tracer(scene, **options).trace(pose, 5)[0]
+    monkeypatch.setattr(pathtrace, "SAMPLES_PER_LAUNCH", 8 * 8 * 16)
+    split = pathtrace.Tracer(scene, **options)
+    assert (split.passes, split.spp) == (4, 16)
+    np.testing.assert_allclose(split.trace(pose, 5)[0].mean(), whole.mean(), rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"views": 0}, "views: 0"),
+        ({"spp": 0}, "spp"),
+        ({"elevation": (50, 20)}, "elevation"),
+        ({"fov": 200}, "fov"),
+        ({"fill": 0}, "fill"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_settings_out_of_range(made: Path, tmp_path: Path, options: dict, words: str) -> None:
+    with pytest.raises(InputError, match=f"ball.xml: {words}.*out of range"):
+        generate(made.parent / "ball.xml", tmp_path / "out", **{**OPTIONS, **options})
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "missing"),
+        ("<scene", "not XML"),
+        ('<scene version="3.0.0"><shape type="blob"/></scene>', "cannot load"),
+        ('<scene version="3.0.0"><emitter type="constant"/></scene>', "shapes: the scene has none"),
+        ('<scene version="3.0.0"><shape type="sphere"/></scene>', "emitters: the scene has none"),
+    ],
+)
+def test_bad_scene(tmp_path: Path, text: str | None, words: str) -> None:
+    scene = tmp_path / "scene.xml"
+    if text is not None:
+        scene.write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        generate(scene, tmp_path / "out", **OPTIONS)
+    assert str(caught.value).startswith(str(scene))
+
+
+def test_unwritable_output(made: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(InputError, match=r"file.*writable"):
+        generate(made.parent / "ball.xml", tmp_path / "file" / "out", **OPTIONS)
+
+
+@pytest.mark.parametrize("name", ["mirror_ring", "mixed", "diffuse", "glossy_demo"])
+def test_example_scenes(name: str) -> None:
+    """Loads in plain Mitsuba; about one unit large, around the origin; nothing from outside the folder."""
+    scene = mi.load_file(str(SCENES / f"{name}.xml"), resx=8, resy=8, spp=4)
+    image = np.array(mi.render(scene))
+    assert image.shape == (8, 8, 4) and np.isfinite(image).all()
+    assert image[0, 0, 3] == 0 and image[3:5, 3:5, 3].min() > 0.5
+    centre, radius = pathtrace.bounding_sphere(scene)
+    assert np.abs(centre).max() < 0.2 and 0.8 < radius < 1.15
+    assert scene.environment() is not None and len(scene.emitters()) == 1
+    used = {e.get("value") or "" for e in ElementTree.parse(SCENES / f"{name}.xml").iter("string")}
+    for file in (SCENES / u for u in used if "/" in u):
+        assert file.stat().st_size < 300_000
+
+
+def test_example_light_has_detail_and_range() -> None:
+    image = read_exr_image(SCENES / "lights" / "studio.exr")
+    assert image.shape == (128, 256, 3) and 5 < image.max() < 15 and image.min() > 0.01
+    saturation = (image.max(axis=-1) - image.min(axis=-1)) / image.max(axis=-1)
+    assert (saturation > 0.8).mean() > 0.01  # the coloured panels
+
+
+def test_settings_are_recorded(made: Path) -> None:
+    record = json.loads((made / "dataset.json").read_text())
+    assert record["spp"] == OPTIONS["spp"] and record["scene"] == "ball.xml"
+    frame = json.loads((made / "transforms_train.json").read_text())["frames"][0]
+    assert {"file_path", "exr_path", "normal_path", "depth_path", "transform_matrix"} <= frame.keys()
