@@ -5,8 +5,8 @@
 #   bash setup.sh demo    set up, then run the main job on an embedded example (writes runs/demo)
 #   bash setup.sh test    set up with the development tools, then run every check
 #
-# Needs Python 3.11 or newer; PYTHON=... names another one than python3. Missing system packages (python3-venv,
-# libllvm19) are installed when this runs as root or sudo asks for no password; else the line to type is printed.
+# Needs Python 3.11 or newer; PYTHON=... names another one than python3. Missing system packages (libllvm19, libatomic1,
+# python3-venv) are installed when this runs as root or sudo asks for no password; else the line to type is printed.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 
@@ -24,7 +24,7 @@ install_packages() {
     local sudo=""
     if [ "$(id -u)" -ne 0 ]; then sudo="sudo"; fi
     if ! command -v apt-get > /dev/null || { [ -n "$sudo" ] && ! sudo -n true 2> /dev/null; }; then
-        fail "$* is missing; type: ${sudo:+$sudo }apt-get install $*"
+        fail "missing: $*; type: ${sudo:+$sudo }apt-get install $*"
     fi
     echo "setup.sh: installing $*"
     export DEBIAN_FRONTEND=noninteractive
@@ -42,10 +42,18 @@ for candidate in "${PYTHON:-python3}" python3.13 python3.12 python3.11; do
 done
 [ -n "$python" ] || fail "Python 3.11 or newer is missing; type: apt-get install python3"
 
-# ---------- LLVM, which Dr.Jit compiles its kernels with ----------
+# ---------- System packages: LLVM compiles Dr.Jit's kernels, libatomic is linked into Dr.Jit ----------
+missing=()
 if ! found=$("$python" -P mi_refgs/llvm.py); then
     if [ -n "${DRJIT_LIBLLVM_PATH:-}" ] || [ "$(uname)" != "Linux" ]; then fail "$found"; fi
-    install_packages libllvm19
+    missing+=(libllvm19)
+fi
+if [ "$(uname)" = "Linux" ]; then
+    "$python" -c 'import ctypes; ctypes.CDLL("libatomic.so.1")' 2> /dev/null || missing+=(libatomic1)
+fi
+"$python" -c 'import ensurepip, venv' 2> /dev/null || missing+=(python3-venv)
+if [ ${#missing[@]} -gt 0 ]; then
+    install_packages "${missing[@]}"
     found=$("$python" -P mi_refgs/llvm.py) || fail "$found"
 fi
 
@@ -56,7 +64,6 @@ holds=$(cksum < pyproject.toml)
 stamp=.venv/set-up
 was=$(cat "$stamp" 2> /dev/null || true)
 if [ "$was" != "$made_for: $holds [dev]" ] && [ "$was" != "$made_for: $holds $extras" ]; then
-    "$python" -c 'import ensurepip, venv' 2> /dev/null || install_packages python3-venv
     rm -f "$stamp"
     echo "setup.sh: installing into .venv (a few minutes the first time)"
     case "$was" in

@@ -19,15 +19,17 @@ from mi_refgs import llvm
 __version__ = "0.1.0"
 
 llvm.select()
+_llvm_problem = llvm.problem()
 
 import drjit as dr  # noqa: E402  (only now is the library named that this loads)
 import mitsuba as mi  # noqa: E402
 
 from mi_refgs import plugins  # noqa: E402
 
-_llvm_problem = llvm.problem()
 # The command must be able to start without LLVM, because `refgs doctor` says what is missing.
-_is_command = Path((getattr(sys, "argv", None) or [""])[0]).stem == "refgs"
+_is_command = Path((getattr(sys, "argv", None) or [""])[0]).stem == "refgs" or (
+    sys.orig_argv[1:3] == ["-m", "mi_refgs"]
+)
 
 if _llvm_problem and not _is_command and not dr.has_backend(dr.JitBackend.CUDA):
     raise ImportError(str(_llvm_problem))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import json
 import os
 import platform
 import re
@@ -58,12 +57,8 @@ class Report:
         return not self.problems
 
     def to_dict(self) -> dict[str, object]:
-        """The report as what `refgs doctor --json` prints."""
+        """The report as `refgs doctor --json` prints it: only what JSON knows."""
         return {"usable": self.usable, **asdict(self)}
-
-    def to_json(self) -> str:
-        """`to_dict` as one JSON object."""
-        return json.dumps(self.to_dict())
 
     def to_text(self) -> str:
         """The report for people, one part a line, problems last."""

@@ -26,11 +26,12 @@ MINIMUM_MAJOR = 17
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
-_INSTALL = "brew install llvm" if sys.platform == "darwin" else "apt-get install libllvm19"
-_IS_USER = sys.platform == "linux" and os.geteuid() != 0
+_SUDO = "sudo " if sys.platform == "linux" and os.geteuid() != 0 else ""
 
-REMEDY = f"sudo {_INSTALL}" if _IS_USER else _INSTALL
+REMEDY = "brew install llvm" if sys.platform == "darwin" else f"{_SUDO}apt-get install libllvm19"
 """The one command that installs a usable library."""
+
+_INSTALL_ATOMIC = f"{_SUDO}apt-get install libatomic1"
 
 
 def search_folders() -> list[Path]:
@@ -116,8 +117,16 @@ def problem() -> Problem | None:
     """What is wrong with the LLVM that Dr.Jit loaded; None when it is usable.
 
     Imports Dr.Jit, which is what loads the library, but runs no kernel.
+
+    Raises:
+        ImportError: when Dr.Jit cannot be loaded at all.
     """
-    import drjit as dr
+    try:
+        import drjit as dr
+    except NameError as error:  # Dr.Jit 1.5 trips over its own message when a system library is missing
+        raise ImportError(
+            f"Dr.Jit cannot be loaded ({error.__context__}): run `{_INSTALL_ATOMIC}`"
+        ) from error
 
     version = dr.detail.llvm_version() if dr.has_backend(dr.JitBackend.LLVM) else None
     if version is not None and version[0] >= MINIMUM_MAJOR:

@@ -1,4 +1,4 @@
-"""Makes scenes/meshes/*.ply with trimesh: the shapes of the example scenes that Mitsuba has no plugin for.
+"""Makes scenes/meshes/*.ply with trimesh: the shapes that Mitsuba has no plugin for.
 
 Run from the repository root: python scenes/make_meshes.py
 """
@@ -31,7 +31,7 @@ def tube(centre_line: np.ndarray, radius: float, sides: int) -> trimesh.Trimesh:
     i, j = np.meshgrid(np.arange(count), np.arange(sides), indexing="ij")
     a, b = i * sides + j, i * sides + (j + 1) % sides
     c, d = (i + 1) % count * sides + j, (i + 1) % count * sides + (j + 1) % sides
-    faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
     flat = vertices.reshape(-1, 3)
     return trimesh.Trimesh(flat, faces, vertex_normals=normals.reshape(-1, 3), process=False)
 

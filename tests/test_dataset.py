@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 
 from mi_refgs.errors import InputError
 from mi_refgs.fit import pathtrace
@@ -244,6 +245,14 @@ def test_example_scenes(name: str) -> None:
     used = {e.get("value") or "" for e in ElementTree.parse(SCENES / f"{name}.xml").iter("string")}
     for file in (SCENES / u for u in used if "/" in u):
         assert file.stat().st_size < 300_000
+
+
+@pytest.mark.parametrize("name", ["torus", "trefoil", "rounded_cube"])
+def test_example_meshes_are_closed_and_face_outwards(name: str) -> None:
+    mesh = trimesh.load(SCENES / "meshes" / f"{name}.ply", process=False)
+    assert mesh.is_watertight and mesh.volume > 0
+    cosine = np.einsum("fi,fvi->fv", mesh.face_normals, mesh.vertex_normals[mesh.faces])
+    assert cosine.min() > 0.95
 
 
 def test_example_light_has_detail_and_range() -> None:

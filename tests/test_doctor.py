@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -30,7 +33,7 @@ def test_the_library_is_named(report: doctor.Report) -> None:
 
 
 def test_json_is_one_object_with_every_field(report: doctor.Report) -> None:
-    loaded = json.loads(report.to_json())
+    loaded = json.loads(json.dumps(report.to_dict()))
     assert loaded["usable"] is True
     assert set(loaded) == {"usable"} | {field.name for field in dataclasses.fields(report)}
 
@@ -66,3 +69,18 @@ def test_a_hanging_kernel_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_PROBE", "import time; time.sleep(60)")
     monkeypatch.setattr(doctor, "PROBE_TIMEOUT", 0.2)
     assert "took longer" in doctor.examine().problems[0].what
+
+
+def test_the_command_reports_what_keeps_the_package_from_being_imported() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "mi_refgs", "doctor"],
+        cwd=Path(__file__).parents[1],
+        env=os.environ | {llvm.ENVIRONMENT_VARIABLE: "/none/libLLVM.so"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert "PROBLEM: DRJIT_LIBLLVM_PATH=/none/libLLVM.so does not exist" in done.stdout
+    assert f"unset {llvm.ENVIRONMENT_VARIABLE}" in done.stdout

@@ -39,6 +39,7 @@ LAYERS: dict[str, set[str]] = {
         "llvm",
     }
     | {"doctor", ""},
+    "__main__": {"cli"},
     "reference": {"constants"},
     "": {"llvm", "plugins"},
 }

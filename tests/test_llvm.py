@@ -100,6 +100,19 @@ def test_find_takes_the_newest_that_loads(usable: Path, tmp_path: Path) -> None:
     assert llvm.find_library([tmp_path / "absent", tmp_path]) == usable
 
 
+def test_find_prefers_the_highest_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(llvm, "loaded_version", llvm.named_version)
+    for name in (
+        "libLLVM-17.so.1",
+        "libLLVM.so.20.1",
+        "libLLVM.so.19.1",
+        "libLLVM-18.so.1",
+        "libLLVM-9.so.1",
+    ):
+        (tmp_path / name).touch()
+    assert llvm.find_library([tmp_path]) == tmp_path / "libLLVM.so.20.1"
+
+
 def test_find_finds_nothing(tmp_path: Path) -> None:
     (tmp_path / "libLLVM-16.so.1").write_bytes(b"too old")
     assert llvm.find_library([tmp_path]) is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import configparser
 import importlib.metadata
 import os
@@ -120,6 +121,39 @@ def test_every_package_is_listed() -> None:
     assert packages | {"mi_refgs.variants", "mi_refgs.scenes"} == set(
         PROJECT["tool"]["setuptools"]["packages"]
     )
+
+
+IMPORT_NAMES = {"scikit_image": "skimage", "pillow": "pil", "mitsuba": "drjit"}
+"""What a distribution brings under another name than its own, in lower case."""
+
+
+def imported(source: str) -> set[str]:
+    """First names of what a file imports that is neither Python's nor its own package's."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            found.add((node.module or "").partition(".")[0])
+    return found - sys.stdlib_module_names - {"mi_refgs"}
+
+
+def declared(requirements: list[str]) -> set[str]:
+    """Import names that a list of requirements provides, in lower case."""
+    names = {re.split(r"[^\w.-]", requirement)[0].lower().replace("-", "_") for requirement in requirements}
+    return names | {IMPORT_NAMES[name] for name in names if name in IMPORT_NAMES}
+
+
+def test_every_import_is_declared() -> None:
+    """What the package imports is a dependency, or belongs to an extra that a user may leave out."""
+    project = PROJECT["project"]
+    extras = [
+        line for name, lines in project["optional-dependencies"].items() if name != "dev" for line in lines
+    ]
+    known = declared(project["dependencies"] + extras)
+    for path in (ROOT / "mi_refgs").rglob("*.py"):
+        missing = {name for name in imported(path.read_text()) if name.lower() not in known}
+        assert not missing, f"{path.name} imports {missing}, which pyproject.toml does not declare"
 
 
 def test_version_is_stated_once() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+
 from mi_refgs.errors import InputError
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import CHANNELS, Surfels, sh_columns
@@ -19,14 +20,18 @@ def table(count: int, rng: np.random.Generator, degree: int = 3) -> Surfels:
     return Surfels.from_numpy({name: rng.normal(size=size) for name, size in shape.items()})
 
 
-def write_file(path: Path, columns: dict[str, np.ndarray], kind: str = "binary_little_endian", dtype: str = "f4") -> Path:
+def write_file(
+    path: Path, columns: dict[str, np.ndarray], kind: str = "binary_little_endian", dtype: str = "f4"
+) -> Path:
     """A PLY file by hand, as another program would write it."""
     count = len(next(iter(columns.values())))
     names = {"f4": "float", "f8": "double"}
     header = f"ply\nformat {kind} 1.0\ncomment by hand\nelement vertex {count}\n"
     header += "".join(f"property {names[dtype]} {name}\n" for name in columns) + "end_header\n"
     if kind == "ascii":
-        body = "".join(" ".join(repr(float(c[i])) for c in columns.values()) + "\n" for i in range(count)).encode()
+        body = "".join(
+            " ".join(repr(float(c[i])) for c in columns.values()) + "\n" for i in range(count)
+        ).encode()
     else:
         order = "<" if "little" in kind else ">"
         rows = np.zeros(count, dtype=[(name, order + dtype) for name in columns])
@@ -61,7 +66,18 @@ def test_layout_is_that_of_2dgs(tmp_path: Path, rng: np.random.Generator) -> Non
     write_ply(tmp_path / "a.ply", surfels)
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
     names = [line.split()[2] for line in header if line.startswith("property")]
-    start = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(45))]
+    start = [
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        *(f"f_rest_{i}" for i in range(45)),
+    ]
     start += ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
     assert names[: len(start)] == start
     assert names[len(start) :][:5] == ["albedo_0", "albedo_1", "albedo_2", "metallic", "roughness"]
@@ -77,7 +93,12 @@ def test_layout_is_that_of_2dgs(tmp_path: Path, rng: np.random.Generator) -> Non
 
 @pytest.mark.parametrize(
     ("kind", "dtype"),
-    [("binary_little_endian", "f4"), ("binary_little_endian", "f8"), ("binary_big_endian", "f4"), ("ascii", "f4")],
+    [
+        ("binary_little_endian", "f4"),
+        ("binary_little_endian", "f8"),
+        ("binary_big_endian", "f4"),
+        ("ascii", "f4"),
+    ],
 )
 def test_files_of_other_programs(kind: str, dtype: str, tmp_path: Path, rng: np.random.Generator) -> None:
     """Other formats, other order, unknown properties; absent groups give absent channels."""
@@ -105,7 +126,9 @@ def test_missing_property_is_named(missing: str, tmp_path: Path, rng: np.random.
         ({"scale_2": 0}, "scale_2: the file holds 3D Gaussians"),
     ],
 )
-def test_partial_groups_are_refused(extra: dict[str, int], message: str, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_partial_groups_are_refused(
+    extra: dict[str, int], message: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
     columns = geometry(rng) | {name: np.zeros(4) for name in extra}
     with pytest.raises(InputError, match=rf"a\.ply: {message}"):
         read_ply(write_file(tmp_path / "a.ply", columns))
@@ -133,9 +156,15 @@ def test_broken_files_are_refused(tmp_path: Path, rng: np.random.Generator) -> N
         (b"\x89PNG\r\n", "not a PLY file"),
         (text[:-30], "row 3 is broken"),
         (text.replace(text.split()[-1], b"zero"), "row 3 is broken"),
-        (whole.replace(b"format binary_little_endian", b"format pdp_endian"), "no format or no leading vertex"),
+        (
+            whole.replace(b"format binary_little_endian", b"format pdp_endian"),
+            "no format or no leading vertex",
+        ),
         (face_first, "no format or no leading vertex"),
-        (whole.replace(b"property float scale_1", b"property list uchar int scale_1"), "scale_1: not a number property"),
+        (
+            whole.replace(b"property float scale_1", b"property list uchar int scale_1"),
+            "scale_1: not a number property",
+        ),
         (whole.replace(b"float scale_1", b"float scale_0"), "a vertex property occurs twice"),
     ]:
         path.write_bytes(data)

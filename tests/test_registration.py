@@ -68,6 +68,21 @@ for variant in ["llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral", "llvm_ad_rgb"]:
     assert "'llvm_ad_spectral' is not supported" in spectral
 
 
+def test_each_supported_variant_gets_its_own_class(tmp_path: Path) -> None:
+    """The base class differs from variant to variant; here a second one counts as supported."""
+    code = """
+plugins.is_supported = lambda variant: "_ad_" in variant
+for variant in ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"]:
+    mi.set_variant(variant)
+    print(make(), isinstance(mi.load_dict({"type": "refgs"}), mi.SamplingIntegrator))
+"""
+    assert run(code, tmp_path) == [
+        "stand-in under llvm_ad_rgb True",
+        "stand-in under llvm_ad_mono True",
+        "stand-in under llvm_ad_rgb True",
+    ]
+
+
 def test_scalar_first_does_not_import_the_plugin(tmp_path: Path) -> None:
     lines = run("mi.set_variant('scalar_rgb')\nprint('stand_in' in sys.modules)", tmp_path)
     assert lines == ["False"]

@@ -136,7 +136,10 @@ def test_one_leaking_view_drills_no_tunnel() -> None:
     poses = ring_of_views(directions(24))
     depths = [ref.depth_map(SHAPES["sphere"], p, FOCAL, SIZE) for p in poses]
     depths[5][44:52, 44:52] = 0
-    solid = as_trimesh(meshes.extract_mesh(fuse(depths, poses)))
+    fused = fuse(depths, poses)
+    corner = fused.origin + fused.voxel * np.moveaxis(np.indices(fused.volume.shape), 0, -1)
+    assert (fused.volume[SHAPES["sphere"](corner) < -6 * fused.voxel] == -1).all()
+    solid = as_trimesh(meshes.extract_mesh(fused))
     assert solid.is_watertight and solid.euler_number == 2
     assert abs(solid.volume / (4 / 3 * np.pi) - 1) < 0.03
 

@@ -1,8 +1,8 @@
 """Losses on images given as planes: lists of mi.Float of width H·W in raster order (or a mi.Color3f).
 
-Letters: I rendered image, T target, A accumulated alpha, L linear radiance, N blended normal Σ w n (not unit).
-Every loss is a mi.Float of width 1, zero for a perfect image, and has finite gradients for finite input. Targets, weights
-and masks have no derivative. SSIM is in `fit.ssim`.
+Letters: I rendered image, T target, A accumulated alpha, L linear radiance, N blended normal Σ w n (not
+unit). Every loss is a mi.Float of width 1, zero for a perfect image, and has finite gradients for finite
+input. Targets, weights and masks have no derivative. SSIM is in `fit.ssim`.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ ENTROPY_MARGIN = 1e-4
 
 
 def linear_to_srgb(linear: Any) -> Any:
-    """sRGB encoding (IEC 61966-2-1) of a linear plane: straight below 0.0031308, else the power curve, unbounded above 1.
+    """sRGB encoding (IEC 61966-2-1) of a linear plane: straight below 0.0031308, else the curve.
 
-    The slope is finite everywhere (12.92 at 0).
+    Unbounded above 1. The slope is finite everywhere (12.92 at 0).
     """
     straight = linear <= SRGB_LINEAR_LIMIT
     curve = 1.055 * dr.power(dr.select(straight, 1.0, linear), 1 / 2.4) - 0.055
@@ -41,8 +41,8 @@ def linear_to_srgb(linear: Any) -> Any:
 def display_image(radiance: Iterable[Any], alpha: Any, background: Iterable[Any]) -> list[Any]:
     """What an 8-bit RGBA picture shows: A srgb(L / A) + (1 - A) background, per plane.
 
-    radiance: linear, premultiplied (L); background: display-encoded floats or planes. Pixels with A < 1e-6 show the
-    background and give radiance no gradient.
+    radiance: linear, premultiplied (L); background: display-encoded floats or planes. Pixels with A < 1e-6
+    show the background and give radiance no gradient.
     """
     seen = alpha >= ALPHA_EMPTY
     inverse = dr.select(seen, dr.rcp(dr.select(seen, alpha, 1.0)), 0.0)
@@ -58,7 +58,7 @@ def saturated(target: Iterable[Any]) -> list[Any]:
 
 
 def clip_highlights(render: Iterable[Any], target: Iterable[Any], clipped: Iterable[Any]) -> list[Any]:
-    """The render with every value above a clipped target value replaced by it: no error and no gradient there."""
+    """The render with every value above a clipped target value replaced by it: no gradient there."""
     return [
         dr.select(mask & (plane > goal), dr.detach(goal), plane)
         for plane, goal, mask in zip(render, target, clipped, strict=True)
@@ -85,7 +85,7 @@ def d_ssim(render: Iterable[Any], target: Iterable[Any], width: int, height: int
 
 
 def alpha_loss(alpha: Any, target: Any, kind: str = "l1") -> Any:
-    """Accumulated alpha against a mask in [0, 1]: kind "l1" (mean absolute difference) or "bce" (cross-entropy)."""
+    """Accumulated alpha against a mask in [0, 1]: kind "l1" or "bce" (cross-entropy), mean."""
     target = dr.detach(target)
     if kind == "l1":
         return _mean(_abs(alpha - target))
@@ -102,18 +102,21 @@ def alpha_loss(alpha: Any, target: Any, kind: str = "l1") -> Any:
 def normal_consistency(normal: Any, depth_normal: Any, valid: Any, alpha: Any) -> Any:
     """Mean over all pixels of A (A - N · n_d), with A detached and only where n_d is valid.
 
-    This is Σ wᵢ (1 - nᵢ · n_d) of 2DGS (eq. 13), weighted by A: its gradient is that of 1 - N · (n_d stopgrad(A)), but
-    empty pixels count zero. normal: N premultiplied; depth_normal: unit (render.depth_normals). Gradients flow to both.
+    This is Σ wᵢ (1 - nᵢ · n_d) of 2DGS (eq. 13), weighted by A: its gradient is that of 1 - N · (n_d
+    stopgrad(A)), but empty pixels count zero. normal: N premultiplied; depth_normal: unit
+    (render.depth_normals). Gradients flow to both.
     """
     weight = dr.select(valid, dr.detach(alpha), 0.0)
     return _mean(weight * (weight - dr.dot(mi.Vector3f(normal), mi.Vector3f(depth_normal))))
 
 
-def normal_smoothness(normal: Iterable[Any], image: Iterable[Any], width: int, height: int, weight: Any = None) -> Any:
-    """Edge-aware normal smoothness ‖∇N‖ exp(-‖∇I‖) (Ref-Gaussian §3.3), mean over pixels, sum over the two axes.
+def normal_smoothness(
+    normal: Iterable[Any], image: Iterable[Any], width: int, height: int, weight: Any = None
+) -> Any:
+    """Edge-aware normal smoothness ‖∇N‖ exp(-‖∇I‖) (Ref-Gaussian §3.3): pixel mean, sum over axes.
 
-    ∇ is Sobel / 8 with the border repeated; ‖·‖ is the mean absolute value over the three planes. `weight` (H·W) masks
-    pixels. Gradients flow to N only.
+    ∇ is Sobel / 8 with the border repeated; ‖·‖ is the mean absolute value over the three planes. `weight`
+    (H·W) masks pixels. Gradients flow to N only.
     """
     total = mi.Float(0)
     normal_slopes = [sobel(plane, width, height) for plane in normal]

@@ -1,7 +1,8 @@
 """Measures of quality, in NumPy: images, normals, recovered light.
 
-Images are (H, W, 3) display-encoded floats, clamped to [0, 1] and never quantised; a data set's value is the mean over its
-images. Normals are (H, W, 3) world vectors. Lights are (h, w, 3) linear lat-long radiance in Mitsuba's orientation.
+Images are (H, W, 3) display-encoded floats, clamped to [0, 1] and never quantised; a data set's value is the
+mean over its images. Normals are (H, W, 3) world vectors. Lights are (h, w, 3) linear lat-long radiance in
+Mitsuba's orientation.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ def psnr(image: np.ndarray, truth: np.ndarray) -> float:
 def ssim(image: np.ndarray, truth: np.ndarray) -> float:
     """Structural similarity as `fit.ssim` trains with it, by scikit-image.
 
-    scikit-image reflects at the border and leaves it out of the mean; padding by the window's radius with zeros turns
-    that into the zero padding and the mean over every pixel that 3DGS and Ref-Gaussian report.
+    scikit-image reflects at the border and leaves it out of the mean; padding by the window's radius with
+    zeros turns that into the zero padding and the mean over every pixel that 3DGS and Ref-Gaussian report.
     """
     from skimage.metrics import structural_similarity
 
@@ -65,7 +66,8 @@ def lpips(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
         network = _lpips_network()
         with torch.no_grad():
             tensors = [
-                torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)[None], dtype=np.float32)) * 2 - 1
+                torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)[None], dtype=np.float32)) * 2
+                - 1
                 for array in _pair(image, truth)
             ]
             return float(network(*tensors)), ""
@@ -83,7 +85,7 @@ def _lpips_network() -> Any:
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
-    """(mean LDR FLIP, ""), or (None, why) without the extra `flip`. Viewing distance: the package's default, 67 ppd."""
+    """(mean LDR FLIP, ""), or (None, why) without the extra `flip`. 67 pixels per degree."""
     try:
         import flip_evaluator
     except ImportError:
@@ -105,10 +107,11 @@ def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> dict[str, float]:
     """Mean angle in degrees between two normal maps, over the foreground and over the whole image.
 
-    normal: recovered, any length; truth: (H, W, 3), zero where nothing is hit; alpha: true alpha (H, W). Foreground is
-    alpha > 0.5 with a true normal; a missing recovered normal counts 90° there. `normal_mae_deg` is the mean over the
-    foreground; `normal_mae_deg_full` divides the same sum by all pixels, so the background counts as 0° (the number
-    that most papers print). Both are 0 for an image without foreground.
+    normal: recovered, any length; truth: (H, W, 3), zero where nothing is hit; alpha: true alpha (H, W).
+    Foreground is alpha > 0.5 with a true normal; a missing recovered normal counts 90° there.
+    `normal_mae_deg` is the mean over the foreground; `normal_mae_deg_full` divides the same sum by all
+    pixels, so the background counts as 0° (the number that most papers print). Both are 0 for an image
+    without foreground.
     """
     normal, truth = np.asarray(normal, np.float64), np.asarray(truth, np.float64)
     if normal.shape != truth.shape or normal.shape[:2] != np.shape(alpha):
@@ -132,21 +135,25 @@ def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> 
 def environment(light: np.ndarray, truth: np.ndarray, peak: float | None = None) -> dict[str, Any]:
     """Recovered against true environment after one least-squares scale per channel, weighted by solid angle.
 
-    Photographs fix the light only up to such a scale, which the albedo takes up. Both maps are brought to the recovered
-    one's size by averaging; with `peak`, both are first clipped there (what no clipped photograph could show).
-    Keys: `env_scale` (three numbers), `env_mae` (linear, after the scale), `env_psnr` (dB, after sRGB encoding and
-    clamping to [0, 1]) and `env_correlation` (Pearson, of the same encoded values).
+    Photographs fix the light only up to such a scale, which the albedo takes up. Both maps are brought to the
+    recovered one's size by averaging; with `peak`, both are first clipped there (what no clipped photograph
+    could show). Keys: `env_scale` (three numbers), `env_mae` (linear, after the scale), `env_psnr` (dB, after
+    sRGB encoding and clamping to [0, 1]) and `env_correlation` (Pearson, of the same encoded values).
     """
     light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
     for name, array in (("light", light), ("truth", truth)):
         if array.ndim != 3 or array.shape[2] != 3 or not np.all(np.isfinite(array)):
-            raise InputError(f"metrics: environment {name}: need finite (h, w, 3) values; write the map again")
+            raise InputError(
+                f"metrics: environment {name}: need finite (h, w, 3) values; write the map again"
+            )
     if peak is not None:
         light, truth = np.minimum(light, peak), np.minimum(truth, peak)
     truth = _average_to(truth, light.shape[0], light.shape[1])
     rows = np.sin((np.arange(light.shape[0]) + 0.5) / light.shape[0] * np.pi)
     weight = np.broadcast_to(rows[:, None, None], light.shape)
-    scale = np.sum(weight * light * truth, axis=(0, 1)) / np.maximum(np.sum(weight * light**2, axis=(0, 1)), 1e-30)
+    scale = np.sum(weight * light * truth, axis=(0, 1)) / np.maximum(
+        np.sum(weight * light**2, axis=(0, 1)), 1e-30
+    )
     fitted = light * scale
     shown, goal = (np.clip(srgb_from_linear(array), 0, 1) for array in (fitted, truth))
     error = float(np.average((shown - goal) ** 2, weights=weight))
@@ -161,8 +168,14 @@ def environment(light: np.ndarray, truth: np.ndarray, peak: float | None = None)
 
 
 def _average_to(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resample an (h, w, C) map by area averages (exact box overlaps along each axis; enlarging repeats texels)."""
-    return np.einsum("ih,jw,hwc->ijc", _overlap(height, image.shape[0]), _overlap(width, image.shape[1]), image, optimize=True)
+    """Resample an (h, w, C) map by area averages (exact box overlaps along each axis)."""
+    return np.einsum(
+        "ih,jw,hwc->ijc",
+        _overlap(height, image.shape[0]),
+        _overlap(width, image.shape[1]),
+        image,
+        optimize=True,
+    )
 
 
 def _overlap(target: int, source: int) -> np.ndarray:

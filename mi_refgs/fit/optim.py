@@ -1,8 +1,9 @@
-"""Adam over named tensors: learning rates per group and column, moments that follow the parent index, exact resume.
+"""Adam over named tensors: rates per group and column, moments that follow the parent index, exact resume.
 
 Letters: θ parameter, g gradient, m v first and second moment, t step count of a tensor, η learning rate.
     m ← β₁ m + (1 - β₁) g,   v ← β₂ v + (1 - β₂) g²,   θ ← θ - η √(1 - β₂ᵗ) / (1 - β₁ᵗ) · m / (√v + ε)
-[Kingman and Ba 2015, §2, the efficient order]. A NaN or infinite gradient entry counts as 0 and is reported by `bad`.
+[Kingman and Ba 2015, §2, the efficient order]. A NaN or infinite gradient entry counts as 0 and is reported
+by `bad`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.surfels.table import gather_rows
 
-# Adam's decay rates and the ε that 3DGS uses: tiny, since per-surfel gradients of a mean over pixels are about 1e-7.
+# Adam's decay rates and the ε that 3DGS uses: tiny, as per-surfel gradients of a pixel mean are about 1e-7.
 BETA_1 = 0.9
 BETA_2 = 0.999
 EPSILON = 1e-15
@@ -27,9 +28,10 @@ EPSILON = 1e-15
 
 @dataclass(frozen=True)
 class Group:
-    """Learning rate of one tensor: from `rate` log-linearly to `final` over `steps` iterations, then constant.
+    """Learning rate of one tensor: from `rate` log-linearly to `final` in `steps` iterations, then constant.
 
-    The first `head` columns learn at the rate, the others at rate · tail (spherical harmonics: head 3, tail 1/20).
+    The first `head` columns learn at the rate, the others at rate · tail (spherical harmonics: head 3, tail
+    1/20).
     """
 
     rate: float  # per step, units of the raw tensor
@@ -47,18 +49,21 @@ class Group:
 
 
 class Adam:
-    """Adam over `params`, a mutable mapping of name to tensor that it updates in place (entries are replaced).
+    """Adam over `params`, a mutable mapping of name to tensor that it updates in place (new entries).
 
-    Each step reads `dr.grad` of the tensors, replaces them by fresh leaves, and leaves names without a group alone.
-    Everything that changes from step to step is opaque, so a second step of the same kind compiles nothing; one kernel is
-    launched per distinct tensor size.
+    Each step reads `dr.grad` of the tensors, replaces them by fresh leaves, and leaves names without a group
+    alone. Everything that changes from step to step is opaque, so a second step of the same kind compiles
+    nothing; one kernel is launched per distinct tensor size.
     """
 
     def __init__(self, params: MutableMapping[str, Any], groups: Mapping[str, Group]) -> None:
-        """Own the moments of params[name] for every name in groups; raises InputError for a group without a tensor."""
+        """Own the moments of params[name] for every name in groups; raises InputError for a group without
+        one."""
         for name in groups:
             if name not in params:
-                raise InputError(f"optimiser: {name}: a learning rate without a parameter; use one of {', '.join(params)}")
+                raise InputError(
+                    f"optimiser: {name}: a learning rate without a parameter; use one of {', '.join(params)}"
+                )
         self.params = params
         self.groups = dict(groups)
         self.factors: dict[str, float] = {}
@@ -72,7 +77,7 @@ class Adam:
             self._make_leaf(name)
 
     def set_factor(self, name: str, factor: float) -> None:
-        """Scale the learning rate of one tensor until further notice (0 freezes it while its moments run on)."""
+        """Scale the learning rate of one tensor until further notice; 0 freezes it."""
         self.factors[name] = factor
 
     def rate(self, name: str, iteration: int) -> float:
@@ -116,10 +121,12 @@ class Adam:
             self._make_leaf(name)
 
     def gather(self, parent: Any, names: list[str], fresh: Any | None = None) -> None:
-        """Let the moments of (N, D) tensors follow their rows: row i takes those of row parent[i] (mi.UInt32).
+        """Let the moments of (N, D) tensors follow their rows: row i takes those of row parent[i].
 
-        Call it together with replacing params[name] by the gathered tensor (`Surfels.gather`). Rows where `fresh`
-        (mi.Bool) holds start with zero moments: clones and children have no history. Step counts stay.
+        parent is an mi.UInt32. Call it together with replacing params[name] by the gathered tensor
+        (`Surfels.gather`). Rows where
+        `fresh` (mi.Bool) holds start with zero moments: clones and children have no history. Step counts
+        stay.
         """
         for name in names:
             if name not in self.groups:
@@ -138,8 +145,8 @@ class Adam:
     def reset(self, name: str, rows: Any | None = None) -> None:
         """Zero the moments of one tensor, or of the rows where `rows` (mi.Bool) holds; its step count stays.
 
-        Keeping the count is what 3DGS does: the next update is up to about 3 η long, not η. Call it after replacing
-        params[name].
+        Keeping the count is what 3DGS does: the next update is up to about 3 η long, not η. Call it after
+        replacing params[name].
         """
         if rows is None:
             self._clear(name)
@@ -153,7 +160,7 @@ class Adam:
         self._make_leaf(name)
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Moments, step counts and rate factors as arrays named '<tensor>/first', '/second', '/steps', '/factor'."""
+        """Moments, step counts and rate factors as arrays named '<tensor>/first' and so on."""
         state = {}
         for name in self.groups:
             state[f"{name}/first"] = np.array(self._first[name], dtype=np.float32)
@@ -170,7 +177,9 @@ class Adam:
                 values = state.get(f"{name}/{part}")
                 if values is None or values.size != size:
                     found = "nothing" if values is None else f"{values.size} values"
-                    raise InputError(f"checkpoint: {name}/{part}: found {found}, expected {size}; resume the run it came from")
+                    raise InputError(
+                        f"checkpoint: {name}/{part}: found {found}, expected {size}; resume its own run"
+                    )
                 moments[name] = mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel())
             self._steps[name] = int(state[f"{name}/steps"])
             factor = float(state[f"{name}/factor"])

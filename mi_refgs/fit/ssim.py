@@ -1,8 +1,8 @@
 """Structural similarity on Dr.Jit planes, with a hand-derived adjoint made of gathers only.
 
-Letters: x, y the two images, μ = G x, q = G (x² + y²), p = G (x y) with G the Gaussian window, zero outside the image;
-    S = (2 μx μy + C1) (2 (p - μx μy) + C2) / ((μx² + μy² + C1) (q - μx² - μy² + C2))           [Wang et al. 2004, eq. 13]
-G is symmetric and so is its zero padding, hence Gᵀ = G and the adjoint is three more blurs:
+Letters: x, y the two images, μ = G x, q = G (x² + y²), p = G (x y) with G the Gaussian window;
+    S = (2 μx μy + C1) (2 (p - μx μy) + C2) / ((μx² + μy² + C1) (q - μx² - μy² + C2))   [Wang 2004, (13)]
+G is symmetric and reads zeros outside the image, hence Gᵀ = G and the adjoint is three more blurs:
     δx = G(∂S/∂μx) + 2x G(∂S/∂q) + y G(∂S/∂p).
 """
 
@@ -33,14 +33,14 @@ def window() -> list[float]:
 def ssim(x: Sequence[Any], y: Sequence[Any], width: int, height: int) -> Any:
     """Mean SSIM (mi.Float, width 1) of two images given as planes (mi.Float, raster order) in [0, 1].
 
-    Window 11×11, σ = 1.5, zero padding, mean over pixels and planes: the definition that 3DGS trains with. The
-    reference image y has no derivative.
+    Window 11×11, σ = 1.5, zero padding, mean over pixels and planes: the definition that 3DGS trains with.
+    The reference image y has no derivative.
     """
     return dr.custom(_Ssim, list(x), [dr.detach(plane) for plane in y], width, height)
 
 
 def _blur_axis(sources: Sequence[Any], width: int, height: int, axis: int, derive: Any = None) -> list[Any]:
-    """Blur planes along x (axis 0) or y (axis 1); `derive` maps the values under one tap to the values to blur."""
+    """Blur planes along x (axis 0) or y (axis 1); `derive` makes the values to blur under a tap."""
     pixel = dr.arange(mi.UInt32, width * height)
     place, size, stride = (pixel % width, width, 1) if axis == 0 else (pixel // width, height, width)
     total: list[Any] = []
@@ -81,7 +81,9 @@ class _Ssim(dr.CustomOp):
             b2 = q[i] - μx[i] * μx[i] - μy[i] * μy[i] + C2
             similarity = a1 * a2 / (b1 * b2)
             value += similarity
-            slopes[0].append(2 * μy[i] * (a2 - a1) / (b1 * b2) - 2 * μx[i] * similarity * (1 / b1 - 1 / b2))  # ∂S/∂μx
+            slopes[0].append(
+                2 * μy[i] * (a2 - a1) / (b1 * b2) - 2 * μx[i] * similarity * (1 / b1 - 1 / b2)
+            )  # ∂S/∂μx
             slopes[1].append(-similarity / b2)  # ∂S/∂q
             slopes[2].append(2 * a1 / (b1 * b2))  # ∂S/∂p
         self.slopes = [*slopes[0], *slopes[1], *slopes[2]]
@@ -97,7 +99,8 @@ class _Ssim(dr.CustomOp):
         blurred = _blur_axis(columns, width, height, 0)
         by_mean, by_square, by_product = (blurred[i * planes : (i + 1) * planes] for i in range(3))
         return [
-            (by_mean[i] + 2 * self.x[i] * by_square[i] + self.y[i] * by_product[i]) / (planes * width * height)
+            (by_mean[i] + 2 * self.x[i] * by_square[i] + self.y[i] * by_product[i])
+            / (planes * width * height)
             for i in range(planes)
         ]
 

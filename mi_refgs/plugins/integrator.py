@@ -1,1 +1,277 @@
-"""The `refgs` integrator (being written)."""
+"""The `refgs` integrator: Gaussian surfels and deferred shading behind `mi.render`.
+
+Imported or reloaded for each variant: see `mi_refgs.plugins`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.errors import InputError
+from mi_refgs.plugins import require_supported_variant
+from mi_refgs.plugins.aovs import MATERIALS, aov_values, parse_aovs
+from mi_refgs.plugins.light import TurnedLight, emitter_light
+from mi_refgs.plugins.properties import read_light, read_shading, read_surfels, read_terms
+from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.table import GEOMETRY, Surfels
+
+
+class RefGSIntegrator(mi.SamplingIntegrator):
+    r"""
+    .. _integrator-refgs:
+
+    Reflective Gaussian surfels (:monosp:`refgs`)
+    ---------------------------------------------
+
+    .. pluginparameters::
+
+     * - filename
+       - |string|
+       - PLY file with the surfels: 2DGS's properties, and albedo, metallic, roughness and indirect SH, all raw (before
+         the activation). In Python, channels may be given instead, or replaced, by tensors under their names.
+
+     * - light *or any name*
+       - |emitter|
+       - An ``envmap`` or ``constant`` emitter, copied into the integrator's own light. Without one, the scene's own
+         environment emitter of these types lights the surfels. In Python also the raw tensor of a
+         ``mi_refgs.shade.envmap.EnvironmentLight``.
+
+     * - mesh
+       - |string|
+       - PLY file of the mesh that occludes mirror reflections. (Default: none)
+
+     * - occlusion
+       - |bool|
+       - Trace visibility along the mirror direction, and show the surfels' indirect light where it is blocked.
+         (Default: whether there is a ``mesh``)
+
+     * - shade_at
+       - |string|
+       - ``pixel`` (blend attributes, then shade) or ``surfel`` (shade, then blend radiance). (Default: ``pixel``)
+
+     * - reflectance
+       - |string|
+       - ``split_sum`` (diffuse and GGX specular) or ``radiance`` (the SH colour alone, needs no light; the two orders
+         of shading are then the same). (Default: ``split_sum`` if the surfels have materials)
+
+     * - diffuse
+       - |string|
+       - ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times light). (Default: ``sh`` if there is one)
+
+     * - terms
+       - |string|
+       - Terms in the image, out of ``diffuse,specular,indirect``. (Default: all)
+
+     * - background
+       - |color|
+       - Linear radiance behind the surfels; alpha is then 1. (Default: none, transparent)
+
+     * - aovs
+       - |string|
+       - Comma-separated ``<name>:<type>`` pairs as in the ``aov`` integrator, appended to RGB(A). Types: ``albedo``,
+         ``metallic``, ``roughness``, ``normal`` (world, towards the camera), ``depth``, ``alpha``, ``visibility``,
+         ``diffuse``, ``specular``, ``indirect``. (Default: none)
+
+     * - position, rotation, scale, opacity, radiance_sh, albedo, metallic, roughness, indirect_sh
+       - |tensor|
+       - Raw channels of shape (N, D). They may be replaced by ones with another N, all in one update.
+       - |exposed|, |differentiable|
+
+     * - light
+       - |tensor|
+       - Raw map (h, w, 3) of the integrator's own light, if it has one: radiance = ``EnvironmentLight(raw).radiance()``,
+         positive for any raw value. Light of the scene is exposed by its emitter instead.
+       - |exposed|, |differentiable|
+
+    The keys start with the integrator's id, `refgs` unless the scene sets one: ``params['refgs.roughness']``.
+
+    This integrator splats surfels in the view of a `perspective` sensor. It does not see the scene's shapes, and shows
+    the environment only as reflections. Without noise, it ignores the seed. A sample count n (of ``mi.render``, else of the
+    sensor's sampler, whose default is 4) gives k × k regular samples a pixel, k = ⌈√n⌉, box filtered; n = 1 takes pixel
+    centres. `mi.render` differentiates it in both modes with respect to the parameters above and to ``data``, ``scale`` or
+    ``radiance.value`` of the scene's environment, but not to sensors, background or mesh; `mi_refgs.splat.blend` lists
+    the derivatives that are absent.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="refgs">
+                <string name="filename" value="surfels.ply"/>
+                <emitter type="envmap" name="light">
+                    <string name="filename" value="envmap.exr"/>
+                </emitter>
+                <string name="aovs" value="nn:normal,rough:roughness"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'refgs',
+            'filename': 'surfels.ply',
+            'light': {'type': 'envmap', 'filename': 'envmap.exr'},
+            'aovs': 'nn:normal,rough:roughness',
+    """
+
+    def __init__(self, props: Any) -> None:
+        require_supported_variant("refgs")
+        super().__init__(props)
+        self.variant = mi.variant()
+        if not props.id():
+            self.set_id("refgs")  # an address otherwise, and with it every parameter's key
+        self.surfels = read_surfels(props)
+        self.light, self.light_rotation = read_light(props)
+        self.shading, self.occluder = read_shading(props, self.surfels)
+        self.terms = read_terms(props)
+        background = props.get("background", None)
+        self.background = None if background is None else mi.Color3f(background)
+        self.aovs = parse_aovs(str(props.get("aovs", "")))
+        self.check()
+
+    def check(self) -> None:
+        """Raise InputError for shapes that do not fit and for channels that are needed but absent."""
+        Surfels(self.surfels.raw)  # checks shapes; values are checked where a file is read
+        needed = [*GEOMETRY]
+        if self.shading.reflectance == "split_sum":
+            needed += MATERIALS
+        if self.shading.reflectance == "radiance" or self.shading.diffuse == "sh":
+            needed += ["radiance_sh"]
+        needed += [aov.type for aov in self.aovs if aov.type in MATERIALS]
+        for name in needed:
+            if not self.surfels.has(name):
+                raise InputError(f"refgs: {name}: the surfels have no such channel; add it, or choose what needs none")
+        if self.light is not None:
+            shape = tuple(self.light.raw.shape)
+            if len(shape) != 3 or shape[2] != 3 or shape[1] != 2 * shape[0] or shape[0] % 4:
+                raise InputError(f"refgs: light: shape {shape}, expected (h, 2h, 3) with h a multiple of 4")
+
+    # ---------------- parameters ----------------
+
+    def traverse(self, cb: Any) -> None:
+        for name, tensor in self.surfels.raw.items():
+            cb.put(name, tensor, mi.ParamFlags.Differentiable)
+        if self.light is not None:
+            cb.put("light", self.light.raw, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        self.check()
+
+    def aov_names(self) -> list[str]:
+        return [channel for aov in self.aovs for channel in aov.channels()]
+
+    # ---------------- rendering ----------------
+
+    def render(
+        self,
+        scene: Any,
+        sensor: Any = 0,
+        seed: Any = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> Any:
+        """The image (h, w, c) of a sensor; see the class for its channels."""
+        image = self._image(scene, sensor, spp)
+        if evaluate:
+            dr.eval(image)
+        return image if develop else mi.TensorXf()
+
+    def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
+        """Tangent of the image for the tangents of the parameters."""
+        with dr.resume_grad():
+            image = self._image(scene, sensor, spp)
+            dr.forward_to(image)
+            return dr.grad(image)
+
+    def render_backward(
+        self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+    ) -> None:
+        """Accumulate the adjoints of the parameters for the adjoint of the image."""
+        with dr.resume_grad():
+            image = self._image(scene, sensor, spp)
+            dr.set_grad(image, grad_in)
+            dr.enqueue(dr.ADMode.Backward, image)
+            dr.traverse(dr.ADMode.Backward)
+
+    def sample(self, *args: Any, **kwargs: Any) -> Any:
+        raise InputError("refgs: sample: whole images only; do not nest it in `aov` or `moment`, use its own `aovs`")
+
+    def _image(self, scene: Any, sensor: Any, spp: int) -> Any:
+        """Render under whatever AD scope is active, through the sensor's film."""
+        if mi.variant() != self.variant:
+            raise InputError(f"refgs: variant: made under {self.variant}, not {mi.variant()}; load the scene again")
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        film = sensor.film()
+        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+            raise InputError("refgs: film: refgs renders RGB radiance only; use an `hdrfilm`")
+        camera = Camera.from_sensor(sensor)
+        factor = math.ceil(math.sqrt(max(1, int(spp) or int(sensor.sampler().sample_count()))))
+        channels = self._channels(scene, camera.supersampled(factor), mi.has_flag(film.flags(), mi.FilmFlags.Alpha))
+        pixels = camera.width * camera.height
+        values = dr.ravel(mi.ArrayXf([_box(channel, camera, factor) for channel in channels]))
+        tensor = mi.TensorXf(values, (camera.height, camera.width, len(channels)))
+        assert dr.width(values) == pixels * len(channels)
+        film.prepare(self.aov_names())
+        film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
+        return film.develop()
+
+    def _channels(self, scene: Any, camera: Camera, alpha: bool) -> list[Any]:
+        """R, G, B, (A), W and the AOVs, as the film's blocks have them."""
+        frame = self._frame(scene, camera)
+        rgb = mi.Color3f(0)
+        for name in self.terms:
+            rgb += getattr(frame.terms, name)
+        coverage = frame.alpha
+        if self.background is not None:
+            rgb += (1 - frame.alpha) * self.background
+            coverage = mi.Float(1)
+        channels = [*rgb, *([coverage] if alpha else []), mi.Float(1)]
+        for aov in self.aovs:
+            channels += aov_values(aov.type, frame, camera)
+        return channels
+
+    def _frame(self, scene: Any, camera: Camera) -> Frame:
+        light = None
+        if self.shading.reflectance == "split_sum":
+            light = self._prefiltered(scene)
+        material_maps = any(aov.type in MATERIALS for aov in self.aovs)
+        return render(self.surfels, camera, self.shading, light, self.occluder, material_maps=material_maps)
+
+    def _prefiltered(self, scene: Any) -> Any:
+        if self.light is None:
+            emitter = scene.environment()
+            if emitter is None:
+                raise InputError("refgs: light: there is none; nest an `envmap` in the integrator or add one to the scene")
+            return emitter_light(emitter)
+        light = self.light.prefilter()
+        return light if self.light_rotation is None else TurnedLight(light, self.light_rotation)
+
+    def to_string(self) -> str:
+        size = "x".join(str(x) for x in self.light.raw.shape[:2]) if self.light is not None else "the scene's"
+        return (
+            f"RefGSIntegrator[\n  surfels = {self.surfels.count},\n  channels = {', '.join(self.surfels.raw)},\n"
+            f"  light = {size},\n  shade_at = {self.shading.at},\n  reflectance = {self.shading.reflectance},\n"
+            f"  diffuse = {self.shading.diffuse},\n  occlusion = {self.shading.occlusion}\n]"
+        )
+
+
+def _box(channel: Any, camera: Camera, factor: int) -> Any:
+    """Mean of each factor × factor block of a (supersampled) raster; a channel of width 1 is constant."""
+    pixels = camera.width * camera.height
+    if dr.width(channel) == 1:
+        return channel + dr.zeros(mi.Float, pixels)
+    if factor == 1:
+        return channel
+    sample = dr.arange(mi.UInt32, pixels * factor * factor)
+    pixel, part = sample // (factor * factor), sample % (factor * factor)
+    x = (pixel % camera.width) * factor + part % factor
+    y = (pixel // camera.width) * factor + part // factor
+    ordered = dr.gather(mi.Float, channel, y * (camera.width * factor) + x, mode=dr.ReduceMode.Permute)
+    return dr.block_sum(ordered, factor * factor) / (factor * factor)
+
+
+mi.register_integrator("refgs", RefGSIntegrator)

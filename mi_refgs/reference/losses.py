@@ -1,4 +1,4 @@
-"""Losses, depth normals and Adam in float64, pixel by pixel: what `fit.losses`, `fit.ssim` and `fit.optim` must equal.
+"""Losses, depth normals and Adam in float64, pixel by pixel: what `fit.losses`, `fit.optim` must equal.
 
 Images are (H, W, 3), planes (H, W); row first. No helper is shared with the fast path.
 """
@@ -15,7 +15,9 @@ def srgb(linear: float) -> float:
     return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
 
 
-def display_image(radiance: np.ndarray, alpha: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
+def display_image(
+    radiance: np.ndarray, alpha: np.ndarray, background: tuple[float, float, float]
+) -> np.ndarray:
     """A srgb(L / A) + (1 - A) background; the background alone where A < 1e-6."""
     out = np.empty_like(radiance)
     for index in np.ndindex(radiance.shape):
@@ -63,7 +65,13 @@ def alpha_loss(alpha: np.ndarray, target: np.ndarray, kind: str) -> float:
 
 
 def normals_from_depth(
-    depth: np.ndarray, alpha: np.ndarray, fx: float, fy: float, cx: float, cy: float, world_from_camera: np.ndarray
+    depth: np.ndarray,
+    alpha: np.ndarray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    world_from_camera: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """World normals (H, W, 3) of a camera-depth map and their validity (H, W), by central differences."""
     height, width = depth.shape
@@ -74,11 +82,18 @@ def normals_from_depth(
 
     for row in range(1, height - 1):
         for column in range(1, width - 1):
-            cross = [(row, column), (row, column - 1), (row, column + 1), (row - 1, column), (row + 1, column)]
+            cross = [
+                (row, column),
+                (row, column - 1),
+                (row, column + 1),
+                (row - 1, column),
+                (row + 1, column),
+            ]
             if min(alpha[place] for place in cross) < 1 / 255:
                 continue
             normal = np.cross(
-                point(row, column + 1) - point(row, column - 1), point(row + 1, column) - point(row - 1, column)
+                point(row, column + 1) - point(row, column - 1),
+                point(row + 1, column) - point(row - 1, column),
             )
             if np.dot(normal, normal) <= 1e-20:
                 continue
@@ -88,7 +103,9 @@ def normals_from_depth(
     return normals, valid
 
 
-def normal_consistency(normal: np.ndarray, depth_normal: np.ndarray, valid: np.ndarray, weight: np.ndarray) -> float:
+def normal_consistency(
+    normal: np.ndarray, depth_normal: np.ndarray, valid: np.ndarray, weight: np.ndarray
+) -> float:
     """Mean over all pixels of A (A - N · n_d) where n_d is valid; `weight` is the constant A."""
     total = 0.0
     for index in np.ndindex(valid.shape):
@@ -102,7 +119,7 @@ def normal_smoothness(normal: np.ndarray, image: np.ndarray) -> float:
     height, width, _ = normal.shape
     kernel = np.array([[-1, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 8
     padded = [np.pad(array, ((1, 1), (1, 1), (0, 0)), mode="edge") for array in (normal, image)]
-    total = 0.0
+    total = np.float64(0)
     for row, column in np.ndindex(height, width):
         for stencil in (kernel, kernel.T):
             bend, edge = (
@@ -113,9 +130,12 @@ def normal_smoothness(normal: np.ndarray, image: np.ndarray) -> float:
 
 
 def adam(
-    parameter: np.ndarray, gradients: list[np.ndarray], rates: list[np.ndarray | float], epsilon: float = 1e-15
+    parameter: np.ndarray,
+    gradients: list[np.ndarray],
+    rates: list[np.ndarray | float],
+    epsilon: float = 1e-15,
 ) -> np.ndarray:
-    """Adam in the form of its Algorithm 1 (bias-corrected moments); ε is scaled as in the efficient order of §2."""
+    """Adam in the form of its Algorithm 1 (bias-corrected moments); ε as in the efficient order."""
     θ, m, v = parameter.astype(np.float64), np.zeros(parameter.shape), np.zeros(parameter.shape)
     for t, (g, rate) in enumerate(zip(gradients, rates, strict=True), start=1):
         m = 0.9 * m + 0.1 * g

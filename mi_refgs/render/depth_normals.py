@@ -1,7 +1,7 @@
 """Normals of the surface that a depth map describes.
 
-Letters: D = Σ w z the blended depth, A the accumulated alpha, z = D / A the expected camera depth, X(i, j) the point
-that pixel (i, j) sees at depth z.
+Letters: D = Σ w z the blended depth, A the accumulated alpha, z = D / A the expected camera depth, X(i, j)
+the point that pixel (i, j) sees at depth z.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from mi_refgs.constants import NORM_FLOOR
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.splat.camera import Camera
 
-# Alpha below which a pixel has no depth: D / A would divide rounding errors. One 8-bit step, the splatter's own cut.
+# Alpha below which a pixel has no depth: D / A would divide rounding errors. The splatter's cut.
 DEPTH_ALPHA_MIN = 1.0 / 255.0
 
 
 def expected_depth(blended: Any, alpha: Any) -> Any:
-    """Expected camera depth z = D / A (scene units), 0 where A < 1/255; gradients flow to D and A and stay finite."""
+    """Expected camera depth z = D / A (scene units), 0 where A < 1/255; finite gradients to D and A."""
     valid = alpha >= DEPTH_ALPHA_MIN
     return dr.select(valid, blended / dr.select(valid, alpha, 1.0), 0.0)
 
@@ -28,10 +28,11 @@ def expected_depth(blended: Any, alpha: Any) -> Any:
 def normals_from_depth(depth: Any, alpha: Any, camera: Camera) -> tuple[Any, Any]:
     """World normals of a depth map by central differences, facing the camera, and where they are valid.
 
-    depth: (H·W) camera depth z, raster order, scene units; alpha: (H·W), read for validity only, no derivative.
-    Returns (normal: mi.Vector3f unit, or zero where invalid; valid: mi.Bool). Invalid: the one-pixel image border,
-    pixels that or whose four neighbours have A < 1/255, and points in one line. Gradients flow to depth.
-    Source: 2DGS, Huang et al. 2024, eq. 15, with X unprojected through the pixel centres (i + ½, j + ½).
+    depth: (H·W) camera depth z, raster order, scene units; alpha: (H·W), read for validity only, no
+    derivative. Returns (normal: mi.Vector3f unit, or zero where invalid; valid: mi.Bool). Invalid: the
+    one-pixel image border, pixels that or whose four neighbours have A < 1/255, and points in one line.
+    Gradients flow to depth. Source: 2DGS, Huang et al. 2024, eq. 15, with X unprojected through the pixel
+    centres (i + ½, j + ½).
     """
     width, height = camera.width, camera.height
     steps = ((-1, 0), (1, 0), (0, -1), (0, 1))
@@ -39,7 +40,9 @@ def normals_from_depth(depth: Any, alpha: Any, camera: Camera) -> tuple[Any, Any
     pixel = camera.pixel_centres()
 
     def point(z: Any, dx: int, dy: int) -> Any:
-        return mi.Vector3f((pixel.x + dx - camera.cx) / camera.fx, (pixel.y + dy - camera.cy) / camera.fy, 1) * z
+        return (
+            mi.Vector3f((pixel.x + dx - camera.cx) / camera.fx, (pixel.y + dy - camera.cy) / camera.fy, 1) * z
+        )
 
     # Camera-frame axes have signed focal lengths, so the orientation is settled by the view direction below.
     along_x = point(right, 1, 0) - point(left, -1, 0)

@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.shade.models import ShadingPoints, Terms, reflect, shade
+from mi_refgs.shade.models import ShadingPoints, Terms, reflect, safe_normalize, shade
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.splat import Blended, Camera, splat
 from mi_refgs.surfels.table import Surfels
@@ -164,7 +164,7 @@ def _shade_at_pixels(
     indirect_used = shading.occlusion and occluder is not None
     if indirect_used and surfels.has("indirect_sh"):
         # The mirror direction of the surfel's centre [Ref-Gaussian, §3.3]; starts at exactly 0 and must train from there.
-        mirrored = reflect(-direction, normal)
+        mirrored = reflect(view=-direction, normal=normal)
         features += [*clamp_positive(eval_sh(surfels.indirect_sh(), mirrored))]
     blended = splat(surfels, features, camera, shift)
 
@@ -183,8 +183,8 @@ def _shade_at_pixels(
         assert occluder is not None
         with dr.suspend_grad():
             point = mi.Point3f(mi.Vector3f(camera.origin) + dr.detach(depth) * ray)
-            facing = dr.detach(normal)
-            visibility = occluder.visible(point, reflect(view, facing), facing)
+            facing = safe_normalize(dr.detach(normal))
+            visibility = occluder.visible(point, reflect(view=view, normal=facing), facing)
         maps["visibility"] = visibility
     points = ShadingPoints(
         normal=normal,

@@ -1,4 +1,4 @@
-"""Neighbouring pixels of an image plane, with an adjoint that only gathers (no atomics, hence deterministic)."""
+"""Neighbouring pixels of an image plane, with an adjoint that only gathers (deterministic)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class _Neighbours(dr.CustomOp):
         self.set_grad_out(self._shift(self.grad_in("plane")))
 
     def backward(self) -> None:
-        """Pixel s was read by the pixels p = s - step and, where the border repeats, by s itself (per axis)."""
+        """Pixel s was read by the pixels p = s - step and, where the border repeats, by s itself."""
         x, y = _pixel(self.width, self.height)
         δ_plane = mi.Float(0)
         δ_out = self.grad_out()

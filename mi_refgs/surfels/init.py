@@ -1,7 +1,7 @@
 """Initial surfels: from points, from the visual hull of alpha masks, or at random.
 
-World positions in scene units; cameras in Mitsuba's frame (+z forward, +x left, +y up), hence signed focal lengths.
-`bounds` is a (2, 3) array: the lowest and highest corner of a box.
+World positions in scene units; cameras in Mitsuba's frame (+z forward, +x left, +y up), hence signed focal
+lengths. `bounds` is a (2, 3) array: the lowest and highest corner of a box.
 """
 
 from __future__ import annotations
@@ -25,14 +25,16 @@ SQUARED_DISTANCE_FLOOR = 1e-7
 NEIGHBOURS = 3
 # Uniform jitter of the initial albedo around its mean: breaks ties between surfels. [Ref-Gaussian]
 ALBEDO_JITTER = 0.025
-# Voxels per edge of the visual hull's grid: at 200² a voxel of the cube that the views span is two pixels wide.
+# Voxels per edge of the visual hull's grid: at 200² a voxel of the cube the views span is two pixels wide.
 HULL_RESOLUTION = 96
-# Mask level that bounds the hull, and the level below which a voxel is given up at once (the mask is blurred).
+# Mask level that bounds the hull, and the level below which a voxel of the blurred masks is given up.
 HULL_LEVEL = 0.5
 HULL_CARVED = 0.05
+# Share of the views that must see a point of the hull: what hardly any camera sees was never carved.
+HULL_SEEN = 0.25
 # Views that vote for a point's colour: a median needs no more, and memory grows with points times views.
 COLOUR_VIEWS = 32
-# Singular value of the mean of (I - d dᵀ), 0 for parallel view axes, below which those axes have no common point.
+# Singular value of the mean of (I - d dᵀ), 0 for parallel view axes, below which they do not meet.
 FOCUS_CONDITION = 1e-3
 
 
@@ -49,14 +51,18 @@ class View:
     colour: np.ndarray | None = None  # (H, W, 3) linear, not premultiplied
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Array indices (row, column) of world points (N, 3), where a pixel centre is an integer, and if they are seen."""
+        """Array indices (row, column), integer at pixel centres, of world points (N, 3); and if seen."""
         to_world = np.asarray(self.to_world, dtype=np.float64)
         local = (points - to_world[:3, 3]) @ to_world[:3, :3]
         depth = np.where(local[:, 2] > 0, local[:, 2], np.inf)
         column = self.fx * local[:, 0] / depth + self.cx - 0.5
         row = self.fy * local[:, 1] / depth + self.cy - 0.5
         height, width = self.alpha.shape
-        seen = (local[:, 2] > 0) & (abs(column - (width - 1) / 2) <= width / 2) & (abs(row - (height - 1) / 2) <= height / 2)
+        seen = (
+            (local[:, 2] > 0)
+            & (abs(column - (width - 1) / 2) <= width / 2)
+            & (abs(row - (height - 1) / 2) <= height / 2)
+        )
         return row, column, seen
 
 
@@ -74,7 +80,9 @@ def camera_bounds(views: Sequence[View]) -> np.ndarray:
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     system = projectors.mean(axis=0) if len(views) else np.zeros((3, 3))
     if np.linalg.svd(system, compute_uv=False)[-1] < FOCUS_CONDITION:
-        raise InputError("views: cameras: they do not look at one point from several sides; give the bounds of the scene")
+        raise InputError(
+            "views: cameras: they do not look at one point from several sides; give the bounds of the scene"
+        )
     focus = np.linalg.solve(system, np.einsum("nij,nj->i", projectors, origins) / len(views))
     distance = np.linalg.norm(origins - focus, axis=1)
     reach = [max(v.alpha.shape[1] / abs(v.fx), v.alpha.shape[0] / abs(v.fy)) / 2 for v in views]
@@ -89,13 +97,18 @@ def random_points(count: int, bounds: np.ndarray, rng: np.random.Generator) -> n
 
 
 def visual_hull_points(
-    views: Sequence[View], count: int, bounds: np.ndarray, rng: np.random.Generator, resolution: int = HULL_RESOLUTION
+    views: Sequence[View],
+    count: int,
+    bounds: np.ndarray,
+    rng: np.random.Generator,
+    resolution: int = HULL_RESOLUTION,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (count, 3) uniform on the surface of the visual hull, and its outward unit normals (count, 3).
 
-    The hull is the set of points inside every mask (alpha > 0.5, blurred by half a voxel); where a view does not see a
-    point it says nothing. Surface by marching cubes (scikit-image) on the smallest mask value over the views.
-    Raises InputError if nothing is inside every mask.
+    The hull is the set of points inside every mask (alpha > 0.5, blurred by half a voxel); where a view does
+    not see a point it says nothing, but a quarter of the views must see it. Surface by marching cubes
+    (scikit-image) on the smallest mask value over the views. Raises InputError if nothing is inside every
+    mask.
     """
     from skimage.measure import marching_cubes
 
@@ -103,6 +116,7 @@ def visual_hull_points(
     voxel = (high - low) / resolution
     centres = np.stack(np.meshgrid(*[np.arange(resolution)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = np.ones(resolution**3, dtype=np.float32)
+    witnesses = np.zeros(resolution**3, dtype=np.int32)
     alive = np.arange(resolution**3)
     middle = (low + high) / 2
     for view in views:
@@ -113,12 +127,16 @@ def visual_hull_points(
         mask = gaussian_filter(np.asarray(view.alpha, dtype=np.float32), blur, mode="nearest")
         value = map_coordinates(mask, np.stack([row[seen], column[seen]]), order=1, mode="nearest")
         inside[alive[seen]] = np.minimum(inside[alive[seen]], value)
+        witnesses[alive[seen]] += 1
         dead = inside[alive] < HULL_CARVED
         inside[alive[dead]] = 0
         alive = alive[~dead]
+    inside[witnesses < HULL_SEEN * len(views)] = 0
     field = np.pad(inside.reshape((resolution,) * 3), 1)
     if not np.any(field > HULL_LEVEL):
-        raise InputError("views: alpha: no point of the scene is inside every mask; check cameras and masks, or do not use alpha")
+        raise InputError(
+            "views: alpha: no point is inside every mask; check cameras and masks, or do not use alpha"
+        )
 
     vertices, faces, _, _ = marching_cubes(field, HULL_LEVEL)
     corners = vertices[faces].astype(np.float64)
@@ -140,13 +158,17 @@ def visual_hull_points(
 
 
 def mean_colours(points: np.ndarray, views: Sequence[View], normals: np.ndarray | None = None) -> np.ndarray:
-    """Median linear colour (N, 3) of the points over the views that show them with alpha > 0.5; 0.5 if none does.
+    """Median linear colour (N, 3) of the points over the views that show them with alpha > 0.5.
 
-    With `normals`, only views in front of a point vote. There is no occlusion test: the median of many views forgives
-    it. At most 32 views, evenly chosen, are read.
+    Points that no view shows are 0.5 grey. With `normals`, only views in front of a point vote. There is no
+    occlusion test: the median of many views forgives it. At most 32 views, evenly chosen, are read.
     """
     chosen = [view for view in views if view.colour is not None]
-    chosen = [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, COLOUR_VIEWS).astype(int))] if chosen else []
+    chosen = (
+        [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, COLOUR_VIEWS).astype(int))]
+        if chosen
+        else []
+    )
     if not chosen or not len(points):
         return np.full((len(points), 3), 0.5)
     samples = np.full((len(chosen), len(points), 3), np.nan, dtype=np.float32)
@@ -183,29 +205,42 @@ def from_points(
     albedo: float = 0.5,
     scale_factor: float = 1.0,
 ) -> Surfels:
-    """One surfel per point: scale from its 3 nearest neighbours, normal as given or uniform at random, raw values.
+    """One surfel per point: scale from its 3 nearest neighbours, normal as given or uniform at random.
 
-    The tangents are turned at random about the normal. `colours` fill the DC of radiance_sh (grey 0.5 by default); the
-    indirect coefficients start at exactly 0. Initial values as in the released Ref-Gaussian, but rotations are uniform
-    over SO(3), not over positive components. Raises InputError for wrong shapes, NaN or unknown channels.
+    The tangents are turned at random about the normal. `colours` fill the DC of radiance_sh (grey 0.5 by
+    default); the indirect coefficients start at exactly 0. Initial values as in the released Ref-Gaussian,
+    but rotations are uniform over SO(3), not over positive components. Raises InputError for wrong shapes,
+    NaN or unknown channels.
     """
     points = _check("points", points, np.shape(points)[:1])
     unknown = [name for name in channels if name not in CHANNELS]
     if unknown or not 0 <= sh_degree <= MAX_SH_DEGREE:
-        wrong = f"channels: {unknown[0]}: unknown" if unknown else f"sh_degree: {sh_degree}: not in 0..{MAX_SH_DEGREE}"
-        raise InputError(f"surfels: {wrong}; use channels of {', '.join(CHANNELS)} and a degree of 0..{MAX_SH_DEGREE}")
+        wrong = (
+            f"channels: {unknown[0]}: unknown"
+            if unknown
+            else f"sh_degree: {sh_degree}: not in 0..{MAX_SH_DEGREE}"
+        )
+        raise InputError(
+            f"surfels: {wrong}; use channels of {', '.join(CHANNELS)} and a degree of 0..{MAX_SH_DEGREE}"
+        )
     count = len(points)
     log_scale = np.log(neighbour_scale(points) * scale_factor)
     raw: dict[str, np.ndarray] = {
         "position": points,
-        "rotation": quaternions(None if normals is None else _check("normals", normals, (count,)), count, rng),
+        "rotation": quaternions(
+            None if normals is None else _check("normals", normals, (count,)), count, rng
+        ),
         "scale": np.repeat(log_scale[:, None], 2, axis=1),
         "opacity": np.full((count, 1), logit(opacity)),
         "radiance_sh": np.zeros((count, sh_columns(sh_degree))),
-        "albedo": logit(np.clip(albedo + rng.uniform(-ALBEDO_JITTER, ALBEDO_JITTER, (count, 3)), 0.001, 0.999)),
+        "albedo": logit(
+            np.clip(albedo + rng.uniform(-ALBEDO_JITTER, ALBEDO_JITTER, (count, 3)), 0.001, 0.999)
+        ),
         "metallic": np.full((count, 1), logit(metallic)),
         "roughness": np.full((count, 1), logit(roughness)),
-        "indirect_sh": np.zeros((count, sh_columns(sh_degree if indirect_degree is None else indirect_degree))),
+        "indirect_sh": np.zeros(
+            (count, sh_columns(sh_degree if indirect_degree is None else indirect_degree))
+        ),
     }
     if colours is not None:
         raw["radiance_sh"][:, :3] = (_check("colours", colours, (count,)) - 0.5) / SH_DC
@@ -222,7 +257,7 @@ def neighbour_scale(points: np.ndarray) -> np.ndarray:
 
 
 def quaternions(normals: np.ndarray | None, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Unit quaternions (count, 4), x y z w, whose third axis is the normal; uniform over SO(3) without normals."""
+    """Unit quaternions (count, 4), x y z w, whose third axis is the normal; without normals uniform."""
     free = rng.normal(size=(count, 4))
     free /= np.linalg.norm(free, axis=1, keepdims=True)
     if normals is None or count == 0:
@@ -245,7 +280,9 @@ def logit(value: float | np.ndarray) -> np.ndarray:
 def _check(name: str, values: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:
     array = np.asarray(values, dtype=np.float64)
     if array.shape != (*rows, 3):
-        raise InputError(f"surfels: {name}: shape {array.shape}, expected {(*rows, 3)}; give one row of three per point")
+        raise InputError(
+            f"surfels: {name}: shape {array.shape}, expected {(*rows, 3)}; give one row of three per point"
+        )
     bad = int(np.count_nonzero(~np.isfinite(array)))
     if bad:
         raise InputError(f"surfels: {name}: {bad} values are NaN or infinite; remove those points")

@@ -1,16 +1,18 @@
-"""Surfels in PLY files, with the property names and raw encodings of 2DGS, so that other viewers read what they know.
+"""Surfels in PLY files, with the property names and raw encodings of 2DGS, which other viewers know.
 
-    x y z                          position                     nx ny nz        zeros, as 2DGS writes them; ignored
-    f_dc_0..2, f_rest_*            radiance_sh                  opacity         logit
-    scale_0 scale_1                log scale                    rot_0..3        quaternion, w first
-    albedo_0..2 metallic roughness logits                       ind_dc_0..2, ind_rest_*   indirect_sh
+    x y z, nx ny nz       position; zeros, as 2DGS writes them, ignored when read
+    f_dc_*, f_rest_*      radiance_sh            opacity                 logit
+    scale_0 scale_1       log scale              rot_0..3                quaternion, w first
+    albedo_0..2           logit                  metallic, roughness     logit
+    ind_dc_*, ind_rest_*  indirect_sh
 
-Everything is raw (before the activation). Spherical harmonics are channel-major: the DC of r, g, b, then every other
-coefficient of r, of g, of b. The table's own column order is 3 coefficient + rgb.
+Everything is raw (before the activation). Spherical harmonics are channel-major: the DC of r, g, b, then
+every other coefficient of r, of g, of b. The table's own column order is 3 coefficient + rgb.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 from typing import BinaryIO
@@ -22,7 +24,7 @@ from mi_refgs.surfels.table import MAX_SH_DEGREE, Surfels, sh_columns
 
 # A header of ours has 124 lines at most; more than this without its end is no PLY header.
 MAX_HEADER_LINES = 1000
-# Property groups of the channels that are not spherical harmonics. The quaternion's x, y, z, w are rot_1, 2, 3, 0.
+# Property groups of the channels that are not spherical harmonics. Quaternion x, y, z, w: rot_1, 2, 3, 0.
 PROPERTIES: dict[str, tuple[str, ...]] = {
     "position": ("x", "y", "z"),
     "rotation": ("rot_1", "rot_2", "rot_3", "rot_0"),
@@ -46,10 +48,11 @@ TYPES = {
 
 
 def read_ply(path: str | Path) -> Surfels:
-    """Read surfels from a binary or ASCII PLY file; unknown properties are ignored, absent groups give absent channels.
+    """Read surfels from a binary or ASCII PLY file; unknown properties are ignored.
 
-    Raises InputError, naming file, property and remedy, if the file is missing, truncated or no PLY, if it holds 3D
-    Gaussians, if x y z, opacity, scale_0/1 or rot_0..3 or part of another group is missing, or if a value is not finite.
+    Absent groups give absent channels. Raises InputError, naming file, property and remedy, if the file is
+    missing, truncated or no PLY, if it holds 3D Gaussians, if x y z, opacity, scale_0/1 or rot_0..3 or part
+    of another group is missing, or if a value is not finite.
     """
     path = Path(path)
     try:
@@ -60,7 +63,9 @@ def read_ply(path: str | Path) -> Surfels:
 
     names = vertices.dtype.names or ()
     if "scale_2" in names:
-        raise InputError(f"{path}: scale_2: the file holds 3D Gaussians; export surfels (2DGS) with two scales instead")
+        raise InputError(
+            f"{path}: scale_2: the file holds 3D Gaussians; export surfels (2DGS) with two scales instead"
+        )
     arrays = {}
     for channel, properties in PROPERTIES.items():
         if channel in REQUIRED or any(name in names for name in properties):
@@ -75,7 +80,9 @@ def read_ply(path: str | Path) -> Surfels:
 def _read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
     """The `vertex` element as a structured array."""
     if file.readline().strip() != b"ply":
-        raise InputError(f"{path}: header: not a PLY file; give the surfels.ply of a run or a 2DGS point_cloud.ply")
+        raise InputError(
+            f"{path}: header: not a PLY file; give the surfels.ply of a run or a 2DGS point_cloud.ply"
+        )
     order, count, fields, in_vertex, skipped = "", -1, [], False, 0
     for _ in range(MAX_HEADER_LINES):
         words = file.readline().decode("ascii", errors="replace").split()
@@ -89,14 +96,18 @@ def _read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
                 skipped += int(words[2])
         elif words[:1] == ["property"] and in_vertex:
             if len(words) != 3 or words[1] not in TYPES:
-                raise InputError(f"{path}: {words[-1]}: not a number property; export the vertices without lists")
+                raise InputError(
+                    f"{path}: {words[-1]}: not a number property; export the vertices without lists"
+                )
             fields.append((words[2], TYPES[words[1]]))
         elif words == ["end_header"]:
             break
     else:
         raise InputError(f"{path}: header: no end_header; the file is truncated, export it again")
     if not order or count < 0 or not fields or skipped:
-        raise InputError(f"{path}: header: no format or no leading vertex element; export it again as a surfel PLY")
+        raise InputError(
+            f"{path}: header: no format or no leading vertex element; export it again as a surfel PLY"
+        )
     if len({name for name, _ in fields}) < len(fields):
         raise InputError(f"{path}: header: a vertex property occurs twice; export it again")
 
@@ -108,7 +119,9 @@ def _read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
     data = file.read(count * dtype.itemsize)
     if len(data) < count * dtype.itemsize:
         found = len(data) // dtype.itemsize
-        raise InputError(f"{path}: vertex: {found} of {count} rows; the file is truncated, copy or export it again")
+        raise InputError(
+            f"{path}: vertex: {found} of {count} rows; the file is truncated, copy or export it again"
+        )
     return np.frombuffer(data, dtype=dtype)
 
 
@@ -119,7 +132,9 @@ def _read_ascii(path: Path, file: BinaryIO, count: int, width: int) -> np.ndarra
         try:
             values[row] = [float(word) for word in words]
         except ValueError as error:
-            raise InputError(f"{path}: vertex: row {row} is broken or missing; copy or export the file again") from error
+            raise InputError(
+                f"{path}: vertex: row {row} is broken or missing; copy or export the file again"
+            ) from error
     return values
 
 
@@ -135,7 +150,9 @@ def _columns(path: Path, vertices: np.ndarray, properties: tuple[str, ...]) -> n
             table[:, column] = vertices[name]
         bad = int(np.count_nonzero(~np.isfinite(table[:, column])))
         if bad:
-            raise InputError(f"{path}: {name}: {bad} values are NaN or infinite; remove those surfels or export it again")
+            raise InputError(
+                f"{path}: {name}: {bad} values are NaN or infinite; remove those surfels or export it again"
+            )
     return table
 
 
@@ -144,7 +161,9 @@ def _sh_degree(path: Path, names: tuple[str, ...], prefix: str) -> int:
     for degree in range(MAX_SH_DEGREE + 1):
         if rest == sh_columns(degree) - 3:
             return degree
-    raise InputError(f"{path}: {prefix}_rest_*: {rest} properties; use 0, 9, 24 or 45 (degrees 0 to {MAX_SH_DEGREE})")
+    raise InputError(
+        f"{path}: {prefix}_rest_*: {rest} properties; use 0, 9, 24 or 45 (degrees 0 to {MAX_SH_DEGREE})"
+    )
 
 
 def _sh_properties(channel: str, degree: int) -> tuple[str, ...]:
@@ -158,9 +177,10 @@ def _sh_properties(channel: str, degree: int) -> tuple[str, ...]:
 
 
 def write_ply(path: str | Path, surfels: Surfels) -> None:
-    """Write surfels as binary little-endian float32 PLY, atomically: readers see the old file or the whole new one.
+    """Write surfels as binary little-endian float32 PLY, atomically (old file or whole new one).
 
-    Reading it back gives the same bits. Raises InputError if a value is not finite or the path cannot be written.
+    Reading it back gives the same bits. Raises InputError if a value is not finite or the path cannot be
+    written.
     """
     surfels.validate()
     values: dict[str, np.ndarray] = {}
@@ -173,7 +193,9 @@ def write_ply(path: str | Path, surfels: Surfels) -> None:
     for name, column in values.items():
         rows[name] = column
     properties_text = "".join(f"property float {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {surfels.count}\n{properties_text}end_header\n"
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {surfels.count}\n{properties_text}end_header\n"
+    )
 
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -181,16 +203,21 @@ def write_ply(path: str | Path, surfels: Surfels) -> None:
         temporary.write_bytes(header.encode("ascii") + rows.tobytes())
         os.replace(temporary, path)
     except OSError as error:
-        raise InputError(f"{path}: output: cannot be written ({error.strerror}); choose a writable folder") from error
+        raise InputError(
+            f"{path}: output: cannot be written ({error.strerror}); choose a writable folder"
+        ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # moved away, or never made
+            temporary.unlink()
 
 
 def _file_order(values: dict[str, np.ndarray]) -> list[str]:
     """2DGS's order: position, normal, spherical harmonics by number, opacity, scale, rotation; then ours."""
 
     def numbered(prefix: str) -> list[str]:
-        return sorted((name for name in values if name.startswith(prefix)), key=lambda name: int(name.split("_")[-1]))
+        return sorted(
+            (name for name in values if name.startswith(prefix)), key=lambda name: int(name.split("_")[-1])
+        )
 
     order = ["x", "y", "z", "nx", "ny", "nz", *numbered("f_dc_"), *numbered("f_rest_"), "opacity"]
     order += [*numbered("scale_"), *numbered("rot_"), *numbered("albedo_")]

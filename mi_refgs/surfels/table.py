@@ -1,12 +1,12 @@
 """The table of surfels: named raw channels, and what they mean after the activation.
 
-Letters: N surfels, D columns of a channel, q quaternion (x, y, z, w), t_u t_v n columns of its rotation matrix.
-A surfel is the point p(u, v) = position + s_u u t_u + s_v v t_v with normal n = t_u × t_v   [2DGS, Huang et al. 2024, §4.1].
+Letters: N surfels, D columns of a channel, q quaternion (x, y, z, w), t_u t_v n columns of its matrix.
+A surfel is the point p(u, v) = position + s_u u t_u + s_v v t_v, n = t_u × t_v. [2DGS, Huang 2024, §4.1]
 
 Named rules for degenerate rows (each keeps values and gradients finite for every finite input):
   zero quaternion   every |component| < QUATERNION_FLOOR: the identity rotation, with gradient 0
   scale limit       the log scale is clamped to ±LOG_SCALE_LIMIT, with gradient 0 beyond
-  logit limit       logits are clamped to ±LOGIT_LIMIT, where the sigmoid is 0 or 1 in float32, with gradient 0 beyond
+  logit limit       logits are clamped to ±LOGIT_LIMIT (sigmoid 0 or 1 in float32), with gradient 0 beyond
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 
-# Raw columns per channel, in table order; 0 stands for 3 (degree + 1)² spherical-harmonic columns, column = 3 coef + rgb.
+# Raw columns per channel, in table order; 0 stands for 3 (degree + 1)² harmonics, column = 3 coef + rgb.
 CHANNELS: dict[str, int] = {
     "position": 3,
     "rotation": 4,
@@ -37,9 +37,9 @@ CHANNELS: dict[str, int] = {
 GEOMETRY = ("position", "rotation", "scale", "opacity")
 # Highest spherical-harmonic degree that the 3DGS family stores; shade.sh evaluates no more.
 MAX_SH_DEGREE = 3
-# Below this largest |component| 1/|q| would overflow float32.
-QUATERNION_FLOOR = 1e-30
-# e^±16 = 1e-7 … 9e6 scene units: its fourth power, which the ray-surfel intersection needs, still fits float32.
+# Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is worthless.
+QUATERNION_FLOOR = 1e-12
+# e^±16 = 1e-7 … 9e6 scene units: its fourth power, which ray-surfel intersection needs, fits float32.
 LOG_SCALE_LIMIT = 16.0
 # 1 / (1 + e^-40) is 1 in float32, and e^40 squared still fits float32 (the derivative needs it).
 LOGIT_LIMIT = 40.0
@@ -58,16 +58,17 @@ def sigmoid(x: Any) -> Any:
 
 
 class Surfels:
-    """N surfels as named raw channels, each an `mi.TensorXf` of shape (N, D) that may be a leaf of the AD graph.
+    """N surfels as named raw channels, each an `mi.TensorXf` of shape (N, D), often a leaf of the AD graph.
 
-    `raw` maps channel names to tensors in the order of CHANNELS; a channel that a scene does not use is absent and costs
-    nothing. Accessors return activated values as Dr.Jit arrays of width N; gradients flow to the raw tensors in both modes.
+    `raw` maps channel names to tensors in the order of CHANNELS; a channel that a scene does not use is
+    absent and costs nothing. Accessors return activated values as Dr.Jit arrays of width N; gradients flow to
+    the raw tensors in both modes.
     """
 
     raw: dict[str, Any]
 
     def __init__(self, raw: Mapping[str, Any]) -> None:
-        """Adopt raw tensors of shape (N, D); raises InputError for unknown names or shapes that do not fit."""
+        """Adopt raw tensors of shape (N, D); raises InputError for unknown names or wrong shapes."""
         unknown = [name for name in raw if name not in CHANNELS]
         if unknown:
             raise InputError(f"surfels: {unknown[0]}: unknown channel; use one of {', '.join(CHANNELS)}")
@@ -108,18 +109,22 @@ class Surfels:
         for name, tensor in self.raw.items():
             shape = tuple(tensor.shape)
             if len(shape) != 2 or shape[0] != rows:
-                raise InputError(f"surfels: {name}: shape {shape}, expected ({rows}, D); give every channel one row per surfel")
+                raise InputError(f"surfels: {name}: shape {shape}, expected ({rows}, D); one row per surfel")
             width = CHANNELS[name]
             allowed = (width,) if width else tuple(sh_columns(degree) for degree in range(MAX_SH_DEGREE + 1))
             if shape[1] not in allowed:
                 choices = " or ".join(str(columns) for columns in allowed)
-                raise InputError(f"surfels: {name}: {shape[1]} columns, expected {choices}; fix the array's shape")
+                raise InputError(
+                    f"surfels: {name}: {shape[1]} columns, expected {choices}; fix the array's shape"
+                )
 
     def validate(self) -> None:
-        """Raise InputError when a geometry channel is missing, a shape does not fit, or a value is NaN or infinite."""
+        """Raise InputError if a geometry channel is missing, a shape is wrong, or a value is not finite."""
         for name in GEOMETRY:
             if name not in self.raw:
-                raise InputError(f"surfels: {name}: the channel is missing; add it, nothing can be splatted without it")
+                raise InputError(
+                    f"surfels: {name}: the channel is missing; add it, nothing can be splatted without it"
+                )
         self._check_shapes()
         for name, tensor in self.raw.items():
             bad = int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0
@@ -131,7 +136,8 @@ class Surfels:
     def columns(self, name: str) -> list[Any]:
         """Raw columns of a channel as D `mi.Float` of width N, under AD.
 
-        Each entry is read once per column, so the adjoint is a plain (not atomic) read-modify-write.
+        Entry i is read by lane i only, so the adjoint is a plain (not atomic) read-modify-write. Gathering
+        from the raw tensor by another index map in the same derivative pass would let the two adjoints race.
         """
         tensor = self.raw[name]
         rows, width = (int(size) for size in tensor.shape)
@@ -139,7 +145,8 @@ class Surfels:
             return [mi.Float() for _ in range(width)]
         index = dr.arange(mi.UInt32, rows) * width
         return [
-            dr.gather(mi.Float, tensor.array, index + column, mode=dr.ReduceMode.NoConflicts) for column in range(width)
+            dr.gather(mi.Float, tensor.array, index + column, mode=dr.ReduceMode.NoConflicts)
+            for column in range(width)
         ]
 
     # ---------------- activated values ----------------
@@ -155,7 +162,7 @@ class Surfels:
         x, y, z, w = self.columns("rotation")
         largest = dr.detach(dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), dr.maximum(dr.abs(z), dr.abs(w))))
         valid = largest >= QUATERNION_FLOOR
-        # Dividing by the largest component first keeps |q|² in range for every finite q; normalising undoes it.
+        # Dividing by the largest component first keeps |q|² in range; normalising undoes it.
         shrink = dr.rcp(dr.select(valid, largest, 1.0))
         x, y, z = (dr.select(valid, part * shrink, 0.0) for part in (x, y, z))
         w = dr.select(valid, w * shrink, 1.0)
@@ -166,7 +173,9 @@ class Surfels:
         """Standard deviations (s_u, s_v) along t_u and t_v (mi.Vector2f), scene units."""
         if self.count == 0:
             return dr.zeros(mi.Vector2f, 0)
-        u, v = (dr.exp(dr.clip(column, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)) for column in self.columns("scale"))
+        u, v = (
+            dr.exp(dr.clip(column, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)) for column in self.columns("scale")
+        )
         return mi.Vector2f(u, v)
 
     def opacity(self) -> Any:
@@ -190,7 +199,7 @@ class Surfels:
         return self._coefficients("radiance_sh")
 
     def indirect_sh(self) -> list[Any]:
-        """Coefficients (mi.Color3f) of the indirect channel; the colour is max(0, Σ c_k Y_k), without an offset."""
+        """Coefficients (mi.Color3f) of the indirect channel; the colour is max(0, Σ c_k Y_k), no offset."""
         return self._coefficients("indirect_sh")
 
     def _coefficients(self, name: str) -> list[Any]:

@@ -1,0 +1,86 @@
+"""`refgs dataset`: a multi-view data set from a Mitsuba scene."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from mi_refgs.cli.command import Result, add_command, add_output
+
+EXAMPLE = "refgs dataset scenes/glossy_demo.xml -o data/glossy --views 80 --size 160 --spp 128"
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    summary = "path-trace a multi-view data set of a Mitsuba scene: pictures, normals, depth, light, cameras"
+    parser = add_command(commands, "dataset", summary, EXAMPLE, run)
+    parser.add_argument(
+        "scene", type=Path, metavar="SCENE.xml", help="a Mitsuba scene with an environment emitter"
+    )
+    add_output(parser, "folder of the data set; what an interrupted run left is continued", "DIR")
+    parser.add_argument(
+        "--views", type=int, default=80, metavar="N", help="training views (default %(default)s)"
+    )
+    parser.add_argument(
+        "--test-views", type=int, metavar="N", help="test views (default: a quarter of --views)"
+    )
+    parser.add_argument(
+        "--size", type=int, default=160, metavar="S", help="pixels a side (default %(default)s)"
+    )
+    parser.add_argument(
+        "--spp", type=int, default=128, metavar="N", help="samples per pixel (default %(default)s)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="of cameras and paths (default %(default)s)"
+    )
+    parser.add_argument(
+        "--max-depth", type=int, default=6, metavar="N", help="longest path (default %(default)s)"
+    )
+    parser.add_argument(
+        "--elevation",
+        type=float,
+        nargs=2,
+        default=(-30.0, 80.0),
+        metavar=("LOW", "HIGH"),
+        help="camera heights, degrees",
+    )
+    parser.add_argument(
+        "--fov", type=float, default=40.0, metavar="DEG", help="field of view (default %(default)s)"
+    )
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace a data set that was made with other settings"
+    )
+
+
+def run(args: argparse.Namespace) -> Result:
+    """Trace the views."""
+    from mi_refgs.fit.dataset import generate
+
+    folder = generate(
+        args.scene,
+        args.output,
+        views=args.views,
+        size=args.size,
+        spp=args.spp,
+        seed=args.seed,
+        test_views=args.test_views,
+        max_depth=args.max_depth,
+        elevation=tuple(args.elevation),
+        fov=args.fov,
+        overwrite=args.overwrite,
+    )
+    counts = {split: len(list((folder / split).glob("r_*.png"))) for split in ("train", "test")}
+    text = (
+        f"{folder}: {counts['train']} training and {counts['test']} test views; "
+        f"next: refgs train {folder} -o runs/{folder.name}"
+    )
+    return Result(
+        {
+            "dataset": str(folder),
+            "train_views": counts["train"],
+            "test_views": counts["test"],
+            "size": args.size,
+        },
+        text,
+    )

@@ -1,0 +1,64 @@
+"""`refgs demo`: the main job on a small scene that comes with the package, up to a contact sheet."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from mi_refgs.cli.command import Result, add_command, add_output, say
+from mi_refgs.cli.evaluate import table
+from mi_refgs.cli.train import fit
+from mi_refgs.resources import resource_dir
+
+SCENE = "glossy_demo.xml"
+VIEWS, TEST_VIEWS, SIZE, SAMPLES = 60, 8, 112, 64
+"""Sized so that all of it takes less than 8 minutes on two cores; the tracing takes one of them."""
+PRESET = "quick"
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    summary = "path-trace a small glossy scene, fit it, evaluate it, and write a contact sheet"
+    parser = add_command(commands, "demo", summary, "refgs demo -o runs/demo", run)
+    add_output(parser, "folder for data set and run; run again, it goes on where it stopped", "DIR")
+    parser.add_argument("--preset", default=PRESET, metavar="P", help="how long to fit (default %(default)s)")
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="key=value",
+        help="change the method, as in `refgs train`",
+    )
+
+
+def run(args: argparse.Namespace) -> Result:
+    """Trace, fit, evaluate; what is finished already is not done again."""
+    from mi_refgs.fit.dataset import generate
+    from mi_refgs.fit.evaluate import SHEET, evaluate, read_metrics
+    from mi_refgs.fit.record import Run
+
+    data, output = args.output / "data", args.output / args.preset
+    say(f"1 of 3: tracing {VIEWS + TEST_VIEWS} views of {SCENE} into {data}")
+    generate(
+        resource_dir("scenes") / SCENE,
+        data,
+        views=VIEWS,
+        test_views=TEST_VIEWS,
+        size=SIZE,
+        spp=SAMPLES,
+        environment_height=64,
+    )
+    say(f"2 of 3: fitting into {output}")
+    started = (output / "config.toml").is_file()
+    trainer = fit(data, output, preset=args.preset, assignments=[] if started else args.set, resume=True)
+    say("3 of 3: evaluating")
+    folder = Run(output)
+    result = read_metrics(folder)
+    if result is None or result.get("iterations") != trainer.iteration or not (output / SHEET).is_file():
+        result = evaluate(folder, progress=True)
+    sheet = output / SHEET
+    text = f"{table(result)}\nlook at the contact sheet: {sheet}\nor open the scene: {output / 'scene.xml'}"
+    return Result(
+        {"contact_sheet": str(sheet), "run": str(output), "data": str(data), "metrics": result}, text
+    )

@@ -1,0 +1,57 @@
+"""`refgs eval`: the quality of a run on its test views."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from mi_refgs.cli.command import Result, add_command
+
+ROWS = (
+    ("psnr", "PSNR", "{:.2f} dB"),
+    ("ssim", "SSIM", "{:.4f}"),
+    ("flip", "FLIP", "{:.4f}"),
+    ("lpips", "LPIPS", "{:.4f}"),
+    ("normal_mae_deg", "normal error, foreground", "{:.2f}°"),
+    ("normal_mae_deg_full", "normal error, whole image", "{:.2f}°"),
+    ("env_psnr", "light, PSNR after scale", "{:.2f} dB"),
+    ("env_correlation", "light, correlation", "{:.3f}"),
+    ("surfels", "surfels", "{}"),
+    ("iterations", "iterations", "{}"),
+    ("train_seconds", "training", "{:.0f} s"),
+    ("ms_per_frame", "frame", "{:.1f} ms"),
+)
+"""Key of metrics.json, name and format of what people read."""
+REASONS = {"flip": "flip", "lpips": "lpips", "normal_mae_deg": "normal", "env_psnr": "env"}
+"""Which `…_reason` explains a missing number."""
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    summary = "measure a run on the test views: metrics.json, renders, a contact sheet"
+    parser = add_command(commands, "eval", summary, "refgs eval runs/glossy --json", run)
+    parser.add_argument("run_folder", type=Path, metavar="RUN", help="run folder that `refgs train` wrote")
+    parser.add_argument(
+        "--data", type=Path, metavar="DATA", help="another data set than the one it was fitted to"
+    )
+
+
+def run(args: argparse.Namespace) -> Result:
+    """Evaluate."""
+    from mi_refgs.fit.evaluate import SHEET, evaluate
+    from mi_refgs.fit.record import Run
+
+    result = evaluate(Run(args.run_folder), args.data, progress=True)
+    return Result(result, f"{table(result)}\ncontact sheet: {args.run_folder / SHEET}")
+
+
+def table(result: dict[str, Any]) -> str:
+    """The numbers of metrics.json for people."""
+    lines = []
+    for key, name, form in ROWS:
+        if result[key] is not None:
+            lines.append(f"{name:<27}{form.format(result[key])}")
+        elif key in REASONS:
+            lines.append(f"{name:<27}none: {result[f'{REASONS[key]}_reason']}")
+    return "\n".join(lines)

@@ -1,0 +1,261 @@
+"""`refgs train`: fits surfels, materials and light to a data set."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mi_refgs.cli.command import Result, add_command, add_output, say, warn
+from mi_refgs.errors import InputError
+from mi_refgs.resources import resource_dir
+
+if TYPE_CHECKING:
+    from mi_refgs.fit.config import Method
+    from mi_refgs.fit.record import Run
+    from mi_refgs.fit.train import Trainer
+
+DEFAULT_METHOD = "ref_gaussian.toml"
+"""File of `variants/` that is fitted when none is named: the full method."""
+DEFAULT_PRESET = "standard"
+PSNR_MEMORY = 0.9
+"""Share of the old value in the running PSNR of the bar: one view's is up to 5 dB off the mean."""
+FEW_VIEWS = 20
+"""Training views below which surfels overfit; published scenes have 100 and more."""
+LARGE_PICTURE = 640 * 640
+"""Pixels from which a step takes more than half a second on two cores."""
+TERMINAL_INTERVAL, LOG_INTERVAL = 0.5, 30.0
+"""Seconds between refreshes of the progress bar, in a terminal and in a file."""
+
+EXAMPLE = "refgs train data/glossy -o runs/glossy --preset quick --set loss.alpha=0.1"
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    summary = "fit surfels with materials and a light to pictures"
+    parser = add_command(commands, "train", summary, EXAMPLE, run)
+    parser.add_argument(
+        "data", type=Path, metavar="DATA", help="data set: a folder with transforms_train.json"
+    )
+    add_output(parser, "run folder", "RUN")
+    parser.add_argument("--variant", metavar="V", help="method: a name or a .toml (default: the full method)")
+    parser.add_argument(
+        "--preset", metavar="P", help=f"quick, standard or paper: how long (default {DEFAULT_PRESET})"
+    )
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="key=value",
+        help="change the method, as in loss.ssim=0.1",
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from the newest checkpoint, if there is one"
+    )
+
+
+def run(args: argparse.Namespace) -> Result:
+    """Fit, from the start or from the newest checkpoint."""
+    trainer = fit(args.data, args.output, args.variant, args.preset, args.set, args.resume)
+    last = trainer.statistics() if trainer.loss is not None else {}
+    data = {
+        "run": str(args.output),
+        "variant": trainer.method.variant,
+        "preset": trainer.method.preset,
+        "iterations": trainer.iteration,
+        "seconds": round(trainer.seconds, 3),
+        "surfels": trainer.surfels.count,
+        "loss": last.get("loss"),
+    }
+    text = (
+        f"{args.output}: {trainer.iteration} iterations in {trainer.seconds:.0f} s, "
+        f"{trainer.surfels.count} surfels; next: refgs eval {args.output}"
+    )
+    return Result(data, text)
+
+
+def fit(
+    data_path: Path,
+    output: Path,
+    variant: str | None = None,
+    preset: str | None = None,
+    assignments: list[str] | None = None,
+    resume: bool = False,
+) -> Trainer:
+    """Train with a progress bar and previews, then write the artefacts; a finished run is only loaded.
+
+    Raises InputError for bad input, and KeyboardInterrupt with a message that says how to go on.
+    """
+    from mi_refgs.fit import config, data
+    from mi_refgs.fit.evaluate import load_split, up_to_date
+    from mi_refgs.fit.record import Run
+    from mi_refgs.fit.train import Trainer
+
+    folder = Run(output)
+    resumed = resume and (output / "config.toml").is_file()
+    if resumed:
+        method = folder.method()
+        _require_same(folder, method, data_path, variant, preset, assignments)
+    else:
+        if (output / "config.toml").exists():
+            raise InputError(
+                f"{output}: holds a run already; add --resume to go on with it, or choose another -o"
+            )
+        method = config.load(
+            variant or str(resource_dir("variants") / DEFAULT_METHOD), preset or DEFAULT_PRESET, assignments
+        )
+    options = method.data
+    views = data.load(
+        data_path,
+        "train",
+        downscale=options.downscale,
+        background=options.background,
+        images=options.images,
+        truth=False,
+    )
+    warn_of_data(method, views)
+    trainer = Trainer(method, views, folder)
+    if resumed:
+        say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
+        folder.truncate_log(trainer.iteration)
+    else:
+        folder.create(method, str(data_path.resolve()))
+
+    try:
+        with Progress(trainer, folder) as progress:
+            trainer.train(progress)
+    except KeyboardInterrupt:
+        kept = "" if folder.checkpoints() else " (before the first iteration was done)"
+        raise KeyboardInterrupt(
+            f"interrupted at iteration {trainer.iteration}{kept}; "
+            f"resume with: refgs train {data_path} -o {output} --resume"
+        ) from None
+    if not any(path.stem == f"{trainer.iteration:07d}" for path in folder.checkpoints()):
+        folder.save_checkpoint(trainer.iteration, trainer.state())
+    try:
+        first = load_split(folder, method, "test", data_path).views[0]
+    except InputError as error:
+        warn(f"{error} (scene.xml gets a training camera, and `refgs eval` will need test views)")
+        first = views.views[0]
+    up_to_date(folder, method, first.camera())
+    warn_of_outcome(trainer)
+    return trainer
+
+
+class Progress:
+    """The progress bar on standard error, and the previews; called by the trainer after each step."""
+
+    def __init__(self, trainer: Trainer, folder: Run) -> None:
+        from tqdm import tqdm
+
+        self.folder = folder
+        self.psnr: float | None = None
+        self.warned = False
+        self.bar = tqdm(
+            total=trainer.method.iterations,
+            initial=trainer.iteration,
+            desc=trainer.method.variant,
+            unit="it",
+            file=sys.stderr,
+            dynamic_ncols=True,
+            smoothing=0.05,  # a short memory: the first steps compile kernels
+            mininterval=TERMINAL_INTERVAL if sys.stderr.isatty() else LOG_INTERVAL,
+        )
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.close()
+
+    def __call__(self, trainer: Trainer) -> None:
+        method = trainer.method
+        if trainer.iteration % method.log_every == 0:
+            # The numbers wait for the device, as the log of this iteration did already.
+            numbers = trainer.statistics()
+            new = float(numbers["psnr"])
+            self.psnr = new if self.psnr is None else PSNR_MEMORY * self.psnr + (1 - PSNR_MEMORY) * new
+            self.bar.set_postfix_str(
+                f"loss {numbers['loss']:.4f}, PSNR {self.psnr:.1f} dB, {numbers['surfels']} surfels",
+                refresh=False,
+            )
+            if numbers["non_finite_gradients"] and not self.warned:
+                self.warned = True
+                warn(f"{numbers['non_finite_gradients']} gradients were NaN or infinite and counted as 0")
+        if trainer.iteration % method.preview_every == 0:
+            self._preview(trainer)
+        self.bar.update()
+
+    def _preview(self, trainer: Trainer) -> None:
+        """The first training view and the light, as previews/<iteration>.png."""
+        import numpy as np
+
+        from mi_refgs.fit import pictures
+        from mi_refgs.fit.images import write_png
+
+        view = trainer.data.views[0]
+        shot = pictures.Shot.of(trainer.view(trainer.targets[0].camera), trainer.data)
+        light = None
+        if trainer.light is not None:
+            radiance = trainer.light.radiance()
+            light = pictures.lights(np.array(radiance, dtype=np.float32).reshape(radiance.shape))
+        image = pictures.sheet([pictures.panels(shot, view)], light)
+        write_png(self.folder.path / "previews" / f"{trainer.iteration:07d}.png", image)
+
+
+def _require_same(
+    folder: Run,
+    method: Method,
+    data_path: Path,
+    variant: str | None,
+    preset: str | None,
+    assignments: list[str] | None,
+) -> None:
+    """Raise InputError if a run that is resumed was started with something else."""
+    if assignments:
+        raise InputError(
+            f"--set: {assignments[0]}: a resumed run keeps its method; drop --set or choose another -o"
+        )
+    for option, wanted, found in (
+        ("--variant", variant and Path(variant).stem, method.variant),
+        ("--preset", preset, method.preset),
+    ):
+        if wanted and wanted != found:
+            raise InputError(
+                f"{folder.path / 'config.toml'}: {option}: the run was started with '{found}', "
+                f"not '{wanted}'; drop {option} or choose another -o"
+            )
+    try:
+        before = folder.dataset()
+    except (OSError, ValueError, KeyError, TypeError):
+        before = data_path.resolve()
+    if before.resolve() != data_path.resolve():
+        warn(f"{folder.path}: was fitted to {before} before, now to {data_path}")
+
+
+def warn_of_data(method: Method, views: Any) -> None:
+    """Say what is unusual about a data set."""
+    count, first = len(views.views), views.views[0]
+    if count < FEW_VIEWS:
+        warn(f"{views.path}: only {count} training views; expect surfaces that fit no others")
+    if any(view.alpha is None for view in views.views):
+        warn(
+            f"{views.path}: pictures without alpha: surfels start at random, "
+            "and the background becomes surfels too"
+        )
+    if first.width * first.height > LARGE_PICTURE:
+        warn(
+            f"{views.path}: {first.width} × {first.height} pixels make slow steps; "
+            "consider --set data.downscale=2"
+        )
+
+
+def warn_of_outcome(trainer: Trainer) -> None:
+    """Say what is unusual about a finished fit."""
+    options, count = trainer.method.surfels, trainer.surfels.count
+    if trainer.method.refine.densify is not None and count >= options.max_count:
+        warn(f"all {count} surfels in use; more may help: --set surfels.max_count={2 * options.max_count}")
+    if count < options.count // 10:
+        warn(f"{count} of {options.count} surfels are left; look at the previews")

@@ -1,0 +1,218 @@
+"""The quality of a run on the test views of its data set: metrics.json and pictures."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.fit import metrics, pictures
+from mi_refgs.fit.config import Method
+from mi_refgs.fit.data import Dataset, load
+from mi_refgs.fit.export import Fitted, export, newest
+from mi_refgs.fit.images import read_exr_image, write_png
+from mi_refgs.fit.record import Run
+from mi_refgs.fit.train import displayed
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.splat import Camera
+
+FOLDER = "eval"
+SHEET = "contact_sheet.png"
+METRICS = "metrics.json"
+SHEET_VIEWS = 4
+"""Rows of the contact sheet, spread evenly over the test views."""
+WARM_UP_FRAMES = 2
+"""Frames before the timing: the first compiles or loads the kernels, the second fills the memory pools."""
+TIMED_FRAMES = 20
+"""Frames whose median is reported; the views repeat if there are fewer."""
+NORMAL_KEYS = ("normal_mae_deg", "normal_mae_deg_full")
+LIGHT_KEYS = ("env_scale", "env_mae", "env_psnr", "env_correlation")
+
+
+def load_split(run: Run, method: Method, split: str, path: Path | None = None) -> Dataset:
+    """A split of the data set that a run was fitted to, or of the one at `path`, read as the method says.
+
+    Raises InputError as `fit.data.load` does, and if the run does not say where its data is or it is gone.
+    """
+    if path is None:
+        try:
+            path = run.dataset()
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                f"{run.path / 'dataset.json'}: path: cannot be read ({error}); name the data with --data"
+            ) from error
+        if not path.is_dir():
+            raise InputError(
+                f"{run.path / 'dataset.json'}: path: {path} is gone; name the data set's folder with --data"
+            )
+    options = method.data
+    return load(
+        path, split, downscale=options.downscale, background=options.background, images=options.images
+    )
+
+
+def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict[str, Any]:
+    """Render the test views, measure them, and write metrics.json, renders and a contact sheet into the run.
+
+    Evaluates the artefacts as they lie in the folder, after writing what a newer checkpoint makes stale.
+    Every key is always there: null, with a `…_reason`, where it does not apply. Normals count where the true
+    alpha is above ½ and there is a true normal. `ms_per_frame` is the median over single synchronised frames,
+    light filtered beforehand.
+
+    Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, and for data
+    that is gone.
+    """
+    from tqdm import tqdm
+
+    method = run.method()
+    views = load_split(run, method, "test", data)
+    fitted = up_to_date(run, method, views.views[0].camera())
+    view = fitted.renderer()
+    folder = run.path / FOLDER
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: output: cannot be created ({error.strerror}); make the run folder writable"
+        ) from error
+
+    shown = set(np.linspace(0, len(views.views) - 1, SHEET_VIEWS).round().astype(int).tolist())
+    rows: list[dict[str, np.ndarray]] = []
+    per_view: list[dict[str, Any]] = []
+    for index, truth in enumerate(
+        tqdm(views.views, desc="eval", unit="view", file=sys.stderr, disable=not progress)
+    ):
+        shot = pictures.Shot.of(view(truth.camera()), views)
+        goal = pictures.target(truth)
+        scores: dict[str, Any] = {
+            "name": truth.name,
+            "psnr": metrics.psnr(shot.image, goal),
+            "ssim": metrics.ssim(shot.image, goal),
+        }
+        for name, measure in (("flip", metrics.flip), ("lpips", metrics.lpips)):
+            previous = per_view[0] if per_view else {}
+            if previous.get(f"{name}_reason"):  # what is not installed for one picture is not for the next
+                scores[name], scores[f"{name}_reason"] = None, previous[f"{name}_reason"]
+            else:
+                scores[name], scores[f"{name}_reason"] = measure(shot.image, goal)
+        if truth.normal is not None:
+            covered = np.linalg.norm(truth.normal, axis=-1) if truth.alpha is None else truth.alpha
+            scores |= metrics.normal_mae_deg(shot.normal, truth.normal, covered)
+        per_view.append(scores)
+        write_png(folder / f"{re.sub(r'[^0-9A-Za-z]+', '_', truth.name).strip('_')}.png", shot.image)
+        if index in shown:
+            rows.append(pictures.panels(shot, truth))
+
+    result: dict[str, Any] = {
+        name: _mean(per_view, name) for name in ("psnr", "ssim", "flip", "lpips", *NORMAL_KEYS)
+    }
+    for name in ("flip", "lpips"):
+        result[f"{name}_reason"] = per_view[0][f"{name}_reason"] or None
+    result["normal_reason"] = (
+        None if result["normal_mae_deg"] is not None else "the data set has no true normals"
+    )
+    light, light_panels = _light(fitted, views)
+    result |= light
+    result |= {
+        "train_seconds": fitted.seconds,
+        "iterations": fitted.iteration,
+        "surfels": fitted.surfels.count,
+        "ms_per_frame": _milliseconds(view, [v.camera() for v in views.views], views),
+        "variant": method.variant,
+        "preset": method.preset,
+        "dataset": str(views.path),
+        "test_views": len(per_view),
+        "image_size": [views.views[0].width, views.views[0].height],
+        "machine": machine(),
+        "views": [
+            {key: value for key, value in scores.items() if not key.endswith("_reason")}
+            for scores in per_view
+        ],
+    }
+    write_png(run.path / SHEET, pictures.sheet(rows, light_panels))
+    run.write_json(METRICS, result)
+    return result
+
+
+def up_to_date(run: Run, method: Method, camera: Camera) -> Fitted:
+    """The artefacts of a run, written first if there are none or the newest checkpoint is newer.
+
+    Raises InputError if there is nothing to write them from.
+    """
+    fresh = newest(run, method)
+    if fresh is not None:
+        export(fresh, run.path, camera)
+    elif not (run.path / "model.json").is_file():
+        raise InputError(
+            f"{run.path}: checkpoints: none yet; train it with `refgs train DATA -o {run.path} --resume`"
+        )
+    return Fitted.read(run.path)
+
+
+def machine() -> dict[str, Any]:
+    """What the numbers were measured on."""
+    try:
+        found = re.search(
+            r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE
+        )
+    except OSError:
+        found = None
+    return {
+        "cpu": found.group(1) if found else platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": int(dr.thread_count()),
+        "system": f"{platform.system()} {platform.machine()}",
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "mitsuba_variant": mi.variant(),
+    }
+
+
+def _light(fitted: Fitted, data: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
+    """The env_ keys, and the pictures of the light."""
+    nothing: dict[str, Any] = dict.fromkeys(LIGHT_KEYS)
+    if fitted.light is None:
+        return nothing | {"env_reason": "the method has no light"}, None
+    tensor = fitted.light.radiance()
+    light = np.array(tensor, dtype=np.float32).reshape(tensor.shape)
+    if data.environment is None:
+        return nothing | {"env_reason": "the data set has no environment.exr"}, pictures.lights(light)
+    truth = read_exr_image(data.environment)[..., :3]
+    return metrics.environment(light, truth) | {"env_reason": None}, pictures.lights(light, truth)
+
+
+def _milliseconds(view: Callable[[Camera], Frame], cameras: list[Camera], data: Dataset) -> float:
+    """Median time of a frame up to the displayed image, each waited for."""
+    seconds = []
+    for i in range(WARM_UP_FRAMES + TIMED_FRAMES):
+        dr.sync_thread()
+        begin = time.perf_counter()
+        dr.eval(displayed(view(cameras[i % len(cameras)]), data.background, data.linear))
+        dr.sync_thread()
+        seconds.append(time.perf_counter() - begin)
+    return 1000 * float(np.median(seconds[WARM_UP_FRAMES:]))
+
+
+def _mean(per_view: list[dict[str, Any]], name: str) -> float | None:
+    values = [scores[name] for scores in per_view if scores.get(name) is not None]
+    return float(np.mean(values)) if values else None
+
+
+def read_metrics(run: Run) -> dict[str, Any] | None:
+    """The metrics.json of a run, or None if it has none that can be read."""
+    try:
+        content = json.loads((run.path / METRICS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None

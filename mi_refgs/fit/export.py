@@ -1,0 +1,160 @@
+"""The artefacts of a run, which need nothing of ours to be read.
+
+    surfels.ply   raw channels, with 2DGS's property names
+    envmap.exr    lat-long radiance, Mitsuba's orientation
+    mesh.ply      the occluder
+    scene.xml     what `mi.load_file` renders
+    model.json    the iteration and the seconds that they stand for, and how they are shaded
+
+What a method does not have (a light, a mesh) has no file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.fit.config import Method
+from mi_refgs.fit.record import Run
+from mi_refgs.fit.train import LIGHT
+from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.render.pipeline import Frame, Shading, render
+from mi_refgs.render.scene_xml import write_scene_xml
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.ply import read_ply, write_ply
+from mi_refgs.surfels.table import Surfels
+
+SURFELS, LIGHT_MAP, MESH, SCENE, MODEL = "surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "model.json"
+PARAMS = "params/"
+"""Prefix of the surfels' channels and of the light in a checkpoint."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What a fit has found: enough to render, and nothing that only training needs."""
+
+    surfels: Surfels
+    light: EnvironmentLight | None
+    mesh: Mesh | None
+    shading: Shading
+    iteration: int
+    seconds: float  # spent training
+
+    @staticmethod
+    def from_state(method: Method, state: Mapping[str, np.ndarray]) -> Fitted:
+        """From the state of a `Trainer`, as a checkpoint holds it."""
+        params = {
+            key.removeprefix(PARAMS): mi.TensorXf(value)
+            for key, value in state.items()
+            if key.startswith(PARAMS)
+        }
+        light = params.pop(LIGHT, None)
+        mesh = None
+        if len(state.get("mesh/faces", ())):
+            mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
+        iteration = int(state["iteration"])
+        _, stage = method.stage_at(max(iteration, 1))
+        occlusion = mesh is not None and stage.at == "pixel" and stage.reflectance == "split_sum"
+        shading = Shading(stage.at, stage.reflectance, stage.diffuse, occlusion)
+        return Fitted(
+            Surfels(params),
+            None if light is None else EnvironmentLight(light),
+            mesh,
+            shading,
+            iteration,
+            float(state["seconds"]),
+        )
+
+    @staticmethod
+    def read(folder: Path) -> Fitted:
+        """From the artefacts in a run folder; raises InputError for a file that cannot be used."""
+        note = folder / MODEL
+        try:
+            content = json.loads(note.read_text(encoding="utf-8"))
+            shading = Shading(**content["shading"])
+            iteration, seconds = int(content["iteration"]), float(content["seconds"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                f"{note}: cannot be read ({error}); write it again with `refgs export {folder}`"
+            ) from error
+        light, mesh = folder / LIGHT_MAP, folder / MESH
+        fitted = Fitted(
+            read_ply(folder / SURFELS),
+            EnvironmentLight.from_file(light) if light.is_file() else None,
+            read_mesh(mesh) if shading.occlusion else None,
+            shading,
+            iteration,
+            seconds,
+        )
+        if shading.reflectance == "split_sum" and fitted.light is None:
+            raise InputError(f"{light}: light: missing; write it again with `refgs export {folder}`")
+        return fitted
+
+    def renderer(self) -> Callable[[Camera], Frame]:
+        """A function that renders views without derivatives; light and mesh are prepared once."""
+        with dr.suspend_grad():
+            light = None if self.light is None else self.light.prefilter()
+        occluder = Occluder(self.mesh)
+
+        def view(camera: Camera) -> Frame:
+            with dr.suspend_grad():
+                return render(self.surfels, camera, self.shading, light, occluder, material_maps=True)
+
+        return view
+
+
+def export(fitted: Fitted, folder: Path, camera: Camera) -> list[Path]:
+    """Write the artefacts into `folder`, each whole or not at all; returns their paths.
+
+    `camera` becomes the sensor of scene.xml. Raises InputError if a file cannot be written or a value is not
+    finite.
+    """
+    light = LIGHT_MAP if fitted.light is not None else None
+    mesh = MESH if fitted.mesh is not None else None
+    for stale in {LIGHT_MAP, MESH} - {light, mesh}:
+        (folder / stale).unlink(missing_ok=True)
+    write_ply(folder / SURFELS, fitted.surfels)
+    if fitted.light is not None:
+        fitted.light.write(folder / LIGHT_MAP)
+    if fitted.mesh is not None:
+        write_mesh(folder / MESH, fitted.mesh)
+    # Transparent: pictures with alpha are composited after the sRGB encoding, which no scene can say.
+    write_scene_xml(
+        folder / SCENE,
+        ply=SURFELS,
+        envmap=light,
+        mesh=mesh,
+        shading=fitted.shading,
+        camera=camera,
+        background=None,
+    )
+    # Last, since it vouches for the others.
+    note: dict[str, Any] = {
+        "iteration": fitted.iteration,
+        "seconds": fitted.seconds,
+        "surfels": fitted.surfels.count,
+    }
+    Run(folder).write_json(MODEL, note | {"shading": dataclasses.asdict(fitted.shading)})
+    return [folder / name for name in (SURFELS, light, mesh, SCENE, MODEL) if name is not None]
+
+
+def newest(run: Run, method: Method) -> Fitted | None:
+    """What the newest checkpoint holds, if there is one that the artefacts do not already show."""
+    shown = -1
+    if all((run.path / name).is_file() for name in (SURFELS, MODEL)):
+        shown = Fitted.read(run.path).iteration
+    state = run.load_checkpoint()
+    if state is None or int(state["iteration"]) <= shown:
+        return None
+    return Fitted.from_state(method, state)

@@ -1,0 +1,107 @@
+"""Mitsuba's environment emitters as the lights that `mi_refgs.shade` knows.
+
+No Mitsuba class is defined here, so that this module need not be reloaded when the variant changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.shade.envmap import MIN_HEIGHT, EnvironmentLight, PrefilteredLight
+from mi_refgs.shade.lobe import resample
+from mi_refgs.shade.prefilter import prefilter
+
+MAX_HEIGHT = 128
+"""Rows above which an emitter's map is averaged down: the finest level that the prefilter has."""
+
+
+@dataclass(frozen=True)
+class TurnedLight:
+    """A prefiltered light seen through a rotation; the same lookups as `PrefilteredLight`."""
+
+    light: Any
+    light_from_world: Any  # mi.Matrix3f, detached
+
+    def specular(self, direction: Any, roughness: Any) -> Any:
+        return self.light.specular(self.light_from_world @ mi.Vector3f(direction), roughness)
+
+    def irradiance(self, normal: Any) -> Any:
+        return self.light.irradiance(self.light_from_world @ mi.Vector3f(normal))
+
+    def mirror(self, direction: Any) -> Any:
+        return self.light.mirror(self.light_from_world @ mi.Vector3f(direction))
+
+
+def own_light(emitter: Any) -> tuple[Any, Any]:
+    """A trainable copy of an `envmap` or `constant` emitter, and its rotation (mi.Matrix3f light from world, or None).
+
+    Raises InputError for any other emitter.
+    """
+    params = mi.traverse(emitter)
+    if "data" in params:
+        radiance, _ = _map_radiance(params, emitter)
+        return EnvironmentLight.from_radiance(radiance.numpy()), _rotation(params)
+    return EnvironmentLight.constant(np.array(_constant_radiance(params, emitter)).ravel()), None
+
+
+def emitter_light(emitter: Any) -> Any:
+    """The prefiltered light of an emitter that is not ours to change: gradients flow to its `data`, `scale` or `radiance.value`.
+
+    A map that must be resampled (see `_map_radiance`) can receive none: asking for it raises InputError, as does any
+    emitter but `envmap` and `constant`.
+    """
+    params = mi.traverse(emitter)
+    if "data" not in params:
+        shape = (MIN_HEIGHT, 2 * MIN_HEIGHT, 3)
+        colour = _constant_radiance(params, emitter) + dr.zeros(mi.Float, shape[0] * shape[1])
+        return PrefilteredLight(*prefilter(mi.TensorXf(dr.ravel(colour), shape)))
+    radiance, resampled = _map_radiance(params, emitter)
+    if resampled and dr.grad_enabled(params["data"]):
+        raise InputError(
+            f"emitter '{emitter.id()}': data: a map of {resampled} cannot be differentiated; use one of h x 2h, h ≤ "
+            f"{MAX_HEIGHT} and a multiple of 4"
+        )
+    light, rotation = PrefilteredLight(*prefilter(radiance)), _rotation(params)
+    return light if rotation is None else TurnedLight(light, rotation)
+
+
+def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
+    """Radiance (h, 2h, 3) of an `envmap`, times its scale; and, where that took resampling, its own size in words."""
+    data = params["data"]
+    rows, columns, channels = (int(x) for x in data.shape)
+    width = columns - 2  # Mitsuba keeps one more column on each side, for its interpolation
+    texel = dr.arange(mi.UInt32, rows * width * 3)
+    source = ((texel // (3 * width)) * columns + (texel // 3) % width + 1) * channels + texel % 3
+    scale = mi.Float(params["scale"])
+    radiance = mi.TensorXf(dr.gather(mi.Float, data.array, source) * scale, (rows, width, 3))
+    if width == 2 * rows and rows % 4 == 0 and MIN_HEIGHT <= rows <= MAX_HEIGHT:
+        return radiance, ""
+    height = min(MAX_HEIGHT, max(MIN_HEIGHT, 4 * (width // 8)))
+    values = resample(radiance.numpy(), height).astype(np.float32)
+    return mi.TensorXf(values), f"{rows} x {width}"
+
+
+def _constant_radiance(params: Any, emitter: Any) -> Any:
+    if emitter.class_name() != "ConstantBackgroundEmitter" or "radiance.value" not in params:
+        raise InputError(
+            f"emitter '{emitter.id()}': type: refgs takes an `envmap` or a `constant` environment, not a "
+            f"{emitter.class_name()}; use one of these"
+        )
+    return mi.Color3f(params["radiance.value"])
+
+
+def _rotation(params: Any) -> Any:
+    """World to light rotation, None where it is the identity. Raises InputError if `to_world` is not a rotation."""
+    matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+    if np.abs(matrix - np.eye(3)).max() < 1e-7:
+        return None
+    matrix /= np.cbrt(np.linalg.det(matrix))
+    if not np.abs(matrix.T @ matrix - np.eye(3)).max() < 1e-4:
+        raise InputError("emitter: to_world: must be a rotation; remove scale and shear")
+    return mi.Matrix3f(np.ascontiguousarray(matrix.T, dtype=np.float32))

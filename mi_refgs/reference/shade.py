@@ -1,0 +1,154 @@
+"""Shading in NumPy float64, point by point and by brute force: the specification that `mi_refgs.shade` is tested against.
+
+It shares no code with it: other formulas for the spherical harmonics, plain quadrature for the split sum and for the
+lobe, plain lookups. Directions are (3,) arrays, colours too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def split_sum(n_dot_v: float, roughness: float, nodes: int = 1500) -> tuple[float, float]:
+    """(A, B) of one pair by midpoints over the half vectors: GGX α = roughness², correlated Smith, Schlick."""
+    α2 = roughness**4
+    ξ = 1 - ((np.arange(nodes) + 0.5) / nodes)[:, None] ** 2
+    weight = 2 * np.sqrt(1 - ξ) / nodes
+    tan2 = α2 * ξ / (1 - ξ)
+    n_h = 1 / np.sqrt(1 + tan2)
+    φ = (np.arange(nodes // 4) + 0.5) * (math.pi / (nodes // 4))
+    v_h = n_dot_v * n_h + math.sqrt(1 - n_dot_v**2) * np.sqrt(1 - n_h**2) * np.cos(φ)
+    n_l = 2 * v_h * n_h - n_dot_v
+    lit = n_l > 0
+    n_l = np.where(lit, n_l, 1)
+
+    def lam(c: float | np.ndarray) -> np.ndarray:
+        return (np.sqrt(1 + α2 * (1 / np.square(c) - 1)) - 1) / 2
+
+    value = np.where(lit, weight / (1 + lam(n_dot_v) + lam(n_l)) * v_h / (n_h * n_dot_v), 0) / len(φ)
+    schlick = (1 - v_h) ** 5
+    return float((value * (1 - schlick)).sum()), float((value * schlick).sum())
+
+
+def sh_basis(direction: np.ndarray, degree: int) -> np.ndarray:
+    """Real spherical harmonics with the Condon-Shortley phase, by Legendre recursion in the polar angle from +z."""
+    x, y, z = (float(c) for c in direction)
+    r = math.hypot(x, y)
+    φ = math.atan2(y, x)
+    p = {(0, 0): 1.0}
+    for m in range(1, degree + 1):
+        p[m, m] = -(2 * m - 1) * r * p[m - 1, m - 1]
+    for m in range(degree):
+        p[m + 1, m] = (2 * m + 1) * z * p[m, m]
+        for n in range(m + 2, degree + 1):
+            p[n, m] = ((2 * n - 1) * z * p[n - 1, m] - (n + m - 1) * p[n - 2, m]) / (n - m)
+    out = []
+    for n in range(degree + 1):
+        for m in range(-n, n + 1):
+            k = abs(m)
+            norm = math.sqrt((2 * n + 1) / (4 * math.pi) * math.factorial(n - k) / math.factorial(n + k))
+            turn = 1.0 if m == 0 else math.sqrt(2) * (math.cos(k * φ) if m > 0 else math.sin(k * φ))
+            out.append(norm * turn * p[n, k])
+    return np.array(out)
+
+
+def bilinear(radiance: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Lat-long (h, w, 3) looked up as Mitsuba's `envmap` does: column centres at half-integers, pole rows on the poles."""
+    h, w = radiance.shape[:2]
+    x, y, z = direction
+    u = (math.atan2(x, -z) / (2 * math.pi)) % 1.0 * w - 0.5
+    v = math.acos(max(-1.0, min(1.0, y))) / math.pi * (h - 1)
+    j, i = math.floor(u), min(math.floor(v), h - 2)
+    s, t = u - j, v - i
+    upper = (1 - s) * radiance[i, j % w] + s * radiance[i, (j + 1) % w]
+    lower = (1 - s) * radiance[i + 1, j % w] + s * radiance[i + 1, (j + 1) % w]
+    return (1 - t) * upper + t * lower
+
+
+def lobe_average(radiance: np.ndarray, direction: np.ndarray, roughness: float, *, rings: int = 400, spokes: int = 600) -> np.ndarray:
+    """∫ L W / ∫ W with W = max(L·R, 0) D(R·H), in polar coordinates around R, rings drawn from D."""
+    α2 = roughness**4
+    pole = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    helper = np.eye(3)[np.argmin(np.abs(pole))]
+    side = np.cross(pole, helper) / np.linalg.norm(np.cross(pole, helper))
+    up = np.cross(pole, side)
+    h, w = radiance.shape[:2]
+    total, weights = np.zeros(3), 0.0
+    φ = (np.arange(spokes) + 0.5) * (2 * math.pi / spokes)
+    around = np.cos(φ)[:, None] * side + np.sin(φ)[:, None] * up
+    for n in range(rings):
+        # tan θ_h = α √(ξ / (1 - ξ)) up to θ_h = 45°, where L stands on the horizon; ξ = 1 - s² resolves the tail.
+        s_max = math.sqrt(α2 / (1 + α2))
+        s = s_max + (1 - s_max) * (n + 0.5) / rings
+        half = math.atan(math.sqrt(α2 * (1 - s * s)) / s)
+        cosine = math.cos(2 * half)
+        # dω_l = 4 cosθ_h dω_h and D cosθ_h dω_h = dξ dφ / 2π
+        weight = cosine * s
+        directions = cosine * pole + math.sin(2 * half) * around
+        total += weight * _bilinear_many(radiance, directions).mean(0)
+        weights += weight
+    return total / weights
+
+
+def _bilinear_many(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    h, w = radiance.shape[:2]
+    u = np.mod(np.arctan2(directions[:, 0], -directions[:, 2]) / (2 * np.pi), 1.0) * w - 0.5
+    v = np.arccos(np.clip(directions[:, 1], -1, 1)) / np.pi * (h - 1)
+    j = np.floor(u).astype(int)
+    i = np.minimum(np.floor(v).astype(int), h - 2)
+    s, t = (u - j)[:, None], (v - i)[:, None]
+    return (1 - t) * ((1 - s) * radiance[i, j % w] + s * radiance[i, (j + 1) % w]) + t * (
+        (1 - s) * radiance[i + 1, j % w] + s * radiance[i + 1, (j + 1) % w]
+    )
+
+
+def specular(levels: Sequence[np.ndarray], roughnesses: Sequence[float], direction: np.ndarray, roughness: float) -> np.ndarray:
+    """Lookup between levels (the map first, then one a roughness): linear in 1/r, in r⁴ below the first roughness."""
+    if roughness <= roughnesses[0]:
+        lower, t = 0, (roughness / roughnesses[0]) ** 4
+    else:
+        lower = max(n for n, r in enumerate(roughnesses[:-1]) if roughness > r) + 1
+        a, b = roughnesses[lower - 1], roughnesses[lower]
+        t = (1 / roughness - 1 / a) / (1 / b - 1 / a)
+    return (1 - t) * bilinear(levels[lower], direction) + t * bilinear(levels[lower + 1], direction)
+
+
+def table_lookup(table: np.ndarray, n_dot_v: float, roughness: float) -> np.ndarray:
+    """Bilinear (A, B) in a table [roughness, N·V], texel centres, outer half texels extrapolated."""
+    n = table.shape[0]
+    x, y = min(max(n_dot_v, 0.0), 1.0) * n - 0.5, min(max(roughness, 0.0), 1.0) * n - 0.5
+    j, i = (min(max(math.floor(c), 0), n - 2) for c in (x, y))
+    s, t = x - j, y - i
+    return (1 - t) * ((1 - s) * table[i, j] + s * table[i, j + 1]) + t * ((1 - s) * table[i + 1, j] + s * table[i + 1, j + 1])
+
+
+def shade(
+    table: np.ndarray,
+    levels: Sequence[np.ndarray],
+    roughnesses: Sequence[float],
+    *,
+    normal: np.ndarray,
+    view: np.ndarray,
+    albedo: np.ndarray,
+    metallic: float,
+    roughness: float,
+    radiance: np.ndarray,
+    visibility: float | None,
+    indirect: np.ndarray | None,
+    diffuse: str,
+) -> np.ndarray:
+    """Terms (3, 3) of one point: diffuse, specular, indirect."""
+    n, v = normal / np.linalg.norm(normal), view / np.linalg.norm(view)
+    a, b = table_lookup(table, float(n @ v), roughness)
+    reflectance = (0.04 * (1 - metallic) + albedo * metallic) * a + b
+    light = specular(levels, roughnesses, 2 * (n @ v) * n - v, roughness)
+    visible = 1.0 if visibility is None else visibility
+    out = np.zeros((3, 3))
+    out[0] = (1 - metallic) * (radiance if diffuse == "sh" else albedo * bilinear(levels[-1], n))
+    out[1] = visible * light * reflectance
+    if visibility is not None and indirect is not None:
+        out[2] = (1 - visible) * indirect * reflectance
+    return out

@@ -1,0 +1,127 @@
+"""The split-sum table: how much of a constant light a GGX surface reflects, A·F0 + B, against (N·V, roughness).
+
+α = roughness², height-correlated Smith shadowing, Schlick's Fresnel. [Karis 2013, "Real Shading in Unreal Engine 4";
+Heitz 2014, "Understanding the Masking-Shadowing Function", eq. 99]
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+RESOLUTION = 256
+"""Texels along N·V and along roughness, values at texel centres: bilinear lookups are then within 3e-4."""
+
+RADIAL_NODES = 48
+AZIMUTH_NODES = 32
+"""Gauss-Legendre nodes over the half vector's polar angle and midpoints over half its azimuth: error below 4e-4 in the
+column of smallest N·V and 1e-4 elsewhere, 1 s of one core. [measured against 600 × 400 float64 midpoints]"""
+
+HORIZON = 1e-7
+"""Smallest N·L whose 1/(N·L)² still fits float32; below it shadowing leaves nothing."""
+
+CACHE_NAME = "split_sum_256_v1.npy"
+"""Raise the version when a number of the table changes."""
+
+
+def compute_table() -> np.ndarray:
+    """Split-sum table (256, 256, 2) float32: [roughness row, N·V column, (A, B)], by deterministic quadrature."""
+    x, weight = np.polynomial.legendre.leggauss(RADIAL_NODES)
+    # ξ = 1 - s² draws half vectors from D cosθ; the square gathers nodes at grazing half vectors, where the rest varies.
+    s, weight = 0.5 * (1 - x), 0.5 * weight * (1 - x)
+    φ = (np.arange(AZIMUTH_NODES) + 0.5) * (np.pi / AZIMUTH_NODES)
+    centre = (np.arange(RESOLUTION) + 0.5) / RESOLUTION
+    n_v = centre.astype(np.float32)[:, None, None]
+    across = np.sqrt(1 - n_v * n_v) * np.cos(φ).astype(np.float32)
+    tan2_v = 1 / (n_v * n_v) - 1
+    table = np.empty((RESOLUTION, RESOLUTION, 2))
+    for row, roughness in enumerate(centre):
+        α2 = np.float32(roughness**4)
+        n_h = np.sqrt(s * s / (s * s + α2 * (1 - s * s)))
+        sin_h = np.sqrt(1 - s * s) * roughness**2 / np.sqrt(s * s + α2 * (1 - s * s))
+        share = (weight / n_h).astype(np.float32)[:, None]
+        n_h, sin_h = n_h.astype(np.float32)[:, None], sin_h.astype(np.float32)[:, None]
+        v_h = n_v * n_h + across * sin_h
+        n_l = 2 * v_h * n_h - n_v
+        lit = n_l > HORIZON
+        n_l = np.maximum(n_l, np.float32(HORIZON))
+        tan2_l = np.maximum(1 / (n_l * n_l) - 1, 0)
+        smith = 2 / (np.sqrt(1 + α2 * tan2_v) + np.sqrt(1 + α2 * tan2_l))  # 1 / (1 + Λ(V) + Λ(L))
+        reflected = np.where(lit, smith * v_h * share, 0)  # f cosθ_l / (pdf F), times N·V
+        schlick = (1 - v_h) ** 5
+        b = (reflected * schlick).sum((1, 2), dtype=np.float64)
+        table[row, :, 0] = reflected.sum((1, 2), dtype=np.float64) - b
+        table[row, :, 1] = b
+    return (table / (AZIMUTH_NODES * centre[None, :, None])).astype(np.float32)
+
+
+def cache_dir() -> Path:
+    """User cache folder of mi_refgs: $XDG_CACHE_HOME/mi_refgs, else ~/.cache/mi_refgs."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "mi_refgs"
+
+
+@functools.lru_cache(maxsize=1)
+def table() -> np.ndarray:
+    """The table of `compute_table`, from the user's cache folder when it is there, else computed and kept there.
+
+    A cache that cannot be read, or written, or that does not hold such a table, is passed over without a word.
+    """
+    path = None
+    with suppress(OSError, ValueError, RuntimeError, EOFError):
+        path = cache_dir() / CACHE_NAME
+        cached = np.load(path, allow_pickle=False)
+        if cached.shape == (RESOLUTION, RESOLUTION, 2) and cached.dtype == np.float32 and np.isfinite(cached).all():
+            return cached
+    computed = compute_table()
+    with suppress(OSError):
+        if path is not None:
+            _write_atomically(path, computed)
+    return computed
+
+
+def _write_atomically(path: Path, array: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.save(file, array)
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+@functools.lru_cache(maxsize=4)
+def _device_table(variant: str) -> Any:
+    return mi.Float(table().ravel())
+
+
+def split_sum(n_dot_v: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """Scale A and bias B of a GGX surface: its reflectance under constant light is F0·A + B.
+
+    Bilinear in the table, both arguments clamped to [0, 1]. The outer half texels continue the outermost two linearly:
+    clamping there would be off by 0.002 at roughness 1. Differentiable in both arguments; the table is not.
+    """
+    data = _device_table(mi.variant())
+
+    def place(x: Any) -> tuple[Any, Any]:
+        x = dr.clip(x, 0, 1) * RESOLUTION - 0.5
+        first = mi.UInt32(dr.clip(dr.floor(dr.detach(x)), 0, RESOLUTION - 2))
+        return first, x - mi.Float(first)
+
+    column, u = place(n_dot_v)
+    row, v = place(roughness)
+    texel = row * RESOLUTION + column
+    t00, t01, t10, t11 = (dr.gather(mi.Vector2f, data, texel + k) for k in (0, 1, RESOLUTION, RESOLUTION + 1))
+    pair = dr.lerp(dr.lerp(t00, t01, u), dr.lerp(t10, t11, u), v)
+    return pair.x, pair.y

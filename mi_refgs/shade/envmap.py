@@ -1,0 +1,227 @@
+"""The environment light: learnable lat-long radiance, its prefiltered levels, and the lookups that shading needs.
+
+Directions follow Mitsuba's `envmap`: up is +y, φ = atan2(x, -z) runs along a row, θ from +y down the rows; column
+centres at half-integers, the first and the last row at the poles (see `lobe`). Images go in and out unturned.
+Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that an optimiser's step
+bounds the change of radiance; an exponential would let one step multiply a highlight.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.shade import lobe
+from mi_refgs.shade.prefilter import Operator, prefilter
+
+DEFAULT_HEIGHT = 64
+"""Rows of a light that is fitted: 2.8° a texel, about what an image of a few hundred pixels resolves in a mirror."""
+
+MIN_HEIGHT = 8
+"""Fewest rows for which the prefilter's symmetries hold."""
+
+RADIANCE_FLOOR = 1e-4
+"""Darkest radiance that an import keeps: softplus has no finite raw value for 0."""
+
+POLE_SINE = 1e-4
+"""Within 0.006° of a pole the azimuth is taken as that of the pole, so that its derivative stays below 1e4."""
+
+ATANH_TERMS = 7
+"""Terms of the series of log(1 + e) in softplus: relative error below 1e-7 for e ≤ 1."""
+
+
+def softplus(x: Any) -> Any:
+    """log(1 + exp x) to full relative precision for every finite x, with a finite derivative."""
+    e = dr.exp(-dr.abs(x))
+    # log(1 + e) = 2 atanh(e / (2 + e)): 1 + e alone would round away all of a dark texel.
+    s = e / (2 + e)
+    series = dr.zeros(type(x), dr.width(x))
+    for n in reversed(range(ATANH_TERMS)):
+        series = dr.fma(series, s * s, 1 / (2 * n + 1))
+    return dr.maximum(0, x) + 2 * s * series
+
+
+def inverse_softplus(radiance: np.ndarray) -> np.ndarray:
+    """Raw value of a positive radiance, float64."""
+    y = np.asarray(radiance, np.float64)
+    return y + np.log(-np.expm1(-y))
+
+
+@dataclass(frozen=True)
+class PrefilteredLight:
+    """Levels of an environment, as made by `EnvironmentLight.prefilter`; lookups are traced and differentiable."""
+
+    operator: Operator
+    levels: Any  # flat RGBA texels, level after level
+
+    def mirror(self, direction: mi.Vector3f) -> mi.Color3f:
+        """Radiance (bilinear) that arrives from unit world directions; derivative in light and direction."""
+        return self._bilinear(*_azimuth_polar(direction), mi.UInt32(0))
+
+    def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
+        """∫ L cosθ dω / π over the hemisphere of unit world normals: constant light 1 gives 1.
+
+        At roughness 1 the lobe D is constant and only the cosine is left, so this is the last level.
+        """
+        return self._bilinear(*_azimuth_polar(normal), mi.UInt32(len(lobe.LEVEL_ROUGHNESS)))
+
+    def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
+        """Radiance averaged over the GGX lobe around unit world directions; derivative in light, direction, roughness.
+
+        Linear between levels in 1/roughness, where the mixture keeps both the lobe's energy (6 %) and its peak, and in
+        roughness⁴ below the first level, where a lobe narrower than a texel only begins to spread. [split sum, Karis 2013]
+        """
+        place = _level(roughness)
+        lower = mi.UInt32(dr.clip(dr.detach(place), 0, len(lobe.LEVEL_ROUGHNESS) - 1))
+        at = _azimuth_polar(direction)
+        return dr.lerp(self._bilinear(*at, lower), self._bilinear(*at, lower + 1), place - mi.Float(lower))
+
+    def _bilinear(self, u: Any, v: Any, level: Any) -> Any:
+        """Colour at the fractions u of a turn and v of a meridian."""
+        info = self.operator.info
+        first, h, w = (dr.gather(mi.UInt32, info, 4 * level + k) for k in range(3))
+        x, y = dr.fma(u, mi.Float(w), -0.5), v * mi.Float(h - 1)
+        left = mi.Int32(dr.floor(dr.detach(x)))
+        row = dr.minimum(mi.UInt32(dr.detach(y)), h - 2)
+        s, t = x - mi.Float(left), y - mi.Float(row)
+        column = mi.UInt32(dr.select(left < 0, mi.Int32(w) - 1, dr.minimum(left, mi.Int32(w) - 1)))
+        right = dr.select(column + 1 < w, column + 1, 0)
+        above = first + row * w
+
+        def texel(index: Any) -> Any:
+            return dr.gather(mi.Vector4f, self.levels, index)
+
+        upper = dr.lerp(texel(above + column), texel(above + right), s)
+        below = dr.lerp(texel(above + w + column), texel(above + w + right), s)
+        colour = dr.lerp(upper, below, t)
+        return mi.Color3f(colour.x, colour.y, colour.z)
+
+
+def _azimuth_polar(direction: Any) -> tuple[Any, Any]:
+    """Fractions u ∈ [0, 1) of a turn and v ∈ [0, 1] of a meridian of unit directions, finite derivatives at the poles."""
+    x, y, z = direction.x, direction.y, direction.z
+    sin2 = x * x + z * z
+    off_pole = sin2 > POLE_SINE**2
+    # Like Mitsuba, whose atan2(0, -0) is π, the pole itself looks along +z.
+    φ = dr.atan2(dr.select(off_pole, x, 0), -dr.select(off_pole, z, 1))
+    u = φ * (0.5 / dr.pi)
+    u = dr.select(u < 0, u + 1, u)
+    # At the pole itself sqrt has no derivative, and y alone tells the two poles apart.
+    sin = dr.select(off_pole, dr.sqrt(dr.select(off_pole, sin2, 1)), 0)
+    return u, dr.atan2(sin, y) * (1 / dr.pi)
+
+
+def _level(roughness: Any) -> Any:
+    """Fractional level 0 … L of a roughness, clamped to [0, 1]."""
+    first = lobe.LEVEL_ROUGHNESS[0]
+    r = dr.clip(roughness, 0, 1)
+    sharp = dr.minimum(r, first) * (1 / first)
+    level = dr.square(dr.square(sharp))
+    inverse = dr.rcp(dr.maximum(r, first))
+    for a, b in zip(lobe.LEVEL_ROUGHNESS, lobe.LEVEL_ROUGHNESS[1:], strict=False):
+        level += dr.clip((inverse - 1 / a) * (1 / (1 / b - 1 / a)), 0, 1)
+    return level
+
+
+@dataclass(frozen=True)
+class EnvironmentLight:
+    """A learnable lat-long light: `raw` is a tensor (h, 2h, 3), h a multiple of 4, radiance = softplus(raw).
+
+    Raises InputError for another shape.
+    """
+
+    raw: Any
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.raw.shape)
+        h = shape[0] if shape else 0
+        if shape != (h, 2 * h, 3) or h % 4 or h < MIN_HEIGHT:
+            raise InputError(
+                f"EnvironmentLight: raw: shape {shape}; need (h, 2h, 3) with h a multiple of 4 from {MIN_HEIGHT} on "
+                "(EnvironmentLight.from_file resamples)"
+            )
+
+    @classmethod
+    def constant(cls, radiance: float = 0.5, height: int = DEFAULT_HEIGHT) -> EnvironmentLight:
+        """The same positive radiance from everywhere."""
+        return cls.from_radiance(np.full((height, 2 * height, 3), radiance))
+
+    @classmethod
+    def from_radiance(cls, radiance: np.ndarray) -> EnvironmentLight:
+        """From linear radiance (h, 2h, 3), in Mitsuba's orientation; values below 1e-4 become 1e-4.
+
+        Raises InputError for NaN, infinity or another shape.
+        """
+        radiance = np.asarray(radiance, np.float64)
+        if not np.isfinite(radiance).all():
+            raise InputError("EnvironmentLight: radiance: holds NaN or infinity; replace those texels")
+        return cls(mi.TensorXf(inverse_softplus(np.maximum(radiance, RADIANCE_FLOOR)).astype(np.float32)))
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:
+        """From a lat-long image that Mitsuba reads (EXR, HDR, …), resampled to `height` rows, keeping its energy.
+
+        Without `height`: the image's own rows, to the next lower multiple of 4. Raises InputError when it is no such image.
+        """
+        try:
+            bitmap = mi.Bitmap(str(path))
+            image = np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False))
+        except Exception as error:  # Mitsuba raises RuntimeError for each of: not there, not an image, not RGB
+            reason = str(error).strip().splitlines()[-1]
+            raise InputError(f"{path}: environment: not a readable image ({reason}); give an EXR or HDR file") from error
+        if image.ndim != 3 or min(image.shape[:2]) < 2:
+            raise InputError(f"{path}: environment: {image.shape} is no lat-long image; give one of at least 2 × 2 texels")
+        if not np.isfinite(image).all():
+            raise InputError(f"{path}: environment: holds NaN or infinity; replace those texels")
+        rows = height if height is not None else max(MIN_HEIGHT, image.shape[0] // 4 * 4)
+        return cls.from_radiance(lobe.resample(np.maximum(image, 0), rows))
+
+    @property
+    def height(self) -> int:
+        """Rows h of the map."""
+        return int(self.raw.shape[0])
+
+    def radiance(self) -> Any:
+        """Linear radiance (h, 2h, 3), a tensor under AD."""
+        return mi.TensorXf(softplus(self.raw.array), shape=tuple(self.raw.shape))
+
+    def prefilter(self) -> PrefilteredLight:
+        """The levels of this light, under AD; a fixed linear operator on the radiance (`prefilter`)."""
+        return PrefilteredLight(*prefilter(self.radiance()))
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the radiance as a float32 EXR that Mitsuba's `envmap` shows in the same directions; atomic.
+
+        Raises InputError when the place cannot be written.
+        """
+        target = Path(path)
+        temporary = None
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".exr")
+            os.close(handle)
+            mi.Bitmap(np.ascontiguousarray(self.radiance().numpy(), np.float32)).write(temporary)
+            os.chmod(temporary, 0o666 & ~_umask())
+            os.replace(temporary, target)
+        except (OSError, RuntimeError) as error:
+            raise InputError(f"{target}: environment: cannot be written ({error}); choose another folder") from error
+        finally:
+            if temporary is not None:
+                with suppress(OSError):
+                    os.unlink(temporary)
+
+
+def _umask() -> int:
+    """The process's file mode mask: mkstemp makes files that only their owner can read."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,239 @@
+"""Azimuthal Fourier rows of lat-long grids in Dr.Jit: analysis, synthesis, and block-sparse products between them.
+
+A texel buffer is flat, `stride` floats a texel. A Fourier buffer is six planes: the cosine coefficients of R, G and B,
+then the sine coefficients. Rows keep only the frequencies they need. Analysis and synthesis are each other's transpose,
+and all three kernels gather, so that adjoints are made of the same kernels and nothing is atomic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+BLOCK = 4
+"""Output rows per lane of `mix_rows`: a gathered coefficient then serves four rows."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Where the rows of some lat-long grids lie in a texel buffer and in a Fourier buffer (all arrays on the device).
+
+    Analysis has one lane per four frequencies, synthesis one per eight columns: those that share their cosines.
+    """
+
+    stride: int  # floats per texel: 3 for the caller's radiance, 4 for ours
+    texels: int
+    coefficients: int
+    analysis: tuple[Any, Any, Any, Any]  # per lane: texel of the row's start, w, m, offset of the twiddles
+    slots: tuple[Any, ...]  # where m, w/2-m, w/4-m and w/4+m go ...
+    exists: tuple[Any, ...]  # ... and whether they do
+    synthesis: tuple[Any, Any, Any, Any, Any, Any]  # row's start, w, column, offset of the twiddles, first slot, M
+    twiddles: Any  # cos and sin, interleaved, of multiples of π/w
+
+
+@dataclass(frozen=True)
+class Mixing:
+    """A block-sparse matrix between Fourier buffers: a lane owns four outputs and the entries [begin, end)."""
+
+    inputs: int
+    outputs: int
+    begin: Any
+    end: Any
+    slot: Any  # first of the four outputs
+    step: Any  # from one output to the next
+    source: Any  # input coefficient of each entry
+    weights: Any  # four floats an entry
+
+
+def _device(*columns: np.ndarray) -> tuple[Any, ...]:
+    return tuple(mi.UInt32(np.ascontiguousarray(column, dtype=np.uint32)) for column in columns)
+
+
+def row_limits(weights: list[np.ndarray]) -> np.ndarray:
+    """Frequencies (rows,) that each row needs in any of `weights` (rows, ·, M), equal within a block of rows."""
+    need = [np.where(w.any(1), np.arange(1, w.shape[2] + 1), 0).max(1) for w in weights]
+    return np.repeat(np.max(need, 0).reshape(-1, BLOCK).max(1), BLOCK)
+
+
+def row_slots(limits: list[np.ndarray]) -> list[np.ndarray]:
+    """First coefficient of each row, for grids that follow each other in the buffer."""
+    ends = np.cumsum(np.concatenate(limits))
+    return np.split(ends - np.concatenate(limits), np.cumsum([len(m) for m in limits])[:-1])
+
+
+def make_rows(firsts: list[int], limits: list[np.ndarray], stride: int) -> Rows:
+    """Lanes for grids of h = len(limit) rows and 2h columns, `limit` frequencies a row, starting at texels `firsts`."""
+    analysis, slots, exists, synthesis, twiddles, at = [], [], [], [], [], 0
+    for first, limit, slot in zip(firsts, limits, row_slots(limits), strict=True):
+        h, w = len(limit), 2 * len(limit)
+        angle = np.arange(2 * w) * (np.pi / w)
+        twiddles.append(np.stack([np.cos(angle), np.sin(angle)], 1).ravel())
+        i, m = np.nonzero(np.arange(w // 8 + 1) < limit[:, None])
+        others = np.stack([m, w // 2 - m, w // 4 - m, w // 4 + m])
+        # At m = 0 and at m = w/8 some of the four are the same frequency; the first one writes it.
+        there = (others < limit[i]) & np.stack([m >= 0, m >= 0, m < w // 8, (m > 0) & (m < w // 8)])
+        analysis.append(np.stack([first + w * i, 0 * i + w, m, 0 * i + at]))
+        slots.append(np.where(there, slot[i] + others, 0))
+        exists.append(there)
+        i, q = (a.ravel() for a in np.meshgrid(np.arange(h), np.arange(w // 8), indexing="ij"))
+        synthesis.append(np.stack([first + w * i, 0 * i + w, q, 0 * i + at, slot[i], limit[i]]))
+        at += 2 * w
+    return Rows(
+        stride=stride,
+        texels=firsts[-1] + 2 * len(limits[-1]) ** 2,
+        coefficients=int(sum(limit.sum() for limit in limits)),
+        analysis=_device(*np.concatenate(analysis, 1)),  # type: ignore[arg-type]
+        slots=_device(*np.concatenate(slots, 1)),
+        exists=tuple(mi.Bool(row) for row in np.concatenate(exists, 1)),
+        synthesis=_device(*np.concatenate(synthesis, 1)),  # type: ignore[arg-type]
+        twiddles=mi.Float(np.concatenate(twiddles).astype(np.float32)),
+    )
+
+
+def make_mixing(blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]], inputs: int, outputs: int) -> Mixing:
+    """The matrix made of (rows, columns, M) pieces, each with the slots of its columns and the slots and limits of its rows.
+
+    Pieces that share output rows add up.
+    """
+    slots, steps, sources, weights = [], [], [], []
+    for matrix, slot_in, slot_out, limit_out in blocks:
+        quads = matrix.reshape(-1, BLOCK, *matrix.shape[1:])
+        b, m, k = np.nonzero((quads != 0).any(1).swapaxes(1, 2))
+        slots.append(slot_out[BLOCK * b] + m)
+        steps.append(limit_out[BLOCK * b])
+        sources.append(slot_in[k] + m)
+        weights.append(quads[b, :, k, m])
+    slot, step, source, weight = (np.concatenate(a) for a in (slots, steps, sources, weights))
+    order = np.lexsort((source, slot))
+    slot, step, source, weight = slot[order], step[order], source[order], weight[order]
+    begin = np.flatnonzero(np.diff(slot, prepend=-1))
+    end = np.append(begin[1:], len(slot))
+    lanes = np.argsort(begin - end, kind="stable")  # equally long lanes side by side: a packet waits for its longest
+    begin, end = begin[lanes], end[lanes]
+    return Mixing(
+        inputs,
+        outputs,
+        *_device(begin, end, slot[begin], step[begin], source),
+        weights=mi.Float(weight.astype(np.float32).ravel()),
+    )
+
+
+def write(target: Any, value: Any, index: Any, active: Any = True) -> None:
+    """Scatter to places of which none is written twice: without that promise Dr.Jit runs one kernel per scatter."""
+    dr.scatter(target, value, index, active, mode=dr.ReduceMode.NoConflicts)
+
+
+def _turn(turn: Any, step: Any, w: Any) -> Any:
+    """Advance a twiddle index, an angle in units of π/w, by `step` < 2w."""
+    turn = turn + step
+    return dr.select(turn >= 2 * w, turn - 2 * w, turn)
+
+
+def analyse(rows: Rows, texels: Any) -> Any:
+    """Fourier buffer Σ_j x_j (cos mφ_j, sin mφ_j) of every row and frequency of a flat texel buffer."""
+    start, w, m, at = rows.analysis
+
+    def body(j: Any, turn: Any, *acc: Any) -> tuple[Any, ...]:
+        out = list(acc)
+        for r in range(4):
+            cos = dr.gather(mi.Float, rows.twiddles, 2 * (at + turn))
+            sin = dr.gather(mi.Float, rows.twiddles, 2 * (at + turn) + 1)
+            for c in range(3):
+                x = dr.gather(mi.Float, texels, (start + j + r) * rows.stride + c)
+                out[6 * r + c] = dr.fma(x, cos, out[6 * r + c])
+                out[6 * r + 3 + c] = dr.fma(x, sin, out[6 * r + 3 + c])
+            turn = _turn(turn, 2 * m, w)  # φ_j = π(2j+1)/w
+        return (j + 4, turn, *out)
+
+    n = dr.width(m)
+    zeros = [dr.zeros(mi.Float, n) for _ in range(24)]
+    state = dr.while_loop((dr.zeros(mi.UInt32, n), m, *zeros), lambda j, *_: j < w, body)
+    cosines = [[state[2 + 6 * r + c] for r in range(4)] for c in range(3)]
+    sines = [[state[5 + 6 * r + c] for r in range(4)] for c in range(3)]
+    # The frequency f - m or f + m turns by γ_j = fφ_j on top, which depends on j mod 4 only: π(j+½) or π(j+½)/2.
+    q = 0.5**0.5
+    quarters = (
+        ((1, 1, 1, 1), (0, 0, 0, 0), 1),  # cos γ, sin γ, sign of m
+        ((0, 0, 0, 0), (1, -1, 1, -1), -1),
+        ((q, -q, -q, q), (q, q, -q, -q), -1),
+        ((q, -q, -q, q), (q, q, -q, -q), 1),
+    )
+    out = dr.zeros(mi.Float, 6 * rows.coefficients)
+    for (cos_γ, sin_γ, sign), slot, exists in zip(quarters, rows.slots, rows.exists, strict=True):
+        for c in range(3):
+            cos = sum(cos_γ[r] * cosines[c][r] - sign * sin_γ[r] * sines[c][r] for r in range(4))
+            sin = sum(sin_γ[r] * cosines[c][r] + sign * cos_γ[r] * sines[c][r] for r in range(4))
+            write(out, cos, slot + c * rows.coefficients, exists)
+            write(out, sin, slot + (3 + c) * rows.coefficients, exists)
+    return out
+
+
+def synthesise(rows: Rows, coefficients: Any, texels: Any) -> None:
+    """Write Σ_m (a_m cos mφ_j + b_m sin mφ_j) of every row and column into the RGBA buffer `texels`."""
+    start, w, q, at, slot, limit = rows.synthesis
+
+    def body(m: Any, turn: Any, *acc: Any) -> tuple[Any, ...]:
+        out = list(acc)
+
+        def add(n: int, a: Any, b: Any) -> None:
+            out[n] = dr.fma(a, b, out[n])
+
+        for r in range(4):
+            inside = m + r < limit
+            cos = dr.gather(mi.Float, rows.twiddles, 2 * (at + turn))
+            sin = dr.gather(mi.Float, rows.twiddles, 2 * (at + turn) + 1)
+            for c in range(3):
+                a = dr.gather(mi.Float, coefficients, slot + m + r + c * rows.coefficients, inside)
+                b = dr.gather(mi.Float, coefficients, slot + m + r + (3 + c) * rows.coefficients, inside)
+                if r % 2 == 0:
+                    add(3 * r + c, a, cos)
+                    add(3 * r + 3 + c, b, sin)
+                else:
+                    sign = 2 - r
+                    add(12 + c, a, cos)
+                    add(15 + c, b, sin)
+                    add(18 + c, a, sign * sin)
+                    add(21 + c, b, sign * cos)
+            turn = _turn(turn, 2 * q + 1, w)
+        return (m + 4, turn, *out)
+
+    n = dr.width(q)
+    zeros = [dr.zeros(mi.Float, n) for _ in range(24)]
+    state = dr.while_loop((dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n), *zeros), lambda m, *_: m < limit, body)
+    even_cos, even_sin, two_cos, two_sin, odd_cos, odd_sin, cross_sin, cross_cos = (
+        state[2 + 3 * k : 5 + 3 * k] for k in range(8)
+    )
+    # The eight azimuths kπ/2 ± φ: m = 0, 2 (mod 4) keep or change sign, odd m swap cosine and sine when k is odd.
+    for k in range(4):
+        for ε in (1, -1):
+            column = q + k * (w // 4) if ε > 0 else ((k or 4) * (w // 4)) - 1 - q
+            for c in range(3):
+                value = even_cos[c] + ε * even_sin[c] + (-1) ** k * (two_cos[c] + ε * two_sin[c])
+                odd = cross_cos[c] - ε * cross_sin[c] if k % 2 else odd_cos[c] + ε * odd_sin[c]
+                write(texels, value + (odd if k < 2 else -odd), 4 * (start + column) + c)
+
+
+def mix_rows(matrix: Mixing, coefficients: Any) -> Any:
+    """The block-sparse product of a `Mixing` and a Fourier buffer."""
+
+    def body(n: Any, *acc: Any) -> tuple[Any, ...]:
+        out = list(acc)
+        source = dr.gather(mi.UInt32, matrix.source, n)
+        weight = dr.gather(mi.Vector4f, matrix.weights, n)
+        for c in range(6):
+            x = dr.gather(mi.Float, coefficients, source + c * matrix.inputs)
+            for row in range(BLOCK):
+                out[6 * row + c] = dr.fma(weight[row], x, out[6 * row + c])
+        return (n + 1, *out)
+
+    zeros = [dr.zeros(mi.Float, dr.width(matrix.begin)) for _ in range(6 * BLOCK)]
+    state = dr.while_loop((mi.UInt32(matrix.begin), *zeros), lambda n, *_: n < matrix.end, body)
+    out = dr.zeros(mi.Float, 6 * matrix.outputs)
+    for row in range(BLOCK):
+        for c in range(6):
+            write(out, state[1 + 6 * row + c], matrix.slot + row * matrix.step + c * matrix.outputs)
+    return out

@@ -1,0 +1,114 @@
+"""The GGX prefilter in Dr.Jit: three gather-only kernels each way, for the matrices that `lobe` builds.
+
+    radiance ─ analyse ─► Fourier rows ─ mix rows ─► Fourier rows of every level ─ synthesise ─► levels
+    δradiance ◄ synthesise ─ Fourier rows ◄ mix rows (transposed) ─ Fourier rows ◄ analyse ─ δlevels
+
+The levels are one flat buffer of RGBA texels, the map itself first; A is padding, so that a lookup is one packet.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.shade import fourier, lobe
+
+
+@dataclass(frozen=True)
+class Operator:
+    """The prefilter of maps with `height` rows: buffers, matrices and the place of each level in the result."""
+
+    height: int
+    base: fourier.Rows
+    levels: fourier.Rows
+    forward: fourier.Mixing
+    adjoint: fourier.Mixing
+    info: Any  # 4 UInt32 a level: first texel, h, w, 0; level 0 is the map itself
+    shapes: tuple[tuple[int, int], ...]  # (first texel, h) of each level, the same on the host
+
+
+@functools.lru_cache(maxsize=4)
+def _host_levels(height: int) -> list[lobe.Level]:
+    return lobe.build_levels(height)
+
+
+@functools.lru_cache(maxsize=4)
+def _build(variant: str, height: int) -> Operator:
+    matrices = [level.weights for level in _host_levels(height)]
+    transposed = [np.ascontiguousarray(matrix.swapaxes(0, 1)) for matrix in matrices]
+    heights = [height] + [len(matrix) for matrix in matrices]
+    firsts = [int(n) for n in np.cumsum([0] + [2 * h * h for h in heights])]
+    frequencies = max(matrix.shape[2] for matrix in matrices)
+    limit_in = fourier.row_limits([np.pad(m, ((0, 0), (0, 0), (0, frequencies - m.shape[2]))) for m in transposed])
+    limits_out = [fourier.row_limits([matrix]) for matrix in matrices]
+    (slot_in,), slots_out = fourier.row_slots([limit_in]), fourier.row_slots(limits_out)
+    base, levels = fourier.make_rows([0], [limit_in], stride=3), fourier.make_rows(firsts[1:-1], limits_out, stride=4)
+    out = list(zip(slots_out, limits_out, strict=True))
+    return Operator(
+        height=height,
+        base=base,
+        levels=levels,
+        forward=fourier.make_mixing(
+            [(m, slot_in, s, n) for m, (s, n) in zip(matrices, out, strict=True)], base.coefficients, levels.coefficients
+        ),
+        adjoint=fourier.make_mixing(
+            [(m, s, slot_in, limit_in) for m, (s, _) in zip(transposed, out, strict=True)],
+            levels.coefficients,
+            base.coefficients,
+        ),
+        info=mi.UInt32(np.array([(f, h, 2 * h, 0) for f, h in zip(firsts, heights, strict=False)], np.uint32).ravel()),
+        shapes=tuple(zip(firsts, heights, strict=False)),
+    )
+
+
+def operator(height: int) -> Operator:
+    """The prefilter for maps (height, 2·height), built once per height and variant (0.2 s at 64 rows, 0.6 s at 128)."""
+    return _build(mi.variant(), height)
+
+
+def apply(op: Operator, radiance: Any) -> Any:
+    """Flat RGBA levels, the map first, of flat radiance (3·h·w)."""
+    dr.eval(radiance)
+    out = dr.zeros(mi.Float, 4 * op.levels.texels)
+    fourier.synthesise(op.levels, fourier.mix_rows(op.forward, fourier.analyse(op.base, radiance)), out)
+    n = dr.arange(mi.UInt32, 3 * op.base.texels)
+    fourier.write(out, radiance, 4 * (n // 3) + n % 3)
+    return out
+
+
+def apply_transposed(op: Operator, δlevels: Any) -> Any:
+    """Adjoint of `apply`: flat δradiance (3·h·w) of flat RGBA δlevels."""
+    dr.eval(δlevels)
+    out = dr.zeros(mi.Float, 4 * op.base.texels)
+    fourier.synthesise(op.base, fourier.mix_rows(op.adjoint, fourier.analyse(op.levels, δlevels)), out)
+    n = dr.arange(mi.UInt32, 3 * op.base.texels)
+    texel = 4 * (n // 3) + n % 3
+    return dr.gather(mi.Float, out, texel) + dr.gather(mi.Float, δlevels, texel)
+
+
+class _Prefilter(dr.CustomOp):
+    """`apply` under automatic differentiation; linear, so its derivative is itself."""
+
+    def eval(self, op: Operator, radiance: Any) -> Any:
+        self.op = op
+        return apply(op, radiance)
+
+    def forward(self) -> None:
+        self.set_grad_out(apply(self.op, self.grad_in("radiance")))
+
+    def backward(self) -> None:
+        self.set_grad_in("radiance", apply_transposed(self.op, self.grad_out()))
+
+    def name(self) -> str:
+        return "prefilter"
+
+
+def prefilter(radiance: Any) -> tuple[Operator, Any]:
+    """Levels of a radiance tensor (h, 2h, 3), h a multiple of 4: its operator and the flat RGBA buffer, under AD."""
+    op = operator(radiance.shape[0])
+    return op, dr.custom(_Prefilter, op, radiance.array)

@@ -1,0 +1,364 @@
+"""Every command through `main`: what it writes and prints, and how it refuses bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from tiny_scene import SETTINGS, SIZE, write_data, write_method
+
+from mi_refgs.cli import main
+from mi_refgs.fit.config import load_resolved
+from mi_refgs.fit.images import read_exr, read_png, write_png
+from mi_refgs.fit.train import Trainer
+
+COMMANDS = ("doctor", "demo", "dataset", "train", "eval", "render", "export")
+ARTEFACTS = ("surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "config.toml", "metrics.jsonl")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data") / "ball")
+
+
+@pytest.fixture(scope="module")
+def method(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_method(tmp_path_factory.mktemp("method"))
+
+
+@pytest.fixture(scope="module")
+def finished(data: Path, method: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run; do not change it."""
+    run = tmp_path_factory.mktemp("runs") / "run"
+    assert main(train_command(data, run, method)) == 0
+    return run
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the finished run, to be spoilt."""
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+def train_command(data: Path, run: Path, method: Path, *more: str) -> list[str]:
+    options = ["--variant", str(method), "--preset", "quick", *more]
+    return ["train", str(data), "-o", str(run), *options, "--set", *SETTINGS]
+
+
+# ---------- Help and output ----------
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as leave:
+        main([command, "--help"])
+    assert leave.value.code == 0
+    text = capsys.readouterr().out
+    assert f"example:\n  refgs {command}" in text and "--json" in text
+
+
+def test_json_is_all_that_is_printed(
+    run: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither Python's nor C++'s chatter on standard output gets between a pipe and the object."""
+    original = Trainer.__init__
+
+    def noisy(self: Trainer, *args: object) -> None:
+        print("from Python")
+        os.write(1, b"from C++\n")
+        original(self, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Trainer, "__init__", noisy)
+    dataset = json.loads((run / "dataset.json").read_text())["path"]
+    capfd.readouterr()
+    assert main(["train", dataset, "-o", str(run), "--resume", "--json"]) == 0
+    out, err = capfd.readouterr()
+    assert json.loads(out)["iterations"] == 6
+    assert "from Python" in err and "from C++" in err
+
+
+def test_doctor_reports_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["doctor", "--json"])
+    report = json.loads(capsys.readouterr().out)
+    assert report["mitsuba"] == mi.__version__ and report["usable"] == (code == 0)
+
+
+# ---------- The main job ----------
+
+
+def test_train_writes_a_run_folder(finished: Path) -> None:
+    for name in ARTEFACTS:
+        assert (finished / name).stat().st_size > 0, name
+    assert [path.name for path in (finished / "previews").iterdir()] == ["0000004.png"]
+    assert (finished / "checkpoints" / "0000006.npz").is_file()
+    assert load_resolved(finished / "config.toml").variant == "tiny"
+    lines = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
+    assert [line["iteration"] for line in lines] == [2, 4, 6]
+    left_over = [
+        path.name for path in finished.rglob("*") if path.name.startswith(".") or path.suffix == ".part"
+    ]
+    assert not left_over
+
+
+def test_train_tells_what_is_unusual(
+    data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*train_command(data, tmp_path / "run", method), "iterations=1", "--threads", "1"]) == 0
+    assert "only 3 training views" in capsys.readouterr().err
+    assert (tmp_path / "run" / "checkpoints" / "0000001.npz").is_file()  # though none was due
+
+
+def test_an_interrupt_says_how_to_resume_and_resuming_finishes(
+    data: Path,
+    method: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    step = Trainer.step
+
+    def interrupted(self: Trainer) -> None:
+        if self.iteration == 4:
+            raise KeyboardInterrupt
+        step(self)
+
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", interrupted)
+        assert main(train_command(data, run, method)) == 130
+    said = capsys.readouterr().err
+    assert f"interrupted at iteration 4; resume with: refgs train {data} -o {run} --resume" in said
+    assert main(["train", str(data), "-o", str(run), "--resume"]) == 0
+    assert "resumed at iteration 4 of 6" in capsys.readouterr().err
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["iteration"] for line in lines] == [2, 4, 6]
+
+
+def test_resume_refuses_another_method(run: Path, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for option, value in (("--preset", "paper"), ("--variant", "other.toml"), ("--set", "loss.ssim=0")):
+        assert main(["train", str(data), "-o", str(run), "--resume", option, value]) == 2
+        assert option in capsys.readouterr().err
+
+
+def test_export_writes_what_is_in_the_newest_checkpoint(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", str(finished), "-o", str(tmp_path / "out"), "--json"]) == 0
+    files = json.loads(capsys.readouterr().out)["files"]
+    for file in files:
+        assert Path(file).read_bytes() == (finished / Path(file).name).read_bytes()
+    assert {Path(file).name for file in files} >= {"surfels.ply", "envmap.exr", "mesh.ply", "scene.xml"}
+
+
+def test_render_writes_exr_with_aovs_and_png(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exr, png = tmp_path / "view.exr", tmp_path / "view.png"
+    assert main(["render", str(finished), "-o", str(exr), "--aov", "albedo", "nn:normal", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["width"] == SIZE
+    channels = read_exr(exr)
+    assert {"R", "G", "B", "A", "albedo.R", "nn.X"} <= channels.keys()
+    assert main(["render", str(finished / "scene.xml"), "-o", str(png)]) == 0
+    pixels = read_png(png)
+    assert pixels.shape == (SIZE, SIZE, 4)
+    assert np.abs(pixels[..., 3] - np.clip(channels["A"], 0, 1)).max() < 0.51 / 255
+
+
+def test_dataset_traces_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        '<scene version="3.0.0"><emitter type="constant"/><shape type="sphere">'
+        '<bsdf type="diffuse"/></shape></scene>'
+    )
+    options = ["--views", "2", "--test-views", "1", "--size", "16", "--spp", "1", "--json"]
+    assert main(["dataset", str(scene), "-o", str(tmp_path / "out"), *options]) == 0
+    assert json.loads(capsys.readouterr().out)["train_views"] == 2
+    assert (tmp_path / "out" / "transforms_test.json").is_file()
+
+
+# ---------- Bad input: one sentence with file, field and remedy, and exit code 2 ----------
+
+
+def refused(argv: list[str], capsys: pytest.CaptureFixture[str], *parts: object) -> None:
+    capsys.readouterr()
+    assert main(argv) == 2
+    out, err = capsys.readouterr()
+    [said] = [line for line in err.splitlines() if line.startswith("refgs: ") and "warning" not in line][-1:]
+    assert not out and "Traceback" not in err
+    assert "; " in said, said  # the remedy follows what is wrong
+    for part in parts:
+        assert str(part) in said, said
+
+
+@pytest.fixture
+def spoilt(data: Path, tmp_path: Path) -> Path:
+    """A copy of the data set, to be spoilt."""
+    return Path(shutil.copytree(data, tmp_path / "ball"))
+
+
+def edit(path: Path, change: Callable[[dict], object]) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_missing_picture(
+    spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (spoilt / "train" / "r_1.png").unlink()
+    refused(train_command(spoilt, tmp_path / "run", method), capsys, "r_1.png", "missing", "restore it")
+    assert not (tmp_path / "run").exists()  # so that the same command works once the picture is back
+
+
+def test_unreadable_picture(
+    spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (spoilt / "train" / "r_1.png").write_bytes(b"\x89PNG\r\n no")
+    refused(train_command(spoilt, tmp_path / "run", method), capsys, "r_1.png", "not a readable image")
+
+
+def test_wrong_json(spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (spoilt / "transforms_train.json").write_text('{"frames": [')
+    refused(train_command(spoilt, tmp_path / "run", method), capsys, "transforms_train.json", "JSON")
+
+
+def test_views_of_unequal_size(
+    spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_png(spoilt / "train" / "r_1.png", np.ones((SIZE, SIZE + 2, 4)))
+    edit(spoilt / "transforms_train.json", lambda content: [content.pop(key) for key in "wh"])
+    refused(
+        train_command(spoilt, tmp_path / "run", method), capsys, "transforms_train.json", "r_1", "one size"
+    )
+
+
+def test_no_training_views(
+    spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit(spoilt / "transforms_train.json", lambda content: content.update(frames=[]))
+    command = train_command(spoilt, tmp_path / "run", method)
+    refused(command, capsys, "transforms_train.json", "zero training views")
+
+
+def test_missing_data(method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused(
+        train_command(tmp_path / "none", tmp_path / "run", method),
+        capsys,
+        tmp_path / "none",
+        "no such folder",
+    )
+
+
+def test_unknown_key_in_a_method(
+    data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(method.read_text().replace("sh_degree", "sh_degrees"))
+    refused(train_command(data, tmp_path / "run", wrong), capsys, "wrong.toml", "surfels", "sh_degrees")
+    command = [*train_command(data, tmp_path / "run", method), "loss.sim=1"]
+    refused(command, capsys, "--set", "loss", "sim")
+    refused([*command[:-1], "loss.ssim"], capsys, "--set", "key=value")
+
+
+def test_a_value_that_is_nan_in_the_ply(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ply = run / "surfels.ply"
+    header, end, body = ply.read_bytes().partition(b"end_header\n")
+    ply.write_bytes(header + end + np.float32(np.nan).tobytes() + body[4:])
+    refused(["render", str(run), "-o", str(tmp_path / "x.exr")], capsys, "surfels.ply", "x: 1 values are NaN")
+    refused(["eval", str(run)], capsys, "surfels.ply", "x: 1 values are NaN")
+
+
+def test_a_property_that_the_ply_lacks(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ply = run / "surfels.ply"
+    ply.write_bytes(ply.read_bytes().replace(b"property float opacity", b"property float opaqueness"))
+    refused(["render", str(run), "-o", str(tmp_path / "x.exr")], capsys, "surfels.ply", "opacity", "missing")
+    refused(["eval", str(run)], capsys, "surfels.ply", "opacity", "missing")
+
+
+def test_what_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("eval", "export"):
+        refused([command, str(tmp_path)], capsys, tmp_path, "config.toml")
+    refused(["render", str(tmp_path), "-o", str(tmp_path / "x.exr")], capsys, "scene.xml", "missing")
+    refused(
+        ["render", str(tmp_path / "no.xml"), "-o", str(tmp_path / "x.exr")], capsys, "no.xml", "no such file"
+    )
+
+
+def test_a_run_that_is_there_already(
+    finished: Path, data: Path, method: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    refused(train_command(data, finished, method), capsys, finished, "--resume")
+
+
+def test_a_run_whose_data_is_gone(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "dataset.json").write_text(json.dumps({"path": str(tmp_path / "gone")}))
+    refused(["eval", str(run)], capsys, "dataset.json", "gone", "--data")
+    (run / "dataset.json").write_text("{}")
+    refused(["eval", str(run)], capsys, "dataset.json", "--data")
+
+
+def test_unwritable_output(
+    finished: Path, data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Below a regular file nobody can write, not even root."""
+    (tmp_path / "file").write_text("")
+    below = tmp_path / "file" / "out"
+    scene = tmp_path / "scene.xml"
+    scene.write_text('<scene version="3.0.0"><emitter type="constant"/><shape type="sphere"/></scene>')
+    tiny = ["--views", "1", "--size", "16", "--spp", "1"]
+    for argv in (
+        train_command(data, below, method),
+        ["dataset", str(scene), "-o", str(below), *tiny],
+        ["export", str(finished), "-o", str(below)],
+        ["render", str(finished), "-o", f"{below}.exr"],
+        ["render", str(finished), "-o", f"{below}.png"],
+    ):
+        refused(argv, capsys, below, "writable folder")
+
+
+@pytest.mark.parametrize(
+    ("argv", "parts"),
+    [
+        ([], ["COMMAND"]),
+        (["train"], ["DATA"]),
+        (["train", "here", "-o", "there", "--preset", "fast"], ["--preset", "quick, standard, paper"]),
+        (["train", "here", "-o", "there", "--variant", "nothing"], ["--variant", "nothing"]),
+        (["train", "here", "-o", "there", "--threads", "0"], ["--threads"]),
+        (
+            ["train", "here", "-o", "there", "--mitsuba-variant", "scalar_rgb"],
+            ["--mitsuba-variant", "llvm_ad_rgb"],
+        ),
+        (["dataset", "no.xml", "-o", "there"], ["no.xml", "missing"]),
+        (["render", "no.xml", "-o", "x.bmp"], ["x.bmp", ".exr or .png"]),
+        (["render", "no.xml", "-o", "x.png", "--spp", "-1"], ["--spp"]),
+    ],
+)
+def test_bad_arguments(
+    argv: list[str],
+    parts: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused(argv, capsys, *parts)
+
+
+def test_bad_requests_of_render(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "x.exr")
+    refused(["render", str(finished), "-o", out, "--sensor", "1"], capsys, "--sensor", "give 0 to 0")
+    refused(["render", str(finished), "-o", out, "--aov", "colour"], capsys, "aovs", "colour", "albedo")
+    broken = tmp_path / "broken.xml"
+    broken.write_text("<scene")
+    refused(["render", str(broken), "-o", out], capsys, "broken.xml")
+    plain = tmp_path / "plain.xml"
+    plain.write_text('<scene version="3.0.0"><integrator type="path"/></scene>')
+    refused(["render", str(plain), "-o", out, "--aov", "albedo"], capsys, "plain.xml", "--aov", "refgs")

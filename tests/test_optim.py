@@ -1,0 +1,208 @@
+"""Adam against NumPy and Dr.Jit's own, schedules, moments that follow their rows, bitwise resume."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.errors import InputError
+from mi_refgs.fit.optim import Adam, Group
+from mi_refgs.reference import losses as reference
+
+
+def tensor(values: np.ndarray) -> object:
+    return mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
+
+
+def give(optimiser: Adam, name: str, gradient: np.ndarray) -> None:
+    dr.set_grad(optimiser.params[name], tensor(gradient))
+
+
+def test_group_rates() -> None:
+    """Log-linear to the end of the schedule, then constant; half-way is the geometric mean."""
+    group = Group(1e-2, final=1e-4, steps=100)
+    assert [group.at(i) for i in (-5, 0, 50, 100, 10**6)] == pytest.approx([1e-2, 1e-2, 1e-3, 1e-4, 1e-4])
+    assert Group(0.05).at(7) == 0.05 and Group(0.0, final=1.0).at(50) == 0.0
+
+
+def test_equals_the_published_algorithm(rng: np.random.Generator) -> None:
+    """Ten steps of two tensors with a schedule and per-column rates; gradients as small as a mean over pixels
+    gives."""
+    start = {"position": rng.normal(size=(7, 3)), "radiance_sh": rng.normal(size=(7, 12))}
+    groups = {"position": Group(1e-2, 1e-4, 10), "radiance_sh": Group(7.5e-3, head=3, tail=1 / 20)}
+    params = {name: tensor(values) for name, values in start.items()}
+    optimiser = Adam(params, groups)
+    gradients = {
+        name: [1e-7 * rng.normal(size=values.shape) for _ in range(10)] for name, values in start.items()
+    }
+    for step in range(10):
+        for name in start:
+            give(optimiser, name, gradients[name][step])
+        optimiser.step(step)
+    columns = np.where(np.arange(12) < 3, 1, 1 / 20)
+    rates = {
+        "position": [1e-2 * 100 ** (-step / 10) for step in range(10)],
+        "radiance_sh": [7.5e-3 * columns] * 10,
+    }
+    for name, values in start.items():
+        wanted = reference.adam(values.astype(np.float32), gradients[name], rates[name])
+        moved = np.linalg.norm(wanted - values)
+        assert np.linalg.norm(params[name].numpy() - wanted) < 2e-4 * moved + 1e-6
+        assert moved > 1e-3 and dr.grad_enabled(params[name])
+
+
+def test_equals_drjit_on_a_quadratic(rng: np.random.Generator) -> None:
+    start, goal = rng.normal(size=(50, 2)), tensor(rng.normal(size=(50, 2)))
+    params = {"x": tensor(start)}
+    ours = Adam(params, {"x": Group(0.02)})
+    theirs = mi.ad.Adam(lr=0.02, epsilon=1e-15, params={"x": tensor(start)})
+    for step in range(200):
+        dr.backward(dr.sum(dr.square(params["x"] - goal)))
+        ours.step(step)
+        dr.backward(dr.sum(dr.square(theirs["x"] - goal)))
+        theirs.step()
+    np.testing.assert_allclose(params["x"].numpy(), theirs["x"].numpy(), atol=2e-5)
+    assert np.abs(params["x"].numpy() - goal.numpy()).mean() < 0.1 < np.abs(start - goal.numpy()).mean()
+
+
+def test_gradients_are_cleared_and_absent_ones_count_zero() -> None:
+    params = {"x": tensor(np.ones((2, 1))), "idle": tensor(np.ones((2, 1)))}
+    optimiser = Adam(params, {"x": Group(0.1)})
+    optimiser.step(0)
+    assert np.all(params["x"].numpy() == 1)
+    give(optimiser, "x", np.ones((2, 1)))
+    optimiser.step(1)
+    assert np.all(dr.grad(params["x"]).numpy() == 0) and np.all(params["x"].numpy() < 1)
+    assert np.all(params["idle"].numpy() == 1)
+
+
+def test_bad_gradients_are_dropped_and_counted() -> None:
+    params = {"x": tensor(np.zeros((4, 2))), "y": tensor(np.zeros((3, 1)))}
+    optimiser = Adam(params, {"x": Group(0.1), "y": Group(0.1)})
+    assert optimiser.bad == 0
+    gradient = np.ones((4, 2))
+    gradient[0, 0], gradient[3, 1] = np.nan, -np.inf
+    give(optimiser, "x", gradient)
+    give(optimiser, "y", np.full((3, 1), np.inf))
+    optimiser.step(0)
+    assert optimiser.bad == 5
+    moved = params["x"].numpy() != 0
+    np.testing.assert_array_equal(moved, np.isfinite(gradient))
+    give(optimiser, "x", np.ones((4, 2)))
+    optimiser.step(1)
+    assert optimiser.bad == 0 and np.all(np.isfinite(params["x"].numpy()))
+
+
+def test_moments_follow_their_rows(rng: np.random.Generator) -> None:
+    """Permuting, cloning and pruning rows commutes with stepping; fresh rows start as a new optimiser
+    would."""
+    start, g1, g2 = (rng.normal(size=(5, 3)) for _ in range(3))
+    whole = Adam({"x": tensor(start)}, {"x": Group(0.01)})
+    give(whole, "x", g1)
+    whole.step(0)
+    middle = whole.params["x"].numpy()
+    parent = np.array([4, 1, 1, 0])
+    moved = Adam({"x": tensor(start)}, {"x": Group(0.01)})
+    give(moved, "x", g1)
+    moved.step(0)
+    moved.params["x"] = tensor(middle[parent])
+    moved.gather(mi.UInt32(parent), ["x", "unknown"], fresh=mi.Bool(False, False, True, False))
+    give(whole, "x", g2)
+    whole.step(1)
+    give(moved, "x", g2[parent])
+    moved.step(1)
+    found, wanted = moved.params["x"].numpy(), whole.params["x"].numpy()[parent]
+    np.testing.assert_array_equal(found[[0, 1, 3]], wanted[[0, 1, 3]])
+    # A row without history: m = 0.1 g, v = 0.001 g², at the step count 2 of its tensor.
+    fresh = 0.01 * np.sqrt(1 - 0.999**2) / (1 - 0.9**2) * 0.1 * np.sign(g2[1]) / np.sqrt(0.001)
+    np.testing.assert_allclose(middle[1] - found[2], fresh, rtol=1e-3)
+
+
+def test_gather_to_nothing_and_back() -> None:
+    params = {"x": tensor(np.ones((3, 2)))}
+    optimiser = Adam(params, {"x": Group(0.1)})
+    params["x"] = dr.zeros(mi.TensorXf, (0, 2))
+    optimiser.gather(mi.UInt32(), ["x"], fresh=mi.Bool())
+    optimiser.step(0)
+    assert params["x"].shape == (0, 2) and optimiser.state_dict()["x/first"].shape == (0,)
+
+
+def test_reset_of_all_rows_and_of_some() -> None:
+    for rows, cleared in ((None, [True, True, True]), (mi.Bool(True, False, True), [True, False, True])):
+        params = {"x": tensor(np.zeros((3, 2)))}
+        optimiser = Adam(params, {"x": Group(0.1)})
+        give(optimiser, "x", np.ones((3, 2)))
+        optimiser.step(0)
+        optimiser.reset("x", rows)
+        state = optimiser.state_dict()
+        for part in ("first", "second"):
+            np.testing.assert_array_equal(state[f"x/{part}"].reshape(3, 2)[:, 0] == 0, cleared)
+        assert state["x/steps"] == 1
+
+
+def test_factor_freezes_a_tensor() -> None:
+    params = {"x": tensor(np.zeros((2, 1)))}
+    optimiser = Adam(params, {"x": Group(0.1)})
+    optimiser.set_factor("x", 0.0)
+    give(optimiser, "x", np.ones((2, 1)))
+    optimiser.step(0)
+    assert np.all(params["x"].numpy() == 0) and np.all(optimiser.state_dict()["x/first"] != 0)
+    optimiser.set_factor("x", 1.0)
+    optimiser.step(1)
+    assert np.all(params["x"].numpy() < 0)
+
+
+def test_resume_is_bitwise(rng: np.random.Generator) -> None:
+    gradients = rng.normal(size=(6, 9, 2))
+
+    def steps(optimiser: Adam, numbers: range) -> None:
+        for number in numbers:
+            give(optimiser, "x", gradients[number])
+            optimiser.step(number)
+
+    groups = {"x": Group(0.01, 0.001, 6)}
+    straight = Adam({"x": tensor(np.ones((9, 2)))}, groups)
+    straight.set_factor("x", 0.5)
+    steps(straight, range(3))
+    saved, values = straight.state_dict(), straight.params["x"].numpy()
+    steps(straight, range(3, 6))
+    resumed = Adam({"x": tensor(values)}, groups)
+    resumed.load_state_dict(saved)
+    steps(resumed, range(3, 6))
+    assert straight.params["x"].numpy().tobytes() == resumed.params["x"].numpy().tobytes()
+    for key, value in straight.state_dict().items():
+        assert value.tobytes() == resumed.state_dict()[key].tobytes()
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    with pytest.raises(InputError, match="optimiser: y: a learning rate without a parameter"):
+        Adam({"x": tensor(np.zeros((2, 1)))}, {"y": Group(0.1)})
+    optimiser = Adam({"x": tensor(np.zeros((2, 1)))}, {"x": Group(0.1)})
+    other = Adam({"x": tensor(np.zeros((3, 1)))}, {"x": Group(0.1)}).state_dict()
+    with pytest.raises(InputError, match="checkpoint: x/first: found 3 values, expected 2"):
+        optimiser.load_state_dict(other)
+    with pytest.raises(InputError, match="x/first: found nothing"):
+        optimiser.load_state_dict({})
+
+
+def test_steps_compile_nothing_after_the_second(rng: np.random.Generator) -> None:
+    """Rates, step counts and factors change every step, the number of rows once."""
+    params = {"x": tensor(np.zeros((30, 3))), "sh": tensor(np.zeros((30, 12)))}
+    optimiser = Adam(params, {"x": Group(0.1, 0.01, 100), "sh": Group(0.1, head=3, tail=0.05)})
+    misses = []
+    for step in range(8):
+        for name in params:
+            give(optimiser, name, rng.normal(size=params[name].shape))
+        dr.eval(*(dr.grad(value) for value in params.values()))
+        before = sum(dr.detail.launch_stats()[1:])
+        optimiser.set_factor("x", 1.0 / (step + 1))
+        optimiser.step(step)
+        misses.append(sum(dr.detail.launch_stats()[1:]) - before)
+        if step == 5:
+            parent = dr.arange(mi.UInt32, 20)
+            for name in params:
+                params[name] = tensor(params[name].numpy()[:20])
+            optimiser.gather(parent, list(params))
+    assert misses[3:] == [0] * 5

@@ -1,0 +1,92 @@
+"""A data set of a ball made by NumPy alone, and a method small enough to fit to it in seconds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from mi_refgs.fit.images import write_exr, write_png
+
+SIZE = 20
+FOCAL = 24.0  # pixels
+RADIUS, DISTANCE = 0.5, 1.5
+
+METHOD = """
+iterations = 3000
+checkpoint_every = 3
+[surfels]
+channels = ["radiance_sh", "albedo", "metallic", "roughness", "indirect_sh"]
+sh_degree = 1
+[light]
+height = 8
+[stage.initial]
+until = 3
+at = "surfel"
+diffuse = "irradiance"
+[stage.deferred]
+until = 3000
+at = "pixel"
+[mesh]
+extract = { start = 3, until = 6, every = 1 }
+resolution = 16
+"""
+"""Written for the iterations of the preset `quick`, so that nothing is scaled."""
+SETTINGS = ["iterations=6", "surfels.count=80", "surfels.max_count=100", "preview_every=4", "log_every=2"]
+
+
+def write_method(folder: Path) -> Path:
+    """The method as `tiny.toml` in a folder."""
+    path = folder / "tiny.toml"
+    path.write_text(METHOD)
+    return path
+
+
+def write_data(folder: Path, views: int = 3, truth: bool = True) -> Path:
+    """Training and two test views of a ball coloured by its normals; `truth`: with normals and a light."""
+    for split, count in (("train", views), ("test", 2)):
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for i in range(count):
+            angle = 2 * np.pi * (i + 0.5 * (split == "test")) / max(count, 1)
+            pose = _look_at_origin(DISTANCE * np.array([np.cos(angle), np.sin(angle), 0.5]) / np.sqrt(1.25))
+            alpha, normal = _ball(pose)
+            picture = np.concatenate([0.5 + 0.4 * normal, alpha[..., None]], axis=-1)
+            write_png(folder / split / f"r_{i}.png", picture)
+            frame = {"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()}
+            if truth:
+                write_exr(folder / split / f"r_{i}_normal.exr", normal, names="XYZ")
+                frame["normal_path"] = f"./{split}/r_{i}_normal.exr"
+            frames.append(frame)
+        content = {"fl_x": FOCAL, "fl_y": FOCAL, "w": SIZE, "h": SIZE, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+    if truth:
+        light = np.linspace(0.1, 2, 8 * 16 * 3).reshape(8, 16, 3)
+        write_exr(folder / "environment.exr", light)
+    return folder
+
+
+def _look_at_origin(origin: np.ndarray) -> np.ndarray:
+    """Camera to world, OpenGL axes (looking along −z), z up."""
+    back = origin / np.linalg.norm(origin)
+    right = np.cross([0.0, 0, 1], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, origin], axis=1)
+    return pose
+
+
+def _ball(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Alpha (H, W) and normals (H, W, 3) of the ball at the pixel centres."""
+    offset = (np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL
+    x, y = np.meshgrid(offset, -offset)
+    ray = np.stack([x, y, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    origin = pose[:3, 3]
+    along = ray @ origin
+    discriminant = along**2 - origin @ origin + RADIUS**2
+    hit = discriminant > 0
+    distance = -along - np.sqrt(np.maximum(discriminant, 0))
+    normal = np.where(hit[..., None], (origin + distance[..., None] * ray) / RADIUS, 0)
+    return hit.astype(np.float64), normal
