@@ -191,7 +191,7 @@ def refused(argv: list[str], capsys: pytest.CaptureFixture[str], *parts: object)
     out, err = capsys.readouterr()
     [said] = [line for line in err.splitlines() if line.startswith("refgs: ") and "warning" not in line][-1:]
     assert not out and "Traceback" not in err
-    assert "; " in said, said  # the remedy follows what is wrong
+    assert "; " in said or "such as" in said, said  # the remedy follows what is wrong
     for part in parts:
         assert str(part) in said, said
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -14,6 +15,8 @@ from typing import Any, NoReturn
 from mi_refgs.errors import InputError
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
+FILE_THREADS = 2
+"""Mitsuba 3.9 reads and writes EXR files on a worker thread and waits for ever if there is only one thread."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ def add_command(
             "--threads",
             type=int,
             metavar="N",
-            help="worker threads (default: every core); 1 makes results reproducible bitwise",
+            help="worker threads (default: every core); with 1, training is reproducible bit for bit",
         )
     parser.set_defaults(run=run, kernels=kernels)
     return parser
@@ -104,11 +107,31 @@ def prepare(args: argparse.Namespace) -> None:
                 f"--threads: {args.threads} is out of range; give 1 to {4 * (os.cpu_count() or 1)}"
             )
         dr.set_thread_count(args.threads)
+    if dr.thread_count() < FILE_THREADS:
+        dr.set_thread_count(FILE_THREADS)
     try:
         mi.set_variant(variant)
     except ImportError as error:
         raise UnusableError(f"{error} (`refgs doctor` says more)") from error
     mi.set_log_level(mi.LogLevel.Warn)
+
+
+@contextlib.contextmanager
+def threads(count: int | None) -> Iterator[None]:
+    """Run a part that neither reads nor writes EXR files through Mitsuba on exactly this many threads."""
+    import drjit as dr
+
+    before = dr.thread_count()
+    if count is None or count == before:
+        yield
+        return
+    dr.sync_thread()
+    dr.set_thread_count(count)
+    try:
+        yield
+    finally:
+        dr.sync_thread()
+        dr.set_thread_count(before)
 
 
 def warn(message: str) -> None:

@@ -42,6 +42,10 @@ def run(args: argparse.Namespace) -> Result:
         raise InputError(
             f"{args.output}: suffix: '{args.output.suffix}' is no picture format here; use .exr or .png"
         )
+    if not args.output.parent.is_dir():
+        raise InputError(
+            f"{args.output}: output: its folder does not exist; create it or choose a writable folder"
+        )
     if args.spp < 0:
         raise InputError(f"--spp: {args.spp} is out of range; give a number from 1")
     scene = load_scene(scene_file(args.scene), args.aov)
@@ -76,6 +80,10 @@ def load_scene(path: Path, aovs: list[str]) -> Any:
     """
     import mitsuba as mi
 
+    before = mi.file_resolver()
+    beside = mi.FileResolver(before)
+    beside.prepend(str(path.parent.resolve()))
+    mi.set_file_resolver(beside)
     try:
         config = mi.parser.ParserConfig(mi.variant())
         state = mi.parser.parse_file(config, str(path))
@@ -88,6 +96,8 @@ def load_scene(path: Path, aovs: list[str]) -> Any:
         loaded = mi.parser.instantiate(config, state)
     except RuntimeError as error:
         raise InputError(f"{path}: scene: {_reason(error)}") from error
+    finally:
+        mi.set_file_resolver(before)
     return loaded[0] if isinstance(loaded, list) else loaded
 
 

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mi_refgs.cli.command import Result, add_command, add_output, say, warn
+from mi_refgs.cli.command import Result, add_command, add_output, say, threads, warn
 from mi_refgs.errors import InputError
 from mi_refgs.resources import resource_dir
 
@@ -58,7 +58,7 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Fit, from the start or from the newest checkpoint."""
-    trainer = fit(args.data, args.output, args.variant, args.preset, args.set, args.resume)
+    trainer = fit(args.data, args.output, args.variant, args.preset, args.set, args.resume, args.threads)
     last = trainer.statistics() if trainer.loss is not None else {}
     data = {
         "run": str(args.output),
@@ -83,6 +83,7 @@ def fit(
     preset: str | None = None,
     assignments: list[str] | None = None,
     resume: bool = False,
+    thread_count: int | None = None,
 ) -> Trainer:
     """Train with a progress bar and previews, then write the artefacts; a finished run is only loaded.
 
@@ -116,7 +117,8 @@ def fit(
         truth=False,
     )
     warn_of_data(method, views)
-    trainer = Trainer(method, views, folder)
+    with threads(thread_count):
+        trainer = Trainer(method, views, folder)
     if resumed:
         say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
         folder.truncate_log(trainer.iteration)
@@ -124,7 +126,7 @@ def fit(
         folder.create(method, str(data_path.resolve()))
 
     try:
-        with Progress(trainer, folder) as progress:
+        with Progress(trainer, folder) as progress, threads(thread_count):
             trainer.train(progress)
     except KeyboardInterrupt:
         kept = "" if folder.checkpoints() else " (before the first iteration was done)"

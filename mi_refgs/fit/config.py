@@ -49,7 +49,8 @@ class SurfelOptions:
     channels: tuple[str, ...] = ("radiance_sh", "albedo", "metallic", "roughness", "indirect_sh")
     count: int = 20_000  # initial surfels
     max_count: int = 40_000  # densification stops here
-    sh_degree: int = 3  # of the radiance and indirect channels
+    sh_degree: int = 3  # of the radiance channel
+    indirect_degree: int = 3  # of the indirect channel, from the start
     sh_raise: Window = Window(0, 3, 1)  # one more degree each time it is due
     opacity: float = 0.1  # initial, activated
     metallic: float = 0.01
@@ -128,7 +129,8 @@ class Rates:
     metallic: float = 5e-3
     roughness: float = 5e-3
     indirect_sh: float = 7.5e-3
-    sh_rest: float = 0.05  # factor of the higher degrees
+    sh_rest: float = 0.05  # factor of the higher degrees of radiance
+    indirect_rest: float = 0.05  # … of the indirect channel
     light: float = 0.01
 
 

@@ -11,6 +11,7 @@ What a method does not have (a light, a mesh) has no file.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
@@ -152,8 +153,9 @@ def export(fitted: Fitted, folder: Path, camera: Camera) -> list[Path]:
 def newest(run: Run, method: Method) -> Fitted | None:
     """What the newest checkpoint holds, if there is one that the artefacts do not already show."""
     shown = -1
-    if all((run.path / name).is_file() for name in (SURFELS, MODEL)):
-        shown = Fitted.read(run.path).iteration
+    if (run.path / SURFELS).is_file():
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            shown = int(json.loads((run.path / MODEL).read_text(encoding="utf-8"))["iteration"])
     state = run.load_checkpoint()
     if state is None or int(state["iteration"]) <= shown:
         return None

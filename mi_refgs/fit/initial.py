@@ -29,10 +29,11 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
     return init.from_points(
         points,
         normals,
-        init.mean_colours(points, views),
+        init.mean_colours(points, views, normals),
         rng=rng,
         channels=(*GEOMETRY, *options.channels),
         sh_degree=options.sh_degree,
+        indirect_degree=options.indirect_degree,
         opacity=options.opacity,
         metallic=options.metallic,
         roughness=options.roughness,

@@ -294,18 +294,18 @@ class Trainer:
         return int(np.random.default_rng([self.method.seed, epoch, 1]).permutation(len(self.targets))[place])
 
     def _groups(self) -> dict[str, Group]:
-        rates, degrees = self.method.rates, {"head": 3, "tail": self.method.rates.sh_rest}
+        rates = self.method.rates
         steps = int(0.6 * self.method.iterations)  # 30,000 of 50,000 in the paper's code
         groups = {
             "position": Group(rates.position * self.extent, rates.position_final * self.extent, steps),
             "rotation": Group(rates.rotation),
             "scale": Group(rates.scale),
             "opacity": Group(rates.opacity),
-            "radiance_sh": Group(rates.radiance_sh, **degrees),
+            "radiance_sh": Group(rates.radiance_sh, head=3, tail=rates.sh_rest),
             "albedo": Group(rates.albedo),
             "metallic": Group(rates.metallic),
             "roughness": Group(rates.roughness),
-            "indirect_sh": Group(rates.indirect_sh, **degrees),
+            "indirect_sh": Group(rates.indirect_sh, head=3, tail=rates.indirect_rest),
             LIGHT: Group(rates.light),
         }
         return {name: group for name, group in groups.items() if name in self.params}

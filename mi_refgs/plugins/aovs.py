@@ -45,12 +45,17 @@ class AOV:
 
 
 def parse_aovs(text: str) -> list[AOV]:
-    """Parse a comma-separated list of `name:type`; raises InputError for a malformed pair, unknown type or repeated name."""
+    """Parse a comma-separated list of `name:type`.
+
+    Raises InputError for a malformed pair, an unknown type or a repeated name.
+    """
     aovs: list[AOV] = []
     for pair in filter(None, (part.strip() for part in text.split(","))):
         name, colon, kind = (part.strip() for part in pair.partition(":"))
         if not colon or not name:
-            raise InputError(f"refgs: aovs: '{pair}' is not a <name>:<type> pair; write for example 'nn:normal'")
+            raise InputError(
+                f"refgs: aovs: '{pair}' is not a <name>:<type> pair; write for example 'nn:normal'"
+            )
         if kind not in SUFFIXES:
             raise InputError(f"refgs: aovs: unknown type '{kind}'; use one of {', '.join(SUFFIXES)}")
         if any(name == other.name for other in aovs):
@@ -62,8 +67,9 @@ def parse_aovs(text: str) -> list[AOV]:
 def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Any]:
     """The channels (mi.Float) of one type, as wide as the frame or 1.
 
-    Materials and the unit normal are those of what is seen, 0 where nothing is; depth is the distance along the ray from
-    the near plane, as Mitsuba's `depth` is; the three terms are premultiplied by alpha and sum to the image over black.
+    Materials and the unit normal are those of what is seen, 0 where nothing is. Depth is the distance along
+    the ray from the near plane, as Mitsuba's `depth` is. The three terms are premultiplied by alpha and sum
+    to the image over black.
     """
     seen = frame.alpha > COVERAGE_FLOOR
     if kind in MATERIALS:

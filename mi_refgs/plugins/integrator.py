@@ -32,14 +32,15 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
      * - filename
        - |string|
-       - PLY file with the surfels: 2DGS's properties, and albedo, metallic, roughness and indirect SH, all raw (before
-         the activation). In Python, channels may be given instead, or replaced, by tensors under their names.
+       - PLY file with the surfels: 2DGS's properties, and albedo, metallic, roughness and indirect SH, all
+         raw (before the activation). In Python, channels may be given instead, or replaced, by tensors
+         under their names.
 
      * - light *or any name*
        - |emitter|
-       - An ``envmap`` or ``constant`` emitter, copied into the integrator's own light. Without one, the scene's own
-         environment emitter of these types lights the surfels. In Python also the raw tensor of a
-         ``mi_refgs.shade.envmap.EnvironmentLight``.
+       - An ``envmap`` or ``constant`` emitter, copied into the integrator's own light. Without one, the
+         scene's own environment emitter of these types lights the surfels. In Python also the raw tensor of
+         a ``mi_refgs.shade.envmap.EnvironmentLight``.
 
      * - mesh
        - |string|
@@ -47,21 +48,23 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
      * - occlusion
        - |bool|
-       - Trace visibility along the mirror direction, and show the surfels' indirect light where it is blocked.
-         (Default: whether there is a ``mesh``)
+       - Trace visibility along the mirror direction, and show the surfels' indirect light where it is
+         blocked. (Default: whether there is a ``mesh``)
 
      * - shade_at
        - |string|
-       - ``pixel`` (blend attributes, then shade) or ``surfel`` (shade, then blend radiance). (Default: ``pixel``)
+       - ``pixel`` (blend attributes, then shade) or ``surfel`` (shade, then blend radiance). (Default:
+         ``pixel``)
 
      * - reflectance
        - |string|
-       - ``split_sum`` (diffuse and GGX specular) or ``radiance`` (the SH colour alone, needs no light; the two orders
-         of shading are then the same). (Default: ``split_sum`` if the surfels have materials)
+       - ``split_sum`` (diffuse and GGX specular) or ``radiance`` (the SH colour alone, needs no light; the
+         two orders of shading are then the same). (Default: ``split_sum`` if the surfels have materials)
 
      * - diffuse
        - |string|
-       - ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times light). (Default: ``sh`` if there is one)
+       - ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times light). (Default: ``sh`` if there
+         is one)
 
      * - terms
        - |string|
@@ -73,9 +76,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
      * - aovs
        - |string|
-       - Comma-separated ``<name>:<type>`` pairs as in the ``aov`` integrator, appended to RGB(A). Types: ``albedo``,
-         ``metallic``, ``roughness``, ``normal`` (world, towards the camera), ``depth``, ``alpha``, ``visibility``,
-         ``diffuse``, ``specular``, ``indirect``. (Default: none)
+       - Comma-separated ``<name>:<type>`` pairs as in the ``aov`` integrator, appended to RGB(A). Types:
+         ``albedo``, ``metallic``, ``roughness``, ``normal`` (world, towards the camera), ``depth``,
+         ``alpha``, ``visibility``, ``diffuse``, ``specular``, ``indirect``. (Default: none)
 
      * - position, rotation, scale, opacity, radiance_sh, albedo, metallic, roughness, indirect_sh
        - |tensor|
@@ -84,18 +87,20 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
      * - light
        - |tensor|
-       - Raw map (h, w, 3) of the integrator's own light, if it has one: radiance = ``EnvironmentLight(raw).radiance()``,
-         positive for any raw value. Light of the scene is exposed by its emitter instead.
+       - Raw map (h, w, 3) of the integrator's own light, if it has one: radiance =
+         ``EnvironmentLight(raw).radiance()``, positive for any raw value. Light of the scene is exposed by
+         its emitter instead.
        - |exposed|, |differentiable|
 
     The keys start with the integrator's id, `refgs` unless the scene sets one: ``params['refgs.roughness']``.
 
-    This integrator splats surfels in the view of a `perspective` sensor. It does not see the scene's shapes, and shows
-    the environment only as reflections. Without noise, it ignores the seed. A sample count n (of ``mi.render``, else of the
-    sensor's sampler, whose default is 4) gives k × k regular samples a pixel, k = ⌈√n⌉, box filtered; n = 1 takes pixel
-    centres. `mi.render` differentiates it in both modes with respect to the parameters above and to ``data``, ``scale`` or
-    ``radiance.value`` of the scene's environment, but not to sensors, background or mesh; `mi_refgs.splat.blend` lists
-    the derivatives that are absent.
+    This integrator splats surfels in the view of a `perspective` sensor. It does not see the scene's
+    shapes, and shows the environment only as reflections. Without noise, it ignores the seed. A sample
+    count n (of ``mi.render``, else of the sensor's sampler, whose default is 4) gives k × k regular samples
+    a pixel, k = ⌈√n⌉, box filtered; n = 1 takes pixel centres. `mi.render` differentiates it in both modes
+    with respect to the parameters above and to ``data``, ``scale`` or ``radiance.value`` of the scene's
+    environment, but not to sensors, background or mesh; `mi_refgs.splat.blend` lists the derivatives that
+    are absent.
 
     .. tabs::
         .. code-tab:: xml
@@ -142,7 +147,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         needed += [aov.type for aov in self.aovs if aov.type in MATERIALS]
         for name in needed:
             if not self.surfels.has(name):
-                raise InputError(f"refgs: {name}: the surfels have no such channel; add it, or choose what needs none")
+                raise InputError(f"refgs: {name}: the surfels have no such channel; add it, or do without it")
         if self.light is not None:
             shape = tuple(self.light.raw.shape)
             if len(shape) != 3 or shape[2] != 3 or shape[1] != 2 * shape[0] or shape[0] % 4:
@@ -197,12 +202,14 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             dr.traverse(dr.ADMode.Backward)
 
     def sample(self, *args: Any, **kwargs: Any) -> Any:
-        raise InputError("refgs: sample: whole images only; do not nest it in `aov` or `moment`, use its own `aovs`")
+        raise InputError("refgs: sample: renders whole images only; do not nest it, use its own `aovs`")
 
     def _image(self, scene: Any, sensor: Any, spp: int) -> Any:
         """Render under whatever AD scope is active, through the sensor's film."""
         if mi.variant() != self.variant:
-            raise InputError(f"refgs: variant: made under {self.variant}, not {mi.variant()}; load the scene again")
+            raise InputError(
+                f"refgs: variant: made under {self.variant}, not {mi.variant()}; load the scene again"
+            )
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         film = sensor.film()
@@ -210,11 +217,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             raise InputError("refgs: film: refgs renders RGB radiance only; use an `hdrfilm`")
         camera = Camera.from_sensor(sensor)
         factor = math.ceil(math.sqrt(max(1, int(spp) or int(sensor.sampler().sample_count()))))
-        channels = self._channels(scene, camera.supersampled(factor), mi.has_flag(film.flags(), mi.FilmFlags.Alpha))
-        pixels = camera.width * camera.height
+        alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        channels = self._channels(scene, camera.supersampled(factor), alpha)
         values = dr.ravel(mi.ArrayXf([_box(channel, camera, factor) for channel in channels]))
         tensor = mi.TensorXf(values, (camera.height, camera.width, len(channels)))
-        assert dr.width(values) == pixels * len(channels)
         film.prepare(self.aov_names())
         film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
         return film.develop()
@@ -245,18 +251,22 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         if self.light is None:
             emitter = scene.environment()
             if emitter is None:
-                raise InputError("refgs: light: there is none; nest an `envmap` in the integrator or add one to the scene")
+                raise InputError(
+                    "refgs: light: there is none; nest an `envmap` in the integrator, or in the scene"
+                )
             return emitter_light(emitter)
         light = self.light.prefilter()
         return light if self.light_rotation is None else TurnedLight(light, self.light_rotation)
 
     def to_string(self) -> str:
         size = "x".join(str(x) for x in self.light.raw.shape[:2]) if self.light is not None else "the scene's"
-        return (
-            f"RefGSIntegrator[\n  surfels = {self.surfels.count},\n  channels = {', '.join(self.surfels.raw)},\n"
-            f"  light = {size},\n  shade_at = {self.shading.at},\n  reflectance = {self.shading.reflectance},\n"
-            f"  diffuse = {self.shading.diffuse},\n  occlusion = {self.shading.occlusion}\n]"
-        )
+        lines = [
+            f"surfels = {self.surfels.count}",
+            f"channels = {', '.join(self.surfels.raw)}",
+            f"light = {size}",
+            f"shading = {self.shading}",
+        ]
+        return "RefGSIntegrator[\n  " + ",\n  ".join(lines) + "\n]"
 
 
 def _box(channel: Any, camera: Camera, factor: int) -> Any:

@@ -23,7 +23,7 @@ TERMS = ("diffuse", "specular", "indirect")
 
 
 def _path(props: Any, name: str) -> str | None:
-    """A file property, found as Mitsuba finds files: beside the XML first. Only possible while the plugin is made."""
+    """A file property, found beside the XML first; Mitsuba knows that folder only while it makes plugins."""
     value = props.get(name, None)
     return None if value is None else str(mi.file_resolver().resolve(str(value)))
 
@@ -44,7 +44,9 @@ def read_surfels(props: Any) -> Surfels:
         if value is not None:
             raw[name] = mi.TensorXf(value)
     if not raw:
-        raise InputError("refgs: filename: there are no surfels; name a PLY file, or give the channels as tensors")
+        raise InputError(
+            "refgs: filename: there are no surfels; name a PLY file, or give the channels as tensors"
+        )
     return Surfels(raw)
 
 
@@ -60,13 +62,13 @@ def read_light(props: Any) -> tuple[Any, Any]:
 
 
 def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None]:
-    """How to shade, with defaults that fit the channels there are; and the occluder if that traces visibility."""
+    """How to shade, by defaults that fit the channels; and the occluder if that traces visibility."""
     materials = all(surfels.has(name) for name in MATERIALS)
     default = "split_sum" if materials else "radiance"
     reflectance = _choice(props, "reflectance", default, ("split_sum", "radiance"))
     default = "sh" if surfels.has("radiance_sh") or reflectance == "radiance" else "irradiance"
     diffuse = _choice(props, "diffuse", default, ("sh", "irradiance"))
-    at = _choice(props, "shade_at", "pixel", ("pixel", "surfel"))
+    at: Any = _choice(props, "shade_at", "pixel", ("pixel", "surfel"))
     mesh = _path(props, "mesh")
     deferred = at == "pixel" and reflectance == "split_sum"
     occlusion = bool(props.get("occlusion", mesh is not None and deferred))
@@ -76,7 +78,9 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
         raise InputError("refgs: occlusion: needs shade_at = pixel and reflectance = split_sum; set these")
     # Radiance is blended linearly, so that both orders are one; the pipeline calls it shading at surfels.
     at = at if reflectance == "split_sum" else "surfel"
-    return Shading(at, reflectance, diffuse, occlusion), Occluder(read_mesh(mesh)) if occlusion and mesh else None
+    return Shading(at, reflectance, diffuse, occlusion), Occluder(
+        read_mesh(mesh)
+    ) if occlusion and mesh else None
 
 
 def read_terms(props: Any) -> list[str]:

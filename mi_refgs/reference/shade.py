@@ -1,7 +1,8 @@
-"""Shading in NumPy float64, point by point and by brute force: the specification that `mi_refgs.shade` is tested against.
+"""Shading in NumPy float64, point by point and by brute force: the specification that `mi_refgs.shade` is
+tested against.
 
-It shares no code with it: other formulas for the spherical harmonics, plain quadrature for the split sum and for the
-lobe, plain lookups. Directions are (3,) arrays, colours too.
+It shares no code with it: other formulas for the spherical harmonics, plain quadrature for the split sum and
+for the lobe, plain lookups. Directions are (3,) arrays, colours too.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import numpy as np
 
 
 def split_sum(n_dot_v: float, roughness: float, nodes: int = 1500) -> tuple[float, float]:
-    """(A, B) of one pair by midpoints over the half vectors: GGX α = roughness², correlated Smith, Schlick."""
+    """(A, B) of one pair by midpoints over the half vectors: GGX α = roughness², correlated Smith,
+    Schlick."""
     α2 = roughness**4
     ξ = 1 - ((np.arange(nodes) + 0.5) / nodes)[:, None] ** 2
     weight = 2 * np.sqrt(1 - ξ) / nodes
@@ -34,7 +36,8 @@ def split_sum(n_dot_v: float, roughness: float, nodes: int = 1500) -> tuple[floa
 
 
 def sh_basis(direction: np.ndarray, degree: int) -> np.ndarray:
-    """Real spherical harmonics with the Condon-Shortley phase, by Legendre recursion in the polar angle from +z."""
+    """Real spherical harmonics with the Condon-Shortley phase, by Legendre recursion in the polar angle from
+    +z."""
     x, y, z = (float(c) for c in direction)
     r = math.hypot(x, y)
     φ = math.atan2(y, x)
@@ -56,7 +59,8 @@ def sh_basis(direction: np.ndarray, degree: int) -> np.ndarray:
 
 
 def bilinear(radiance: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Lat-long (h, w, 3) looked up as Mitsuba's `envmap` does: column centres at half-integers, pole rows on the poles."""
+    """Lat-long (h, w, 3) looked up as Mitsuba's `envmap` does: column centres at half-integers, pole rows on
+    the poles."""
     h, w = radiance.shape[:2]
     x, y, z = direction
     u = (math.atan2(x, -z) / (2 * math.pi)) % 1.0 * w - 0.5
@@ -68,32 +72,36 @@ def bilinear(radiance: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return (1 - t) * upper + t * lower
 
 
-def lobe_average(radiance: np.ndarray, direction: np.ndarray, roughness: float, *, rings: int = 400, spokes: int = 600) -> np.ndarray:
-    """∫ L W / ∫ W with W = max(L·R, 0) D(R·H), in polar coordinates around R, rings drawn from D."""
-    α2 = roughness**4
+def lobe_average(
+    radiance: np.ndarray, direction: np.ndarray, roughness: float, *, rings: int = 400, spokes: int = 400
+) -> np.ndarray:
+    """∫ L W / ∫ W with W = max(L·R, 0) D(R·H), in polar coordinates around R: even rings in the core, wider
+    in the tail."""
+    α = roughness**2
     pole = np.asarray(direction, np.float64) / np.linalg.norm(direction)
     helper = np.eye(3)[np.argmin(np.abs(pole))]
     side = np.cross(pole, helper) / np.linalg.norm(np.cross(pole, helper))
     up = np.cross(pole, side)
-    h, w = radiance.shape[:2]
-    total, weights = np.zeros(3), 0.0
     φ = (np.arange(spokes) + 0.5) * (2 * math.pi / spokes)
     around = np.cos(φ)[:, None] * side + np.sin(φ)[:, None] * up
+    total, weights = np.zeros(3), 0.0
+    end = math.asinh(1 / α)  # tan θ_h = 1 puts L on the horizon
     for n in range(rings):
-        # tan θ_h = α √(ξ / (1 - ξ)) up to θ_h = 45°, where L stands on the horizon; ξ = 1 - s² resolves the tail.
-        s_max = math.sqrt(α2 / (1 + α2))
-        s = s_max + (1 - s_max) * (n + 0.5) / rings
-        half = math.atan(math.sqrt(α2 * (1 - s * s)) / s)
-        cosine = math.cos(2 * half)
-        # dω_l = 4 cosθ_h dω_h and D cosθ_h dω_h = dξ dφ / 2π
-        weight = cosine * s
-        directions = cosine * pole + math.sin(2 * half) * around
-        total += weight * _bilinear_many(radiance, directions).mean(0)
+        t = end * (n + 0.5) / rings
+        half = math.atan(α * math.sinh(t))
+        d = α**2 / (math.cos(half) ** 2 * (α**2 - 1) + 1) ** 2
+        width = α * math.cosh(t) * math.cos(half) ** 2  # dθ_h / dt
+        # dω_l = 4 cosθ_h dω_h
+        weight = math.cos(2 * half) * d * math.cos(half) * math.sin(half) * width
+        total += weight * bilinear_many(
+            radiance, math.cos(2 * half) * pole + math.sin(2 * half) * around
+        ).mean(0)
         weights += weight
     return total / weights
 
 
-def _bilinear_many(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def bilinear_many(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """`bilinear` of directions (n, 3), for the quadratures."""
     h, w = radiance.shape[:2]
     u = np.mod(np.arctan2(directions[:, 0], -directions[:, 2]) / (2 * np.pi), 1.0) * w - 0.5
     v = np.arccos(np.clip(directions[:, 1], -1, 1)) / np.pi * (h - 1)
@@ -105,8 +113,11 @@ def _bilinear_many(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
     )
 
 
-def specular(levels: Sequence[np.ndarray], roughnesses: Sequence[float], direction: np.ndarray, roughness: float) -> np.ndarray:
-    """Lookup between levels (the map first, then one a roughness): linear in 1/r, in r⁴ below the first roughness."""
+def specular(
+    levels: Sequence[np.ndarray], roughnesses: Sequence[float], direction: np.ndarray, roughness: float
+) -> np.ndarray:
+    """Lookup between levels (the map first, then one a roughness): linear in 1/r, in r⁴ below the first
+    roughness."""
     if roughness <= roughnesses[0]:
         lower, t = 0, (roughness / roughnesses[0]) ** 4
     else:
@@ -122,7 +133,9 @@ def table_lookup(table: np.ndarray, n_dot_v: float, roughness: float) -> np.ndar
     x, y = min(max(n_dot_v, 0.0), 1.0) * n - 0.5, min(max(roughness, 0.0), 1.0) * n - 0.5
     j, i = (min(max(math.floor(c), 0), n - 2) for c in (x, y))
     s, t = x - j, y - i
-    return (1 - t) * ((1 - s) * table[i, j] + s * table[i, j + 1]) + t * ((1 - s) * table[i + 1, j] + s * table[i + 1, j + 1])
+    return (1 - t) * ((1 - s) * table[i, j] + s * table[i, j + 1]) + t * (
+        (1 - s) * table[i + 1, j] + s * table[i + 1, j + 1]
+    )
 
 
 def shade(

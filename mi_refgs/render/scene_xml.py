@@ -1,4 +1,4 @@
-"""The `scene.xml` of a run: what `mi.load_file` needs, after `import mi_refgs`, to render the fitted scene."""
+"""The `scene.xml` of a run: what `mi.load_file` renders after `import mi_refgs`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.render.pipeline import Shading
 from mi_refgs.splat.camera import Camera
 
-# Mitsuba's perspective sensor has square pixels; float32 focal lengths of one camera agree far better than this.
+# Mitsuba's perspective sensor has square pixels; float32 focal lengths of one camera agree far better.
 SQUARE_PIXEL_TOLERANCE = 1e-4
 
 
@@ -31,12 +31,12 @@ def write_scene_xml(
 ) -> None:
     """Write a Mitsuba scene with one `refgs` integrator and one perspective sensor, atomically.
 
-    ply, envmap, mesh: file names relative to the folder of the XML, so that the folder can be moved. background: linear
-    radiance (r, g, b) composited under alpha, or None for a transparent image. The scene has a parameter `spp`, as in
-    `mi.load_file(path, spp=4)`, 1 by default: pixel centres, as in training.
+    ply, envmap, mesh: file names relative to the folder of the XML, so that the folder can be moved.
+    background: linear radiance (r, g, b) composited under alpha, or None for a transparent image. The scene
+    has a parameter `spp`, as in `mi.load_file(path, spp=4)`, 1 by default: pixel centres, as in training.
 
-    Raises InputError if the camera is none that Mitsuba has (mirrored, or without square pixels), or if the path cannot
-    be written.
+    Raises InputError if the camera is none that Mitsuba has (mirrored, or without square pixels), or if the
+    path cannot be written.
     """
     scene = ElementTree.Element("scene", version="3.0.0")
     scene.append(ElementTree.Comment(" needs `import mi_refgs` before mi.load_file "))
@@ -46,7 +46,9 @@ def write_scene_xml(
     _put(integrator, "string", "shade_at", shading.at)
     _put(integrator, "string", "reflectance", shading.reflectance)
     _put(integrator, "string", "diffuse", shading.diffuse)
-    _put(integrator, "boolean", "occlusion", str(shading.occlusion and mesh is not None).lower())
+    deferred = shading.at == "pixel" and shading.reflectance == "split_sum"
+    occlusion = shading.occlusion and deferred and mesh is not None
+    _put(integrator, "boolean", "occlusion", str(occlusion).lower())
     if mesh is not None:
         _put(integrator, "string", "mesh", mesh)
     if background is not None:
@@ -63,7 +65,9 @@ def write_scene_xml(
         temporary.write_text(ElementTree.tostring(scene, encoding="unicode") + "\n", encoding="utf-8")
         os.replace(temporary, path)
     except OSError as error:
-        raise InputError(f"{path}: output: cannot be written ({error.strerror}); choose a writable folder") from error
+        raise InputError(
+            f"{path}: output: cannot be written ({error.strerror}); choose a writable folder"
+        ) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -80,8 +84,8 @@ def _add_sensor(scene: ElementTree.Element, camera: Camera) -> None:
     fx, fy, cx, cy, near = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy, camera.near))
     if not (fx < 0 and fy < 0 and abs(fx - fy) < SQUARE_PIXEL_TOLERANCE * abs(fx)):
         raise InputError(
-            f"camera: fx, fy: {fx:g} and {fy:g} pixels are no Mitsuba `perspective` sensor, whose pixels are square and not "
-            "mirrored; choose another view"
+            f"camera: fx, fy: {fx:g} and {fy:g} pixels are no Mitsuba `perspective` sensor, whose pixels are "
+            "square and not mirrored; choose another view"
         )
     to_world = np.eye(4)
     to_world[:3, :3] = np.array(camera.rotation, dtype=np.float64).reshape(3, 3).T

@@ -1,7 +1,8 @@
-"""The split-sum table: how much of a constant light a GGX surface reflects, A·F0 + B, against (N·V, roughness).
+"""The split-sum table: how much of a constant light a GGX surface reflects, A·F0 + B, against (N·V,
+roughness).
 
-α = roughness², height-correlated Smith shadowing, Schlick's Fresnel. [Karis 2013, "Real Shading in Unreal Engine 4";
-Heitz 2014, "Understanding the Masking-Shadowing Function", eq. 99]
+α = roughness², height-correlated Smith shadowing, Schlick's Fresnel. [Karis 2013, "Real Shading in Unreal
+Engine 4"; Heitz 2014, "Understanding the Masking-Shadowing Function", eq. 99]
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ RESOLUTION = 256
 
 RADIAL_NODES = 48
 AZIMUTH_NODES = 32
-"""Gauss-Legendre nodes over the half vector's polar angle and midpoints over half its azimuth: error below 4e-4 in the
-column of smallest N·V and 1e-4 elsewhere, 1 s of one core. [measured against 600 × 400 float64 midpoints]"""
+"""Gauss-Legendre nodes over the half vector's polar angle and midpoints over half its azimuth: error below
+4e-4 in the column of smallest N·V and 1e-4 elsewhere, 1 s of one core. [measured against 600 × 400 float64
+midpoints]"""
 
 HORIZON = 1e-7
 """Smallest N·L whose 1/(N·L)² still fits float32; below it shadowing leaves nothing."""
@@ -33,9 +35,11 @@ CACHE_NAME = "split_sum_256_v1.npy"
 
 
 def compute_table() -> np.ndarray:
-    """Split-sum table (256, 256, 2) float32: [roughness row, N·V column, (A, B)], by deterministic quadrature."""
+    """Split-sum table (256, 256, 2) float32: [roughness row, N·V column, (A, B)], by deterministic
+    quadrature."""
     x, weight = np.polynomial.legendre.leggauss(RADIAL_NODES)
-    # ξ = 1 - s² draws half vectors from D cosθ; the square gathers nodes at grazing half vectors, where the rest varies.
+    # ξ = 1 - s² draws half vectors from D cosθ; the square gathers nodes at grazing half vectors, where the
+    # rest varies.
     s, weight = 0.5 * (1 - x), 0.5 * weight * (1 - x)
     φ = (np.arange(AZIMUTH_NODES) + 0.5) * (np.pi / AZIMUTH_NODES)
     centre = (np.arange(RESOLUTION) + 0.5) / RESOLUTION
@@ -71,15 +75,21 @@ def cache_dir() -> Path:
 
 @functools.lru_cache(maxsize=1)
 def table() -> np.ndarray:
-    """The table of `compute_table`, from the user's cache folder when it is there, else computed and kept there.
+    """The table of `compute_table`, from the user's cache folder when it is there, else computed and kept
+    there.
 
-    A cache that cannot be read, or written, or that does not hold such a table, is passed over without a word.
+    A cache that cannot be read, or written, or that does not hold such a table, is passed over without a
+    word.
     """
     path = None
     with suppress(OSError, ValueError, RuntimeError, EOFError):
         path = cache_dir() / CACHE_NAME
         cached = np.load(path, allow_pickle=False)
-        if cached.shape == (RESOLUTION, RESOLUTION, 2) and cached.dtype == np.float32 and np.isfinite(cached).all():
+        if (
+            cached.shape == (RESOLUTION, RESOLUTION, 2)
+            and cached.dtype == np.float32
+            and np.isfinite(cached).all()
+        ):
             return cached
     computed = compute_table()
     with suppress(OSError):
@@ -109,8 +119,9 @@ def _device_table(variant: str) -> Any:
 def split_sum(n_dot_v: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Scale A and bias B of a GGX surface: its reflectance under constant light is F0·A + B.
 
-    Bilinear in the table, both arguments clamped to [0, 1]. The outer half texels continue the outermost two linearly:
-    clamping there would be off by 0.002 at roughness 1. Differentiable in both arguments; the table is not.
+    Bilinear in the table, both arguments clamped to [0, 1]. The outer half texels continue the outermost two
+    linearly: clamping there would be off by 0.002 at roughness 1. Differentiable in both arguments; the table
+    is not.
     """
     data = _device_table(mi.variant())
 

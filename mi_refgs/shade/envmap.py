@@ -1,9 +1,10 @@
-"""The environment light: learnable lat-long radiance, its prefiltered levels, and the lookups that shading needs.
+"""The environment light: learnable lat-long radiance, its prefiltered levels, and the lookups that shading
+needs.
 
-Directions follow Mitsuba's `envmap`: up is +y, φ = atan2(x, -z) runs along a row, θ from +y down the rows; column
-centres at half-integers, the first and the last row at the poles (see `lobe`). Images go in and out unturned.
-Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that an optimiser's step
-bounds the change of radiance; an exponential would let one step multiply a highlight.
+Directions follow Mitsuba's `envmap`: up is +y, φ = atan2(x, -z) runs along a row, θ from +y down the rows;
+column centres at half-integers, the first and the last row at the poles (see `lobe`). Images go in and out
+unturned. Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that
+an optimiser's step bounds the change of radiance; an exponential would let one step multiply a highlight.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from mi_refgs.shade import lobe
 from mi_refgs.shade.prefilter import Operator, prefilter
 
 DEFAULT_HEIGHT = 64
-"""Rows of a light that is fitted: 2.8° a texel, about what an image of a few hundred pixels resolves in a mirror."""
+"""Rows of a light that is fitted: 2.8° a texel, about what an image of a few hundred pixels resolves in a
+mirror."""
 
 MIN_HEIGHT = 8
 """Fewest rows for which the prefilter's symmetries hold."""
@@ -33,7 +35,8 @@ RADIANCE_FLOOR = 1e-4
 """Darkest radiance that an import keeps: softplus has no finite raw value for 0."""
 
 POLE_SINE = 1e-4
-"""Within 0.006° of a pole the azimuth is taken as that of the pole, so that its derivative stays below 1e4."""
+"""Within 0.006° of a pole the azimuth is taken as that of the pole, so that its derivative stays below
+1e4."""
 
 ATANH_TERMS = 7
 """Terms of the series of log(1 + e) in softplus: relative error below 1e-7 for e ≤ 1."""
@@ -47,7 +50,7 @@ def softplus(x: Any) -> Any:
     series = dr.zeros(type(x), dr.width(x))
     for n in reversed(range(ATANH_TERMS)):
         series = dr.fma(series, s * s, 1 / (2 * n + 1))
-    return dr.maximum(0, x) + 2 * s * series
+    return 0.5 * x + 0.5 * dr.abs(x) + 2 * s * series  # not max(0, x), whose slope at 0 is not ½
 
 
 def inverse_softplus(radiance: np.ndarray) -> np.ndarray:
@@ -58,7 +61,8 @@ def inverse_softplus(radiance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PrefilteredLight:
-    """Levels of an environment, as made by `EnvironmentLight.prefilter`; lookups are traced and differentiable."""
+    """Levels of an environment, as made by `EnvironmentLight.prefilter`; lookups are traced and
+    differentiable."""
 
     operator: Operator
     levels: Any  # flat RGBA texels, level after level
@@ -75,10 +79,12 @@ class PrefilteredLight:
         return self._bilinear(*_azimuth_polar(normal), mi.UInt32(len(lobe.LEVEL_ROUGHNESS)))
 
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
-        """Radiance averaged over the GGX lobe around unit world directions; derivative in light, direction, roughness.
+        """Radiance averaged over the GGX lobe around unit world directions; derivative in light, direction,
+        roughness.
 
-        Linear between levels in 1/roughness, where the mixture keeps both the lobe's energy (6 %) and its peak, and in
-        roughness⁴ below the first level, where a lobe narrower than a texel only begins to spread. [split sum, Karis 2013]
+        Linear between levels in 1/roughness, where the mixture keeps both the lobe's energy (6 %) and its
+        peak, and in roughness⁴ below the first level, where a lobe narrower than a texel only begins to
+        spread. [split sum, Karis 2013]
         """
         place = _level(roughness)
         lower = mi.UInt32(dr.clip(dr.detach(place), 0, len(lobe.LEVEL_ROUGHNESS) - 1))
@@ -107,17 +113,18 @@ class PrefilteredLight:
 
 
 def _azimuth_polar(direction: Any) -> tuple[Any, Any]:
-    """Fractions u ∈ [0, 1) of a turn and v ∈ [0, 1] of a meridian of unit directions, finite derivatives at the poles."""
+    """Fractions u ∈ [0, 1) of a turn and v ∈ [0, 1] of a meridian of unit directions, finite derivatives at
+    the poles."""
     x, y, z = direction.x, direction.y, direction.z
     sin2 = x * x + z * z
     off_pole = sin2 > POLE_SINE**2
-    # Like Mitsuba, whose atan2(0, -0) is π, the pole itself looks along +z.
+    # The pole itself has no azimuth, in Mitsuba neither; it looks along +z here.
     φ = dr.atan2(dr.select(off_pole, x, 0), -dr.select(off_pole, z, 1))
     u = φ * (0.5 / dr.pi)
     u = dr.select(u < 0, u + 1, u)
-    # At the pole itself sqrt has no derivative, and y alone tells the two poles apart.
+    # At the pole itself sqrt has no derivative, and the sign of y alone tells the two poles apart.
     sin = dr.select(off_pole, dr.sqrt(dr.select(off_pole, sin2, 1)), 0)
-    return u, dr.atan2(sin, y) * (1 / dr.pi)
+    return u, dr.atan2(sin, dr.select(off_pole, y, dr.select(y < 0, -1, 1))) * (1 / dr.pi)
 
 
 def _level(roughness: Any) -> Any:
@@ -168,18 +175,28 @@ class EnvironmentLight:
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:
-        """From a lat-long image that Mitsuba reads (EXR, HDR, …), resampled to `height` rows, keeping its energy.
+        """From a lat-long image that Mitsuba reads (EXR, HDR, …), resampled to `height` rows, keeping its
+        energy.
 
-        Without `height`: the image's own rows, to the next lower multiple of 4. Raises InputError when it is no such image.
+        Without `height`: the image's own rows, to the next lower multiple of 4. Raises InputError when it is
+        no such image.
         """
         try:
             bitmap = mi.Bitmap(str(path))
-            image = np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False))
-        except Exception as error:  # Mitsuba raises RuntimeError for each of: not there, not an image, not RGB
+            image = np.array(
+                bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+            )
+        except (
+            Exception
+        ) as error:  # Mitsuba raises RuntimeError for each of: not there, not an image, not RGB
             reason = str(error).strip().splitlines()[-1]
-            raise InputError(f"{path}: environment: not a readable image ({reason}); give an EXR or HDR file") from error
+            raise InputError(
+                f"{path}: environment: not a readable image ({reason}); give an EXR or HDR file"
+            ) from error
         if image.ndim != 3 or min(image.shape[:2]) < 2:
-            raise InputError(f"{path}: environment: {image.shape} is no lat-long image; give one of at least 2 × 2 texels")
+            raise InputError(
+                f"{path}: environment: {image.shape} is no lat-long image; give one of at least 2 × 2 texels"
+            )
         if not np.isfinite(image).all():
             raise InputError(f"{path}: environment: holds NaN or infinity; replace those texels")
         rows = height if height is not None else max(MIN_HEIGHT, image.shape[0] // 4 * 4)
@@ -213,7 +230,9 @@ class EnvironmentLight:
             os.chmod(temporary, 0o666 & ~_umask())
             os.replace(temporary, target)
         except (OSError, RuntimeError) as error:
-            raise InputError(f"{target}: environment: cannot be written ({error}); choose another folder") from error
+            raise InputError(
+                f"{target}: environment: cannot be written ({error}); choose another folder"
+            ) from error
         finally:
             if temporary is not None:
                 with suppress(OSError):

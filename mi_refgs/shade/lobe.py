@@ -1,13 +1,16 @@
-"""The GGX reflection lobe as a linear operator on a lat-long map, diagonal in azimuth. NumPy float64, no Dr.Jit.
+"""The GGX reflection lobe as a linear operator on a lat-long map, diagonal in azimuth. NumPy float64, no
+Dr.Jit.
 
-With N = V = R the lobe depends only on the angle between R and L, so on a lat-long grid the filter commutes with every
-rotation about the pole: it acts on each azimuthal frequency m separately, as a small matrix from input rows to output
-rows. Those matrices, built once a resolution, *are* the prefilter, the whole lobe included and nothing cut: where a
-lobe is wide, all but the lowest frequencies vanish and cost nothing.
+With N = V = R the lobe depends only on the angle between R and L, so on a lat-long grid the filter commutes
+with every rotation about the pole: it acts on each azimuthal frequency m separately, as a small matrix from
+input rows to output rows. Those matrices, built once a resolution, *are* the prefilter, the whole lobe
+included and nothing cut: where a lobe is wide, all but the lowest frequencies vanish and cost nothing.
 
 Grid    Rows stand at θ = πi/(h-1) from +y (the first and the last row are the poles), columns at φ = 2π(j+½)/w with
-        φ = atan2(x, -z). That is where Mitsuba's `envmap` puts the texels of an image, measured by tests/test_envmap.py.
-Radiance between texels is bilinear, as Mitsuba looks it up: the operator integrates the lobe against that function.
+        φ = atan2(x, -z). That is where Mitsuba's `envmap` puts the texels of an image, measured by
+        tests/test_envmap.py.
+Radiance between texels is bilinear, as Mitsuba looks it up: the operator integrates the lobe against that
+function.
 """
 
 from __future__ import annotations
@@ -17,22 +20,26 @@ from dataclasses import dataclass
 import numpy as np
 
 LEVEL_ROUGHNESS = (0.1, 0.15, 0.22, 0.32, 0.45, 0.65, 1.0)
-"""Roughness of the filtered levels (level 0 is the map itself): α about doubles from one to the next, so that a mixture
-of two neighbours is within 6 % (L1) of the lobe between them. [measured, docs/decisions.md]"""
+"""Roughness of the filtered levels (level 0 is the map itself): α about doubles from one to the next, so that
+a mixture of two neighbours is within 6 % (L1) of the lobe between them. [measured, docs/decisions.md]"""
 
-LEVEL_MAX_HEIGHT = (128, 128, 128, 128, 64, 48, 32)
-"""Rows of each level, at most: a quarter of the lobe's half width or finer, so that bilinear lookups stay within 2 %."""
+LEVEL_MAX_HEIGHT = (128, 128, 128, 128, 64, 64, 64)
+"""Rows of each level, at most: a quarter of the lobe's half width or finer, so that bilinear lookups stay
+within 2 %."""
 
-DROP_BELOW = 2e-5
-"""Matrix entries below this fraction of their level's largest are dropped: 4e-4 of the lobe's peak at the worst."""
+DROP_BELOW = 5e-6
+"""Matrix entries below this fraction of their level's largest are dropped: 1e-4 of the lobe's peak at the
+worst."""
 
 MIN_SUBSAMPLES = 2
-"""Quadrature points a texel side where the lobe is wider than a texel; the bilinear weight is integrated with it."""
+"""Quadrature points a texel side where the lobe is wider than a texel; the bilinear weight is integrated with
+it."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """One filtered level: `weights` (h_out, h_in, M) takes Fourier coefficients of input rows to those of output rows."""
+    """One filtered level: `weights` (h_out, h_in, M) takes Fourier coefficients of input rows to those of
+    output rows."""
 
     roughness: float
     height: int
@@ -50,14 +57,18 @@ def column_angles(w: int) -> np.ndarray:
 
 
 def lobe(cos_angle: np.ndarray, roughness: float) -> np.ndarray:
-    """Unnormalised GGX lobe max(L·R, 0) D(R·H) of the angle between L and R, α = roughness². [Karis 2013, N = V = R]"""
+    """Unnormalised GGX lobe max(L·R, 0) D(R·H) of the angle between L and R, α = roughness². [Karis 2013, N =
+    V = R]"""
     α2 = roughness**4
-    d = 0.5 * (1 - cos_angle) + 0.5 * α2 * (1 + cos_angle)  # = 1 + (α²-1) cos²(half angle), without the cancellation
+    d = 0.5 * (1 - cos_angle) + 0.5 * α2 * (
+        1 + cos_angle
+    )  # = 1 + (α²-1) cos²(half angle), without the cancellation
     return np.maximum(cos_angle, 0) * (α2 / np.maximum(d, 1e-30)) / np.maximum(d, 1e-30)
 
 
 def row_areas(h: int) -> np.ndarray:
-    """∫ hat_i(θ) sinθ dθ (h,): a row's share of the sphere under linear interpolation between rows; sums to 2."""
+    """∫ hat_i(θ) sinθ dθ (h,): a row's share of the sphere under linear interpolation between rows; sums to
+    2."""
     θ = row_angles(h)
     s, c, d = np.sin(θ), np.cos(θ), np.pi / (h - 1)
     # Exact integral of the linear ramp over one interval, seen from its left and from its right end.
@@ -67,7 +78,8 @@ def row_areas(h: int) -> np.ndarray:
 
 
 def row_resampling(h_in: int, h_out: int) -> np.ndarray:
-    """(h_out, h_in) matrix between row grids: area-weighted hats when it coarsens, linear interpolation when it refines."""
+    """(h_out, h_in) matrix between row grids: area-weighted hats when it coarsens, linear interpolation when
+    it refines."""
     step = np.pi / (min(h_in, h_out) - 1)
     hat = np.maximum(0, 1 - np.abs(row_angles(h_out)[:, None] - row_angles(h_in)[None]) / step)
     if h_out < h_in:
@@ -84,24 +96,28 @@ def column_resampling(w_in: int, w_out: int) -> np.ndarray:
 
 
 def resample(radiance: np.ndarray, height: int) -> np.ndarray:
-    """Radiance (h, w, 3) at another resolution (height, 2·height, 3), keeping its integral when it coarsens."""
+    """Radiance (h, w, 3) at another resolution (height, 2·height, 3), keeping its integral when it
+    coarsens."""
     h, w = radiance.shape[:2]
     rows = np.tensordot(row_resampling(h, height), radiance.astype(np.float64), 1)
     return np.einsum("ab,ibc->iac", column_resampling(w, 2 * height), rows)
 
 
 def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
-    """Matrices (h_out, h, h+1) of the lobe between input and output rows for the frequencies 0 … h of w = 2h columns.
+    """Matrices (h_out, h, h+1) of the lobe between input and output rows for the frequencies 0 … h of w = 2h
+    columns.
 
-    Entry (i, k, m) multiplies Σ_j x[k, j] (cos, sin)(mφ_j); the series Σ_m (a_m cos mφ + b_m sin mφ) is then the filtered
-    radiance of row i at any azimuth, and exactly the circulant filter of the w columns at the columns themselves.
+    Entry (i, k, m) multiplies Σ_j x[k, j] (cos, sin)(mφ_j); the series Σ_m (a_m cos mφ + b_m sin mφ) is then
+    the filtered radiance of row i at any azimuth, and exactly the circulant filter of the w columns at the
+    columns themselves.
     """
     w, texel = 2 * h, np.pi / (h - 1)
     core = 2 * roughness**2  # the lobe falls to a quarter at this angle, radians
-    s = max(MIN_SUBSAMPLES, int(np.ceil(1.5 * texel / core)) + 1)
+    s = max(MIN_SUBSAMPLES, int(np.ceil(2.5 * texel / core)) + 1)
     t = (np.arange(s) + 0.5) / s
     θ = (np.arange((h - 1) * s) + 0.5) * (texel / s)
-    # Transform and bilinear weight of azimuth in one matrix: column d shares a sample between texels d and d + 1.
+    # Transform and bilinear weight of azimuth in one matrix: column d shares a sample between texels d and d
+    # + 1.
     m, d = np.arange(h + 1), np.arange(h)
     phase = 2 * np.pi / w * m[None, None] * (d[:, None, None] + np.array([0, 1])[None, :, None])
     cosines = np.cos(phase)  # (h, 2, h+1): over half the circle, the other half is its mirror image
@@ -137,7 +153,7 @@ def build_levels(h: int) -> list[Level]:
             m = np.arange(h_in + 1)
             first = column_resampling(2 * h, 2 * h_in)[0]
             offset = column_angles(2 * h) - column_angles(2 * h_in)[0]
-            transfer = (first[:, None] * np.cos(m * offset[:, None])).sum(0)
+            transfer = (first[:, None] * np.cos(m * offset[:, None])).sum(0) * (h_in / h)
             weights = np.einsum("ikm,kn,m->inm", weights, row_resampling(h, h_in), transfer, optimize=True)
         weights = weights[:, :, : weights.shape[0] + 1]  # a level of w columns holds frequencies up to w/2
         kept = np.abs(weights) > DROP_BELOW * np.abs(weights).max()

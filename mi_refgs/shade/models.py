@@ -1,7 +1,7 @@
 """Shading: from points with materials, under a prefiltered light, to named terms of outgoing radiance.
 
-One function for every order of work: at pixels (deferred) and at surfels (forward) the same points come in and the
-same terms go out. [Reflective Gaussian Splatting, §3.2-3.3; split sum: Karis 2013]
+One function for every order of work: at pixels (deferred) and at surfels (forward) the same points come in
+and the same terms go out. [Reflective Gaussian Splatting, §3.2-3.3; split sum: Karis 2013]
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ def reflect(view: mi.Vector3f, normal: mi.Vector3f) -> mi.Vector3f:
 def shade(points: ShadingPoints, light: PrefilteredLight, diffuse: Diffuse = "sh") -> Terms:
     """Outgoing radiance towards the camera, by cause.
 
-    With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected direction r:
-    specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, and diffuse = (1 - metallic) radiance ("sh") or
-    (1 - metallic) albedo irradiance(n) ("irradiance"). n·v is clamped to [0, 1]: a point seen from behind keeps its
-    mirror direction, with the reflectance at grazing incidence.
+    With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected direction
+    r: specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, and diffuse = (1 - metallic) radiance
+    ("sh") or (1 - metallic) albedo irradiance(n) ("irradiance"). n·v is clamped to [0, 1]: a point seen from
+    behind keeps its mirror direction, with the reflectance at grazing incidence.
 
     Differentiable in everything but the branches of the clamps. Finite for every finite input.
     Raises InputError for an unknown `diffuse`, or "sh" without a radiance.

@@ -3,7 +3,8 @@
     radiance ─ analyse ─► Fourier rows ─ mix rows ─► Fourier rows of every level ─ synthesise ─► levels
     δradiance ◄ synthesise ─ Fourier rows ◄ mix rows (transposed) ─ Fourier rows ◄ analyse ─ δlevels
 
-The levels are one flat buffer of RGBA texels, the map itself first; A is padding, so that a lookup is one packet.
+The levels are one flat buffer of RGBA texels, the map itself first; A is padding, so that a lookup is one
+packet.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from mi_refgs.shade import fourier, lobe
 
 @dataclass(frozen=True)
 class Operator:
-    """The prefilter of maps with `height` rows: buffers, matrices and the place of each level in the result."""
+    """The prefilter of maps with `height` rows: buffers, matrices and the place of each level in the
+    result."""
 
     height: int
     base: fourier.Rows
@@ -44,30 +46,40 @@ def _build(variant: str, height: int) -> Operator:
     heights = [height] + [len(matrix) for matrix in matrices]
     firsts = [int(n) for n in np.cumsum([0] + [2 * h * h for h in heights])]
     frequencies = max(matrix.shape[2] for matrix in matrices)
-    limit_in = fourier.row_limits([np.pad(m, ((0, 0), (0, 0), (0, frequencies - m.shape[2]))) for m in transposed])
+    limit_in = fourier.row_limits(
+        [np.pad(m, ((0, 0), (0, 0), (0, frequencies - m.shape[2]))) for m in transposed]
+    )
     limits_out = [fourier.row_limits([matrix]) for matrix in matrices]
     (slot_in,), slots_out = fourier.row_slots([limit_in]), fourier.row_slots(limits_out)
-    base, levels = fourier.make_rows([0], [limit_in], stride=3), fourier.make_rows(firsts[1:-1], limits_out, stride=4)
+    base, levels = (
+        fourier.make_rows([0], [limit_in], stride=3),
+        fourier.make_rows(firsts[1:-1], limits_out, stride=4),
+    )
     out = list(zip(slots_out, limits_out, strict=True))
     return Operator(
         height=height,
         base=base,
         levels=levels,
         forward=fourier.make_mixing(
-            [(m, slot_in, s, n) for m, (s, n) in zip(matrices, out, strict=True)], base.coefficients, levels.coefficients
+            [(m, slot_in, s, n) for m, (s, n) in zip(matrices, out, strict=True)],
+            base.coefficients,
+            levels.coefficients,
         ),
         adjoint=fourier.make_mixing(
             [(m, s, slot_in, limit_in) for m, (s, _) in zip(transposed, out, strict=True)],
             levels.coefficients,
             base.coefficients,
         ),
-        info=mi.UInt32(np.array([(f, h, 2 * h, 0) for f, h in zip(firsts, heights, strict=False)], np.uint32).ravel()),
+        info=mi.UInt32(
+            np.array([(f, h, 2 * h, 0) for f, h in zip(firsts, heights, strict=False)], np.uint32).ravel()
+        ),
         shapes=tuple(zip(firsts, heights, strict=False)),
     )
 
 
 def operator(height: int) -> Operator:
-    """The prefilter for maps (height, 2·height), built once per height and variant (0.2 s at 64 rows, 0.6 s at 128)."""
+    """The prefilter for maps (height, 2·height), built once per height and variant (0.2 s at 64 rows, 0.6 s
+    at 128)."""
     return _build(mi.variant(), height)
 
 
@@ -109,6 +121,7 @@ class _Prefilter(dr.CustomOp):
 
 
 def prefilter(radiance: Any) -> tuple[Operator, Any]:
-    """Levels of a radiance tensor (h, 2h, 3), h a multiple of 4: its operator and the flat RGBA buffer, under AD."""
+    """Levels of a radiance tensor (h, 2h, 3), h a multiple of 4: its operator and the flat RGBA buffer, under
+    AD."""
     op = operator(radiance.shape[0])
     return op, dr.custom(_Prefilter, op, radiance.array)

@@ -1,7 +1,7 @@
 """Real spherical harmonics up to degree 3 in the sign convention of the 3DGS family.
 
-Y_00 = ½√(1/π) and, in degree 1, (-y, +z, -x)·½√(3/π): the Condon-Shortley phase (-1)^m is kept, so that files of other
-programs hold the same coefficients. [Ramamoorthi and Hanrahan 2001; Sloan 2013]
+Y_00 = ½√(1/π) and, in degree 1, (-y, +z, -x)·½√(3/π): the Condon-Shortley phase (-1)^m is kept, so that files
+of other programs hold the same coefficients. [Ramamoorthi and Hanrahan 2001; Sloan 2013]
 """
 
 from __future__ import annotations
@@ -40,7 +40,11 @@ def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
             0.5 * k * (xx - yy),
         ]
     if degree >= 3:
-        k33, k32, k31 = 0.25 * math.sqrt(35 / (2 * math.pi)), 0.5 * math.sqrt(105 / math.pi), 0.25 * math.sqrt(21 / (2 * math.pi))
+        k33, k32, k31 = (
+            0.25 * math.sqrt(35 / (2 * math.pi)),
+            0.5 * math.sqrt(105 / math.pi),
+            0.25 * math.sqrt(21 / (2 * math.pi)),
+        )
         basis += [
             -k33 * y * (3 * xx - yy),
             k32 * x * y * z,
@@ -54,7 +58,8 @@ def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
 
 
 def eval_sh(coefs: Sequence[mi.Color3f], direction: mi.Vector3f) -> mi.Color3f:
-    """Σ coefs[i] basis_i(direction), without offset or clamp; the degree follows from the number of coefficients.
+    """Σ coefs[i] basis_i(direction), without offset or clamp; the degree follows from the number of
+    coefficients.
 
     Args:
         coefs: 1, 4, 9 or 16 colours.
@@ -65,7 +70,9 @@ def eval_sh(coefs: Sequence[mi.Color3f], direction: mi.Vector3f) -> mi.Color3f:
     """
     degree = math.isqrt(len(coefs)) - 1
     if (degree + 1) ** 2 != len(coefs) or not 0 <= degree <= MAX_SH_DEGREE:
-        raise InputError(f"eval_sh: coefs: {len(coefs)} colours; a degree of 0 … {MAX_SH_DEGREE} has 1, 4, 9 or 16")
+        raise InputError(
+            f"eval_sh: coefs: {len(coefs)} colours; a degree of 0 … {MAX_SH_DEGREE} has 1, 4, 9 or 16"
+        )
     colour = mi.Color3f(0)
     for coef, basis in zip(coefs, sh_basis(direction, degree), strict=True):
         colour = dr.fma(coef, basis, colour)
@@ -73,5 +80,6 @@ def eval_sh(coefs: Sequence[mi.Color3f], direction: mi.Vector3f) -> mi.Color3f:
 
 
 def clamp_positive(x: Any) -> Any:
-    """max(0, x) whose derivative at exactly 0 is 1, not 0: coefficients that start at 0 must be able to leave it."""
+    """max(0, x) whose derivative at exactly 0 is 1, not 0: coefficients that start at 0 must be able to leave
+    it."""
     return dr.maximum(0, x)

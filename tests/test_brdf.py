@@ -1,0 +1,134 @@
+"""Split-sum table: published values, brute-force quadrature, derivatives, and the cache."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.reference import shade as reference
+from mi_refgs.shade import brdf
+
+# (N·V, r): (A, B), by Monte Carlo integration with 1 million samples.
+KNOWN = {
+    (0.1, 0.2): (0.4592, 0.4697),
+    (0.3, 0.5): (0.7725, 0.0654),
+    (0.5, 0.1): (0.9683, 0.0314),
+    (0.5, 0.5): (0.8349, 0.0223),
+    (0.7, 0.8): (0.5801, 0.0020),
+    (0.9, 0.3): (0.9893, 0.0001),
+    (0.2, 0.9): (0.6776, 0.0198),
+    (0.95, 1.0): (0.3168, 0.0001),
+}
+
+
+def lookup(n_dot_v: float, roughness: float) -> tuple[float, float]:
+    a, b = brdf.split_sum(mi.Float(n_dot_v), mi.Float(roughness))
+    return a[0], b[0]
+
+
+@pytest.mark.parametrize("pair", KNOWN)
+def test_known_values_through_the_lookup(pair: tuple[float, float]) -> None:
+    np.testing.assert_allclose(lookup(*pair), KNOWN[pair], atol=5e-4)
+
+
+@pytest.mark.parametrize(
+    "pair", [(0.05, 0.06), (0.15, 0.3), (0.35, 0.15), (0.6, 0.95), (0.8, 0.45), (1.0, 0.7)]
+)
+def test_against_brute_force(pair: tuple[float, float]) -> None:
+    np.testing.assert_allclose(lookup(*pair), reference.split_sum(*pair), atol=5e-4)
+
+
+def test_smooth_surface_mirrors_with_schlick() -> None:
+    """At roughness → 0 the half vector is the normal: A + B = 1 and B = (1 - N·V)⁵."""
+    for n_dot_v in (0.2, 0.5, 0.9):
+        a, b = lookup(n_dot_v, 0.01)
+        assert abs(a + b - 1) < 5e-4
+        assert abs(b - (1 - n_dot_v) ** 5) < 5e-4
+
+
+def test_no_surface_gains_energy_or_loses_sign() -> None:
+    table = brdf.table()
+    assert table.min() >= 0
+    assert table.sum(-1).max() < 1 + 1e-5
+
+
+def test_texel_centres_and_axes() -> None:
+    """A lookup at a texel centre returns the texel: columns are N·V, rows roughness, both at (i + ½)/256."""
+    row, column = np.array([0, 40, 255, 128]), np.array([200, 7, 255, 0])
+    a, b = brdf.split_sum(mi.Float((column + 0.5) / 256), mi.Float((row + 0.5) / 256))
+    np.testing.assert_allclose(np.stack([a, b], 1), brdf.table()[row, column], atol=1e-5)
+
+
+def test_derivatives_in_both_arguments(rng: np.random.Generator) -> None:
+    n = 200
+    # Half-way between grid lines of the bilinear patches, so that no difference straddles one.
+    n_dot_v = (rng.integers(1, 254, n) + 0.5 + rng.uniform(0.2, 0.8, n)) / 256
+    roughness = (rng.integers(1, 254, n) + 0.5 + rng.uniform(0.2, 0.8, n)) / 256
+    weight = rng.normal(size=(2, n))
+    x, y = mi.Float(n_dot_v), mi.Float(roughness)
+    dr.enable_grad(x, y)
+    a, b = brdf.split_sum(x, y)
+    dr.backward(a * mi.Float(weight[0]) + b * mi.Float(weight[1]))
+    table = brdf.table().astype(np.float64)
+    ε = 1e-5
+
+    def value(u: float, v: float, w: np.ndarray) -> float:
+        return float(reference.table_lookup(table, u, v) @ w)
+
+    for k in range(n):
+        u, v, w = n_dot_v[k], roughness[k], weight[:, k]
+        for got, plus, minus in (
+            (dr.grad(x)[k], value(u + ε, v, w), value(u - ε, v, w)),
+            (dr.grad(y)[k], value(u, v + ε, w), value(u, v - ε, w)),
+        ):
+            assert abs(got - (plus - minus) / (2 * ε)) < 1e-3 + 1e-3 * abs(got)
+
+
+def test_finite_outside_the_table() -> None:
+    x = mi.Float(-1, 0, 0, 1, 1, 2, 0.5, -3)
+    y = mi.Float(-1, 0, 1, 0, 1, 2, -2, 7)
+    dr.enable_grad(x, y)
+    a, b = brdf.split_sum(x, y)
+    dr.backward(a + b)
+    for value in (a, b, dr.grad(x), dr.grad(y)):
+        assert dr.all(dr.isfinite(value))
+    assert dr.all((a > -1e-4) & (b > -1e-4) & (a + b < 1 + 2e-4))
+
+
+def test_cache_is_written_read_and_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    computed = brdf.table()
+    calls = []
+    monkeypatch.setattr(brdf, "compute_table", lambda: calls.append(1) or computed)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    path = tmp_path / "mi_refgs" / brdf.CACHE_NAME
+    fresh = brdf.table.__wrapped__
+    np.testing.assert_array_equal(fresh(), computed)
+    assert path.is_file() and len(calls) == 1 and list(path.parent.iterdir()) == [path]
+    np.testing.assert_array_equal(fresh(), computed)
+    assert len(calls) == 1, "the second call should read the cache"
+    path.write_bytes(path.read_bytes()[:1000])
+    np.testing.assert_array_equal(fresh(), computed)
+    assert len(calls) == 2 and np.load(path).shape == computed.shape, "a damaged cache should be replaced"
+    np.save(path, np.zeros((2, 2)))
+    np.testing.assert_array_equal(fresh(), computed)
+    assert len(calls) == 3, "another array should not pass for the table"
+
+
+def test_unwritable_cache_is_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    computed = brdf.table()
+    monkeypatch.setattr(brdf, "compute_table", lambda: computed)
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
+    np.testing.assert_array_equal(brdf.table.__wrapped__(), computed)
+
+
+def test_survives_a_change_of_variant() -> None:
+    before = lookup(0.4, 0.3)
+    mi.set_variant("scalar_rgb")
+    mi.set_variant("llvm_ad_rgb")
+    assert lookup(0.4, 0.3) == before

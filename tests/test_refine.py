@@ -1,0 +1,98 @@
+"""Every edit of the table: who descends from whom, what changes, what must not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mi_refgs.fit import refine
+from mi_refgs.fit.config import Refine
+from mi_refgs.surfels.table import Surfels
+
+OPTIONS = Refine()
+
+
+def table(count: int = 6, scale: float = 0.005, opacity: float = 0.8) -> Surfels:
+    rng = np.random.default_rng(0)
+    return Surfels.from_numpy(
+        {
+            "position": rng.normal(size=(count, 3)),
+            "rotation": rng.normal(size=(count, 4)),
+            "scale": np.full((count, 2), np.log(scale)),
+            "opacity": np.full((count, 1), refine.logit(opacity)),
+            "metallic": np.full((count, 1), refine.logit(0.5)),
+            "roughness": np.full((count, 1), refine.logit(0.05)),
+            "albedo": rng.normal(size=(count, 3)),
+        }
+    )
+
+
+def densify(surfels: Surfels, gradient: np.ndarray, max_count: int = 100, extent: float = 1.0):
+    return refine.densify_and_prune(surfels, gradient, extent, OPTIONS, max_count, np.random.default_rng(1))
+
+
+def test_small_hot_surfels_are_cloned_and_cold_ones_left_alone():
+    surfels = table()
+    edited = densify(surfels, np.array([0, 1e-3, 0, 0, 5e-4, 0]))
+    assert edited.parent.tolist() == [0, 1, 2, 3, 4, 5, 1, 4]
+    assert edited.fresh.tolist() == [False] * 6 + [True] * 2
+    for name, values in edited.surfels.to_numpy().items():
+        assert np.array_equal(values, surfels.to_numpy()[name][edited.parent]), name
+
+
+def test_large_hot_surfels_are_split_within_their_own_plane():
+    surfels = table(scale=0.05)
+    edited = densify(surfels, np.array([0, 1e-3, 0, 0, 0, 0]))
+    assert edited.parent.tolist() == [0, 2, 3, 4, 5, 1, 1]
+    raw, children = surfels.to_numpy(), edited.surfels.to_numpy()
+    shrunk = np.exp(children["scale"][5:] - raw["scale"][[1, 1]])
+    np.testing.assert_allclose(shrunk, 1 / refine.SPLIT_SHRINK, rtol=1e-5)
+    normal = np.array(surfels.frame()[2]).T[1]
+    offsets = children["position"][5:] - raw["position"][1]
+    assert np.abs(offsets @ normal).max() < 1e-6
+    assert 0 < np.abs(offsets).max() < 6 * 0.05
+
+
+def test_transparent_and_oversized_surfels_go_even_when_hot():
+    raw = table().to_numpy()
+    raw["opacity"][0] = refine.logit(0.01)
+    raw["scale"][1] = np.log(0.5)
+    edited = densify(Surfels.from_numpy(raw), np.full(6, 1e-3))
+    assert sorted(set(edited.parent.tolist())) == [2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("scale", [0.005, 0.05])
+def test_growth_stops_at_the_limit_and_takes_the_hottest(scale):
+    edited = densify(table(scale=scale), np.array([3, 9, 4, 8, 5, 7]) * 1e-3, max_count=8)
+    assert len(edited.parent) == 8
+    assert np.flatnonzero(np.bincount(edited.parent) == 2).tolist() == [1, 3]
+
+
+def test_reset_lowers_opacity_and_lifts_metallic_only():
+    surfels = table()
+    edited = refine.reset_opacity(surfels, OPTIONS, metallic=0.6).to_numpy()
+    np.testing.assert_allclose(refine.sigmoid(edited["opacity"]), OPTIONS.reset_opacity, rtol=1e-5)
+    np.testing.assert_allclose(refine.sigmoid(edited["metallic"]), 0.6, rtol=1e-5)
+    assert np.array_equal(edited["scale"], surfels.to_numpy()["scale"])
+
+
+def test_propagation_is_material_aware():
+    """Only metallic and smooth surfels grow; all become opaque. [Ref-Gaussian §3.4]"""
+    raw = table().to_numpy()
+    raw["metallic"][0] = refine.logit(0.01)  # no metal
+    raw["roughness"][1] = refine.logit(0.5)  # a rough metal
+    raw["opacity"][2] = refine.logit(0.95)  # opaque already
+    edited = refine.propagate_normals(Surfels.from_numpy(raw), OPTIONS).to_numpy()
+    grown = np.exp(edited["scale"] - raw["scale"])[:, 0]
+    np.testing.assert_allclose(grown, [1, 1, 1.5, 1.5, 1.5, 1.5], rtol=1e-5)
+    np.testing.assert_allclose(refine.sigmoid(edited["opacity"])[:, 0], [0.9, 0.9, 0.95, 0.9, 0.9, 0.9], rtol=1e-5)
+
+
+def test_material_reset_leaves_geometry():
+    surfels = table()
+    edited = refine.reset_materials(surfels, 0.01, 0.1, np.random.default_rng(0)).to_numpy()
+    np.testing.assert_allclose(refine.sigmoid(edited["metallic"]), 0.01, rtol=1e-5)
+    np.testing.assert_allclose(refine.sigmoid(edited["roughness"]), 0.1, rtol=1e-5)
+    assert np.abs(refine.sigmoid(edited["albedo"]) - 0.5).max() <= 0.025 + 1e-6
+    for name in ("position", "rotation", "scale", "opacity"):
+        assert np.array_equal(edited[name], surfels.to_numpy()[name])

@@ -1,0 +1,116 @@
+"""Spherical harmonics: values against two other formulas, the sign convention, and derivatives."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import scipy.special
+
+from mi_refgs.errors import InputError
+from mi_refgs.reference import shade as reference
+from mi_refgs.shade.sh import clamp_positive, eval_sh, sh_basis
+
+
+def directions(rng: np.random.Generator, n: int) -> np.ndarray:
+    d = np.concatenate([rng.normal(size=(n, 3)), np.eye(3), -np.eye(3)])
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def basis_of(d: np.ndarray, degree: int = 3) -> np.ndarray:
+    return np.array(sh_basis(mi.Vector3f(d.T.astype(np.float32)), degree)).T
+
+
+def scipy_basis(d: np.ndarray) -> np.ndarray:
+    """Real combinations of SciPy's complex Y_lm, which carries the Condon-Shortley phase: nothing is negated
+    here.
+
+    m < 0: √2 Im Y_l|m|, m = 0: Y_l0, m > 0: √2 Re Y_lm. With that phase degree 1 is (-y, +z, -x), as 3DGS
+    files have it.
+    """
+    polar, azimuth = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
+    out = []
+    for n in range(4):
+        for m in range(-n, n + 1):
+            if hasattr(scipy.special, "sph_harm_y"):
+                y = scipy.special.sph_harm_y(n, abs(m), polar, azimuth)
+            else:  # SciPy before 1.15
+                y = scipy.special.sph_harm(abs(m), n, azimuth, polar)
+            out.append(y.real if m == 0 else np.sqrt(2) * (y.imag if m < 0 else y.real))
+    return np.stack(out, 1)
+
+
+def test_against_scipy(rng: np.random.Generator) -> None:
+    d = directions(rng, 300)
+    np.testing.assert_allclose(basis_of(d), scipy_basis(d), atol=2e-6)
+
+
+def test_against_the_recursion(rng: np.random.Generator) -> None:
+    d = directions(rng, 50)
+    np.testing.assert_allclose(basis_of(d), [reference.sh_basis(x, 3) for x in d], atol=2e-6)
+
+
+def test_degree_one_signs() -> None:
+    """3DGS: (-y, +z, -x) times ½√(3/π)."""
+    k = 0.5 * np.sqrt(3 / np.pi)
+    np.testing.assert_allclose(
+        basis_of(np.eye(3), 1)[:, 1:], k * np.array([[0, 0, -1], [-1, 0, 0], [0, 1, 0]]), atol=1e-7
+    )
+
+
+def test_orthonormal() -> None:
+    z, weight = np.polynomial.legendre.leggauss(8)
+    φ = (np.arange(16) + 0.5) * (2 * np.pi / 16)
+    zz, pp = (a.ravel() for a in np.meshgrid(z, φ, indexing="ij"))
+    r = np.sqrt(1 - zz * zz)
+    y = basis_of(np.stack([r * np.cos(pp), r * np.sin(pp), zz], 1))
+    gram = (y * (np.repeat(weight, 16) * 2 * np.pi / 16)[:, None]).T @ y
+    np.testing.assert_allclose(gram, np.eye(16), atol=1e-5)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_derivatives_of_eval(degree: int, rng: np.random.Generator) -> None:
+    n, count = 40, (degree + 1) ** 2
+    d, coefs, weight = directions(rng, n - 6), rng.normal(size=(count, 3, n)), rng.normal(size=(3, n))
+    direction = mi.Vector3f(d.T.astype(np.float32))
+    colours = [mi.Color3f(c.astype(np.float32)) for c in coefs]
+    dr.enable_grad(direction, colours)
+    dr.backward(dr.dot(mi.Vector3f(eval_sh(colours, direction)), mi.Vector3f(weight.astype(np.float32))))
+    basis = np.array([reference.sh_basis(x, degree) for x in d])
+    for k in range(count):
+        np.testing.assert_allclose(dr.grad(colours[k]).numpy(), basis[:, k] * weight, atol=5e-6)
+
+    # The basis off the unit sphere is only defined up to its formula: compare the tangential derivative.
+    def value(x: np.ndarray, i: int) -> float:
+        return float(weight[:, i] @ (reference.sh_basis(x / np.linalg.norm(x), degree) @ coefs[:, :, i]))
+
+    got = dr.grad(direction).numpy().T
+    for i in range(n):
+        tangent = np.cross(d[i], rng.normal(size=3))
+        expected = (value(d[i] + 1e-5 * tangent, i) - value(d[i] - 1e-5 * tangent, i)) / 2e-5
+        assert abs(got[i] @ tangent - expected) < 2e-4 * (1 + abs(expected))
+
+
+def test_wrong_numbers_of_coefficients() -> None:
+    d = mi.Vector3f(0, 0, 1)
+    for count in (0, 2, 8, 25):
+        with pytest.raises(InputError, match="coefs"):
+            eval_sh([mi.Color3f(1)] * count, d)
+    with pytest.raises(InputError, match="degree"):
+        sh_basis(d, 4)
+
+
+def test_clamp_lets_a_coefficient_leave_zero() -> None:
+    """Indirect coefficients start at exactly 0; a derivative of 0 there would keep them there for ever."""
+    coefs = [mi.Color3f(dr.zeros(mi.Float, 3)) for _ in range(4)]
+    dr.enable_grad(coefs)
+    colour = clamp_positive(eval_sh(coefs, mi.Vector3f([1, 0, 0], [0, 0, 1], [0, 1, 0])))
+    assert dr.all(colour == 0, axis=None)
+    dr.backward(colour)
+    assert dr.all(dr.grad(coefs[0]) != 0, axis=None)
+
+    x = mi.Float(-1, 0, 2)
+    dr.enable_grad(x)
+    dr.backward(clamp_positive(x))
+    np.testing.assert_array_equal(dr.grad(x), [0, 1, 1])

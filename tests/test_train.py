@@ -1,0 +1,162 @@
+"""The loop: it learns, resumes to the same bits, survives a kill, and compiles nothing new once warm."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mi_refgs.errors import InputError
+from mi_refgs.fit import config
+from mi_refgs.fit.data import Dataset, View
+from mi_refgs.fit.record import Run
+from mi_refgs.fit.train import Trainer
+
+SIZE = 24
+
+METHOD = """
+iterations = 30
+checkpoint_every = 5
+log_every = 3
+[surfels]
+sh_degree = 1
+sh_raise = { start = 2, until = 4, every = 2 }
+opacity = 0.6
+metallic = 0.3
+roughness = 0.3
+[light]
+height = 8
+[stage.initial]
+until = 8
+at = "surfel"
+diffuse = "irradiance"
+[stage.deferred]
+until = 30
+reset_materials = true
+[mesh]
+extract = { start = 9, until = 30, every = 10 }
+resolution = 24
+[refine]
+densify = { start = 3, until = 24, every = 6 }
+gradient = 1e-6
+reset = { start = 0, until = 24, every = 14 }
+propagate = { start = 0, until = 24, every = 5 }
+propagate_hold = 4
+[loss]
+smooth = 0.1
+alpha = 0.1
+"""
+
+
+def ball(size: int = SIZE, views: int = 6) -> Dataset:
+    """A ball with a sharp highlight that moves with the camera, from a ring of views."""
+    focal, pictures = 1.6 * size, []
+    y, x = (np.mgrid[0:size, 0:size] + 0.5 - size / 2) / focal
+    for i in range(views):
+        angle = 2 * np.pi * i / views
+        forward = -np.array([np.cos(angle) * 0.9, np.sin(angle) * 0.9, np.sqrt(0.19)])
+        left = np.cross([0, 0, 1.0], forward)
+        left /= np.linalg.norm(left)
+        to_world = np.eye(4)
+        to_world[:3, :3] = np.stack([left, np.cross(forward, left), forward], axis=1)
+        to_world[:3, 3] = -4 * forward
+        radius = np.hypot(x, y)
+        alpha = (radius < np.tan(np.arcsin(0.25))).astype(np.float32)
+        shine = np.exp(-((x - 0.05) ** 2 + (y + 0.05) ** 2) / 0.002)
+        colour = np.stack([0.3 + 0.6 * shine, 0.4 + x, 0.5 + 0.5 * shine + y], axis=-1)
+        image = (alpha[..., None] * colour + 1 - alpha[..., None]).clip(0, 1).astype(np.float32)
+        c = size / 2
+        pictures.append(View(f"{i}", size, size, focal, focal, c, c, to_world, image, alpha, None, None, linear=False))
+    return Dataset(Path("ball"), "train", tuple(pictures), np.ones(3, np.float32), False, None)
+
+
+@pytest.fixture
+def method(tmp_path):
+    path = tmp_path / "small.toml"
+    path.write_text(METHOD)
+    settings = ["surfels.count=150", "surfels.max_count=220"]
+    return dataclasses.replace(config.load_resolved(path), surfels=config.load(str(path), "quick", settings).surfels)
+
+
+def run_folder(path, method) -> Run:
+    run = Run(path)
+    run.create(method, "ball")
+    return run
+
+
+def test_the_loss_falls_and_everything_trains(method):
+    data = ball()
+    trainer = Trainer(dataclasses.replace(method, refine=config.Refine(), iterations=60), data)
+    before = {name: tensor.numpy().copy() for name, tensor in trainer.params.items()}
+    losses = []
+    while trainer.iteration < 60:
+        trainer.step()
+        losses.append(float(trainer.loss[0]))
+    assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:6])
+    assert trainer.optimiser.bad == 0
+    for name, tensor in trainer.params.items():  # the indirect channel starts at exactly 0 and must leave it
+        assert np.all(np.isfinite(tensor.numpy())), name
+        assert not np.array_equal(before[name], tensor.numpy()), name
+
+
+def test_resume_repeats_a_straight_run_bit_for_bit(method, tmp_path, one_thread):
+    data = ball()
+    straight = Trainer(method, data, run_folder(tmp_path / "straight", method))
+    straight.train()
+    first = Trainer(method, data, run_folder(tmp_path / "resumed", method))
+
+    def stop(trainer):
+        if trainer.iteration == 17:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        first.train(stop)
+    second = Trainer(method, data, Run(tmp_path / "resumed"))
+    assert second.iteration == 17
+    second.train()
+    expected, got = straight.state(), second.state()
+    assert expected.keys() == got.keys()
+    for name in expected.keys() - {"seconds"}:
+        assert np.array_equal(expected[name], got[name]), name
+    assert "mesh/faces" in expected
+
+
+def test_a_kill_loses_at_most_one_checkpoint_interval(method, tmp_path):
+    """A killed process leaves its last periodic checkpoint, and a torn file from the one being written is passed over."""
+    run = run_folder(tmp_path / "run", method)
+    trainer = Trainer(method, ball(), run)
+
+    class Killed(BaseException):
+        pass
+
+    def kill(state):
+        if state.iteration == 13:
+            raise Killed
+
+    with pytest.raises(Killed):
+        trainer.train(kill)
+    (run.path / "checkpoints" / "0000013.npz").write_bytes(b"PK torn")
+    assert Trainer(method, ball(), run).iteration == 10
+
+
+def test_a_run_is_not_overwritten(method, tmp_path):
+    run_folder(tmp_path / "run", method)
+    with pytest.raises(InputError, match="--resume"):
+        run_folder(tmp_path / "run", method)
+
+
+def test_a_warm_step_compiles_nothing(method):
+    trainer = Trainer(dataclasses.replace(method, refine=config.Refine()), ball())
+    while trainer.iteration < 22:  # into the deferred stage, with a mesh
+        trainer.step()
+    dr.sync_thread()
+    launches, _, misses = dr.detail.launch_stats()
+    for _ in range(3):
+        trainer.step()
+    dr.sync_thread()
+    after, _, misses_after = dr.detail.launch_stats()
+    assert misses_after == misses
+    assert (after - launches) / 3 < 80
