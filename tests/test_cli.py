@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from tiny_scene import SETTINGS, SIZE, write_data, write_method
 
-from mi_refgs.cli import main
+from mi_refgs.cli import demo, main
 from mi_refgs.fit.config import load_resolved
-from mi_refgs.fit.images import read_exr, read_png, write_png
+from mi_refgs.fit.images import read_exr, read_png, srgb_from_linear, write_png
 from mi_refgs.fit.train import Trainer
 
 COMMANDS = ("doctor", "demo", "dataset", "train", "eval", "render", "export")
@@ -114,7 +114,7 @@ def test_train_tells_what_is_unusual(
     assert (tmp_path / "run" / "checkpoints" / "0000001.npz").is_file()  # though none was due
 
 
-def test_an_interrupt_says_how_to_resume_and_resuming_finishes(
+def test_an_interrupt_says_how_to_resume_and_resuming_changes_nothing(
     data: Path,
     method: Path,
     tmp_path: Path,
@@ -128,14 +128,19 @@ def test_an_interrupt_says_how_to_resume_and_resuming_finishes(
             raise KeyboardInterrupt
         step(self)
 
-    run = tmp_path / "run"
+    straight, run, one = tmp_path / "straight", tmp_path / "run", ("--threads", "1")
+    assert main(train_command(data, straight, method, *one)) == 0
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "step", interrupted)
-        assert main(train_command(data, run, method)) == 130
+        assert main(train_command(data, run, method, *one)) == 130
     said = capsys.readouterr().err
     assert f"interrupted at iteration 4; resume with: refgs train {data} -o {run} --resume" in said
-    assert main(["train", str(data), "-o", str(run), "--resume"]) == 0
+    with (run / "metrics.jsonl").open("a") as log:  # as after a kill between a log line and its checkpoint
+        log.write(json.dumps({"iteration": 6}) + "\n")
+    assert main(["train", str(data), "-o", str(run), "--resume", *one]) == 0
     assert "resumed at iteration 4 of 6" in capsys.readouterr().err
+    for name in ("surfels.ply", "envmap.exr", "mesh.ply"):
+        assert (run / name).read_bytes() == (straight / name).read_bytes(), name
     lines = (run / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["iteration"] for line in lines] == [2, 4, 6]
 
@@ -168,6 +173,9 @@ def test_render_writes_exr_with_aovs_and_png(
     pixels = read_png(png)
     assert pixels.shape == (SIZE, SIZE, 4)
     assert np.abs(pixels[..., 3] - np.clip(channels["A"], 0, 1)).max() < 0.51 / 255
+    shown = np.clip(srgb_from_linear(channels["G"] / np.maximum(channels["A"], 1e-8)), 0, 1)
+    seen = channels["A"] > 0.1
+    assert seen.any() and np.abs(pixels[..., 1] - shown)[seen].max() < 0.51 / 255
 
 
 def test_dataset_traces_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -180,6 +188,23 @@ def test_dataset_traces_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main(["dataset", str(scene), "-o", str(tmp_path / "out"), *options]) == 0
     assert json.loads(capsys.readouterr().out)["train_views"] == 2
     assert (tmp_path / "out" / "transforms_test.json").is_file()
+
+
+def test_demo_goes_from_nothing_to_a_contact_sheet_and_is_not_done_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("VIEWS", 3), ("TEST_VIEWS", 1), ("SIZE", 16), ("SAMPLES", 1)):
+        monkeypatch.setattr(demo, name, value)
+    settings = ["iterations=2", "surfels.count=60", "surfels.max_count=60", "light.height=8"]
+    command = ["demo", "-o", str(tmp_path / "demo"), "--json", "--set", *settings]
+    assert main(command) == 0
+    first = json.loads(capsys.readouterr().out)
+    sheet = Path(first["contact_sheet"])
+    assert sheet.is_file() and first["metrics"]["iterations"] == 2
+    written = {path: path.stat().st_mtime_ns for path in (tmp_path / "demo").rglob("*.[ep]*")}
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out) == first
+    assert {path: path.stat().st_mtime_ns for path in written} == written
 
 
 # ---------- Bad input: one sentence with file, field and remedy, and exit code 2 ----------

@@ -76,6 +76,19 @@ def test_the_numbers_are_those_of_the_trainer(run: Run, folder: Path) -> None:
     assert [view["psnr"] for view in result["views"]] == pytest.approx(scores, abs=1e-4)
 
 
+def test_mitsuba_renders_the_exported_scene_as_the_trainer_does(run: Run, folder: Path) -> None:
+    evaluate(run)
+    scene = mi.load_file(str(run.path / "scene.xml"))
+    image = np.array(mi.render(scene))
+    frame = Trainer(run.method(), data.load(folder / "ball", "train"), run).view(
+        data.load(folder / "ball", "test").views[0].camera()
+    )
+    planes = [*frame.radiance(), frame.alpha]
+    expected = np.stack([np.array(plane).reshape(SIZE, SIZE) for plane in planes], axis=-1)
+    assert frame.alpha[SIZE * SIZE // 2 + SIZE // 2] > 0.5
+    np.testing.assert_allclose(image, expected, atol=1e-5)
+
+
 def test_what_does_not_apply_is_null_with_a_reason(run: Run, tmp_path: Path) -> None:
     plain = write_data(tmp_path / "plain", truth=False)
     result = evaluate(run, plain)

@@ -16,7 +16,7 @@ from mi_refgs.errors import InputError
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 FILE_THREADS = 2
-"""Mitsuba 3.9 reads and writes EXR files on a worker thread and waits for ever if there is only one thread."""
+"""Mitsuba 3.9 reads and writes EXR files on a worker thread; with one thread in all it waits for ever."""
 
 
 @dataclass(frozen=True)

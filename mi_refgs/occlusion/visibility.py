@@ -81,6 +81,18 @@ class Occluder:
             return dr.select(self._scene.ray_test(ray, active), mi.Float(0), mi.Float(1))
 
 
+    def first_hit(self, origin: Any, direction: Any) -> tuple[Any, Any]:
+        """Distance to the mesh in lengths of `direction`, and whether there is a hit; 0 where there is none. Detached."""
+        width = max(dr.width(origin), dr.width(direction))
+        if self._mesh is None or not len(self._mesh.faces):
+            return dr.zeros(mi.Float, width), dr.zeros(mi.Bool, width)
+        with dr.suspend_grad():
+            ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+            hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+            valid = hit.is_valid()
+            return dr.select(valid, hit.t, 0), valid
+
+
 def _unit(v: Any) -> tuple[Any, Any]:
     """Unit vector and whether there is one; (0, 0, 0) where there is none."""
     squared = dr.squared_norm(v)

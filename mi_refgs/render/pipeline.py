@@ -181,10 +181,7 @@ def _shade_at_pixels(
     visibility = None
     if indirect_used:
         assert occluder is not None
-        with dr.suspend_grad():
-            point = mi.Point3f(mi.Vector3f(camera.origin) + dr.detach(depth) * ray)
-            facing = safe_normalize(dr.detach(normal))
-            visibility = occluder.visible(point, reflect(view=view, normal=facing), facing)
+        visibility = _visibility(occluder, camera.origin, ray, dr.detach(normal), view)
         maps["visibility"] = visibility
     points = ShadingPoints(
         normal=normal,
@@ -205,6 +202,20 @@ def _shade_at_pixels(
         terms=Terms(*(term * blended.alpha for term in (terms.diffuse, terms.specular, terms.indirect))),
         maps=maps,
     )
+
+
+def _visibility(occluder: Occluder, origin: Any, ray: Any, normal: Any, view: Any) -> Any:
+    """Is the mirror direction free, seen from where the pixel's ray meets the mesh itself?
+
+    Not from the blended depth: at a silhouette, and between two layers, that lies inside the object and every ray from
+    there is blocked, which draws a dark outline. A ray that misses the mesh sees the light.
+    """
+    with dr.suspend_grad():
+        distance, hit = occluder.first_hit(origin, ray)
+        point = mi.Point3f(mi.Vector3f(origin) + distance * ray)
+        facing = safe_normalize(normal)
+        free = occluder.visible(point, reflect(view=view, normal=facing), facing)
+        return dr.select(hit, free, 1)
 
 
 def _inverse_alpha(blended: Blended) -> Any:

@@ -1,2 +1,1 @@
-"""Reflectance and light: split-sum table, prefiltered environment, spherical harmonics, and the models made
-of them."""
+"""Reflectance and light: split-sum table, prefiltered environment, spherical harmonics, shading models."""

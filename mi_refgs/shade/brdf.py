@@ -1,5 +1,4 @@
-"""The split-sum table: how much of a constant light a GGX surface reflects, A·F0 + B, against (N·V,
-roughness).
+"""The split-sum table: what a GGX surface reflects of a constant light, F0·A + B, over (N·V, roughness).
 
 α = roughness², height-correlated Smith shadowing, Schlick's Fresnel. [Karis 2013, "Real Shading in Unreal
 Engine 4"; Heitz 2014, "Understanding the Masking-Shadowing Function", eq. 99]
@@ -35,11 +34,9 @@ CACHE_NAME = "split_sum_256_v1.npy"
 
 
 def compute_table() -> np.ndarray:
-    """Split-sum table (256, 256, 2) float32: [roughness row, N·V column, (A, B)], by deterministic
-    quadrature."""
+    """Split-sum table (256, 256, 2) float32, [roughness row, N·V column, (A, B)], by fixed quadrature."""
     x, weight = np.polynomial.legendre.leggauss(RADIAL_NODES)
-    # ξ = 1 - s² draws half vectors from D cosθ; the square gathers nodes at grazing half vectors, where the
-    # rest varies.
+    # ξ = 1 - s² draws half vectors from D cosθ; the square gathers nodes at the grazing ones.
     s, weight = 0.5 * (1 - x), 0.5 * weight * (1 - x)
     φ = (np.arange(AZIMUTH_NODES) + 0.5) * (np.pi / AZIMUTH_NODES)
     centre = (np.arange(RESOLUTION) + 0.5) / RESOLUTION
@@ -75,11 +72,9 @@ def cache_dir() -> Path:
 
 @functools.lru_cache(maxsize=1)
 def table() -> np.ndarray:
-    """The table of `compute_table`, from the user's cache folder when it is there, else computed and kept
-    there.
+    """The table of `compute_table`, kept in the user's cache folder once it is computed.
 
-    A cache that cannot be read, or written, or that does not hold such a table, is passed over without a
-    word.
+    A cache that cannot be read or written, or that holds something else, is passed over without a word.
     """
     path = None
     with suppress(OSError, ValueError, RuntimeError, EOFError):

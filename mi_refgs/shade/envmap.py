@@ -1,9 +1,10 @@
-"""The environment light: learnable lat-long radiance, its prefiltered levels, and the lookups that shading
-needs.
+"""The environment light: learnable lat-long radiance, its prefiltered levels, and lookups for shading.
 
 Directions follow Mitsuba's `envmap`: up is +y, φ = atan2(x, -z) runs along a row, θ from +y down the rows;
 column centres at half-integers, the first and the last row at the poles (see `lobe`). Images go in and out
-unturned. Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that
+unturned.
+
+Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that
 an optimiser's step bounds the change of radiance; an exponential would let one step multiply a highlight.
 """
 
@@ -35,8 +36,7 @@ RADIANCE_FLOOR = 1e-4
 """Darkest radiance that an import keeps: softplus has no finite raw value for 0."""
 
 POLE_SINE = 1e-4
-"""Within 0.006° of a pole the azimuth is taken as that of the pole, so that its derivative stays below
-1e4."""
+"""Within 0.006° of a pole the azimuth is fixed, so that its derivative stays below 1e4."""
 
 ATANH_TERMS = 7
 """Terms of the series of log(1 + e) in softplus: relative error below 1e-7 for e ≤ 1."""
@@ -61,8 +61,7 @@ def inverse_softplus(radiance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PrefilteredLight:
-    """Levels of an environment, as made by `EnvironmentLight.prefilter`; lookups are traced and
-    differentiable."""
+    """Levels of an environment (`EnvironmentLight.prefilter`); lookups are traced and differentiable."""
 
     operator: Operator
     levels: Any  # flat RGBA texels, level after level
@@ -79,12 +78,11 @@ class PrefilteredLight:
         return self._bilinear(*_azimuth_polar(normal), mi.UInt32(len(lobe.LEVEL_ROUGHNESS)))
 
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
-        """Radiance averaged over the GGX lobe around unit world directions; derivative in light, direction,
-        roughness.
+        """Radiance averaged over the GGX lobe around unit world directions.
 
         Linear between levels in 1/roughness, where the mixture keeps both the lobe's energy (6 %) and its
         peak, and in roughness⁴ below the first level, where a lobe narrower than a texel only begins to
-        spread. [split sum, Karis 2013]
+        spread. Derivative in light, direction and roughness. [split sum, Karis 2013]
         """
         place = _level(roughness)
         lower = mi.UInt32(dr.clip(dr.detach(place), 0, len(lobe.LEVEL_ROUGHNESS) - 1))
@@ -113,8 +111,7 @@ class PrefilteredLight:
 
 
 def _azimuth_polar(direction: Any) -> tuple[Any, Any]:
-    """Fractions u ∈ [0, 1) of a turn and v ∈ [0, 1] of a meridian of unit directions, finite derivatives at
-    the poles."""
+    """Fractions u of a turn and v of a meridian of unit directions, with finite derivatives at the poles."""
     x, y, z = direction.x, direction.y, direction.z
     sin2 = x * x + z * z
     off_pole = sin2 > POLE_SINE**2
@@ -153,8 +150,8 @@ class EnvironmentLight:
         h = shape[0] if shape else 0
         if shape != (h, 2 * h, 3) or h % 4 or h < MIN_HEIGHT:
             raise InputError(
-                f"EnvironmentLight: raw: shape {shape}; need (h, 2h, 3) with h a multiple of 4 from {MIN_HEIGHT} on "
-                "(EnvironmentLight.from_file resamples)"
+                f"EnvironmentLight: raw: shape {shape}; need (h, 2h, 3), h ≥ {MIN_HEIGHT} a multiple of 4: "
+                "EnvironmentLight.from_file resamples"
             )
 
     @classmethod
@@ -175,8 +172,7 @@ class EnvironmentLight:
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:
-        """From a lat-long image that Mitsuba reads (EXR, HDR, …), resampled to `height` rows, keeping its
-        energy.
+        """From a lat-long image that Mitsuba reads, resampled to `height` rows, keeping its energy.
 
         Without `height`: the image's own rows, to the next lower multiple of 4. Raises InputError when it is
         no such image.

@@ -1,5 +1,4 @@
-"""Azimuthal Fourier rows of lat-long grids in Dr.Jit: analysis, synthesis, and block-sparse products between
-them.
+"""Azimuthal Fourier rows of lat-long grids in Dr.Jit: analysis, synthesis, block-sparse products.
 
 A texel buffer is flat, `stride` floats a texel. A Fourier buffer is six planes: the cosine coefficients of R,
 G and B, then the sine coefficients. Rows keep only the frequencies they need. Analysis and synthesis are each
@@ -22,11 +21,9 @@ BLOCK = 4
 
 @dataclass(frozen=True)
 class Rows:
-    """Where the rows of some lat-long grids lie in a texel buffer and in a Fourier buffer (all arrays on the
-    device).
+    """Where the rows of some lat-long grids lie in a texel buffer and in a Fourier buffer.
 
-    Analysis has one lane per four frequencies, synthesis one per eight columns: those that share their
-    cosines.
+    Analysis has one lane per four frequencies, synthesis one per eight columns that share their cosines.
     """
 
     stride: int  # floats per texel: 3 for the caller's radiance, 4 for ours
@@ -43,8 +40,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Mixing:
-    """A block-sparse matrix between Fourier buffers: a lane owns four outputs and the entries [begin,
-    end)."""
+    """A block-sparse matrix between Fourier buffers: a lane owns four outputs, entries [begin, end)."""
 
     inputs: int
     outputs: int
@@ -61,8 +57,7 @@ def _device(*columns: np.ndarray) -> tuple[Any, ...]:
 
 
 def row_limits(weights: list[np.ndarray]) -> np.ndarray:
-    """Frequencies (rows,) that each row needs in any of `weights` (rows, ·, M), equal within a block of
-    rows."""
+    """Frequencies (rows,) that each row needs in any of `weights` (rows, ·, M), equal within a block."""
     need = [np.where(w.any(1), np.arange(1, w.shape[2] + 1), 0).max(1) for w in weights]
     return np.repeat(np.max(need, 0).reshape(-1, BLOCK).max(1), BLOCK)
 
@@ -74,8 +69,7 @@ def row_slots(limits: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def make_rows(firsts: list[int], limits: list[np.ndarray], stride: int) -> Rows:
-    """Lanes for grids of h = len(limit) rows and 2h columns, `limit` frequencies a row, starting at texels
-    `firsts`."""
+    """Lanes for grids of len(limit) rows and twice as many columns, from texels `firsts` on."""
     analysis, slots, exists, synthesis, twiddles, at = [], [], [], [], [], 0
     for first, limit, slot in zip(firsts, limits, row_slots(limits), strict=True):
         h, w = len(limit), 2 * len(limit)
@@ -95,10 +89,10 @@ def make_rows(firsts: list[int], limits: list[np.ndarray], stride: int) -> Rows:
         stride=stride,
         texels=firsts[-1] + 2 * len(limits[-1]) ** 2,
         coefficients=int(sum(limit.sum() for limit in limits)),
-        analysis=_device(*np.concatenate(analysis, 1)),  # type: ignore[arg-type]
+        analysis=_device(*np.concatenate(analysis, 1)),
         slots=_device(*np.concatenate(slots, 1)),
         exists=tuple(mi.Bool(row) for row in np.concatenate(exists, 1)),
-        synthesis=_device(*np.concatenate(synthesis, 1)),  # type: ignore[arg-type]
+        synthesis=_device(*np.concatenate(synthesis, 1)),
         twiddles=mi.Float(np.concatenate(twiddles).astype(np.float32)),
     )
 
@@ -106,8 +100,7 @@ def make_rows(firsts: list[int], limits: list[np.ndarray], stride: int) -> Rows:
 def make_mixing(
     blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]], inputs: int, outputs: int
 ) -> Mixing:
-    """The matrix made of (rows, columns, M) pieces, each with the slots of its columns and the slots and
-    limits of its rows.
+    """The matrix of pieces (rows, columns, M), each with slots of its columns, slots and limits of its rows.
 
     Pieces that share output rows add up.
     """
@@ -124,21 +117,16 @@ def make_mixing(
     slot, step, source, weight = slot[order], step[order], source[order], weight[order]
     begin = np.flatnonzero(np.diff(slot, prepend=-1))
     end = np.append(begin[1:], len(slot))
-    lanes = np.argsort(
-        begin - end, kind="stable"
-    )  # equally long lanes side by side: a packet waits for its longest
+    # Equally long lanes side by side: a packet waits for its longest.
+    lanes = np.argsort(begin - end, kind="stable")
     begin, end = begin[lanes], end[lanes]
-    return Mixing(
-        inputs,
-        outputs,
-        *_device(begin, end, slot[begin], step[begin], source),
-        weights=mi.Float(weight.astype(np.float32).ravel()),
-    )
+    first, last, place, stride, origin = _device(begin, end, slot[begin], step[begin], source)
+    entries = mi.Float(weight.astype(np.float32).ravel())
+    return Mixing(inputs, outputs, first, last, place, stride, origin, entries)
 
 
 def write(target: Any, value: Any, index: Any, active: Any = True) -> None:
-    """Scatter to places of which none is written twice: without that promise Dr.Jit runs one kernel per
-    scatter."""
+    """Scatter to distinct places: without that promise Dr.Jit runs one kernel, loop and all, per scatter."""
     dr.scatter(target, value, index, active, mode=dr.ReduceMode.NoConflicts)
 
 
@@ -169,8 +157,7 @@ def analyse(rows: Rows, texels: Any) -> Any:
     state = dr.while_loop((dr.zeros(mi.UInt32, n), m, *zeros), lambda j, *_: j < w, body)
     cosines = [[state[2 + 6 * r + c] for r in range(4)] for c in range(3)]
     sines = [[state[5 + 6 * r + c] for r in range(4)] for c in range(3)]
-    # The frequency f - m or f + m turns by γ_j = fφ_j on top, which depends on j mod 4 only: π(j+½) or
-    # π(j+½)/2.
+    # The frequency f - m or f + m turns by γ_j = fφ_j on top: π(j+½) or π(j+½)/2, which repeats after 4.
     q = 0.5**0.5
     quarters = (
         ((1, 1, 1, 1), (0, 0, 0, 0), 1),  # cos γ, sin γ, sign of m
@@ -225,8 +212,7 @@ def synthesise(rows: Rows, coefficients: Any, texels: Any) -> None:
     even_cos, even_sin, two_cos, two_sin, odd_cos, odd_sin, cross_sin, cross_cos = (
         state[2 + 3 * k : 5 + 3 * k] for k in range(8)
     )
-    # The eight azimuths kπ/2 ± φ: m = 0, 2 (mod 4) keep or change sign, odd m swap cosine and sine when k is
-    # odd.
+    # The eight azimuths kπ/2 ± φ: m ≡ 2 (mod 4) changes sign, odd m swaps cosine and sine when k is odd.
     for k in range(4):
         for ε in (1, -1):
             column = q + k * (w // 4) if ε > 0 else ((k or 4) * (w // 4)) - 1 - q

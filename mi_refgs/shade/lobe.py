@@ -1,12 +1,11 @@
-"""The GGX reflection lobe as a linear operator on a lat-long map, diagonal in azimuth. NumPy float64, no
-Dr.Jit.
+"""The GGX lobe as a linear operator on a lat-long map, diagonal in azimuth. NumPy float64, no Dr.Jit.
 
 With N = V = R the lobe depends only on the angle between R and L, so on a lat-long grid the filter commutes
 with every rotation about the pole: it acts on each azimuthal frequency m separately, as a small matrix from
 input rows to output rows. Those matrices, built once a resolution, *are* the prefilter, the whole lobe
 included and nothing cut: where a lobe is wide, all but the lowest frequencies vanish and cost nothing.
 
-Grid    Rows stand at θ = πi/(h-1) from +y (the first and the last row are the poles), columns at φ = 2π(j+½)/w with
+Grid    Rows stand at θ = πi/(h-1) from +y (first and last row are the poles), columns at φ = 2π(j+½)/w with
         φ = atan2(x, -z). That is where Mitsuba's `envmap` puts the texels of an image, measured by
         tests/test_envmap.py.
 Radiance between texels is bilinear, as Mitsuba looks it up: the operator integrates the lobe against that
@@ -32,14 +31,12 @@ DROP_BELOW = 5e-6
 worst."""
 
 MIN_SUBSAMPLES = 2
-"""Quadrature points a texel side where the lobe is wider than a texel; the bilinear weight is integrated with
-it."""
+"""Quadrature points a texel side where the lobe is wider than a texel."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """One filtered level: `weights` (h_out, h_in, M) takes Fourier coefficients of input rows to those of
-    output rows."""
+    """One filtered level: `weights` (h_out, h_in, M) from Fourier coefficients of input to output rows."""
 
     roughness: float
     height: int
@@ -57,18 +54,14 @@ def column_angles(w: int) -> np.ndarray:
 
 
 def lobe(cos_angle: np.ndarray, roughness: float) -> np.ndarray:
-    """Unnormalised GGX lobe max(L·R, 0) D(R·H) of the angle between L and R, α = roughness². [Karis 2013, N =
-    V = R]"""
+    """Unnormalised GGX lobe max(L·R, 0) D(R·H) of the angle between L and R, α = roughness². [Karis 2013]"""
     α2 = roughness**4
-    d = 0.5 * (1 - cos_angle) + 0.5 * α2 * (
-        1 + cos_angle
-    )  # = 1 + (α²-1) cos²(half angle), without the cancellation
-    return np.maximum(cos_angle, 0) * (α2 / np.maximum(d, 1e-30)) / np.maximum(d, 1e-30)
+    d = 0.5 * (1 + α2) - (0.5 * (1 - α2)) * cos_angle  # = 1 + (α²-1) cos²(half the angle)
+    return np.maximum(cos_angle, 0) / (d * d)
 
 
 def row_areas(h: int) -> np.ndarray:
-    """∫ hat_i(θ) sinθ dθ (h,): a row's share of the sphere under linear interpolation between rows; sums to
-    2."""
+    """∫ hat_i(θ) sinθ dθ (h,): a row's share of the sphere, linear between rows; they sum to 2."""
     θ = row_angles(h)
     s, c, d = np.sin(θ), np.cos(θ), np.pi / (h - 1)
     # Exact integral of the linear ramp over one interval, seen from its left and from its right end.
@@ -78,8 +71,7 @@ def row_areas(h: int) -> np.ndarray:
 
 
 def row_resampling(h_in: int, h_out: int) -> np.ndarray:
-    """(h_out, h_in) matrix between row grids: area-weighted hats when it coarsens, linear interpolation when
-    it refines."""
+    """(h_out, h_in) matrix between row grids: area-weighted hats to coarsen, linear to refine."""
     step = np.pi / (min(h_in, h_out) - 1)
     hat = np.maximum(0, 1 - np.abs(row_angles(h_out)[:, None] - row_angles(h_in)[None]) / step)
     if h_out < h_in:
@@ -96,16 +88,14 @@ def column_resampling(w_in: int, w_out: int) -> np.ndarray:
 
 
 def resample(radiance: np.ndarray, height: int) -> np.ndarray:
-    """Radiance (h, w, 3) at another resolution (height, 2·height, 3), keeping its integral when it
-    coarsens."""
+    """Radiance (h, w, 3) at (height, 2·height, 3), keeping its integral when it coarsens."""
     h, w = radiance.shape[:2]
     rows = np.tensordot(row_resampling(h, height), radiance.astype(np.float64), 1)
     return np.einsum("ab,ibc->iac", column_resampling(w, 2 * height), rows)
 
 
 def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
-    """Matrices (h_out, h, h+1) of the lobe between input and output rows for the frequencies 0 … h of w = 2h
-    columns.
+    """Matrices (h_out, h, h+1) of the lobe from input to output rows, frequencies 0 … h of w = 2h columns.
 
     Entry (i, k, m) multiplies Σ_j x[k, j] (cos, sin)(mφ_j); the series Σ_m (a_m cos mφ + b_m sin mφ) is then
     the filtered radiance of row i at any azimuth, and exactly the circulant filter of the w columns at the
@@ -116,8 +106,7 @@ def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
     s = max(MIN_SUBSAMPLES, int(np.ceil(2.5 * texel / core)) + 1)
     t = (np.arange(s) + 0.5) / s
     θ = (np.arange((h - 1) * s) + 0.5) * (texel / s)
-    # Transform and bilinear weight of azimuth in one matrix: column d shares a sample between texels d and d
-    # + 1.
+    # Transform and bilinear weight of azimuth in one matrix: a sample lies between texels d and d + 1.
     m, d = np.arange(h + 1), np.arange(h)
     phase = 2 * np.pi / w * m[None, None] * (d[:, None, None] + np.array([0, 1])[None, :, None])
     cosines = np.cos(phase)  # (h, 2, h+1): over half the circle, the other half is its mirror image
@@ -127,12 +116,13 @@ def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
     out = np.zeros((h_out, h, h + 1))
     for i, θ_out in enumerate(row_angles(h_out)[: (h_out + 1) // 2]):
         near = θ <= θ_out + 0.5 * np.pi  # rows beyond hold no light of this hemisphere
-        c = np.cos(θ_out) * np.cos(θ[near])[:, None] + np.sin(θ_out) * np.sin(θ[near])[:, None] * cos_φ
+        cos_angle = np.outer(np.sin(θ_out) * np.sin(θ[near]), cos_φ)
+        cos_angle += (np.cos(θ_out) * np.cos(θ[near]))[:, None]
         spectrum = np.zeros((len(θ), h + 1))
-        spectrum[near] = (lobe(c, roughness) * np.sin(θ[near])[:, None]) @ transform
-        spectrum = spectrum.reshape(h - 1, s, h + 1)
-        out[i, :-1] += np.einsum("s,ksm->km", 1 - t, spectrum)
-        out[i, 1:] += np.einsum("s,ksm->km", t, spectrum)
+        spectrum[near] = lobe(cos_angle, roughness) @ transform * np.sin(θ[near])[:, None]
+        rows = spectrum.reshape(h - 1, s, h + 1)
+        out[i, :-1] += np.einsum("s,ksm->km", 1 - t, rows)
+        out[i, 1:] += np.einsum("s,ksm->km", t, rows)
         out[i] /= out[i, :, 0].sum()  # a constant map stays constant, exactly
         out[h_out - 1 - i] = out[i, ::-1]
     scale = np.full(h + 1, 2.0 / w)

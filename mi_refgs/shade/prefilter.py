@@ -22,8 +22,7 @@ from mi_refgs.shade import fourier, lobe
 
 @dataclass(frozen=True)
 class Operator:
-    """The prefilter of maps with `height` rows: buffers, matrices and the place of each level in the
-    result."""
+    """The prefilter of maps with `height` rows: buffers, matrices, and where each level is in the result."""
 
     height: int
     base: fourier.Rows
@@ -78,8 +77,7 @@ def _build(variant: str, height: int) -> Operator:
 
 
 def operator(height: int) -> Operator:
-    """The prefilter for maps (height, 2·height), built once per height and variant (0.2 s at 64 rows, 0.6 s
-    at 128)."""
+    """The prefilter for maps (height, 2·height), built once per height and variant (1 s at 64 rows)."""
     return _build(mi.variant(), height)
 
 
@@ -121,7 +119,6 @@ class _Prefilter(dr.CustomOp):
 
 
 def prefilter(radiance: Any) -> tuple[Operator, Any]:
-    """Levels of a radiance tensor (h, 2h, 3), h a multiple of 4: its operator and the flat RGBA buffer, under
-    AD."""
+    """Operator and levels (flat RGBA, under AD) of a radiance tensor (h, 2h, 3), h a multiple of 4."""
     op = operator(radiance.shape[0])
     return op, dr.custom(_Prefilter, op, radiance.array)

@@ -58,8 +58,7 @@ def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
 
 
 def eval_sh(coefs: Sequence[mi.Color3f], direction: mi.Vector3f) -> mi.Color3f:
-    """Σ coefs[i] basis_i(direction), without offset or clamp; the degree follows from the number of
-    coefficients.
+    """Σ coefs[i] basis_i(direction), without offset or clamp; their number tells the degree.
 
     Args:
         coefs: 1, 4, 9 or 16 colours.
@@ -80,6 +79,5 @@ def eval_sh(coefs: Sequence[mi.Color3f], direction: mi.Vector3f) -> mi.Color3f:
 
 
 def clamp_positive(x: Any) -> Any:
-    """max(0, x) whose derivative at exactly 0 is 1, not 0: coefficients that start at 0 must be able to leave
-    it."""
+    """max(0, x) with derivative 1 at exactly 0: coefficients that start at 0 must be able to leave it."""
     return dr.maximum(0, x)
