@@ -1,10 +1,11 @@
-"""Where the time of a training step goes: milliseconds by stage, kernel launches, and kernel-cache misses after warm-up.
+"""Where the time of a training step goes: milliseconds by stage, kernel launches, cache misses once warm.
 
     python benchmarks/step.py [--surfels 20000] [--size 200] [--steps 30] [--json]
 
-Surfels cover a unit sphere, so every one of them is on the surface, about half of them seen. Each stage is timed between barriers, in
-steps of their own; `step` is the wall time of undisturbed steps, which is less than the sum because kernels fuse across stages.
-Error: the splatter against its float64 oracle on the same surfels (a 32² crop of the view).
+Surfels cover a unit sphere, so every one of them is on the surface, about half of them seen. Each stage is
+timed between barriers, in steps of their own; `step` is the wall time of undisturbed steps, which is less
+than the sum because kernels fuse across stages. Error: the splatter against its float64 oracle on the same
+surfels (a 32² crop of the view).
 """
 
 from __future__ import annotations
@@ -30,19 +31,15 @@ import mitsuba as mi  # isort: skip
 def sphere_data(size: int, views: int, rng: np.random.Generator) -> Any:
     """Views of a unit sphere with a smooth random picture on it."""
     from mi_refgs.fit.data import Dataset, View
+    from mi_refgs.reference.camera import look_at
 
     focal = 0.5 * size / np.tan(np.radians(20))
     y, x = np.mgrid[0:size, 0:size] + 0.5 - size / 2
     inside = (np.hypot(x, y) / focal < np.tan(np.arcsin(0.25))).astype(np.float32)
     pictures = []
     for i in range(views):
-        forward = -rng.normal(size=3)
-        forward /= np.linalg.norm(forward)
-        left = np.cross([0, 0, 1.0], forward)
-        left /= np.linalg.norm(left)
-        to_world = np.eye(4)
-        to_world[:3, :3] = np.stack([left, np.cross(forward, left), forward], axis=1)
-        to_world[:3, 3] = -4 * forward
+        outward = rng.normal(size=3)
+        to_world = look_at(4 * outward / np.linalg.norm(outward), np.zeros(3))
         waves = [np.sin(x * rng.uniform(0.02, 0.1) + y * rng.uniform(0.02, 0.1)) for _ in range(3)]
         colour = 0.5 + 0.4 * np.stack(waves, axis=-1)
         image = (inside[..., None] * colour + 1 - inside[..., None]).astype(np.float32)
@@ -92,7 +89,7 @@ def stage_times(trainer: Any, steps: int) -> dict[str, float]:
     splat = importlib.import_module("mi_refgs.splat")
     blend = importlib.import_module("mi_refgs.splat.blend")
     pipeline = importlib.import_module("mi_refgs.render.pipeline")
-    train = importlib.import_module("mi_refgs.fit.train")
+    objective = importlib.import_module("mi_refgs.fit.objective")
     optim = importlib.import_module("mi_refgs.fit.optim")
     envmap = importlib.import_module("mi_refgs.shade.envmap")
     clock = StageClock()
@@ -102,9 +99,9 @@ def stage_times(trainer: Any, steps: int) -> dict[str, float]:
     clock.wrap(blend, "_blend_backward", "splat backward")
     clock.wrap(pipeline, "shade", "shade forward")
     clock.wrap(envmap.EnvironmentLight, "prefilter", "prefilter forward")
-    clock.wrap(train, "ssim", "ssim forward")
+    clock.wrap(objective, "ssim", "ssim forward")
     clock.wrap(optim.Adam, "step", "optimiser")
-    clock.wrap(train.dr, "backward", "all backward")
+    clock.wrap(dr, "backward", "all backward")
     rows = []
     try:
         for _ in range(steps):
@@ -124,20 +121,27 @@ def splat_error(surfels: Any, camera: Any, view: Any) -> float:
     from mi_refgs.splat import Camera, splat
 
     size, corner = 32, view.width // 3
-    pinhole = oracle.PinholeCamera(size, size, -view.fx, -view.fy, view.cx - corner, view.cy - corner, view.to_world)
-    fast = Camera.look(size, size, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, view.to_world, pinhole.near)
+    pinhole = oracle.PinholeCamera(
+        size, size, -view.fx, -view.fy, view.cx - corner, view.cy - corner, view.to_world
+    )
+    fast = Camera.look(
+        size, size, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, view.to_world, pinhole.near
+    )
     raw = {name: values.astype(np.float64) for name, values in surfels.to_numpy().items()}
     features = np.random.default_rng(0).uniform(size=(surfels.count, 3)).astype(np.float32)
     columns = [mi.Float(np.ascontiguousarray(column)) for column in features.T]
     with dr.suspend_grad():
-        got = np.stack([f.numpy() for f in splat(surfels, columns, fast).features], axis=-1).reshape(size, size, 3)
+        blended = splat(surfels, columns, fast)
+        got = np.stack([f.numpy() for f in blended.features], axis=-1).reshape(size, size, 3)
     expected = oracle.splat(raw, features.astype(np.float64), pinhole)
     return float(np.abs(got - expected.features)[~expected.band].max())
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--surfels", type=int, default=20_000)
     parser.add_argument("--size", type=int, default=200, help="image edge, pixels")
     parser.add_argument("--steps", type=int, default=30)

@@ -1,31 +1,36 @@
 """Conventions and thresholds: the one place that fixes a letter, a frame or a number.
 
-Frames      World is right-handed, in scene units. The camera frame is Mitsuba's: +z forward, +x left, +y up; data
-            readers convert once, at the door.
+Frames      World is right-handed, in scene units. The camera frame is Mitsuba's: +z forward, +x left, +y up;
+            data readers convert once, at the door.
 Pixels      The centre of pixel (i, j) is (i + ½, j + ½); only `splat.camera.pixel_centres` says so in code.
 Quaternions (x, y, z, w) everywhere but in PLY files, which store w first.
-Colour      Linear radiance everywhere; the sRGB curve is applied once, at the camera (`fit.losses`, `fit.images`).
-Letters     N surfels, M surfel-tile pairs, P pixels, K channels, α opacity after the footprint, T transmittance,
-            w = αT, δx the adjoint of x, a_from_b an index map.
+Colour      Linear radiance everywhere; the sRGB curve is applied once, at the camera (`fit.losses`).
+Letters     N surfels, M surfel-tile pairs, P pixels, K channels, α opacity after the footprint,
+            T transmittance, w = αT, δx the adjoint of x, a_from_b an index map.
 """
 
-# --- Footprint and compositing -------------------------------------------------------------------------------------
+# ---------------- cameras ----------------
+
+RIGID_TOLERANCE = 1e-3
+"""Largest deviation of RᵀR from the identity in a camera: float32 in text files carries about 1e-6."""
+
+# ---------------- footprint and compositing ----------------
 
 ALPHA_MAX = 0.99
 """Largest opacity of one surfel at one pixel: keeps 1/(1-α) ≤ 100 in the adjoint. [3DGS, appendix C]"""
 
 ALPHA_MIN = 1.0 / 255.0
-"""A contribution below one 8-bit step is skipped; the declared discontinuity of the renderer. [3DGS, appendix C]"""
+"""A contribution below one 8-bit step is skipped; the declared discontinuity. [3DGS, appendix C]"""
 
 TRANSMITTANCE_MIN = 1e-4
-"""A pixel ends before the surfel that would bring T below this: what is left cannot move 8 bits. [3DGS, appendix C]"""
+"""A pixel ends before the surfel that would bring T below this: 8 bits show no more. [3DGS, appendix C]"""
 
 LOW_PASS_INV_VARIANCE = 2.0
 """1/pixel²: the screen-space filter is a Gaussian of σ = 1/√2 pixel. [2DGS, §4.2]"""
 
 EDGE_ON_COSINE = 1e-4
-"""|cos| between a surfel's plane and the ray to its centre below which it is culled: it covers less than 1/10000 of
-its area, and its ray-plane intersection loses every float32 digit."""
+"""|cos| between a surfel's plane and the ray to its centre below which it is culled: it covers less than
+1/10000 of its area, and its ray-plane intersection loses every float32 digit."""
 
 MEDIAN_TRANSMITTANCE = 0.5
 """The median depth is that of the last surfel met while T is above one half. [2DGS, §5]"""
@@ -33,11 +38,15 @@ MEDIAN_TRANSMITTANCE = 0.5
 TILE = 4
 """Tile edge in pixels: 4×4 = one 16-lane AVX-512 packet, whose lanes then share every surfel they read."""
 
-# --- Surfels -------------------------------------------------------------------------------------------------------
+# ---------------- surfels ----------------
 
 NORM_FLOOR = 1e-20
 """Squared length below which a vector has no direction; the caller then takes a named fallback."""
 
 COVERAGE_FLOOR = 1e-3
-"""Accumulated alpha below which a pixel counts as empty: material maps are divided by alpha, and a quarter of an 8-bit
-step of coverage shows nothing worth dividing by."""
+"""Accumulated alpha below which a pixel counts as empty: material maps are divided by alpha, and a quarter of
+an 8-bit step of coverage shows nothing worth dividing by."""
+
+FACING_TOLERANCE = 0.25
+"""Cosine by which a normal may point away from the camera before it is turned round: 14° behind the
+silhouette."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.fit.images import box_downscale, write_exr
+from mi_refgs.images import box_downscale, write_exr
 
 HEIGHT = 128  # rows; twice as many columns
 OVERSAMPLING = 4  # samples a texel and axis

@@ -13,6 +13,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refgs.images import MITSUBA_EXR_THREADS
+
+THREADS = max(dr.thread_count(), MITSUBA_EXR_THREADS)
+"""Tests let Mitsuba read EXR files, on machines of one core too."""
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if dr.has_backend(dr.JitBackend.CUDA):
@@ -24,12 +29,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def llvm_ad_rgb() -> Iterator[None]:
-    """Set the variant; afterwards wait for kernels, restore the flags, and return the memory of the test.
+    """Set variant and threads; afterwards wait for kernels, restore the flags, return the test's memory.
 
     Compiled kernels and registered objects stay: module-scoped fixtures hold scenes, and recompiling costs
     most of a test's time.
     """
     mi.set_variant("llvm_ad_rgb")
+    if dr.thread_count() != THREADS:  # a command was run with --threads
+        dr.set_thread_count(THREADS)
     yield
     gc.collect()
     if mi.variant() != "scalar_rgb":
@@ -48,8 +55,7 @@ def rng() -> np.random.Generator:
 @pytest.fixture
 def one_thread() -> Iterator[None]:
     """Run Dr.Jit on one thread: floating-point sums by scatter are then bitwise the same in every run."""
-    threads = dr.thread_count()
     dr.set_thread_count(1)
     yield
     dr.sync_thread()
-    dr.set_thread_count(threads)
+    dr.set_thread_count(THREADS)

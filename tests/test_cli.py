@@ -15,8 +15,8 @@ from tiny_scene import SETTINGS, SIZE, write_data, write_method
 
 from mi_refgs.cli import demo, main
 from mi_refgs.fit.config import load_resolved
-from mi_refgs.fit.images import read_exr, read_png, srgb_from_linear, write_png
 from mi_refgs.fit.train import Trainer
+from mi_refgs.images import read_exr, read_png, srgb_from_linear, write_png
 
 COMMANDS = ("doctor", "demo", "dataset", "train", "eval", "render", "export")
 ARTEFACTS = ("surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "config.toml", "metrics.jsonl")

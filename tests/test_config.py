@@ -40,16 +40,24 @@ def test_stages_and_windows_meet_without_gap_or_overlap():
 
 
 def test_assignments_are_applied_unscaled():
-    method = config.load("ref_gaussian", "quick", ["loss.ssim=0.3", "mesh.resolution=64", "refine.densify.until=7"])
+    method = config.load(
+        "ref_gaussian", "quick", ["loss.ssim=0.3", "mesh.resolution=64", "refine.densify.until=7"]
+    )
     assert (method.loss.ssim, method.mesh.resolution, method.refine.densify.until) == (0.3, 64, 7)
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("iterations = 10\n[stage.a]\nuntil = 10\n[loss]\nsim = 1", ["own.toml", "loss", "unknown key 'sim'"]),
+        (
+            "iterations = 10\n[stage.a]\nuntil = 10\n[loss]\nsim = 1",
+            ["own.toml", "loss", "unknown key 'sim'"],
+        ),
         ("iterations = 10\n[stage.a]\nuntil = 'x'", ["own.toml", "until", "expected int"]),
-        ("iterations = 10\n[stage.a]\nuntil = 10\nat = 'voxel'", ["own.toml", "'voxel' is not allowed", "surfel"]),
+        (
+            "iterations = 10\n[stage.a]\nuntil = 10\nat = 'voxel'",
+            ["own.toml", "'voxel' is not allowed", "surfel"],
+        ),
         ("iterations = 10", ["own.toml", "missing key 'stage'"]),
         ("[stage.a]\nuntil = 10", ["own.toml", "missing key 'iterations'"]),
         ("iterations = [", ["own.toml", "not valid TOML"]),
@@ -65,7 +73,7 @@ def test_bad_files_are_named(text, words, tmp_path):
 
 @pytest.mark.parametrize("assignment", ["loss.sim=1", "loss", "iterations.x=1"])
 def test_bad_assignments_are_named(assignment):
-    with pytest.raises(InputError, match="--set|unknown key"):
+    with pytest.raises(InputError, match=r"--set|unknown key"):
         config.load("ref_gaussian", "quick", [assignment])
 
 

@@ -14,16 +14,7 @@ from PIL import Image
 
 from mi_refgs.errors import InputError
 from mi_refgs.fit.data import Dataset, load
-from mi_refgs.fit.images import (
-    box_downscale,
-    linear_from_srgb,
-    read_exr,
-    read_exr_image,
-    read_png,
-    srgb_from_linear,
-    write_exr,
-    write_png,
-)
+from mi_refgs.images import box_downscale, read_exr_image, read_png, write_exr, write_png
 
 ANGLE = 0.7  # camera_angle_x, radians
 WIDTH, HEIGHT = 6, 4
@@ -282,29 +273,3 @@ def test_lone_picture_leaves_zero_training_views(folder: Path) -> None:
     (folder / "transforms_test.json").unlink()
     with pytest.raises(InputError, match="zero training views"):
         load(folder, "train")
-
-
-def test_srgb_curve() -> None:
-    x = np.linspace(0, 4, 1001)
-    np.testing.assert_allclose(linear_from_srgb(srgb_from_linear(x)), x, atol=1e-9)
-    known = srgb_from_linear(np.array([0.0, 0.0031308, 0.5, 1.0]))
-    np.testing.assert_allclose(known, [0, 0.04045, 0.735357, 1], atol=1e-5)
-    assert np.isfinite(srgb_from_linear(np.array([-1.0]))).all()
-
-
-def test_exr_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
-    image = rng.normal(size=(5, 7, 3)).astype(np.float32)
-    write_exr(tmp_path / "a.exr", image, names="XYZ")
-    np.testing.assert_array_equal(read_exr_image(tmp_path / "a.exr"), image)
-    write_exr(tmp_path / "a.exr", image[..., 0], half=True)
-    np.testing.assert_allclose(read_exr(tmp_path / "a.exr")["Y"], image[..., 0], rtol=1e-3)
-    write_exr(tmp_path / "b.exr", image[..., :2], names="UV")
-    with pytest.raises(InputError, match="channels: found U, V"):
-        read_exr_image(tmp_path / "b.exr")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "b.exr"]
-
-
-def test_unwritable_output(tmp_path: Path) -> None:
-    for write_file, name in ((write_png, "none/a.png"), (write_exr, "none/a.exr")):
-        with pytest.raises(InputError, match=r"none/a.*writable"):
-            write_file(tmp_path / name, np.zeros((2, 2, 3)))

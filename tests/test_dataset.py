@@ -17,7 +17,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fit import pathtrace
 from mi_refgs.fit.data import Dataset, load
 from mi_refgs.fit.dataset import generate
-from mi_refgs.fit.images import read_exr_image, srgb_from_linear
+from mi_refgs.images import read_exr_image, srgb_from_linear
 
 SCENES = Path(__file__).parent.parent / "scenes"
 CENTRE, RADIUS = np.array([0.3, -0.2, 0.5]), 0.7

@@ -22,7 +22,12 @@ def test_python_blocks_run(number, tmp_path):
     """Each block in a process of its own, as a reader would paste it; warnings are errors."""
     code = blocks("python")[number]
     result = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
     )
     assert result.returncode == 0, result.stderr[-2000:]
 

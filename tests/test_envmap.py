@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import level_maps, unit, vector
 
 from mi_refgs.errors import InputError
 from mi_refgs.reference import shade as reference
@@ -16,14 +17,6 @@ from mi_refgs.shade import envmap, lobe, prefilter
 from mi_refgs.shade.envmap import EnvironmentLight
 
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
-
-
-def unit(d: np.ndarray) -> np.ndarray:
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
-
-
-def vector(d: np.ndarray) -> mi.Vector3f:
-    return mi.Vector3f(np.ascontiguousarray(np.asarray(d).T, dtype=np.float32))
 
 
 def mitsuba_radiance(emitter: dict, d: np.ndarray) -> np.ndarray:
@@ -50,11 +43,6 @@ def random_map(rng: np.random.Generator, h: int) -> np.ndarray:
     radiance = rng.uniform(0.1, 2, (h, 2 * h, 3)).astype(np.float32)
     radiance[0], radiance[-1] = radiance[0, 0], radiance[-1, 0]
     return radiance
-
-
-def level_maps(light: envmap.PrefilteredLight) -> list[np.ndarray]:
-    flat = np.array(light.levels).reshape(-1, 4)[:, :3]
-    return [flat[first : first + 2 * h * h].reshape(h, 2 * h, 3) for first, h in light.operator.shapes]
 
 
 # ---------------- orientation, files ----------------

@@ -15,9 +15,10 @@ from tiny_scene import SETTINGS, SIZE, write_data, write_method
 from mi_refgs.fit import config, data, metrics, pictures
 from mi_refgs.fit.evaluate import evaluate
 from mi_refgs.fit.export import Fitted, export
-from mi_refgs.fit.images import read_png
+from mi_refgs.fit.objective import displayed
 from mi_refgs.fit.record import Run
-from mi_refgs.fit.train import Trainer, displayed
+from mi_refgs.fit.train import Trainer
+from mi_refgs.images import read_png
 from mi_refgs.surfels.ply import write_ply
 
 KEYS = (

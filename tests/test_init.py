@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.errors import InputError
+from mi_refgs.reference.camera import look_at
 from mi_refgs.surfels import init
 
 
@@ -70,11 +71,7 @@ def sphere_views(
     for number in range(count):
         forward = rng.normal(size=3)
         forward /= np.linalg.norm(forward)
-        left = np.cross([0.3, 0.5, 0.8], forward)
-        left /= np.linalg.norm(left)
-        to_world = np.eye(4)
-        to_world[:3, :3] = np.stack([left, np.cross(forward, left), forward], axis=-1)
-        to_world[:3, 3] = centre - 4 * forward
+        to_world = look_at(centre - 4 * forward, centre, (0.3, 0.5, 0.8))
         column, row = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
         rays = np.stack([(column - size / 2) / focal, (row - size / 2) / focal, np.ones_like(row)], axis=-1)
         cosine = rays[..., 2] / np.linalg.norm(rays, axis=-1)

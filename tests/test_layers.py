@@ -9,36 +9,30 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from helpers import ROOT, imported_packages
 
-ROOT = Path(__file__).parents[1]
 PACKAGE = "mi_refgs"
+
+BOTTOM = {"constants", "errors", "files", "images"}
+"""What everything may stand on."""
 
 LAYERS: dict[str, set[str]] = {
     "errors": set(),
     "constants": set(),
     "llvm": set(),
     "resources": {"errors"},
-    "surfels": {"constants", "errors"},
-    "splat": {"surfels", "constants", "errors"},
-    "shade": {"splat.camera", "surfels", "constants", "errors"},
-    "occlusion": {"splat.camera", "surfels", "constants", "errors"},
-    "render": {"shade", "occlusion", "splat", "surfels", "constants", "errors"},
-    "fit": {"render", "shade", "occlusion", "splat", "surfels", "resources", "constants", "errors", ""},
-    "plugins": {"fit", "render", "shade", "occlusion", "splat", "surfels", "constants", "errors"},
+    "files": {"errors"},
+    "images": {"files", "errors"},
+    "surfels": BOTTOM,
+    "splat": {"surfels"} | BOTTOM,
+    "shade": {"splat.camera", "surfels"} | BOTTOM,
+    "occlusion": {"splat.camera", "surfels"} | BOTTOM,
+    "render": {"shade", "occlusion", "splat", "surfels"} | BOTTOM,
+    "fit": {"render", "shade", "occlusion", "splat", "surfels", "resources", ""} | BOTTOM,
+    "plugins": {"fit", "render", "shade", "occlusion", "splat", "surfels"} | BOTTOM,
     "doctor": {"llvm", "errors", ""},
-    "cli": {
-        "fit",
-        "render",
-        "shade",
-        "occlusion",
-        "splat",
-        "surfels",
-        "resources",
-        "constants",
-        "errors",
-        "llvm",
-    }
-    | {"doctor", ""},
+    "cli": {"fit", "render", "shade", "occlusion", "splat", "surfels", "resources", "llvm", "doctor", ""}
+    | BOTTOM,
     "__main__": {"cli"},
     "reference": {"constants"},
     "": {"llvm", "plugins"},
@@ -103,17 +97,6 @@ def layer_breaches(modules: dict[str, str]) -> list[str]:
                 dotted = [name for name in allowed if "." in name]
                 if not any(imported.startswith(f"{name}.") for name in dotted):
                     found.append(f"{module}: imports {imported or PACKAGE}")
-    return found
-
-
-def imported_packages(source: str) -> set[str]:
-    """First names of everything that `source` imports absolutely."""
-    found = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            found |= {alias.name.partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            found.add((node.module or "").partition(".")[0])
     return found
 
 

@@ -11,8 +11,8 @@ import pytest
 from image_checks import GRADIENT, HEIGHT, STEP, VALUE, WIDTH, check, gradient, planes, stack
 
 from mi_refgs.fit import losses
-from mi_refgs.fit.images import srgb_from_linear
 from mi_refgs.fit.ssim import ssim
+from mi_refgs.images import srgb_from_linear
 from mi_refgs.reference import losses as reference
 
 

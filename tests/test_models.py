@@ -9,19 +9,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import level_maps, unit
 
 from mi_refgs.errors import InputError
 from mi_refgs.reference import shade as reference
 from mi_refgs.shade import brdf, lobe
-from mi_refgs.shade.envmap import EnvironmentLight, PrefilteredLight
+from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.models import ShadingPoints, reflect, safe_normalize, shade
 
 N = 50
 CASES = [(d, o) for d in ("sh", "irradiance") for o in ("open", "visibility", "indirect")]
-
-
-def unit(d: np.ndarray) -> np.ndarray:
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
 def scene(rng: np.random.Generator, occlusion: str) -> dict[str, Any]:
@@ -56,11 +53,6 @@ def points_of(values: dict[str, Any]) -> ShadingPoints:
 @pytest.fixture(scope="module")
 def radiance() -> np.ndarray:
     return np.random.default_rng(3).uniform(0.1, 3, (16, 32, 3))
-
-
-def level_maps(light: PrefilteredLight) -> list[np.ndarray]:
-    flat = np.array(light.levels, np.float64).reshape(-1, 4)[:, :3]
-    return [flat[first : first + 2 * h * h].reshape(h, 2 * h, 3) for first, h in light.operator.shapes]
 
 
 def oracle(values: dict[str, Any], levels: list[np.ndarray], diffuse: str, k: int) -> np.ndarray:

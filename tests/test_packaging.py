@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import configparser
 import importlib.metadata
-import os
 import re
 import shutil
 import subprocess
@@ -15,11 +13,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from helpers import ROOT, imported_packages, run_python
 
 from mi_refgs.errors import InputError
 from mi_refgs.resources import resource_dir
 
-ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
@@ -60,21 +58,6 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(code: str, folder: Path) -> str:
-    """What `code` prints in a fresh process that finds the package only in `folder`."""
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(folder)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
-
-
 def test_wheel_holds_every_module_and_data_file(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         packed = set(archive.namelist())
@@ -111,7 +94,7 @@ def test_plugins_and_entry_points_name_the_same_modules() -> None:
 
 def test_wheel_imports_and_finds_its_data(installed: Path) -> None:
     code = "import mi_refgs\nfrom mi_refgs.resources import resource_dir\nprint(resource_dir('scenes'))"
-    assert Path(run(code, installed)) == installed / "mi_refgs" / "scenes"
+    assert Path(run_python(code, folder=installed, package=installed)) == installed / "mi_refgs" / "scenes"
 
 
 def test_every_package_is_listed() -> None:
@@ -129,13 +112,7 @@ IMPORT_NAMES = {"scikit_image": "skimage", "pillow": "pil", "mitsuba": "drjit"}
 
 def imported(source: str) -> set[str]:
     """First names of what a file imports that is neither Python's nor its own package's."""
-    found = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            found |= {alias.name.partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            found.add((node.module or "").partition(".")[0])
-    return found - sys.stdlib_module_names - {"mi_refgs"}
+    return imported_packages(source) - sys.stdlib_module_names - {"mi_refgs"}
 
 
 def declared(requirements: list[str]) -> set[str]:

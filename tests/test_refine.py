@@ -7,6 +7,7 @@ import pytest
 
 from mi_refgs.fit import refine
 from mi_refgs.fit.config import Refine
+from mi_refgs.surfels.init import logit
 from mi_refgs.surfels.table import Surfels
 
 OPTIONS = Refine()
@@ -19,9 +20,9 @@ def table(count: int = 6, scale: float = 0.005, opacity: float = 0.8) -> Surfels
             "position": rng.normal(size=(count, 3)),
             "rotation": rng.normal(size=(count, 4)),
             "scale": np.full((count, 2), np.log(scale)),
-            "opacity": np.full((count, 1), refine.logit(opacity)),
-            "metallic": np.full((count, 1), refine.logit(0.5)),
-            "roughness": np.full((count, 1), refine.logit(0.05)),
+            "opacity": np.full((count, 1), logit(opacity)),
+            "metallic": np.full((count, 1), logit(0.5)),
+            "roughness": np.full((count, 1), logit(0.05)),
             "albedo": rng.normal(size=(count, 3)),
         }
     )
@@ -55,7 +56,7 @@ def test_large_hot_surfels_are_split_within_their_own_plane():
 
 def test_transparent_and_oversized_surfels_go_even_when_hot():
     raw = table().to_numpy()
-    raw["opacity"][0] = refine.logit(0.01)
+    raw["opacity"][0] = logit(0.01)
     raw["scale"][1] = np.log(0.5)
     edited = densify(Surfels.from_numpy(raw), np.full(6, 1e-3))
     assert sorted(set(edited.parent.tolist())) == [2, 3, 4, 5]
@@ -79,13 +80,15 @@ def test_reset_lowers_opacity_and_lifts_metallic_only():
 def test_propagation_is_material_aware():
     """Only metallic and smooth surfels grow; all become opaque. [Ref-Gaussian §3.4]"""
     raw = table().to_numpy()
-    raw["metallic"][0] = refine.logit(0.01)  # no metal
-    raw["roughness"][1] = refine.logit(0.5)  # a rough metal
-    raw["opacity"][2] = refine.logit(0.95)  # opaque already
+    raw["metallic"][0] = logit(0.01)  # no metal
+    raw["roughness"][1] = logit(0.5)  # a rough metal
+    raw["opacity"][2] = logit(0.95)  # opaque already
     edited = refine.propagate_normals(Surfels.from_numpy(raw), OPTIONS).to_numpy()
     grown = np.exp(edited["scale"] - raw["scale"])[:, 0]
     np.testing.assert_allclose(grown, [1, 1, 1.5, 1.5, 1.5, 1.5], rtol=1e-5)
-    np.testing.assert_allclose(refine.sigmoid(edited["opacity"])[:, 0], [0.9, 0.9, 0.95, 0.9, 0.9, 0.9], rtol=1e-5)
+    np.testing.assert_allclose(
+        refine.sigmoid(edited["opacity"])[:, 0], [0.9, 0.9, 0.95, 0.9, 0.9, 0.9], rtol=1e-5
+    )
 
 
 def test_material_reset_leaves_geometry():

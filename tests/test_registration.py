@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers import run_python
 
 STAND_IN = """
 import mitsuba as mi
@@ -40,20 +41,7 @@ def make():
 def run(code: str, folder: Path, order: str = "import mi_refgs, mitsuba as mi") -> list[str]:
     """Lines that `code` prints after the plugin's module was replaced by a stand-in, in a fresh process."""
     (folder / "stand_in.py").write_text(STAND_IN)
-    repository = Path(__file__).parents[1]
-    program = f"import sys; sys.path[:0] = [{str(folder)!r}, {str(repository)!r}]\n" + PRELUDE.format(
-        order=order
-    )
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", program + code],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
+    return run_python(PRELUDE.format(order=order) + code, folder=folder).splitlines()
 
 
 def test_every_switch_registers_again(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from mi_refgs.fit import config
 from mi_refgs.fit.data import Dataset, View
 from mi_refgs.fit.record import Run
 from mi_refgs.fit.train import Trainer
+from mi_refgs.reference.camera import look_at
 
 SIZE = 24
 
@@ -22,6 +23,8 @@ iterations = 30
 checkpoint_every = 5
 log_every = 3
 [surfels]
+count = 150
+max_count = 220
 sh_degree = 1
 sh_raise = { start = 2, until = 4, every = 2 }
 opacity = 0.6
@@ -57,19 +60,17 @@ def ball(size: int = SIZE, views: int = 6) -> Dataset:
     y, x = (np.mgrid[0:size, 0:size] + 0.5 - size / 2) / focal
     for i in range(views):
         angle = 2 * np.pi * i / views
-        forward = -np.array([np.cos(angle) * 0.9, np.sin(angle) * 0.9, np.sqrt(0.19)])
-        left = np.cross([0, 0, 1.0], forward)
-        left /= np.linalg.norm(left)
-        to_world = np.eye(4)
-        to_world[:3, :3] = np.stack([left, np.cross(forward, left), forward], axis=1)
-        to_world[:3, 3] = -4 * forward
+        outward = np.array([np.cos(angle) * 0.9, np.sin(angle) * 0.9, np.sqrt(0.19)])
+        to_world = look_at(4 * outward, np.zeros(3))
         radius = np.hypot(x, y)
         alpha = (radius < np.tan(np.arcsin(0.25))).astype(np.float32)
         shine = np.exp(-((x - 0.05) ** 2 + (y + 0.05) ** 2) / 0.002)
         colour = np.stack([0.3 + 0.6 * shine, 0.4 + x, 0.5 + 0.5 * shine + y], axis=-1)
         image = (alpha[..., None] * colour + 1 - alpha[..., None]).clip(0, 1).astype(np.float32)
         c = size / 2
-        pictures.append(View(f"{i}", size, size, focal, focal, c, c, to_world, image, alpha, None, None, linear=False))
+        pictures.append(
+            View(f"{i}", size, size, focal, focal, c, c, to_world, image, alpha, None, None, linear=False)
+        )
     return Dataset(Path("ball"), "train", tuple(pictures), np.ones(3, np.float32), False, None)
 
 
@@ -77,8 +78,7 @@ def ball(size: int = SIZE, views: int = 6) -> Dataset:
 def method(tmp_path):
     path = tmp_path / "small.toml"
     path.write_text(METHOD)
-    settings = ["surfels.count=150", "surfels.max_count=220"]
-    return dataclasses.replace(config.load_resolved(path), surfels=config.load(str(path), "quick", settings).surfels)
+    return config.load_resolved(path)
 
 
 def run_folder(path, method) -> Run:
@@ -125,7 +125,7 @@ def test_resume_repeats_a_straight_run_bit_for_bit(method, tmp_path, one_thread)
 
 
 def test_a_kill_loses_at_most_one_checkpoint_interval(method, tmp_path):
-    """A killed process leaves its last periodic checkpoint, and a torn file from the one being written is passed over."""
+    """A killed process leaves its last periodic checkpoint, and a torn file is passed over."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
 

@@ -18,6 +18,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.occlusion import mesh as meshes
 from mi_refgs.occlusion import tsdf
 from mi_refgs.reference import occlusion as ref
+from mi_refgs.reference.camera import look_at
 from mi_refgs.splat.camera import Camera
 
 SIZE = 96
@@ -36,7 +37,7 @@ def directions(count: int) -> np.ndarray:
 
 
 def ring_of_views(where: np.ndarray) -> list[np.ndarray]:
-    return [ref.look_at(4.0 * d, np.zeros(3)) for d in where]
+    return [look_at(4.0 * d, np.zeros(3)) for d in where]
 
 
 def camera(pose: np.ndarray) -> Camera:

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from helpers import vector
 
 from mi_refgs.occlusion import tsdf, visibility
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
@@ -56,10 +57,6 @@ def point3(x: np.ndarray) -> mi.Point3f:
     return mi.Point3f(np.ascontiguousarray(x.T, np.float32))
 
 
-def vector3(x: np.ndarray) -> mi.Vector3f:
-    return mi.Vector3f(np.ascontiguousarray(x.T, np.float32))
-
-
 @pytest.mark.parametrize("name", SHAPES)
 def test_mirror_rays_against_the_true_shape(name: str) -> None:
     """Points up to half a voxel off the surface, either side, noisy mesh: few false occlusions, few missed
@@ -70,7 +67,7 @@ def test_mirror_rays_against_the_true_shape(name: str) -> None:
     point, normal, mirror = mirror_rays(shape, 30000)
     truth = ref.visible(shape, point, mirror, 1e-4)
     shift = np.random.default_rng(6).uniform(-0.5, 0.5, (len(point), 1)) * mesh.voxel
-    answer = occluder.visible(point3(point + shift * normal), vector3(mirror), vector3(normal))
+    answer = occluder.visible(point3(point + shift * normal), vector(mirror), vector(normal))
     seen = np.array(answer) == 1
     grazing = np.sum(mirror * normal, axis=1) < 0.2
     false_occlusion, missed = np.mean(truth & ~seen), np.mean(~truth & seen)
@@ -90,7 +87,7 @@ def test_offset_is_what_prevents_self_occlusion(monkeypatch: pytest.MonkeyPatch)
     mesh = extracted(shape)
     occluder = Occluder(mesh)
     point, normal, mirror = mirror_rays(shape, 2000)
-    args = point3(point - mesh.voxel * normal), vector3(mirror), vector3(normal)
+    args = point3(point - mesh.voxel * normal), vector(mirror), vector(normal)
     assert dr.all(occluder.visible(*args) == 1)
     steep = np.sum(mirror * normal, axis=1) > 0.6
     assert np.array(occluder.visible(args[0], args[1]))[steep].all()
@@ -104,7 +101,7 @@ def test_independent_of_scene_size(scale: float) -> None:
     shape = SHAPES["facing plates"]
     mesh = extracted(shape)
     point, normal, mirror = mirror_rays(shape, 4000)
-    rays = vector3(mirror), vector3(normal)
+    rays = vector(mirror), vector(normal)
     here = np.array(Occluder(mesh).visible(point3(point), *rays))
     scaled = Mesh(mesh.vertices * np.float32(scale), mesh.faces, mesh.voxel * scale)
     there = np.array(Occluder(scaled).visible(point3(scale * point), *rays))

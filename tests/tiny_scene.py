@@ -7,14 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.fit.images import write_exr, write_png
+from mi_refgs.fit.config import PRESETS
+from mi_refgs.fit.frames import MITSUBA_FROM_OPENGL
+from mi_refgs.images import write_exr, write_png
+from mi_refgs.reference.camera import look_at
 
 SIZE = 20
 FOCAL = 24.0  # pixels
 RADIUS, DISTANCE = 0.5, 1.5
 
-METHOD = """
-iterations = 3000
+METHOD = f"""
+iterations = {PRESETS["quick"].iterations}
 checkpoint_every = 3
 [surfels]
 channels = ["radiance_sh", "albedo", "metallic", "roughness", "indirect_sh"]
@@ -26,13 +29,13 @@ until = 3
 at = "surfel"
 diffuse = "irradiance"
 [stage.deferred]
-until = 3000
+until = {PRESETS["quick"].iterations}
 at = "pixel"
 [mesh]
-extract = { start = 3, until = 6, every = 1 }
+extract = {{ start = 3, until = 6, every = 1 }}
 resolution = 16
 """
-"""Written for the iterations of the preset `quick`, so that nothing is scaled."""
+"""Written for the preset `quick`, so that nothing is scaled."""
 SETTINGS = ["iterations=6", "surfels.count=80", "surfels.max_count=100", "preview_every=4", "log_every=2"]
 
 
@@ -50,7 +53,8 @@ def write_data(folder: Path, views: int = 3, truth: bool = True) -> Path:
         frames = []
         for i in range(count):
             angle = 2 * np.pi * (i + 0.5 * (split == "test")) / max(count, 1)
-            pose = _look_at_origin(DISTANCE * np.array([np.cos(angle), np.sin(angle), 0.5]) / np.sqrt(1.25))
+            origin = DISTANCE * np.array([np.cos(angle), np.sin(angle), 0.5]) / np.sqrt(1.25)
+            pose = look_at(origin, np.zeros(3)) @ MITSUBA_FROM_OPENGL
             alpha, normal = _ball(pose)
             picture = np.concatenate([0.5 + 0.4 * normal, alpha[..., None]], axis=-1)
             write_png(folder / split / f"r_{i}.png", picture)
@@ -67,18 +71,8 @@ def write_data(folder: Path, views: int = 3, truth: bool = True) -> Path:
     return folder
 
 
-def _look_at_origin(origin: np.ndarray) -> np.ndarray:
-    """Camera to world, OpenGL axes (looking along −z), z up."""
-    back = origin / np.linalg.norm(origin)
-    right = np.cross([0.0, 0, 1], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(back, right), back, origin], axis=1)
-    return pose
-
-
 def _ball(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Alpha (H, W) and normals (H, W, 3) of the ball at the pixel centres."""
+    """Alpha (H, W) and normals (H, W, 3) of the ball at the pixel centres; `pose` has OpenGL axes."""
     offset = (np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL
     x, y = np.meshgrid(offset, -offset)
     ray = np.stack([x, y, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -15,8 +14,6 @@ from typing import Any, NoReturn
 from mi_refgs.errors import InputError
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
-FILE_THREADS = 2
-"""Mitsuba 3.9 reads and writes EXR files on a worker thread; with one thread in all it waits for ever."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +84,18 @@ def add_output(parser: Parser, what: str, metavar: str) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar=metavar, help=what)
 
 
+def add_settings(parser: Parser) -> None:
+    """Add the option --set."""
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="key=value",
+        help="change the method, as in loss.ssim=0.1",
+    )
+
+
 def prepare(args: argparse.Namespace) -> None:
     """Set the number of threads and Mitsuba's variant.
 
@@ -107,31 +116,11 @@ def prepare(args: argparse.Namespace) -> None:
                 f"--threads: {args.threads} is out of range; give 1 to {4 * (os.cpu_count() or 1)}"
             )
         dr.set_thread_count(args.threads)
-    if dr.thread_count() < FILE_THREADS:
-        dr.set_thread_count(FILE_THREADS)
     try:
         mi.set_variant(variant)
     except ImportError as error:
         raise UnusableError(f"{error} (`refgs doctor` says more)") from error
     mi.set_log_level(mi.LogLevel.Warn)
-
-
-@contextlib.contextmanager
-def threads(count: int | None) -> Iterator[None]:
-    """Run a part that neither reads nor writes EXR files through Mitsuba on exactly this many threads."""
-    import drjit as dr
-
-    before = dr.thread_count()
-    if count is None or count == before:
-        yield
-        return
-    dr.sync_thread()
-    dr.set_thread_count(count)
-    try:
-        yield
-    finally:
-        dr.sync_thread()
-        dr.set_thread_count(before)
 
 
 def warn(message: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from mi_refgs.cli.command import Result, add_command, add_output, say
+from mi_refgs.cli.command import Result, add_command, add_output, add_settings, say
 from mi_refgs.cli.evaluate import table
 from mi_refgs.cli.train import fit
 from mi_refgs.resources import resource_dir
@@ -22,14 +22,7 @@ def add(commands: Any) -> None:
     parser = add_command(commands, "demo", summary, "refgs demo -o runs/demo", run)
     add_output(parser, "folder for data set and run; run again, it goes on where it stopped", "DIR")
     parser.add_argument("--preset", default=PRESET, metavar="P", help="how long to fit (default %(default)s)")
-    parser.add_argument(
-        "--set",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="key=value",
-        help="change the method, as in `refgs train`",
-    )
+    add_settings(parser)
 
 
 def run(args: argparse.Namespace) -> Result:

@@ -80,6 +80,8 @@ def load_scene(path: Path, aovs: list[str]) -> Any:
     """
     import mitsuba as mi
 
+    from mi_refgs.images import mitsuba_exr
+
     before = mi.file_resolver()
     beside = mi.FileResolver(before)
     beside.prepend(str(path.parent.resolve()))
@@ -93,7 +95,8 @@ def load_scene(path: Path, aovs: list[str]) -> Any:
             if not integrators:
                 raise InputError(f"{path}: --aov: the scene has no `refgs` integrator; drop --aov")
             integrators[0]["aovs"] = ",".join(aov if ":" in aov else f"{aov}:{aov}" for aov in aovs)
-        loaded = mi.parser.instantiate(config, state)
+        with mitsuba_exr():
+            loaded = mi.parser.instantiate(config, state)
     except RuntimeError as error:
         raise InputError(f"{path}: scene: {_reason(error)}") from error
     finally:
@@ -106,7 +109,8 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
     import mitsuba as mi
     import numpy as np
 
-    from mi_refgs.fit.images import replace_file, srgb_from_linear, write_png
+    from mi_refgs.files import replace_file
+    from mi_refgs.images import mitsuba_exr, srgb_from_linear, write_png
 
     try:
         image = mi.render(scene, sensor=sensor, spp=spp)
@@ -115,7 +119,8 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
     bitmap = sensor.film().bitmap()
     names = [channel.name for channel in bitmap.struct_()]
     if path.suffix.lower() == ".exr":
-        replace_file(path, lambda temporary: bitmap.write(str(temporary)))
+        with mitsuba_exr():
+            replace_file(path, lambda temporary: bitmap.write(str(temporary)))
         return names
     pixels = np.array(image, dtype=np.float32)
     if "A" in names:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mi_refgs.cli.command import Result, add_command, add_output, say, threads, warn
+from mi_refgs.cli.command import Result, add_command, add_output, add_settings, say, warn
 from mi_refgs.errors import InputError
 from mi_refgs.resources import resource_dir
 
@@ -43,14 +43,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--preset", metavar="P", help=f"quick, standard or paper: how long (default {DEFAULT_PRESET})"
     )
-    parser.add_argument(
-        "--set",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="key=value",
-        help="change the method, as in loss.ssim=0.1",
-    )
+    add_settings(parser)
     parser.add_argument(
         "--resume", action="store_true", help="go on from the newest checkpoint, if there is one"
     )
@@ -58,7 +51,7 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Fit, from the start or from the newest checkpoint."""
-    trainer = fit(args.data, args.output, args.variant, args.preset, args.set, args.resume, args.threads)
+    trainer = fit(args.data, args.output, args.variant, args.preset, args.set, args.resume)
     last = trainer.statistics() if trainer.loss is not None else {}
     data = {
         "run": str(args.output),
@@ -83,7 +76,6 @@ def fit(
     preset: str | None = None,
     assignments: list[str] | None = None,
     resume: bool = False,
-    thread_count: int | None = None,
 ) -> Trainer:
     """Train with a progress bar and previews, then write the artefacts; a finished run is only loaded.
 
@@ -117,8 +109,7 @@ def fit(
         truth=False,
     )
     warn_of_data(method, views)
-    with threads(thread_count):
-        trainer = Trainer(method, views, folder)
+    trainer = Trainer(method, views, folder)
     if resumed:
         say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
         folder.truncate_log(trainer.iteration)
@@ -126,7 +117,7 @@ def fit(
         folder.create(method, str(data_path.resolve()))
 
     try:
-        with Progress(trainer, folder) as progress, threads(thread_count):
+        with Progress(trainer, folder) as progress:
             trainer.train(progress)
     except KeyboardInterrupt:
         kept = "" if folder.checkpoints() else " (before the first iteration was done)"
@@ -195,7 +186,7 @@ class Progress:
         import numpy as np
 
         from mi_refgs.fit import pictures
-        from mi_refgs.fit.images import write_png
+        from mi_refgs.images import write_png
 
         view = trainer.data.views[0]
         shot = pictures.Shot.of(trainer.view(trainer.targets[0].camera), trainer.data)

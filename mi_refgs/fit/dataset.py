@@ -27,11 +27,10 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit.images import read_exr, read_png, replace_file, srgb_from_linear, write_exr, write_png
+from mi_refgs.files import write_bytes
+from mi_refgs.fit.frames import MITSUBA_FROM_OPENGL
 from mi_refgs.fit.pathtrace import Tracer, bounding_sphere, camera_poses, environment_image
-
-OPENGL_FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
-"""Mitsuba's camera looks along +z with +x left, OpenGL's along −z with +x right; its own inverse."""
+from mi_refgs.images import mitsuba_exr, read_exr, read_png, srgb_from_linear, write_exr, write_png
 
 VIEW_FILES = (
     "transforms_*.json",
@@ -172,7 +171,7 @@ def _frame(split: str, index: int, pose: np.ndarray) -> dict[str, Any]:
         "exr_path": f"{stem}.exr",
         "normal_path": f"{stem}_normal.exr",
         "depth_path": f"{stem}_depth.exr",
-        "transform_matrix": (pose @ OPENGL_FROM_MITSUBA).tolist(),
+        "transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist(),
     }
 
 
@@ -192,8 +191,7 @@ def _transforms(settings: Settings, frames: list[dict[str, Any]]) -> dict[str, A
 
 
 def _write_json(path: Path, value: Any) -> None:
-    text = json.dumps(value, indent=1) + "\n"
-    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_bytes(path, f"{json.dumps(value, indent=1)}\n".encode())
 
 
 def _scene_hash(scene: Path) -> str:
@@ -216,7 +214,8 @@ def _load_scene(scene: Path) -> Any:
     import mitsuba as mi
 
     try:
-        loaded = mi.load_file(str(scene))
+        with mitsuba_exr():
+            loaded = mi.load_file(str(scene))
     except RuntimeError as error:
         raise InputError(f"{scene}: scene: Mitsuba cannot load it: {error}; mend the scene") from error
     if not loaded.shapes():

@@ -21,9 +21,9 @@ from mi_refgs.fit import metrics, pictures
 from mi_refgs.fit.config import Method
 from mi_refgs.fit.data import Dataset, load
 from mi_refgs.fit.export import Fitted, export, newest
-from mi_refgs.fit.images import read_exr_image, write_png
+from mi_refgs.fit.objective import displayed
 from mi_refgs.fit.record import Run
-from mi_refgs.fit.train import displayed
+from mi_refgs.images import read_exr_image, write_png
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.splat import Camera
 

@@ -26,7 +26,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.fit.config import Method
 from mi_refgs.fit.record import Run
-from mi_refgs.fit.train import LIGHT
+from mi_refgs.fit.schedule import LIGHT
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, Shading, render

@@ -9,18 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mi_refgs.constants import RIGID_TOLERANCE
 from mi_refgs.errors import InputError
-from mi_refgs.fit.images import box_downscale, read_exr_image, read_png
+from mi_refgs.images import box_downscale, read_exr_image, read_png
 
 if TYPE_CHECKING:
     from mi_refgs.splat.camera import Camera
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 """File name endings that `file_path` may carry or leave out, in the order in which they are tried."""
-RIGID_TOLERANCE = 1e-3
-"""Largest deviation of RᵀR from the identity: matrices in text files carry about 1e-6."""
 MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
-"""OpenGL's camera looks along −z with +x right, Mitsuba's along +z with +x left."""
+"""OpenGL's camera looks along −z with +x right, Mitsuba's along +z with +x left; its own inverse."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The surfels a fit starts from: on the visual hull where pictures have alpha, else at random in the cameras' box."""
+"""The surfels a fit starts from: on the visual hull where pictures have alpha, else at random."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from mi_refgs.fit.config import Method
 from mi_refgs.fit.data import Dataset, View
-from mi_refgs.fit.images import linear_from_srgb
+from mi_refgs.images import linear_from_srgb
 from mi_refgs.surfels import init
 from mi_refgs.surfels.table import GEOMETRY, Surfels
 

@@ -13,8 +13,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.fit.images import SRGB_LINEAR_LIMIT
 from mi_refgs.fit.ssim import ssim
+from mi_refgs.images import SRGB_LINEAR_LIMIT
 from mi_refgs.render.stencil import neighbours
 
 # An 8-bit target value of 255 stands for everything from here up: the sensor clipped.

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit.images import srgb_from_linear
 from mi_refgs.fit.ssim import WINDOW_RADIUS, WINDOW_SIGMA
+from mi_refgs.images import srgb_from_linear
 
 # What identical images read, dB: JSON has no infinity, and float32 images cannot differ by less.
 PSNR_MAX = 100.0

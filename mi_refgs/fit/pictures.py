@@ -13,9 +13,9 @@ import numpy as np
 
 from mi_refgs.fit.data import Dataset
 from mi_refgs.fit.frames import View
-from mi_refgs.fit.images import srgb_from_linear
 from mi_refgs.fit.metrics import environment
-from mi_refgs.fit.train import displayed
+from mi_refgs.fit.objective import displayed
+from mi_refgs.images import srgb_from_linear
 from mi_refgs.render.pipeline import Frame
 
 LIGHT_KEY = 0.36

@@ -1,33 +1,25 @@
 """The run folder: readable without this package, written atomically, resumable.
 
-    config.toml  metrics.jsonl  metrics.json  surfels.ply  envmap.exr  mesh.ply  scene.xml  checkpoints/  previews/
+config.toml  dataset.json  metrics.jsonl  checkpoints/  previews/      written while it is fitted
+surfels.ply  envmap.exr  mesh.ply  scene.xml  model.json               by `fit.export`
+metrics.json  contact_sheet.png  eval/                                 by `fit.evaluate`
 """
 
 from __future__ import annotations
 
 import io
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.files import write_bytes
 from mi_refgs.fit.config import Method, dump, load_resolved
 
 CHECKPOINTS_KEPT = 2
-"""One could be enough, since a checkpoint appears only when complete; two survive a disk that lies about that."""
-
-
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write a file so that it is either the old one or the whole new one; raises InputError if it cannot."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose a writable folder with -o") from error
+"""One could be enough, since a checkpoint appears only when complete; two survive a disk that lies."""
 
 
 class Run:
@@ -39,19 +31,25 @@ class Run:
     def create(self, method: Method, dataset: str) -> None:
         """Start a run; raises InputError if the folder holds one already or cannot be written."""
         if (self.path / "config.toml").exists():
-            raise InputError(f"{self.path}: holds a run already; add --resume to go on with it, or choose another -o")
+            raise InputError(
+                f"{self.path}: holds a run already; add --resume to go on with it, or choose another -o"
+            )
         try:
             for folder in ("checkpoints", "previews"):
                 (self.path / folder).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{self.path}: cannot be created ({error.strerror}); choose a writable folder with -o") from error
-        write_atomic(self.path / "dataset.json", json.dumps({"path": dataset}).encode())
-        write_atomic(self.path / "config.toml", dump(method).encode())
+            raise InputError(
+                f"{self.path}: cannot be created ({error.strerror}); choose a writable folder with -o"
+            ) from error
+        write_bytes(self.path / "dataset.json", json.dumps({"path": dataset}).encode())
+        write_bytes(self.path / "config.toml", dump(method).encode())
 
     def method(self) -> Method:
         """The resolved method; raises InputError if this is no run folder."""
         if not (self.path / "config.toml").is_file():
-            raise InputError(f"{self.path}: config.toml: missing; give the folder that `refgs train -o` wrote")
+            raise InputError(
+                f"{self.path}: config.toml: missing; give the folder that `refgs train -o` wrote"
+            )
         return load_resolved(self.path / "config.toml")
 
     def dataset(self) -> Path:
@@ -68,7 +66,7 @@ class Run:
         """Save a state, then drop all but the newest CHECKPOINTS_KEPT."""
         buffer = io.BytesIO()
         np.savez(buffer, **state)  # type: ignore[arg-type]
-        write_atomic(self.path / "checkpoints" / f"{iteration:07d}.npz", buffer.getvalue())
+        write_bytes(self.path / "checkpoints" / f"{iteration:07d}.npz", buffer.getvalue())
         for old in self.checkpoints()[:-CHECKPOINTS_KEPT]:
             old.unlink()
 
@@ -95,8 +93,8 @@ class Run:
         if path.exists():
             lines = [line for line in path.read_text().splitlines() if line.endswith("}")]
             kept = [line for line in lines if json.loads(line)["iteration"] <= iteration]
-            write_atomic(path, "".join(f"{line}\n" for line in kept).encode())
+            write_bytes(path, "".join(f"{line}\n" for line in kept).encode())
 
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write a JSON file of the run."""
-        write_atomic(self.path / name, (json.dumps(content, indent=2) + "\n").encode())
+        write_bytes(self.path / name, (json.dumps(content, indent=2) + "\n").encode())

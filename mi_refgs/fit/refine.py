@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refgs.fit.config import Refine
+from mi_refgs.surfels.init import jittered_albedo, logit
 from mi_refgs.surfels.table import Surfels
 
 SPLIT_SHRINK = 1.6
@@ -26,24 +27,23 @@ class Edited:
     fresh: np.ndarray  # (M,) bool
 
 
-def logit(p: float | np.ndarray) -> np.ndarray:
-    """Inverse of the sigmoid, float64."""
-    p = np.clip(np.asarray(p, dtype=np.float64), 1e-6, 1 - 1e-6)
-    return np.log(p) - np.log1p(-p)
-
-
 def sigmoid(x: np.ndarray) -> np.ndarray:
     """Logistic sigmoid without overflow, float64."""
     return 0.5 * (1 + np.tanh(0.5 * np.asarray(x, dtype=np.float64)))
 
 
 def densify_and_prune(
-    surfels: Surfels, gradient: np.ndarray, extent: float, options: Refine, max_count: int, rng: np.random.Generator
+    surfels: Surfels,
+    gradient: np.ndarray,
+    extent: float,
+    options: Refine,
+    max_count: int,
+    rng: np.random.Generator,
 ) -> Edited:
-    """Clone small and split large surfels with a high screen gradient, then drop transparent and oversized ones.
+    """Clone small and split large surfels with a high screen gradient; drop transparent and oversized ones.
 
-    `gradient` (N,) is the mean length of the screen-translation gradient in NDC units over the views that saw a surfel.
-    At most max_count surfels result: those with the highest gradient grow first.
+    `gradient` (N,) is the mean length of the screen-translation gradient in NDC units over the views that saw
+    a surfel. At most max_count surfels result: those with the highest gradient grow first.
     """
     raw = surfels.to_numpy()
     count = len(gradient)
@@ -90,10 +90,10 @@ def reset_opacity(surfels: Surfels, options: Refine, metallic: float) -> Surfels
 
 
 def propagate_normals(surfels: Surfels, options: Refine) -> Surfels:
-    """Material-aware normal propagation [Ref-Gaussian §3.4]: make all surfels opaque and enlarge the reflective ones.
+    """Material-aware normal propagation: make all surfels opaque, enlarge the reflective. [Ref-Gaussian §3.4]
 
-    Enlarged opaque surfels cover their neighbours, whose reflections then follow the normals that already explain them.
-    Reflective means metallic and smooth; a rough metal has no sharp reflection to propagate.
+    Enlarged opaque surfels cover their neighbours, whose reflections then follow the normals that already
+    explain them. Reflective means metallic and smooth; a rough metal has no sharp reflection to propagate.
     """
     raw = surfels.to_numpy()
     raw["opacity"] = np.maximum(raw["opacity"], np.float32(logit(options.propagate_opacity)))
@@ -103,12 +103,10 @@ def propagate_normals(surfels: Surfels, options: Refine) -> Surfels:
     return Surfels.from_numpy(raw)
 
 
-def reset_materials(
-    surfels: Surfels, metallic: float, roughness: float, rng: np.random.Generator
-) -> Surfels:
+def reset_materials(surfels: Surfels, metallic: float, roughness: float, rng: np.random.Generator) -> Surfels:
     """Albedo, metallic and roughness back to their initial values. [Ref-Gaussian, implementation details]"""
     raw = surfels.to_numpy()
-    raw["albedo"] = logit(0.5 + rng.uniform(-0.025, 0.025, size=raw["albedo"].shape)).astype(np.float32)
+    raw["albedo"] = jittered_albedo(surfels.count, rng)
     raw["metallic"] = np.full_like(raw["metallic"], logit(metallic))
     raw["roughness"] = np.full_like(raw["roughness"], logit(roughness))
     return Surfels.from_numpy(raw)

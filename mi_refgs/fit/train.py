@@ -1,72 +1,34 @@
-"""The optimisation loop: stages from the method, one view a step, refinement and mesh extraction on their windows.
+"""The optimisation loop: stages from the method, one view a step, refinement and meshes on their windows.
 
-A step is a pure function of the state and the iteration number (view order and random draws are derived from the seed
-and the iteration), so a resumed run repeats a straight one: bit for bit with one thread.
+A step is a pure function of the state and the iteration number (view order and random draws are derived from
+the seed and the iteration), so a resumed run repeats a straight one: bit for bit with one thread.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.fit import losses, refine
+from mi_refgs.fit import refine
 from mi_refgs.fit.config import Method, Stage
-from mi_refgs.fit.data import Dataset, View
+from mi_refgs.fit.data import Dataset
 from mi_refgs.fit.initial import initial_surfels
+from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.optim import Adam, Group
 from mi_refgs.fit.record import Run
-from mi_refgs.fit.ssim import ssim
+from mi_refgs.fit.schedule import LIGHT, Schedule
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.pipeline import Frame, Shading, render
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.table import Surfels
-
-LIGHT = "light"
-
-
-@dataclass(frozen=True)
-class Target:
-    """A view on the device: camera and planes of H·W values."""
-
-    camera: Camera
-    image: list[Any]  # display-encoded
-    clipped: list[Any] | None  # where an 8-bit target says only "at least this bright"
-    alpha: Any | None
-
-    @staticmethod
-    def of(view: View) -> Target:
-        """Upload a view."""
-        planes = [mi.Float(np.ascontiguousarray(view.image[..., i].ravel())) for i in range(3)]
-        image = [losses.linear_to_srgb(plane) for plane in planes] if view.linear else planes
-        clipped = None if view.linear else losses.saturated(image)
-        alpha = None if view.alpha is None else mi.Float(np.ascontiguousarray(view.alpha.ravel()))
-        target = Target(view.camera(), image, clipped, alpha)
-        dr.eval(target.image, target.clipped, target.alpha)
-        return target
-
-
-def displayed(frame: Frame, background: np.ndarray, linear: bool) -> list[Any]:
-    """What the camera shows of a frame, display-encoded planes.
-
-    Pictures with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it.
-    """
-    behind = [float(x) for x in background]
-    radiance = list(frame.radiance())
-    if not linear:
-        return losses.display_image(radiance, frame.alpha, behind)
-    return [
-        losses.linear_to_srgb(plane + (1 - frame.alpha) * value) for plane, value in zip(radiance, behind, strict=True)
-    ]
+from mi_refgs.surfels.table import GEOMETRY, Surfels
 
 
 class Trainer:
@@ -76,13 +38,15 @@ class Trainer:
         """Set up a fit of `data`, from the newest checkpoint of `run` if it has one."""
         self.method, self.data, self.run = method, data, run
         self.extent = data.scene_extent
+        self.schedule = Schedule(method, len(data.views))
         self.targets = [Target.of(view) for view in data.views]
         self.occluder = Occluder()
         self.iteration, self.seconds = 0, 0.0
+        self.held_until = 0  # iteration before which opacities do not learn
         self.params: dict[str, Any] = {}
         state = run.load_checkpoint() if run is not None else None
         if state is None:
-            self.params |= initial_surfels(method, data, self._rng(0)).raw
+            self.params |= initial_surfels(method, data, self.schedule.rng(0)).raw
             if method.light is not None:
                 start = EnvironmentLight.constant(method.light.radiance, method.light.height)
                 self.params[LIGHT] = start.raw
@@ -120,7 +84,7 @@ class Trainer:
                 self.shading(),
                 light,
                 self.occluder,
-                sh_degree=self._sh_degree(self.iteration),
+                sh_degree=self.schedule.sh_degree(self.iteration),
                 material_maps=material_maps,
             )
 
@@ -177,9 +141,8 @@ class Trainer:
         surfels = self.surfels.detach()
         bounds = bounds_from_points(surfels.to_numpy()["position"])
         plain = Shading(at="surfel", reflectance="radiance")
-        depth_only = Surfels({k: v for k, v in surfels.raw.items() if k in ("position", "rotation", "scale", "opacity")})
-        zeros = np.zeros((surfels.count, 3), np.float32)
-        depth_only.raw["radiance_sh"] = mi.TensorXf(zeros)
+        black = mi.TensorXf(np.zeros((surfels.count, 3), np.float32))
+        depth_only = Surfels({name: surfels.raw[name] for name in GEOMETRY} | {"radiance_sh": black})
         frames = (render(depth_only, target.camera, plain) for target in self.targets)
         pairs = [(frame.depth, frame.alpha) for frame in frames]
         assert self.method.mesh is not None
@@ -197,9 +160,8 @@ class Trainer:
     # ---------------- one step ----------------
 
     def _gradient_step(self, iteration: int, stage: Stage) -> None:
-        target = self.targets[self._view_index(iteration)]
-        camera, weights = target.camera, self.method.loss
-        surfels = self.surfels
+        target = self.targets[self.schedule.view(iteration)]
+        camera, surfels = target.camera, self.surfels
         shift = mi.Point2f(dr.opaque(mi.Float, 0, surfels.count), dr.opaque(mi.Float, 0, surfels.count))
         dr.enable_grad(shift)
         shading = self._shading(stage)
@@ -210,27 +172,11 @@ class Trainer:
             shading,
             self.light.prefilter() if uses_light and self.light is not None else None,
             self.occluder,
-            sh_degree=self._sh_degree(iteration),
+            sh_degree=self.schedule.sh_degree(iteration),
             shift=shift,
         )
-        image = displayed(frame, self.data.background, self.data.linear)
-        if target.clipped is not None:
-            image = losses.clip_highlights(image, target.image, target.clipped)
-        loss = (1 - weights.ssim) * losses.l1(image, target.image)
-        if weights.ssim:
-            loss += weights.ssim * (1 - ssim(image, target.image, camera.width, camera.height))
-        if weights.normal and iteration > weights.normal_from:
-            depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, camera)
-            loss += weights.normal * losses.normal_consistency(frame.normal, depth_normal, valid, frame.alpha)
-        if weights.smooth and iteration <= weights.smooth_until:
-            loss += weights.smooth * losses.normal_smoothness(
-                list(frame.normal), target.image, camera.width, camera.height
-            )
-        if weights.alpha and target.alpha is not None:
-            loss += weights.alpha * losses.alpha_loss(frame.alpha, target.alpha)
+        loss, self.error = objective(frame, target, self.data, self.method.loss, iteration)
         self.loss = dr.detach(loss)
-        error = sum((dr.square(dr.detach(a) - b) for a, b in zip(image, target.image, strict=True)), mi.Float(0))
-        self.error = dr.mean(error) / 3
         dr.backward(loss)
 
         if self.method.refine.densify is not None and iteration <= self.method.refine.densify.until:
@@ -247,14 +193,16 @@ class Trainer:
         if options.densify is not None and options.densify.due(iteration):
             mean = self.gradient_sum.numpy() / np.maximum(self.gradient_count.numpy(), 1)
             edited = refine.densify_and_prune(
-                self.surfels, mean, self.extent, options, surfels.max_count, self._rng(iteration)
+                self.surfels, mean, self.extent, options, surfels.max_count, self.schedule.rng(iteration)
             )
             self._replace(edited.surfels)
             names = list(edited.surfels.raw)
             self.optimiser.gather(mi.UInt32(edited.parent), names, mi.Bool(edited.fresh))
             self._clear_statistics()
         if options.reset is not None and options.reset.due(iteration):
-            self._replace(refine.reset_opacity(self.surfels, options, surfels.metallic), cleared=("opacity", "metallic"))
+            self._replace(
+                refine.reset_opacity(self.surfels, options, surfels.metallic), cleared=("opacity", "metallic")
+            )
         elif options.propagate is not None and options.propagate.due(iteration) and "metallic" in self.params:
             self._replace(refine.propagate_normals(self.surfels, options), cleared=("opacity", "scale"))
             self.optimiser.set_factor("opacity", 0.0)
@@ -264,7 +212,9 @@ class Trainer:
 
     def _reset_materials(self, iteration: int) -> None:
         options = self.method.surfels
-        edited = refine.reset_materials(self.surfels, options.metallic, options.roughness, self._rng(iteration))
+        edited = refine.reset_materials(
+            self.surfels, options.metallic, options.roughness, self.schedule.rng(iteration)
+        )
         self._replace(edited, cleared=("albedo", "metallic", "roughness"))
 
     def _replace(self, surfels: Surfels, cleared: tuple[str, ...] = ()) -> None:
@@ -275,39 +225,11 @@ class Trainer:
             if name in self.params:
                 self.optimiser.reset(name)
 
-    # ---------------- schedule ----------------
-
     def _shading(self, stage: Stage) -> Shading:
         return Shading(stage.at, stage.reflectance, stage.diffuse, self.occluder.mesh() is not None)
 
-    def _sh_degree(self, iteration: int) -> int:
-        window = self.method.surfels.sh_raise
-        raised = max(min(iteration, window.until) - window.start, 0) // window.every
-        return min(raised, self.method.surfels.sh_degree)
-
-    def _rng(self, iteration: int) -> np.random.Generator:
-        return np.random.default_rng([self.method.seed, iteration])
-
-    def _view_index(self, iteration: int) -> int:
-        """Sampling without replacement: a fresh permutation of the views every epoch."""
-        epoch, place = divmod(iteration - 1, len(self.targets))
-        return int(np.random.default_rng([self.method.seed, epoch, 1]).permutation(len(self.targets))[place])
-
     def _groups(self) -> dict[str, Group]:
-        rates = self.method.rates
-        steps = int(0.6 * self.method.iterations)  # 30,000 of 50,000 in the paper's code
-        groups = {
-            "position": Group(rates.position * self.extent, rates.position_final * self.extent, steps),
-            "rotation": Group(rates.rotation),
-            "scale": Group(rates.scale),
-            "opacity": Group(rates.opacity),
-            "radiance_sh": Group(rates.radiance_sh, head=3, tail=rates.sh_rest),
-            "albedo": Group(rates.albedo),
-            "metallic": Group(rates.metallic),
-            "roughness": Group(rates.roughness),
-            "indirect_sh": Group(rates.indirect_sh, head=3, tail=rates.indirect_rest),
-            LIGHT: Group(rates.light),
-        }
+        groups = self.schedule.groups(self.extent)
         return {name: group for name, group in groups.items() if name in self.params}
 
     # ---------------- state ----------------
@@ -316,8 +238,6 @@ class Trainer:
         count = self.surfels.count
         self.gradient_sum = dr.opaque(mi.Float, 0, count)
         self.gradient_count = dr.opaque(mi.Float, 0, count)
-        if not hasattr(self, "held_until"):
-            self.held_until = 0
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that a checkpoint holds."""
@@ -328,19 +248,32 @@ class Trainer:
         state |= {"iteration": np.array(self.iteration), "seconds": np.array(self.seconds)}
         state["held_until"] = np.array(self.held_until)
         if mesh is not None:
-            state |= {"mesh/vertices": mesh.vertices, "mesh/faces": mesh.faces, "mesh/voxel": np.array(mesh.voxel)}
+            state |= {
+                "mesh/vertices": mesh.vertices,
+                "mesh/faces": mesh.faces,
+                "mesh/voxel": np.array(mesh.voxel),
+            }
         return state
 
     def _restore(self, state: dict[str, np.ndarray]) -> None:
         self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
         self.params |= {
-            key.removeprefix("params/"): mi.TensorXf(value) for key, value in state.items() if key.startswith("params/")
+            key.removeprefix("params/"): mi.TensorXf(value)
+            for key, value in state.items()
+            if key.startswith("params/")
         }
         self.optimiser = Adam(self.params, self._groups())
         self.optimiser.load_state_dict(
-            {key.removeprefix("optimiser/"): value for key, value in state.items() if key.startswith("optimiser/")}
+            {
+                key.removeprefix("optimiser/"): value
+                for key, value in state.items()
+                if key.startswith("optimiser/")
+            }
         )
-        self.gradient_sum, self.gradient_count = mi.Float(state["gradient_sum"]), mi.Float(state["gradient_count"])
+        self.gradient_sum = mi.Float(state["gradient_sum"])
+        self.gradient_count = mi.Float(state["gradient_count"])
         self.held_until = int(state["held_until"])
         if "mesh/faces" in state:
-            self.occluder.update(Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"])))
+            self.occluder.update(
+                Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
+            )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import trimesh
 from skimage import measure
 
 from mi_refgs.errors import InputError
+from mi_refgs.files import write_bytes
 from mi_refgs.occlusion.tsdf import TSDF
 
 COMPONENT_KEEP = 0.1
@@ -81,19 +81,14 @@ def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float) -> Mesh:
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
-    """Write a binary PLY, voxel size in a comment; atomic: a kill leaves the old file or the new one."""
-    path = Path(path)
+    """Write a binary PLY, voxel size in a comment; atomic: a kill leaves the old file or the new one.
+
+    Raises InputError if the path cannot be written.
+    """
     data: Any = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply")
     first, second, rest = data.split(b"\n", 2)
     comment = f"comment {VOXEL_COMMENT} {float(mesh.voxel)!r}".encode()
-    temporary = path.with_name(path.name + ".part")
-    try:
-        temporary.write_bytes(b"\n".join((first, second, comment, rest)))
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: mesh: cannot be written ({error.strerror}); choose a writable folder"
-        ) from error
+    write_bytes(path, b"\n".join((first, second, comment, rest)))
 
 
 def read_mesh(path: Path | str) -> Mesh:

@@ -80,9 +80,8 @@ class Occluder:
             ray = mi.Ray3f(mi.Point3f(dr.select(active, o, 0)), d)
             return dr.select(self._scene.ray_test(ray, active), mi.Float(0), mi.Float(1))
 
-
     def first_hit(self, origin: Any, direction: Any) -> tuple[Any, Any]:
-        """Distance to the mesh in lengths of `direction`, and whether there is a hit; 0 where there is none. Detached."""
+        """Distance to the mesh in lengths of `direction` (0 without a hit), and if it is hit; detached."""
         width = max(dr.width(origin), dr.width(direction))
         if self._mesh is None or not len(self._mesh.faces):
             return dr.zeros(mi.Float, width), dr.zeros(mi.Bool, width)

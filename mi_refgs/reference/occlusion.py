@@ -50,17 +50,6 @@ def normal(shape: Shape, points: np.ndarray, step: float = 1e-5) -> np.ndarray:
     return gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
 
 
-def look_at(origin: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """World from camera, +z towards the target, +x left, +y up (world z, unless looking along it)."""
-    forward = (target - origin) / np.linalg.norm(target - origin)
-    up = np.array([0.0, 0, 1]) if abs(forward[2]) < 0.95 else np.array([0.0, 1, 0])
-    left = np.cross(up, forward)
-    left /= np.linalg.norm(left)
-    matrix = np.eye(4)
-    matrix[:3] = np.stack([left, np.cross(forward, left), forward, origin], axis=1)
-    return matrix
-
-
 def trace(shape: Shape, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Distance to the shape along unit directions by sphere tracing, infinite for a miss."""
     t, result = np.zeros(len(origin)), np.full(len(origin), np.inf)

@@ -1,4 +1,4 @@
-"""Oracle of the splatter: one surfel after the other over whole images, float64, textbook ray-plane intersection."""
+"""Oracle of the splatter: surfel after surfel over whole images, float64, textbook ray-plane intersection."""
 
 from __future__ import annotations
 
@@ -46,8 +46,10 @@ def rotation_matrix(q: np.ndarray) -> np.ndarray:
     )
 
 
-def splat(raw: dict[str, np.ndarray], features: np.ndarray, camera: PinholeCamera, band: float = 1e-3) -> Maps:
-    """Render raw surfel channels with per-surfel features (N, K). `band` is the relative width of the declared band."""
+def splat(
+    raw: dict[str, np.ndarray], features: np.ndarray, camera: PinholeCamera, band: float = 1e-3
+) -> Maps:
+    """Render raw channels with features (N, K); `band` is the relative width of the declared band."""
     height, width = camera.height, camera.width
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)

@@ -17,6 +17,10 @@ from mi_refgs.splat.camera import Camera
 
 # Alpha below which a pixel has no depth: D / A would divide rounding errors. The splatter's cut.
 DEPTH_ALPHA_MIN = 1.0 / 255.0
+# Cosine to the viewing ray below which a depth difference is read as a step between two surfaces, not as a
+# slope: the normal of such a step would pull at the rims of both. At 160² and 40° it is a step of a twentieth
+# of the depth.
+DEPTH_EDGE_COSINE = 0.2
 
 
 def expected_depth(blended: Any, alpha: Any) -> Any:
@@ -48,13 +52,15 @@ def normals_from_depth(depth: Any, alpha: Any, camera: Camera) -> tuple[Any, Any
     along_x = point(right, 1, 0) - point(left, -1, 0)
     along_y = point(down, 0, 1) - point(up, 0, -1)
     normal = dr.cross(along_x, along_y)
-    towards = dr.dot(normal, point(mi.Float(1), 0, 0)) > 0
-    normal = dr.select(dr.detach(towards), -normal, normal)
+    ray = point(mi.Float(1), 0, 0)
+    cosine = dr.detach(dr.dot(normal, ray))
+    normal = dr.select(cosine > 0, -normal, normal)
 
     covered = dr.select(dr.detach(alpha) >= DEPTH_ALPHA_MIN, mi.Float(1), mi.Float(0))
     around = neighbours(covered, width, height, (*steps, (0, 0)))
     inside = (pixel.x > 1) & (pixel.x < width - 1) & (pixel.y > 1) & (pixel.y < height - 1)
     length2 = dr.squared_norm(normal)
     valid = inside & (sum(around[1:], around[0]) > 4.5) & (dr.detach(length2) > NORM_FLOOR)
+    valid &= dr.square(cosine) > DEPTH_EDGE_COSINE**2 * dr.detach(length2) * dr.squared_norm(ray)
     normal = normal * dr.rsqrt(dr.select(valid, length2, 1.0))
     return dr.select(valid, camera.rotation.T @ normal, 0.0), valid

@@ -3,8 +3,9 @@
     shade at surfels:  attributes ─ shade ─► radiance channel ─ blend ─► image
     shade at pixels:   attributes ─ blend ─► G-buffer ─ shade ─► image
 
-The same `splat` and the same `shade` serve both. Everything is traced by Dr.Jit; the derivatives that are absent on purpose
-are those of `splat.blend`, the visibility, the side to which a normal is turned, and the camera.
+The same `splat` and the same `shade` serve both. Everything is traced by Dr.Jit; the derivatives that are
+absent on purpose are those of `splat.blend`, the visibility, the side to which a normal is turned, and the
+camera.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any, Literal
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import COVERAGE_FLOOR
+from mi_refgs.constants import COVERAGE_FLOOR, FACING_TOLERANCE
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.models import ShadingPoints, Terms, reflect, safe_normalize, shade
 from mi_refgs.shade.sh import clamp_positive, eval_sh
@@ -64,9 +65,9 @@ def render(
 ) -> Frame:
     """Render a view.
 
-    `light` is a `shade.PrefilteredLight`, needed unless `shading.reflectance` is "radiance". `sh_degree` limits the degree of the
-    radiance channel, for coarse-to-fine schedules. `material_maps` asks for albedo, metallic and roughness even where shading does not
-    need them per pixel. `shift`: see `splat.project`.
+    `light` is a `shade.PrefilteredLight`, needed unless `shading.reflectance` is "radiance". `sh_degree`
+    limits the degree of the radiance channel, for coarse-to-fine schedules. `material_maps` asks for albedo,
+    metallic and roughness even where shading does not need them per pixel. `shift`: see `splat.project`.
     """
     if shading.at == "surfel":
         return _shade_at_surfels(surfels, camera, shading, light, sh_degree, shift, material_maps)
@@ -77,12 +78,17 @@ def render(
 
 
 def _facing(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
-    """Unit direction from the camera to each surfel, and its normal turned towards the camera."""
+    """Unit direction from the camera to each surfel, and its normal turned towards the camera.
+
+    A normal that points away by less than FACING_TOLERANCE stays: such a surfel lies just behind a
+    silhouette, and shows there through the low-pass; turned round it would oppose its neighbours and leave
+    the outline without a normal.
+    """
     offset = mi.Vector3f(surfels.position()) - mi.Vector3f(camera.origin)
     # A surfel at the camera's own position has no direction; it is culled, so any finite one will do.
     direction = offset * dr.rsqrt(dr.maximum(dr.squared_norm(offset), 1e-12))
     normal = surfels.frame()[2]
-    return direction, dr.select(dr.detach(dr.dot(normal, direction)) > 0, -normal, normal)
+    return direction, dr.select(dr.detach(dr.dot(normal, direction)) > FACING_TOLERANCE, -normal, normal)
 
 
 def _radiance(surfels: Surfels, direction: Any, sh_degree: int | None) -> Any:
@@ -111,9 +117,7 @@ def _shade_at_surfels(
 ) -> Frame:
     direction, normal = _facing(surfels, camera)
     if shading.reflectance == "radiance":
-        zero = dr.zeros(mi.Color3f, dr.width(normal))
-        terms = Terms(_radiance(surfels, direction, sh_degree), None, None)
-        features = [*terms.diffuse]
+        terms = [_radiance(surfels, direction, sh_degree)]
     else:
         points = ShadingPoints(
             normal=normal,
@@ -123,27 +127,24 @@ def _shade_at_surfels(
             roughness=surfels.roughness(),
             radiance=_radiance(surfels, direction, sh_degree) if shading.diffuse == "sh" else None,
         )
-        terms = shade(points, light, shading.diffuse)
-        features = [*terms.diffuse, *terms.specular]
-    radiance_features = len(features)
-    features += [*normal]
+        shaded = shade(points, light, shading.diffuse)
+        terms = [shaded.diffuse, shaded.specular]
+    features = [x for term in terms for x in term] + [*normal]
     show_materials = material_maps and surfels.has("albedo")
     if show_materials:
         features += _materials(surfels)
     blended = splat(surfels, features, camera, shift)
 
-    maps = blended.features
-    zero = dr.zeros(mi.Color3f, 1)
-    diffuse = mi.Color3f(*maps[0:3])
-    specular = mi.Color3f(*maps[3:6]) if radiance_features == 6 else zero
-    rest = maps[radiance_features:]
     inverse = _inverse_alpha(blended)
+    maps = [blended.features[i : i + 3] for i in range(0, 3 * len(terms), 3)]
+    absent = [dr.zeros(mi.Color3f, 1)] * (3 - len(terms))
+    rest = blended.features[3 * len(terms) :]
     return Frame(
         alpha=blended.alpha,
         depth=blended.depth * inverse,
         median_depth=blended.median_depth,
         normal=mi.Vector3f(*rest[0:3]),
-        terms=Terms(diffuse, specular, zero),
+        terms=Terms(*(mi.Color3f(*colour) for colour in maps), *absent),
         maps=_material_maps(rest[3:8], inverse) if show_materials else {},
     )
 
@@ -163,7 +164,8 @@ def _shade_at_pixels(
         features += [*_radiance(surfels, direction, sh_degree)]
     indirect_used = shading.occlusion and occluder is not None
     if indirect_used and surfels.has("indirect_sh"):
-        # The mirror direction of the surfel's centre [Ref-Gaussian, §3.3]; starts at exactly 0 and must train from there.
+        # The mirror direction of the surfel's centre [Ref-Gaussian, §3.3]; starts at exactly 0 and must train
+        # from there.
         mirrored = reflect(view=-direction, normal=normal)
         features += [*clamp_positive(eval_sh(surfels.indirect_sh(), mirrored))]
     blended = splat(surfels, features, camera, shift)
@@ -207,8 +209,8 @@ def _shade_at_pixels(
 def _visibility(occluder: Occluder, origin: Any, ray: Any, normal: Any, view: Any) -> Any:
     """Is the mirror direction free, seen from where the pixel's ray meets the mesh itself?
 
-    Not from the blended depth: at a silhouette, and between two layers, that lies inside the object and every ray from
-    there is blocked, which draws a dark outline. A ray that misses the mesh sees the light.
+    Not from the blended depth: at a silhouette, and between two layers, that lies inside the object and every
+    ray from there is blocked, which draws a dark outline. A ray that misses the mesh sees the light.
     """
     with dr.suspend_grad():
         distance, hit = occluder.first_hit(origin, ray)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.files import write_bytes
 from mi_refgs.render.pipeline import Shading
 from mi_refgs.splat.camera import Camera
 
@@ -59,17 +59,7 @@ def write_scene_xml(
     _add_sensor(scene, camera)
 
     ElementTree.indent(scene, "    ")
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(ElementTree.tostring(scene, encoding="unicode") + "\n", encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: output: cannot be written ({error.strerror}); choose a writable folder"
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(path, f"{ElementTree.tostring(scene, encoding='unicode')}\n".encode())
 
 
 def _put(parent: ElementTree.Element, kind: str, name: str, value: str) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import os
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.files import replace_file
 
 RESOLUTION = 256
 """Texels along N·V and along roughness, values at texel centres: bilinear lookups are then within 3e-4."""
@@ -87,23 +89,11 @@ def table() -> np.ndarray:
         ):
             return cached
     computed = compute_table()
-    with suppress(OSError):
+    with suppress(OSError, InputError):
         if path is not None:
-            _write_atomically(path, computed)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(path, lambda temporary: np.save(temporary, computed))
     return computed
-
-
-def _write_atomically(path: Path, array: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.save(file, array)
-        os.replace(temporary, path)
-    except BaseException:
-        with suppress(OSError):
-            os.unlink(temporary)
-        raise
 
 
 @functools.lru_cache(maxsize=4)

@@ -11,7 +11,6 @@ an optimiser's step bounds the change of radiance; an exponential would let one 
 from __future__ import annotations
 
 import os
-import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.images import is_exr, read_exr_image, write_exr
 from mi_refgs.shade import lobe
 from mi_refgs.shade.prefilter import Operator, prefilter
 
@@ -172,23 +172,12 @@ class EnvironmentLight:
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:
-        """From a lat-long image that Mitsuba reads, resampled to `height` rows, keeping its energy.
+        """From a lat-long image (EXR, HDR), resampled to `height` rows, keeping its energy.
 
         Without `height`: the image's own rows, to the next lower multiple of 4. Raises InputError when it is
         no such image.
         """
-        try:
-            bitmap = mi.Bitmap(str(path))
-            image = np.array(
-                bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-            )
-        except (
-            Exception
-        ) as error:  # Mitsuba raises RuntimeError for each of: not there, not an image, not RGB
-            reason = str(error).strip().splitlines()[-1]
-            raise InputError(
-                f"{path}: environment: not a readable image ({reason}); give an EXR or HDR file"
-            ) from error
+        image = _read_image(Path(path))
         if image.ndim != 3 or min(image.shape[:2]) < 2:
             raise InputError(
                 f"{path}: environment: {image.shape} is no lat-long image; give one of at least 2 × 2 texels"
@@ -216,27 +205,24 @@ class EnvironmentLight:
 
         Raises InputError when the place cannot be written.
         """
-        target = Path(path)
-        temporary = None
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".exr")
-            os.close(handle)
-            mi.Bitmap(np.ascontiguousarray(self.radiance().numpy(), np.float32)).write(temporary)
-            os.chmod(temporary, 0o666 & ~_umask())
-            os.replace(temporary, target)
-        except (OSError, RuntimeError) as error:
-            raise InputError(
-                f"{target}: environment: cannot be written ({error}); choose another folder"
-            ) from error
-        finally:
-            if temporary is not None:
-                with suppress(OSError):
-                    os.unlink(temporary)
+        path = Path(path)
+        with suppress(OSError):  # a folder that cannot be made cannot be written to either
+            path.parent.mkdir(parents=True, exist_ok=True)
+        write_exr(path, self.radiance().numpy())
 
 
-def _umask() -> int:
-    """The process's file mode mask: mkstemp makes files that only their owner can read."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _read_image(path: Path) -> np.ndarray:
+    """Linear radiance (H, W, 3) of an EXR file, or of another image that Mitsuba reads."""
+    try:
+        if not is_exr(path):
+            bitmap = mi.Bitmap(str(path))
+            return np.array(
+                bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+            )
+    except Exception as error:  # Mitsuba raises RuntimeError for whatever is no image
+        reason = str(error).strip().splitlines()[-1]
+        raise InputError(
+            f"{path}: environment: not a readable image ({reason}); give an EXR or HDR file"
+        ) from error
+    image = read_exr_image(path)
+    return image[..., :3] if image.shape[-1] > 1 else np.repeat(image, 3, axis=-1)

@@ -17,7 +17,7 @@ __all__ = ["Blended", "Camera", "Footprints", "TileLists", "blend", "list_by_til
 
 
 def splat(surfels: Surfels, features: list[Any], camera: Camera, shift: Any = None) -> Blended:
-    """Splat per-surfel features (K × mi.Float (N,)) to maps of width·height pixels; see `blend` for what is differentiable.
+    """Splat per-surfel features (K × mi.Float (N,)) to maps of H·W pixels; derivatives as in `blend`.
 
     `shift` is an optional zero mi.Point2f (N,) that receives the gradient of a screen translation, in pixels.
     """

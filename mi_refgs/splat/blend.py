@@ -1,16 +1,18 @@
-"""Front-to-back compositing of K channels, its adjoint and its tangent, as three traced loops over tile lists.
+"""Front-to-back compositing of K channels, its adjoint and its tangent: three traced loops over tile lists.
 
-    out_k = Σᵢ wᵢ f_ik,    wᵢ = αᵢ Tᵢ,    Tᵢ = Π_{j<i} (1 - αⱼ)                                  [2DGS, eq. 12]
+    out_k = Σᵢ wᵢ f_ik,    wᵢ = αᵢ Tᵢ,    Tᵢ = Π_{j<i} (1 - αⱼ)                             [2DGS, eq. 12]
 
-Depth and accumulated alpha are two more channels (f = z and f = 1). The adjoint replays the same order; with gᵢ = Σ_k δ_k f_ik
-and S = Σ_k δ_k out_k, which is diminished by wᵢ gᵢ at each step so that it always holds what lies behind,
+Depth and accumulated alpha are two more channels (f = z and f = 1). The adjoint replays the same order; with
+gᵢ = Σ_k δ_k f_ik and S = Σ_k δ_k out_k, which is diminished by wᵢ gᵢ at each step so that it always holds
+what lies behind,
 
     δf_ik = wᵢ δ_k,        δαᵢ = Tᵢ gᵢ - S_{j>i} / (1 - αᵢ)
 
-needs neither a reversed list nor storage per pair. One tile is one SIMD packet, so its lanes read the same rows.
+needs neither a reversed list nor storage per pair. One tile is one SIMD packet, so its lanes read the same
+rows.
 
-No derivative, on purpose: the sort order, the tile lists, the α < 1/255 cut and the end at T < 1e-4, the near plane,
-the clamp at α_max (zero), the median depth.
+No derivative, on purpose: the sort order, the tile lists, the α < 1/255 cut and the end at T < 1e-4, the near
+plane, the clamp at α_max (zero), the median depth.
 """
 
 from __future__ import annotations

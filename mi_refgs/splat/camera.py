@@ -1,4 +1,4 @@
-"""A pinhole camera as the splatter needs it: a rigid map into the camera frame and signed pixel focal lengths."""
+"""A pinhole camera as the splatter needs it: a rigid map into its frame, focal lengths in signed pixels."""
 
 from __future__ import annotations
 
@@ -9,18 +9,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.constants import RIGID_TOLERANCE
 from mi_refgs.errors import InputError
-
-RIGID_TOLERANCE = 1e-3
-"""Largest deviation of RᵀR from the identity: float32 matrices in JSON files carry about 1e-6."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; a point p of the camera frame lands on pixel coordinates (fx·p.x/p.z + cx, fy·p.y/p.z + cy).
+    """A pinhole camera: the point p of its frame lands on the pixel (fx·p.x/p.z + cx, fy·p.y/p.z + cy).
 
-    In Mitsuba's camera frame (+x left, +y up) both focal lengths are negative. All numbers but the image size are
-    opaque Dr.Jit values, so that one compiled kernel serves every view of a data set. Cameras carry no derivatives.
+    In Mitsuba's camera frame (+x left, +y up) both focal lengths are negative. All numbers but the image size
+    are opaque Dr.Jit values, so that one compiled kernel serves every view of a data set. Cameras carry no
+    derivatives.
     """
 
     width: int  # pixels
@@ -35,7 +34,14 @@ class Camera:
 
     @staticmethod
     def look(
-        width: int, height: int, fx: float, fy: float, cx: float, cy: float, to_world: np.ndarray, near: float = 0.01
+        width: int,
+        height: int,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        to_world: np.ndarray,
+        near: float = 0.01,
     ) -> Camera:
         """Camera from signed focal lengths in pixels and a rigid (4, 4) world-from-camera matrix.
 
@@ -43,7 +49,10 @@ class Camera:
         """
         matrix = np.asarray(to_world, dtype=np.float64)
         rotation = matrix[:3, :3]
-        if not np.all(np.isfinite(matrix)) or np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE:
+        if (
+            not np.all(np.isfinite(matrix))
+            or np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE
+        ):
             raise InputError("camera: to_world: must be a rotation and a translation; remove scale and shear")
 
         def opaque(x: float) -> Any:
@@ -53,7 +62,15 @@ class Camera:
         camera_from_world = mi.Matrix3f([columns[0:3], columns[3:6], columns[6:9]])
         origin = mi.Point3f(*(opaque(x) for x in matrix[:3, 3]))
         return Camera(
-            width, height, opaque(fx), opaque(fy), opaque(cx), opaque(cy), camera_from_world, origin, opaque(near)
+            width,
+            height,
+            opaque(fx),
+            opaque(fy),
+            opaque(cx),
+            opaque(cy),
+            camera_from_world,
+            origin,
+            opaque(near),
         )
 
     @staticmethod
@@ -65,13 +82,13 @@ class Camera:
         params = mi.traverse(sensor)
         if "x_fov" not in params or "aperture_radius" in params:
             raise InputError(
-                f"sensor '{sensor.id()}': type: refgs renders pinhole cameras only; use a `perspective` sensor"
+                f"sensor '{sensor.id()}': type: refgs has pinhole cameras only; use a `perspective` sensor"
             )
         width, height = (int(x) for x in sensor.film().crop_size())
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
         # A uniform scale in to_world moves no ray of a pinhole; take it out before the rigidity check.
         matrix[:3, :3] /= np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
-        # The sensor's own corner rays hold field of view, crop window and principal point, whatever their order.
+        # The sensor's own corner rays hold field of view, crop window and principal point.
         corners = mi.Point2f(mi.Float([0, 1, 0]), mi.Float([0, 0, 1]))
         ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), corners, mi.Point2f(0.5))
         local = np.array(ray.d, dtype=np.float64).reshape(3, 3).T @ matrix[:3, :3]
@@ -79,7 +96,14 @@ class Camera:
         fx = width / (slope[1, 0] - slope[0, 0])
         fy = height / (slope[2, 1] - slope[0, 1])
         return Camera.look(
-            width, height, fx, fy, -fx * slope[0, 0], -fy * slope[0, 1], matrix, near=float(params["near_clip"])
+            width,
+            height,
+            fx,
+            fy,
+            -fx * slope[0, 0],
+            -fy * slope[0, 1],
+            matrix,
+            near=float(params["near_clip"]),
         )
 
     def to_camera(self, point: Any) -> Any:
@@ -92,7 +116,7 @@ class Camera:
         return mi.Point2f(index % self.width + 0.5, index // self.width + 0.5)
 
     def rays(self) -> Any:
-        """World directions through the pixel centres, raster order; their camera-frame z is 1, not their length."""
+        """World directions through the pixel centres, raster order: 1 along the viewing axis, not unit."""
         pixel = self.pixel_centres()
         local = mi.Vector3f((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1)
         return self.rotation.T @ local

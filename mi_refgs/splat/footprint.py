@@ -1,17 +1,19 @@
 """The screen footprint of a surfel: ray-plane intersection in pixel offsets, with the 2D low-pass.
 
-A surfel has centre p, unit tangents t_u, t_v, normal n (camera frame) and standard deviations s_u, s_v. The ray through a
-pixel at offset δ from the projected centre meets its plane at depth z and tangent coordinates (u, v), in units of s:
+A surfel has centre p, unit tangents t_u, t_v, normal n (camera frame) and standard deviations s_u, s_v. The
+ray through a pixel at offset δ from the projected centre meets its plane at depth z and tangent coordinates
+(u, v), in units of s:
 
-    1/z = k + c·δ        u = z a·δ        v = z b·δ                                               [2DGS, eq. 8-10]
+    1/z = k + c·δ        u = z a·δ        v = z b·δ                                       [2DGS, eq. 8-10]
 
-with, per axis, c = n/(p·n)/f, a = (t_u - (p·t_u) n/(p·n))/(s_u f), b likewise, k = 1/p_z. Offsets from the centre, not
-pixel coordinates, enter: the two large terms that cancel in the textbook form are gone, so float32 holds. Opacity is
+with, per axis, c = n/(p·n)/f, a = (t_u - (p·t_u) n/(p·n))/(s_u f), b likewise, k = 1/p_z. Offsets from the
+centre, not pixel coordinates, enter: the two large terms that cancel in the textbook form are gone, so
+float32 holds. Opacity is
 
-    α = min(α_max, o exp(-ρ/2)),   ρ = min(u² + v², 2 |δ|²)                                       [2DGS, eq. 11]
+    α = min(α_max, o exp(-ρ/2)),   ρ = min(u² + v², 2 |δ|²)                                 [2DGS, eq. 11]
 
-and the sample lies at depth z, or at the centre's depth where the low-pass is the smaller (there the intersection may be
-anywhere along the ray).
+and the sample lies at depth z, or at the centre's depth where the low-pass is the smaller (there the
+intersection may be anywhere along the ray).
 """
 
 from __future__ import annotations
@@ -36,14 +38,14 @@ class Footprints:
     columns: list[Any]  # GEOMETRY_COLUMNS × mi.Float (N,), in the order of the comment above
     depth: Any  # mi.Float (N,), detached: camera z of the centre, the sort key
     first: tuple[Any, Any]  # mi.Int32 (N,): first covered pixel column and row
-    last: tuple[Any, Any]  # mi.Int32 (N,): last covered pixel column and row, below `first` if nothing is covered
+    last: tuple[Any, Any]  # mi.Int32 (N,): last covered column and row, below `first` if there is none
 
 
 def project(surfels: Surfels, camera: Camera, shift: Any = None) -> Footprints:
     """Footprints of all surfels in a camera.
 
-    `shift` is an optional mi.Point2f (N,) in pixels added to the centres: zero-valued, it receives the gradient
-    with respect to a screen translation of each surfel, which densification reads.
+    `shift` is an optional mi.Point2f (N,) in pixels added to the centres: zero-valued, it receives the
+    gradient with respect to a screen translation of each surfel, which densification reads.
 
     Culled (they cover no pixel, and get zero gradient): centre not beyond the near plane, edge-on by
     EDGE_ON_COSINE, opacity below ALPHA_MIN, non-finite. The rectangles carry no derivative.
@@ -92,9 +94,9 @@ def project(surfels: Surfels, camera: Camera, shift: Any = None) -> Footprints:
 def _extent(t_u: Any, t_v: Any, s: Any, slope: Any, z: Any, opacity: Any, focal: Any) -> tuple[Any, Any]:
     """Rectangle around the centre, in pixels, that holds every pixel with α ≥ ALPHA_MIN.
 
-    The contour u² + v² = r², r² = 2 ln(o/α_min), projects to a conic; its bounds per axis follow from the tangent
-    lines of the dual conic [2DGS, appendix A, with r for 3 and the origin at the projected centre]. A contour that
-    reaches behind the camera has no bounds: such a surfel is listed everywhere.
+    The contour u² + v² = r², r² = 2 ln(o/α_min), projects to a conic; its bounds per axis follow from the
+    tangent lines of the dual conic [2DGS, appendix A, with r for 3 and the origin at the projected centre]. A
+    contour that reaches behind the camera has no bounds: such a surfel is listed everywhere.
     """
     r2 = dr.maximum(2 * dr.log(dr.maximum(opacity, ALPHA_MIN) / ALPHA_MIN), 0)
     depth_u, depth_v = s.x * t_u.z, s.y * t_v.z
@@ -183,8 +185,14 @@ def evaluate_forward(row: Any, sample: Sample, drow: Any) -> tuple[Any, Any]:
         plane, drow[4] * delta.x + drow[5] * delta.y + row[4] * ddelta_x + row[5] * ddelta_y, 0
     )
     dz = -dr.square(z) * dinverse_depth
-    du = z * (drow[0] * delta.x + drow[1] * delta.y + row[0] * ddelta_x + row[1] * ddelta_y) - u * z * dinverse_depth
-    dv = z * (drow[2] * delta.x + drow[3] * delta.y + row[2] * ddelta_x + row[3] * ddelta_y) - v * z * dinverse_depth
+    du = (
+        z * (drow[0] * delta.x + drow[1] * delta.y + row[0] * ddelta_x + row[1] * ddelta_y)
+        - u * z * dinverse_depth
+    )
+    dv = (
+        z * (drow[2] * delta.x + drow[3] * delta.y + row[2] * ddelta_x + row[3] * ddelta_y)
+        - v * z * dinverse_depth
+    )
     drho = dr.select(
         plane, 2 * (u * du + v * dv), 2 * LOW_PASS_INV_VARIANCE * (delta.x * ddelta_x + delta.y * ddelta_y)
     )

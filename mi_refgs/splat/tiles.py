@@ -15,7 +15,7 @@ from mi_refgs.splat.footprint import Footprints
 
 @dataclass(frozen=True)
 class TileLists:
-    """M surfel-tile pairs, sorted by tile, then by the depth of the surfel's centre. Carries no derivative."""
+    """M surfel-tile pairs, sorted by tile, then by the depth of the surfel's centre; no derivative."""
 
     surfel_from_pair: Any  # mi.UInt32 (M,)
     pair_begin: Any  # mi.UInt32 (tiles,): first pair of a tile
@@ -53,7 +53,7 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     pair_from_rank = dr.prefix_reduce(dr.ReduceOp.Add, count_from_rank, exclusive=True)
     surfel = dr.gather(mi.UInt32, surfel_from_rank, rank_from_pair)
     place = dr.arange(mi.UInt32, dr.width(surfel)) - dr.gather(mi.UInt32, pair_from_rank, rank_from_pair)
-    # The masked lanes that fill up the last packet divide too: an integer division by 0 would kill the process.
+    # The masked lanes that fill up the last packet divide too: dividing an integer by 0 kills the process.
     span = dr.maximum(dr.gather(mi.UInt32, span_x, surfel), 1)
     row = place // span
     tile_x = mi.UInt32(dr.gather(mi.Int32, first_x, surfel)) + place - row * span

@@ -25,6 +25,8 @@ SQUARED_DISTANCE_FLOOR = 1e-7
 NEIGHBOURS = 3
 # Uniform jitter of the initial albedo around its mean: breaks ties between surfels. [Ref-Gaussian]
 ALBEDO_JITTER = 0.025
+# Distance that initial values keep from 0 and 1, where the logit ends and the sigmoid has no slope left.
+PROBABILITY_MARGIN = 1e-6
 # Voxels per edge of the visual hull's grid: at 200² a voxel of the cube the views span is two pixels wide.
 HULL_RESOLUTION = 96
 # Mask level that bounds the hull, and the level below which a voxel of the blurred masks is given up.
@@ -233,9 +235,7 @@ def from_points(
         "scale": np.repeat(log_scale[:, None], 2, axis=1),
         "opacity": np.full((count, 1), logit(opacity)),
         "radiance_sh": np.zeros((count, sh_columns(sh_degree))),
-        "albedo": logit(
-            np.clip(albedo + rng.uniform(-ALBEDO_JITTER, ALBEDO_JITTER, (count, 3)), 0.001, 0.999)
-        ),
+        "albedo": jittered_albedo(count, rng, albedo),
         "metallic": np.full((count, 1), logit(metallic)),
         "roughness": np.full((count, 1), logit(roughness)),
         "indirect_sh": np.zeros(
@@ -271,9 +271,15 @@ def quaternions(normals: np.ndarray | None, count: int, rng: np.random.Generator
     return Rotation.from_matrix(np.stack([tangent, np.cross(n, tangent), n], axis=-1)).as_quat()
 
 
+def jittered_albedo(count: int, rng: np.random.Generator, albedo: float = 0.5) -> np.ndarray:
+    """Raw albedo (count, 3): uniform noise around `albedo`, kept within 0.001 and 0.999."""
+    noise = rng.uniform(-ALBEDO_JITTER, ALBEDO_JITTER, (count, 3))
+    return logit(np.clip(albedo + noise, 0.001, 0.999))
+
+
 def logit(value: float | np.ndarray) -> np.ndarray:
-    """Inverse of the logistic sigmoid, for values in (0, 1)."""
-    value = np.asarray(value, dtype=np.float64)
+    """Inverse of the logistic sigmoid, float64, of values clipped to [1e-6, 1 - 1e-6]."""
+    value = np.clip(np.asarray(value, dtype=np.float64), PROBABILITY_MARGIN, 1 - PROBABILITY_MARGIN)
     return np.log(value) - np.log1p(-value)
 
 

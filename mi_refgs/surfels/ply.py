@@ -12,14 +12,13 @@ every other coefficient of r, of g, of b. The table's own column order is 3 coef
 
 from __future__ import annotations
 
-import contextlib
-import os
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.files import write_bytes
 from mi_refgs.surfels.table import MAX_SH_DEGREE, Surfels, sh_columns
 
 # A header of ours has 124 lines at most; more than this without its end is no PLY header.
@@ -196,19 +195,7 @@ def write_ply(path: str | Path, surfels: Surfels) -> None:
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {surfels.count}\n{properties_text}end_header\n"
     )
-
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(header.encode("ascii") + rows.tobytes())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: output: cannot be written ({error.strerror}); choose a writable folder"
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):  # moved away, or never made
-            temporary.unlink()
+    write_bytes(path, header.encode("ascii") + rows.tobytes())
 
 
 def _file_order(values: dict[str, np.ndarray]) -> list[str]:

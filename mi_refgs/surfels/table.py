@@ -86,7 +86,7 @@ class Surfels:
         return Surfels(raw)
 
     def to_numpy(self) -> dict[str, np.ndarray]:
-        """Raw channels as float32 arrays of shape (N, D): copies, since Dr.Jit's own view shares the tensor's memory."""
+        """Raw channels as float32 arrays (N, D): copies, since Dr.Jit's own view shares the memory."""
         return {name: np.array(tensor.numpy()).reshape(tensor.shape) for name, tensor in self.raw.items()}
 
     # ---------------- shape ----------------

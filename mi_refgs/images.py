@@ -1,19 +1,32 @@
-"""Image files and the sRGB transfer function in NumPy: 8-bit PNG and float EXR, written whole or not."""
+"""Image files and the sRGB transfer function in NumPy: 8-bit PNG and float EXR, written whole or not.
+
+Mitsuba's own EXR files are left to it only where it loads or saves a scene (`mitsuba_exr` says why).
+"""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.files import replace_file
 
 SRGB_LINEAR_LIMIT = 0.0031308
 """Linear value below which the sRGB curve is a straight line (IEC 61966-2-1)."""
 SRGB_ENCODED_LIMIT = 0.04045
 """The same point after encoding."""
+EXR_MAGIC = b"\x76\x2f\x31\x01"
+"""First bytes of every EXR file."""
+SRGB_CHROMATICITIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
+"""x, y of red, green, blue and white (ITU-R BT.709), which an EXR file without the attribute has."""
+CHROMATICITY_TOLERANCE = 1e-3
+"""Half the last digit that standards give, and far below the difference between any two of them."""
+MITSUBA_EXR_THREADS = 2
+"""Mitsuba 3.9 reads and writes EXR files on a worker thread; with one thread in all it waits for ever."""
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -72,18 +85,48 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
     replace_file(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG"))
 
 
+def is_exr(path: str | Path) -> bool:
+    """Whether a file starts as EXR files do, whatever its name; raises OSError if it cannot be read."""
+    with Path(path).open("rb") as file:
+        return file.read(len(EXR_MAGIC)) == EXR_MAGIC
+
+
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     """All channels of an EXR file's first part by name, float32 (H, W) each.
 
     Raises InputError if the file is missing, unreadable or holds NaN or infinite values.
     """
+    return _read_exr(Path(path))[0]
+
+
+def read_exr_image(path: str | Path) -> np.ndarray:
+    """EXR file as float32 (H, W, C): C = 4 for R, G, B, A, 3 for R, G, B, or X, Y, Z, 1 for a single channel.
+
+    Raises InputError as `read_exr` does, if the file has none of these sets of channels, and for colours in
+    other primaries than those of linear sRGB.
+    """
+    channels, header = _read_exr(Path(path))
+    primaries = header.get("chromaticities", SRGB_CHROMATICITIES)
+    if "R" in channels and not np.allclose(primaries, SRGB_CHROMATICITIES, atol=CHROMATICITY_TOLERANCE):
+        raise InputError(f"{path}: chromaticities: not those of sRGB; convert the image to linear sRGB")
+    for names in ("RGBA", "RGB", "XYZ"):
+        if set(names) <= channels.keys():
+            return np.stack([channels[name] for name in names], axis=-1)
+    if len(channels) == 1:
+        return next(iter(channels.values()))[..., None]
+    found = ", ".join(sorted(channels))
+    raise InputError(f"{path}: channels: found {found}; export R, G, B (and A), or X, Y, Z, or one channel")
+
+
+def _read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Channels and header of the first part."""
     import OpenEXR
 
-    path = Path(path)
     _require_file(path)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(c.pixels, dtype=np.float32) for name, c in file.channels().items()}
+            header = dict(file.header())
     except Exception as error:  # the binding raises RuntimeError, TypeError or its own types
         raise InputError(f"{path}: pixels: not a readable EXR file ({error}); export it again") from error
     for name, pixels in channels.items():
@@ -94,22 +137,7 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
                 f"{path}: channel {name}: {len(bad)} NaN or infinite values, the first at row {row}, "
                 f"column {column}; render the image again"
             )
-    return channels
-
-
-def read_exr_image(path: str | Path) -> np.ndarray:
-    """EXR file as float32 (H, W, C): C = 4 for R, G, B, A, 3 for R, G, B, or X, Y, Z, 1 for a single channel.
-
-    Raises InputError as `read_exr` does, and if the file has none of these sets of channels.
-    """
-    channels = read_exr(path)
-    for names in ("RGBA", "RGB", "XYZ"):
-        if set(names) <= channels.keys():
-            return np.stack([channels[name] for name in names], axis=-1)
-    if len(channels) == 1:
-        return next(iter(channels.values()))[..., None]
-    found = ", ".join(sorted(channels))
-    raise InputError(f"{path}: channels: found {found}; export R, G, B (and A), or X, Y, Z, or one channel")
+    return channels, header
 
 
 def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, half: bool = False) -> None:
@@ -129,24 +157,24 @@ def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, hal
     replace_file(path, lambda temporary: OpenEXR.File(header, channels).write(str(temporary)))
 
 
-def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
-    """Let `write(temporary)` make a file beside `path`, then move it there: readers see the old or the new.
+@contextlib.contextmanager
+def mitsuba_exr() -> Iterator[None]:
+    """Give Dr.Jit a second thread, if it has but one, while Mitsuba itself may read or write EXR files."""
+    import drjit as dr
 
-    Raises InputError if the folder is missing or cannot be written.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp{path.suffix}")
+    before = dr.thread_count()
+    if before >= MITSUBA_EXR_THREADS:
+        yield
+        return
+    dr.sync_thread()
+    dr.set_thread_count(MITSUBA_EXR_THREADS)
     try:
-        write(temporary)
-        os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"{path}: output: cannot be written ({error}); choose a writable folder") from error
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+        yield
+    finally:
+        dr.sync_thread()
+        dr.set_thread_count(before)
 
 
 def _require_file(path: Path) -> None:
     if not path.is_file():
-        raise InputError(f"{path}: file: missing; restore it or remove its frame from the transforms file")
+        raise InputError(f"{path}: file: missing; restore it, or remove what refers to it")

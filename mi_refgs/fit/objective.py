@@ -1,0 +1,79 @@
+"""What a step lowers: the loss of one rendered view against its picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.fit import losses
+from mi_refgs.fit.config import LossWeights
+from mi_refgs.fit.data import Dataset, View
+from mi_refgs.fit.ssim import ssim
+from mi_refgs.render.depth_normals import normals_from_depth
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.splat import Camera
+
+
+@dataclass(frozen=True)
+class Target:
+    """A view on the device: camera and planes of H·W values."""
+
+    camera: Camera
+    image: list[Any]  # display-encoded
+    clipped: list[Any] | None  # where an 8-bit target says only "at least this bright"
+    alpha: Any | None
+
+    @staticmethod
+    def of(view: View) -> Target:
+        """Upload a view."""
+        planes = [mi.Float(np.ascontiguousarray(view.image[..., i].ravel())) for i in range(3)]
+        image = [losses.linear_to_srgb(plane) for plane in planes] if view.linear else planes
+        clipped = None if view.linear else losses.saturated(image)
+        alpha = None if view.alpha is None else mi.Float(np.ascontiguousarray(view.alpha.ravel()))
+        target = Target(view.camera(), image, clipped, alpha)
+        dr.eval(target.image, target.clipped, target.alpha)
+        return target
+
+
+def displayed(frame: Frame, background: np.ndarray, linear: bool) -> list[Any]:
+    """What the camera shows of a frame, display-encoded planes.
+
+    Pictures with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it.
+    """
+    behind = [float(x) for x in background]
+    radiance = list(frame.radiance())
+    if not linear:
+        return losses.display_image(radiance, frame.alpha, behind)
+    return [
+        losses.linear_to_srgb(plane + (1 - frame.alpha) * value)
+        for plane, value in zip(radiance, behind, strict=True)
+    ]
+
+
+def objective(
+    frame: Frame, target: Target, data: Dataset, weights: LossWeights, iteration: int
+) -> tuple[Any, Any]:
+    """Weighted sum of the losses of a frame (mi.Float of width 1), and its mean squared error, detached.
+
+    The terms are those of `LossWeights`, each between the iterations that it names; see `fit.losses`.
+    """
+    width, height = target.camera.width, target.camera.height
+    image = displayed(frame, data.background, data.linear)
+    if target.clipped is not None:
+        image = losses.clip_highlights(image, target.image, target.clipped)
+    loss = (1 - weights.ssim) * losses.l1(image, target.image)
+    if weights.ssim:
+        loss += weights.ssim * (1 - ssim(image, target.image, width, height))
+    if weights.normal and iteration > weights.normal_from:
+        depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, target.camera)
+        loss += weights.normal * losses.normal_consistency(frame.normal, depth_normal, valid, frame.alpha)
+    if weights.smooth and iteration <= weights.smooth_until:
+        loss += weights.smooth * losses.normal_smoothness(list(frame.normal), target.image, width, height)
+    if weights.alpha and target.alpha is not None:
+        loss += weights.alpha * losses.alpha_loss(frame.alpha, target.alpha)
+    squares = (dr.square(dr.detach(a) - b) for a, b in zip(image, target.image, strict=True))
+    return loss, dr.mean(sum(squares, mi.Float(0))) / 3

@@ -1,0 +1,57 @@
+"""What several tests need: vectors, light levels, fresh processes, imports of a source."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+
+
+def unit(d: np.ndarray) -> np.ndarray:
+    """Rows of length 1."""
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def vector(d: np.ndarray) -> mi.Vector3f:
+    """(N, 3) array → mi.Vector3f."""
+    return mi.Vector3f(np.ascontiguousarray(np.asarray(d).T, dtype=np.float32))
+
+
+def level_maps(light: Any) -> list[np.ndarray]:
+    """The levels of a prefiltered light as float64 maps (h, 2h, 3)."""
+    flat = np.array(light.levels, np.float64).reshape(-1, 4)[:, :3]
+    return [flat[first : first + 2 * h * h].reshape(h, 2 * h, 3) for first, h in light.operator.shapes]
+
+
+def run_python(code: str, *arguments: object, folder: Path, package: Path = ROOT) -> str:
+    """What `code` prints in a fresh process with warnings as errors, which finds mi_refgs below `package`."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code, *map(str, arguments)],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(package)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def imported_packages(source: str) -> set[str]:
+    """First names of everything that `source` imports absolutely."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            found.add((node.module or "").partition(".")[0])
+    return found
