@@ -28,9 +28,9 @@ def tube(centre_line: np.ndarray, radius: float, sides: int) -> trimesh.Trimesh:
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False) - gap * np.arange(count)[:, None] / count
     normals = np.cos(angle)[..., None] * across[:, None] + np.sin(angle)[..., None] * up[:, None]
     vertices = centre_line[:, None] + radius * normals
-    i, j = np.meshgrid(np.arange(count), np.arange(sides), indexing="ij")
-    a, b = i * sides + j, i * sides + (j + 1) % sides
-    c, d = (i + 1) % count * sides + j, (i + 1) % count * sides + (j + 1) % sides
+    section, side = np.meshgrid(np.arange(count), np.arange(sides), indexing="ij")
+    a, b = section * sides + side, section * sides + (side + 1) % sides
+    c, d = (section + 1) % count * sides + side, (section + 1) % count * sides + (side + 1) % sides
     faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
     flat = vertices.reshape(-1, 3)
     return trimesh.Trimesh(flat, faces, vertex_normals=normals.reshape(-1, 3), process=False)

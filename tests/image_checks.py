@@ -33,8 +33,7 @@ def gradient(
 ) -> np.ndarray:
     """Central differences of a float64 function, for all entries or those of a mask."""
     slope = np.zeros(at.shape)
-    for index in np.argwhere(np.ones(at.shape, bool) if entries is None else entries):
-        index = tuple(index)
+    for index in zip(*np.nonzero(np.ones(at.shape, bool) if entries is None else entries), strict=True):
         shifted = at.copy()
         shifted[index] = at[index] + STEP
         above = function(shifted)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -46,7 +47,7 @@ def sky(height: int = 32) -> np.ndarray:
     return np.exp(np.stack(log, -1)).astype(np.float32)
 
 
-def sensor(**changes: object) -> dict:
+def sensor(**changes: Any) -> dict:
     film = {
         "type": "hdrfilm",
         "width": WIDTH,
@@ -54,7 +55,7 @@ def sensor(**changes: object) -> dict:
         "pixel_format": "rgb",
         "rfilter": {"type": "box"},
     }
-    film |= changes.pop("film", {})  # type: ignore[operator]
+    film |= changes.pop("film", {})
     to_world = mi.ScalarTransform4f().look_at([3, 1, 2], [0, 0, 0], [0, 0, 1])
     sampler = {"type": "independent", "sample_count": 1}
     return {

@@ -6,6 +6,7 @@ import json
 import math
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -34,7 +35,14 @@ SCENE = f"""<scene version="3.0.0">
         <bsdf type="diffuse"/>
     </shape>
 </scene>"""
-OPTIONS = {"views": 3, "test_views": 2, "size": SIZE, "spp": 16, "environment_height": 64, "progress": False}
+OPTIONS: dict[str, Any] = {
+    "views": 3,
+    "test_views": 2,
+    "size": SIZE,
+    "spp": 16,
+    "environment_height": 64,
+    "progress": False,
+}
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +190,7 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
 def test_passes_average(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = mi.load_string(SCENE)
     pose = pathtrace.camera_poses(1, CENTRE, 3.0, (0, 30), np.random.default_rng(0))[0]
-    options = {"size": 8, "fov": 30, "spp": 64, "max_depth": 3, "near": 0.1, "far": 50}
+    options: dict[str, Any] = {"size": 8, "fov": 30, "spp": 64, "max_depth": 3, "near": 0.1, "far": 50}
     whole = pathtrace.Tracer(scene, **options).trace(pose, 5)[0]
     monkeypatch.setattr(pathtrace, "SAMPLES_PER_LAUNCH", 8 * 8 * 16)
     split = pathtrace.Tracer(scene, **options)
@@ -249,7 +257,7 @@ def test_example_scenes(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["torus", "trefoil", "rounded_cube"])
 def test_example_meshes_are_closed_and_face_outwards(name: str) -> None:
-    mesh = trimesh.load(SCENES / "meshes" / f"{name}.ply", process=False)
+    mesh: Any = trimesh.load(SCENES / "meshes" / f"{name}.ply", process=False)
     assert mesh.is_watertight and mesh.volume > 0
     cosine = np.einsum("fi,fvi->fv", mesh.face_normals, mesh.vertex_normals[mesh.faces])
     assert cosine.min() > 0.95

@@ -18,7 +18,7 @@ def blocks(language: str) -> list[str]:
 
 
 @pytest.mark.parametrize("number", range(len(blocks("python"))))
-def test_python_blocks_run(number, tmp_path):
+def test_python_blocks_run(number: int, tmp_path: Path) -> None:
     """Each block in a process of its own, as a reader would paste it; warnings are errors."""
     code = blocks("python")[number]
     result = subprocess.run(
@@ -32,7 +32,7 @@ def test_python_blocks_run(number, tmp_path):
     assert result.returncode == 0, result.stderr[-2000:]
 
 
-def test_commands_of_the_readme_exist():
+def test_commands_of_the_readme_exist() -> None:
     """Every `refgs` line parses: its command and options are known."""
     from mi_refgs.cli import build_parser
 
@@ -42,12 +42,12 @@ def test_commands_of_the_readme_exist():
         build_parser().parse_args(line.split("#")[0].split()[1:])
 
 
-def test_setup_commands_of_the_readme_are_those_of_ci():
+def test_setup_commands_of_the_readme_are_those_of_ci() -> None:
     assert "bash setup.sh test" in README and "bash setup.sh demo" in README
     assert "bash setup.sh test" in (ROOT / ".ci" / "run").read_text()
 
 
-def test_links_of_the_readme_lead_somewhere():
+def test_links_of_the_readme_lead_somewhere() -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", README):
         if not target.startswith("http"):
             assert (ROOT / target).exists(), target

@@ -12,6 +12,7 @@ import pytest
 from helpers import level_maps, unit, vector
 
 from mi_refgs.errors import InputError
+from mi_refgs.images import write_exr
 from mi_refgs.reference import shade as reference
 from mi_refgs.shade import envmap, lobe, prefilter
 from mi_refgs.shade.envmap import EnvironmentLight
@@ -91,6 +92,14 @@ def test_import_at_another_resolution_keeps_the_energy(rng: np.random.Generator,
         assert radiance.shape == (height, 2 * height, 3)
         np.testing.assert_allclose(np.tensordot(lobe.row_areas(height), radiance.mean(1), 1), mean, rtol=0.02)
     assert EnvironmentLight.from_file(tmp_path / "odd.exr").height == 48
+
+
+def test_files_are_known_by_what_they_hold(tmp_path: Path) -> None:
+    write_exr(tmp_path / "grey.hdr", np.full((8, 16), 0.75))
+    mi.Bitmap(np.full((8, 16, 3), [0.5, 1, 2], np.float32)).write(str(tmp_path / "colour.hdr"))
+    for name, colour in (("grey", [0.75, 0.75, 0.75]), ("colour", [0.5, 1, 2])):
+        radiance = EnvironmentLight.from_file(tmp_path / f"{name}.hdr").radiance().numpy()
+        np.testing.assert_allclose(radiance, np.broadcast_to(colour, (8, 16, 3)), rtol=1e-2)
 
 
 def test_bad_input(tmp_path: Path) -> None:

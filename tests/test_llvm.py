@@ -158,7 +158,9 @@ def test_an_old_choice_of_the_user_is_refused(old: Path) -> None:
     assert done.returncode == 1
     message = last_line(done.stderr)
     assert message.startswith("ImportError")
-    assert f"is LLVM {llvm.named_version(old)[0]}" in message and "unset DRJIT_LIBLLVM_PATH" in message
+    version = llvm.named_version(old)
+    assert version is not None
+    assert f"is LLVM {version[0]}" in message and "unset DRJIT_LIBLLVM_PATH" in message
     assert "LLVM ERROR" not in done.stderr
 
 

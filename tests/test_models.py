@@ -56,7 +56,7 @@ def radiance() -> np.ndarray:
 
 
 def oracle(values: dict[str, Any], levels: list[np.ndarray], diffuse: str, k: int) -> np.ndarray:
-    one = {name: None if x is None else x[k] for name, x in values.items()}
+    one: dict[str, Any] = {name: None if x is None else x[k] for name, x in values.items()}
     return reference.shade(
         brdf.table().astype(np.float64), levels, lobe.LEVEL_ROUGHNESS, diffuse=diffuse, **one
     )
@@ -200,7 +200,7 @@ def test_safe_normalize() -> None:
     n = safe_normalize(v)
     dr.backward(n.x + 2 * n.y + 3 * n.z)
     np.testing.assert_allclose(
-        n.numpy().T, [[0, 0, 1], [0.6, 0, 0.8], [0.6, 0, 0.8], [0, 0, 1], [0, 1, 0]], atol=1e-6
+        n.numpy().T, [[0.0, 0, 1], [0.6, 0, 0.8], [0.6, 0, 0.8], [0.0, 0, 1], [0.0, 1, 0]], atol=1e-6
     )
     gradient = dr.grad(v).numpy().T
     assert np.isfinite(gradient).all()

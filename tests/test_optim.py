@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -12,11 +14,11 @@ from mi_refgs.fit.optim import Adam, Group
 from mi_refgs.reference import losses as reference
 
 
-def tensor(values: np.ndarray) -> object:
+def tensor(values: np.ndarray | float) -> Any:
     return mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def give(optimiser: Adam, name: str, gradient: np.ndarray) -> None:
+def give(optimiser: Adam, name: str, gradient: np.ndarray | float) -> None:
     dr.set_grad(optimiser.params[name], tensor(gradient))
 
 

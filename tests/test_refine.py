@@ -28,11 +28,13 @@ def table(count: int = 6, scale: float = 0.005, opacity: float = 0.8) -> Surfels
     )
 
 
-def densify(surfels: Surfels, gradient: np.ndarray, max_count: int = 100, extent: float = 1.0):
+def densify(
+    surfels: Surfels, gradient: np.ndarray, max_count: int = 100, extent: float = 1.0
+) -> refine.Edited:
     return refine.densify_and_prune(surfels, gradient, extent, OPTIONS, max_count, np.random.default_rng(1))
 
 
-def test_small_hot_surfels_are_cloned_and_cold_ones_left_alone():
+def test_small_hot_surfels_are_cloned_and_cold_ones_left_alone() -> None:
     surfels = table()
     edited = densify(surfels, np.array([0, 1e-3, 0, 0, 5e-4, 0]))
     assert edited.parent.tolist() == [0, 1, 2, 3, 4, 5, 1, 4]
@@ -41,7 +43,7 @@ def test_small_hot_surfels_are_cloned_and_cold_ones_left_alone():
         assert np.array_equal(values, surfels.to_numpy()[name][edited.parent]), name
 
 
-def test_large_hot_surfels_are_split_within_their_own_plane():
+def test_large_hot_surfels_are_split_within_their_own_plane() -> None:
     surfels = table(scale=0.05)
     edited = densify(surfels, np.array([0, 1e-3, 0, 0, 0, 0]))
     assert edited.parent.tolist() == [0, 2, 3, 4, 5, 1, 1]
@@ -54,7 +56,7 @@ def test_large_hot_surfels_are_split_within_their_own_plane():
     assert 0 < np.abs(offsets).max() < 6 * 0.05
 
 
-def test_transparent_and_oversized_surfels_go_even_when_hot():
+def test_transparent_and_oversized_surfels_go_even_when_hot() -> None:
     raw = table().to_numpy()
     raw["opacity"][0] = logit(0.01)
     raw["scale"][1] = np.log(0.5)
@@ -63,13 +65,13 @@ def test_transparent_and_oversized_surfels_go_even_when_hot():
 
 
 @pytest.mark.parametrize("scale", [0.005, 0.05])
-def test_growth_stops_at_the_limit_and_takes_the_hottest(scale):
+def test_growth_stops_at_the_limit_and_takes_the_hottest(scale: float) -> None:
     edited = densify(table(scale=scale), np.array([3, 9, 4, 8, 5, 7]) * 1e-3, max_count=8)
     assert len(edited.parent) == 8
     assert np.flatnonzero(np.bincount(edited.parent) == 2).tolist() == [1, 3]
 
 
-def test_reset_lowers_opacity_and_lifts_metallic_only():
+def test_reset_lowers_opacity_and_lifts_metallic_only() -> None:
     surfels = table()
     edited = refine.reset_opacity(surfels, OPTIONS, metallic=0.6).to_numpy()
     np.testing.assert_allclose(refine.sigmoid(edited["opacity"]), OPTIONS.reset_opacity, rtol=1e-5)
@@ -77,7 +79,7 @@ def test_reset_lowers_opacity_and_lifts_metallic_only():
     assert np.array_equal(edited["scale"], surfels.to_numpy()["scale"])
 
 
-def test_propagation_is_material_aware():
+def test_propagation_is_material_aware() -> None:
     """Only metallic and smooth surfels grow; all become opaque. [Ref-Gaussian §3.4]"""
     raw = table().to_numpy()
     raw["metallic"][0] = logit(0.01)  # no metal
@@ -91,7 +93,7 @@ def test_propagation_is_material_aware():
     )
 
 
-def test_material_reset_leaves_geometry():
+def test_material_reset_leaves_geometry() -> None:
     surfels = table()
     edited = refine.reset_materials(surfels, 0.01, 0.1, np.random.default_rng(0)).to_numpy()
     np.testing.assert_allclose(refine.sigmoid(edited["metallic"]), 0.01, rtol=1e-5)

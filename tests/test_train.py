@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import signal
 from pathlib import Path
 
 import drjit as dr
@@ -11,6 +13,7 @@ import pytest
 
 from mi_refgs.errors import InputError
 from mi_refgs.fit import config
+from mi_refgs.fit.config import Method
 from mi_refgs.fit.data import Dataset, View
 from mi_refgs.fit.record import Run
 from mi_refgs.fit.train import Trainer
@@ -75,19 +78,19 @@ def ball(size: int = SIZE, views: int = 6) -> Dataset:
 
 
 @pytest.fixture
-def method(tmp_path):
+def method(tmp_path: Path) -> Method:
     path = tmp_path / "small.toml"
     path.write_text(METHOD)
     return config.load_resolved(path)
 
 
-def run_folder(path, method) -> Run:
+def run_folder(path: Path, method: Method) -> Run:
     run = Run(path)
     run.create(method, "ball")
     return run
 
 
-def test_the_loss_falls_and_everything_trains(method):
+def test_the_loss_falls_and_everything_trains(method: Method) -> None:
     data = ball()
     trainer = Trainer(dataclasses.replace(method, refine=config.Refine(), iterations=60), data)
     before = {name: tensor.numpy().copy() for name, tensor in trainer.params.items()}
@@ -102,13 +105,13 @@ def test_the_loss_falls_and_everything_trains(method):
         assert not np.array_equal(before[name], tensor.numpy()), name
 
 
-def test_resume_repeats_a_straight_run_bit_for_bit(method, tmp_path, one_thread):
+def test_resume_repeats_a_straight_run_bit_for_bit(method: Method, tmp_path: Path, one_thread: None) -> None:
     data = ball()
     straight = Trainer(method, data, run_folder(tmp_path / "straight", method))
     straight.train()
     first = Trainer(method, data, run_folder(tmp_path / "resumed", method))
 
-    def stop(trainer):
+    def stop(trainer: Trainer) -> None:
         if trainer.iteration == 17:
             raise KeyboardInterrupt
 
@@ -124,7 +127,7 @@ def test_resume_repeats_a_straight_run_bit_for_bit(method, tmp_path, one_thread)
     assert "mesh/faces" in expected
 
 
-def test_a_kill_loses_at_most_one_checkpoint_interval(method, tmp_path):
+def test_a_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: Path) -> None:
     """A killed process leaves its last periodic checkpoint, and a torn file is passed over."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
@@ -132,7 +135,7 @@ def test_a_kill_loses_at_most_one_checkpoint_interval(method, tmp_path):
     class Killed(BaseException):
         pass
 
-    def kill(state):
+    def kill(state: Trainer) -> None:
         if state.iteration == 13:
             raise Killed
 
@@ -142,13 +145,37 @@ def test_a_kill_loses_at_most_one_checkpoint_interval(method, tmp_path):
     assert Trainer(method, ball(), run).iteration == 10
 
 
-def test_a_run_is_not_overwritten(method, tmp_path):
+def test_ctrl_c_waits_for_the_step_in_hand(
+    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal inside iteration 7, before its refinement: the checkpoint holds the whole iteration."""
+    run = run_folder(tmp_path / "run", method)
+    trainer = Trainer(method, ball(), run)
+    refine = trainer._refine
+
+    def interrupted_refine(iteration: int) -> None:
+        if iteration == 7:
+            os.kill(os.getpid(), signal.SIGINT)
+        refine(iteration)
+
+    monkeypatch.setattr(trainer, "_refine", interrupted_refine)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.train()
+    assert signal.getsignal(signal.SIGINT) is before
+    state = run.load_checkpoint()
+    assert state is not None and int(state["iteration"]) == 7
+    for name, value in trainer.state().items():
+        assert np.array_equal(state[name], value), name
+
+
+def test_a_run_is_not_overwritten(method: Method, tmp_path: Path) -> None:
     run_folder(tmp_path / "run", method)
     with pytest.raises(InputError, match="--resume"):
         run_folder(tmp_path / "run", method)
 
 
-def test_a_warm_step_compiles_nothing(method):
+def test_a_warm_step_compiles_nothing(method: Method) -> None:
     trainer = Trainer(dataclasses.replace(method, refine=config.Refine()), ball())
     while trainer.iteration < 22:  # into the deferred stage, with a mesh
         trainer.step()

@@ -1,7 +1,8 @@
 """A method as data: frozen dataclasses, read strictly from the TOML files of `variants/`.
 
-Iteration numbers in a file are written for the file's own `iterations`; a preset gives the number of iterations to run,
-and every window, stage and interval is scaled with it. No other module opens a TOML or knows a method's name.
+Iteration numbers in a file are written for the file's own `iterations`; a preset gives the number of iterations
+to run, and every window, stage and interval is scaled with it. No other module opens a TOML or knows a method's
+name.
 """
 
 from __future__ import annotations
@@ -183,7 +184,7 @@ class Preset:
     max_surfels: int
 
 
-# Wall time is for 200² images on two AVX-512 cores: about 4, 15 and 60 minutes.
+# About 3 and 15 minutes for 160² to 200² pictures on one AVX-512 core; the last follows from these.
 PRESETS = {
     "quick": Preset(2_000, 15_000, 20_000),
     "standard": Preset(6_000, 20_000, 30_000),
@@ -216,7 +217,8 @@ def load(variant: str, preset: str = "standard", assignments: list[str] | None =
     table["surfels"] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
     for assignment in assignments or []:
         _assign(table, assignment)
-    return _build(Method, table | {"variant": path.stem, "preset": preset}, "--set" if assignments else str(path))
+    where = "--set" if assignments else str(path)
+    return _build(Method, table | {"variant": path.stem, "preset": preset}, where)
 
 
 def load_resolved(path: Path) -> Method:
@@ -237,7 +239,8 @@ def names() -> list[str]:
 def _find(variant: str) -> Path:
     path = Path(variant) if variant.endswith(".toml") else resource_dir("variants") / f"{variant}.toml"
     if not path.is_file():
-        raise InputError(f"--variant: {variant}: no such method; use one of {', '.join(names())}, or a path to a .toml")
+        known = ", ".join(names())
+        raise InputError(f"--variant: {variant}: no such method; use one of {known}, or a path to a .toml")
     return path
 
 
@@ -301,19 +304,19 @@ def _build(kind: Any, value: Any, where: str) -> Any:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
-            raise InputError(f"{where}: expected a table, found {value!r}; see variants/ref_gaussian.toml for the form")
+            raise InputError(
+                f"{where}: expected a table, found {value!r}; the files of variants/ show the form"
+            )
         hints = typing.get_type_hints(kind)
         for key in value:
             if key not in hints:
                 raise InputError(f"{where}: unknown key '{key}'; use one of {', '.join(hints)}")
-        missing = [
-            f.name
-            for f in dataclasses.fields(kind)
-            if f.name not in value and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-        ]
+        needed = [f.name for f in dataclasses.fields(kind) if f.default is dataclasses.MISSING]
+        missing = [name for name in needed if name not in value]
         if missing:
             raise InputError(f"{where}: missing key '{missing[0]}'; add it")
-        return kind(**{key: _build(hints[key], inner, f"{where}: {key}") for key, inner in value.items()})
+        make: Any = kind
+        return make(**{key: _build(hints[key], inner, f"{where}: {key}") for key, inner in value.items()})
     if origin in (types.UnionType, typing.Union):
         return _build(next(option for option in arguments if option is not type(None)), value, where)
     if origin is dict:
@@ -326,7 +329,8 @@ def _build(kind: Any, value: Any, where: str) -> Any:
         return tuple(_build(arguments[0], inner, where) for inner in value)
     if origin is Literal:
         if value not in arguments:
-            raise InputError(f"{where}: {value!r} is not allowed; use one of {', '.join(map(str, arguments))}")
+            known = ", ".join(map(str, arguments))
+            raise InputError(f"{where}: {value!r} is not allowed; use one of {known}")
         return value
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)

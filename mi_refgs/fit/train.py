@@ -18,6 +18,7 @@ from mi_refgs.fit import refine
 from mi_refgs.fit.config import Method, Stage
 from mi_refgs.fit.data import Dataset
 from mi_refgs.fit.initial import initial_surfels
+from mi_refgs.fit.interrupt import held_interrupts
 from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.optim import Adam, Group
 from mi_refgs.fit.record import Run
@@ -91,24 +92,32 @@ class Trainer:
     # ---------------- the loop ----------------
 
     def train(self, progress: Callable[[Trainer], None] | None = None) -> None:
-        """Run to the last iteration; on an interrupt, save a checkpoint and pass the interrupt on."""
-        try:
+        """Run to the last iteration; an interrupt ends it after the step in hand, saved, and is passed on."""
+        with held_interrupts() as interrupted:
             while self.iteration < self.method.iterations:
                 begin = time.perf_counter()
                 self.step()
                 if self.iteration % self.method.log_every == 0:
                     dr.sync_thread()
                 self.seconds += time.perf_counter() - begin
-                if self.run is not None and self.iteration % self.method.log_every == 0:
-                    self.run.log(self.statistics())
-                if self.run is not None and self.iteration % self.method.checkpoint_every == 0:
-                    self.run.save_checkpoint(self.iteration, self.state())
-                if progress is not None:
-                    progress(self)
-        except KeyboardInterrupt:
-            if self.run is not None and self.iteration:
-                self.run.save_checkpoint(self.iteration, self.state())
-            raise
+                self._record()
+                try:
+                    if progress is not None:
+                        progress(self)
+                    if interrupted():
+                        raise KeyboardInterrupt
+                except KeyboardInterrupt:
+                    if self.run is not None:
+                        self.run.save_checkpoint(self.iteration, self.state())
+                    raise
+
+    def _record(self) -> None:
+        if self.run is None:
+            return
+        if self.iteration % self.method.log_every == 0:
+            self.run.log(self.statistics())
+        if self.iteration % self.method.checkpoint_every == 0:
+            self.run.save_checkpoint(self.iteration, self.state())
 
     def step(self) -> None:
         """One iteration: enter a stage if it begins, one gradient step, then what falls due."""

@@ -11,12 +11,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import NORM_FLOOR
+from mi_refgs.constants import ALPHA_MIN, NORM_FLOOR
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.splat.camera import Camera
 
-# Alpha below which a pixel has no depth: D / A would divide rounding errors. The splatter's cut.
-DEPTH_ALPHA_MIN = 1.0 / 255.0
 # Cosine to the viewing ray below which a depth difference is read as a step between two surfaces, not as a
 # slope: the normal of such a step would pull at the rims of both. At 160² and 40° it is a step of a twentieth
 # of the depth.
@@ -25,7 +23,7 @@ DEPTH_EDGE_COSINE = 0.2
 
 def expected_depth(blended: Any, alpha: Any) -> Any:
     """Expected camera depth z = D / A (scene units), 0 where A < 1/255; finite gradients to D and A."""
-    valid = alpha >= DEPTH_ALPHA_MIN
+    valid = alpha >= ALPHA_MIN  # below it, D / A would divide rounding errors
     return dr.select(valid, blended / dr.select(valid, alpha, 1.0), 0.0)
 
 
@@ -56,7 +54,7 @@ def normals_from_depth(depth: Any, alpha: Any, camera: Camera) -> tuple[Any, Any
     cosine = dr.detach(dr.dot(normal, ray))
     normal = dr.select(cosine > 0, -normal, normal)
 
-    covered = dr.select(dr.detach(alpha) >= DEPTH_ALPHA_MIN, mi.Float(1), mi.Float(0))
+    covered = dr.select(dr.detach(alpha) >= ALPHA_MIN, mi.Float(1), mi.Float(0))
     around = neighbours(covered, width, height, (*steps, (0, 0)))
     inside = (pixel.x > 1) & (pixel.x < width - 1) & (pixel.y > 1) & (pixel.y < height - 1)
     length2 = dr.squared_norm(normal)
