@@ -1,8 +1,7 @@
 """A method as data: frozen dataclasses, read strictly from the TOML files of `variants/`.
 
-Iteration numbers in a file are written for the file's own `iterations`; a preset gives the number of iterations
-to run, and every window, stage and interval is scaled with it. No other module opens a TOML or knows a method's
-name.
+Iteration numbers in a file are written for the file's own `iterations`; a preset gives the number to run, and
+every window, stage and interval is scaled with it. No other module opens a TOML or knows a method's name.
 """
 
 from __future__ import annotations
