@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from image_checks import HEIGHT, STEP, VALUE, WIDTH, gradient, planes, stack
 
+from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.fit import losses
 from mi_refgs.reference import losses as reference
-from mi_refgs.render.depth_normals import expected_depth, normals_from_depth
+from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.splat.camera import Camera
 
@@ -41,6 +42,12 @@ def test_neighbours_adjoint_is_the_transpose(size: tuple[int, int], rng: np.rand
 INTRINSICS = (-21.0, -19.0, 7.3, 8.1)  # Mitsuba's signs, off-centre
 ROTATION = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
 ROTATION = ROTATION * np.sign(np.linalg.det(ROTATION))
+
+
+def expected_depth(blended: Any, alpha: Any) -> Any:
+    """z = D / A as the renderer forms it: 0 where the pixel is empty, with a finite gradient."""
+    seen = alpha > COVERAGE_FLOOR
+    return dr.select(seen, blended / dr.select(seen, alpha, 1.0), 0.0)
 
 
 def camera() -> Camera:

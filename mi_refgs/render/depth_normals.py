@@ -21,12 +21,6 @@ from mi_refgs.splat.camera import Camera
 DEPTH_EDGE_COSINE = 0.2
 
 
-def expected_depth(blended: Any, alpha: Any) -> Any:
-    """Expected camera depth z = D / A (scene units), 0 where A < 1/255; finite gradients to D and A."""
-    valid = alpha >= ALPHA_MIN  # below it, D / A would divide rounding errors
-    return dr.select(valid, blended / dr.select(valid, alpha, 1.0), 0.0)
-
-
 def normals_from_depth(depth: Any, alpha: Any, camera: Camera) -> tuple[Any, Any]:
     """World normals of a depth map by central differences, facing the camera, and where they are valid.
 
