@@ -37,6 +37,7 @@ def test_stages_and_windows_meet_without_gap_or_overlap() -> None:
     assert sorted(set(names), key=names.index) == order
     window = config.Window(2, 8, 3)
     assert [i for i in range(12) if window.due(i)] == [3, 6]
+    assert [window.since(i) for i in (3, 4, 6, 7, 9, 20)] == [None, 1, 3, 1, 3, 14]
 
 
 def test_assignments_are_applied_unscaled() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mi_refgs.errors import InputError
 from mi_refgs.fit import refine
 from mi_refgs.fit.config import Refine
 from mi_refgs.surfels.init import logit
@@ -62,6 +63,15 @@ def test_transparent_and_oversized_surfels_go_even_when_hot() -> None:
     raw["scale"][1] = np.log(0.5)
     edited = densify(Surfels.from_numpy(raw), np.full(6, 1e-3))
     assert sorted(set(edited.parent.tolist())) == [2, 3, 4, 5]
+
+
+def test_opacities_get_time_to_grow_back_after_a_reset() -> None:
+    surfels = table(opacity=0.02)
+    gradient = np.zeros(6)
+    limits = (gradient, 1.0, OPTIONS, 100, np.random.default_rng(1))
+    assert len(refine.densify_and_prune(surfels, *limits, since_reset=refine.PRUNE_WAIT - 1).parent) == 6
+    with pytest.raises(InputError, match=r"refine\.prune_opacity"):
+        refine.densify_and_prune(surfels, *limits, since_reset=refine.PRUNE_WAIT)
 
 
 @pytest.mark.parametrize("scale", [0.005, 0.05])

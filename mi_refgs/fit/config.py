@@ -32,6 +32,11 @@ class Window:
         """Whether the action falls on this (1-based) iteration."""
         return self.start < iteration <= self.until and iteration % self.every == 0
 
+    def since(self, iteration: int) -> int | None:
+        """Iterations since the action last fell due before this one; None if it has not yet."""
+        last = min(iteration - 1, self.until) // self.every * self.every
+        return iteration - last if last > self.start else None
+
 
 @dataclass(frozen=True)
 class About:

@@ -10,12 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mi_refgs.errors import InputError
 from mi_refgs.fit.config import Refine
 from mi_refgs.surfels.init import jittered_albedo, logit
 from mi_refgs.surfels.table import Surfels
 
 SPLIT_SHRINK = 1.6
 """A split surfel's two children have its scale divided by this. [3DGS §5.2: φ = 1.6, found by experiment]"""
+
+
+PRUNE_WAIT = 150
+"""Iterations that opacities get to grow back after a reset. Adam lifts a logit by at most its rate a step, so 0.01
+to 0.05 takes 33 steps at 0.05; 67 were too few on a diffuse scene, which lost every surfel."""
 
 
 @dataclass(frozen=True)
@@ -39,16 +45,27 @@ def densify_and_prune(
     options: Refine,
     max_count: int,
     rng: np.random.Generator,
+    since_reset: int | None = None,
 ) -> Edited:
     """Clone small and split large surfels with a high screen gradient; drop transparent and oversized ones.
 
     `gradient` (N,) is the mean length of the screen-translation gradient in NDC units over the views that saw
-    a surfel. At most max_count surfels result: those with the highest gradient grow first.
+    a surfel. At most max_count surfels result: those with the highest gradient grow first. Transparent ones
+    stay while the last opacity reset is less than PRUNE_WAIT iterations ago.
+
+    Raises InputError if no surfel would be left.
     """
     raw = surfels.to_numpy()
     count = len(gradient)
     size = np.exp(raw["scale"]).max(axis=1)
-    keep = (sigmoid(raw["opacity"][:, 0]) >= options.prune_opacity) & (size <= options.prune_extent * extent)
+    keep = size <= options.prune_extent * extent
+    if since_reset is None or since_reset >= PRUNE_WAIT:
+        keep &= sigmoid(raw["opacity"][:, 0]) >= options.prune_opacity
+    if not keep.any():
+        raise InputError(
+            "refine.prune_opacity: no surfel is opaque and small enough to stay; lower it, raise "
+            "refine.prune_extent, or check that the pictures and their cameras belong together"
+        )
 
     hot = np.flatnonzero(keep & (gradient >= options.gradient))
     room = max(max_count - int(keep.sum()), 0)

@@ -202,7 +202,13 @@ class Trainer:
         if options.densify is not None and options.densify.due(iteration):
             mean = self.gradient_sum.numpy() / np.maximum(self.gradient_count.numpy(), 1)
             edited = refine.densify_and_prune(
-                self.surfels, mean, self.extent, options, surfels.max_count, self.schedule.rng(iteration)
+                self.surfels,
+                mean,
+                self.extent,
+                options,
+                surfels.max_count,
+                self.schedule.rng(iteration),
+                since_reset=options.reset.since(iteration) if options.reset is not None else None,
             )
             self._replace(edited.surfels)
             names = list(edited.surfels.raw)
