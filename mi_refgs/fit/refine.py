@@ -20,8 +20,8 @@ SPLIT_SHRINK = 1.6
 
 
 PRUNE_WAIT = 150
-"""Iterations that opacities get to grow back after a reset. Adam lifts a logit by at most its rate a step, so 0.01
-to 0.05 takes 33 steps at 0.05; 67 were too few on a diffuse scene, which lost every surfel."""
+"""Iterations that opacities get to grow back after a reset. Adam lifts a logit by at most its rate a step, so
+0.01 to 0.05 takes 33 steps at 0.05; 67 were too few on a diffuse scene, which lost every surfel."""
 
 
 @dataclass(frozen=True)
