@@ -217,7 +217,10 @@ def _visibility(occluder: Occluder, origin: Any, ray: Any, normal: Any, view: An
         point = mi.Point3f(mi.Vector3f(origin) + distance * ray)
         facing = safe_normalize(normal)
         free = occluder.visible(point, reflect(view=view, normal=facing), facing)
-        return dr.select(hit, free, 1)
+        visibility = dr.select(hit, free, 1)
+        # Now, once: every kernel of the adjoint that reads it would trace the rays again.
+        dr.eval(visibility)
+        return visibility
 
 
 def _inverse_alpha(blended: Blended) -> Any:
