@@ -100,7 +100,7 @@ def stage_times(trainer: Any, steps: int) -> dict[str, float]:
     clock.wrap(blend, "_blend_backward", "splat backward")
     clock.wrap(pipeline, "shade", "shade forward")
     clock.wrap(envmap.EnvironmentLight, "prefilter", "prefilter forward")
-    clock.wrap(objective, "ssim", "ssim forward")
+    clock.wrap(objective.losses, "ssim", "ssim forward")
     clock.wrap(optim.Adam, "step", "optimiser")
     clock.wrap(dr, "backward", "all backward")
     rows = []

@@ -12,7 +12,6 @@ import numpy as np
 from mi_refgs.fit import losses
 from mi_refgs.fit.config import LossWeights
 from mi_refgs.fit.data import Dataset, View
-from mi_refgs.fit.ssim import ssim
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.splat import Camera
@@ -67,7 +66,7 @@ def objective(
         image = losses.clip_highlights(image, target.image, target.clipped)
     loss = (1 - weights.ssim) * losses.l1(image, target.image)
     if weights.ssim:
-        loss += weights.ssim * (1 - ssim(image, target.image, width, height))
+        loss += weights.ssim * losses.d_ssim(image, target.image, width, height)
     if weights.normal and iteration > weights.normal_from:
         depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, target.camera)
         loss += weights.normal * losses.normal_consistency(frame.normal, depth_normal, valid, frame.alpha)
