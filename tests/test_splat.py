@@ -307,6 +307,21 @@ def test_order_of_the_table_is_irrelevant_and_culled_surfels_change_nothing() ->
             assert np.abs(a.numpy() - b.numpy()).max() <= 1e-6
 
 
+def test_crossing_surfels_each_hide_the_other_on_their_own_side() -> None:
+    """Two opaque, tilted discs that cross: a tile shows the nearer plane, not the one with the nearer centre."""
+    tilt = np.radians(50)
+    raw = {
+        "position": np.array([[0, 0, 0], [0, 0, 0.01]]),
+        "rotation": np.array([[0, np.sin(s * tilt / 2), 0, np.cos(tilt / 2)] for s in (1, -1)]),
+        "scale": np.zeros((2, 2)),
+        "opacity": np.full((2, 1), 8.0),
+    }
+    camera = oracle.PinholeCamera(32, 32, -50, -50, 16, 16, look_at(np.array([0, 0, 4.0]), np.zeros(3)))
+    first, second = (f.numpy().reshape(32, 32)[16] for f in fast_maps(Scene(raw, np.eye(2), camera)).features)
+    left, right = first[11] - second[11], first[20] - second[20]
+    assert left * right < 0 and min(abs(left), abs(right)) > 0.5
+
+
 @pytest.mark.parametrize(
     "values", ["zero_scale", "huge_scale", "zero_quaternion", "saturated_opacity", "at_camera", "none"]
 )

@@ -56,29 +56,25 @@ def splat(
     to_camera, origin = camera.to_world[:3, :3].T, camera.to_world[:3, 3]
     centres = (raw["position"] - origin) @ to_camera.T
 
+    surfels = _surfels(raw, centres, to_camera, camera)
+    order = _order(surfels, camera)
     out = np.zeros((height, width, features.shape[1]))
     depth, alpha, median = np.zeros((height, width)), np.zeros((height, width)), np.zeros((height, width))
     transmittance = np.ones((height, width))
     alive = np.ones((height, width), bool)
     in_band = np.zeros((height, width), bool)
 
-    for i in np.argsort(centres[:, 2], kind="stable"):
-        p = centres[i]
-        axes = to_camera @ rotation_matrix(raw["rotation"][i])
-        t_u, t_v, n = axes.T
-        s_u, s_v = np.exp(raw["scale"][i])
-        opacity = 1 / (1 + np.exp(-raw["opacity"][i, 0]))
-        if p[2] <= camera.near or abs(p @ n) <= c.EDGE_ON_COSINE * np.linalg.norm(p) or opacity < c.ALPHA_MIN:
-            continue
+    for i in order:  # (H, W): the next surfel of each pixel
+        s = {name: values[i] for name, values in surfels.items()}
+        p = s["p"]
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = (p @ n) / (ray @ n)
+            t = np.sum(p * s["n"], -1) / np.sum(ray * s["n"], -1)
             offset = t[..., None] * ray - p
-            rho_plane = (offset @ t_u / s_u) ** 2 + (offset @ t_v / s_v) ** 2
+            rho_plane = np.sum(offset * s["u"], -1) ** 2 + np.sum(offset * s["v"], -1) ** 2
         rho_plane = np.where(t > 0, rho_plane, np.inf)
-        px, py = camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy
-        rho_screen = c.LOW_PASS_INV_VARIANCE * ((x - px) ** 2 + (y - py) ** 2)
-        z = np.where(rho_screen < rho_plane, p[2], t)
-        a = np.minimum(c.ALPHA_MAX, opacity * np.exp(-0.5 * np.minimum(rho_plane, rho_screen)))
+        rho_screen = c.LOW_PASS_INV_VARIANCE * ((x - s["centre"][..., 0]) ** 2 + (y - s["centre"][..., 1]) ** 2)
+        z = np.where(rho_screen < rho_plane, p[..., 2], t)
+        a = np.minimum(c.ALPHA_MAX, s["opacity"] * np.exp(-0.5 * np.minimum(rho_plane, rho_screen)))
 
         after = transmittance * (1 - a)
         shown = alive & (a >= c.ALPHA_MIN) & (z > camera.near)
@@ -98,3 +94,53 @@ def splat(
         median = np.where(shown & (transmittance > c.MEDIAN_TRANSMITTANCE), z, median)
         transmittance = np.where(shown, after, transmittance)
     return Maps(out, depth, alpha, median, in_band)
+
+
+def _surfels(
+    raw: dict[str, np.ndarray], centres: np.ndarray, to_camera: np.ndarray, camera: PinholeCamera
+) -> dict[str, np.ndarray]:
+    """Per surfel: centre p, tangents u and v over their σ, normal n (camera frame), projection, opacity.
+
+    Culled surfels stay, with opacity 0.
+    """
+    axes = np.array([to_camera @ rotation_matrix(q) for q in raw["rotation"]]).reshape(-1, 3, 3)
+    sigma = np.exp(raw["scale"])
+    opacity = 1 / (1 + np.exp(-raw["opacity"][:, 0]))
+    facing = np.abs(np.sum(centres * axes[:, :, 2], axis=1))
+    culled = centres[:, 2] <= camera.near
+    culled |= facing <= c.EDGE_ON_COSINE * np.linalg.norm(centres, axis=1)
+    culled |= opacity < c.ALPHA_MIN
+    focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    return {
+        "p": centres,
+        "u": axes[:, :, 0] / sigma[:, :1],
+        "v": axes[:, :, 1] / sigma[:, 1:],
+        "n": axes[:, :, 2],
+        "centre": focal * centres[:, :2] / np.where(culled, 1, centres[:, 2])[:, None] + middle,
+        "opacity": np.where(culled, 0, opacity),
+    }
+
+
+def _order(surfels: dict[str, np.ndarray], camera: PinholeCamera) -> np.ndarray:
+    """Surfel indices (N, H, W), front to back by the depth near the centre of each pixel's tile.
+
+    With the ray (x, y, 1) through that centre, 1/z of a surfel's plane is (ray·n) / (p·n). The point on the
+    plane is brought to within SORT_REACH σ of p along 1/z, which is linear across the screen.
+    """
+    p, n = surfels["p"], surfels["n"]
+    shown = surfels["opacity"] > 0
+    k = 1 / np.where(shown, p[:, 2], 1)
+    pn = np.where(shown, np.sum(p * n, axis=1), 1)
+    order = np.zeros((len(p), camera.height, camera.width), int)
+    for top in range(0, camera.height, c.TILE):
+        for left in range(0, camera.width, c.TILE):
+            x, y = left + c.TILE / 2, top + c.TILE / 2
+            ray = np.array([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1])
+            beside = ray - k[:, None] * p  # in the plane z = 1, from the projected centre
+            across = beside - (np.sum(beside * n, axis=1) / pn)[:, None] * p
+            distance = np.hypot(np.sum(across * surfels["u"], axis=1), np.sum(across * surfels["v"], axis=1))
+            share = np.minimum(1, c.SORT_REACH * k / np.maximum(distance, 1e-10))
+            inverse = np.maximum(k + share * (n @ ray / pn - k), k / c.SORT_DEPTH_RANGE)
+            ranked = np.argsort(1 / inverse, kind="stable")
+            order[:, top : top + c.TILE, left : left + c.TILE] = ranked[:, None, None]
+    return order

@@ -24,7 +24,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN, EDGE_ON_COSINE, LOW_PASS_INV_VARIANCE
+from mi_refgs.constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    EDGE_ON_COSINE,
+    LOW_PASS_INV_VARIANCE,
+    NORM_FLOOR,
+    SORT_DEPTH_RANGE,
+    SORT_REACH,
+)
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 
@@ -36,7 +44,6 @@ class Footprints:
     """N footprints: differentiable columns, and the detached pixel rectangles outside which they vanish."""
 
     columns: list[Any]  # GEOMETRY_COLUMNS × mi.Float (N,), in the order of the comment above
-    depth: Any  # mi.Float (N,), detached: camera z of the centre, the sort key
     first: tuple[Any, Any]  # mi.Int32 (N,): first covered pixel column and row
     last: tuple[Any, Any]  # mi.Int32 (N,): last covered column and row, below `first` if there is none
 
@@ -88,7 +95,7 @@ def project(surfels: Surfels, camera: Camera, shift: Any = None) -> Footprints:
             end = dr.floor(dr.clip(centre[axis] + high[axis], -1, size + 1) - 0.5)
             first.append(dr.select(visible, mi.Int32(dr.maximum(begin, 0)), 1))
             last.append(dr.select(visible, mi.Int32(dr.minimum(end, size - 1)), 0))
-        return Footprints(columns, dr.detach(z), (first[0], first[1]), (last[0], last[1]))
+        return Footprints(columns, (first[0], first[1]), (last[0], last[1]))
 
 
 def _extent(t_u: Any, t_v: Any, s: Any, slope: Any, z: Any, opacity: Any, focal: Any) -> tuple[Any, Any]:
@@ -114,6 +121,24 @@ def _extent(t_u: Any, t_v: Any, s: Any, slope: Any, z: Any, opacity: Any, focal:
         low.append(dr.select(bounded, dr.minimum(middle - half, -low_pass), -dr.inf))
         high.append(dr.select(bounded, dr.maximum(middle + half, low_pass), dr.inf))
     return mi.Vector2f(*low), mi.Vector2f(*high)
+
+
+def depth_near(footprints: Footprints, surfel: Any, pixel: Any) -> Any:
+    """Depth at which surfels (mi.UInt32, M) lie for a tile with the given centre (mi.Point2f, M); the sort key.
+
+    It is that of the surfel's plane, no further than SORT_REACH standard deviations along the way from its centre
+    (in the affine approximation), because beyond the plane says nothing about the surfel. Neighbours
+    on a curved surface tilt away from each other, so the nearest plane is that of the surfel one looks at;
+    sorted by their centres, those on the camera's side of it would always come first. [cf. StopThePop, Radl et
+    al. 2024, §4: depth at the tile]
+    """
+    columns = [dr.gather(mi.Float, dr.detach(column), surfel) for column in footprints.columns[:9]]
+    a_x, a_y, b_x, b_y, c_x, c_y, k, x, y = columns
+    delta = mi.Vector2f(pixel.x - x, pixel.y - y)
+    u, v = a_x * delta.x + a_y * delta.y, b_x * delta.x + b_y * delta.y  # times k
+    inside = dr.minimum(1, SORT_REACH * k * dr.rsqrt(dr.maximum(u * u + v * v, NORM_FLOOR)))
+    inverse_depth = k + inside * (c_x * delta.x + c_y * delta.y)
+    return dr.rcp(dr.maximum(inverse_depth, k / SORT_DEPTH_RANGE))
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ import mitsuba as mi
 
 from mi_refgs.constants import TILE
 from mi_refgs.splat.camera import Camera
-from mi_refgs.splat.footprint import Footprints
+from mi_refgs.splat.footprint import Footprints, depth_near
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """M surfel-tile pairs, sorted by tile, then by the depth of the surfel's centre; no derivative."""
+    """M surfel-tile pairs, sorted by tile, then by the surfel's depth there; no derivative."""
 
     surfel_from_pair: Any  # mi.UInt32 (M,)
     pair_begin: Any  # mi.UInt32 (tiles,): first pair of a tile
@@ -41,27 +41,26 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     covers = (footprints.last[0] >= footprints.first[0]) & (footprints.last[1] >= footprints.first[1])
     span_x = mi.UInt32(last_x - first_x + 1)
     count = dr.select(covers, span_x * mi.UInt32(last_y - first_y + 1), 0)
-    dr.eval(footprints.depth, count, span_x, first_x, first_y)
+    dr.eval(count, span_x, first_x, first_y)
 
-    surfel_from_rank = dr.argsort(footprints.depth)
-    count_from_rank = dr.gather(mi.UInt32, count, surfel_from_rank)
-    rank_from_pair = dr.repeat(dr.arange(mi.UInt32, dr.width(count)), count_from_rank)
-    if dr.width(rank_from_pair) == 0:
+    surfel = dr.repeat(dr.arange(mi.UInt32, dr.width(count)), count)
+    if dr.width(surfel) == 0:
         empty = dr.zeros(mi.UInt32, tiles)
         return TileLists(mi.UInt32(), empty, empty, tiles_x, tiles_y)
 
-    pair_from_rank = dr.prefix_reduce(dr.ReduceOp.Add, count_from_rank, exclusive=True)
-    surfel = dr.gather(mi.UInt32, surfel_from_rank, rank_from_pair)
-    place = dr.arange(mi.UInt32, dr.width(surfel)) - dr.gather(mi.UInt32, pair_from_rank, rank_from_pair)
+    first_pair = dr.prefix_reduce(dr.ReduceOp.Add, count, exclusive=True)
+    place = dr.arange(mi.UInt32, dr.width(surfel)) - dr.gather(mi.UInt32, first_pair, surfel)
     # The masked lanes that fill up the last packet divide too: dividing an integer by 0 kills the process.
     span = dr.maximum(dr.gather(mi.UInt32, span_x, surfel), 1)
     row = place // span
     tile_x = mi.UInt32(dr.gather(mi.Int32, first_x, surfel)) + place - row * span
     tile_y = mi.UInt32(dr.gather(mi.Int32, first_y, surfel)) + row
     tile = tile_y * tiles_x + tile_x
-    dr.eval(tile, surfel)
+    depth = depth_near(footprints, surfel, TILE * (mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) + 0.5))
+    dr.eval(tile, surfel, depth)
 
-    order = dr.argsort(tile)
+    pair_from_rank = dr.argsort(depth)
+    order = dr.gather(mi.UInt32, pair_from_rank, dr.argsort(dr.gather(mi.UInt32, tile, pair_from_rank)))
     histogram = dr.zeros(mi.UInt32, tiles)
     dr.scatter_add(histogram, mi.UInt32(1), tile)
     pair_end = dr.prefix_reduce(dr.ReduceOp.Add, histogram, exclusive=False)
