@@ -98,8 +98,9 @@ def _lanes(op: _Blend) -> tuple[Any, Any, Any, Any, Any]:
     lists, camera = op.lists, op.camera
     lane = dr.arange(mi.UInt32, lists.tiles_x * lists.tiles_y * TILE * TILE)
     tile, local = lane // (TILE * TILE), lane % (TILE * TILE)
-    x = (tile % lists.tiles_x) * TILE + local % TILE
-    y = (tile // lists.tiles_x) * TILE + local // TILE
+    # Pixels before the image wrap round to huge numbers, and are not inside either.
+    x = (tile % lists.tiles_x) * TILE + local % TILE - camera.phase[0]
+    y = (tile // lists.tiles_x) * TILE + local // TILE - camera.phase[1]
     inside = (x < camera.width) & (y < camera.height)
     begin = dr.gather(mi.UInt32, lists.pair_begin, tile)
     end = dr.gather(mi.UInt32, lists.pair_end, tile)

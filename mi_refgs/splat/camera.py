@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.constants import RIGID_TOLERANCE
+from mi_refgs.constants import RIGID_TOLERANCE, TILE
 from mi_refgs.errors import InputError
 
 
@@ -31,6 +31,7 @@ class Camera:
     rotation: mi.Matrix3f  # camera from world
     origin: mi.Point3f  # world
     near: mi.Float  # scene units along the camera's z axis
+    phase: tuple[int, int] = (0, 0)  # pixels, below TILE: a crop window keeps the tiles of the whole film
 
     @staticmethod
     def look(
@@ -95,7 +96,7 @@ class Camera:
         slope = local[:, :2] / local[:, 2:]
         fx = width / (slope[1, 0] - slope[0, 0])
         fy = height / (slope[2, 1] - slope[0, 1])
-        return Camera.look(
+        camera = Camera.look(
             width,
             height,
             fx,
@@ -105,6 +106,8 @@ class Camera:
             matrix,
             near=float(params["near_clip"]),
         )
+        x, y = (int(offset) % TILE for offset in sensor.film().crop_offset())
+        return replace(camera, phase=(x, y))
 
     def to_camera(self, point: Any) -> Any:
         """World point to camera frame."""
@@ -133,4 +136,5 @@ class Camera:
             fy=self.fy * factor,
             cx=self.cx * factor,
             cy=self.cy * factor,
+            phase=(self.phase[0] * factor % TILE, self.phase[1] * factor % TILE),
         )

@@ -34,10 +34,11 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
 
     Both sorts are stable, so surfels of equal depth keep the order of the table.
     """
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    phase_x, phase_y = camera.phase
+    tiles_x, tiles_y = -(-(camera.width + phase_x) // TILE), -(-(camera.height + phase_y) // TILE)
     tiles = tiles_x * tiles_y
-    first_x, first_y = (x // TILE for x in footprints.first)
-    last_x, last_y = (x // TILE for x in footprints.last)
+    first_x, first_y = ((x + start) // TILE for x, start in zip(footprints.first, camera.phase, strict=True))
+    last_x, last_y = ((x + start) // TILE for x, start in zip(footprints.last, camera.phase, strict=True))
     covers = (footprints.last[0] >= footprints.first[0]) & (footprints.last[1] >= footprints.first[1])
     span_x = mi.UInt32(last_x - first_x + 1)
     count = dr.select(covers, span_x * mi.UInt32(last_y - first_y + 1), 0)
@@ -56,7 +57,8 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     tile_x = mi.UInt32(dr.gather(mi.Int32, first_x, surfel)) + place - row * span
     tile_y = mi.UInt32(dr.gather(mi.Int32, first_y, surfel)) + row
     tile = tile_y * tiles_x + tile_x
-    depth = depth_near(footprints, surfel, TILE * (mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) + 0.5))
+    centre = TILE * (mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) + 0.5) - mi.Vector2f(phase_x, phase_y)
+    depth = depth_near(footprints, surfel, centre)
     dr.eval(tile, surfel, depth)
 
     pair_from_rank = dr.argsort(depth)
