@@ -308,7 +308,7 @@ def test_order_of_the_table_is_irrelevant_and_culled_surfels_change_nothing() ->
 
 
 def test_crossing_surfels_each_hide_the_other_on_their_own_side() -> None:
-    """Two opaque, tilted discs that cross: a tile shows the nearer plane, not the one with the nearer centre."""
+    """Two opaque, tilted discs that cross: a tile shows the nearer plane, not the nearer centre."""
     tilt = np.radians(50)
     raw = {
         "position": np.array([[0, 0, 0], [0, 0, 0.01]]),

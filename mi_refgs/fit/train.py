@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from itertools import tee
 from typing import Any
 
 import drjit as dr
@@ -26,10 +27,10 @@ from mi_refgs.fit.schedule import LIGHT, Schedule
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.pipeline import Frame, Shading, render
+from mi_refgs.render.pipeline import Frame, Shading, render, render_depth
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.table import GEOMETRY, Surfels
+from mi_refgs.surfels.table import Surfels
 
 
 class Trainer:
@@ -148,18 +149,13 @@ class Trainer:
     def extract_mesh(self) -> Mesh:
         """Fuse the rendered depth of all training views into a mesh and make it the occluder."""
         surfels = self.surfels.detach()
-        bounds = bounds_from_points(surfels.to_numpy()["position"])
-        plain = Shading(at="surfel", reflectance="radiance")
-        black = mi.TensorXf(np.zeros((surfels.count, 3), np.float32))
-        depth_only = Surfels({name: surfels.raw[name] for name in GEOMETRY} | {"radiance_sh": black})
-        frames = (render(depth_only, target.camera, plain) for target in self.targets)
-        pairs = [(frame.depth, frame.alpha) for frame in frames]
+        views = tee(render_depth(surfels, target.camera) for target in self.targets)
         assert self.method.mesh is not None
         volume = fuse(
-            [depth for depth, _ in pairs],
-            [alpha for _, alpha in pairs],
-            [target.camera for target in self.targets],
-            bounds,
+            (depth for depth, _ in views[0]),
+            (alpha for _, alpha in views[1]),
+            (target.camera for target in self.targets),
+            bounds_from_points(surfels.to_numpy()["position"]),
             self.method.mesh.resolution,
         )
         mesh = extract_mesh(volume)

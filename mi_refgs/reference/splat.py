@@ -72,7 +72,9 @@ def splat(
             offset = t[..., None] * ray - p
             rho_plane = np.sum(offset * s["u"], -1) ** 2 + np.sum(offset * s["v"], -1) ** 2
         rho_plane = np.where(t > 0, rho_plane, np.inf)
-        rho_screen = c.LOW_PASS_INV_VARIANCE * ((x - s["centre"][..., 0]) ** 2 + (y - s["centre"][..., 1]) ** 2)
+        rho_screen = c.LOW_PASS_INV_VARIANCE * (
+            (x - s["centre"][..., 0]) ** 2 + (y - s["centre"][..., 1]) ** 2
+        )
         z = np.where(rho_screen < rho_plane, p[..., 2], t)
         a = np.minimum(c.ALPHA_MAX, s["opacity"] * np.exp(-0.5 * np.minimum(rho_plane, rho_screen)))
 

@@ -74,6 +74,12 @@ def render(
     return _shade_at_pixels(surfels, camera, shading, light, occluder, sh_degree, shift)
 
 
+def render_depth(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
+    """Expected camera-z depth (0 where nothing is seen) and alpha of a view, and nothing else."""
+    blended = splat(surfels, [], camera)
+    return blended.depth * _inverse_alpha(blended), blended.alpha
+
+
 # ---------------- attributes of surfels ----------------
 
 

@@ -124,13 +124,13 @@ def _extent(t_u: Any, t_v: Any, s: Any, slope: Any, z: Any, opacity: Any, focal:
 
 
 def depth_near(footprints: Footprints, surfel: Any, pixel: Any) -> Any:
-    """Depth at which surfels (mi.UInt32, M) lie for a tile with the given centre (mi.Point2f, M); the sort key.
+    """Depth of surfels (mi.UInt32, M) in tiles with the given centres (mi.Point2f, M): the sort key; detached.
 
-    It is that of the surfel's plane, no further than SORT_REACH standard deviations along the way from its centre
-    (in the affine approximation), because beyond the plane says nothing about the surfel. Neighbours
-    on a curved surface tilt away from each other, so the nearest plane is that of the surfel one looks at;
-    sorted by their centres, those on the camera's side of it would always come first. [cf. StopThePop, Radl et
-    al. 2024, §4: depth at the tile]
+    It is that of the surfel's plane, no further than SORT_REACH standard deviations along the way from its
+    centre (in the affine approximation): beyond, the plane says nothing about the surfel. Where neighbours on
+    a curved surface tilt away from each other, the one that is looked at is the nearest; in the order of
+    their centres, those on the camera's side of it would always come first, and the picture would depend on
+    the view as no surface does. [cf. StopThePop, Radl et al. 2024, §4: depth at the tile]
     """
     columns = [dr.gather(mi.Float, dr.detach(column), surfel) for column in footprints.columns[:9]]
     a_x, a_y, b_x, b_y, c_x, c_y, k, x, y = columns
