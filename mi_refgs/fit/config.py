@@ -188,10 +188,10 @@ class Preset:
     max_surfels: int
 
 
-# About 3 and 15 minutes for 160² to 200² pictures on one AVX-512 core; the last follows from these.
+# About 4 and 11 minutes for 200² pictures on one AVX-512 core; the last follows from these.
 PRESETS = {
     "quick": Preset(2_000, 15_000, 20_000),
-    "standard": Preset(6_000, 20_000, 30_000),
+    "standard": Preset(4_000, 25_000, 40_000),
     "paper": Preset(50_000, 30_000, 100_000),
 }
 

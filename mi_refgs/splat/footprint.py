@@ -124,7 +124,7 @@ def _extent(t_u: Any, t_v: Any, s: Any, slope: Any, z: Any, opacity: Any, focal:
 
 
 def depth_near(footprints: Footprints, surfel: Any, pixel: Any) -> Any:
-    """Depth of surfels (mi.UInt32, M) in tiles with the given centres (mi.Point2f, M): the sort key; detached.
+    """Depth of surfels (mi.UInt32, M) in tiles with given centres (mi.Point2f, M): the sort key; detached.
 
     It is that of the surfel's plane, no further than SORT_REACH standard deviations along the way from its
     centre (in the affine approximation): beyond, the plane says nothing about the surfel. Where neighbours on
