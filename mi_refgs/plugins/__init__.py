@@ -28,7 +28,10 @@ import mitsuba as mi
 
 from mi_refgs.errors import InputError
 
-PLUGINS = {"refgs": ("register_integrator", "mi_refgs.plugins.integrator")}
+PLUGINS = {
+    "refgs": ("register_integrator", "mi_refgs.plugins.integrator"),
+    "refgs_bsdf": ("register_bsdf", "mi_refgs.plugins.bsdf"),
+}
 """For each plugin name, the Mitsuba function that registers it and the module that defines it."""
 
 

@@ -152,16 +152,104 @@ def shade(
     visibility: float | None,
     indirect: np.ndarray | None,
     diffuse: str,
+    dominant: bool = False,
+    multiscatter: bool = False,
 ) -> np.ndarray:
     """Terms (3, 3) of one point: diffuse, specular, indirect."""
     n, v = normal / np.linalg.norm(normal), view / np.linalg.norm(view)
     a, b = table_lookup(table, float(n @ v), roughness)
-    reflectance = (0.04 * (1 - metallic) + albedo * metallic) * a + b
-    light = specular(levels, roughnesses, 2 * (n @ v) * n - v, roughness)
+    f0 = 0.04 * (1 - metallic) + albedo * metallic
+    reflectance = f0 * a + b
+    direction = 2 * (n @ v) * n - v
+    if dominant:
+        direction = dominant_direction(n, direction, roughness)
+    reflected = specular(levels, roughnesses, direction, roughness) * reflectance
+    if multiscatter:
+        further = multiple_scattering(f0, a, b)
+        reflected = reflected + further * bilinear(levels[-1], n)
+        reflectance = reflectance + further
     visible = 1.0 if visibility is None else visibility
     out = np.zeros((3, 3))
     out[0] = (1 - metallic) * (radiance if diffuse == "sh" else albedo * bilinear(levels[-1], n))
-    out[1] = visible * light * reflectance
+    out[1] = visible * reflected
     if visibility is not None and indirect is not None:
         out[2] = (1 - visible) * indirect * reflectance
     return out
+
+
+def dominant_direction(normal: np.ndarray, mirror: np.ndarray, roughness: float) -> np.ndarray:
+    """Normalised lerp from normal to mirror by (1 - α)(√(1 - α) + α), α = roughness². [Lagarde and
+    de Rousiers 2014, §4.9.3]"""
+    α = roughness**2
+    mixed = normal + (1 - α) * (math.sqrt(1 - α) + α) * (mirror - normal)
+    return mixed / np.linalg.norm(mixed)
+
+
+def multiple_scattering(f0: np.ndarray, a: float, b: float, bounces: int = 400) -> np.ndarray:
+    """Σ_{n ≥ 1} (F0 a + b) (F (1 - a - b))ⁿ with Schlick's mean F, bounce by bounce. [Fdez-Agüera 2019]"""
+    fresnel = f0 + (1 - f0) / 21
+    return (f0 * a + b) * sum((fresnel * (1 - a - b)) ** n for n in range(1, bounces))
+
+
+def brdf_cosine(
+    albedo: np.ndarray,
+    metallic: float,
+    roughness: float,
+    normal: np.ndarray,
+    view: np.ndarray,
+    lights: np.ndarray,
+) -> np.ndarray:
+    """BRDF times n·l, (n, 3), for unit directions `lights` (n, 3): GGX α = roughness², correlated Smith,
+    Schlick, and (1 - metallic) albedo / π; zero below the horizon."""
+    α2 = roughness**4
+    n_l, n_v = lights @ normal, float(normal @ view)
+    lit = (n_l > 0) & (n_v > 0)
+    half = np.where(lit[:, None], lights + view, normal)
+    half = half / np.linalg.norm(half, axis=1, keepdims=True)
+    n_h, v_h = half @ normal, half @ view
+    d = α2 / (math.pi * (n_h**2 * (α2 - 1) + 1) ** 2)
+
+    def lam(c: np.ndarray) -> np.ndarray:
+        return (np.sqrt(1 + α2 * (1 / c**2 - 1)) - 1) / 2
+
+    safe = np.where(lit, n_l, 1)
+    g = 1 / (1 + lam(safe) + lam(np.array(n_v if n_v > 0 else 1)))
+    f0 = 0.04 * (1 - metallic) + albedo * metallic
+    fresnel = f0 + (1 - f0) * (1 - v_h[:, None]) ** 5
+    specular = fresnel * (d * g / (4 * safe * (n_v if n_v > 0 else 1)))[:, None]
+    return np.where(lit, n_l, 0)[:, None] * (specular + (1 - metallic) * albedo / math.pi)
+
+
+def reflected_radiance(
+    radiance: np.ndarray,
+    albedo: np.ndarray,
+    metallic: float,
+    roughness: float,
+    normal: np.ndarray,
+    view: np.ndarray,
+    *,
+    nodes: int = 400,
+) -> np.ndarray:
+    """∫ L f cosθ dω of a lat-long map under `brdf_cosine`, (3,), by midpoints: over half vectors drawn from
+    D cosθ for the specular term, with more nodes in the tail, and over cos²θ for the diffuse one."""
+    helper = np.eye(3)[np.argmin(np.abs(normal))]
+    side = np.cross(normal, helper) / np.linalg.norm(np.cross(normal, helper))
+    s, turn = (x.ravel() for x in np.meshgrid(*[(np.arange(nodes) + 0.5) / nodes] * 2))
+    φ = (2 * math.pi * turn)[:, None]
+    around = np.cos(φ) * side + np.sin(φ) * np.cross(normal, side)
+
+    def at(cosine: np.ndarray) -> np.ndarray:
+        return cosine[:, None] * normal + np.sqrt(1 - cosine**2)[:, None] * around
+
+    lights = at(np.sqrt(s))
+    diffuse = (1 - metallic) * albedo * bilinear_many(radiance, lights).mean(0)
+    α2 = roughness**4
+    n_h = s / np.sqrt(s**2 + α2 * (1 - s**2))  # 1 - s² is uniform
+    half = at(n_h)
+    v_h = half @ view
+    lights = 2 * v_h[:, None] * half - view
+    density = α2 / (math.pi * (n_h**2 * (α2 - 1) + 1) ** 2) * n_h  # of half vectors; dω_l = 4 v·h dω_h
+    specular = brdf_cosine(albedo, metallic, roughness, normal, view, lights)
+    specular -= np.maximum(lights @ normal, 0)[:, None] * (1 - metallic) * albedo / math.pi
+    weight = (2 * s * np.where(v_h > 0, 4 * v_h, 0) / density)[:, None]
+    return diffuse + (specular * weight * bilinear_many(radiance, lights)).mean(0)

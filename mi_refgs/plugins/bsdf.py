@@ -1,0 +1,266 @@
+"""The `refgs_bsdf` BSDF: the reflectance model that `mi_refgs.shade` approximates, for path tracers.
+
+Imported or reloaded for each variant: see `mi_refgs.plugins`.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.errors import InputError
+from mi_refgs.plugins import require_supported_variant
+from mi_refgs.shade.models import DIELECTRIC_F0
+
+ROUGHNESS_FLOOR = 0.01
+"""Smaller roughness counts as this one: α = 1e-4 is the smallest that Mitsuba's microfacet distribution
+samples. The split-sum table has no floor; what a surface reflects changes by less than 3e-5 below this one.
+[measured against quadrature, N·V ≥ 0.02]"""
+
+SPECULAR, DIFFUSE = 0, 1
+"""Indices of the components."""
+
+FLAGS = (
+    mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide,
+    mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide,
+)
+
+
+@dataclass(frozen=True)
+class Material:
+    """The parameters at surface points, all of one width."""
+
+    f0: Any  # mi.Color3f, reflectance at normal incidence
+    diffuse: Any  # mi.Color3f
+    α: Any  # mi.Float
+
+    def distribution(self) -> Any:
+        """GGX; Mitsuba's own shadowing, which is separable, is not used."""
+        return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self.α, True)
+
+    def slope(self, cosine: Any) -> Any:
+        """cosθ (1 + 2 Λ(θ)) of Smith's Λ, finite at cosθ = 0."""
+        return dr.sqrt(dr.lerp(dr.square(self.α), 1, dr.square(cosine)))
+
+
+class RefGSBSDF(mi.BSDF):
+    r"""
+    .. _bsdf-refgs_bsdf:
+
+    Reflectance of the reflective Gaussian surfels (:monosp:`refgs_bsdf`)
+    ---------------------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - albedo
+       - |spectrum| or |texture|
+       - Diffuse reflectance, or that of a metal at normal incidence; 0 to 1. (Default: 0.5)
+       - |exposed|, |differentiable|
+
+     * - metallic
+       - |float| or |texture|
+       - From 0, a dielectric that reflects 0.04 at normal incidence, to 1, a metal without diffuse
+         reflection. (Default: 0)
+       - |exposed|, |differentiable|
+
+     * - roughness
+       - |float| or |texture|
+       - In (0, 1]; GGX's α is its square. Below 0.01 it counts as 0.01, above 1 as 1. (Default: 0.5)
+       - |exposed|, |differentiable|
+
+    The integral of this BRDF and of the light is what the shading of the `refgs` integrator
+    (``reflectance = split_sum``, ``diffuse = irradiance``) approximates:
+
+    .. math::
+
+        f = (1 - m) \frac{a}{\pi} + \frac{D\,G\,F}{4 (n \cdot v) (n \cdot l)}, \quad
+        F = F_0 + (1 - F_0) (1 - v \cdot h)^5, \quad F_0 = 0.04 (1 - m) + a\,m
+
+    with GGX's D, and the height-correlated G of Smith [Heitz 2014, "Understanding the Masking-Shadowing
+    Function", eqs. 72, 99]. Metals never reflect more than they receive, but lose light between the
+    microfacets when rough. As the diffuse term is not reduced by what the specular one reflects, a dielectric
+    seen at grazing angles can reflect up to 1 + albedo; averaged over the angles (with the cosine) it stays
+    below albedo + 0.09.
+
+    It reflects on the side of the normal only, which is all that closed meshes need: nest it in a `twosided`
+    for open ones. Component 0 is the specular reflection, 1 the diffuse one. Maps of metallic and roughness
+    should be loaded with ``raw = true``, as numbers and not as sRGB.
+
+    Samples are drawn from the visible normals [Heitz 2018] or from the cosine, chosen in proportion to
+    Schlick's reflectance at (n · v) and to the diffuse albedo. `eval`, and the weight that `sample` returns,
+    carry derivatives with respect to the parameters and the directions; samples and densities carry none.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <bsdf type="refgs_bsdf">
+                <rgb name="albedo" value="0.9, 0.6, 0.3"/>
+                <float name="metallic" value="1"/>
+                <texture type="bitmap" name="roughness">
+                    <string name="filename" value="roughness.exr"/>
+                    <boolean name="raw" value="true"/>
+                </texture>
+            </bsdf>
+
+        .. code-tab:: python
+
+            'type': 'refgs_bsdf',
+            'albedo': {'type': 'rgb', 'value': [0.9, 0.6, 0.3]},
+            'metallic': 1.0,
+            'roughness': {'type': 'bitmap', 'filename': 'roughness.exr', 'raw': True},
+    """
+
+    def __init__(self, props: Any) -> None:
+        require_supported_variant("refgs_bsdf")
+        super().__init__(props)
+        self.textures = {
+            "albedo": _texture(props, "albedo", 0.5),
+            "metallic": _texture(props, "metallic", 0.0),
+            "roughness": _texture(props, "roughness", 0.5),
+        }
+        self.m_components = list(FLAGS)
+        self.m_flags = FLAGS[SPECULAR] | FLAGS[DIFFUSE]
+
+    def traverse(self, cb: Any) -> None:
+        for name, texture in self.textures.items():
+            cb.put(name, texture, mi.ParamFlags.Differentiable)
+
+    # ---------------- the BSDF interface ----------------
+
+    def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+        """A direction with its density, and f cosθ / density; see mi.BSDF."""
+        wi, active = _front(si.wi, active)
+        material = self._material(si, active)
+        with dr.suspend_grad():
+            choice = _specular_probability(ctx, material, wi.z)
+            specular = sample1 < choice
+            normal, _ = material.distribution().sample(wi, sample2)
+            cosine = mi.warp.square_to_cosine_hemisphere(sample2)
+            wo, above = _front(dr.select(specular, mi.reflect(wi, normal), cosine), active)
+            sampled = dr.zeros(mi.BSDFSample3f, dr.width(wo))
+            sampled.wo = wo
+            sampled.pdf = dr.select(above, _density(ctx, material, wi, wo), 0)
+            sampled.eta = 1
+            sampled.sampled_component = dr.select(specular, mi.UInt32(SPECULAR), mi.UInt32(DIFFUSE))
+            sampled.sampled_type = dr.select(
+                specular,
+                mi.UInt32(mi.BSDFFlags.GlossyReflection),
+                mi.UInt32(mi.BSDFFlags.DiffuseReflection),
+            )
+            valid = above & (sampled.pdf > 0)
+            inverse = dr.rcp(dr.select(valid, sampled.pdf, 1))
+        return sampled, dr.select(valid, _value(ctx, material, wi, wo) * inverse, 0)
+
+    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        """f cosθ; see mi.BSDF."""
+        wi, active = _front(si.wi, active)
+        wo, active = _front(wo, active)
+        return dr.select(active, _value(ctx, self._material(si, active), wi, wo), 0)
+
+    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        """Density of `sample` per solid angle, without derivatives; see mi.BSDF."""
+        with dr.suspend_grad():
+            wi, active = _front(si.wi, active)
+            wo, active = _front(wo, active)
+            return dr.select(active, _density(ctx, self._material(si, active), wi, wo), 0)
+
+    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+        """Both; see mi.BSDF."""
+        wi, active = _front(si.wi, active)
+        wo, active = _front(wo, active)
+        material = self._material(si, active)
+        value = dr.select(active, _value(ctx, material, wi, wo), 0)
+        with dr.suspend_grad():
+            return value, dr.select(active, _density(ctx, material, wi, wo), 0)
+
+    def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
+        """(1 - metallic) albedo; see mi.BSDF."""
+        return self._material(si, active).diffuse
+
+    def _material(self, si: Any, active: Any) -> Material:
+        albedo = mi.Color3f(self.textures["albedo"].eval(si, active))
+        metallic = self.textures["metallic"].eval_1(si, active)
+        roughness = dr.clip(self.textures["roughness"].eval_1(si, active), ROUGHNESS_FLOOR, 1)
+        f0 = dr.fma(albedo - DIELECTRIC_F0, metallic, DIELECTRIC_F0)
+        return Material(f0, (1 - metallic) * albedo, dr.square(roughness))
+
+    def to_string(self) -> str:
+        lines = ",\n".join(f"{name} = {texture}" for name, texture in self.textures.items())
+        return f"RefGSBSDF[\n{textwrap.indent(lines, '  ')}\n]"
+
+
+def _texture(props: Any, name: str, default: float) -> Any:
+    """A texture property, or the texture of a constant one.
+
+    Raises InputError for a constant out of range, and for a colour where a number is needed.
+    """
+    value = props.get(name, default)
+    colour = isinstance(value, mi.ScalarColor3d)
+    if colour and name != "albedo":
+        raise InputError(f"refgs_bsdf: {name}: {value} is a colour; give a number or a texture")
+    numbers = value if colour else [value] if isinstance(value, int | float) else []
+    positive = name == "roughness"
+    if not all(0 <= x <= 1 and (x > 0 or not positive) for x in numbers):
+        bounds = "(0, 1]" if positive else "[0, 1]"
+        raise InputError(f"refgs_bsdf: {name}: {value} is outside {bounds}; give a value inside")
+    return props.get_texture(name, default)
+
+
+def _front(direction: Any, active: Any) -> tuple[Any, Any]:
+    """The directions on the side of the normal, the normal itself in place of others; and which they are."""
+    active = mi.Bool(active) & (direction.z > 0)
+    return dr.select(active, direction, mi.Vector3f(0, 0, 1)), active
+
+
+def _schlick(f0: Any, cosine: Any) -> Any:
+    grazing = dr.maximum(1 - cosine, 0)
+    return dr.fma(1 - f0, dr.square(dr.square(grazing)) * grazing, f0)
+
+
+def _enabled(ctx: Any) -> tuple[bool, bool]:
+    """Whether the context asks for the specular and for the diffuse component."""
+    return (
+        ctx.is_enabled(mi.BSDFFlags.GlossyReflection, SPECULAR),
+        ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, DIFFUSE),
+    )
+
+
+def _value(ctx: Any, material: Material, wi: Any, wo: Any) -> Any:
+    """f cosθ of directions above the surface."""
+    specular, diffuse = _enabled(ctx)
+    value: Any = mi.Color3f(0)
+    if specular:
+        h = dr.normalize(wi + wo)
+        # G / (4 cosθi cosθo) = ½ / (cosθo slope(cosθi) + cosθi slope(cosθo))
+        shadowing = 0.5 * wo.z / (wo.z * material.slope(wi.z) + wi.z * material.slope(wo.z))
+        value += _schlick(material.f0, dr.dot(wi, h)) * (material.distribution().eval(h) * shadowing)
+    if diffuse:
+        value += material.diffuse * (wo.z * (1 / math.pi))
+    return value
+
+
+def _density(ctx: Any, material: Material, wi: Any, wo: Any) -> Any:
+    """Density of `sample` for directions above the surface."""
+    choice = _specular_probability(ctx, material, wi.z)
+    # D G1 (v·h) / cosθi, over dω_o / dω_h = 4 (v·h); G1 = 2 cosθi / (cosθi + slope(cosθi))
+    visible = material.distribution().eval(dr.normalize(wi + wo)) * 0.5 / (wi.z + material.slope(wi.z))
+    return dr.lerp(wo.z * (1 / math.pi), visible, choice) if any(_enabled(ctx)) else mi.Float(0)
+
+
+def _specular_probability(ctx: Any, material: Material, cosine: Any) -> Any:
+    """Share of the samples that the specular component gets: 0 or 1 if the context asks for one only."""
+    specular, diffuse = _enabled(ctx)
+    if not (specular and diffuse):
+        return mi.Float(specular)
+    reflected = dr.maximum(dr.mean(_schlick(material.f0, cosine)), 0)
+    scattered = dr.maximum(dr.mean(material.diffuse), 0)
+    total = reflected + scattered
+    return dr.select(total > 0, reflected / dr.select(total > 0, total, 1), 1)
+
+
+mi.register_bsdf("refgs_bsdf", RefGSBSDF)
