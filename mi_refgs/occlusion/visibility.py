@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.errors import InputError
+from mi_refgs.occlusion.attributes import Neighbourhood, Surface
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.mesh_compat import make_mesh, update_mesh
+from mi_refgs.surfels.table import Surfels
 
 OFFSET_VOXELS = 2.0
 """Voxels by which a ray's origin leaves the surface along the normal. What it must cover: the mesh's own
@@ -17,6 +21,16 @@ points 1 voxel too deep and normals off by 6°: a quarter of all rays is falsely
 1.5 and at 2, and what a larger offset loses, contacts, is as small (0.6 % of the rays at 2 voxels where
 points float 0.5 voxel above the surface). Along the ray instead, a grazing ray gains no height: 2 voxels,
 points half a voxel too deep, leave 94 % of them occluded."""
+
+
+@dataclass(frozen=True)
+class Hit:
+    """Where rays meet the mesh first, detached."""
+
+    valid: Any  # mi.Bool: something is hit
+    point: Any  # mi.Point3f, world
+    triangle: Any  # mi.UInt32
+    place: Any  # mi.Point2f on it: barycentric coordinates of its second and third corner
 
 
 class Occluder:
@@ -34,6 +48,7 @@ class Occluder:
         self._scene: Any = None
         self._params: Any = None
         self._variant: str | None = None
+        self._around: Neighbourhood | None = None
         if mesh is not None:
             self.update(mesh)
 
@@ -43,7 +58,7 @@ class Occluder:
 
     def update(self, mesh: Mesh) -> None:
         """Replace the mesh. Vertex and face counts may change, to zero too; compiled kernels stay valid."""
-        self._mesh = mesh
+        self._mesh, self._around = mesh, None
         if not len(mesh.faces):
             return
         if self._scene is None or self._variant != mi.variant():
@@ -54,42 +69,84 @@ class Occluder:
         else:
             update_mesh(self._params, f"{self.NAME}.", mesh.vertices, mesh.faces)
 
-    def visible(self, origin: Any, direction: Any, normal: Any = None) -> Any:
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing that a ray could hit."""
+        return self._mesh is None or not len(self._mesh.faces)
+
+    def set_materials(self, surfels: Surfels) -> None:
+        """Give every vertex the surfels around it, whose materials `surface` then reads, under AD.
+
+        To be called again after `update`, and whenever surfels move or their number changes; new values of
+        their materials need no call. Raises InputError without surfels or without their material channels.
+        """
+        self._around = None
+        if self._mesh is not None and not self.empty:
+            self._around = Neighbourhood.of(self._mesh, surfels)
+
+    def surface(self, surfels: Surfels) -> Surface:
+        """The mesh with the present materials of `surfels`, to look up where `closest` hits it.
+
+        Raises InputError without a `set_materials` for this mesh and this number of surfels.
+        """
+        if self._around is None:
+            raise InputError("occluder: materials: none are set; call Occluder.set_materials after update")
+        return self._around.surface(surfels)
+
+    def visible(self, origin: Any, direction: Any, normal: Any = None, active: Any = True) -> Any:
         """1 where the ray leaves the scene freely, 0 where the mesh stops it.
 
         `origin` (mi.Point3f) is in world space; `direction` and `normal` need not be unit. The origin first
         moves OFFSET_VOXELS off the surface along the normal; without one (or where it is zero) along the ray,
         which is right for steep rays only. There is no distance threshold. Rays without a finite direction,
-        and all rays while there is no mesh, are visible. Detached: visibility has no derivative."""
+        those that are not `active`, and all rays while there is no mesh, are visible. Detached: visibility
+        has no derivative."""
         width = max(dr.width(origin), dr.width(direction))
-        if self._mesh is None or not len(self._mesh.faces):
+        if self.empty:
             return dr.full(mi.Float, 1, width)
-        if self._variant != mi.variant():
-            raise RuntimeError(
-                f"Occluder was made under {self._variant}, not under {mi.variant()}: call update again"
-            )
         with dr.suspend_grad():
-            offset = OFFSET_VOXELS * dr.opaque(mi.Float, self._mesh.voxel)
-            d, active = _unit(mi.Vector3f(direction))
-            away = d
-            if normal is not None:
-                n, has_normal = _unit(mi.Vector3f(normal))
-                away = dr.select(has_normal, n, d)
-            o = mi.Vector3f(origin) + offset * away
-            active &= dr.all(dr.isfinite(o))
-            ray = mi.Ray3f(mi.Point3f(dr.select(active, o, 0)), d)
-            return dr.select(self._scene.ray_test(ray, active), mi.Float(0), mi.Float(1))
+            ray, valid = self._ray(origin, direction, normal)
+            return dr.select(self._scene.ray_test(ray, valid & active), mi.Float(0), mi.Float(1))
+
+    def closest(self, origin: Any, direction: Any, normal: Any, active: Any = True) -> Hit:
+        """What the rays of `visible` hit first; detached. The mesh must not be empty."""
+        with dr.suspend_grad():
+            ray, valid = self._ray(origin, direction, normal)
+            hit = self._scene.ray_intersect_preliminary(ray, coherent=False, active=valid & active)
+            stopped = hit.is_valid()
+            # Of a miss Embree leaves what was in its registers, NaN among it.
+            distance, triangle, place = (
+                dr.select(stopped, x, 0) for x in (hit.t, hit.prim_index, hit.prim_uv)
+            )
+            return Hit(stopped, ray(distance), triangle, place)
 
     def first_hit(self, origin: Any, direction: Any) -> tuple[Any, Any]:
         """Distance to the mesh in lengths of `direction` (0 without a hit), and if it is hit; detached."""
         width = max(dr.width(origin), dr.width(direction))
-        if self._mesh is None or not len(self._mesh.faces):
+        if self.empty:
             return dr.zeros(mi.Float, width), dr.zeros(mi.Bool, width)
         with dr.suspend_grad():
             ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
             hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
             valid = hit.is_valid()
             return dr.select(valid, hit.t, 0), valid
+
+    def _ray(self, origin: Any, direction: Any, normal: Any) -> tuple[Any, Any]:
+        """The ray that starts off the surface, and whether it can be traced."""
+        assert self._mesh is not None
+        if self._variant != mi.variant():
+            raise RuntimeError(
+                f"Occluder was made under {self._variant}, not under {mi.variant()}: call update again"
+            )
+        offset = OFFSET_VOXELS * dr.opaque(mi.Float, self._mesh.voxel)
+        d, active = _unit(mi.Vector3f(direction))
+        away = d
+        if normal is not None:
+            n, has_normal = _unit(mi.Vector3f(normal))
+            away = dr.select(has_normal, n, d)
+        o = mi.Vector3f(origin) + offset * away
+        active &= dr.all(dr.isfinite(o))
+        return mi.Ray3f(mi.Point3f(dr.select(active, o, 0)), d), active
 
 
 def _unit(v: Any) -> tuple[Any, Any]:

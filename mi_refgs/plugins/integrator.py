@@ -66,6 +66,15 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times light). (Default: ``sh`` if there
          is one)
 
+     * - dominant, multiscatter, traced_indirect
+       - |bool|
+       - Buy accuracy: look the light up along the GGX lobe's dominant direction; add what bounces between
+         facets; shade what blocked rays hit, in place of the surfels' indirect light. (Default: false)
+
+     * - visibility_rays
+       - |int|
+       - Rays of the lobe that visibility is averaged over; 1 is the mirror ray. (Default: 1)
+
      * - terms
        - |string|
        - Terms in the image, out of ``diffuse,specular,indirect``. (Default: all)
@@ -163,6 +172,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     def parameters_changed(self, keys: list[str]) -> None:
         self.check()
+        moved = not keys or not {*keys}.isdisjoint(GEOMETRY)
+        if moved and self.occluder is not None and self.shading.accuracy.traced_indirect:
+            self.occluder.set_materials(self.surfels)
 
     def aov_names(self) -> list[str]:
         return [channel for aov in self.aovs for channel in aov.channels()]

@@ -5,6 +5,7 @@ No Mitsuba class is defined here, so that this module need not be reloaded when 
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import mitsuba as mi
@@ -16,6 +17,7 @@ from mi_refgs.plugins.aovs import MATERIALS
 from mi_refgs.plugins.light import own_light
 from mi_refgs.render.pipeline import Shading
 from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.models import Accuracy
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import CHANNELS, Surfels
 
@@ -76,11 +78,25 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
         raise InputError("refgs: occlusion: there is no mesh to trace; name its PLY file in `mesh`")
     if occlusion and not deferred:
         raise InputError("refgs: occlusion: needs shade_at = pixel and reflectance = split_sum; set these")
+    accuracy = _accuracy(props)
+    if (accuracy.dominant or accuracy.multiscatter) and reflectance != "split_sum":
+        raise InputError("refgs: dominant, multiscatter: need reflectance = split_sum; set it")
+    if (accuracy.visibility_rays > 1 or accuracy.traced_indirect) and not occlusion:
+        raise InputError("refgs: visibility_rays, traced_indirect: need occlusion; name a `mesh` to trace")
     # Radiance is blended linearly, so that both orders are one; the pipeline calls it shading at surfels.
     at = at if reflectance == "split_sum" else "surfel"
-    return Shading(at, reflectance, diffuse, occlusion), Occluder(
-        read_mesh(mesh)
-    ) if occlusion and mesh else None
+    shading = Shading(at, reflectance, diffuse, occlusion, accuracy)
+    if not (occlusion and mesh):
+        return shading, None
+    occluder = Occluder(read_mesh(mesh))
+    if accuracy.traced_indirect:
+        occluder.set_materials(surfels)
+    return shading, occluder
+
+
+def _accuracy(props: Any) -> Accuracy:
+    """The knobs that buy accuracy, of which `Accuracy` refuses what is no bool or no number of rays."""
+    return Accuracy(**{knob.name: props.get(knob.name, knob.default) for knob in fields(Accuracy)})
 
 
 def read_terms(props: Any) -> list[str]:

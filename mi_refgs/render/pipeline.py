@@ -10,6 +10,7 @@ camera.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -18,7 +19,8 @@ import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR, FACING_TOLERANCE
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.shade.models import ShadingPoints, Terms, reflect, safe_normalize, shade
+from mi_refgs.render.reflection import reflection
+from mi_refgs.shade.models import Accuracy, ShadingPoints, Terms, reflect, shade
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.splat import Blended, Camera, splat
 from mi_refgs.surfels.table import Surfels
@@ -32,6 +34,11 @@ class Shading:
     reflectance: Literal["radiance", "split_sum"] = "split_sum"  # SH colour alone, or diffuse + GGX specular
     diffuse: Literal["sh", "irradiance"] = "sh"  # view-dependent SH colour, or albedo × prefiltered light
     occlusion: bool = False  # trace visibility along the mirror direction, and fill with the indirect channel
+    accuracy: Accuracy = field(default_factory=Accuracy)  # what to pay for less error; rays need occlusion
+
+    def __post_init__(self) -> None:
+        if isinstance(self.accuracy, Mapping):  # as JSON keeps it
+            object.__setattr__(self, "accuracy", Accuracy(**self.accuracy))
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,7 @@ def render(
     `light` is a `shade.PrefilteredLight`, needed unless `shading.reflectance` is "radiance". `sh_degree`
     limits the degree of the radiance channel, for coarse-to-fine schedules. `material_maps` asks for albedo,
     metallic and roughness even where shading does not need them per pixel. `shift`: see `splat.project`.
+    `shading.accuracy.traced_indirect` needs an occluder whose `set_materials` has seen these surfels.
     """
     if shading.at == "surfel":
         return _shade_at_surfels(surfels, camera, shading, light, sh_degree, shift, material_maps)
@@ -133,7 +141,7 @@ def _shade_at_surfels(
             roughness=surfels.roughness(),
             radiance=_radiance(surfels, direction, sh_degree) if shading.diffuse == "sh" else None,
         )
-        shaded = shade(points, light, shading.diffuse)
+        shaded = shade(points, light, shading.diffuse, shading.accuracy)
         terms = [shaded.diffuse, shaded.specular]
     features = [x for term in terms for x in term] + [*normal]
     show_materials = material_maps and surfels.has("albedo")
@@ -168,8 +176,8 @@ def _shade_at_pixels(
     features = [*normal, *_materials(surfels)]
     if shading.diffuse == "sh":
         features += [*_radiance(surfels, direction, sh_degree)]
-    indirect_used = shading.occlusion and occluder is not None
-    if indirect_used and surfels.has("indirect_sh"):
+    occluded = shading.occlusion and occluder is not None
+    if occluded and surfels.has("indirect_sh") and not shading.accuracy.traced_indirect:
         # The mirror direction of the surfel's centre [Ref-Gaussian, §3.3]; starts at exactly 0 and must train
         # from there.
         mirrored = reflect(view=-direction, normal=normal)
@@ -186,11 +194,6 @@ def _shade_at_pixels(
     depth = blended.depth * inverse
     ray = camera.rays()
     view = -dr.normalize(ray)
-    visibility = None
-    if indirect_used:
-        assert occluder is not None
-        visibility = _visibility(occluder, camera.origin, ray, dr.detach(normal), view)
-        maps["visibility"] = visibility
     points = ShadingPoints(
         normal=normal,
         view=view,
@@ -198,10 +201,15 @@ def _shade_at_pixels(
         metallic=maps["metallic"],
         roughness=maps["roughness"],
         radiance=radiance,
-        visibility=visibility,
         indirect=mi.Color3f(*rest) if rest else None,
     )
-    terms = shade(points, light, shading.diffuse)
+    if occluded:
+        assert occluder is not None
+        points = reflection(
+            occluder, surfels, light, shading.accuracy, shading.diffuse, camera.origin, ray, points
+        )
+        maps["visibility"] = points.visibility
+    terms = shade(points, light, shading.diffuse, shading.accuracy)
     return Frame(
         alpha=blended.alpha,
         depth=depth,
@@ -210,23 +218,6 @@ def _shade_at_pixels(
         terms=Terms(*(term * blended.alpha for term in (terms.diffuse, terms.specular, terms.indirect))),
         maps=maps,
     )
-
-
-def _visibility(occluder: Occluder, origin: Any, ray: Any, normal: Any, view: Any) -> Any:
-    """Is the mirror direction free, seen from where the pixel's ray meets the mesh itself?
-
-    Not from the blended depth: at a silhouette, and between two layers, that lies inside the object and every
-    ray from there is blocked, which draws a dark outline. A ray that misses the mesh sees the light.
-    """
-    with dr.suspend_grad():
-        distance, hit = occluder.first_hit(origin, ray)
-        point = mi.Point3f(mi.Vector3f(origin) + distance * ray)
-        facing = safe_normalize(normal)
-        free = occluder.visible(point, reflect(view=view, normal=facing), facing)
-        visibility = dr.select(hit, free, 1)
-        # Now, once: every kernel of the adjoint that reads it would trace the rays again.
-        dr.eval(visibility)
-        return visibility
 
 
 def _inverse_alpha(blended: Blended) -> Any:

@@ -20,7 +20,35 @@ from mi_refgs.shade.envmap import PrefilteredLight
 DIELECTRIC_F0 = 0.04
 """Reflectance at normal incidence of a surface that is not metal (index of refraction 1.5)."""
 
+SMOOTHNESS_FLOOR = 1e-12
+"""Below it √(1 - α), whose slope is infinite at α = 1, is held: its factor is below 1e-12 there."""
+
+MEAN_FRESNEL_MAX = 1.25
+"""The mean of Schlick's term is at most 1 for a colour in 0 … 1; this cap, out of its reach, keeps the series
+of bounces finite for any other colour: A + B ≥ 0.31 everywhere."""
+
 Diffuse = Literal["sh", "irradiance"]
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """What to pay for a smaller error; everything is off by default, and costs nothing then.
+
+    `shade` knows the first two, `render.pipeline` the others. Raises InputError for a value out of range.
+    """
+
+    dominant: bool = False  # look light up along the lobe's dominant direction, not the mirror direction
+    multiscatter: bool = False  # add the light that leaves after several bounces between facets
+    visibility_rays: int = 1  # rays of the GGX lobe that the visibility is averaged over; 1: the mirror ray
+    traced_indirect: bool = False  # shade what blocked rays hit, in place of the indirect channel
+
+    def __post_init__(self) -> None:
+        for name in ("dominant", "multiscatter", "traced_indirect"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError(f"accuracy: {name}: {getattr(self, name)!r} is neither True nor False")
+        rays: Any = self.visibility_rays
+        if isinstance(rays, bool) or not isinstance(rays, int) or rays < 1:
+            raise InputError(f"accuracy: visibility_rays: {rays!r} is no number of rays; use 1, 2, 3, …")
 
 
 @dataclass(frozen=True)
@@ -64,7 +92,44 @@ def reflect(view: mi.Vector3f, normal: mi.Vector3f) -> mi.Vector3f:
     return dr.fma(2 * dr.dot(normal, view), normal, -view)
 
 
-def shade(points: ShadingPoints, light: PrefilteredLight, diffuse: Diffuse = "sh") -> Terms:
+def base_reflectance(points: ShadingPoints) -> mi.Color3f:
+    """F0: reflectance at normal incidence, between a dielectric's and the metal's albedo."""
+    return dr.fma(points.albedo - DIELECTRIC_F0, points.metallic, DIELECTRIC_F0)
+
+
+def dominant_direction(normal: mi.Vector3f, mirror: mi.Vector3f, roughness: mi.Float) -> mi.Vector3f:
+    """Unit direction near the peak of the GGX lobe, cosine and shadowing included; unit vectors in.
+
+    With α = roughness² and s = 1 - α it lies s (√s + α) of the way from the normal to the mirror direction.
+    Differentiable, but for the clamp of roughness to [0, 1]. [Lagarde and de Rousiers 2014, "Moving Frostbite
+    to Physically Based Rendering", §4.9.3; of its two fits the one that it recommends with a prefiltered map]
+    """
+    α = dr.square(dr.clip(roughness, 0, 1))
+    smooth = 1 - α
+    mirrored = smooth * (dr.sqrt(dr.maximum(smooth, SMOOTHNESS_FLOOR)) + α)
+    return safe_normalize(dr.lerp(normal, mirror, mirrored))
+
+
+def multiple_scattering(f0: mi.Color3f, single: mi.Color3f, energy: mi.Float) -> mi.Color3f:
+    """What light that bounced more than once between facets adds to the reflectance under diffuse light.
+
+    `single` = F0 A + B leaves after one bounce and `energy` = A + B would if nothing were absorbed; the rest
+    bounces on, each time by the mean of Schlick's term, F0 + (1 - F0) / 21: single F E / (1 - F E) with
+    E = 1 - energy. A white metal then returns all light. [Fdez-Agüera 2019, "A Multiple-Scattering Microfacet
+    Model for Real-Time Image Based Lighting"] Its weight of the diffuse term is left out: in this model the
+    diffuse term does not yield to the specular one.
+    """
+    fresnel = dr.clip(dr.fma(f0, 20 / 21, 1 / 21), 0, MEAN_FRESNEL_MAX)
+    again = (1 - energy) * fresnel
+    return single * again * dr.rcp(1 - again)
+
+
+def shade(
+    points: ShadingPoints,
+    light: PrefilteredLight,
+    diffuse: Diffuse = "sh",
+    accuracy: Accuracy = Accuracy(),
+) -> Terms:
     """Outgoing radiance towards the camera, by cause.
 
     With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected direction
@@ -72,14 +137,25 @@ def shade(points: ShadingPoints, light: PrefilteredLight, diffuse: Diffuse = "sh
     ("sh") or (1 - metallic) albedo irradiance(n) ("irradiance"). n·v is clamped to [0, 1]: a point seen from
     behind keeps its mirror direction, with the reflectance at grazing incidence.
 
+    `accuracy.dominant` turns r to `dominant_direction`; with `accuracy.multiscatter` and M of
+    `multiple_scattering`, specular = V (L(r, roughness) S + irradiance(n) M) and
+    indirect = (1 - V) L_indirect (S + M).
+
     Differentiable in everything but the branches of the clamps. Finite for every finite input.
     Raises InputError for an unknown `diffuse`, or "sh" without a radiance.
     """
     normal, view = safe_normalize(points.normal), safe_normalize(points.view)
-    f0 = dr.fma(points.albedo - DIELECTRIC_F0, points.metallic, DIELECTRIC_F0)
+    f0 = base_reflectance(points)
     scale, bias = split_sum(dr.dot(normal, view), points.roughness)
     reflectance = dr.fma(f0, scale, bias)
-    specular = light.specular(reflect(view, normal), points.roughness) * reflectance
+    direction = reflect(view, normal)
+    if accuracy.dominant:
+        direction = dominant_direction(normal, direction, points.roughness)
+    specular = light.specular(direction, points.roughness) * reflectance
+    if accuracy.multiscatter:
+        further = multiple_scattering(f0, reflectance, scale + bias)
+        specular += light.irradiance(normal) * further
+        reflectance += further
     indirect: Any = mi.Color3f(0)
     if points.visibility is not None:
         specular *= points.visibility

@@ -1,0 +1,142 @@
+"""Materials on the extracted mesh, taken from the surfels around each vertex, under AD.
+
+Who a vertex's neighbours are, their weights and the vertex's normal are found once per mesh, in NumPy; the
+materials are gathered anew for every render, so that the surfels' own parameters receive the gradient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from mi_refgs.errors import InputError
+from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.surfels.table import Surfels
+
+NEIGHBOURS = 4
+"""Surfels that a vertex mixes: those that overlap at a point of a fitted surface with visible weight."""
+
+WEIGHT_FLOOR = 1e-6
+"""Sum of weights below which no surfel reaches a vertex: the nearest one then speaks alone."""
+
+NORMAL_AGREEMENT = 0.5
+"""Cosine between the neighbours' mean normal and the mesh's from which the former, which a fit has smoothed,
+is believed: at a rim the neighbours are another face's."""
+
+CHANNELS = ("albedo", "metallic", "roughness")
+"""What a surface that is hit is shaded with."""
+
+
+@dataclass(frozen=True)
+class SurfaceSample:
+    """What the surface is like where rays meet it; the normal is detached."""
+
+    albedo: Any  # mi.Color3f
+    metallic: Any
+    roughness: Any
+    normal: Any  # mi.Vector3f, interpolated, outward, not unit
+    surfel: Any  # mi.UInt32: the surfel nearest to the nearest vertex
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Of every vertex of a mesh, the surfels around it. V vertices, K neighbours, F faces."""
+
+    count: int  # surfels
+    faces: Any  # mi.UInt32 (3 F)
+    surfel: list[Any]  # K × mi.UInt32 (V), the nearest first
+    weight: list[Any]  # K × mi.Float (V), their sum is 1
+    normal: Any  # mi.Vector3f (V)
+
+    @staticmethod
+    def of(mesh: Mesh, surfels: Surfels) -> Neighbourhood:
+        """The NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint.
+
+        The footprint is the surfel's Gaussian in its plane, and one of a voxel across it. Detached. Raises
+        InputError if there are no surfels, or a channel of their materials is missing.
+        """
+        for name in CHANNELS:
+            if not surfels.has(name):
+                raise InputError(
+                    f"occluder: {name}: the surfels have no such channel; add it, or trace nothing"
+                )
+        if not surfels.count:
+            raise InputError("occluder: surfels: there are none to take materials from")
+        surfels = surfels.detach()
+        position, opacity = surfels.position().numpy().T, surfels.opacity().numpy()
+        scale = surfels.scale().numpy().T
+        axes = [axis.numpy().T for axis in surfels.frame()]
+        count = min(NEIGHBOURS, surfels.count)
+        _, found = cKDTree(position).query(mesh.vertices, k=np.arange(1, count + 1))
+        offset = mesh.vertices[:, None] - position[found]
+        u, v, w = ((offset * axis[found]).sum(-1) for axis in axes)
+        across = scale[found]
+        reach = np.square(u / across[..., 0]) + np.square(v / across[..., 1]) + np.square(w / mesh.voxel)
+        weight = opacity[found] * np.exp(-0.5 * reach)
+        total = weight.sum(1, keepdims=True)
+        alone = np.arange(count) == 0
+        weight = np.where(total > WEIGHT_FLOOR, weight / np.maximum(total, WEIGHT_FLOOR), alone)
+        normal = _normals(mesh, axes[2][found], weight)
+        return Neighbourhood(
+            surfels.count,
+            mi.UInt32(mesh.faces.ravel()),
+            [mi.UInt32(column.astype(np.uint32)) for column in found.T],
+            [mi.Float(column.astype(np.float32)) for column in weight.T],
+            mi.Vector3f(np.ascontiguousarray(normal.T, np.float32)),
+        )
+
+    def surface(self, surfels: Surfels) -> Surface:
+        """The mesh with the present materials of the surfels, under AD.
+
+        Raises InputError unless it is the table, or one with as many rows, that `of` saw.
+        """
+        if surfels.count != self.count:
+            raise InputError(
+                f"occluder: surfels: there are {surfels.count}, and the mesh knows {self.count}; call "
+                "Occluder.set_materials whenever their number changes"
+            )
+        columns = [*surfels.albedo(), surfels.metallic(), surfels.roughness()]
+        mixed = [mi.Float(0) for _ in columns]
+        for surfel, weight in zip(self.surfel, self.weight, strict=True):
+            for i, column in enumerate(columns):
+                mixed[i] += weight * dr.gather(mi.Float, column, surfel)
+        return Surface(self, dr.ravel(mi.ArrayXf([*mixed, *self.normal])))
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A mesh with materials, to look up at hits."""
+
+    around: Neighbourhood
+    rows: Any  # mi.Float (8 V): albedo, metallic, roughness, normal
+
+    def at(self, triangle: mi.UInt32, place: mi.Point2f, active: mi.Bool) -> SurfaceSample:
+        """Attributes at the barycentric coordinates `place` (of the second and third corner)."""
+        shares = (1 - place.x - place.y, place.x, place.y)
+        near, far = mi.Vector4f(0), mi.Vector4f(0)
+        closest, largest = mi.UInt32(0), mi.Float(-1)
+        for corner, share in enumerate(shares):
+            vertex = dr.gather(mi.UInt32, self.around.faces, 3 * triangle + corner, active)
+            near += share * dr.gather(mi.Vector4f, self.rows, 2 * vertex, active)
+            far += share * dr.gather(mi.Vector4f, self.rows, 2 * vertex + 1, active)
+            closest = dr.select(share > largest, vertex, closest)
+            largest = dr.maximum(share, largest)
+        surfel = dr.gather(mi.UInt32, self.around.surfel[0], closest, active)
+        normal = mi.Vector3f(far.y, far.z, far.w)
+        return SurfaceSample(mi.Color3f(near.x, near.y, near.z), near.w, far.x, normal, surfel)
+
+
+def _normals(mesh: Mesh, neighbours: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Outward unit normals (V, 3): the weighted normals (V, K, 3) of the surfels where the mesh's agree."""
+    own = np.asarray(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals)
+    outward = np.where((neighbours * own[:, None]).sum(-1) < 0, -1.0, 1.0)
+    mean = (neighbours * (weight * outward)[..., None]).sum(1)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    agrees = (mean * own).sum(1, keepdims=True) > NORMAL_AGREEMENT
+    return np.where(agrees, mean, own)

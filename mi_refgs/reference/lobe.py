@@ -1,0 +1,146 @@
+"""The GGX lobe by brute force in NumPy float64: the integrals that `shade`'s accuracy knobs approximate.
+
+GGX α = roughness², height-correlated Smith, Schlick. Directions are unit (3,) or (n, 3) arrays and point away
+from the surface; colours have three channels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+Incoming = Callable[[np.ndarray], np.ndarray]
+"""Radiance (n, 3), or any other quantity (n, c), that arrives from unit directions (n, 3)."""
+
+HORIZON = 1e-4
+"""|cosine| below which a walk inside the microsurface counts as horizontal, and keeps its height."""
+
+
+def smith_lambda(cosine: np.ndarray, α: float) -> np.ndarray:
+    """Smith's Λ of GGX; of directions below the horizon too. [Heitz et al. 2016, eq. 15 ff.]"""
+    cosine = np.where(np.abs(cosine) < 1e-9, 1e-9, cosine)
+    return (np.sign(cosine) * np.sqrt(1 + α**2 * (1 / np.square(cosine) - 1)) - 1) / 2
+
+
+def frame(normal: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) whose rows are two tangents and the unit normal."""
+    helper = np.eye(3)[np.argmin(np.abs(normal))]
+    side = np.cross(helper, normal)
+    side /= np.linalg.norm(side)
+    return np.stack([side, np.cross(normal, side), normal])
+
+
+def lobe_nodes(
+    normal: np.ndarray, view: np.ndarray, roughness: float, rings: int = 200, spokes: int = 200
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Directions (n, 3), cosines between view and half vector (n,), and weights (n,) of a quadrature:
+
+    Σ weight F(cosine) L(direction) = ∫ f L cosθ dω. Midpoints over the half vectors, drawn from D cosθ.
+    """
+    α2 = roughness**4
+    s = ((np.arange(rings) + 0.5) / rings)[:, None]
+    n_h = np.sqrt(s**2 / (s**2 + α2 * (1 - s**2)))
+    sin_h = np.sqrt(1 - n_h**2)
+    φ = (np.arange(spokes) + 0.5) * (2 * math.pi / spokes)
+    half = np.stack(np.broadcast_arrays(sin_h * np.cos(φ), sin_h * np.sin(φ), n_h), -1).reshape(-1, 3)
+    share = np.broadcast_to(2 * s / (rings * spokes), (rings, spokes)).ravel()
+    rotation = frame(normal)
+    local = rotation @ view
+    v_h = half @ local
+    light = 2 * v_h[:, None] * half - local
+    lit = (light[:, 2] > 0) & (v_h > 0)
+    half, light, v_h, share = half[lit], light[lit], v_h[lit], share[lit]
+    α = roughness**2
+    g = 1 / (1 + smith_lambda(local[2], α) + smith_lambda(light[:, 2], α))
+    return light @ rotation, v_h, share * g * v_h / (half[:, 2] * local[2])
+
+
+def schlick(cosine: np.ndarray, f0: np.ndarray) -> np.ndarray:
+    """Fresnel reflectance (n, c) of cosines (n,) and F0 (c,)."""
+    return f0 + (1 - f0) * (1 - cosine[:, None]) ** 5
+
+
+def reflected(
+    incoming: Incoming,
+    normal: np.ndarray,
+    view: np.ndarray,
+    roughness: float,
+    f0: np.ndarray,
+    nodes: int = 200,
+) -> np.ndarray:
+    """∫ f L cosθ dω (3,): what a GGX surface reflects of any incoming light, with no approximation."""
+    direction, v_h, weight = lobe_nodes(normal, view, roughness, nodes, nodes)
+    return (weight[:, None] * schlick(v_h, f0) * incoming(direction)).sum(0)
+
+
+def traced_fraction(
+    free: Incoming, normal: np.ndarray, view: np.ndarray, roughness: float, f0: float, nodes: int = 200
+) -> float:
+    """∫ V f cosθ dω / ∫ f cosθ dω of the visibility `free` (n, 1): where an average over k rays converges."""
+    direction, v_h, weight = lobe_nodes(normal, view, roughness, nodes, nodes)
+    weight = weight * schlick(v_h, np.array([f0]))[:, 0]
+    return float((weight * free(direction)[:, 0]).sum() / weight.sum())
+
+
+def microsurface_walk(
+    n_dot_v: float,
+    roughness: float,
+    f0: np.ndarray,
+    rng: np.random.Generator,
+    walks: int = 20000,
+    bounces: int = 64,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Albedo (c,) of the rough surface itself, `bounces` between its facets, and its standard error.
+
+    A random walk through the Smith microsurface, heights uniform in [-1, 1]; its first bounce alone is the
+    GGX model with height-correlated shadowing. [Heitz et al. 2016, "Multiple-Scattering Microfacet BSDFs with
+    the Smith Model", algorithms 1, 2 and 4]
+    """
+    α = roughness**2
+    direction = -np.tile([math.sqrt(1 - n_dot_v**2), 0.0, n_dot_v], (walks, 1))
+    height = np.ones(walks)
+    weight = np.ones((walks, len(f0)))
+    total = np.zeros((walks, len(f0)))
+    inside = np.arange(walks)
+    for bounce in range(bounces + 1):
+        height, leaves = _next_height(direction, height, α, rng)
+        total[inside[leaves]] = weight[leaves] if bounce else 0
+        stays = ~leaves
+        inside, direction, height, weight = (x[stays] for x in (inside, direction, height, weight))
+        if not len(inside):
+            break
+        facet = _visible_normals(-direction, α, rng)
+        cosine = -(direction * facet).sum(1)
+        weight = weight * schlick(cosine, f0)
+        direction = direction + 2 * cosine[:, None] * facet
+    return total.mean(0), total.std(0) / math.sqrt(walks)
+
+
+def _next_height(
+    direction: np.ndarray, height: np.ndarray, α: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Height of the next facet that each ray meets, and which rays leave instead. [Heitz 2016, alg. 2]"""
+    u = rng.uniform(size=len(height))
+    below = np.clip((height + 1) / 2, 0, 1)  # C1, the share of the surface below
+    cosine = direction[:, 2]
+    level = np.abs(cosine) < HORIZON
+    λ = smith_lambda(cosine, α)
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        escape = np.where(cosine > 0, below**λ, 0.0)
+        after = 2 * below / (1 - u) ** (1 / λ) - 1
+    leaves = (u > 1 - escape) & ~level
+    return np.where(level | leaves, height, np.clip(after, -1, 1)), leaves
+
+
+def _visible_normals(view: np.ndarray, α: float, rng: np.random.Generator) -> np.ndarray:
+    """Facets that unit views (n, 3) see, from below the horizon too. [Dupuy and Benyoub 2023]"""
+    stretched = view * [α, α, 1.0]
+    stretched /= np.linalg.norm(stretched, axis=1, keepdims=True)
+    z = (1 - rng.uniform(size=len(view))) * (1 + stretched[:, 2]) - stretched[:, 2]
+    φ = rng.uniform(0, 2 * math.pi, len(view))
+    ring = np.sqrt(np.clip(1 - z**2, 0, 1))
+    half = np.stack([ring * np.cos(φ), ring * np.sin(φ), z], 1) + stretched
+    half *= [α, α, 1.0]
+    return half / np.linalg.norm(half, axis=1, keepdims=True)

@@ -1,0 +1,92 @@
+"""Rays of the GGX lobe: visible normals at points that every pixel shifts by a hash of its own index.
+
+The points repeat from render to render, differ between neighbouring pixels, and are spread evenly for any
+number of rays: a spiral of the golden ratio. Everything here is detached.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.shade.models import safe_normalize
+
+GOLDEN = 2654435769
+"""2³² / golden ratio: multiples of it, modulo 2³², are the most even sequence on a circle."""
+
+ALPHA_FLOOR = 1e-4
+"""Narrower lobes are traced as this one, 0.01° wide: facets of a perfect mirror have no distribution."""
+
+COSINE_FLOOR = 1e-3
+"""Smallest n·v of a lobe: a view from behind is taken as a grazing one, as `shade` takes its reflectance."""
+
+HORIZON = 1e-6
+"""Smallest n·l of a ray: what goes below leaves no light, and 1/(n·l)² fits float32."""
+
+
+def lobe_points(index: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+    """The two shifts (32-bit fractions) of the points of pixels `index`: a hash and nothing else."""
+    first, second = mi.sample_tea_32(index, dr.zeros(mi.UInt32, dr.width(index)))
+    return first, second
+
+
+def lobe_point(shift: tuple[Any, Any], ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    """Point `ray` of `count` in the unit square, shifted around it; below 1 in either coordinate."""
+    first, second = (mi.UInt32(x) for x in shift)
+    turn = mi.Float((ray * GOLDEN + second) >> 8) * 2.0**-24
+    along = (mi.Float(ray) + mi.Float(first >> 8) * 2.0**-24) / mi.Float(count)
+    return dr.minimum(along, 1 - 2.0**-24), turn
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """The GGX lobes of N points, ready to be sampled; α = roughness², height-correlated Smith, Schlick."""
+
+    frame: Any  # mi.Frame3f around the normals
+    view: Any  # mi.Vector3f, local, unit, above the horizon
+    α: Any
+    f0: Any  # mean of the channels
+    shift: tuple[Any, Any]  # of the points, see `lobe_points`
+
+    @staticmethod
+    def of(normal: mi.Vector3f, view: mi.Vector3f, roughness: mi.Float, f0: mi.Color3f) -> Lobe:
+        """Lobes around unit normals, seen from unit directions; lane i has the points of pixel i."""
+        frame = mi.Frame3f(normal)
+        local = frame.to_local(view)
+        local.z = dr.maximum(local.z, COSINE_FLOOR)
+        return Lobe(
+            frame,
+            safe_normalize(local),
+            dr.maximum(dr.square(dr.clip(roughness, 0, 1)), ALPHA_FLOOR),
+            dr.clip((f0.x + f0.y + f0.z) * (1 / 3), 0, 1),
+            lobe_points(dr.arange(mi.UInt32, dr.width(normal))),
+        )
+
+    def sample(self, ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
+        """World direction of ray `ray` of `count`, and its weight: f cosθ / density, 0 below the horizon.
+
+        Visible normals by a cap of the sphere. [Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with
+        Spherical Caps"; weight F G / G₁: Heitz 2018, "Sampling the GGX Distribution of Visible Normals"]
+        """
+        along, turn = lobe_point(self.shift, ray, count)
+        stretched = dr.normalize(mi.Vector3f(self.α * self.view.x, self.α * self.view.y, self.view.z))
+        z = dr.fma(1 - along, 1 + stretched.z, -stretched.z)
+        ring = dr.sqrt(dr.maximum(1 - z * z, 0))
+        sin, cos = dr.sincos(dr.two_pi * turn)
+        cap = mi.Vector3f(ring * cos, ring * sin, z) + stretched
+        half = safe_normalize(mi.Vector3f(self.α * cap.x, self.α * cap.y, dr.maximum(cap.z, HORIZON)))
+        v_h = dr.clip(dr.dot(self.view, half), 0, 1)
+        local = dr.fma(2 * v_h, half, -self.view)
+        lit = local.z > HORIZON
+        shadow_v = self._smith(self.view.z)
+        shadow_l = self._smith(dr.select(lit, local.z, 1))
+        grazing = dr.square(dr.square(1 - v_h)) * (1 - v_h)
+        weight = dr.fma(1 - self.f0, grazing, self.f0) * (1 + shadow_v) / (1 + shadow_v + shadow_l)
+        return self.frame.to_world(local), dr.select(lit, weight, 0)
+
+    def _smith(self, cosine: Any) -> Any:
+        """Λ of GGX above the horizon."""
+        return 0.5 * (dr.sqrt(1 + self.α * self.α * (dr.rcp(cosine * cosine) - 1)) - 1)

@@ -1,0 +1,70 @@
+"""The knobs that buy accuracy as properties of the `refgs` plugin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from integrator_scenes import image, integrator, plane_mesh, raw_channels, scene
+from test_integrator_derivatives import check_derivatives
+
+from mi_refgs.shade.models import Accuracy
+
+
+def test_properties_of_the_plugin(tmp_path: Path) -> None:
+    mesh = plane_mesh(tmp_path)
+    knobs: dict[str, Any] = {
+        "dominant": True,
+        "multiscatter": True,
+        "visibility_rays": 4,
+        "traced_indirect": True,
+    }
+    of = scene(mesh=mesh, **knobs)
+    assert of.integrator().shading.accuracy == Accuracy(True, True, 4, True)
+    assert scene(mesh=mesh).integrator().shading.accuracy == Accuracy()
+    plain = image(scene(mesh=mesh, terms="specular,indirect"))
+    for name, value in knobs.items():
+        assert (
+            np.abs(image(scene(mesh=mesh, terms="specular,indirect", **{name: value})) - plain).max() > 0.01
+        ), name
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"visibility_rays": 0}, "visibility_rays"),
+        ({"visibility_rays": 1.5}, "visibility_rays"),
+        ({"visibility_rays": 4}, "name a `mesh`"),
+        ({"traced_indirect": True}, "name a `mesh`"),
+        ({"dominant": "yes"}, "dominant"),
+        ({"multiscatter": True, "reflectance": "radiance"}, "split_sum"),
+    ],
+)
+def test_bad_properties_are_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(Exception, match=words):
+        mi.load_dict(integrator(**changes))
+
+
+@pytest.mark.parametrize("rays", [1, 3])
+def test_derivatives_of_mi_render(rays: int, tmp_path: Path) -> None:
+    knobs: dict[str, Any] = {
+        "dominant": True,
+        "multiscatter": True,
+        "visibility_rays": rays,
+        "traced_indirect": True,
+    }
+    check_derivatives(scene(mesh=plane_mesh(tmp_path), diffuse="irradiance", **knobs), "integrator.light")
+
+
+def test_new_surfels_give_new_materials(tmp_path: Path) -> None:
+    """Another number of surfels through the parameters, as a scene that is loaded with them."""
+    mesh = plane_mesh(tmp_path)
+    of, other = scene(mesh=mesh, traced_indirect=True), raw_channels(40, seed=5)
+    params = mi.traverse(of)
+    for name, values in other.items():
+        params[f"integrator.{name}"] = mi.TensorXf(values)
+    params.update()
+    np.testing.assert_array_equal(image(of), image(scene(raw=other, mesh=mesh, traced_indirect=True)))
