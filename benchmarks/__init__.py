@@ -1,0 +1,1 @@
+"""Measurements of speed and error; run from the repository root."""

@@ -1,0 +1,69 @@
+"""How the benchmarks' plots look."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.files import replace_file
+
+COLOURS = {
+    "path": "#444444",
+    "monte_carlo": "#c77b30",
+    "split_sum": "#1f77b4",
+    "knob": "#2a9d5c",
+    "floor": "#bbbbbb",
+}
+DOTS_PER_INCH = 110
+
+
+def new(rows: int, columns: int, width: float, height: float, **options: Any) -> tuple[Any, Any]:
+    """Figure and (rows, columns) axes; width and height of one panel in inches."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(
+        rows,
+        columns,
+        figsize=(columns * width, rows * height),
+        squeeze=False,
+        layout="constrained",
+        **options,
+    )
+    for ax in axes.flat:
+        ax.tick_params(labelsize=8)
+        ax.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def save(figure: Any, path: Path) -> Path:
+    """Write a PNG, whole or not at all."""
+    import matplotlib.pyplot as plt
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    replace_file(path, lambda temporary: figure.savefig(temporary, dpi=DOTS_PER_INCH, format="png"))
+    plt.close(figure)
+    return path
+
+
+def heat(
+    ax: Any, values: np.ndarray, texts: list[list[str]], rows: list[str], columns: list[str], **scale: Any
+) -> Any:
+    """Heat map with a number in each cell; NaN stays white."""
+    image = ax.imshow(values, aspect="auto", **scale)
+    norm = image.norm
+    for i, line in enumerate(texts):
+        for j, text in enumerate(line):
+            if np.isfinite(values[i, j]):
+                red, green, blue, _ = image.cmap(norm(values[i, j]))
+                dark = 0.3 * red + 0.59 * green + 0.11 * blue < 0.5
+                ax.text(j, i, text, ha="center", va="center", fontsize=7, color="white" if dark else "black")
+    ax.set_xticks(range(len(columns)), columns)
+    ax.set_yticks(range(len(rows)), rows)
+    ax.spines[:].set_visible(False)
+    ax.tick_params(length=0)
+    return image

@@ -1,0 +1,288 @@
+"""The integrals that a split sum stands for, by Monte Carlo in Dr.Jit, sharing no code with `mi_refgs.shade`.
+
+A `Lobe` names a way to draw directions and the weights whose integrals against the light are wanted.
+`integrate` combines each lobe with samples of the light (balance heuristic) over randomly shifted Fibonacci
+lattices: the shifts are independent, so the batches tell their own standard error. [Veach 1997, §9; Cranley
+and Patterson 1976]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from benchmarks.common.view import Points
+
+LATTICES = (34, 55, 89, 144, 233, 377, 610, 987, 1597, 2584, 4181)
+"""Fibonacci numbers: the good sizes of a rank-1 lattice with the predecessor as its generator."""
+RAY_OFFSET = 1e-4
+"""Distance by which a visibility ray starts off the surface; objects have a size of about 2."""
+NORM_NODES = 20_000
+"""Midpoints of the one-dimensional integral that normalises the prefilter's lobe: exact to 1e-8."""
+GOLDEN = 0x9E3779B9
+"""Spreads the seeds of random streams."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Mean over batches and the standard error of that mean, both (P, 3) float64."""
+
+    mean: np.ndarray
+    error: np.ndarray
+
+    def __add__(self, other: Estimate) -> Estimate:
+        return Estimate(self.mean + other.mean, np.hypot(self.error, other.error))
+
+    def scaled(self, factor: Any) -> Estimate:
+        """Times numbers that broadcast to (P, 3)."""
+        return Estimate(self.mean * factor, self.error * np.abs(factor))
+
+
+def estimate(batches: np.ndarray) -> Estimate:
+    """Of independent batches (B, P, 3)."""
+    return Estimate(batches.mean(0), batches.std(0, ddof=1) / np.sqrt(len(batches)))
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """Directions l in a frame: how to draw them, with which density, and the weights to integrate."""
+
+    frame: Any  # mi.Frame3f
+    sample: Callable[[Any], Any]  # mi.Point2f → l
+    pdf: Callable[[Any], Any]
+    weights: Callable[[Any], list[Any]]
+
+
+# ---------------- GGX, α = roughness² ----------------
+
+
+def smith_lambda(cosine: Any, α2: Any) -> Any:
+    """Λ of a direction. [Heitz 2014, eq. 72]"""
+    c2 = dr.square(cosine)
+    return 0.5 * (dr.sqrt(1 + α2 * dr.maximum(1 - c2, 0) / c2) - 1)
+
+
+def ggx(half: Any, α2: Any) -> Any:
+    """D of unit half vectors in the normal's frame; sin² is x² + y², as 1 - cos² would lose narrow lobes."""
+    return α2 * dr.inv_pi / dr.square(α2 * dr.square(half.z) + dr.square(half.x) + dr.square(half.y))
+
+
+def sample_visible(view: Any, α: Any, u: Any) -> Any:
+    """Half vector drawn from the normals that `view` sees. [Dupuy and Benyoub 2023, spherical caps]"""
+    stretched = dr.normalize(mi.Vector3f(α * view.x, α * view.y, view.z))
+    sin_φ, cos_φ = dr.sincos(dr.two_pi * u.x)
+    z = dr.fma(1 - u.y, 1 + stretched.z, -stretched.z)
+    sine = dr.sqrt(dr.clip(1 - z * z, 0, 1))
+    cap = mi.Vector3f(sine * cos_φ, sine * sin_φ, z) + stretched
+    return dr.normalize(mi.Vector3f(α * cap.x, α * cap.y, cap.z))
+
+
+def _reflect(view: Any, half: Any) -> Any:
+    return 2 * dr.dot(view, half) * half - view
+
+
+def specular_times_cosine(view: Any, light: Any, α2: Any) -> tuple[Any, Any, Any]:
+    """(D G₂ / (4 n·v) without Fresnel, density of `sample_visible` for it, Schlick's (1 - v·h)⁵)."""
+    half = dr.normalize(view + light)
+    lit = light.z > 0
+    λ_view, λ_light = smith_lambda(view.z, α2), smith_lambda(dr.select(lit, light.z, 1), α2)
+    d = ggx(half, α2) / (4 * view.z)
+    schlick = dr.clip(1 - dr.dot(view, half), 0, 1)
+    value = dr.select(lit, d / (1 + λ_view + λ_light), 0)
+    return value, d / (1 + λ_view), dr.square(dr.square(schlick)) * schlick
+
+
+def brdf_lobe(points: Points, α: Any) -> Lobe:
+    """GGX reflectance in two parts, (1 - Fc) f cosθ and Fc f cosθ, for F = F0 (1 - Fc) + Fc."""
+    frame = mi.Frame3f(points.normal)
+    view, α2 = frame.to_local(points.view), dr.square(α)
+
+    def weights(light: Any) -> list[Any]:
+        value, _, schlick = specular_times_cosine(view, light, α2)
+        return [value * (1 - schlick), value * schlick]
+
+    return Lobe(
+        frame,
+        lambda u: _reflect(view, sample_visible(view, α, u)),
+        lambda light: specular_times_cosine(view, light, α2)[1],
+        weights,
+    )
+
+
+def prefilter_lobe(points: Points, roughness: float, α: Any) -> Lobe:
+    """The lobe of a prefiltered map: N = V = R, weight max(L·R, 0) D(H), normalised. [Karis 2013]"""
+    axis = 2 * dr.dot(points.normal, points.view) * points.normal - points.view
+    frame, α2 = mi.Frame3f(axis), dr.square(α)
+    up = mi.Vector3f(0, 0, 1)
+    # ∫ D cosθ_l dω_l = ∫ 4 cosθ_l (D cosθ_h dω_h), and D cosθ_h dω_h = d(ξ) with tan²θ_h = α² ξ / (1 - ξ).
+    ξ = (np.arange(NORM_NODES) + 0.5) / NORM_NODES
+    light_cosine = 2 / (1 + roughness**4 * ξ / (1 - ξ)) - 1
+    norm = 4 * float(np.maximum(light_cosine, 0).mean())
+
+    def sample(u: Any) -> Any:
+        s = dr.sqrt(u.y)
+        tan = α * s / dr.sqrt(dr.maximum(1 - u.y, 1e-7))
+        sin_φ, cos_φ = dr.sincos(dr.two_pi * u.x)
+        return _reflect(up, dr.normalize(mi.Vector3f(tan * cos_φ, tan * sin_φ, 1)))
+
+    def pdf(light: Any) -> Any:
+        return 0.25 * ggx(dr.normalize(up + light), α2)
+
+    scale = dr.opaque(mi.Float, 1 / norm)
+    return Lobe(
+        frame,
+        sample,
+        pdf,
+        lambda light: [dr.maximum(light.z, 0) * scale * ggx(dr.normalize(up + light), α2)],
+    )
+
+
+def cosine_lobe(points: Points) -> Lobe:
+    """max(cosθ, 0)/π around the normal: irradiance over π."""
+
+    def pdf(light: Any) -> Any:
+        return dr.maximum(light.z, 0) * dr.inv_pi
+
+    return Lobe(
+        mi.Frame3f(points.normal), mi.warp.square_to_cosine_hemisphere, pdf, lambda light: [pdf(light)]
+    )
+
+
+# ---------------- integration ----------------
+
+
+def radiance(emitter: Any, direction: Any) -> Any:
+    """Radiance of an environment emitter from unit world directions."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
+    si.wi = -direction
+    return emitter.eval(si)
+
+
+def _visible(occluder: Any, origin: Any, direction: Any) -> Any:
+    return True if occluder is None else ~occluder.ray_test(mi.Ray3f(origin, direction))
+
+
+def integrate(
+    make_lobe: Callable[[Points], Lobe],
+    points: Points,
+    emitter: Any,
+    *,
+    samples: int = 610,
+    batches: int = 8,
+    seed: int = 0,
+    occluder: Any = None,
+) -> list[np.ndarray]:
+    """∫ L(l) weight(l) dω for each weight of the lobe: arrays (batches, P, 3).
+
+    Args:
+        emitter: an environment emitter of a loaded scene.
+        samples: of the lobe, and as many of the light; a member of LATTICES.
+        occluder: a scene that blocks light, or None.
+    """
+    predecessor = round(samples / 1.618033988749895)
+    lane = dr.arange(mi.UInt32, batches * points.count)
+    every = points.gather(lane % points.count)
+    lobe = make_lobe(every)
+    state = dr.opaque(mi.UInt32, 1 + seed)
+    rng = mi.PCG32(initstate=mi.UInt64(lane) + mi.UInt64(state) * GOLDEN, initseq=mi.UInt64(state))
+    shift = [mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(2)]
+    count, generator = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, predecessor)
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
+    si.p = every.position
+    origin = every.position + RAY_OFFSET * every.offset
+    sums = len(lobe.weights(mi.Vector3f(0, 0, 1)))
+
+    def body(i: Any, *total: Any) -> tuple[Any, ...]:
+        lattice = mi.Point2f(mi.Float(i) + 0.5, mi.Float((i * generator) % count) + 0.5) / mi.Float(count)
+        new = list(total)
+
+        def add(light: Any, radiance_: Any, density: Any, free: Any) -> None:
+            for k, weight in enumerate(lobe.weights(light)):
+                share = dr.select(free & (density > 0), weight / density, 0)
+                new[k] = new[k] + radiance_ * share
+
+        light = lobe.sample(_wrap(lattice + shift[0]))
+        world = lobe.frame.to_world(light)
+        si.wi = -world
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.d = world
+        density = lobe.pdf(light) + emitter.pdf_direction(si, ds)
+        add(light, radiance(emitter, world), density, _visible(occluder, origin, world))
+
+        ds, ratio = emitter.sample_direction(si, _wrap(lattice + shift[1]))
+        light = lobe.frame.to_local(ds.d)
+        density = lobe.pdf(light) + ds.pdf
+        add(light, ratio * ds.pdf, density, (ds.pdf > 0) & _visible(occluder, origin, ds.d))
+        return (i + 1, *new)
+
+    start = (mi.UInt32(0), *(dr.zeros(mi.Color3f, dr.width(lane)) for _ in range(sums)))
+    _, *total = dr.while_loop(start, lambda i, *_: i < count, body)
+    dr.eval(total)
+    return [np.array(t, np.float64).T.reshape(batches, points.count, 3) / samples for t in total]
+
+
+def _wrap(u: Any) -> Any:
+    return u - dr.floor(u)
+
+
+@dataclass(frozen=True)
+class Material:
+    """One material for a whole object, on the device and opaque: another one compiles no new kernel."""
+
+    albedo: Any  # mi.Color3f
+    metallic: Any
+    roughness: Any
+    f0: Any
+
+
+def device_material(albedo: tuple[float, float, float], metallic: float, roughness: float) -> Material:
+    """Opaque values; F0 = 0.04 (1 - metallic) + albedo metallic."""
+    f0 = [0.04 * (1 - metallic) + a * metallic for a in albedo]
+
+    def opaque(values: Any) -> Any:
+        return mi.Color3f(*(dr.opaque(mi.Float, float(x)) for x in values))
+
+    return Material(opaque(albedo), dr.opaque(mi.Float, metallic), dr.opaque(mi.Float, roughness), opaque(f0))
+
+
+def monte_carlo(points: Points, material: Material, emitter: Any, samples: Any, seed: Any) -> Any:
+    """Outgoing radiance by plain importance sampling of the reflectance, `samples` (mi.UInt32) a point.
+
+    One of two lobes is drawn for each sample, visible normals or the cosine, and divided by their mixture's
+    density. The light is not sampled: this is what a renderer with a good BSDF and no emitter sampling pays.
+    """
+    frame = mi.Frame3f(points.normal)
+    view, α = frame.to_local(points.view), dr.square(material.roughness)
+    α2 = dr.square(α)
+    diffuse = (1 - material.metallic) * material.albedo
+    # Schlick at the view angle is close enough to choose a lobe by.
+    grazing = dr.clip(1 - view.z, 0, 1)
+    mirror = (
+        mi.luminance(material.f0) + (1 - mi.luminance(material.f0)) * dr.square(dr.square(grazing)) * grazing
+    )
+    share = mirror / (mirror + mi.luminance(diffuse))
+    rng = mi.PCG32(size=points.count, initstate=mi.UInt64(seed))
+
+    def body(i: Any, total: Any, rng: Any) -> tuple[Any, ...]:
+        choice = rng.next_float32()
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        light = dr.select(
+            choice < share,
+            _reflect(view, sample_visible(view, α, u)),
+            mi.warp.square_to_cosine_hemisphere(u),
+        )
+        specular, density, schlick = specular_times_cosine(view, light, α2)
+        cosine = dr.maximum(light.z, 0) * dr.inv_pi
+        value = diffuse * cosine + (material.f0 * (1 - schlick) + schlick) * specular
+        density = dr.lerp(cosine, density, share)
+        arriving = radiance(emitter, frame.to_world(light))
+        return i + 1, total + dr.select(light.z > 0, value * arriving / density, 0), rng
+
+    start = (mi.UInt32(0), dr.zeros(mi.Color3f, points.count), rng)
+    _, total, _ = dr.while_loop(start, lambda i, *_: i < samples, body)
+    return total / mi.Float(samples)

@@ -1,0 +1,39 @@
+"""Times of warm runs, taken in turns."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, TypeVar
+
+import drjit as dr
+import numpy as np
+
+Key = TypeVar("Key", bound=Hashable)
+
+MIN_ROUNDS = 5
+
+
+def milliseconds(calls: Mapping[Key, Callable[[], Any]], seconds: float, most: int = 25) -> dict[Key, float]:
+    """Median wall time of each call, its result evaluated and waited for; first calls are not counted.
+
+    All calls run once in each round, so that a machine that slows down slows all of them: ratios of these
+    times stay true. Rounds go on until `seconds` have passed for each call, at least five and at most `most`.
+    """
+    for call in calls.values():
+        _once(call)
+    times: dict[Key, list[float]] = {key: [] for key in calls}
+    begin, rounds = time.perf_counter(), 0
+    while rounds < MIN_ROUNDS or (rounds < most and time.perf_counter() - begin < seconds * len(calls)):
+        for key, call in calls.items():
+            times[key].append(_once(call))
+        rounds += 1
+    return {key: 1e3 * float(np.median(found)) for key, found in times.items()}
+
+
+def _once(call: Callable[[], Any]) -> float:
+    dr.sync_thread()
+    begin = time.perf_counter()
+    dr.eval(call())
+    dr.sync_thread()
+    return time.perf_counter() - begin

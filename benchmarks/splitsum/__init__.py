@@ -1,0 +1,1 @@
+"""The split-sum approximation measured against Mitsuba's path tracer: speed against error."""

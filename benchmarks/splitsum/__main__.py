@@ -1,0 +1,84 @@
+"""Speed against error of the split-sum approximation, with Mitsuba's path tracer beside it.
+
+    python -m benchmarks.splitsum                      the page docs/splitsum.md, below 10 minutes on 2 cores
+    python -m benchmarks.splitsum --small -o out       a small instance, below a minute
+    python -m benchmarks.splitsum --full -o out        more pixels, more samples
+    python -m benchmarks.splitsum --envmap sky.exr --shape sphere -o out   your light beside the built-in ones
+
+Writes splitsum.md, images/splitsum_*.png, splitsum.csv and splitsum.json to the output folder; without -o,
+the page and its pictures go to docs/ and the two others to runs/.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
+
+import mitsuba as mi  # isort: skip
+
+from benchmarks.common.lights import BUILT_IN, ROOT
+from benchmarks.common.report import write_csv, write_json, write_text
+from mi_refgs.errors import InputError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, and write the reports; exit code 2 for bad input."""
+    mi.set_variant("llvm_ad_rgb")
+    from benchmarks.splitsum.settings import CONVEX, FULL, PAGE, SMALL
+
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.splitsum",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--small", action="store_true", help="a coarse instance, below a minute")
+    size.add_argument("--full", action="store_true", help="more pixels and samples, about an hour")
+    parser.add_argument(
+        "--envmap", metavar="FILE", action="append", default=[], help="another light; repeatable"
+    )
+    parser.add_argument(
+        "--light", action="append", choices=BUILT_IN, help="only these built-in lights; repeatable"
+    )
+    parser.add_argument("--shape", action="append", choices=CONVEX, help="only these shapes; repeatable")
+    parser.add_argument("--size", type=int, help="edge of the pictures whose error is measured, pixels")
+    parser.add_argument("-o", "--output", type=Path, help="folder; without it docs/ and runs/")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write page and pictures of this earlier run"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    options = parser.parse_args(arguments)
+
+    from benchmarks.splitsum.measure import measure
+    from benchmarks.splitsum.page import page
+    from benchmarks.splitsum.plots import plot
+
+    settings = SMALL if options.small else FULL if options.full else PAGE
+    settings = replace(settings, lights=(*(options.light or settings.lights), *options.envmap))
+    if options.shape:
+        settings = replace(settings, shapes=tuple(options.shape), budget_shapes=tuple(options.shape))
+    if options.size:
+        settings = replace(settings, size=options.size)
+    try:
+        if options.json:
+            result = json.loads(options.json.read_text(encoding="utf-8"))
+        else:
+            result = measure(settings, options.quiet)
+        folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", ROOT / "runs")
+        write_json(data / "splitsum.json", result)
+        write_csv(data / "splitsum.csv", result["rows"])
+        write_text(folder / "splitsum.md", page(result, plot(result, folder / "images"), folder))
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    print(folder / "splitsum.md")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

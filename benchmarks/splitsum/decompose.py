@@ -1,0 +1,128 @@
+"""The split sum's error taken apart: one approximation after the other replaced by its exact counterpart."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from benchmarks.common.budget import Step, take_apart
+from benchmarks.common.errors import CLEAR, weight
+from benchmarks.splitsum import methods
+from benchmarks.splitsum.exact import Stage, diffuse, reflectance
+from benchmarks.splitsum.settings import CONVEX
+from mi_refgs.reference.shade import split_sum as exact_split_sum
+from mi_refgs.shade.models import reflect
+
+TABLE = "table lookup"
+IRRADIANCE = "irradiance lookup"
+RESOLUTION = "light resolution"
+LEVELS = "level interpolation"
+LOBE = "lobe with N = V = R"
+SCHLICK = "Schlick in the table"
+SHADOW = "no shadow"
+BOUNCES = "no inter-reflection"
+
+NODES = 700
+"""Midpoints of the float64 quadrature: (A, B) to 1e-6."""
+COSINES = np.linspace(0.05, 1.0, 40) ** 2
+"""n·v at which the quadrature is done; a cubic spline in √(n·v) lies between."""
+
+
+@functools.cache
+def _exact_table(roughness: float) -> Any:
+    pairs = np.array([exact_split_sum(float(c), roughness, NODES) for c in COSINES])
+    return CubicSpline(np.sqrt(COSINES), pairs)
+
+
+def exact_table(n_dot_v: np.ndarray, roughness: float) -> tuple[np.ndarray, np.ndarray]:
+    """(A, B) (P, 1) each, by float64 quadrature of the reference implementation."""
+    a, b = _exact_table(roughness)(np.sqrt(np.clip(n_dot_v, COSINES[0], 1))).T
+    return a[:, None], b[:, None]
+
+
+def budgets(stage: Stage) -> list[dict[str, Any]]:
+    """Budgets of every roughness and metal of a shape under a light, at the default height and the finest."""
+    settings = stage.settings
+    heights = sorted({settings.height, settings.heights[-1]})
+    lights = {height: stage.light.prefiltered(height) for height in heights}
+    finest = stage.light.prefiltered(settings.truth_height)
+    found = []
+    for roughness in settings.roughness:
+        around = stage.prefiltered(roughness).mean
+        for height in heights:
+            lookups = _lookups(stage, roughness, lights[height], finest, around)
+            for metallic in settings.budget_metallic:
+                steps = _chain(stage, roughness, metallic, lights[height], lookups)
+                found.append(
+                    {
+                        "shape": stage.name,
+                        "light": stage.light.name,
+                        "roughness": roughness,
+                        "metallic": metallic,
+                        "height": height,
+                        "floor": _noise(stage, roughness, metallic),
+                        **take_apart(steps).record(),
+                    }
+                )
+    return found
+
+
+def _lookups(
+    stage: Stage, roughness: float, shipped: Any, finest: Any, around: np.ndarray
+) -> dict[str, np.ndarray]:
+    """What the chains of all metals share: radiance around the mirror direction in three qualities."""
+    points = stage.points
+    mirror = reflect(points.view, points.normal)
+    r = dr.opaque(mi.Float, roughness)
+    return {
+        "shipped": methods.picture_values(shipped.specular(mirror, r)),
+        "finest": methods.picture_values(finest.specular(mirror, r)),
+        "exact": around,
+        "irradiance": methods.picture_values(shipped.irradiance(points.normal)),
+    }
+
+
+def _chain(
+    stage: Stage, roughness: float, metallic: float, shipped: Any, lookups: dict[str, np.ndarray]
+) -> list[Step]:
+    """From the product's own picture to the exact one."""
+    f0 = reflectance(metallic)
+    values = methods.picture_values(
+        methods.split_sum(stage.points, methods.material(metallic, roughness), shipped)
+    )
+    a, b = exact_table(stage.points.n_dot_v(), roughness)
+    integrals = stage.integrals(roughness)
+    looked_up, exact = (
+        diffuse(metallic) * lookups["irradiance"],
+        diffuse(metallic) * integrals.irradiance.mean,
+    )
+    around = (integrals.scale.mean + integrals.bias.mean) / (a + b)
+    table = f0 * a + b
+    steps = [
+        Step("", values),
+        Step(TABLE, lookups["shipped"] * table + looked_up),
+        Step(IRRADIANCE, lookups["shipped"] * table + exact),
+        Step(RESOLUTION, lookups["finest"] * table + exact),
+        Step(LEVELS, lookups["exact"] * table + exact),
+        Step(LOBE, around * table + exact),
+        Step(SCHLICK, integrals.radiance(metallic).mean),
+    ]
+    return steps if stage.name in CONVEX else steps + _concave(stage, roughness, metallic)
+
+
+def _concave(stage: Stage, roughness: float, metallic: float) -> list[Step]:
+    """What the shape itself adds: its shadow, and light that it reflects onto itself."""
+    direct = stage.integrals(roughness, occluded=True).radiance(metallic).mean
+    further = stage.bounces(roughness, metallic)
+    return [Step(SHADOW, direct), Step(BOUNCES, direct + further)]
+
+
+def _noise(stage: Stage, roughness: float, metallic: float) -> float:
+    """relMSE below which a part or a whole cannot be told from the references' noise."""
+    reference = stage.integrals(roughness).radiance(metallic)
+    return CLEAR * float((reference.error**2 * weight(reference.mean)).mean())

@@ -1,0 +1,258 @@
+"""The experiment: errors and times of every method, from one run and on the same pixels."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.common import errors, report, timing
+from benchmarks.common import montecarlo as mc
+from benchmarks.common.lights import Light, make_light
+from benchmarks.common.view import Points
+from benchmarks.splitsum import decompose, methods, surfels
+from benchmarks.splitsum.exact import Stage
+from benchmarks.splitsum.settings import VIEW_BINS, Settings
+from benchmarks.splitsum.speedup import line, speed_ups
+
+ALL = "all"
+LEVELS_HEIGHT = 128
+"""Rows of the light for other sets of levels: enough that its resolution does not hide them."""
+TIMED_METALLIC, TIMED_ROUGHNESS = 0.5, 0.3
+"""The material on which times are taken; a kernel is the same for every other."""
+
+
+@dataclass
+class Run:
+    """What a run collects; `rows` and the rest go to JSON as they are."""
+
+    settings: Settings
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    times: dict[tuple[str, str, str, int], float] = field(default_factory=dict)  # ms per megapixel
+    prefilter_ms: list[dict[str, Any]] = field(default_factory=list)
+    scores: list[dict[str, Any]] = field(default_factory=list)
+    budgets: list[dict[str, Any]] = field(default_factory=list)
+    surfel_budgets: list[dict[str, Any]] = field(default_factory=list)
+    flip_reason: str = ""
+
+    def time(self, stage: Stage, calls: dict[tuple[str, int], Callable[[], Any]]) -> None:
+        """Book the times of calls by (method, setting) that make the timed picture."""
+        megapixels = self.settings.timing_size**2 / 1e6
+        for key, ms in timing.milliseconds(calls, self.settings.timing_seconds).items():
+            self.times[(stage.name, stage.light.name, *key)] = ms / megapixels
+
+    def add(
+        self, stage: Stage, method: str, setting: int, roughness: float, metallic: float, values: np.ndarray
+    ) -> None:
+        """Book the errors of a picture (P, 3), for the split sum also by view angle."""
+        reference = stage.integrals(roughness).radiance(metallic)
+        points = stage.points
+        flip, self.flip_reason = errors.flip(points.image(values), points.image(reference.mean))
+        masks: dict[str, Any] = {ALL: None}
+        if method.startswith("split_sum"):
+            cosine = points.n_dot_v()
+            masks |= {f"{a:g}-{b:g}": (cosine > a) & (cosine <= b) for a, b in VIEW_BINS}
+        for name, mask in masks.items():
+            if mask is not None and not mask.any():
+                continue
+            found = errors.compare(values, reference, mask)
+            self.rows.append(
+                {
+                    "shape": stage.name,
+                    "light": stage.light.name,
+                    "roughness": roughness,
+                    "metallic": metallic,
+                    "method": method,
+                    "setting": setting,
+                    "n_dot_v": name,
+                    "bias": found.bias,
+                    "bias_floor": found.bias_floor,
+                    "relmse": found.relmse,
+                    "relmse_floor": found.relmse_floor,
+                    "below_floor": found.below_floor,
+                    "mape": found.mape,
+                    "flip": flip if mask is None else None,
+                }
+            )
+
+
+def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
+    """Run it all; what comes back is the JSON report."""
+    begin = time.perf_counter()
+    lights = [make_light(name, settings.truth_height) for name in settings.lights]
+    run = Run(settings)
+    materials = [(r, m) for r in settings.roughness for m in settings.metallic]
+    stages = [Stage(name, light, settings) for name in settings.shapes for light in lights]
+
+    for stage in tqdm(stages, desc="references, path tracer, Monte Carlo", disable=quiet):
+        for roughness, metallic in materials:
+            _sampled(run, stage, roughness, metallic)
+    for levels in (methods.SHIPPED, *settings.level_sets):
+        variants = [variant for variant in _variants(settings) if variant.levels == levels]
+        with methods.level_set(levels):
+            filtered = _prefilter(run, lights, variants)
+            for stage in tqdm(stages, desc=f"split sum, times ({levels})", disable=quiet):
+                calls = _split_sums(run, stage, variants, filtered, materials)
+                if levels == methods.SHIPPED:
+                    calls |= _sampled_calls(run, stage)
+                run.time(stage, calls)
+    shared = {(stage.name, stage.light.name): stage for stage in stages}
+    for name in tqdm(settings.budget_shapes, desc="error budget", disable=quiet):
+        for light in lights:
+            stage = shared.get((name, light.name)) or Stage(name, light, settings)
+            run.budgets += decompose.budgets(stage)
+            if name == surfels.SHAPE:
+                run.surfel_budgets.append(surfels.budget(stage))
+    return {
+        "machine": report.machine(),
+        "settings": vars(settings),
+        "seconds": time.perf_counter() - begin,
+        "frequencies": {light.name: light.frequency() for light in lights},
+        "pixels": {stage.name: stage.points.count for stage in stages},
+        "rows": [_timed(run, row) for row in run.rows],
+        "times": [
+            {"shape": s, "light": n, "method": method, "setting": k, "ms_per_mpx": ms}
+            for (s, n, method, k), ms in run.times.items()
+        ],
+        "prefilter_ms": run.prefilter_ms,
+        "scores": run.scores,
+        "speed_ups": speed_ups(run.rows, run.times, settings),
+        "budgets": run.budgets,
+        "surfel_budgets": run.surfel_budgets,
+        "flip_reason": run.flip_reason,
+    }
+
+
+def _timed(run: Run, row: dict[str, Any]) -> dict[str, Any]:
+    """A row with its time: measured, or on the straight line through the measured ones."""
+    key = (row["shape"], row["light"], row["method"])
+    exact = run.times.get((*key, row["setting"]))
+    if exact is None:
+        known = {k[3]: ms for k, ms in run.times.items() if k[:3] == key}
+        exact = line(known)(row["setting"]) if len(known) > 1 else None
+    return {**row, "ms_per_mpx": exact}
+
+
+# ---------------- errors ----------------
+
+
+def _sampled(run: Run, stage: Stage, roughness: float, metallic: float) -> None:
+    """Pictures of the path tracer and of plain Monte Carlo."""
+    settings = run.settings
+    stage.set_material(metallic, roughness)
+    material = methods.material(metallic, roughness)
+    seed = 1 + len(run.rows)
+    for spp in settings.spp:
+        image = mi.render(stage.scene, sensor=stage.sensor, integrator=stage.direct, spp=spp, seed=seed + spp)
+        values = stage.points.of_image(image)
+        run.add(stage, "path", spp, roughness, metallic, values)
+    reference = stage.integrals(roughness).radiance(metallic)
+    run.scores.append(
+        {
+            "shape": stage.name,
+            "light": stage.light.name,
+            "roughness": roughness,
+            "metallic": metallic,
+            "score": errors.mean_score(values, reference),
+        }
+    )
+    if metallic != settings.metallic[len(settings.metallic) // 2]:
+        return  # plain Monte Carlo only serves the plots of speed against error, which show one metal
+    for samples in settings.samples:
+        count, stream = (dr.opaque(mi.UInt32, n) for n in (samples, seed + samples))
+        found = mc.monte_carlo(stage.points, material, stage.emitter, count, stream)
+        run.add(stage, "monte_carlo", samples, roughness, metallic, methods.picture_values(found))
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A split sum: levels, rows of the light, and a knob of `shade`."""
+
+    levels: str
+    height: int
+    knob: str = ""
+
+    @property
+    def method(self) -> str:
+        """Its name in the report."""
+        levels = "" if self.levels == methods.SHIPPED else f"_{self.levels}_levels"
+        return f"split_sum{levels}" + (f"_{self.knob}" if self.knob else "")
+
+
+def _variants(settings: Settings) -> list[Variant]:
+    shipped = [Variant(methods.SHIPPED, height) for height in settings.heights]
+    knobs = [
+        Variant(methods.SHIPPED, height, knob)
+        for height in {settings.height, settings.heights[-1]}
+        for knob in methods.KNOBS
+        if knob
+    ]
+    levels = [Variant(name, min(LEVELS_HEIGHT, settings.heights[-1])) for name in settings.level_sets]
+    return sorted(shipped + knobs, key=lambda variant: variant.height) + levels
+
+
+def _prefilter(run: Run, lights: list[Light], variants: list[Variant]) -> dict[tuple[str, int], Any]:
+    """Every light at every height, by (light, height), with one set of levels; books the time it takes."""
+    filtered, calls = {}, {}
+    for variant in (variant for variant in variants if not variant.knob):
+        environments = {light.name: light.environment(variant.height) for light in lights}
+        for name, environment in environments.items():
+            filtered[name, variant.height] = environment.prefilter()
+
+        def again(environment: Any = environments[lights[0].name]) -> Any:
+            return environment.prefilter().levels
+
+        calls[variant.method, variant.height] = again
+    dr.eval([light.levels for light in filtered.values()])
+    # One height after the other: only a few operators are kept at a time.
+    for (method, height), call in calls.items():
+        ms = timing.milliseconds({0: call}, run.settings.timing_seconds)[0]
+        run.prefilter_ms.append({"method": method, "height": height, "ms": ms})
+    return filtered
+
+
+def _split_sums(
+    run: Run, stage: Stage, variants: list[Variant], filtered: dict[tuple[str, int], Any], materials: Any
+) -> dict[tuple[str, int], Callable[[], Any]]:
+    """Book pictures of the split sums of a stage; calls that make the timed ones."""
+    timed = methods.material(TIMED_METALLIC, TIMED_ROUGHNESS)
+    calls = {}
+    for variant in variants:
+        light = filtered[stage.light.name, variant.height]
+
+        def shader(points: Points, light: Any = light, knob: str = variant.knob) -> Any:
+            return methods.split_sum(points, timed, light, knob)
+
+        for roughness, metallic in materials:
+            material = methods.material(metallic, roughness)
+            radiance = methods.split_sum(stage.points, material, light, variant.knob)
+            values = methods.picture_values(radiance)
+            run.add(stage, variant.method, variant.height, roughness, metallic, values)
+        calls[variant.method, variant.height] = methods.with_primary_rays(stage, shader)
+    return calls
+
+
+def _sampled_calls(run: Run, stage: Stage) -> dict[tuple[str, int], Callable[[], Any]]:
+    """Calls that make the timed pictures of the path tracer and of plain Monte Carlo."""
+    stage.set_material(TIMED_METALLIC, TIMED_ROUGHNESS)
+    material = methods.material(TIMED_METALLIC, TIMED_ROUGHNESS)
+    calls: dict[tuple[str, int], Callable[[], Any]] = {}
+    for count in run.settings.timed_spp:
+
+        def path(spp: int = count) -> Any:
+            return mi.render(stage.scene, sensor=stage.timing_sensor, integrator=stage.direct, spp=spp)
+
+        samples, seed = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, 1)
+
+        def plain(points: Points, samples: Any = samples, seed: Any = seed) -> Any:
+            return mc.monte_carlo(points, material, stage.emitter, samples, seed)
+
+        calls["path", count] = path
+        calls["monte_carlo", count] = methods.with_primary_rays(stage, plain)
+    return calls

@@ -1,0 +1,86 @@
+"""The methods that are compared, each as a picture and as a call to be timed with its primary rays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from benchmarks.common import montecarlo as mc
+from benchmarks.common.view import Points, first_hits
+from benchmarks.splitsum.exact import Stage
+from benchmarks.splitsum.settings import ALBEDO
+from mi_refgs.shade import lobe, prefilter
+from mi_refgs.shade.models import Accuracy, ShadingPoints, shade
+
+SHIPPED = "shipped"
+LEVEL_SETS: dict[str, tuple[float, ...]] = {
+    "few": (0.1, 0.32, 1.0),
+    SHIPPED: lobe.LEVEL_ROUGHNESS,
+    "many": (0.07, 0.1, 0.12, 0.15, 0.18, 0.22, 0.265, 0.32, 0.38, 0.45, 0.54, 0.65, 0.8, 1.0),
+}
+"""Roughness of the filtered levels; the map itself is one more."""
+
+
+@contextmanager
+def level_set(name: str) -> Iterator[int]:
+    """Prefilter with other levels inside this context, which yields how many there are.
+
+    A light must be looked up in the context that it was filtered in.
+    """
+    shipped = lobe.LEVEL_ROUGHNESS, lobe.LEVEL_MAX_HEIGHT
+    caches = (prefilter._host_levels, prefilter._build)
+    if name == SHIPPED:
+        yield len(shipped[0]) + 1
+        return
+    roughness = LEVEL_SETS[name]
+    heights = tuple(shipped[1][int(np.searchsorted(shipped[0], r - 1e-6))] for r in roughness)
+    try:
+        for cache in caches:
+            cache.cache_clear()
+        # The levels are constants of the product; only this experiment replaces them.
+        vars(lobe).update(LEVEL_ROUGHNESS=roughness, LEVEL_MAX_HEIGHT=heights)
+        yield len(roughness) + 1
+    finally:
+        vars(lobe).update(LEVEL_ROUGHNESS=shipped[0], LEVEL_MAX_HEIGHT=shipped[1])
+        for cache in caches:
+            cache.cache_clear()
+
+
+KNOBS = {"": Accuracy(), "dominant": Accuracy(dominant=True), "multiscatter": Accuracy(multiscatter=True)}
+"""Settings of `shade` that concern a surface that nothing shadows."""
+
+
+def split_sum(points: Any, material: mc.Material, light: Any, knob: str = "") -> Any:
+    """Outgoing radiance as the product shades it."""
+    surface = ShadingPoints(
+        points.normal, points.view, material.albedo, material.metallic, material.roughness
+    )
+    return shade(surface, light, "irradiance", KNOBS[knob]).total()
+
+
+def picture_values(radiance: Any) -> np.ndarray:
+    """mi.Color3f of P points as (P, 3) float64."""
+    return np.array(radiance, np.float64).T
+
+
+def material(metallic: float, roughness: float) -> mc.Material:
+    """Opaque, with the albedo of all scenes."""
+    return mc.device_material(ALBEDO, metallic, roughness)
+
+
+def with_primary_rays(stage: Stage, shader: Callable[[Points], Any]) -> Callable[[], Any]:
+    """A call that meets the surface at the centre of every pixel of the timed picture and shades it there."""
+    size, sensor = stage.settings.timing_size, stage.timing_sensor
+
+    def run() -> Any:
+        hit, ray = first_hits(stage.scene, sensor, size)
+        pixel = dr.arange(mi.UInt32, size * size)
+        colour = shader(Points(size, pixel, hit.p, hit.sh_frame.n, -ray.d, hit.n))
+        return dr.select(hit.is_valid(), colour, 0)
+
+    return run

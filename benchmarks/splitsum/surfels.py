@@ -1,0 +1,139 @@
+"""What surfels add to the error: a sphere of two materials in bands, covered with them, against the sphere.
+
+Blending before shading mixes materials where bands meet; blended normals are not the surface's; coverage is
+not exactly 1, and a band ends at a surfel's edge and not where it should. Each is replaced in turn, and the
+split sum itself comes last.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from benchmarks.common import montecarlo as mc
+from benchmarks.common.budget import Step, take_apart
+from benchmarks.common.errors import CLEAR, weight
+from benchmarks.common.view import Points
+from benchmarks.splitsum import methods
+from benchmarks.splitsum.exact import Stage
+from benchmarks.splitsum.settings import ALBEDO
+from mi_refgs.constants import COVERAGE_FLOOR
+from mi_refgs.render.pipeline import Shading, render
+from mi_refgs.splat import Camera, splat
+from mi_refgs.surfels.init import from_points, logit
+from mi_refgs.surfels.table import Surfels
+
+SHAPE = "sphere"
+BLENDING = "deferred blending"
+NORMALS = "surfel normals"
+COVERAGE = "surfel coverage and edges"
+SPLIT_SUM = "split sum itself"
+
+MATERIALS = ((1.0, 0.2), (0.0, 0.6))
+"""(metallic, roughness) of even and odd bands: polished metal and dull plastic."""
+BANDS = 6
+"""Bands from pole to pole, of equal area."""
+OPACITY = 0.99
+EXTREME = 1e-6
+"""Distance of metallic from 0 and 1, which their activation cannot reach."""
+
+
+def band(y: np.ndarray) -> np.ndarray:
+    """Material (0 or 1) at heights -1 … 1."""
+    return np.floor((np.clip(y, -1, 0.999999) + 1) * (BANDS / 2)).astype(int) % 2
+
+
+def sphere_surfels(count: int) -> Surfels:
+    """Surfels evenly on the unit sphere, with its exact normals and the materials of its bands."""
+    i = np.arange(count) + 0.5
+    y, φ = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
+    sine = np.sqrt(1 - y * y)
+    points = np.stack([sine * np.cos(φ), y, sine * np.sin(φ)], axis=-1)
+    surfels = from_points(points, points, rng=np.random.default_rng(0), opacity=OPACITY)
+    raw = surfels.to_numpy()
+    metallic, roughness = np.array(MATERIALS)[band(y)].T
+    raw["metallic"] = logit(np.clip(metallic, EXTREME, 1 - EXTREME))[:, None].astype(np.float32)
+    raw["roughness"] = logit(roughness)[:, None].astype(np.float32)
+    raw["albedo"] = np.tile(logit(np.array(ALBEDO)), (count, 1)).astype(np.float32)
+    return Surfels.from_numpy(raw)
+
+
+def budget(stage: Stage) -> dict[str, Any]:
+    """Budget of the surfels' picture of a sphere, where they cover its pixels."""
+    settings = stage.settings
+    height = settings.heights[-1]
+    light = stage.light.prefiltered(height)
+    surfels = sphere_surfels(settings.surfels)
+    camera = Camera.from_sensor(stage.sensor.inner)
+    shading = Shading(at="pixel", reflectance="split_sum", diffuse="irradiance")
+    shipped = stage.points.of_image(
+        methods.picture_values(render(surfels, camera, shading, light).radiance())
+    )
+
+    group = mi.Float(band(surfels.to_numpy()["position"][:, 1]).astype(np.float32))
+    blended = splat(surfels, [*surfels.frame()[2], group], camera)
+    normal = _at(blended.features[:3], stage.points)
+    odd, alpha = (_at([x], stage.points)[:, 0] for x in (blended.features[3], blended.alpha))
+    covered = alpha > COVERAGE_FLOOR
+    share = np.stack([alpha - odd, odd], axis=-1)
+
+    facing = np.where(np.sum(normal * _rows(stage.points.view), -1, keepdims=True) < 0, -normal, normal)
+    by_surfel = _shaded(stage, light, facing)
+    by_mesh = _shaded(stage, light, _rows(stage.points.normal))
+    here = band(_rows(stage.points.position)[:, 1])
+    exact = [stage.integrals(roughness).radiance(metallic) for metallic, roughness in MATERIALS]
+    steps = [
+        Step("", shipped),
+        Step(BLENDING, _mixed(by_surfel, share)),
+        Step(NORMALS, _mixed(by_mesh, share)),
+        Step(COVERAGE, _chosen(by_mesh, here)),
+        Step(SPLIT_SUM, _chosen([estimate.mean for estimate in exact], here)),
+    ]
+    reference = mc.Estimate(
+        steps[-1].values[covered], _chosen([estimate.error for estimate in exact], here)[covered]
+    )
+    found = take_apart([Step(step.replaced, step.values[covered]) for step in steps])
+    floor = CLEAR * float((reference.error**2 * weight(reference.mean)).mean())
+    return {
+        "light": stage.light.name,
+        "height": height,
+        "surfels": settings.surfels,
+        "covered": float(covered.mean()),
+        "floor": floor,
+        **found.record(),
+    }
+
+
+def _rows(vectors: Any) -> np.ndarray:
+    return np.array(vectors, np.float64).T
+
+
+def _at(maps: list[Any], points: Points) -> np.ndarray:
+    """Values (P, K) of K full pictures at the points."""
+    return np.stack([np.array(x, np.float64) for x in maps], axis=-1)[points.pixel.numpy()]
+
+
+def _shaded(stage: Stage, light: Any, normal: np.ndarray) -> list[np.ndarray]:
+    """The split sum of each material with these normals (P, 3)."""
+    points = stage.points
+    turned = Points(
+        points.size,
+        points.pixel,
+        points.position,
+        mi.Vector3f(np.ascontiguousarray(normal.T, dtype=np.float32)),
+        points.view,
+        points.offset,
+    )
+    dr.eval(turned.normal)
+    return [methods.picture_values(methods.split_sum(turned, methods.material(*m), light)) for m in MATERIALS]
+
+
+def _mixed(values: list[np.ndarray], share: np.ndarray) -> np.ndarray:
+    return values[0] * share[:, :1] + values[1] * share[:, 1:]
+
+
+def _chosen(values: list[np.ndarray], which: np.ndarray) -> np.ndarray:
+    return np.where(which[:, None] == 0, values[0], values[1])

@@ -1,0 +1,368 @@
+"""The benchmark of the split sum runs, and its numbers are ordered as they must be. No times are tested."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import ROOT
+
+sys.path.insert(0, str(ROOT))  # `benchmarks` is no part of the package
+from benchmarks.common import budget, errors, lights, view
+from benchmarks.common import montecarlo as mc
+from benchmarks.splitsum import decompose, methods, speedup, surfels
+from mi_refgs.errors import InputError
+from mi_refgs.reference.shade import lobe_average, split_sum
+from mi_refgs.shade import lobe
+
+Row = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output of the small instance, made as a reader would make it."""
+    target = tmp_path_factory.mktemp("splitsum")
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-m", "benchmarks.splitsum", "--small", "--quiet", "-o", str(target)],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return target
+
+
+@pytest.fixture(scope="module")
+def result(folder: Path) -> dict[str, Any]:
+    """Its JSON."""
+    found: dict[str, Any] = json.loads((folder / "splitsum.json").read_text())
+    return found
+
+
+def select(rows: list[Row], **values: Any) -> list[Row]:
+    return [row for row in rows if all(row[k] == v for k, v in values.items())]
+
+
+def cases(
+    result: dict[str, Any], method: str, view_bin: str = "all"
+) -> dict[tuple[Any, ...], dict[int, Row]]:
+    """Rows of a method by case, then by setting."""
+    found: dict[tuple[Any, ...], dict[int, Row]] = {}
+    for row in select(result["rows"], method=method, n_dot_v=view_bin):
+        key = (row["shape"], row["light"], row["roughness"], row["metallic"])
+        found.setdefault(key, {})[row["setting"]] = row
+    return found
+
+
+# ---------- The small instance ----------
+
+
+def test_reports_are_written(folder: Path, result: dict[str, Any]) -> None:
+    page = (folder / "splitsum.md").read_text()
+    assert not re.search(r"\bnan\b|\binf\b", page)
+    for name in ("pareto", "lights", "trust", "speedup", "budget"):
+        assert f"](images/splitsum_{name}.png)" in page
+        assert (folder / "images" / f"splitsum_{name}.png").stat().st_size > 10_000
+    with (folder / "splitsum.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(result["rows"])
+    for row in rows:
+        assert float(row["relmse"]) >= 0 and float(row["mape"]) >= 0
+    split = cases(result, "split_sum")
+    settings = result["settings"]
+    assert len(split) == math.prod(len(settings[k]) for k in ("shapes", "lights", "roughness", "metallic"))
+    assert all(set(by) == set(settings["heights"]) for by in split.values())
+
+
+def test_every_method_has_a_time(result: dict[str, Any]) -> None:
+    assert all(row["ms_per_mpx"] > 0 for row in result["rows"])
+
+
+def test_the_path_tracer_agrees_with_the_reference(result: dict[str, Any]) -> None:
+    """Mean errors in standard errors: within 4 each, and with a spread of about 1."""
+    scores = np.array([row["score"] for row in result["scores"]])
+    assert np.abs(scores).max() < 4
+    assert 0.5 < scores.std() < 1.6
+
+
+def test_more_samples_are_better(result: dict[str, Any]) -> None:
+    """Path tracer: as 1/samples. Plain Monte Carlo: where it does not miss the sun."""
+    for key, by in cases(result, "path").items():
+        values = [by[n]["relmse"] for n in sorted(by)]
+        assert values == sorted(values, reverse=True), key
+    slopes = [row["path_exponent"] for row in result["speed_ups"]]
+    assert -1.2 < min(slopes) and max(slopes) < -0.8
+    for key, by in cases(result, "monte_carlo").items():
+        if key[1] != "sunsky":
+            values = [by[n]["relmse"] for n in sorted(by)]
+            assert values == sorted(values, reverse=True), key
+
+
+def test_more_rows_are_not_worse(result: dict[str, Any]) -> None:
+    """They help where details show; elsewhere other errors are left, and may grow by a quarter at most.
+
+    But for the sun's glint on a floor: the lobe is wrong there by more than what it should show.
+    """
+    for key, by in cases(result, "split_sum").items():
+        values = [by[height]["relmse"] for height in sorted(by)]
+        floor = 2 * max(row["relmse_floor"] for row in by.values())
+        if key[1] == "checker" and key[2] == 0.1:
+            assert values == sorted(values, reverse=True), key
+        if key[:2] != ("patch", "sunsky"):
+            assert values[-1] < 1.25 * values[0] + floor, key
+
+
+def test_a_constant_light_has_no_error(result: dict[str, Any]) -> None:
+    """The table is exact for it: only its own interpolation is left, 5e-4 of the radiance."""
+    for key, by in cases(result, "split_sum").items():
+        if key[1] == "constant":
+            assert all(row["relmse"] < 2.5e-7 + 2 * row["relmse_floor"] for row in by.values()), key
+
+
+def test_grazing_errors_grow_with_the_frequency_of_the_light(result: dict[str, Any]) -> None:
+    """Sphere, n·v < 0.1, median over materials."""
+    order = sorted(result["frequencies"], key=lambda name: float(result["frequencies"][name]))
+    assert order == ["constant", "gradient", "checker", "sunsky"]
+    finest = max(result["settings"]["heights"])
+    grazing = {
+        light: np.median(
+            [
+                by[finest]["relmse"]
+                for key, by in cases(result, "split_sum", "0-0.1").items()
+                if key[:2] == ("sphere", light)
+            ]
+        )
+        for light in order
+    }
+    assert grazing["constant"] < grazing["gradient"] < grazing["checker"] < grazing["sunsky"], grazing
+
+
+def test_grazing_is_worse_than_facing(result: dict[str, Any]) -> None:
+    """On the sphere under a smooth light: by more than twice in relMSE at every roughness."""
+    finest = max(result["settings"]["heights"])
+    grazing, facing = (cases(result, "split_sum", name) for name in ("0.1-0.2", "0.5-1"))
+    for key, by in grazing.items():
+        if key[0] == "sphere" and key[1] == "gradient":
+            assert by[finest]["relmse"] > 2 * facing[key][finest]["relmse"], key
+
+
+def test_fewer_levels_are_not_better(result: dict[str, Any]) -> None:
+    """Over all cases together."""
+    shipped, few = cases(result, "split_sum"), cases(result, "split_sum_few_levels")
+    ratios = [
+        row["relmse"] / shipped[key][height]["relmse"]
+        for key, by in few.items()
+        for height, row in by.items()
+        if not shipped[key][height]["below_floor"]
+    ]
+    assert np.mean(np.log(ratios)) > 0
+
+
+def test_budgets_add_up(result: dict[str, Any]) -> None:
+    """Shares to 1 and signed errors to the whole, always; and the torus has what a convex shape has not."""
+    for row in result["budgets"]:
+        parts = {part["name"]: part for part in row["parts"]}
+        if row["total"] > row["floor"]:
+            assert sum(part["share"] for part in parts.values()) == pytest.approx(1)
+        alone = sum(part["relmse"] for part in parts.values())
+        assert row["total"] == pytest.approx(alone + row["interaction"])
+        assert (decompose.SHADOW in parts) == (row["shape"] == "torus")
+        assert parts[decompose.TABLE]["relmse"] < 1e-6
+    sphere = select(result["budgets"], shape="sphere", light="checker", roughness=0.1, height=32)
+    for row in sphere:
+        assert max(row["parts"], key=lambda part: float(part["relmse"]))["name"] == decompose.RESOLUTION
+    rough = select(result["budgets"], shape="sphere", light="gradient", roughness=0.8)
+    for row in rough:
+        assert max(row["parts"], key=lambda part: float(part["relmse"]))["name"] == decompose.LOBE
+
+
+def test_surfels_cost_something_and_add_up(result: dict[str, Any]) -> None:
+    """One budget a light; under a constant one the split sum is exact and the rest is the surfels' own."""
+    found = {row["light"]: row for row in result["surfel_budgets"]}
+    assert set(found) == set(result["frequencies"])
+    for row in found.values():
+        assert row["covered"] > 0.9
+        assert sum(part["share"] for part in row["parts"]) == pytest.approx(1)
+    parts = {part["name"]: part["relmse"] for part in found["constant"]["parts"]}
+    assert parts[surfels.SPLIT_SUM] < 1e-5 < parts[surfels.BLENDING] < 1e-2
+
+
+# ---------- Its parts, against what they stand for ----------
+
+
+def stage(size: int = 16) -> tuple[Any, view.Points]:
+    """A sphere under a gradient, and its points."""
+    light = lights.make_light("gradient", 32)
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "light": light.emitter()})
+    look = view.Look((0, 0.6, 4), (0, 0, 0), 30)
+    return scene, view.surface(scene, view.make_sensor(look, size), size)
+
+
+def test_samples_go_through_pixel_centres() -> None:
+    """However many samples, Mitsuba's depth of a sphere is that of the central rays, to float32."""
+    size = 16
+    scene, points = stage(size)
+    sensor = view.make_sensor(view.Look((0, 0.6, 4), (0, 0, 0), 30), size)
+    depth = mi.load_dict({"type": "aov", "aovs": "p:position", "path": {"type": "direct"}})
+    image = np.array(mi.render(scene, sensor=sensor, integrator=depth, spp=16))[..., -3:]
+    position = np.array(points.position).T
+    assert points.count > 100
+    np.testing.assert_allclose(points.of_image(image), position, atol=2e-6)
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.5, 1.0])
+def test_integrals_of_a_constant_light_are_the_table(roughness: float) -> None:
+    """∫ (1 - Fc) f cosθ and ∫ Fc f cosθ against float64 quadrature, and their noise says how far."""
+    light = lights.make_light("constant", 16)
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "light": light.emitter()})
+    look = view.Look((0, 0.6, 4), (0, 0, 0), 30)
+    points = view.surface(scene, view.make_sensor(look, 8), 8)
+    α = dr.opaque(mi.Float, roughness**2)
+    found = mc.integrate(lambda p: mc.brdf_lobe(p, α), points, scene.environment(), samples=1597)
+    wanted = np.array([split_sum(float(c), roughness, 800) for c in points.n_dot_v()])
+    for k, batches in enumerate(found):
+        estimate = mc.estimate(batches)
+        error = np.abs(estimate.mean[:, 0] - wanted[:, k])
+        assert (error < 6 * estimate.error[:, 0] + 1e-4).all()
+        assert error.max() < 2e-3
+    a, b = decompose.exact_table(points.n_dot_v(), roughness)
+    np.testing.assert_allclose(np.concatenate([a, b], axis=1), wanted, atol=3e-5)
+
+
+@pytest.mark.parametrize("roughness", [0.15, 0.6, 1.0])
+def test_lobe_average_is_the_reference_one(roughness: float) -> None:
+    scene, points = stage(6)
+    α = dr.opaque(mi.Float, roughness**2)
+    environment = scene.environment()
+    estimate = mc.estimate(
+        mc.integrate(lambda p: mc.prefilter_lobe(p, roughness, α), points, environment, samples=987)[0]
+    )
+    normal, towards = (np.array(v, np.float64).T for v in (points.normal, points.view))
+    mirror = 2 * np.sum(normal * towards, -1, keepdims=True) * normal - towards
+    radiance = lights.make_light("gradient", 32).radiance.astype(np.float64)
+    for k in range(0, points.count, 5):
+        wanted = lobe_average(radiance, mirror[k], roughness, rings=200, spokes=200)
+        assert (np.abs(estimate.mean[k] - wanted) < 6 * estimate.error[k] + 2e-3 * wanted).all()
+
+
+def test_the_standard_error_is_honest() -> None:
+    """Two independent estimates differ by as much as they say: root mean square of the scores near 1."""
+    scene, points = stage(24)
+    α = dr.opaque(mi.Float, 0.25)
+    first, second = (
+        mc.estimate(
+            mc.integrate(
+                lambda p: mc.brdf_lobe(p, α), points, scene.environment(), samples=89, batches=16, seed=seed
+            )[0]
+        )
+        for seed in (1, 2)
+    )
+    score = (first.mean - second.mean) / np.hypot(first.error, second.error)
+    assert 0.8 < np.sqrt((score**2).mean()) < 1.25
+
+
+def test_lights_have_a_mean_of_one_and_rise_in_frequency() -> None:
+    made = [lights.make_light(name, 64) for name in lights.BUILT_IN]
+    for light in made:
+        assert light.radiance.shape == (64, 128, 3)
+        mean = np.average(light.radiance.mean((1, 2)), weights=lobe.row_areas(64))
+        assert mean == pytest.approx(1, rel=2e-3)
+    sky = made[-1].radiance.mean(-1)
+    row, column = np.unravel_index(sky.argmax(), sky.shape)
+    elevation = 90 - np.degrees(lobe.row_angles(64)[row])
+    azimuth = np.degrees(lobe.column_angles(128)[column])
+    assert elevation == pytest.approx(lights.SUN_ELEVATION, abs=3)
+    assert azimuth == pytest.approx(lights.SUN_AZIMUTH % 360, abs=3)
+    assert made[0].frequency() == 0 < made[1].frequency() < made[-1].frequency()
+    with pytest.raises(InputError, match=r"nowhere\.exr"):
+        lights.make_light("nowhere.exr", 64)
+
+
+def test_errors_know_their_floor() -> None:
+    rng = np.random.default_rng(3)
+    truth = rng.uniform(0.5, 1.5, (4000, 3))
+    reference = mc.Estimate(truth + 0.01 * rng.normal(size=truth.shape), np.full(truth.shape, 0.01))
+    same = errors.compare(truth, reference)
+    assert same.below_floor and same.relmse == pytest.approx(same.relmse_floor, rel=0.1)
+    assert abs(same.bias) < 4 * same.bias_floor
+    off = errors.compare(1.05 * truth, reference)
+    assert not off.below_floor and off.bias == pytest.approx(0.05, abs=1e-3)
+    assert off.relmse == pytest.approx(0.05**2, rel=0.1) and off.mape == pytest.approx(0.05, rel=0.05)
+
+
+def test_a_budget_of_known_parts() -> None:
+    """Two orthogonal errors and two that cancel."""
+    exact = np.ones((2, 3))
+    a, b = np.array([[0.1], [0.0]]), np.array([[0.0], [0.2]])
+    steps = [budget.Step("", exact + a + b), budget.Step("a", exact + b), budget.Step("b", exact)]
+    found = budget.take_apart(steps)
+    assert found.adds_up and found.interaction == pytest.approx(0, abs=1e-12)
+    assert [part.share for part in found.parts] == pytest.approx([0.2, 0.8])
+    assert [part.bias for part in found.parts] == pytest.approx([0.05, 0.1])
+    opposed = [budget.Step("", exact), budget.Step("a", exact - a), budget.Step("b", exact)]
+    with np.errstate(all="raise"):
+        found = budget.take_apart(opposed)
+    assert found.total == pytest.approx(0) and not found.adds_up
+    assert found.correlation == pytest.approx(-1)
+
+
+def test_equal_error_is_interpolated() -> None:
+    """relMSE = 0.8 / spp and 3 + 2 spp milliseconds: a split sum of 0.01 is worth 80 spp, 163 ms."""
+    points = [(n, 0.8 / n, 0.0) for n in (1, 4, 16)]
+    assert speedup.error_times_samples(points) / 0.01 == pytest.approx(80)
+    assert speedup.exponent(points) == pytest.approx(-1)
+    assert speedup.line({n: 3 + 2.0 * n for n in (1, 4, 16)})(80) == pytest.approx(163)
+    noisy = [(n, 0.8 / n + 0.1, 0.1) for n in (1, 4)]
+    assert speedup.error_times_samples(noisy) == pytest.approx(0.8)
+
+
+def test_other_levels_leave_nothing_behind() -> None:
+    """The product's levels are restored, even after an error, and no operator of the others stays cached."""
+    light = lights.make_light("gradient", 16).environment(16)
+    before = np.array(light.prefilter().levels)
+
+    def use(fail: bool) -> None:
+        with methods.level_set("few") as count:
+            assert count == 4
+            assert len(np.array(light.prefilter().levels)) < len(before)
+            if fail:
+                raise KeyError
+
+    shipped = lobe.LEVEL_ROUGHNESS
+    use(False)
+    with pytest.raises(KeyError):
+        use(True)
+    assert lobe.LEVEL_ROUGHNESS == shipped
+    np.testing.assert_array_equal(np.array(light.prefilter().levels), before)
+
+
+def refuse(arguments: list[str]) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.splitsum", *arguments],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 2
+    return done.stderr
+
+
+def test_a_missing_light_is_one_sentence(tmp_path: Path) -> None:
+    assert "nowhere.exr: light" in refuse(["--small", "--envmap", "nowhere.exr", "-o", str(tmp_path)])
