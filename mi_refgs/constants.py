@@ -26,8 +26,9 @@ TRANSMITTANCE_MIN = 1e-4
 """A pixel ends before the surfel that would bring T below this: 8 bits show no more. [3DGS, appendix C]"""
 
 LOW_PASS_INV_VARIANCE = 12.0
-"""1/pixel²: the screen-space filter is a Gaussian of the variance of a pixel's box, 1/12. The 1/2 of 2DGS (§4.2)
-widens every outline by about a pixel, and a fit then shrinks the surface behind it (docs/decisions.md)."""
+"""1/pixel²: the screen-space filter is a Gaussian of the variance of a pixel's box, 1/12. The 1/2 of 2DGS
+(§4.2) widens every outline by about a pixel, and a fit then shrinks the surface behind it
+(docs/decisions.md)."""
 
 EDGE_ON_COSINE = 1e-4
 """|cos| between a surfel's plane and the ray to its centre below which it is culled: it covers less than
@@ -37,13 +38,13 @@ MEDIAN_TRANSMITTANCE = 0.5
 """The median depth is that of the last surfel met while T is above one half. [2DGS, §5]"""
 
 SORT_REACH = 1.0
-"""Standard deviations from its centre up to which a surfel's plane tells its depth in a tile. Near-mirrors fitted
-with 0 (sorted by centres), 1 and 3 reach 26.0, 26.7 and 26.3 dB on test views: with a longer reach the order
-follows every error of a normal."""
+"""Standard deviations from its centre up to which a surfel's plane tells its depth in a tile. Near-mirrors
+fitted with 0 (sorted by centres), 1 and 3 reach 26.0, 26.7 and 26.3 dB on test views: with a longer reach
+the order follows every error of a normal."""
 
 SORT_DEPTH_RANGE = 5.0
-"""Factor by which a surfel's depth in a tile may exceed that of its centre in the sort: a plane that turns away
-from the camera within its reach has no depth of its own there."""
+"""Factor by which a surfel's depth in a tile may exceed that of its centre in the sort: a plane that turns
+away from the camera within its reach has no depth of its own there."""
 
 TILE = 4
 """Tile edge in pixels: 4×4 = one 16-lane AVX-512 packet, whose lanes then share every surfel they read."""

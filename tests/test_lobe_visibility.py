@@ -62,6 +62,34 @@ def test_weights_add_up_to_the_table(roughness: float) -> None:
         np.testing.assert_allclose(mean[k] / count, expected, atol=3e-3)
 
 
+def test_limits_of_the_lobe() -> None:
+    """Roughness 0 is the mirror, with Schlick's weight; beyond 1 it is 1; views along and below the surface
+    are grazing ones."""
+    rng = np.random.default_rng(9)
+    normal = unit(rng.normal(size=(60, 3)))
+    across = unit(np.cross(normal, rng.normal(size=(60, 3))))
+    height = np.repeat([0.0, -1.0, -0.3, 1.0, 0.2, 0.7], 10)[:, None]
+    view = height * normal + np.sqrt(1 - height**2) * across
+
+    def sample(roughness: float) -> tuple[np.ndarray, np.ndarray]:
+        r = dr.full(mi.Float, roughness, 60)
+        lobe = Lobe.of(vector(normal), vector(view), r, mi.Color3f(0.3))
+        direction, weight = lobe.sample(mi.UInt32(5), mi.UInt32(8))
+        return direction.numpy().T, np.array(weight)
+
+    direction, weight = sample(0.0)
+    mirror, above = 2 * height * normal - view, height[:, 0] > 0
+    np.testing.assert_allclose(direction[above], mirror[above], atol=1e-5)
+    np.testing.assert_allclose(weight[above], 0.3 + 0.7 * (1 - height[above, 0]) ** 5, rtol=1e-4)
+    for roughness in (0.0, 0.01, 0.5, 1.0):
+        direction, weight = sample(roughness)
+        np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1, atol=1e-5)
+        assert np.isfinite(weight).all() and (weight >= 0).all() and (weight <= 1 + 1e-5).all()
+        up = weight > 0
+        assert ((direction * normal).sum(1)[up] > 0).all() and up.mean() > 0.5
+    np.testing.assert_array_equal(sample(7.0)[0], sample(1.0)[0])
+
+
 # ---------------- visibility ----------------
 
 

@@ -17,9 +17,6 @@ from mi_refgs.shade.models import safe_normalize
 GOLDEN = 2654435769
 """2³² / golden ratio: multiples of it, modulo 2³², are the most even sequence on a circle."""
 
-ALPHA_FLOOR = 1e-4
-"""Narrower lobes are traced as this one, 0.01° wide: facets of a perfect mirror have no distribution."""
-
 COSINE_FLOOR = 1e-3
 """Smallest n·v of a lobe: a view from behind is taken as a grazing one, as `shade` takes its reflectance."""
 
@@ -60,7 +57,7 @@ class Lobe:
         return Lobe(
             frame,
             safe_normalize(local),
-            dr.maximum(dr.square(dr.clip(roughness, 0, 1)), ALPHA_FLOOR),
+            dr.square(dr.clip(roughness, 0, 1)),
             dr.clip((f0.x + f0.y + f0.z) * (1 / 3), 0, 1),
             lobe_points(dr.arange(mi.UInt32, dr.width(normal))),
         )
