@@ -1,0 +1,1 @@
+"""Visibility and indirect light of the specular term in concave scenes, against Mitsuba's path tracer."""

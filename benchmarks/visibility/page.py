@@ -1,0 +1,203 @@
+"""The page in words: what the numbers of a run say, written by the program."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common.report import number, prose, signed, table
+from benchmarks.visibility.payoff import BUDGET, PAPER, TARGET, where
+from benchmarks.visibility.settings import ALBEDO
+
+WHAT = {"ms": "shading the mesh", "frame_ms": "the product's frame"}
+
+
+def page(result: dict[str, Any], picture: Path, folder: Path) -> str:
+    """Markdown; the picture is linked relative to `folder`."""
+    link = os.path.relpath(picture, folder).replace(os.sep, "/")
+    parts = [
+        _opening(result, link),
+        _how(result),
+        _gains(result),
+        _errors(result),
+        _curve(result),
+        _again(result),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _opening(result: dict[str, Any], link: str) -> str:
+    said = []
+    for key, what in WHAT.items():
+        found = where(result["payoffs"], time=key)
+        met = [row for row in found if row["gain"] >= TARGET]
+        low, high = (pick(found, key=lambda row: float(row["gain"])) for pick in (min, max))
+        said.append(
+            f"""Measured by the time of {what}, {len(met)} of {len(found)} cases reach {TARGET:g}×; the least
+            is {number(low["gain"], 2)}× ({_case(low)}), the most {number(high["gain"], 2)}×
+            ({_case(high)})."""
+        )
+    text = f"""How much closer to the path tracer at full depth do the knobs come than one mirror ray without
+        traced light, within {BUDGET:g} times its time? {" ".join(said)}"""
+    return "\n\n".join(
+        [
+            "# Visibility and indirect light in concave scenes",
+            "*Written by `python -m benchmarks.visibility`; every number on this page is from one run.*",
+            prose(text),
+            f"![Error over time, and convergence with the number of rays]({link})",
+            prose(
+                """Above: error over time, a number beside a mark is its rays of the lobe, the grey line the
+                mirror ray alone. Below: how rays of the lobe approach the traced answer (solid: mean
+                visibility against exact visibility, dotted that one's own noise; dashed: the picture with
+                traced light against the same with very many rays)."""
+            ),
+        ]
+    )
+
+
+def _case(row: dict[str, Any]) -> str:
+    return f"{row['scene']}, roughness {row['roughness']:g}"
+
+
+def _how(result: dict[str, Any]) -> str:
+    s, machine = result["settings"], result["machine"]
+    scenes = ", ".join(
+        f"{name} ({fact['pixels']:,} pixels, {fact['triangles']:,} triangles, {fact['surfels']:,} surfels)"
+        for name, fact in result["scenes"].items()
+    )
+    spp = s["spp"] * s["batches"]
+    items = [
+        f"""**Scenes** {scenes}. `bowl` is a torus in a bowl that reaches to 60° from its lowest point,
+        `deep_bowl` one in half a sphere, `plates` are two plates that face each other at 60°. All is metal of
+        albedo {ALBEDO}: the picture is its specular part. The light is `scenes/lights/studio.exr` with
+        {s["light_height"]} rows on both sides, scaled to a mean of 1.""",
+        """**The same pixels** one ray through each pixel's centre on both sides. Points and normals to shade
+        are Mitsuba's own, the occluder is the same mesh, and the surfels that traced light takes its material
+        from sit on its vertices: only visibility, indirect light, and the split sum's own error differ.""",
+        f"""**Reference** Mitsuba's `path` with `refgs_bsdf`, {spp:,} samples a pixel in {s["batches"]}
+        batches, whose scatter is its standard error: at `max_depth` 2 (light after one reflection), 3
+        and 12, the full depth.""",
+        """**Errors** relMSE: mean of (x − ref)² / (ref² + ε), ε = (0.01 × mean)²; in brackets the bias, mean
+        signed error over mean radiance. A `<` marks what the reference's noise may be all of. A
+        few pixels that see next to no light weigh much at depth 2.""",
+        f"""**Times** medians of warm runs, all rules in turns, roughness 0.3, {s["timing_size"]}² pixels,
+        {machine["threads"]} threads of {machine["cpu"]}, Mitsuba {machine["mitsuba"]},
+        `{machine["variant"]}`. *Shading*: primary rays, visibility and shading on the mesh. *Frame*: what
+        `mi_refgs.render` takes for the surfels on its vertices, splatting included.""",
+    ]
+    return "\n".join(["## What is measured", "", *(f"- {prose(item)}" for item in items)])
+
+
+def _gains(result: dict[str, Any]) -> str:
+    rows = []
+    for row in result["payoffs"]:
+        rows.append(
+            [
+                _case(row),
+                WHAT[row["time"]],
+                row["method"],
+                number(row["paper_relmse"]),
+                number(row["relmse"]),
+                f"{number(row['gain'])}×",
+                f"{number(row['price'], 2)}×",
+            ]
+        )
+    head = ["case", "time of", "best rule", "mirror ray", "best", "gain", "price"]
+    short = [row for row in where(result["payoffs"], time="frame_ms") if row["gain"] < TARGET]
+    lines = ["## What the knobs buy", table(head, rows), _blocked(result)]
+    if short:
+        names = "; ".join(f"{_case(row)} ({number(row['gain'])}×)" for row in short)
+        lines.append(
+            prose(
+                f"""Below {TARGET:g}× by the time of the frame: {names}. The next table says what is left with
+                traced light and the most rays, whatever their price: against the path tracer stopped after
+                one more reflection (`max_depth` 3), which is all that traced light stands for, and at full
+                depth. Where the second is much the larger, what is missing is light of further
+                reflections; the first is the split sum's own error, and that of the one mirror ray by which
+                the light at the hit is found."""
+            )
+        )
+        head = ["case", "rays", "at depth 3: relMSE (bias)", "at full depth"]
+        lines.append(table(head, [_limit(result, row) for row in short]))
+    return "\n\n".join(lines)
+
+
+def _blocked(result: dict[str, Any]) -> str:
+    """Where blocking light without giving any back is worse than not blocking it."""
+    cases = where(result["rows"], depth="full", method=PAPER)
+    bare = where(result["rows"], depth="full", rays=0)
+    worse = [a for a, b in zip(cases, bare, strict=True) if a["relmse"] > b["relmse"]]
+    names = ", ".join(_case(row) for row in worse) or "none"
+    return prose(
+        f"""Cases in which the mirror ray alone is further from the full picture than no occlusion at all, as
+        what blocks light also reflects some: {names}. Rays of the lobe without traced light cannot mend
+        that."""
+    )
+
+
+def _limit(result: dict[str, Any], case: dict[str, Any]) -> list[str]:
+    rows = where(
+        result["rows"], scene=case["scene"], roughness=case["roughness"], traced=True, dominant=False
+    )
+    rays = max(int(row["rays"]) for row in rows)
+    return [
+        _case(case),
+        str(rays),
+        *(_cell(where(rows, rays=rays, depth=depth)[0]) for depth in ("bounce", "full")),
+    ]
+
+
+def _errors(result: dict[str, Any]) -> str:
+    lines = ["## Every rule"]
+    depths = {
+        "direct": (
+            "Against the path tracer at depth 2, which has no light from other surfaces either",
+            {"traced": False},
+        ),
+        "full": ("Against the path tracer at full depth", {}),
+    }
+    roughness = list(result["settings"]["roughness"])
+    for scene in result["scenes"]:
+        lines.append(f"### {scene}")
+        for depth, (caption, chosen) in depths.items():
+            found = where(result["rows"], scene=scene, depth=depth, **chosen)
+            rows = []
+            for method in dict.fromkeys(row["method"] for row in found):
+                by = {row["roughness"]: row for row in where(found, method=method)}
+                first = by[roughness[0]]
+                if first["ms"] is None:
+                    continue
+                cells = [_cell(by[r]) for r in roughness]
+                rows.append([method, *cells, number(first["ms"]), number(first["frame_ms"])])
+            head = ["rule", *(f"r = {r:g}" for r in roughness), "shading, ms", "frame, ms"]
+            lines += [f"{caption}: relMSE (bias).", table(head, rows)]
+    return "\n\n".join(lines)
+
+
+def _cell(row: dict[str, Any]) -> str:
+    small = "< " if row["below_floor"] else ""
+    return f"{small}{number(row['relmse'], 2)} ({signed(row['bias'])})"
+
+
+def _curve(result: dict[str, Any]) -> str:
+    rows = []
+    counts = list(dict.fromkeys(row["rays"] for row in result["curve"]))
+    for case in dict.fromkeys((row["scene"], row["roughness"]) for row in result["curve"]):
+        found = {row["rays"]: row for row in where(result["curve"], scene=case[0], roughness=case[1])}
+        cells = [number(found[k]["visibility_rms"], 2) for k in counts]
+        rows.append([f"{case[0]}, r = {case[1]:g}", *cells, number(found[counts[0]]["visibility_floor"], 2)])
+    text = """Root mean square difference of the mean visibility over k rays from the exact one: the share of
+        the reflectance, integrated by code of the benchmark's own, that Mitsuba's rays find free. The last
+        column is that integral's own standard error."""
+    head = ["case", *(f"k = {k}" for k in counts), "noise"]
+    return "\n\n".join(["## Many rays are the traced answer", prose(text), table(head, rows)])
+
+
+def _again(result: dict[str, Any]) -> str:
+    files = "".join(f" with `--mesh {Path(name).name}`" for name in result["settings"]["meshes"])
+    text = f"""`python -m benchmarks.visibility` writes this page and its plot, and `visibility.csv` and
+        `visibility.json` with all rows behind them to `runs/`; this run took {result["seconds"] / 60:.1f}
+        minutes{files}. `--mesh FILE` (repeatable) adds a closed mesh of yours, `--small` is a coarse
+        instance for a quick look."""
+    return "## Again\n\n" + prose(text)

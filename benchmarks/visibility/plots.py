@@ -1,0 +1,93 @@
+"""The plot: error over time, and convergence with the number of rays, a column for each scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common import figures
+from benchmarks.visibility.payoff import PAPER, where
+
+STYLES = {
+    (False, False): ("#c77b30", "o", "rays only"),
+    (True, False): ("#1f77b4", "o", "traced light"),
+    (True, True): ("#2a9d5c", "^", "traced light, dominant"),
+}
+"""By (traced, dominant): colour, marker, label."""
+SHADES = ("#9ecae1", "#4292c6", "#08306b")
+
+
+def middle(values: list[float]) -> float:
+    """The roughness that the plot of error over time shows."""
+    return values[len(values) // 2]
+
+
+def plot(result: dict[str, Any], folder: Path) -> Path:
+    """Write visibility_convergence.png."""
+    scenes = list(result["scenes"])
+    figure, axes = figures.new(2, len(scenes), 3.9, 3.2)
+    roughness = middle(list(result["settings"]["roughness"]))
+    for column, scene in enumerate(scenes):
+        _speed(axes[0, column], result, scene, roughness)
+        _convergence(axes[1, column], result, scene)
+    for row in axes:
+        row[0].legend(fontsize=6, framealpha=0.9, edgecolor="none", handlelength=3)
+    return figures.save(figure, folder / "visibility_convergence.png")
+
+
+def _speed(ax: Any, result: dict[str, Any], scene: str, roughness: float) -> None:
+    from matplotlib import ticker
+
+    rows = where(result["rows"], scene=scene, roughness=roughness, depth="full")
+    timed = [row for row in rows if row["ms"] is not None]
+    for (traced, dominant), (colour, marker, label) in STYLES.items():
+        found = [row for row in where(timed, traced=traced, dominant=dominant) if row["rays"]]
+        if not found:
+            continue
+        x, y = [row["ms"] for row in found], [row["relmse"] for row in found]
+        ax.plot(x, y, marker, color=colour, label=label, ms=5)
+        if not dominant:
+            for row in found:
+                ax.annotate(
+                    f"{row['rays']}",
+                    (row["ms"], row["relmse"]),
+                    fontsize=6,
+                    xytext=(3, 3),
+                    textcoords="offset points",
+                )
+    none, paper = where(timed, rays=0)[0], where(timed, method=PAPER)[0]
+    ax.plot(none["ms"], none["relmse"], "x", color="#444444", label="no occlusion")
+    ax.axhline(paper["relmse"], color="#bbbbbb", lw=0.8, zorder=0)
+    ax.set(xscale="log", yscale="log", xlabel="ms per frame", title=f"{scene}, roughness {roughness:g}")
+    ax.set_ylabel("relMSE at full depth")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_minor_formatter(ticker.LogFormatterSciNotation(minor_thresholds=(1.2, 0.3)))
+        axis.set_tick_params(which="minor", labelsize=6)
+
+
+def _convergence(ax: Any, result: dict[str, Any], scene: str) -> None:
+    values = list(result["settings"]["roughness"])
+    for k, roughness in enumerate(values):
+        rows = where(result["curve"], scene=scene, roughness=roughness)
+        colour = SHADES[k % len(SHADES)]
+        rays = [row["rays"] for row in rows]
+        ax.plot(
+            rays,
+            [row["visibility_rms"] for row in rows],
+            "o-",
+            color=colour,
+            ms=3,
+            label=f"visibility, r = {roughness:g}",
+        )
+        near = rows[:-1]
+        ax.plot(
+            rays[:-1],
+            [row["to_limit"] ** 0.5 for row in near],
+            "s--",
+            color=colour,
+            ms=3,
+            label=f"traced picture, r = {roughness:g}",
+        )
+        ax.axhline(rows[0]["visibility_floor"], color=colour, lw=0.8, ls=":", zorder=0)
+    ax.set(xscale="log", yscale="log", xlabel="rays of the lobe", ylabel="distance to the traced answer")
+    ax.set_title(scene)

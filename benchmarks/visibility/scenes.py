@@ -1,0 +1,109 @@
+"""Concave scenes: triangle meshes that Mitsuba renders and the occluder traces, with smooth normals."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from benchmarks.common.view import Look
+from benchmarks.visibility.settings import ALBEDO, METALLIC
+from mi_refgs.occlusion.mesh import read_mesh
+
+BOWLS = {"bowl": (60.0, -0.15), "deep_bowl": (90.0, -0.42)}
+"""Degrees from a bowl's lowest point to its rim, of radius 1 at height 0; height of the torus in it."""
+WALL = 0.08
+RING = (0.45, 0.17)
+"""Radii of the torus."""
+PLATE = (0.1, 1.4, 1.6)
+PLATE_DISTANCE, PLATE_ANGLE = 0.8, 30.0
+"""From the middle to each plate, and the degrees by which each opens towards the camera: a mirror ray of the
+one meets the other."""
+
+
+@dataclass(frozen=True)
+class Concave:
+    """A named mesh of size about 2, and the camera that looks into it."""
+
+    name: str
+    mesh: Any  # trimesh.Trimesh
+    look: Look
+
+    def load(self, emitter: dict[str, Any]) -> Any:
+        """Mitsuba's scene under a light."""
+        bsdf = {
+            "type": "refgs_bsdf",
+            "albedo": {"type": "rgb", "value": list(ALBEDO)},
+            "metallic": METALLIC,
+            "roughness": 0.3,
+        }
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "mesh.ply"
+            path.write_bytes(self.mesh.export(file_type="ply", vertex_normal=True))
+            shape = {"type": "ply", "filename": str(path), "bsdf": bsdf}
+            return mi.load_dict({"type": "scene", "shape": shape, "light": emitter})
+
+
+def _bowl(name: str, detail: int) -> Concave:
+    """A torus that hovers in a bowl with a round rim: a part of a spherical shell."""
+    degrees, height = BOWLS[name]
+    sections, widest = 64 * (1 + detail), np.radians(degrees)
+    θ = np.linspace(0, widest, sections // 4 + 1)[:, None]
+    away, along = (np.concatenate(x, -1) for x in ((np.sin(θ), -np.cos(θ)), (np.cos(θ), np.sin(θ))))
+    radius = 1 / np.sin(widest)
+    turn = np.linspace(0, np.pi, 9)[1:-1, None]
+    rim = (radius + WALL / 2) * away[-1] + WALL / 2 * (np.cos(turn) * away[-1] + np.sin(turn) * along[-1])
+    line = np.concatenate([(radius + WALL) * away, rim, radius * away[::-1]])
+    line[:, 1] += radius * np.cos(widest)
+    bowl = trimesh.creation.revolve(line, sections=sections)
+    torus = trimesh.creation.torus(*RING, major_sections=sections, minor_sections=sections // 2)
+    torus.apply_translation([0, 0, height])
+    whole = trimesh.util.concatenate([_outward(part) for part in (bowl, torus)])
+    whole.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
+    return Concave(name, whole, Look((0, 2.6, 2.4), (0, -0.25, 0), 33))
+
+
+def _plates(detail: int) -> Concave:
+    """Two plates that face each other, opened towards the camera."""
+    plates = []
+    for side in (-1, 1):
+        box = trimesh.creation.box(PLATE)
+        # Corners of their own for every triangle: vertex normals are then those of the faces.
+        plate = trimesh.Trimesh(box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
+        for _ in range(3 + detail):
+            plate = plate.subdivide()
+        turn = trimesh.transformations.rotation_matrix(side * np.radians(PLATE_ANGLE), [0, 1, 0])
+        turn[0, 3] = side * PLATE_DISTANCE
+        plates.append(plate.apply_transform(turn))
+    return Concave("plates", trimesh.util.concatenate(plates), Look((0.2, 0.5, 4.2), (0, 0, 0), 32))
+
+
+def _outward(mesh: Any) -> Any:
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh
+
+
+def _file(name: str) -> Concave:
+    """A triangle mesh of any format of trimesh, closed and with outward faces, scaled to a radius of 1."""
+    loaded = read_mesh(name)
+    # Processing merges vertices at one place, such as those along the seams of a texture.
+    mesh = trimesh.Trimesh(loaded.vertices, loaded.faces, process=True)
+    mesh.apply_translation(-mesh.bounds.mean(0))
+    mesh.apply_scale(1 / np.linalg.norm(mesh.vertices, axis=1).max())
+    return Concave(Path(name).stem, _outward(mesh), Look((1.5, 1.6, 3.2), (0, 0, 0), 31))
+
+
+def make_scene(name: str, detail: int) -> Concave:
+    """A built-in scene (a bowl or "plates"), or the mesh file of that name.
+
+    Raises InputError if that cannot be read.
+    """
+    if name in BOWLS:
+        return _bowl(name, detail)
+    return _plates(detail) if name == "plates" else _file(name)

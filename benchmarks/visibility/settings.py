@@ -1,0 +1,57 @@
+"""What is measured: scenes, roughness, numbers of rays and samples; in two sizes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+ALBEDO = (0.9, 0.6, 0.3)
+METALLIC = 1.0
+"""A metal has no diffuse term: the whole picture is the specular one."""
+VOXEL = 5e-5
+"""Resolution the occluder is told, for objects of size 2. Mesh and points are exact: a ray
+leaves the surface by no more than rounding asks for. Ten times as much keeps many rays from the exact
+visibility: they then differ from it by 0.003 instead of 0.0004 (plates, roughness 0.1)."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """One run; numbers of rays rise."""
+
+    scenes: tuple[str, ...] = ("bowl", "deep_bowl", "plates")
+    meshes: tuple[str, ...] = ()  # files
+    roughness: tuple[float, ...] = (0.1, 0.3, 0.6)
+    rays: tuple[int, ...] = (2, 4, 8, 16, 64)  # of the lobe, measured and timed
+    more_rays: tuple[int, ...] = (256,)  # for the curve, not timed
+    limit: int = 2048  # rays that stand for infinitely many
+    size: int = 48  # edge of the pictures whose error is measured
+    timing_size: int = 192  # of those that are timed
+    light_height: int = 128  # rows, for the path tracer and the prefiltered light alike
+    spp: int = 64  # of each batch of the references
+    batches: int = 8
+    lattice: int = 610  # points of each lattice of the exact visibility
+    dominant: tuple[bool, ...] = (False, True)  # for traced light: off, and on
+    detail: int = 1  # 0: coarse meshes
+    timing_seconds: float = 0.2  # spent on each time, at least
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """All numbers of rays, one (the mirror ray) included."""
+        return tuple(sorted({1, *self.rays, *self.more_rays}))
+
+
+PAGE = Settings()
+SMALL = Settings(
+    scenes=("bowl", "plates"),
+    roughness=(0.3,),
+    rays=(4, 64),
+    more_rays=(),
+    limit=512,
+    size=32,
+    timing_size=64,
+    light_height=64,
+    spp=16,
+    lattice=233,
+    dominant=(False,),
+    detail=0,
+    timing_seconds=0.02,
+)

@@ -1,0 +1,171 @@
+"""The benchmark of visibility runs, and its numbers are ordered as they must be. No times are tested."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from helpers import ROOT
+from scipy.spatial import cKDTree
+
+sys.path.insert(0, str(ROOT))  # `benchmarks` is no part of the package
+from benchmarks.visibility import payoff, scenes
+from benchmarks.visibility.__main__ import main
+from benchmarks.visibility.payoff import where
+
+Row = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output of the small instance, made as a reader would make it."""
+    target = tmp_path_factory.mktemp("visibility")
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-W",
+            "error",
+            "-m",
+            "benchmarks.visibility",
+            "--small",
+            "--quiet",
+            "-o",
+            str(target),
+        ],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return target
+
+
+@pytest.fixture(scope="module")
+def result(folder: Path) -> dict[str, Any]:
+    """Its JSON."""
+    found: dict[str, Any] = json.loads((folder / "visibility.json").read_text())
+    return found
+
+
+def errors_of(result: dict[str, Any], scene: str, depth: str) -> dict[str, float]:
+    """relMSE by rule."""
+    return {row["method"]: row["relmse"] for row in where(result["rows"], scene=scene, depth=depth)}
+
+
+# ---------- The small instance ----------
+
+
+def test_reports_are_written(folder: Path, result: dict[str, Any]) -> None:
+    page = (folder / "visibility.md").read_text()
+    assert not re.search(r"\bnan\b|\binf\b|\bNone\b", page)
+    (link,) = re.findall(r"\]\((images/visibility_\w+\.png)\)", page)
+    assert (folder / link).stat().st_size > 10_000
+    with (folder / "visibility.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == len(result["rows"])
+    for row in result["payoffs"]:
+        assert f"{row['scene']}, roughness {row['roughness']:g}" in page
+
+
+@pytest.mark.parametrize("scene", ["bowl", "plates"])
+def test_occlusion_beats_none_at_depth_2(result: dict[str, Any], scene: str) -> None:
+    error = errors_of(result, scene, "direct")
+    for rule in ("mirror ray", "4 rays", "64 rays"):
+        assert error[rule] < 0.1 * error["no occlusion"]
+    assert error["64 rays"] < min(error["4 rays"], error["mirror ray"])
+
+
+@pytest.mark.parametrize("scene", ["bowl", "plates"])
+def test_traced_light_beats_none_at_full_depth(result: dict[str, Any], scene: str) -> None:
+    error = errors_of(result, scene, "full")
+    for rule in ("mirror ray", "4 rays", "64 rays"):
+        assert error[f"{rule}, traced"] < 0.85 * error[rule]
+    assert error["64 rays, traced"] < error["4 rays, traced"] < error["mirror ray, traced"]
+    assert error["64 rays, traced"] < 0.5 * error["mirror ray"]
+
+
+@pytest.mark.parametrize("scene", ["bowl", "plates"])
+def test_the_path_tracer_adds_light_with_depth(result: dict[str, Any], scene: str) -> None:
+    """A rule's bias falls as the reference grows; traced light stands for one reflection more."""
+    bias = {row["depth"]: row["bias"] for row in where(result["rows"], scene=scene, method="64 rays, traced")}
+    assert bias["direct"] > bias["bounce"] > bias["full"]
+    assert abs(bias["bounce"]) < 0.15
+
+
+@pytest.mark.parametrize("scene", ["bowl", "plates"])
+def test_many_rays_are_the_traced_answer(result: dict[str, Any], scene: str) -> None:
+    curve = {row["rays"]: row for row in where(result["curve"], scene=scene)}
+    most = max(curve)
+    distance = [curve[k]["visibility_rms"] for k in (1, 4, 64, most)]
+    assert distance == sorted(distance, reverse=True)
+    assert distance[-1] < 4 * curve[most]["visibility_floor"] and distance[-1] < 0.01
+    assert abs(curve[most]["visibility_bias"]) < 2e-3
+    assert curve[64]["to_limit"] < 0.2 * curve[4]["to_limit"]
+
+
+def test_the_noise_is_below_what_is_compared(result: dict[str, Any]) -> None:
+    for row in where(result["rows"], depth="full"):
+        assert not row["below_floor"]
+
+
+# ---------- Its parts ----------
+
+
+def test_payoff_is_the_best_within_the_budget() -> None:
+    methods: dict[str, tuple[float, float | None]] = {
+        "mirror ray": (1.0, 10.0),
+        "good": (0.2, 29.0),
+        "dear": (0.1, 31.0),
+        "untimed": (0.0, None),
+    }
+    rows = [
+        {
+            "scene": "s",
+            "roughness": 0.3,
+            "depth": "full",
+            "method": name,
+            "relmse": e,
+            "ms": t,
+            "frame_ms": 5.0,
+        }
+        for name, (e, t) in methods.items()
+    ]
+    rows[-1]["frame_ms"] = None
+    shading, frame = payoff.payoffs(rows)
+    assert (shading["method"], frame["method"]) == ("good", "dear")
+    assert shading["gain"] == pytest.approx(5) and shading["price"] == pytest.approx(2.9)
+
+
+@pytest.mark.parametrize("name", ["bowl", "deep_bowl", "plates"])
+def test_scenes_are_closed_and_face_outwards(name: str) -> None:
+    mesh = scenes.make_scene(name, 0).mesh
+    whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+    assert whole.is_watertight
+    parts = whole.split()
+    assert len(parts) == 2 and all(part.volume > 0 for part in parts)
+    assert cKDTree(parts[0].vertices).query(parts[1].vertices)[0].min() > 0.02  # they do not touch
+    assert np.abs(np.linalg.norm(mesh.vertex_normals, axis=1) - 1).max() < 1e-6
+
+
+def test_a_mesh_of_a_file_is_scaled() -> None:
+    concave = scenes.make_scene(str(ROOT / "scenes" / "meshes" / "trefoil.ply"), 0)
+    assert concave.name == "trefoil" and concave.mesh.volume > 0
+    assert np.linalg.norm(concave.mesh.vertices, axis=1).max() == pytest.approx(1)
+
+
+def test_a_bad_mesh_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--small", "--quiet", "--mesh", str(tmp_path / "none.ply"), "-o", str(tmp_path)]
+    assert main(arguments) == 2
+    assert "none.ply" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
