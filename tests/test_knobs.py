@@ -190,6 +190,14 @@ def test_degenerate_points_stay_finite(knobs: Accuracy, radiance: np.ndarray) ->
     dr.backward(total)
     for array in (total, dr.grad(raw).array, *map(dr.grad, inputs)):
         assert dr.all(dr.isfinite(array), axis=None)
+    assert total.numpy()[:, a >= 0].min() > -1e-6
+    leaf = mi.Float(r.astype(np.float32))
+    dr.enable_grad(leaf)
+    dr.set_grad(leaf, 1)
+    total = shade(
+        replace(points, roughness=leaf), EnvironmentLight(raw).prefilter(), "irradiance", knobs
+    ).total()
+    assert dr.all(dr.isfinite(dr.forward_to(total)), axis=None)
 
 
 # ---------------- what they are for ----------------

@@ -88,6 +88,12 @@ def test_limits_of_the_lobe() -> None:
         up = weight > 0
         assert ((direction * normal).sum(1)[up] > 0).all() and up.mean() > 0.3
     np.testing.assert_array_equal(sample(7.0)[0], sample(1.0)[0])
+    below = -0.3
+    view = below * normal + np.sqrt(1 - below**2) * across
+    seen_below = sample(0.4)
+    view = across
+    for got, expected in zip(seen_below, sample(0.4), strict=True):
+        np.testing.assert_allclose(got, expected, atol=2e-3)
 
 
 # ---------------- visibility ----------------

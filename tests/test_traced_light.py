@@ -75,6 +75,36 @@ def test_materials_of_the_surfels_reach_the_hits() -> None:
     np.testing.assert_allclose(found.normal.numpy().T, np.tile([1, 0, 0], (500, 1)), atol=1e-4)
     distance = np.linalg.norm(position[np.array(found.surfel)][:, 1:] - np.stack([y, z], 1), axis=1)
     assert distance.max() < 0.35  # half a cell's diagonal
+    missed = occluder.closest(origin, mi.Vector3f(1, 0, 0), mi.Vector3f(1, 0, 0))
+    assert not dr.any(missed.valid) and dr.all(missed.triangle == 0) and dr.all(missed.place == 0, axis=None)
+
+
+def test_vertices_mix_surfels_by_opacity_and_footprint() -> None:
+    """Three surfels by the formula, exp(-½ (u²/s_u² + v²/s_v² + distance²/voxel²)); one alone far away."""
+    position = np.array([[0.2, 0.1, 0.0], [-0.1, 0.3, 0.05], [0.0, -0.4, -0.08]])
+    scale = np.array([[0.3, 0.2], [0.25, 0.4], [0.5, 0.3]])
+    opacity, colour = np.array([0.9, 0.5, 0.2]), np.array([0.1, 0.5, 0.9])
+    logit = np.log(colour / (1 - colour))
+    surfels = Surfels.from_numpy(
+        {
+            "position": position,
+            "rotation": np.tile([0.0, 0, 0, 1], (3, 1)),
+            "scale": np.log(scale),
+            "opacity": np.log(opacity / (1 - opacity)),
+            "albedo": np.tile(logit[:, None], 3),
+            "metallic": logit,
+            "roughness": logit,
+        }
+    )
+    vertices = np.array([[0, 0, 0], [0.4, 0, 0], [0, 0.4, 0.1], [50, 0, 0]], np.float32)
+    mesh = Mesh(vertices, np.array([[0, 1, 2], [1, 3, 2]], np.uint32), 0.1)
+    rows = np.array(with_materials(mesh, surfels).surface(surfels).rows).reshape(4, 8)
+    for vertex, row in zip(vertices[:3], rows, strict=False):
+        u, v, w = (vertex - position).T
+        weight = opacity * np.exp(-0.5 * ((u / scale[:, 0]) ** 2 + (v / scale[:, 1]) ** 2 + (w / 0.1) ** 2))
+        np.testing.assert_allclose(row[:5], (weight @ colour) / weight.sum(), rtol=1e-4)
+    np.testing.assert_allclose(rows[3, :5], 0.1, rtol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 5:], axis=1), 1, rtol=1e-5)
 
 
 def test_misuse_is_refused() -> None:

@@ -58,9 +58,9 @@ def reflection(
     """`points` with the visibility (mi.Float, 0 … 1, detached) and indirect light that `accuracy` asks for.
 
     `origin` and `ray` lead from the camera to the points; `points.indirect` (of the indirect channel) stays
-    unless `accuracy.traced_indirect` replaces it by the mean radiance of what blocked rays hit: one bounce,
-    lit by the unoccluded light. Its gradient goes to the light and to the materials of the surfels around the
-    hits, in both modes; rays and hits are detached.
+    unless `accuracy.traced_indirect` replaces it by the mean radiance of what blocked rays hit, one bounce
+    (`MeshRadiance`). Its gradient goes to the light and to the materials of the surfels around the hits, in
+    both modes; rays and hits are detached, and so is what the pixel's own roughness does to the rays.
     """
     normal = dr.detach(points.normal)
     if accuracy.visibility_rays == 1 and not accuracy.traced_indirect:
@@ -135,6 +135,11 @@ class MeshHit:
 @dataclass(frozen=True)
 class MeshRadiance:
     """The mesh as the second surface that light meets: shaded by `shade` with the materials of the surfels.
+
+    Its specular light must arrive along its own mirror direction, which is traced once more: without that, a
+    hit deep in a bowl shines as if it lay in the open, and the picture is worse than with no indirect light
+    at all (relMSE 4.7 against 1.0, at roughness 0.3; with it 0.2 at 0.4). What is blocked there is dark: one
+    bounce ends here.
 
     With diffuse="sh" the diffuse part is the SH radiance of the surfel nearest to the hit, along the ray: the
     same quantity that pixels blend, and like it tied to the light it was fitted under; a picture to be relit
