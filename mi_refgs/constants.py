@@ -46,8 +46,15 @@ SORT_DEPTH_RANGE = 5.0
 """Factor by which a surfel's depth in a tile may exceed that of its centre in the sort: a plane that turns
 away from the camera within its reach has no depth of its own there."""
 
-TILE = 4
-"""Tile edge in pixels: 4×4 = one 16-lane AVX-512 packet, whose lanes then share every surfel they read."""
+BLOCK = 4
+"""Edge in pixels of the block that one SIMD packet covers: 4×4 = the 16 lanes of AVX-512, which then share
+every surfel they read."""
+
+TILE = (8, 4)
+"""Width and height in pixels of a tile, whose pixels share a list of surfels. A lane does the pixel at its
+place in each block of the tile: what it reads of a surfel then serves them all, and what it adds to the
+surfel's gradient is their sum. Larger tiles are faster, but give one order to more pixels: measurements in
+docs/decisions.md."""
 
 # ---------------- surfels ----------------
 

@@ -17,6 +17,8 @@ from integrator_scenes import (
     sensor,
 )
 
+from mi_refgs.constants import TILE
+
 EVERY_AOV = "al:albedo,m:metallic,r:roughness,n:normal,dd.y:depth,a:alpha,v:visibility"
 EVERY_AOV += ",di:diffuse,sp:specular,ind:indirect"
 
@@ -91,11 +93,15 @@ def test_crop_window_is_part_of_the_whole() -> None:
 
 def test_principal_point_moves_the_image() -> None:
     # By whole tiles, in which surfels have an order.
-    moved = image(scene(sensor(principal_point_offset_x=4 / WIDTH, principal_point_offset_y=4 / HEIGHT)))
+    dx, dy = TILE
+    moved = image(scene(sensor(principal_point_offset_x=dx / WIDTH, principal_point_offset_y=dy / HEIGHT)))
     still = image(scene())
-    shifts = [
-        np.abs(np.roll(still, (dy, dx), (0, 1)) - moved)[4:-4, 4:-4].max() for dx in (-4, 4) for dy in (-4, 4)
-    ]
+
+    def difference(down: int, right: int) -> float:
+        kept = np.s_[max(down, 0) : HEIGHT + min(down, 0), max(right, 0) : WIDTH + min(right, 0)]
+        return float(np.abs(np.roll(still, (down, right), (0, 1)) - moved)[kept].max())
+
+    shifts = [difference(*offset) for offset in ((dy, dx), (dy, -dx), (-dy, dx), (-dy, -dx))]
     assert min(shifts) < 2e-5
 
 

@@ -12,12 +12,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refgs.constants import ALPHA_MIN, TILE
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
-from mi_refgs.splat import Blended, Camera, splat
+from mi_refgs.splat import Blended, Camera, list_by_tile, project, splat
+from mi_refgs.splat.footprint import FootprintAdjoint, evaluate
 from mi_refgs.surfels.table import Surfels
 
 blend_module = importlib.import_module("mi_refgs.splat.blend")
+tiles_module = importlib.import_module("mi_refgs.splat.tiles")
 IMAGE_TOLERANCE = 1e-4  # the product's promise; observed 2e-6 … 3e-5
 GRADIENT_TOLERANCE = 1e-3  # relative L2; observed 1e-5 … 3e-4 (float32 of the smallest surfels)
 Mutation = Callable[[pytest.MonkeyPatch], None]
@@ -231,29 +234,27 @@ def test_shift_receives_the_screen_translation_gradient() -> None:
 
 
 def _drop_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = blend_module.evaluate_backward
+    original = FootprintAdjoint.add
     monkeypatch.setattr(
-        blend_module, "evaluate_backward", lambda row, s, δa, δz: original(row, s, δa * (1 - s.alpha), δz)
+        FootprintAdjoint, "add", lambda self, s, δa, δz: original(self, s, δa * (1 - s.alpha), δz)
     )
 
 
 def _drop_depth(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = blend_module.evaluate_backward
-    monkeypatch.setattr(
-        blend_module, "evaluate_backward", lambda row, s, δa, δz: original(row, s, δa, 0 * δz)
-    )
+    original = FootprintAdjoint.add
+    monkeypatch.setattr(FootprintAdjoint, "add", lambda self, s, δa, δz: original(self, s, δa, 0 * δz))
 
 
 def _scale_column(index: int) -> Mutation:
     def mutate(monkeypatch: pytest.MonkeyPatch) -> None:
-        original = blend_module.evaluate_backward
+        original = FootprintAdjoint.columns
 
-        def mutant(row: Any, s: Any, δa: Any, δz: Any) -> Any:
-            columns = original(row, s, δa, δz)
+        def mutant(self: FootprintAdjoint, row: list[Any]) -> list[Any]:
+            columns = original(self, row)
             columns[index] = columns[index] * 1.1
             return columns
 
-        monkeypatch.setattr(blend_module, "evaluate_backward", mutant)
+        monkeypatch.setattr(FootprintAdjoint, "columns", mutant)
 
     return mutate
 
@@ -360,3 +361,44 @@ def test_second_view_compiles_nothing() -> None:
     misses = dr.detail.launch_stats()[2]
     fast_gradients(moved, weights)
     assert dr.detail.launch_stats()[2] == misses
+
+
+@pytest.mark.parametrize("seed", range(0, 20, 3))
+def test_tile_lists_hold_what_contributes_and_little_else(seed: int) -> None:
+    """Of all surfel-tile pairs, those with a pixel at α ≥ ALPHA_MIN are listed, and few others."""
+    scene = make_scene(seed)
+    camera = scene.fast_camera()
+    footprints = project(scene.surfels(), camera)
+    lists = list_by_tile(footprints, camera)
+    begin, end = lists.pair_begin.numpy(), lists.pair_end.numpy()
+    surfel = lists.surfel_from_pair.numpy()
+    listed = {(int(i), tile) for tile in range(len(begin)) for i in surfel[begin[tile] : end[tile]]}
+    assert len(listed) == lists.pairs, "a pair is listed twice"
+
+    y, x = np.mgrid[0 : camera.height, 0 : camera.width]
+    pixel = mi.Point2f(mi.Float(x.ravel() + 0.5), mi.Float(y.ravel() + 0.5))
+    tile = (y // TILE[1] * lists.tiles_x + x // TILE[0]).ravel()
+    columns = np.array([column.numpy() for column in footprints.columns])
+    needed = set()
+    for i in range(columns.shape[1]):
+        sample = evaluate([mi.Float(v) for v in columns[:, i]], pixel, camera.near)
+        strong = (sample.alpha >= ALPHA_MIN).numpy() & (columns[9, i] > 0)
+        needed |= {(i, int(t)) for t in np.unique(tile[strong])}
+    assert needed <= listed
+    # A tile may see a footprint between its pixels only, or beyond the near plane.
+    assert len(listed) <= 1.25 * len(needed) + 20
+
+
+def test_tile_lists_are_sorted_by_depth() -> None:
+    scene = make_scene(12)
+    camera = scene.fast_camera()
+    footprints = project(scene.surfels(), camera)
+    lists = list_by_tile(footprints, camera)
+    pair_tile = np.repeat(np.arange(len(lists.pair_begin)), lists.pair_end.numpy() - lists.pair_begin.numpy())
+    corner = np.array(TILE)[:, None] * np.stack([pair_tile % lists.tiles_x, pair_tile // lists.tiles_x])
+    centre = mi.Point2f(mi.Float(corner[0] + TILE[0] / 2), mi.Float(corner[1] + TILE[1] / 2))
+    row = [dr.gather(mi.Float, column, lists.surfel_from_pair) for column in footprints.columns]
+    depth = tiles_module.depth_near(row, centre).numpy()
+    same = pair_tile[1:] == pair_tile[:-1]
+    assert np.count_nonzero(same) > 30
+    assert np.all(depth[1:][same] >= depth[:-1][same])

@@ -134,9 +134,10 @@ def _order(surfels: dict[str, np.ndarray], camera: PinholeCamera) -> np.ndarray:
     k = 1 / np.where(shown, p[:, 2], 1)
     pn = np.where(shown, np.sum(p * n, axis=1), 1)
     order = np.zeros((len(p), camera.height, camera.width), int)
-    for top in range(0, camera.height, c.TILE):
-        for left in range(0, camera.width, c.TILE):
-            x, y = left + c.TILE / 2, top + c.TILE / 2
+    width, height = c.TILE
+    for top in range(0, camera.height, height):
+        for left in range(0, camera.width, width):
+            x, y = left + width / 2, top + height / 2
             ray = np.array([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1])
             beside = ray - k[:, None] * p  # in the plane z = 1, from the projected centre
             across = beside - (np.sum(beside * n, axis=1) / pn)[:, None] * p
@@ -144,5 +145,5 @@ def _order(surfels: dict[str, np.ndarray], camera: PinholeCamera) -> np.ndarray:
             share = np.minimum(1, c.SORT_REACH * k / np.maximum(distance, 1e-10))
             inverse = np.maximum(k + share * (n @ ray / pn - k), k / c.SORT_DEPTH_RANGE)
             ranked = np.argsort(1 / inverse, kind="stable")
-            order[:, top : top + c.TILE, left : left + c.TILE] = ranked[:, None, None]
+            order[:, top : top + height, left : left + width] = ranked[:, None, None]
     return order

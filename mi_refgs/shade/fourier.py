@@ -1,9 +1,9 @@
 """Azimuthal Fourier rows of lat-long grids in Dr.Jit: analysis, synthesis, block-sparse products.
 
-A texel buffer is flat, `stride` floats a texel. A Fourier buffer is six planes: the cosine coefficients of R,
-G and B, then the sine coefficients. Rows keep only the frequencies they need. Analysis and synthesis are each
-other's transpose, and all three kernels gather, so that adjoints are made of the same kernels and nothing is
-atomic.
+A texel buffer is flat, four floats a texel (RGBA, A unused). A Fourier buffer has eight floats a coefficient:
+the cosine coefficients of R, G and B, the sine coefficients, and two unused, so that each is one packet. Rows
+keep only the frequencies they need. Analysis and synthesis are each other's transpose, and all three kernels
+gather, so that adjoints are made of the same kernels and nothing is atomic.
 """
 
 from __future__ import annotations
@@ -18,6 +18,10 @@ import numpy as np
 BLOCK = 4
 """Output rows per lane of `mix_rows`: a gathered coefficient then serves four rows."""
 
+COEFFICIENT = 8
+"""Floats a coefficient, and TEXEL floats a texel: powers of two, as packets are."""
+TEXEL = 4
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -26,7 +30,6 @@ class Rows:
     Analysis has one lane per four frequencies, synthesis one per eight columns that share their cosines.
     """
 
-    stride: int  # floats per texel: 3 for the caller's radiance, 4 for ours
     texels: int
     coefficients: int
     analysis: tuple[Any, Any, Any, Any]  # per lane: texel of the row's start, w, m, offset of the twiddles
@@ -35,7 +38,7 @@ class Rows:
     synthesis: tuple[
         Any, Any, Any, Any, Any, Any
     ]  # row's start, w, column, offset of the twiddles, first slot, M
-    twiddles: Any  # cos and sin, interleaved, of multiples of π/w
+    twiddles: Any  # pairs of cos and sin of multiples of π/w
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ def row_slots(limits: list[np.ndarray]) -> list[np.ndarray]:
     return np.split(ends - np.concatenate(limits), np.cumsum([len(m) for m in limits])[:-1])
 
 
-def make_rows(firsts: list[int], limits: list[np.ndarray], stride: int) -> Rows:
+def make_rows(firsts: list[int], limits: list[np.ndarray]) -> Rows:
     """Lanes for grids of len(limit) rows and twice as many columns, from texels `firsts` on."""
     analysis, slots, exists, synthesis, twiddles, at = [], [], [], [], [], 0
     for first, limit, slot in zip(firsts, limits, row_slots(limits), strict=True):
@@ -86,7 +89,6 @@ def make_rows(firsts: list[int], limits: list[np.ndarray], stride: int) -> Rows:
         synthesis.append(np.stack([first + w * i, 0 * i + w, q, 0 * i + at, slot[i], limit[i]]))
         at += 2 * w
     return Rows(
-        stride=stride,
         texels=firsts[-1] + 2 * len(limits[-1]) ** 2,
         coefficients=int(sum(limit.sum() for limit in limits)),
         analysis=_device(*np.concatenate(analysis, 1)),
@@ -125,9 +127,15 @@ def make_mixing(
     return Mixing(inputs, outputs, first, last, place, stride, origin, entries)
 
 
-def write(target: Any, value: Any, index: Any, active: Any = True) -> None:
-    """Scatter to distinct places: without that promise Dr.Jit runs one kernel, loop and all, per scatter."""
-    dr.scatter(target, value, index, active, mode=dr.ReduceMode.NoConflicts)
+def write(target: Any, values: list[Any], place: Any, active: Any = True) -> None:
+    """Scatter packets to distinct places, padded with zeros to TEXEL or COEFFICIENT floats."""
+    padded = values + [mi.Float(0)] * ((TEXEL if len(values) <= TEXEL else COEFFICIENT) - len(values))
+    # Without the promise of no conflicts Dr.Jit runs one kernel, loop and all, per scatter.
+    dr.scatter(target, mi.ArrayXf(padded), place, active, mode=dr.ReduceMode.NoConflicts)
+
+
+def _read(size: int, source: Any, place: Any, active: Any = True) -> list[Any]:
+    return list(dr.gather(mi.ArrayXf, source, place, active, shape=(size, dr.width(place))))
 
 
 def _turn(turn: Any, step: Any, w: Any) -> Any:
@@ -136,20 +144,32 @@ def _turn(turn: Any, step: Any, w: Any) -> Any:
     return dr.select(turn >= 2 * w, turn - 2 * w, turn)
 
 
+def _four_turns(rows: Rows, at: Any, turn: Any, step: Any, w: Any) -> tuple[list[tuple[Any, Any]], Any]:
+    """(cos, sin) at `turn` and after one, two and three steps, and the turn after four.
+
+    One is looked up and three are rotated from it: lookups are what the loops here spend their time on, and a
+    longer chain of rotations would lose digits.
+    """
+    cos, sin = _read(2, rows.twiddles, at + turn)
+    c, s = _read(2, rows.twiddles, at + step)  # the same in every turn of a loop: read once
+    angles = [(cos, sin)]
+    for _ in range(3):
+        cos, sin = dr.fma(cos, c, -sin * s), dr.fma(cos, s, sin * c)
+        angles.append((cos, sin))
+    return angles, _turn(_turn(turn, 2 * step, w), 2 * step, w)
+
+
 def analyse(rows: Rows, texels: Any) -> Any:
     """Fourier buffer Σ_j x_j (cos mφ_j, sin mφ_j) of every row and frequency of a flat texel buffer."""
     start, w, m, at = rows.analysis
 
     def body(j: Any, turn: Any, *acc: Any) -> tuple[Any, ...]:
         out = list(acc)
-        for r in range(4):
-            cos = dr.gather(mi.Float, rows.twiddles, 2 * (at + turn))
-            sin = dr.gather(mi.Float, rows.twiddles, 2 * (at + turn) + 1)
-            for c in range(3):
-                x = dr.gather(mi.Float, texels, (start + j + r) * rows.stride + c)
+        angles, turn = _four_turns(rows, at, turn, 2 * m, w)  # φ_j = π(2j+1)/w
+        for r, (cos, sin) in enumerate(angles):
+            for c, x in enumerate(_read(TEXEL, texels, start + j + r)[:3]):
                 out[6 * r + c] = dr.fma(x, cos, out[6 * r + c])
                 out[6 * r + 3 + c] = dr.fma(x, sin, out[6 * r + 3 + c])
-            turn = _turn(turn, 2 * m, w)  # φ_j = π(2j+1)/w
         return (j + 4, turn, *out)
 
     n = dr.width(m)
@@ -165,13 +185,15 @@ def analyse(rows: Rows, texels: Any) -> Any:
         ((q, -q, -q, q), (q, q, -q, -q), -1),
         ((q, -q, -q, q), (q, q, -q, -q), 1),
     )
-    out = dr.zeros(mi.Float, 6 * rows.coefficients)
+    out = dr.zeros(mi.Float, COEFFICIENT * rows.coefficients)
     for (cos_γ, sin_γ, sign), slot, exists in zip(quarters, rows.slots, rows.exists, strict=True):
-        for c in range(3):
-            cos = sum(cos_γ[r] * cosines[c][r] - sign * sin_γ[r] * sines[c][r] for r in range(4))
-            sin = sum(sin_γ[r] * cosines[c][r] + sign * cos_γ[r] * sines[c][r] for r in range(4))
-            write(out, cos, slot + c * rows.coefficients, exists)
-            write(out, sin, slot + (3 + c) * rows.coefficients, exists)
+        cos = [
+            sum(cos_γ[r] * cosines[c][r] - sign * sin_γ[r] * sines[c][r] for r in range(4)) for c in range(3)
+        ]
+        sin = [
+            sum(sin_γ[r] * cosines[c][r] + sign * cos_γ[r] * sines[c][r] for r in range(4)) for c in range(3)
+        ]
+        write(out, cos + sin, slot, exists)
     return out
 
 
@@ -185,13 +207,12 @@ def synthesise(rows: Rows, coefficients: Any, texels: Any) -> None:
         def add(n: int, a: Any, b: Any) -> None:
             out[n] = dr.fma(a, b, out[n])
 
-        for r in range(4):
+        angles, turn = _four_turns(rows, at, turn, 2 * q + 1, w)
+        for r, (cos, sin) in enumerate(angles):
             inside = m + r < limit
-            cos = dr.gather(mi.Float, rows.twiddles, 2 * (at + turn))
-            sin = dr.gather(mi.Float, rows.twiddles, 2 * (at + turn) + 1)
+            x = _read(COEFFICIENT, coefficients, slot + m + r, inside)
             for c in range(3):
-                a = dr.gather(mi.Float, coefficients, slot + m + r + c * rows.coefficients, inside)
-                b = dr.gather(mi.Float, coefficients, slot + m + r + (3 + c) * rows.coefficients, inside)
+                a, b = x[c], x[3 + c]
                 if r % 2 == 0:
                     add(3 * r + c, a, cos)
                     add(3 * r + 3 + c, b, sin)
@@ -201,7 +222,6 @@ def synthesise(rows: Rows, coefficients: Any, texels: Any) -> None:
                     add(15 + c, b, sin)
                     add(18 + c, a, sign * sin)
                     add(21 + c, b, sign * cos)
-            turn = _turn(turn, 2 * q + 1, w)
         return (m + 4, turn, *out)
 
     n = dr.width(q)
@@ -216,10 +236,12 @@ def synthesise(rows: Rows, coefficients: Any, texels: Any) -> None:
     for k in range(4):
         for ε in (1, -1):
             column = q + k * (w // 4) if ε > 0 else ((k or 4) * (w // 4)) - 1 - q
+            colour = []
             for c in range(3):
                 value = even_cos[c] + ε * even_sin[c] + (-1) ** k * (two_cos[c] + ε * two_sin[c])
                 odd = cross_cos[c] - ε * cross_sin[c] if k % 2 else odd_cos[c] + ε * odd_sin[c]
-                write(texels, value + (odd if k < 2 else -odd), 4 * (start + column) + c)
+                colour.append(value + (odd if k < 2 else -odd))
+            write(texels, colour, start + column)
 
 
 def mix_rows(matrix: Mixing, coefficients: Any) -> Any:
@@ -229,16 +251,14 @@ def mix_rows(matrix: Mixing, coefficients: Any) -> Any:
         out = list(acc)
         source = dr.gather(mi.UInt32, matrix.source, n)
         weight = dr.gather(mi.Vector4f, matrix.weights, n)
-        for c in range(6):
-            x = dr.gather(mi.Float, coefficients, source + c * matrix.inputs)
+        for c, x in enumerate(_read(COEFFICIENT, coefficients, source)[:6]):
             for row in range(BLOCK):
                 out[6 * row + c] = dr.fma(weight[row], x, out[6 * row + c])
         return (n + 1, *out)
 
     zeros = [dr.zeros(mi.Float, dr.width(matrix.begin)) for _ in range(6 * BLOCK)]
     state = dr.while_loop((mi.UInt32(matrix.begin), *zeros), lambda n, *_: n < matrix.end, body)
-    out = dr.zeros(mi.Float, 6 * matrix.outputs)
+    out = dr.zeros(mi.Float, COEFFICIENT * matrix.outputs)
     for row in range(BLOCK):
-        for c in range(6):
-            write(out, state[1 + 6 * row + c], matrix.slot + row * matrix.step + c * matrix.outputs)
+        write(out, list(state[1 + 6 * row : 7 + 6 * row]), matrix.slot + row * matrix.step)
     return out

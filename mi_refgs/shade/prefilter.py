@@ -51,8 +51,8 @@ def _build(variant: str, height: int) -> Operator:
     limits_out = [fourier.row_limits([matrix]) for matrix in matrices]
     (slot_in,), slots_out = fourier.row_slots([limit_in]), fourier.row_slots(limits_out)
     base, levels = (
-        fourier.make_rows([0], [limit_in], stride=3),
-        fourier.make_rows(firsts[1:-1], limits_out, stride=4),
+        fourier.make_rows([0], [limit_in]),
+        fourier.make_rows(firsts[1:-1], limits_out),
     )
     out = list(zip(slots_out, limits_out, strict=True))
     return Operator(
@@ -83,11 +83,11 @@ def operator(height: int) -> Operator:
 
 def apply(op: Operator, radiance: Any) -> Any:
     """Flat RGBA levels, the map first, of flat radiance (3·h·w)."""
-    dr.eval(radiance)
     out = dr.zeros(mi.Float, 4 * op.levels.texels)
-    fourier.synthesise(op.levels, fourier.mix_rows(op.forward, fourier.analyse(op.base, radiance)), out)
-    n = dr.arange(mi.UInt32, 3 * op.base.texels)
-    fourier.write(out, radiance, 4 * (n // 3) + n % 3)
+    texel = dr.arange(mi.UInt32, op.base.texels)
+    fourier.write(out, [dr.gather(mi.Float, radiance, 3 * texel + c) for c in range(3)], texel)
+    dr.eval(out)
+    fourier.synthesise(op.levels, fourier.mix_rows(op.forward, fourier.analyse(op.base, out)), out)
     return out
 
 

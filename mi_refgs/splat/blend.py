@@ -8,8 +8,11 @@ what lies behind,
 
     δf_ik = wᵢ δ_k,        δαᵢ = Tᵢ gᵢ - S_{j>i} / (1 - αᵢ)
 
-needs neither a reversed list nor storage per pair. One tile is one SIMD packet, so its lanes read the same
-rows.
+needs neither a reversed list nor storage per pair.
+
+One packet works on one tile, so its lanes read the same rows; each lane has one pixel in every block of the
+tile and keeps their states side by side. Reading a row and adding to its gradient, most of the work with one
+pixel a lane, are then shared, and there are fewer pairs to list and sort.
 
 No derivative, on purpose: the sort order, the tile lists, the α < 1/255 cut and the end at T < 1e-4, the near
 plane, the clamp at α_max (zero), the median depth.
@@ -17,19 +20,22 @@ plane, the clamp at α_max (zero), the median depth.
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import MEDIAN_TRANSMITTANCE, TILE, TRANSMITTANCE_MIN
+from mi_refgs.constants import BLOCK, MEDIAN_TRANSMITTANCE, TILE, TRANSMITTANCE_MIN
+from mi_refgs.rows import Rows
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.footprint import (
     GEOMETRY_COLUMNS,
+    FootprintAdjoint,
     Footprints,
     evaluate,
-    evaluate_backward,
     evaluate_forward,
 )
 from mi_refgs.splat.tiles import TileLists
@@ -55,10 +61,10 @@ class _Blend(dr.CustomOp):
     """columns (N-wide) → [features…, depth, alpha, median depth] (pixel-wide)."""
 
     def eval(self, columns: list[Any], lists: TileLists, camera: Camera) -> list[Any]:
-        self.columns, self.lists, self.camera = len(columns), lists, camera
-        self.surfels = dr.width(columns[0])
-        self.width = 1 << (self.columns - 1).bit_length()  # packet accesses want a power of two
-        self.rows = self._pack(columns)
+        self.lists, self.camera = lists, camera
+        self.rows = Rows.pack(columns)
+        dr.eval(self.rows.data)
+        self.features = len(columns) - GEOMETRY_COLUMNS
         self.out = _blend_primal(self) if lists.pairs else self._blank()
         return self.out
 
@@ -66,49 +72,78 @@ class _Blend(dr.CustomOp):
         if not self.lists.pairs:
             self.set_grad_out(self._blank())
             return
-        tangents = _blend_forward(self, self._pack(self.grad_in("columns")))
+        tangents = _blend_forward(self, Rows.pack(self.grad_in("columns")))
         self.set_grad_out([*tangents, dr.zeros(mi.Float, dr.width(self.out[-1]))])
 
     def backward(self) -> None:
         if not self.lists.pairs:  # Dr.Jit refuses to gather from an empty list, even fully masked
             return
-        δrows = _blend_backward(self, self.grad_out()[:-1])
-        base = dr.arange(mi.UInt32, self.surfels) * self.width
-        self.set_grad_in("columns", [dr.gather(mi.Float, δrows, base + i) for i in range(self.columns)])
+        δout = self.grad_out()[:-1]
+        dr.eval(δout)  # together: to gather from them would evaluate one by one what they have in common
+        self.set_grad_in("columns", _blend_backward(self, δout).columns())
 
     def name(self) -> str:
         return "blend"
 
     def _blank(self) -> list[Any]:
-        maps = self.columns - GEOMETRY_COLUMNS + 3
-        return [dr.zeros(mi.Float, self.camera.width * self.camera.height) for _ in range(maps)]
-
-    def _pack(self, columns: list[Any]) -> Any:
-        """Columns to rows of `width` floats, so that one surfel is one packet access."""
-        rows = dr.zeros(mi.Float, self.surfels * self.width)
-        padding = [mi.Float(0)] * (self.width - self.columns)
-        packet = mi.ArrayXf([dr.detach(column) for column in columns] + padding)
-        dr.scatter(rows, packet, dr.arange(mi.UInt32, self.surfels))
-        dr.eval(rows)
-        return rows
+        pixels = self.camera.width * self.camera.height
+        return [dr.zeros(mi.Float, pixels) for _ in range(self.features + 3)]
 
 
-def _lanes(op: _Blend) -> tuple[Any, Any, Any, Any, Any]:
-    """Tile-major lanes: pixel centre, raster index, inside the image, first and one-past-last pair."""
-    lists, camera = op.lists, op.camera
-    lane = dr.arange(mi.UInt32, lists.tiles_x * lists.tiles_y * TILE * TILE)
-    tile, local = lane // (TILE * TILE), lane % (TILE * TILE)
-    # Pixels before the image wrap round to huge numbers, and are not inside either.
-    x = (tile % lists.tiles_x) * TILE + local % TILE - camera.phase[0]
-    y = (tile // lists.tiles_x) * TILE + local // TILE - camera.phase[1]
-    inside = (x < camera.width) & (y < camera.height)
-    begin = dr.gather(mi.UInt32, lists.pair_begin, tile)
-    end = dr.gather(mi.UInt32, lists.pair_end, tile)
-    return mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5), y * camera.width + x, inside, begin, end
+@dataclass(frozen=True)
+class _Lanes:
+    """Tile-major lanes, and their pixel in each block of the tile."""
+
+    pixel: list[Any]  # mi.Point2f: centre
+    raster: list[Any]  # mi.UInt32: index in the image
+    inside: list[Any]  # mi.Bool: is it inside the image?
+    begin: Any  # first pair of the tile
+    end: Any  # one past its last pair
+
+    @staticmethod
+    def of(op: _Blend) -> _Lanes:
+        lists, camera = op.lists, op.camera
+        lane = dr.arange(mi.UInt32, lists.tiles_x * lists.tiles_y * BLOCK * BLOCK)
+        tile, local = lane // (BLOCK * BLOCK), lane % (BLOCK * BLOCK)
+        # Pixels before the image wrap round to huge numbers, and are not inside either.
+        corner_x = (tile % lists.tiles_x) * TILE[0] + local % BLOCK - camera.phase[0]
+        corner_y = (tile // lists.tiles_x) * TILE[1] + local // BLOCK - camera.phase[1]
+        blocks_x, blocks_y = (range(0, size, BLOCK) for size in TILE)
+        places = [(corner_x + x, corner_y + y) for y in blocks_y for x in blocks_x]
+        return _Lanes(
+            [mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5) for x, y in places],
+            [y * camera.width + x for x, y in places],
+            [(x < camera.width) & (y < camera.height) for x, y in places],
+            dr.gather(mi.UInt32, lists.pair_begin, tile),
+            dr.gather(mi.UInt32, lists.pair_end, tile),
+        )
+
+    def each(self, *values: list[Any]) -> Any:
+        """Pixel, raster index and inside, with anything else that there is one of for each block."""
+        return zip(self.pixel, self.raster, self.inside, *values, strict=True)
+
+    def to_raster(self, op: _Blend, values: list[list[Any]]) -> list[Any]:
+        """Values of each block to raster images, in the kernel of the loop that made them."""
+        images = [dr.empty(mi.Float, op.camera.width * op.camera.height) for _ in values[0]]
+        for _, raster, inside, of_block in self.each(values):
+            for image, value in zip(images, of_block, strict=True):
+                dr.scatter(image, value, raster, inside, mode=dr.ReduceMode.NoConflicts)
+        dr.eval(images)
+        return images
+
+    def from_raster(self, images: list[Any]) -> list[list[Any]]:
+        """Inverse of `to_raster`; 0 outside the image."""
+        return [[dr.gather(mi.Float, x, raster, inside) for x in images] for _, raster, inside in self.each()]
 
 
-def _fetch(op: _Blend, rows: Any, surfel: Any, active: Any) -> Any:
-    return dr.gather(mi.ArrayXf, rows, surfel, active, shape=(op.width, dr.width(surfel)))
+def _surfel(op: _Blend, pair: Any, active: list[Any]) -> tuple[Any, Any]:
+    """The surfel of a pair, and whether any pixel of the lane still looks at it."""
+    goes_on = _any(active)
+    return dr.gather(mi.UInt32, op.lists.surfel_from_pair, pair, goes_on), goes_on
+
+
+def _any(flags: list[Any]) -> Any:
+    return reduce(operator.or_, flags)
 
 
 def _next(sample: Any, active: Any, transmittance: Any) -> tuple[Any, Any, Any]:
@@ -121,102 +156,112 @@ def _next(sample: Any, active: Any, transmittance: Any) -> tuple[Any, Any, Any]:
     return weight, dr.select(hit, after, transmittance), active & ~ends
 
 
-def _to_raster(op: _Blend, values: list[Any], raster: Any, inside: Any) -> list[Any]:
-    """Tile-major lanes to raster images, in the kernel of the loop that made them."""
-    images = [dr.empty(mi.Float, op.camera.width * op.camera.height) for _ in values]
-    for image, value in zip(images, values, strict=True):
-        dr.scatter(image, value, raster, inside, mode=dr.ReduceMode.NoConflicts)
-    dr.eval(images)
-    return images
-
-
 def _values(op: _Blend, row: Any, z: Any) -> list[Any]:
     """What a surfel adds to each map: its features, its depth, and 1 for alpha."""
-    return [row[i] for i in range(GEOMETRY_COLUMNS, op.columns)] + [z, mi.Float(1)]
+    return [*row[GEOMETRY_COLUMNS:][: op.features], z, mi.Float(1)]
 
 
 def _blend_primal(op: _Blend) -> list[Any]:
-    pixel, raster, inside, begin, end = _lanes(op)
-    near = op.camera.near
-    maps = op.columns - GEOMETRY_COLUMNS + 2
+    lanes = _Lanes.of(op)
+    maps = op.features + 2
 
-    def condition(pair: Any, active: Any, transmittance: Any, median: Any, out: Any) -> Any:
-        return active & (pair < end)
+    def condition(pair: Any, active: Any, *state: Any) -> Any:
+        return _any(active) & (pair < lanes.end)
 
-    def body(pair: Any, active: Any, transmittance: Any, median: Any, out: Any) -> Any:
-        surfel = dr.gather(mi.UInt32, op.lists.surfel_from_pair, pair, active)
-        row = _fetch(op, op.rows, surfel, active)
-        sample = evaluate(row, pixel, near)
-        weight, after, goes_on = _next(sample, active, transmittance)
-        median = dr.select((weight > 0) & (transmittance > MEDIAN_TRANSMITTANCE), sample.z, median)
-        out = [total + weight * value for total, value in zip(out, _values(op, row, sample.z), strict=True)]
-        return pair + 1, goes_on, after, median, out
+    def body(pair: Any, active: Any, *state: Any) -> Any:
+        surfel, some = _surfel(op, pair, active)
+        row = op.rows.fetch(surfel, some)
+        after = []
+        for pixel, _, _, active_here, transmittance, median, out in lanes.each(active, *state):
+            sample = evaluate(row, pixel, op.camera.near)
+            weight, transmittance_after, goes_on = _next(sample, active_here, transmittance)
+            in_front = (weight > 0) & (transmittance > MEDIAN_TRANSMITTANCE)
+            values = _values(op, row, sample.z)
+            out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
+            after.append((goes_on, transmittance_after, dr.select(in_front, sample.z, median), out))
+        return pair + 1, *_transposed(after)
 
-    state = (begin, mi.Bool(inside), mi.Float(1), mi.Float(0), [mi.Float(0) for _ in range(maps)])
-    _, _, _, median, out = dr.while_loop(state, condition, body, label="blend")
-    return _to_raster(op, [*out, median], raster, inside)
+    start = [(mi.Bool(inside), mi.Float(1), mi.Float(0), [mi.Float(0)] * maps) for inside in lanes.inside]
+    *_, median, out = dr.while_loop((lanes.begin, *_transposed(start)), condition, body, label="blend")
+    return lanes.to_raster(op, [[*totals, last] for totals, last in zip(out, median, strict=True)])
 
 
-def _blend_backward(op: _Blend, δout: list[Any]) -> Any:
-    pixel, raster, inside, begin, end = _lanes(op)
-    near = op.camera.near
-    δ = [dr.gather(mi.Float, x, raster, inside) for x in δout]
-    behind = mi.Float(0)
-    for adjoint, total in zip(δ, op.out, strict=False):
-        behind += adjoint * dr.gather(mi.Float, total, raster, inside)
-    δrows = dr.zeros(mi.Float, op.surfels * op.width)
+def _transposed(rows: list[tuple[Any, ...]]) -> tuple[list[Any], ...]:
+    """One tuple a block to one list a quantity."""
+    return tuple(list(column) for column in zip(*rows, strict=True))
 
-    def condition(pair: Any, active: Any, transmittance: Any, behind: Any) -> Any:
-        return active & (pair < end)
 
-    def body(pair: Any, active: Any, transmittance: Any, behind: Any) -> Any:
-        surfel = dr.gather(mi.UInt32, op.lists.surfel_from_pair, pair, active)
-        row = _fetch(op, op.rows, surfel, active)
-        sample = evaluate(row, pixel, near)
-        weight, after, goes_on = _next(sample, active, transmittance)
-        hit = weight > 0
-        g = mi.Float(0)
-        for adjoint, value in zip(δ, _values(op, row, sample.z), strict=True):
-            g += adjoint * value
-        behind = behind - weight * g
-        δalpha = dr.select(hit, transmittance * g - behind / (1 - sample.alpha), 0)
-        δgeometry = evaluate_backward(row, sample, δalpha, weight * δ[-2])
-        δrow = δgeometry + [weight * adjoint for adjoint in δ[:-2]] + [mi.Float(0)] * (op.width - op.columns)
-        dr.scatter_add(δrows, mi.ArrayXf(δrow), surfel, hit)
-        return pair + 1, goes_on, after, behind
+def _blend_backward(op: _Blend, δout: list[Any]) -> Rows:
+    lanes = _Lanes.of(op)
+    δ = lanes.from_raster(δout)
+    behind = [
+        sum((a * b for a, b in zip(of_block, total, strict=True)), start=mi.Float(0))
+        for of_block, total in zip(δ, lanes.from_raster(op.out[:-1]), strict=True)
+    ]
+    δrows = Rows.zeros(op.rows.count, op.rows.width)
 
-    dr.while_loop((begin, mi.Bool(inside), mi.Float(1), behind), condition, body, label="blend_backward")
-    dr.eval(δrows)
+    def condition(pair: Any, active: Any, *state: Any) -> Any:
+        return _any(active) & (pair < lanes.end)
+
+    def body(pair: Any, active: Any, *state: Any) -> Any:
+        surfel, some = _surfel(op, pair, active)
+        row = op.rows.fetch(surfel, some)
+        after, weights = [], []
+        geometry = FootprintAdjoint()
+        for pixel, _, _, active_here, transmittance, behind_here, δhere in lanes.each(active, *state, δ):
+            sample = evaluate(row, pixel, op.camera.near)
+            weight, transmittance_after, goes_on = _next(sample, active_here, transmittance)
+            g = mi.Float(0)
+            for adjoint, value in zip(δhere, _values(op, row, sample.z), strict=True):
+                g = dr.fma(adjoint, value, g)
+            rest = dr.fma(-weight, g, behind_here)
+            δalpha = dr.select(weight > 0, dr.fma(transmittance, g, -rest / (1 - sample.alpha)), 0)
+            geometry.add(sample, δalpha, weight * δhere[-2])
+            after.append((goes_on, transmittance_after, rest))
+            weights.append(weight)
+        δrow = geometry.columns(row)
+        for k in range(op.features):
+            δfeature = mi.Float(0)
+            for weight, δhere in zip(weights, δ, strict=True):
+                δfeature = dr.fma(weight, δhere[k], δfeature)
+            δrow.append(δfeature)
+        δrows.add(surfel, δrow, _any([weight > 0 for weight in weights]))
+        return pair + 1, *_transposed(after)
+
+    start = [
+        (mi.Bool(inside), mi.Float(1), total) for inside, total in zip(lanes.inside, behind, strict=True)
+    ]
+    dr.while_loop((lanes.begin, *_transposed(start)), condition, body, label="blend_backward")
+    dr.eval(δrows.data)
     return δrows
 
 
-def _blend_forward(op: _Blend, drows: Any) -> list[Any]:
-    pixel, raster, inside, begin, end = _lanes(op)
-    near = op.camera.near
-    maps = op.columns - GEOMETRY_COLUMNS + 2
+def _blend_forward(op: _Blend, drows: Rows) -> list[Any]:
+    lanes = _Lanes.of(op)
+    maps = op.features + 2
 
-    def condition(pair: Any, active: Any, transmittance: Any, dtransmittance: Any, dout: Any) -> Any:
-        return active & (pair < end)
+    def condition(pair: Any, active: Any, *state: Any) -> Any:
+        return _any(active) & (pair < lanes.end)
 
-    def body(pair: Any, active: Any, transmittance: Any, dtransmittance: Any, dout: Any) -> Any:
-        surfel = dr.gather(mi.UInt32, op.lists.surfel_from_pair, pair, active)
-        row, drow = _fetch(op, op.rows, surfel, active), _fetch(op, drows, surfel, active)
-        sample = evaluate(row, pixel, near)
-        weight, after, goes_on = _next(sample, active, transmittance)
-        hit = weight > 0
-        dalpha, dz = evaluate_forward(row, sample, drow)
-        dweight = dr.select(hit, dtransmittance * sample.alpha + transmittance * dalpha, 0)
-        dvalues = [drow[i] for i in range(GEOMETRY_COLUMNS, op.columns)] + [dz, mi.Float(0)]
-        values = _values(op, row, sample.z)
-        dout = [
-            total + dweight * value + dr.select(hit, weight * dvalue, 0)
-            for total, value, dvalue in zip(dout, values, dvalues, strict=True)
-        ]
-        dtransmittance = dr.select(
-            hit, dtransmittance * (1 - sample.alpha) - transmittance * dalpha, dtransmittance
-        )
-        return pair + 1, goes_on, after, dtransmittance, dout
+    def body(pair: Any, active: Any, *state: Any) -> Any:
+        surfel, some = _surfel(op, pair, active)
+        row, drow = op.rows.fetch(surfel, some), drows.fetch(surfel, some)
+        after = []
+        for pixel, _, _, active_here, transmittance, dtransmittance, dout in lanes.each(active, *state):
+            sample = evaluate(row, pixel, op.camera.near)
+            weight, transmittance_after, goes_on = _next(sample, active_here, transmittance)
+            hit = weight > 0
+            dalpha, dz = evaluate_forward(row, sample, drow)
+            dweight = dr.select(hit, dtransmittance * sample.alpha + transmittance * dalpha, 0)
+            dvalues = [*drow[GEOMETRY_COLUMNS:][: op.features], dz, mi.Float(0)]
+            dout = [
+                total + dweight * value + dr.select(hit, weight * dvalue, 0)
+                for total, value, dvalue in zip(dout, _values(op, row, sample.z), dvalues, strict=True)
+            ]
+            dafter = dtransmittance * (1 - sample.alpha) - transmittance * dalpha
+            after.append((goes_on, transmittance_after, dr.select(hit, dafter, dtransmittance), dout))
+        return pair + 1, *_transposed(after)
 
-    state = (begin, mi.Bool(inside), mi.Float(1), mi.Float(0), [mi.Float(0) for _ in range(maps)])
-    dout = dr.while_loop(state, condition, body, label="blend_forward")[-1]
-    return _to_raster(op, dout, raster, inside)
+    start = [(mi.Bool(inside), mi.Float(1), mi.Float(0), [mi.Float(0)] * maps) for inside in lanes.inside]
+    *_, dout = dr.while_loop((lanes.begin, *_transposed(start)), condition, body, label="blend_forward")
+    return lanes.to_raster(op, dout)

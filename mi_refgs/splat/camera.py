@@ -106,7 +106,7 @@ class Camera:
             matrix,
             near=float(params["near_clip"]),
         )
-        x, y = (int(offset) % TILE for offset in sensor.film().crop_offset())
+        x, y = (int(offset) % size for offset, size in zip(sensor.film().crop_offset(), TILE, strict=True))
         return replace(camera, phase=(x, y))
 
     def to_camera(self, point: Any) -> Any:
@@ -136,5 +136,5 @@ class Camera:
             fy=self.fy * factor,
             cx=self.cx * factor,
             cy=self.cy * factor,
-            phase=(self.phase[0] * factor % TILE, self.phase[1] * factor % TILE),
+            phase=(self.phase[0] * factor % TILE[0], self.phase[1] * factor % TILE[1]),
         )

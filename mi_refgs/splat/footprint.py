@@ -105,7 +105,7 @@ def _extent(t_u: Any, t_v: Any, s: Any, slope: Any, z: Any, opacity: Any, focal:
     tangent lines of the dual conic [2DGS, appendix A, with r for 3 and the origin at the projected centre]. A
     contour that reaches behind the camera has no bounds: such a surfel is listed everywhere.
     """
-    r2 = dr.maximum(2 * dr.log(dr.maximum(opacity, ALPHA_MIN) / ALPHA_MIN), 0)
+    r2 = _reach(opacity)
     depth_u, depth_v = s.x * t_u.z, s.y * t_v.z
     denominator = r2 * (dr.square(depth_u) + dr.square(depth_v)) - dr.square(z)
     bounded = denominator < -1e-4 * dr.square(z)  # float32 margin: the bounds diverge at 0
@@ -123,8 +123,13 @@ def _extent(t_u: Any, t_v: Any, s: Any, slope: Any, z: Any, opacity: Any, focal:
     return mi.Vector2f(*low), mi.Vector2f(*high)
 
 
-def depth_near(footprints: Footprints, surfel: Any, pixel: Any) -> Any:
-    """Depth of surfels (mi.UInt32, M) in tiles with given centres (mi.Point2f, M): the sort key; detached.
+def _reach(opacity: Any) -> Any:
+    """r² = 2 ln(o/α_min): the ρ at which α falls to ALPHA_MIN."""
+    return 2 * dr.log(dr.maximum(opacity, ALPHA_MIN) / ALPHA_MIN)
+
+
+def depth_near(row: list[Any], pixel: Any) -> Any:
+    """Depth of footprint rows near given points (mi.Point2f, pixels), the centres of tiles: the sort key.
 
     It is that of the surfel's plane, no further than SORT_REACH standard deviations along the way from its
     centre (in the affine approximation): beyond, the plane says nothing about the surfel. Where neighbours on
@@ -132,13 +137,44 @@ def depth_near(footprints: Footprints, surfel: Any, pixel: Any) -> Any:
     their centres, those on the camera's side of it would always come first, and the picture would depend on
     the view as no surface does. [cf. StopThePop, Radl et al. 2024, §4: depth at the tile]
     """
-    columns = [dr.gather(mi.Float, dr.detach(column), surfel) for column in footprints.columns[:9]]
-    a_x, a_y, b_x, b_y, c_x, c_y, k, x, y = columns
+    a_x, a_y, b_x, b_y, c_x, c_y, k, x, y = row[:9]
     delta = mi.Vector2f(pixel.x - x, pixel.y - y)
-    u, v = a_x * delta.x + a_y * delta.y, b_x * delta.x + b_y * delta.y  # times k
-    inside = dr.minimum(1, SORT_REACH * k * dr.rsqrt(dr.maximum(u * u + v * v, NORM_FLOOR)))
-    inverse_depth = k + inside * (c_x * delta.x + c_y * delta.y)
+    u, v = _linear(a_x, a_y, delta), _linear(b_x, b_y, delta)  # times k
+    inside = dr.minimum(1, SORT_REACH * k * dr.rsqrt(dr.maximum(dr.fma(u, u, v * v), NORM_FLOOR)))
+    inverse_depth = dr.fma(inside, _linear(c_x, c_y, delta), k)
     return dr.rcp(dr.maximum(inverse_depth, k / SORT_DEPTH_RANGE))
+
+
+def overlaps(row: list[Any], low: Any, high: Any) -> Any:
+    """Whether footprint rows may reach α ≥ ALPHA_MIN in screen rectangles [low, high] (mi.Point2f).
+
+    With r as in `_extent`, u² + v² ≤ r² is q ≤ 0 for the quadratic q(δ) = (a·δ)² + (b·δ)² - r² (k + c·δ)².
+    The least q of a rectangle lies at the minimum of q itself or on an edge that faces it, where q is a
+    parabola. [cf. Speedy-Splat, Hanson et al. 2025, §4: tiles by the exact ellipse]
+    """
+    a_x, a_y, b_x, b_y, c_x, c_y, k, x, y, opacity = row[:GEOMETRY_COLUMNS]
+    r2 = _reach(opacity) * 1.0005 + 1e-4  # rounding of q
+    xx = dr.fma(a_x, a_x, b_x * b_x) - r2 * c_x * c_x
+    xy = dr.fma(a_x, a_y, b_x * b_y) - r2 * c_x * c_y
+    yy = dr.fma(a_y, a_y, b_y * b_y) - r2 * c_y * c_y
+    along_x, along_y = -r2 * k * c_x, -r2 * k * c_y
+    determinant = dr.fma(xx, yy, -xy * xy)
+    ellipse = (determinant > 0) & (xx > 0)  # else the contour reaches behind the camera
+    scale = dr.rcp(dr.select(ellipse, determinant, 1))
+    low, high = mi.Vector2f(low.x - x, low.y - y), mi.Vector2f(high.x - x, high.y - y)
+    near_x = dr.clip((xy * along_y - yy * along_x) * scale, low.x, high.x)
+    near_y = dr.clip((xy * along_x - xx * along_y) * scale, low.y, high.y)
+    on_x = dr.clip(-dr.fma(xy, near_x, along_y) / dr.select(ellipse, yy, 1), low.y, high.y)
+    on_y = dr.clip(-dr.fma(xy, near_y, along_x) / dr.select(ellipse, xx, 1), low.x, high.x)
+
+    def q(x: Any, y: Any) -> Any:
+        squares = dr.fma(xx * x, x, dr.fma(2 * xy * x, y, yy * y * y))
+        return squares + 2 * dr.fma(along_x, x, along_y * y) - r2 * k * k
+
+    by_plane = dr.minimum(q(near_x, on_x), q(on_y, near_y)) <= 0
+    beside_x, beside_y = dr.clip(0, low.x, high.x), dr.clip(0, low.y, high.y)
+    by_screen = LOW_PASS_INV_VARIANCE * dr.fma(beside_x, beside_x, beside_y * beside_y) <= r2
+    return ~ellipse | by_plane | by_screen
 
 
 @dataclass(frozen=True)
@@ -159,13 +195,13 @@ class Sample:
 def evaluate(row: Any, pixel: Any, near: Any) -> Sample:
     """Evaluate footprint rows at pixel centres. `row[0:10]` are the geometry columns."""
     delta = mi.Vector2f(pixel.x - row[7], pixel.y - row[8])
-    inverse_depth = row[6] + row[4] * delta.x + row[5] * delta.y
+    inverse_depth = dr.fma(row[4], delta.x, dr.fma(row[5], delta.y, row[6]))
     in_front = inverse_depth > 0
     z = dr.rcp(dr.select(in_front, inverse_depth, 1))
-    u = z * (row[0] * delta.x + row[1] * delta.y)
-    v = z * (row[2] * delta.x + row[3] * delta.y)
-    rho_plane = dr.square(u) + dr.square(v)
-    rho_screen = LOW_PASS_INV_VARIANCE * dr.squared_norm(delta)
+    u = z * _linear(row[0], row[1], delta)
+    v = z * _linear(row[2], row[3], delta)
+    rho_plane = dr.fma(u, u, v * v)
+    rho_screen = LOW_PASS_INV_VARIANCE * dr.fma(delta.x, delta.x, delta.y * delta.y)
     low_pass = ~in_front | (rho_screen < rho_plane)
     gaussian = dr.exp(-0.5 * dr.select(low_pass, rho_screen, rho_plane))
     alpha = row[9] * gaussian
@@ -176,29 +212,56 @@ def evaluate(row: Any, pixel: Any, near: Any) -> Sample:
     return Sample(alpha, z, valid, gaussian, clamped, low_pass, delta, u, v)
 
 
-def evaluate_backward(row: Any, sample: Sample, δalpha: Any, δz: Any) -> list[Any]:
-    """Adjoint of `evaluate`: adjoints of α and z to those of the ten geometry columns."""
-    plane = ~sample.low_pass
-    delta, u, v, z = sample.delta, sample.u, sample.v, sample.z
-    # α = o gaussian, unless clamped;  gaussian = exp(-ρ/2)
-    δalpha = dr.select(sample.clamped, 0, δalpha)
-    δopacity = δalpha * sample.gaussian
-    δrho = -0.5 * δalpha * sample.alpha
-    # ρ = u² + v²
-    δu = dr.select(plane, 2 * u * δrho, 0)
-    δv = dr.select(plane, 2 * v * δrho, 0)
-    # u = z a·δ,  v = z b·δ  (u δu = z (a·δ) δu)
-    δa, δb = δu * z, δv * z
-    δinverse_depth = -z * (z * δz + u * δu + v * δv)  # z = 1/(k + c·δ), or 1/k under the low-pass
-    δc = dr.select(plane, δinverse_depth, 0)
-    # δ = pixel - centre enters a·δ, b·δ, c·δ and ρ = 2 |δ|²
-    screen = dr.select(plane, 0, 2 * LOW_PASS_INV_VARIANCE * δrho)
-    δdelta_x = δa * row[0] + δb * row[2] + δc * row[4] + screen * delta.x
-    δdelta_y = δa * row[1] + δb * row[3] + δc * row[5] + screen * delta.y
-    return [
-        δa * delta.x, δa * delta.y, δb * delta.x, δb * delta.y, δc * delta.x, δc * delta.y,
-        δinverse_depth, -δdelta_x, -δdelta_y, δopacity,
-    ]  # fmt: skip
+def _linear(x: Any, y: Any, delta: Any) -> Any:
+    return dr.fma(x, delta.x, y * delta.y)
+
+
+class FootprintAdjoint:
+    """Adjoint of `evaluate`, summed over the pixels of one lane before it becomes that of the columns.
+
+    The sums are of adjoints times 1, δ.x and δ.y, for the three linear forms a·δ, b·δ, c·δ: all that the
+    pixels of a footprint have in common, the row itself, is applied once at the end.
+    """
+
+    def __init__(self) -> None:
+        self.a, self.b, self.c = ([mi.Float(0)] * 3 for _ in range(3))
+        self.inverse_depth, self.opacity = mi.Float(0), mi.Float(0)
+        self.screen = [mi.Float(0)] * 2
+
+    def add(self, sample: Sample, δalpha: Any, δz: Any) -> None:
+        """Take in a pixel, by the adjoints of its α and z."""
+        plane = ~sample.low_pass
+        delta, u, v, z = sample.delta, sample.u, sample.v, sample.z
+        # α = o gaussian, unless clamped;  gaussian = exp(-ρ/2)
+        δalpha = dr.select(sample.clamped, 0, δalpha)
+        self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)
+        minus_2δrho = δalpha * sample.alpha
+        # ρ = u² + v²,  u = z a·δ,  v = z b·δ
+        by_plane = dr.select(plane, -z * minus_2δrho, 0)
+        δa, δb = u * by_plane, v * by_plane  # of a·δ and b·δ
+        δz = dr.select(plane, dr.fma(z, δz, dr.fma(u, u, v * v) * -minus_2δrho), z * δz)
+        δinverse_depth = -z * δz  # z = 1/(k + c·δ), or 1/k under the low-pass
+        self.inverse_depth += δinverse_depth
+        # By the low-pass, ρ is a multiple of δ·δ.
+        by_screen = dr.select(plane, 0, minus_2δrho)
+        self.screen = [dr.fma(by_screen, d, total) for d, total in zip(delta, self.screen, strict=True)]
+        self.a = _moments(self.a, δa, delta)
+        self.b = _moments(self.b, δb, delta)
+        self.c = _moments(self.c, dr.select(plane, δinverse_depth, 0), delta)
+
+    def columns(self, row: Any) -> list[Any]:
+        """Adjoint of the ten geometry columns."""
+        a, b, c = self.a, self.b, self.c
+        # δ = pixel - centre enters a·δ, b·δ, c·δ and ρ
+        δcentre = [
+            dr.fma(LOW_PASS_INV_VARIANCE, screen, -(a[0] * row[i] + b[0] * row[2 + i] + c[0] * row[4 + i]))
+            for i, screen in enumerate(self.screen)
+        ]
+        return [*a[1:], *b[1:], *c[1:], self.inverse_depth, *δcentre, self.opacity]
+
+
+def _moments(total: list[Any], x: Any, delta: Any) -> list[Any]:
+    return [total[0] + x, dr.fma(x, delta.x, total[1]), dr.fma(x, delta.y, total[2])]
 
 
 def evaluate_forward(row: Any, sample: Sample, drow: Any) -> tuple[Any, Any]:

@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.rows import columns_of
 
 # Raw columns per channel, in table order; 0 stands for 3 (degree + 1)² harmonics, column = 3 coef + rgb.
 CHANNELS: dict[str, int] = {
@@ -134,20 +135,12 @@ class Surfels:
     # ---------------- raw columns ----------------
 
     def columns(self, name: str) -> list[Any]:
-        """Raw columns of a channel as D `mi.Float` of width N, under AD.
-
-        Entry i is read by lane i only, so the adjoint is a plain (not atomic) read-modify-write. Gathering
-        from the raw tensor by another index map in the same derivative pass would let the two adjoints race.
-        """
+        """Raw columns of a channel as D `mi.Float` of width N, under AD."""
         tensor = self.raw[name]
         rows, width = (int(size) for size in tensor.shape)
         if rows == 0:
             return [mi.Float() for _ in range(width)]
-        index = dr.arange(mi.UInt32, rows) * width
-        return [
-            dr.gather(mi.Float, tensor.array, index + column, mode=dr.ReduceMode.NoConflicts)
-            for column in range(width)
-        ]
+        return columns_of(tensor.array, width)
 
     # ---------------- activated values ----------------
 

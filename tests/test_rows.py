@@ -1,0 +1,57 @@
+"""Tables read and written in packets: values, both derivative modes, accumulation."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.rows import Rows, columns_of
+
+ROWS = 37
+
+
+@pytest.mark.parametrize("width", [1, 2, 3, 4, 8, 12, 27, 48])
+def test_columns_of_a_table_and_their_derivatives(width: int) -> None:
+    """Whatever divides the width, columns are those of the table, in value, tangent and adjoint."""
+    rng = np.random.default_rng(width)
+    table, tangent, adjoint = rng.normal(size=(3, ROWS, width)).astype(np.float32)
+    array = mi.Float(table.ravel())
+    dr.enable_grad(array)
+    columns = columns_of(array, width)
+    np.testing.assert_array_equal(np.stack([c.numpy() for c in columns], axis=1), table)
+
+    weighted = sum(dr.sum(c * mi.Float(np.ascontiguousarray(adjoint[:, i]))) for i, c in enumerate(columns))
+    dr.backward(weighted)
+    np.testing.assert_allclose(dr.grad(array).numpy().reshape(ROWS, width), adjoint, rtol=1e-6)
+
+    array = mi.Float(table.ravel())
+    dr.enable_grad(array)
+    dr.set_grad(array, mi.Float(tangent.ravel()))
+    columns = columns_of(array, width)
+    dr.enqueue(dr.ADMode.Forward, array)
+    dr.traverse(dr.ADMode.Forward)
+    moved = np.stack([dr.grad(c).numpy() for c in columns], axis=1)
+    np.testing.assert_allclose(moved, tangent, rtol=1e-6)
+
+
+@pytest.mark.parametrize("width", [5, 8, 19])
+def test_rows_pack_fetch_and_add(width: int) -> None:
+    rng = np.random.default_rng(width)
+    table = rng.normal(size=(ROWS, width)).astype(np.float32)
+    rows = Rows.pack([mi.Float(np.ascontiguousarray(column)) for column in table.T])
+    np.testing.assert_array_equal(rows.unpadded().numpy().reshape(ROWS, width), table)
+    np.testing.assert_array_equal(np.stack([c.numpy() for c in rows.columns()], axis=1), table)
+
+    picked = rng.integers(0, ROWS, 200).astype(np.uint32)
+    active = rng.uniform(size=200) < 0.5
+    fetched = rows.fetch(mi.UInt32(picked), mi.Bool(active))
+    expected = np.where(active[:, None], table[picked], 0)
+    np.testing.assert_array_equal(np.stack([c.numpy() for c in fetched[:width]], axis=1), expected)
+
+    sums = Rows.zeros(ROWS, width)
+    sums.add(mi.UInt32(picked), [mi.Float(np.ascontiguousarray(c)) for c in table[picked].T], mi.Bool(active))
+    expected = np.zeros_like(table)
+    np.add.at(expected, picked[active], table[picked][active])
+    np.testing.assert_allclose(sums.unpadded().numpy().reshape(ROWS, width), expected, rtol=1e-5, atol=1e-6)
