@@ -27,11 +27,13 @@ TEXEL = 4
 class Rows:
     """Where the rows of some lat-long grids lie in a texel buffer and in a Fourier buffer.
 
-    Analysis has one lane per four frequencies, synthesis one per eight columns that share their cosines.
+    Analysis has one lane per four columns, to fold them, then one per four frequencies; synthesis has one per
+    eight columns that share their cosines.
     """
 
     texels: int
     coefficients: int
+    folding: tuple[Any, Any, Any]  # per lane: texel of the row's start, w, column below w/4
     analysis: tuple[Any, Any, Any, Any]  # per lane: texel of the row's start, w, m, offset of the twiddles
     slots: tuple[Any, ...]  # where m, w/2-m, w/4-m and w/4+m go ...
     exists: tuple[Any, ...]  # ... and whether they do
@@ -45,7 +47,6 @@ class Rows:
 class Mixing:
     """A block-sparse matrix between Fourier buffers: a lane owns four outputs, entries [begin, end)."""
 
-    inputs: int
     outputs: int
     begin: Any
     end: Any
@@ -73,11 +74,13 @@ def row_slots(limits: list[np.ndarray]) -> list[np.ndarray]:
 
 def make_rows(firsts: list[int], limits: list[np.ndarray]) -> Rows:
     """Lanes for grids of len(limit) rows and twice as many columns, from texels `firsts` on."""
-    analysis, slots, exists, synthesis, twiddles, at = [], [], [], [], [], 0
+    folding, analysis, slots, exists, synthesis, twiddles, at = [], [], [], [], [], [], 0
     for first, limit, slot in zip(firsts, limits, row_slots(limits), strict=True):
         h, w = len(limit), 2 * len(limit)
         angle = np.arange(2 * w) * (np.pi / w)
         twiddles.append(np.stack([np.cos(angle), np.sin(angle)], 1).ravel())
+        i, j = (a.ravel() for a in np.meshgrid(np.arange(h), np.arange(w // 4), indexing="ij"))
+        folding.append(np.stack([first + w * i, 0 * i + w, j]))
         i, m = np.nonzero(np.arange(w // 8 + 1) < limit[:, None])
         others = np.stack([m, w // 2 - m, w // 4 - m, w // 4 + m])
         # At m = 0 and at m = w/8 some of the four are the same frequency; the first one writes it.
@@ -91,6 +94,7 @@ def make_rows(firsts: list[int], limits: list[np.ndarray]) -> Rows:
     return Rows(
         texels=firsts[-1] + 2 * len(limits[-1]) ** 2,
         coefficients=int(sum(limit.sum() for limit in limits)),
+        folding=_device(*np.concatenate(folding, 1)),
         analysis=_device(*np.concatenate(analysis, 1)),
         slots=_device(*np.concatenate(slots, 1)),
         exists=tuple(mi.Bool(row) for row in np.concatenate(exists, 1)),
@@ -99,9 +103,7 @@ def make_rows(firsts: list[int], limits: list[np.ndarray]) -> Rows:
     )
 
 
-def make_mixing(
-    blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]], inputs: int, outputs: int
-) -> Mixing:
+def make_mixing(blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]], outputs: int) -> Mixing:
     """The matrix of pieces (rows, columns, M), each with slots of its columns, slots and limits of its rows.
 
     Pieces that share output rows add up.
@@ -124,7 +126,7 @@ def make_mixing(
     begin, end = begin[lanes], end[lanes]
     first, last, place, stride, origin = _device(begin, end, slot[begin], step[begin], source)
     entries = mi.Float(weight.astype(np.float32).ravel())
-    return Mixing(inputs, outputs, first, last, place, stride, origin, entries)
+    return Mixing(outputs, first, last, place, stride, origin, entries)
 
 
 def write(target: Any, values: list[Any], place: Any, active: Any = True) -> None:
@@ -159,24 +161,45 @@ def _four_turns(rows: Rows, at: Any, turn: Any, step: Any, w: Any) -> tuple[list
     return angles, _turn(_turn(turn, 2 * step, w), 2 * step, w)
 
 
+def _fold(rows: Rows, texels: Any) -> Any:
+    """Four columns with the same cosines and sines, up to signs, as one.
+
+    At 2 (row's start/4 + j) for even frequencies, and at the next place for odd ones: the sums that go with
+    the cosine at column j, then those that go with the sine.
+    """
+    start, w, j = rows.folding
+    half = w // 2
+    columns = (j, w - 1 - j, half + j, half - 1 - j)
+    colours = list(zip(*(_read(TEXEL, texels, start + column)[:3] for column in columns), strict=True))
+    out = dr.zeros(mi.Float, COEFFICIENT * (rows.texels // 2))
+    for parity, sign in enumerate((1, -1)):
+        cosines = [a + b + sign * (c + d) for a, b, c, d in colours]
+        sines = [a - b + sign * (c - d) for a, b, c, d in colours]
+        write(out, cosines + sines, 2 * (start // 4 + j) + parity)
+    dr.eval(out)
+    return out
+
+
 def analyse(rows: Rows, texels: Any) -> Any:
     """Fourier buffer Σ_j x_j (cos mφ_j, sin mφ_j) of every row and frequency of a flat texel buffer."""
     start, w, m, at = rows.analysis
+    folded = _fold(rows, texels)
+    quarter = w // 4
+    place = 2 * (start // 4) + m % 2  # w/2 - m and w/4 ± m are as even or odd as m
 
     def body(j: Any, turn: Any, *acc: Any) -> tuple[Any, ...]:
-        out = list(acc)
+        out = []
         angles, turn = _four_turns(rows, at, turn, 2 * m, w)  # φ_j = π(2j+1)/w
         for r, (cos, sin) in enumerate(angles):
-            for c, x in enumerate(_read(TEXEL, texels, start + j + r)[:3]):
-                out[6 * r + c] = dr.fma(x, cos, out[6 * r + c])
-                out[6 * r + 3 + c] = dr.fma(x, sin, out[6 * r + 3 + c])
+            x = _read(COEFFICIENT, folded, place + 2 * (j + r), j + r < quarter)[:6]
+            out += [dr.fma(x[c], cos, acc[12 * r + c]) for c in range(6)]
+            out += [dr.fma(x[c], sin, acc[12 * r + 6 + c]) for c in range(6)]
         return (j + 4, turn, *out)
 
     n = dr.width(m)
-    zeros = [dr.zeros(mi.Float, n) for _ in range(24)]
-    state = dr.while_loop((dr.zeros(mi.UInt32, n), m, *zeros), lambda j, *_: j < w, body)
-    cosines = [[state[2 + 6 * r + c] for r in range(4)] for c in range(3)]
-    sines = [[state[5 + 6 * r + c] for r in range(4)] for c in range(3)]
+    zeros = [dr.zeros(mi.Float, n) for _ in range(48)]
+    _, _, *sums = dr.while_loop((dr.zeros(mi.UInt32, n), m, *zeros), lambda j, *_: j < quarter, body)
+    by_cos, by_sin = ([sums[12 * r + k : 12 * r + k + 6] for r in range(4)] for k in (0, 6))
     # The frequency f - m or f + m turns by γ_j = fφ_j on top: π(j+½) or π(j+½)/2, which repeats after 4.
     q = 0.5**0.5
     quarters = (
@@ -188,10 +211,11 @@ def analyse(rows: Rows, texels: Any) -> Any:
     out = dr.zeros(mi.Float, COEFFICIENT * rows.coefficients)
     for (cos_γ, sin_γ, sign), slot, exists in zip(quarters, rows.slots, rows.exists, strict=True):
         cos = [
-            sum(cos_γ[r] * cosines[c][r] - sign * sin_γ[r] * sines[c][r] for r in range(4)) for c in range(3)
+            sum(cos_γ[r] * by_cos[r][c] - sign * sin_γ[r] * by_sin[r][c] for r in range(4)) for c in range(3)
         ]
         sin = [
-            sum(sin_γ[r] * cosines[c][r] + sign * cos_γ[r] * sines[c][r] for r in range(4)) for c in range(3)
+            sum(sin_γ[r] * by_cos[r][c] + sign * cos_γ[r] * by_sin[r][c] for r in range(4))
+            for c in range(3, 6)
         ]
         write(out, cos + sin, slot, exists)
     return out

@@ -61,12 +61,10 @@ def _build(variant: str, height: int) -> Operator:
         levels=levels,
         forward=fourier.make_mixing(
             [(m, slot_in, s, n) for m, (s, n) in zip(matrices, out, strict=True)],
-            base.coefficients,
             levels.coefficients,
         ),
         adjoint=fourier.make_mixing(
             [(m, s, slot_in, limit_in) for m, (s, _) in zip(transposed, out, strict=True)],
-            levels.coefficients,
             base.coefficients,
         ),
         info=mi.UInt32(
