@@ -4,19 +4,15 @@
 
 Surfels cover a unit sphere, so every one of them is on the surface, about half of them seen. Each stage is
 timed between barriers, in steps of their own; `step` is the wall time of undisturbed steps, which is less
-than the sum because kernels fuse across stages. Error: the splatter against its float64 oracle on the same
-surfels (a 32² crop of the view).
+than the sum because kernels fuse across stages. `refgs profile` does the same for a scene of yours, and
+`python -m benchmarks.splatting` measures the splatter alone, its errors included.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import sys
-import time
-from collections import defaultdict
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +22,8 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
+
+METHOD = "ref_gaussian"
 
 
 def sphere_data(size: int, views: int, rng: np.random.Generator) -> Any:
@@ -50,100 +48,33 @@ def sphere_data(size: int, views: int, rng: np.random.Generator) -> Any:
     return Dataset(Path("sphere"), "train", tuple(pictures), np.ones(3, np.float32), False, None)
 
 
-class StageClock:
-    """Wraps functions so that each call is evaluated, waited for and booked under a name."""
+def make_trainer(surfels: int, data: Any, variant: str = METHOD) -> tuple[Any, Any]:
+    """A trainer at the preset `standard` that keeps its number of surfels, and its method."""
+    from mi_refgs.fit import config
+    from mi_refgs.fit.train import Trainer
 
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = defaultdict(float)
-        self._undo: list[tuple[Any, str, Any]] = []
-
-    def wrap(self, module: Any, attribute: str, stage: str) -> None:
-        """Replace module.attribute by a timed version until `restore`."""
-        original = getattr(module, attribute)
-
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            dr.eval(args)  # what the stage is given is not its own time
-            return self.measure(stage, lambda: original(*args, **kwargs))
-
-        self._undo.append((module, attribute, original))
-        setattr(module, attribute, timed)
-
-    def measure(self, stage: str, call: Callable[[], Any]) -> Any:
-        """Run, evaluate, wait, book."""
-        dr.eval()
-        dr.sync_thread()
-        begin = time.perf_counter()
-        result = call()
-        dr.eval(result)
-        dr.sync_thread()
-        self.seconds[stage] += time.perf_counter() - begin
-        return result
-
-    def restore(self) -> None:
-        """Put the originals back."""
-        for module, attribute, original in self._undo:
-            setattr(module, attribute, original)
+    settings = [f"surfels.count={surfels}", f"surfels.max_count={surfels}", "refine={}"]
+    method = config.load(variant, "standard", settings)
+    return Trainer(method, data), method
 
 
-def stage_times(trainer: Any, steps: int) -> dict[str, float]:
-    """Milliseconds a step by stage, between barriers."""
-    splat = importlib.import_module("mi_refgs.splat")
-    blend = importlib.import_module("mi_refgs.splat.blend")
-    pipeline = importlib.import_module("mi_refgs.render.pipeline")
-    objective = importlib.import_module("mi_refgs.fit.objective")
-    optim = importlib.import_module("mi_refgs.fit.optim")
-    envmap = importlib.import_module("mi_refgs.shade.envmap")
-    clock = StageClock()
-    clock.wrap(splat, "project", "project")
-    clock.wrap(splat, "list_by_tile", "sort")
-    clock.wrap(splat, "blend", "splat forward")
-    clock.wrap(blend, "_blend_backward", "splat backward")
-    clock.wrap(pipeline, "shade", "shade forward")
-    clock.wrap(envmap.EnvironmentLight, "prefilter", "prefilter forward")
-    clock.wrap(objective.losses, "ssim", "ssim forward")
-    clock.wrap(optim.Adam, "step", "optimiser")
-    clock.wrap(dr, "backward", "all backward")
-    rows = []
-    try:
-        for _ in range(steps):
-            clock.seconds.clear()
-            clock.measure("barriered step", trainer.step)
-            row = dict(clock.seconds)
-            row["shade, light, loss backward"] = row.pop("all backward") - row["splat backward"]
-            rows.append(row)
-    finally:
-        clock.restore()
-    return {stage: round(1e3 * float(np.median([row[stage] for row in rows])), 2) for stage in rows[0]}
+def step_times(surfels: int, size: int, steps: int, variant: str = METHOD) -> dict[str, Any]:
+    """For every stage of the schedule: a step's time, launches, cache misses, and where its time goes."""
+    from mi_refgs.fit.profile import profile_stage
 
-
-def splat_error(surfels: Any, camera: Any, view: Any) -> dict[str, float]:
-    """Image error of the splatter outside the declared band, on a crop of the view.
-
-    The largest one is that of a pair whose depths float32 cannot tell apart, blended in the other order.
-    """
-    from mi_refgs.reference import splat as oracle
-    from mi_refgs.splat import Camera, splat
-
-    size, corner = 32, view.width // 3
-    pinhole = oracle.PinholeCamera(
-        size, size, -view.fx, -view.fy, view.cx - corner, view.cy - corner, view.to_world
-    )
-    fast = Camera.look(
-        size, size, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, view.to_world, pinhole.near
-    )
-    raw = {name: values.astype(np.float64) for name, values in surfels.to_numpy().items()}
-    features = np.random.default_rng(0).uniform(size=(surfels.count, 3)).astype(np.float32)
-    columns = [mi.Float(np.ascontiguousarray(column)) for column in features.T]
-    with dr.suspend_grad():
-        blended = splat(surfels, columns, fast)
-        got = np.stack([f.numpy() for f in blended.features], axis=-1).reshape(size, size, 3)
-    expected = oracle.splat(raw, features.astype(np.float64), pinhole)
-    error = np.abs(got - expected.features)[~expected.band]
-    return {
-        "median": float(np.median(error)),
-        "q99": float(np.quantile(error, 0.99)),
-        "max": float(error.max()),
-    }
+    trainer, method = make_trainer(surfels, sphere_data(size, 8, np.random.default_rng(0)), variant)
+    result = {}
+    for name, stage in method.stages():
+        if stage.at == "pixel" and method.mesh is not None:
+            trainer.extract_mesh()
+        found = profile_stage(trainer, name, steps)
+        result[name] = {
+            "step_ms": round(found.step_ms, 2),
+            "launches": found.launches,
+            "cache_misses": found.misses,
+            "stages_ms": {key: round(value, 2) for key, value in found.stages_ms.items()},
+        }
+    return result
 
 
 def main() -> None:
@@ -154,41 +85,12 @@ def main() -> None:
     parser.add_argument("--surfels", type=int, default=20_000)
     parser.add_argument("--size", type=int, default=200, help="image edge, pixels")
     parser.add_argument("--steps", type=int, default=30)
-    parser.add_argument("--variant", default="ref_gaussian")
+    parser.add_argument("--variant", default=METHOD)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-
-    from mi_refgs.fit import config
-    from mi_refgs.fit.train import Trainer
-
-    settings = [f"surfels.count={options.surfels}", f"surfels.max_count={options.surfels}", "refine={}"]
-    method = config.load(options.variant, "standard", settings)
-    data = sphere_data(options.size, 8, np.random.default_rng(0))
-    trainer = Trainer(method, data)
     result: dict[str, Any] = {"surfels": options.surfels, "size": options.size, "threads": dr.thread_count()}
-    for name, stage in method.stages():
-        trainer.iteration = stage.until - options.steps * 3
-        if stage.at == "pixel" and method.mesh is not None:
-            trainer.extract_mesh()
-        for _ in range(4):
-            trainer.step()
-        dr.sync_thread()
-        launches, _, misses = dr.detail.launch_stats()
-        times = []
-        for _ in range(options.steps):
-            begin = time.perf_counter()
-            trainer.step()
-            dr.sync_thread()
-            times.append(time.perf_counter() - begin)
-        after, _, misses_after = dr.detail.launch_stats()
-        result[name] = {
-            "step_ms": round(1e3 * float(np.median(times)), 2),
-            "launches": (after - launches) / options.steps,
-            "cache_misses": misses_after - misses,
-            "stages_ms": stage_times(trainer, max(options.steps // 3, 5)),
-        }
-    result["splat_error"] = splat_error(trainer.surfels, trainer.targets[0].camera, data.views[0])
+    result |= step_times(options.surfels, options.size, options.steps, options.variant)
     json.dump(result, sys.stdout, indent=None if options.json else 2)
     print()
 

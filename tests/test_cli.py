@@ -19,7 +19,7 @@ from mi_refgs.fit.config import load_resolved
 from mi_refgs.fit.train import Trainer
 from mi_refgs.images import read_exr, read_png, srgb_from_linear, write_png
 
-COMMANDS = ("doctor", "demo", "dataset", "train", "eval", "render", "export")
+COMMANDS = ("doctor", "demo", "dataset", "train", "eval", "render", "export", "profile")
 ARTEFACTS = ("surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "config.toml", "metrics.jsonl")
 
 

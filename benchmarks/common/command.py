@@ -1,0 +1,52 @@
+"""What the benchmarks' command lines share: options, where reports go, exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common.lights import ROOT
+from benchmarks.common.report import write_csv, write_json, write_text
+from mi_refgs.errors import InputError
+
+
+def make_parser(name: str, description: str | None) -> argparse.ArgumentParser:
+    """Parser of `python -m benchmarks.NAME` with the options that all have, but for the sizes."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m benchmarks.{name}",
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("-o", "--output", type=Path, help="folder; without it docs/ and runs/")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write page and pictures of this earlier run"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    return parser
+
+
+def write_reports(
+    name: str,
+    options: argparse.Namespace,
+    measure: Callable[[], dict[str, Any]],
+    page: Callable[[dict[str, Any], Path], str],
+) -> int:
+    """Measure, or read `options.json`; write JSON, CSV (of "rows") and page. The exit code: 2 for bad input.
+
+    `page` gets the result and the folder in which it may write its pictures, and returns Markdown.
+    """
+    folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", ROOT / "runs")
+    try:
+        result = json.loads(options.json.read_text(encoding="utf-8")) if options.json else measure()
+        write_json(data / f"{name}.json", result)
+        write_csv(data / f"{name}.csv", result["rows"])
+        write_text(folder / f"{name}.md", page(result, folder))
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    print(folder / f"{name}.md")
+    return 0

@@ -1,0 +1,147 @@
+"""What only a fresh process can tell: peak memory, and how long kernels take to compile.
+
+python -m benchmarks.splatting.process memory 50000 256
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
+
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
+
+from benchmarks.common.lights import ROOT
+
+SPREAD = 1.5
+STEPS = 3
+TINY = (64, 16)
+"""Surfels and pixels that compile a view's kernels, so that the compiler's own memory is not counted."""
+
+
+def measure_memory(grid: tuple[tuple[int, int], ...]) -> list[dict[str, Any]]:
+    """Peak memory of forward and backward for each number of surfels and size."""
+    return [_run("memory", case) for case in grid]
+
+
+def measure_step(case: tuple[int, int]) -> dict[str, Any]:
+    """Peak memory and time of whole training steps."""
+    return _run("step", case)
+
+
+def measure_compile(case: tuple[int, int]) -> dict[str, Any]:
+    """Milliseconds of the first forward and the first forward + backward: kernel cache empty, full, warm."""
+    with tempfile.TemporaryDirectory() as folder:
+        cold, cached = (_run("compile", case, DRJIT_CACHE_DIR=folder) for _ in range(2))
+    return {"cold": cold["first"], "cached": cached["first"], "warm": cached["second"]}
+
+
+def _run(task: str, case: tuple[int, int], **environment: str) -> dict[str, Any]:
+    command = [sys.executable, "-m", "benchmarks.splatting.process", task, *map(str, case)]
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        env=os.environ | environment,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return result
+
+
+# ---------------- in the fresh process ----------------
+
+
+def _memory(count: int, size: int) -> dict[str, Any]:
+    from benchmarks.splatting.ours import Ours
+    from benchmarks.splatting.workload import FEATURES, sphere
+
+    dr.eval(Ours(sphere(*TINY, SPREAD), FEATURES).both())
+    workload = sphere(count, size, SPREAD)
+    before = _start()
+    ours = Ours(workload, FEATURES)
+    for _ in range(STEPS):
+        dr.eval(ours.both())
+        dr.sync_thread()
+    result = _peaks(before)
+    counts = ours.counts()
+    return {"surfels": count, "size": size, "pixels": size**2, "pairs": counts.pairs} | result
+
+
+def _step(count: int, size: int) -> dict[str, Any]:
+    import numpy as np
+
+    from benchmarks.step import make_trainer, sphere_data
+
+    rng = np.random.default_rng(0)
+    trainer, method = make_trainer(count, sphere_data(size, 2, rng))
+    trainer.extract_mesh()
+    before = _start()
+    times = []
+    trainer.iteration = method.stages()[-1][1].until - STEPS - 1
+    for _ in range(STEPS + 1):
+        begin = time.perf_counter()
+        trainer.step()
+        dr.sync_thread()
+        times.append(1e3 * (time.perf_counter() - begin))
+    whole = _resident("VmHWM")
+    found = {"surfels": trainer.surfels.count, "size": size, "ms": float(np.median(times[1:]))}
+    return found | _peaks(before) | {"whole_process": whole}
+
+
+def _compile(count: int, size: int) -> dict[str, Any]:
+    from benchmarks.splatting.ours import Ours
+    from benchmarks.splatting.workload import FEATURES, sphere
+
+    ours = Ours(sphere(count, size, SPREAD), FEATURES)
+    found: dict[str, Any] = {}
+    for turn in ("first", "second"):
+        found[turn] = {}
+        for kind in ("forward", "both"):
+            begin = time.perf_counter()
+            dr.eval(getattr(ours, kind)())
+            dr.sync_thread()
+            found[turn][kind] = 1e3 * (time.perf_counter() - begin)
+    return found
+
+
+def _start() -> int:
+    """Forget earlier peaks; the memory that the process has now."""
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    reset = Path("/proc/self/clear_refs")
+    if reset.exists():
+        reset.write_text("5")
+    return _resident("VmRSS")
+
+
+def _peaks(before: int) -> dict[str, int]:
+    """Bytes since `_start`: what the process grew by at most, and what Dr.Jit's allocator held at most."""
+    backend = dr.JitBackend.LLVM
+    return {"peak": _resident("VmHWM") - before, "allocated": int(dr.detail.malloc_watermark(backend))}
+
+
+def _resident(field: str) -> int:
+    """VmRSS (now) or VmHWM (peak) in bytes; the peak where the system has no /proc."""
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    line = next(line for line in status.read_text().splitlines() if line.startswith(field))
+    return 1024 * int(line.split()[1])
+
+
+if __name__ == "__main__":
+    mi.set_variant("llvm_ad_rgb")
+    tasks = {"memory": _memory, "step": _step, "compile": _compile}
+    print(json.dumps(tasks[sys.argv[1]](int(sys.argv[2]), int(sys.argv[3]))))

@@ -1,0 +1,130 @@
+"""`refgs profile`: where the time of a training step goes, and what would help."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mi_refgs.cli.command import Result, add_command, add_settings
+from mi_refgs.cli.train import DEFAULT_METHOD, DEFAULT_PRESET
+from mi_refgs.errors import InputError
+from mi_refgs.resources import resource_dir
+
+if TYPE_CHECKING:
+    from mi_refgs.fit.profile import Profile
+    from mi_refgs.fit.train import Trainer
+
+DEFAULT_STEPS = 15
+MOST_STEPS = 1000
+MEBIBYTE = 2**20
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    summary = "say where the time of a training step goes, and what would help"
+    parser = add_command(commands, "profile", summary, "refgs profile runs/glossy", run)
+    parser.add_argument(
+        "path",
+        type=Path,
+        metavar="RUN|DATA",
+        help="run folder (its newest checkpoint, in its stage) or data set (a fresh fit, every stage)",
+    )
+    parser.add_argument("--data", type=Path, metavar="DATA", help="with RUN: its data set, if it has moved")
+    parser.add_argument("--variant", metavar="V", help="with DATA: method (default: the full one)")
+    parser.add_argument("--preset", metavar="P", help=f"with DATA: preset (default {DEFAULT_PRESET})")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=DEFAULT_STEPS,
+        metavar="N",
+        help=f"steps to measure (default {DEFAULT_STEPS})",
+    )
+    add_settings(parser)
+
+
+def run(args: argparse.Namespace) -> Result:
+    """Measure, and advise. Nothing is written."""
+    from mi_refgs.fit.advice import advice
+    from mi_refgs.fit.profile import profile
+
+    if not 1 <= args.steps <= MOST_STEPS:
+        raise InputError(f"--steps: {args.steps} is out of range; give 1 to {MOST_STEPS}")
+    trainer, stages = _trainer(args)
+    found = profile(trainer, stages, args.steps)
+    said = advice(found, trainer.method)
+    data = asdict(found) | {"threads": _threads(), "advice": said}
+    data["work"]["share"] = found.work.share
+    return Result(data, text(found, said))
+
+
+def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
+    """The trainer of a run or of a fresh fit, and the stages of the schedule to look at."""
+    from mi_refgs.fit import config, data
+    from mi_refgs.fit.evaluate import load_split
+    from mi_refgs.fit.record import Run
+    from mi_refgs.fit.train import Trainer
+
+    if not args.path.is_dir():
+        raise InputError(f"{args.path}: RUN|DATA: no such folder; give a run folder or a data set")
+    if (args.path / "config.toml").is_file():
+        for option, value in (("--variant", args.variant), ("--preset", args.preset), ("--set", args.set)):
+            if value:
+                raise InputError(f"{option}: {args.path} is a run and keeps its method; drop {option}")
+        folder = Run(args.path)
+        method = folder.method()
+        if not folder.checkpoints():
+            raise InputError(f"{args.path}: checkpoints: none yet; train on, or profile its data set")
+        trainer = Trainer(method, load_split(folder, method, "train", args.data), folder)
+        return trainer, [method.stage_at(max(trainer.iteration, 1))[0]]
+    if args.data is not None:
+        raise InputError(f"--data: {args.path} is no run; drop --data")
+    path = args.variant or str(resource_dir("variants") / DEFAULT_METHOD)
+    method = config.load(path, args.preset or DEFAULT_PRESET, args.set)
+    options = method.data
+    views = data.load(
+        args.path,
+        "train",
+        downscale=options.downscale,
+        background=options.background,
+        images=options.images,
+        truth=False,
+    )
+    return Trainer(method, views), [name for name, _ in method.stages()]
+
+
+def _threads() -> int:
+    import drjit as dr
+
+    return int(dr.thread_count())
+
+
+def text(found: Profile, said: list[str]) -> str:
+    """For people."""
+    names = list(dict.fromkeys(name for stage in found.stages for name in stage.stages_ms))
+    lines = [_row("a training step, ms", [stage.name for stage in found.stages])]
+    for name in names:
+        lines.append(_row(f"  {name}", [f"{stage.stages_ms.get(name, 0):.2f}" for stage in found.stages]))
+    sums = [sum(stage.stages_ms.values()) for stage in found.stages]
+    lines.append(_row("  sum, between barriers", [f"{ms:.2f}" for ms in sums]))
+    lines.append(_row("undisturbed step", [f"{stage.step_ms:.2f}" for stage in found.stages]))
+    lines.append(_row("kernel launches", [f"{stage.launches:.0f}" for stage in found.stages]))
+    lines.append(_row("kernels compiled, warm", [f"{stage.misses}" for stage in found.stages]))
+    work = found.work
+    counts = [
+        ("surfels", f"{work.surfels}"),
+        ("pixels", f"{work.pixels:.0f}, {work.covered / work.pixels:.0%} covered"),
+        ("surfel-tile pairs", f"{work.pairs:.0f}"),
+        ("surfel-pixel evaluations", f"{work.evaluated:.0f}"),
+        ("  that contribute", f"{work.contributing:.0f} ({work.share:.0%})"),
+        ("layers of a covered pixel", f"{work.contributing / max(work.covered, 1):.1f}"),
+        ("surfels in no view", f"{work.unseen_share:.0%}"),
+        ("memory of the kernels", f"{found.allocated / MEBIBYTE:.0f} MiB at most"),
+    ]
+    lines += ["", f"a view, mean of {work.views}", *(f"{name:<28}{value}" for name, value in counts), ""]
+    return "\n".join([*lines, *(said or ["Nothing stands out."])])
+
+
+def _row(name: str, cells: list[str]) -> str:
+    return f"{name:<28}" + "".join(f"{cell:>12}" for cell in cells)

@@ -1,0 +1,102 @@
+"""What a profile suggests: each sentence follows from a number that was measured, and names it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mi_refgs.fit.config import Method
+from mi_refgs.fit.counts import TILE_PIXELS
+from mi_refgs.fit.profile import FAINT, Profile, StageProfile
+
+LOW_SHARE = 0.25
+"""Contributing share of the evaluations below which it is worth asking why."""
+THIN = 5.0
+MANY = 0.3
+"""A share of surfels that is more than a few."""
+HEAVY = 0.25
+"""A share of a step that is more than a detail."""
+CROWDED = 0.5
+"""Share of the machine's memory above which it becomes tight."""
+SMALLEST_LIGHT = 32
+"""Rows of the light below which its filter no longer matters."""
+
+
+def advice(found: Profile, method: Method) -> list[str]:
+    """Sentences, the same one only once; empty where nothing stands out."""
+    lines = [*_of_work(found), *(line for stage in found.stages for line in _of_stage(stage, found, method))]
+    if found.allocated > CROWDED * found.physical:
+        lines.append(
+            f"A step held {found.allocated / 2**30:.1f} of the machine's {found.physical / 2**30:.1f} GiB: "
+            "use smaller pictures (--set data.downscale=2) or fewer surfels (surfels.max_count)."
+        )
+    return list(dict.fromkeys(lines))
+
+
+def _of_work(found: Profile) -> Iterator[str]:
+    work = found.work
+    if work.unseen_share > MANY:
+        yield (
+            f"{work.unseen_share:.0%} of the surfels contribute in none of {work.views} views, and are "
+            "projected and optimised all the same: start with fewer (--set surfels.count), or prune more "
+            "(refine.prune_opacity)."
+        )
+    if work.single_share > MANY:
+        yield (
+            f"{work.single_share:.0%} of the surfels that are seen never cover more than one pixel: they are "
+            "smaller than the pictures can show; train with fewer (--set surfels.max_count)."
+        )
+    if work.share >= LOW_SHARE:
+        return
+    low = f"Only {work.share:.0%} of the evaluated surfel-pixel pairs contribute"
+    if work.faint_share > MANY:
+        yield (
+            f"{low}, and {work.faint_share:.0%} of the surfels are of an opacity below {FAINT:g}: prune them "
+            "earlier (--set refine.prune_opacity=0.1)."
+        )
+    if work.aspect > THIN:
+        yield (
+            f"{low}, and the median surfel is {work.aspect:.0f} times as long as wide: it crosses many "
+            f"tiles of {TILE_PIXELS} pixels and fills none; a lower rate of scales (--set rates.scale) keeps "
+            "surfels rounder."
+        )
+    if work.footprint < TILE_PIXELS:
+        yield (
+            f"{low}, and a surfel covers {work.footprint:.1f} pixels on average, less than a tile's "
+            f"{TILE_PIXELS}: fewer surfels would do (--set surfels.max_count)."
+        )
+
+
+def _of_stage(stage: StageProfile, found: Profile, method: Method) -> Iterator[str]:
+    ms = stage.stages_ms
+    whole = sum(ms.values())
+
+    def of(*names: str) -> float:
+        return sum(ms.get(name, 0.0) for name in names)
+
+    light, splat = of("prefilter forward", "prefilter backward"), of("splat forward", "splat backward")
+    if light > splat and method.light is not None and method.light.height > SMALLEST_LIGHT:
+        yield (
+            f"Stage {stage.name}: filtering the light takes {light:.1f} ms, more than splatting "
+            f"({splat:.1f} ms): halve its rows (--set light.height={method.light.height // 2})."
+        )
+    if of("sort") > splat:
+        yield (
+            f"Stage {stage.name}: listing and sorting takes {of('sort'):.1f} ms, more than splatting "
+            f"({splat:.1f} ms), for {found.work.pairs / max(found.work.surfels, 1):.0f} tiles a surfel: "
+            "large, faint surfels do that (--set refine.prune_opacity, refine.prune_extent)."
+        )
+    if of("ssim forward", "loss backward") > HEAVY * whole and method.loss.ssim:
+        yield (
+            f"Stage {stage.name}: the losses take {of('ssim forward', 'loss backward') / whole:.0%} of a "
+            "step: without SSIM (--set loss.ssim=0) they are cheaper, at some cost in quality."
+        )
+    if of("optimiser") > HEAVY * whole:
+        yield (
+            f"Stage {stage.name}: the optimiser takes {of('optimiser') / whole:.0%} of a step: lower the "
+            "degree of the spherical harmonics (--set surfels.sh_degree, surfels.indirect_degree)."
+        )
+    if stage.misses:
+        yield (
+            f"Stage {stage.name}: {stage.misses} kernels were compiled in steps that should be warm: run "
+            "the command again, and if it stays so, report it."
+        )

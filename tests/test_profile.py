@@ -1,0 +1,288 @@
+"""`refgs profile`: time is booked where it is spent, advice follows from numbers, and nothing is changed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from tiny_scene import SETTINGS, SIZE, write_data, write_method
+
+from mi_refgs import splat
+from mi_refgs.cli import main
+from mi_refgs.fit import config, optim, stages, train
+from mi_refgs.fit import data as data_module
+from mi_refgs.fit.advice import advice
+from mi_refgs.fit.config import LightOptions, Method
+from mi_refgs.fit.profile import Profile, StageProfile, Work, count_work, profile_stage
+from mi_refgs.fit.train import Trainer
+from mi_refgs.shade import prefilter
+
+PAUSE = 0.25
+"""Seconds that a planted sleep takes: far more than any stage of the tiny scene, on a busy machine too."""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data") / "ball")
+
+
+@pytest.fixture(scope="module")
+def method(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_method(tmp_path_factory.mktemp("method"))
+
+
+@pytest.fixture(scope="module")
+def finished(data: Path, method: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "run"
+    options = ["--variant", str(method), "--preset", "quick", "--set", *SETTINGS]
+    assert main(["train", str(data), "-o", str(run), *options]) == 0
+    return run
+
+
+@pytest.fixture
+def trainer(data: Path, method: Path) -> Trainer:
+    """Stages up to iterations 30 and 60."""
+    until = ["iterations=60", "stage.initial.until=30", "stage.deferred.until=60"]
+    resolved = config.load(str(method), "quick", [*SETTINGS, *until])
+    return Trainer(resolved, data_module.load(data, "train"))
+
+
+# ---------- Stages ----------
+
+
+class Sleepy(dr.CustomOp):
+    """Identity whose adjoint sleeps."""
+
+    def eval(self, value: Any) -> Any:
+        return type(value)(value)
+
+    def backward(self) -> None:
+        time.sleep(PAUSE)
+        self.set_grad_in("value", self.grad_out())
+
+    def name(self) -> str:
+        return "sleepy"
+
+
+def sleepy_blend(footprints: Any, features: Any, *rest: Any) -> Any:
+    return _blend(footprints, [dr.custom(Sleepy, features[0]), *features[1:]], *rest)
+
+
+def sleepy_apply(*arguments: Any) -> Any:
+    time.sleep(PAUSE)
+    return _apply_transposed(*arguments)
+
+
+def sleepy_render(surfels: Any, *rest: Any, **options: Any) -> Any:
+    frame = _render(surfels, *rest, **options)
+    return replace(frame, alpha=dr.custom(Sleepy, frame.alpha))
+
+
+def sleepy_objective(frame: Any, *rest: Any) -> Any:
+    return _objective(replace(frame, alpha=dr.custom(Sleepy, frame.alpha)), *rest)
+
+
+def sleepy_project(surfels: Any, *rest: Any) -> Any:
+    found = _project(surfels, *rest)
+    return replace(found, columns=[dr.custom(Sleepy, found.columns[0]), *found.columns[1:]])
+
+
+def sleepy_step(self: Any, iteration: int) -> None:
+    time.sleep(PAUSE)
+    _step(self, iteration)
+
+
+_blend, _project, _render, _objective = splat.blend, splat.project, train.render, train.objective
+_apply_transposed, _step = prefilter.apply_transposed, optim.Adam.step
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "planted", "stage", "at"),
+    [
+        (splat, "blend", sleepy_blend, "splat backward", "initial"),
+        (splat, "blend", sleepy_blend, "splat backward", "deferred"),
+        (splat, "project", sleepy_project, "surfels backward", "deferred"),
+        (prefilter, "apply_transposed", sleepy_apply, "prefilter backward", "initial"),
+        (prefilter, "apply_transposed", sleepy_apply, "prefilter backward", "deferred"),
+        (train, "render", sleepy_render, "shade backward", "deferred"),
+        (train, "objective", sleepy_objective, "loss backward", "deferred"),
+        (optim.Adam, "step", sleepy_step, "optimiser", "deferred"),
+    ],
+)
+def test_time_is_booked_where_it_is_spent(
+    owner: Any,
+    name: str,
+    planted: Any,
+    stage: str,
+    at: str,
+    trainer: Trainer,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(owner, name, planted)
+    monkeypatch.setattr(stages, "WARM_UP", 1)
+    trainer.iteration = {"initial": 5, "deferred": 35}[at]
+    found = stages.stage_times(trainer, 3)
+    assert found[stage] > 1e3 * PAUSE
+    assert max(ms for other, ms in found.items() if other != stage) < 1e3 * PAUSE
+
+
+def test_the_clock_leaves_nothing_behind(trainer: Trainer) -> None:
+    before = splat.blend, splat.project, train.render, dr.backward, optim.Adam.step
+    method = trainer.method
+    profile_stage(trainer, "initial", 1)
+    assert (splat.blend, splat.project, train.render, dr.backward, optim.Adam.step) == before
+    assert trainer.iteration == 0 and trainer.method is method
+
+
+def test_a_step_with_a_clock_is_the_same_step(
+    data: Path, method: Path, one_thread: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Boundaries are identities: the table moves as in plain steps."""
+    monkeypatch.setattr(stages, "WARM_UP", 0)
+    tables = []
+    for timed in (False, True):
+        resolved = config.load(str(method), "quick", [*SETTINGS, "iterations=40"])
+        trainer = Trainer(resolved, data_module.load(data, "train"))
+        trainer.iteration = 1
+        if timed:
+            stages.stage_times(trainer, 1)
+        else:
+            trainer.step()
+        tables.append(trainer.surfels.to_numpy())
+    for name, values in tables[0].items():
+        assert np.allclose(values, tables[1][name], rtol=1e-5, atol=1e-6), name
+
+
+# ---------- The command ----------
+
+
+def files(folder: Path) -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+def test_of_a_run(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files(finished)
+    capsys.readouterr()
+    assert main(["profile", str(finished), "--steps", "2", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert files(finished) == before  # nothing is written
+    (stage,) = found["stages"]
+    assert stage["name"] == "deferred" and stage["misses"] >= 0 and stage["launches"] > 10
+    assert list(stage["stages_ms"]) == list(stages.STAGES)
+    assert 0 < stage["step_ms"] and all(ms >= 0 for ms in stage["stages_ms"].values())
+    work = found["work"]
+    assert work["views"] == 3 and work["pixels"] == SIZE**2 and 0 < work["covered"] <= SIZE**2
+    assert 0 < work["contributing"] < work["evaluated"] and 0 < work["share"] < 1
+    assert work["share"] == pytest.approx(work["contributing"] / work["evaluated"])
+    assert found["allocated"] > 1e5 and found["threads"] >= 1 and isinstance(found["advice"], list)
+
+
+def test_of_a_data_set(data: Path, method: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--variant", str(method), "--preset", "quick", "--steps", "1", "--set", *SETTINGS]
+    assert main(["profile", str(data), *options]) == 0
+    said = capsys.readouterr().out
+    head = said.splitlines()[0].split()
+    assert head[-2:] == ["initial", "deferred"]
+    for part in (*stages.STAGES, "undisturbed step", "kernel launches", "that contribute"):
+        assert part in said
+
+
+@pytest.mark.parametrize(
+    ("more", "parts"),
+    [
+        (["--steps", "0"], ["--steps", "give 1 to"]),
+        (["--preset", "quick"], ["--preset", "drop"]),
+        (["--set", "loss.ssim=0"], ["--set", "drop"]),
+        (["--data", "nowhere"], ["nowhere", "no such folder"]),
+    ],
+)
+def test_bad_requests(
+    more: list[str], parts: list[str], finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    assert main(["profile", str(finished), *more]) == 2
+    out, err = capsys.readouterr()
+    assert not out and "Traceback" not in err and "; " in err
+    assert all(part in err for part in parts), err
+
+
+def test_what_is_neither_run_nor_data(
+    finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for argv, part in (
+        ([str(tmp_path / "none")], "no such folder"),
+        ([str(tmp_path)], "transforms_train.json"),
+        ([str(data), "--data", str(data)], "drop --data"),
+    ):
+        assert main(["profile", *argv]) == 2
+        assert part in capsys.readouterr().err
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    shutil.rmtree(run / "checkpoints")
+    assert main(["profile", str(run)]) == 2
+    assert "checkpoints: none yet" in capsys.readouterr().err
+
+
+# ---------- Counts and advice ----------
+
+
+def test_work_is_counted_over_views(trainer: Trainer) -> None:
+    work = count_work(trainer)
+    assert (work.views, work.surfels, work.pixels) == (3, 80, SIZE**2)
+    hidden = trainer.surfels.to_numpy()
+    hidden["opacity"][:20] = -20.0
+    for name, values in hidden.items():
+        trainer.params[name] = type(trainer.params[name])(values)
+    fewer = count_work(trainer)
+    assert fewer.unseen_share >= 0.25 > work.unseen_share
+    assert fewer.contributing < work.contributing
+
+
+def quiet_profile() -> Profile:
+    """One that nothing can be said about."""
+    stage = StageProfile("deferred", 10.0, 60, 0, dict.fromkeys(stages.STAGES, 1.0))
+    work = Work(8, 1000, 4e4, 2e4, 5e4, 8e5, 4e5, 0.1, 0.1, 0.1, 2.0, 40.0)
+    return Profile((stage,), work, 2**20, 2**34)
+
+
+def test_nothing_stands_out() -> None:
+    assert advice(quiet_profile(), a_method()) == []
+
+
+def a_method() -> Method:
+    return replace(config.load("base_2dgs", "quick"), light=LightOptions(height=64))
+
+
+def cases() -> Iterator[tuple[dict[str, Any], dict[str, Any], str]]:
+    yield {"unseen_share": 0.5}, {}, "50% of the surfels contribute in none of 8 views"
+    yield {"single_share": 0.6}, {}, "60% of the surfels that are seen never cover more than one pixel"
+    yield {"contributing": 8e4, "faint_share": 0.5}, {}, "Only 10% of the evaluated"
+    yield {"contributing": 8e4, "aspect": 9.0}, {}, "9 times as long as wide"
+    yield {"contributing": 8e4, "footprint": 5.0}, {}, "5.0 pixels on average"
+    yield {}, {"prefilter forward": 5.0}, "light.height=32"
+    yield {}, {"sort": 3.0}, "50 tiles a surfel"
+    yield {}, {"ssim forward": 5.0}, "loss.ssim=0"
+    yield {}, {"optimiser": 9.0}, "the optimiser takes"
+
+
+@pytest.mark.parametrize(("work", "ms", "part"), list(cases()))
+def test_each_rule_follows_from_its_number(work: dict[str, Any], ms: dict[str, float], part: str) -> None:
+    base = quiet_profile()
+    stage = replace(base.stages[0], stages_ms=base.stages[0].stages_ms | ms)
+    found = replace(base, stages=(stage,), work=replace(base.work, **work))
+    said = advice(found, a_method())
+    assert len(said) == 1 and part in said[0]
+
+
+def test_compiling_and_crowding_are_said() -> None:
+    base = quiet_profile()
+    found = replace(base, stages=(replace(base.stages[0], misses=3),), allocated=2**34)
+    compiled, crowded = advice(found, a_method())
+    assert "3 kernels were compiled" in compiled and "16.0 of the machine's 16.0 GiB" in crowded
