@@ -1,4 +1,4 @@
-"""Two plates that meet in a concave edge: a scene for tests of rays and of what they hit."""
+"""Two plates that meet in a concave edge, or three that form a channel: for tests of rays and their hits."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ VOXEL = 1e-4
 """So small that the offset of the rays' origins does not matter."""
 FLOOR, WALL, EYE = 2.0, 1.5, np.array([1.4, 1.2, 0.3])
 """A floor (y = 0) of depth FLOOR and twice that width, a wall (x = 0) WALL high on it, and the camera."""
+LOW_EYE = np.array([1.4, 0.3, 0.3])
+"""A camera whose mirror rays in the floor are so flat that they meet several walls of a `channel`."""
 WALL_COLOUR = (0.9, 0.6, 0.3)
 
 
@@ -36,6 +38,15 @@ def corner(cells: int = 8) -> Mesh:
     wall = np.stack([0 * u, WALL * u, FLOOR * z], 1)
     vertices = np.concatenate([floor, wall]).astype(np.float32)
     return Mesh(vertices, np.concatenate([faces, faces[:, ::-1] + len(floor)]).astype(np.uint32), VOXEL)
+
+
+def channel() -> Mesh:
+    """A `corner` with another wall across the floor (x = FLOOR): rays go to and fro till they leave above."""
+    base = corner()
+    wall = len(base.vertices) // 2
+    vertices = base.vertices[wall:] + np.array([FLOOR, 0, 0], np.float32)
+    faces = base.faces[len(base.faces) // 2 :, ::-1] + np.uint32(wall)
+    return Mesh(np.concatenate([base.vertices, vertices]), np.concatenate([base.faces, faces]), VOXEL)
 
 
 def wall_surfels(
@@ -56,15 +67,25 @@ def wall_surfels(
     return Surfels.from_numpy(raw)
 
 
-def floor_points(roughness: float, count: int = 40, copies: int = 1) -> tuple[np.ndarray, ShadingPoints]:
-    """Points of a metal floor near the wall, seen from EYE, each `copies` times; with rays from EYE."""
+def channel_surfels(albedo: np.ndarray | None = None) -> Surfels:
+    """400 discs on either wall of a `channel`: other colours, less metallic and rougher on the second."""
+    near, far = wall_surfels(albedo), wall_surfels(-1.5 + np.zeros((400, 3)), -0.5, 1.0, seed=3)
+    raw = {name: np.concatenate([near.raw[name].numpy(), x.numpy()]) for name, x in far.raw.items()}
+    raw["position"][400:, 0] = FLOOR
+    return Surfels.from_numpy(raw)
+
+
+def floor_points(
+    roughness: float, count: int = 40, copies: int = 1, eye: np.ndarray = EYE
+) -> tuple[np.ndarray, ShadingPoints]:
+    """Points of a metal floor near the wall, seen from `eye`, each `copies` times."""
     rng = np.random.default_rng(7)
     place = np.stack([rng.uniform(0.1, 0.9, count), np.zeros(count), rng.uniform(-0.3, 0.6, count)], 1)
     place = np.repeat(place, copies, 0)
     n = len(place)
     points = ShadingPoints(
         normal=vector(np.tile([0, 1.0, 0], (n, 1))),
-        view=vector(unit(EYE - place)),
+        view=vector(unit(eye - place)),
         albedo=mi.Color3f(0.8, 0.7, 0.6) + dr.zeros(mi.Color3f, n),
         metallic=dr.full(mi.Float, 1, n),
         roughness=dr.full(mi.Float, roughness, n),
@@ -86,12 +107,13 @@ def seen(
     light: PrefilteredLight | None = None,
     diffuse: Any = "irradiance",
     occluder: Occluder | None = None,
+    eye: np.ndarray = EYE,
 ) -> Any:
-    """The points with what `reflection` finds in the corner."""
+    """The points with what `reflection` finds, by default in the corner."""
     if occluder is None:
         occluder = Occluder(corner()) if surfels is None else with_materials(corner(), surfels)
     table: Any = surfels
-    return reflection(occluder, table, light, accuracy, diffuse, mi.Point3f(EYE), vector(place - EYE), points)
+    return reflection(occluder, table, light, accuracy, diffuse, mi.Point3f(eye), vector(place - eye), points)
 
 
 def wall_blocks(place: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -102,9 +124,20 @@ def wall_blocks(place: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, n
     return (point[:, 1] < WALL) & (np.abs(point[:, 2]) < FLOOR) & np.isfinite(t), point
 
 
-def mirrored(place: np.ndarray) -> np.ndarray:
+def wall_hit(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, int] | None:
+    """Analytic: where a rising ray in a `channel` meets a wall, its normal, and which; None if it leaves."""
+    side = int(direction[0] > 0)
+    if direction[0] == 0:
+        return None
+    point = origin + (side * FLOOR - origin[0]) / direction[0] * direction
+    if point[1] > WALL or abs(point[2]) > FLOOR:
+        return None
+    return point, np.array([1.0 - 2 * side, 0, 0]), side
+
+
+def mirrored(place: np.ndarray, eye: np.ndarray = EYE) -> np.ndarray:
     """Mirror directions (n, 1, 3) of the floor."""
-    return (unit(place - EYE) * [1, -1, 1])[:, None]
+    return (unit(place - eye) * [1, -1, 1])[:, None]
 
 
 def gradient_sky(h: int = 16) -> np.ndarray:

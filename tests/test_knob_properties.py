@@ -20,10 +20,10 @@ def test_properties_of_the_plugin(tmp_path: Path) -> None:
         "dominant": True,
         "multiscatter": True,
         "visibility_rays": 4,
-        "traced_indirect": True,
+        "traced_bounces": 2,
     }
     of = scene(mesh=mesh, **knobs)
-    assert of.integrator().shading.accuracy == Accuracy(True, True, 4, True)
+    assert of.integrator().shading.accuracy == Accuracy(True, True, 4, 2)
     assert scene(mesh=mesh).integrator().shading.accuracy == Accuracy()
     plain = image(scene(mesh=mesh, terms="specular,indirect"))
     for name, value in knobs.items():
@@ -37,8 +37,10 @@ def test_properties_of_the_plugin(tmp_path: Path) -> None:
     [
         ({"visibility_rays": 0}, "visibility_rays"),
         ({"visibility_rays": 1.5}, "visibility_rays"),
+        ({"traced_bounces": -1}, "traced_bounces"),
+        ({"traced_bounces": True}, "traced_bounces"),
         ({"visibility_rays": 4}, "name a `mesh`"),
-        ({"traced_indirect": True}, "name a `mesh`"),
+        ({"traced_bounces": 1}, "name a `mesh`"),
         ({"dominant": "yes"}, "dominant"),
         ({"multiscatter": True, "reflectance": "radiance"}, "split_sum"),
     ],
@@ -54,7 +56,7 @@ def test_derivatives_of_mi_render(rays: int, tmp_path: Path) -> None:
         "dominant": True,
         "multiscatter": True,
         "visibility_rays": rays,
-        "traced_indirect": True,
+        "traced_bounces": 2,
     }
     check_derivatives(scene(mesh=plane_mesh(tmp_path), diffuse="irradiance", **knobs), "integrator.light")
 
@@ -62,9 +64,9 @@ def test_derivatives_of_mi_render(rays: int, tmp_path: Path) -> None:
 def test_new_surfels_give_new_materials(tmp_path: Path) -> None:
     """Another number of surfels through the parameters, as a scene that is loaded with them."""
     mesh = plane_mesh(tmp_path)
-    of, other = scene(mesh=mesh, traced_indirect=True), raw_channels(40, seed=5)
+    of, other = scene(mesh=mesh, traced_bounces=1), raw_channels(40, seed=5)
     params = mi.traverse(of)
     for name, values in other.items():
         params[f"integrator.{name}"] = mi.TensorXf(values)
     params.update()
-    np.testing.assert_array_equal(image(of), image(scene(raw=other, mesh=mesh, traced_indirect=True)))
+    np.testing.assert_array_equal(image(of), image(scene(raw=other, mesh=mesh, traced_bounces=1)))

@@ -50,7 +50,7 @@ def oracle(
 
 def test_everything_is_off_by_default(radiance: np.ndarray, rng: np.random.Generator) -> None:
     """Same bits as without the argument, and as the paper's formula written out."""
-    assert Shading().accuracy == Accuracy() == Accuracy(False, False, 1, False)
+    assert Shading().accuracy == Accuracy() == Accuracy(False, False, 1, 0)
     points = points_of(scene(rng, "open"))
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     plain, same = shade(points, light), shade(points, light, "sh", Accuracy())
@@ -61,7 +61,7 @@ def test_everything_is_off_by_default(radiance: np.ndarray, rng: np.random.Gener
 
 
 def test_shading_survives_json() -> None:
-    shading = Shading(occlusion=True, accuracy=Accuracy(True, False, 8, True))
+    shading = Shading(occlusion=True, accuracy=Accuracy(True, False, 8, 3))
     assert Shading(**json.loads(json.dumps(asdict(shading)))) == shading
 
 
@@ -70,7 +70,9 @@ def test_shading_survives_json() -> None:
     [
         {"dominant": 1},
         {"multiscatter": "true"},
-        {"traced_indirect": None},
+        {"traced_bounces": None},
+        {"traced_bounces": -1},
+        {"traced_bounces": True},
         {"visibility_rays": 0},
         {"visibility_rays": 2.0},
         {"visibility_rays": True},

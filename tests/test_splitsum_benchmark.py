@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import csv
-import json
+import importlib.util
 import math
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +13,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import ROOT
+from benchmark_runs import read_result, run_benchmark, small_instance
 
-sys.path.insert(0, str(ROOT))  # `benchmarks` is no part of the package
-from benchmarks.common import budget, errors, lights, view
+from benchmarks.common import budget, errors, lights, page_budget, view
 from benchmarks.common import montecarlo as mc
 from benchmarks.splitsum import decompose, methods, speedup, surfels
+from benchmarks.splitsum.select import where
 from mi_refgs.errors import InputError
 from mi_refgs.reference.shade import lobe_average, split_sum
 from mi_refgs.shade import lobe
@@ -31,30 +28,14 @@ Row = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output of the small instance, made as a reader would make it."""
-    target = tmp_path_factory.mktemp("splitsum")
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "benchmarks.splitsum", "--small", "--quiet", "-o", str(target)],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return target
+    """Output of the small instance."""
+    return small_instance("splitsum", tmp_path_factory.mktemp("splitsum"))
 
 
 @pytest.fixture(scope="module")
 def result(folder: Path) -> dict[str, Any]:
     """Its JSON."""
-    found: dict[str, Any] = json.loads((folder / "splitsum.json").read_text())
-    return found
-
-
-def select(rows: list[Row], **values: Any) -> list[Row]:
-    return [row for row in rows if all(row[k] == v for k, v in values.items())]
+    return read_result("splitsum", folder)
 
 
 def cases(
@@ -62,7 +43,7 @@ def cases(
 ) -> dict[tuple[Any, ...], dict[int, Row]]:
     """Rows of a method by case, then by setting."""
     found: dict[tuple[Any, ...], dict[int, Row]] = {}
-    for row in select(result["rows"], method=method, n_dot_v=view_bin):
+    for row in where(result["rows"], method=method, n_dot_v=view_bin):
         key = (row["shape"], row["light"], row["roughness"], row["metallic"])
         found.setdefault(key, {})[row["setting"]] = row
     return found
@@ -86,6 +67,17 @@ def test_reports_are_written(folder: Path, result: dict[str, Any]) -> None:
     settings = result["settings"]
     assert len(split) == math.prod(len(settings[k]) for k in ("shapes", "lights", "roughness", "metallic"))
     assert all(set(by) == set(settings["heights"]) for by in split.values())
+
+
+def test_flip_is_there_where_it_is_installed(folder: Path, result: dict[str, Any]) -> None:
+    """Of whole pictures; and more samples look better."""
+    installed = importlib.util.find_spec("flip_evaluator") is not None
+    assert all((row["flip"] is not None) == (installed and row["n_dot_v"] == "all") for row in result["rows"])
+    assert ("(FLIP: not installed" in (folder / "splitsum.md").read_text()) == (not installed)
+    if installed:
+        found = [[by[n]["flip"] for n in sorted(by)] for by in cases(result, "path").values()]
+        mean = np.mean(found, axis=0)
+        assert 0 < mean[-1] < 0.5 * mean[0] < 0.5
 
 
 def test_every_method_has_a_time(result: dict[str, Any]) -> None:
@@ -182,10 +174,10 @@ def test_budgets_add_up(result: dict[str, Any]) -> None:
         assert row["total"] == pytest.approx(alone + row["interaction"])
         assert (decompose.SHADOW in parts) == (row["shape"] == "torus")
         assert parts[decompose.TABLE]["relmse"] < 1e-6
-    sphere = select(result["budgets"], shape="sphere", light="checker", roughness=0.1, height=32)
+    sphere = where(result["budgets"], shape="sphere", light="checker", roughness=0.1, height=32)
     for row in sphere:
         assert max(row["parts"], key=lambda part: float(part["relmse"]))["name"] == decompose.RESOLUTION
-    rough = select(result["budgets"], shape="sphere", light="gradient", roughness=0.8)
+    rough = where(result["budgets"], shape="sphere", light="gradient", roughness=0.8)
     for row in rough:
         assert max(row["parts"], key=lambda part: float(part["relmse"]))["name"] == decompose.LOBE
 
@@ -306,18 +298,45 @@ def test_errors_know_their_floor() -> None:
 
 def test_a_budget_of_known_parts() -> None:
     """Two orthogonal errors and two that cancel."""
-    exact = np.ones((2, 3))
+    exact, facing = np.ones((2, 3)), np.array([0.05, 0.9])
     a, b = np.array([[0.1], [0.0]]), np.array([[0.0], [0.2]])
     steps = [budget.Step("", exact + a + b), budget.Step("a", exact + b), budget.Step("b", exact)]
-    found = budget.take_apart(steps)
-    assert found.adds_up and found.interaction == pytest.approx(0, abs=1e-12)
+    found = budget.take_apart(steps, facing)
+    assert found.record()["adds_up"] and found.interaction == pytest.approx(0, abs=1e-12)
     assert [part.share for part in found.parts] == pytest.approx([0.2, 0.8])
     assert [part.bias for part in found.parts] == pytest.approx([0.05, 0.1])
     opposed = [budget.Step("", exact), budget.Step("a", exact - a), budget.Step("b", exact)]
     with np.errstate(all="raise"):
-        found = budget.take_apart(opposed)
-    assert found.total == pytest.approx(0) and not found.adds_up
+        found = budget.take_apart(opposed, facing)
+    assert found.total == pytest.approx(0) and not found.record()["adds_up"]
     assert found.correlation == pytest.approx(-1)
+
+
+def test_a_budget_knows_its_pair() -> None:
+    """Three parts, of which the last two cancel at the second of two points: one part, they add up."""
+    exact, facing = np.ones((2, 3)), np.array([0.05, 0.9])
+    a, b = np.array([[0.3], [0.0]]), np.array([[0.0], [0.2]])
+    steps = [
+        budget.Step("", exact + a),
+        budget.Step("a", exact),
+        budget.Step("b", exact - b),
+        budget.Step("c", exact),
+    ]
+    found = budget.take_apart(steps, facing, (("x", "c"), ("b", "c")))
+    record = found.record()
+    assert record["pair"] == ["b", "c"] and found.correlation == pytest.approx(-1)
+    assert not record["adds_up"] and record["pair_explains"]
+    assert record["joined_add_up"] == [False, True]
+    assert [(place.name, place.points) for place in found.where] == [("0-0.1", 0.5), ("0.5-1", 0.5)]
+    assert [place.share for place in found.where] == pytest.approx([0, 1])
+    row = {"floor": 0.0, **record}
+    text = page_budget.interactions([row, {**row, "total": 0.0, "floor": 1.0}])
+    assert text.count("\n- ") == 1
+    assert "b and c, in 1: they cancel in 1 (median ρ -1.00); as one part they make 1 of these" in text
+    assert "100 % of their product comes from n·v 0.5-1, 50 % of the pixels" in text
+    assert "in **0**; with b and c as one part in **1**" in page_budget.adding_up(
+        [{**row, "joined_add_up": [True]}], [("b", "c")]
+    )
 
 
 def test_equal_error_is_interpolated() -> None:
@@ -350,19 +369,7 @@ def test_other_levels_leave_nothing_behind() -> None:
     np.testing.assert_array_equal(np.array(light.prefilter().levels), before)
 
 
-def refuse(arguments: list[str]) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.splitsum", *arguments],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 2
-    return done.stderr
-
-
 def test_a_missing_light_is_one_sentence(tmp_path: Path) -> None:
-    assert "nowhere.exr: light" in refuse(["--small", "--envmap", "nowhere.exr", "-o", str(tmp_path)])
+    done = run_benchmark("splitsum", "--small", "--envmap", "nowhere.exr", "-o", tmp_path)
+    assert done.returncode == 2
+    assert "nowhere.exr: light" in done.stderr

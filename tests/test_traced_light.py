@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import drjit as dr
@@ -11,15 +12,19 @@ import pytest
 from corner_scene import (
     EYE,
     FLOOR,
+    LOW_EYE,
     VOXEL,
     WALL,
     WALL_COLOUR,
+    channel,
+    channel_surfels,
     corner,
     floor_points,
     gradient_sky,
     mirrored,
     seen,
     wall_blocks,
+    wall_hit,
     wall_surfels,
     with_materials,
 )
@@ -30,10 +35,12 @@ from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import lobe as exact
 from mi_refgs.reference import shade as reference
+from mi_refgs.render import reflection
 from mi_refgs.shade import brdf
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.lobe import LEVEL_ROUGHNESS
 from mi_refgs.shade.models import Accuracy, ShadingPoints, shade
+from mi_refgs.shade.rays import Lobe
 from mi_refgs.surfels.table import Surfels
 
 # ---------------- materials on the mesh ----------------
@@ -164,9 +171,9 @@ def test_traced_light_comes_closer_to_the_integral(roughness: float) -> None:
     for name, accuracy in {
         "mirror ray": Accuracy(),
         "8 rays": Accuracy(visibility_rays=8),
-        "traced mirror ray": Accuracy(traced_indirect=True),
-        "8 traced rays": Accuracy(visibility_rays=8, traced_indirect=True),
-        "all knobs": Accuracy(dominant=True, visibility_rays=64, traced_indirect=True),
+        "traced mirror ray": Accuracy(traced_bounces=1),
+        "8 traced rays": Accuracy(visibility_rays=8, traced_bounces=1),
+        "all knobs": Accuracy(dominant=True, visibility_rays=64, traced_bounces=1),
     }.items():
         terms = shade(seen(points, place, accuracy, surfels, light), light, "irradiance", accuracy)
         got = (terms.specular + terms.indirect).numpy().T
@@ -187,7 +194,7 @@ def test_a_traced_mirror_ray_is_shaded_as_a_pixel_is(diffuse: Any) -> None:
         surfels.raw | {"radiance_sh": mi.TensorXf(np.tile(harmonics, (400, 1)).astype(np.float32))}
     )
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
-    found = seen(points, place, Accuracy(traced_indirect=True), surfels, light, diffuse)
+    found = seen(points, place, Accuracy(traced_bounces=1), surfels, light, diffuse)
     indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
     assert 0 < visibility.mean() < 0.8 and (indirect[visibility == 1] == 0).all()
     levels = level_maps(light)
@@ -222,7 +229,7 @@ def test_a_hit_in_the_dark_is_dark() -> None:
     )
     place, points = floor_points(0.2)
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
-    accuracy, surfels = Accuracy(traced_indirect=True), wall_surfels(metallic=14.0)
+    accuracy, surfels = Accuracy(traced_bounces=1), wall_surfels(metallic=14.0)
     open_, dark = (
         seen(points, place, accuracy, surfels, light, occluder=occluder).indirect.numpy()
         for occluder in (with_materials(base, surfels), with_materials(lidded, surfels))
@@ -231,29 +238,165 @@ def test_a_hit_in_the_dark_is_dark() -> None:
     assert hits.any() and dark[:, hits].max() < 1e-4 < open_[:, hits].min()
 
 
+# ---------------- further bounces ----------------
+
+
+def oracle_of_walls(light: PrefilteredLight, surfels: Surfels, diffuse: str) -> exact.Outgoing:
+    """What leaves the walls of a channel, by the float64 `shade`."""
+    table, levels = brdf.table().astype(np.float64), level_maps(light)
+    raw = {name: x.numpy().astype(np.float64)[[0, -1]] for name, x in surfels.raw.items()}
+    materials = {name: 1 / (1 + np.exp(-raw[name])) for name in ("albedo", "metallic", "roughness")}
+
+    def outgoing(wall: int, normal: np.ndarray, view: np.ndarray, free: float, beyond: np.ndarray) -> Any:
+        own = reference.sh_basis(-view, 1) @ raw["radiance_sh"][wall].reshape(4, 3) + 0.5
+        terms = reference.shade(
+            table,
+            levels,
+            LEVEL_ROUGHNESS,
+            normal=normal,
+            view=view,
+            albedo=materials["albedo"][wall],
+            metallic=float(materials["metallic"][wall, 0]),
+            roughness=float(materials["roughness"][wall, 0]),
+            radiance=np.maximum(own, 0),
+            visibility=free,
+            indirect=beyond,
+            diffuse=diffuse,
+        )
+        return terms.sum(0)
+
+    return outgoing
+
+
+def harmonic_channel_surfels(albedo: np.ndarray | None = None, uneven: float = 0.0) -> Surfels:
+    """Surfels of a channel with harmonics, those of a wall alike but for `uneven`."""
+    rng, surfels = np.random.default_rng(4), channel_surfels(albedo)
+    harmonics = np.repeat(0.2 * rng.normal(size=(2, 12)), 400, 0) + uneven * rng.normal(size=(800, 12))
+    return Surfels(surfels.raw | {"radiance_sh": mi.TensorXf(harmonics.astype(np.float32))})
+
+
+def lengths(place: np.ndarray, directions: np.ndarray) -> list[int]:
+    """Number of walls that rays from points of the floor of a channel meet one after the other."""
+    found = []
+    for origin, direction in zip(place, directions, strict=True):
+        count, hit = 0, wall_hit(origin, direction)
+        while hit is not None:
+            direction = direction * [-1, 1, 1]
+            count, hit = count + 1, wall_hit(hit[0], direction)
+        found.append(count)
+    return found
+
+
+@pytest.mark.parametrize("diffuse", ["irradiance", "sh"])
+@pytest.mark.parametrize("bounces", [1, 2, 3])
+def test_bounces_of_a_mirror_ray_against_the_oracle(bounces: int, diffuse: Any) -> None:
+    """To and fro between two walls, recursion in float64: rays that end before the last bounce, and after."""
+    place, points = floor_points(0.3, eye=LOW_EYE)
+    surfels = harmonic_channel_surfels()
+    light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
+    occluder = with_materials(channel(), surfels)
+    accuracy = Accuracy(traced_bounces=bounces)
+    found = seen(points, place, accuracy, surfels, light, diffuse, occluder, LOW_EYE)
+    indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
+    outgoing, mirrors = oracle_of_walls(light, surfels, diffuse), mirrored(place, LOW_EYE)[:, 0]
+    for k, mirror in enumerate(mirrors):
+        expected = exact.chain(wall_hit, outgoing, place[k], mirror, bounces)
+        assert visibility[k] == (expected is None)
+        np.testing.assert_allclose(indirect[k], 0 if expected is None else expected, rtol=2e-3)
+    assert {1, 2, 3, 4} <= set(lengths(place, mirrors))
+
+
+@pytest.mark.parametrize("rays", [2, 6])
+def test_bounces_of_rays_of_the_lobe_against_the_oracle(rays: int) -> None:
+    """The mean over the blocked rays, one by one, and a single bright ray among them held back."""
+    place, points = floor_points(0.4, count=25, eye=LOW_EYE)
+    surfels = harmonic_channel_surfels()
+    sky = gradient_sky()
+    sky[1:4, 4:7] += 40.0  # a lamp
+    light = EnvironmentLight.from_radiance(sky).prefilter()
+    accuracy = Accuracy(visibility_rays=rays, traced_bounces=2)
+    occluder = with_materials(channel(), surfels)
+    found = seen(points, place, accuracy, surfels, light, "irradiance", occluder, LOW_EYE)
+    indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
+    lobe = Lobe.of(points.normal, points.view, points.roughness, mi.Color3f(0.8, 0.7, 0.6))
+    samples = [lobe.sample(mi.UInt32(i), mi.UInt32(rays)) for i in range(rays)]
+    direction = np.stack([d.numpy().T for d, _ in samples], 1).astype(np.float64)
+    weight = np.stack([np.array(w) for _, w in samples], 1).astype(np.float64)
+    outgoing, levels, held = oracle_of_walls(light, surfels, "irradiance"), level_maps(light), 0
+    for k, mirror in enumerate(mirrored(place, LOW_EYE)[:, 0]):
+        arriving = [exact.chain(wall_hit, outgoing, place[k], d, 2) for d in direction[k]]
+        blocked = np.array([x is not None for x in arriving]) & (weight[k] > 0)
+        radiance = np.array([np.zeros(3) if x is None else x for x in arriving])
+        free = reference.specular(levels, LEVEL_ROUGHNESS, mirror, 0.4)
+        np.testing.assert_allclose(visibility[k], weight[k][~blocked].sum() / weight[k].sum(), atol=1e-4)
+        if blocked.any():
+            expected = exact.blocked_mean(radiance, weight[k], blocked, free, 1 - 3 * 0.4**2)
+            np.testing.assert_allclose(indirect[k], expected, rtol=5e-3)
+            plain = weight[k][blocked] @ radiance[blocked] / weight[k][blocked].sum()
+            held += bool((expected < 0.9 * plain).any())
+    assert held > 2
+
+
+@pytest.mark.parametrize("rays", [1, 4])
+def test_bounces_add_light_and_converge(rays: int) -> None:
+    """Every bounce adds light somewhere and takes none anywhere; the last ones add next to nothing."""
+    place, points = floor_points(0.3, count=300, eye=LOW_EYE)
+    surfels = channel_surfels()
+    light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
+    occluder = with_materials(channel(), surfels)
+    images = [
+        seen(
+            points,
+            place,
+            Accuracy(visibility_rays=rays, traced_bounces=bounces),
+            surfels,
+            light,
+            occluder=occluder,
+            eye=LOW_EYE,
+        ).indirect.numpy()
+        for bounces in (1, 2, 3, 6, 7)
+    ]
+    steps = [after - before for before, after in pairwise(images)]
+    for step in steps:
+        assert step.min() > (-1e-5 if rays == 1 else -0.02)  # a brighter ray may hold another back less
+    size = [float(step.mean()) for step in steps]
+    assert size[0] > size[1] > size[2] > size[3] and size[0] > 0.01 and size[3] < 0.01 * size[0]
+
+
 # ---------------- derivatives ----------------
 
 
 @pytest.mark.parametrize("rays", [1, 5])
 @pytest.mark.parametrize("name", ["light", "albedo", "metallic", "roughness", "radiance_sh"])
-def test_derivatives_of_traced_light(name: str, rays: int) -> None:
-    """Both modes against central differences of the indirect radiance, with random weights and steps."""
+def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two bounces, both modes against central differences of the indirect radiance, with random weights and
+    steps; what is held back of bright rays stays as it was, as the derivative has it."""
     rng = np.random.default_rng(8)
-    place, points = floor_points(0.4, count=60)
-    surfels = wall_surfels(albedo=rng.normal(size=(400, 3)))
-    surfels = Surfels(
-        surfels.raw | {"radiance_sh": mi.TensorXf(0.1 * rng.normal(size=(400, 12)).astype(np.float32))}
-    )
-    occluder = with_materials(corner(), surfels)
-    leaves = surfels.raw | {"light": EnvironmentLight.from_radiance(gradient_sky()).raw}
-    accuracy = Accuracy(visibility_rays=rays, traced_indirect=True)
+    place, points = floor_points(0.4, count=60, eye=LOW_EYE)
+    surfels = harmonic_channel_surfels(rng.normal(size=(400, 3)), 0.1)
+    occluder = with_materials(channel(), surfels)
+    sky = gradient_sky()
+    sky[1:4, 4:7] += 20.0  # a lamp
+    leaves = surfels.raw | {"light": EnvironmentLight.from_radiance(sky).raw}
+    accuracy = Accuracy(visibility_rays=rays, traced_bounces=2)
     diffuse = "sh" if name == "radiance_sh" else "irradiance"
     weight = vector(rng.normal(size=(len(place), 3)))
 
     def indirect(value: Any) -> Any:
         changed = leaves | {name: value}
         light = EnvironmentLight(changed.pop("light")).prefilter()
-        return seen(points, place, accuracy, Surfels(changed), light, diffuse, occluder).indirect
+        return seen(points, place, accuracy, Surfels(changed), light, diffuse, occluder, LOW_EYE).indirect
+
+    kept, held_back = [], reflection._held_back
+
+    def keep(*arguments: Any) -> Any:
+        if not kept:
+            kept.append(held_back(*arguments))
+            dr.eval(kept)
+        return kept[0]
+
+    assert max(lengths(place, mirrored(place, LOW_EYE)[:, 0])) > 1
+    monkeypatch.setattr(reflection, "_held_back", keep)
 
     base = leaves[name].numpy().copy()
     step = rng.normal(size=base.shape).astype(np.float32)
@@ -263,6 +406,7 @@ def test_derivatives_of_traced_light(name: str, rays: int) -> None:
     ]
     difference = (ends[1] - ends[0]) / 0.02
     assert abs(difference) > 1e-3
+    assert rays == 1 or 0 < (kept[0].numpy() < 0.9).mean() < 0.5
 
     leaf = mi.TensorXf(base)
     dr.enable_grad(leaf)
@@ -286,7 +430,7 @@ def test_rays_and_geometry_are_detached() -> None:
     surfels.enable_grad()
     dr.enable_grad(points.normal, points.view, points.roughness, points.albedo)
     for rays in (1, 3):
-        accuracy = Accuracy(visibility_rays=rays, traced_indirect=True)
+        accuracy = Accuracy(visibility_rays=rays, traced_bounces=1)
         found = seen(points, place, accuracy, surfels, light, occluder=occluder)
         assert not dr.grad_enabled(found.visibility)
         dr.backward(dr.sum(found.indirect.x))
@@ -319,8 +463,8 @@ def test_degenerate_pixels_stay_finite() -> None:
     for occluder in (with_materials(corner(), surfels), empty):
         for accuracy in (
             Accuracy(visibility_rays=7),
-            Accuracy(True, True, 7, True),
-            Accuracy(True, True, 1, True),
+            Accuracy(True, True, 7, 3),
+            Accuracy(True, True, 1, 3),
         ):
             raw = mi.TensorXf(light.raw)
             dr.enable_grad(raw)

@@ -3,60 +3,40 @@
 from __future__ import annotations
 
 import csv
-import json
-import os
 import re
-import subprocess
-import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from benchmark_runs import read_result, small_instance
 from helpers import ROOT
 from scipy.spatial import cKDTree
 
-sys.path.insert(0, str(ROOT))  # `benchmarks` is no part of the package
+from benchmarks.common.errors import compare
+from benchmarks.common.montecarlo import estimate
 from benchmarks.visibility import payoff, scenes
 from benchmarks.visibility.__main__ import main
 from benchmarks.visibility.payoff import where
+from benchmarks.visibility.rules import Rule
+from benchmarks.visibility.settings import SMALL
+from benchmarks.visibility.stage import Stage
 
 Row = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output of the small instance, made as a reader would make it."""
-    target = tmp_path_factory.mktemp("visibility")
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-W",
-            "error",
-            "-m",
-            "benchmarks.visibility",
-            "--small",
-            "--quiet",
-            "-o",
-            str(target),
-        ],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return target
+    """Output of the small instance."""
+    return small_instance("visibility", tmp_path_factory.mktemp("visibility"))
 
 
 @pytest.fixture(scope="module")
 def result(folder: Path) -> dict[str, Any]:
     """Its JSON."""
-    found: dict[str, Any] = json.loads((folder / "visibility.json").read_text())
-    return found
+    return read_result("visibility", folder)
 
 
 def errors_of(result: dict[str, Any], scene: str, depth: str) -> dict[str, float]:
@@ -90,15 +70,20 @@ def test_occlusion_beats_none_at_depth_2(result: dict[str, Any], scene: str) -> 
 def test_traced_light_beats_none_at_full_depth(result: dict[str, Any], scene: str) -> None:
     error = errors_of(result, scene, "full")
     for rule in ("mirror ray", "4 rays", "64 rays"):
-        assert error[f"{rule}, traced"] < 0.85 * error[rule]
-    assert error["64 rays, traced"] < error["4 rays, traced"] < error["mirror ray, traced"]
-    assert error["64 rays, traced"] < 0.5 * error["mirror ray"]
+        assert error[f"{rule}, 4 bounces"] < error[f"{rule}, 1 bounce"] < 0.85 * error[rule]
+    for bounces in ("1 bounce", "4 bounces"):
+        few, many = (error[f"{rays} rays, {bounces}"] for rays in (4, 64))
+        assert many < few < error[f"mirror ray, {bounces}"]
+    assert error["64 rays, 1 bounce"] < 0.5 * error["mirror ray"]
+    assert error["64 rays, 4 bounces"] < 0.25 * error["mirror ray"]
 
 
 @pytest.mark.parametrize("scene", ["bowl", "plates"])
 def test_the_path_tracer_adds_light_with_depth(result: dict[str, Any], scene: str) -> None:
-    """A rule's bias falls as the reference grows; traced light stands for one reflection more."""
-    bias = {row["depth"]: row["bias"] for row in where(result["rows"], scene=scene, method="64 rays, traced")}
+    """A rule's bias falls as the reference grows; one bounce stands for one reflection more."""
+    bias = {
+        row["depth"]: row["bias"] for row in where(result["rows"], scene=scene, method="64 rays, 1 bounce")
+    }
     assert bias["direct"] > bias["bounce"] > bias["full"]
     assert abs(bias["bounce"]) < 0.15
 
@@ -119,7 +104,39 @@ def test_the_noise_is_below_what_is_compared(result: dict[str, Any]) -> None:
         assert not row["below_floor"]
 
 
+@pytest.mark.parametrize("indirect", ["harmonics", "1 bounce", "4 bounces"])
+@pytest.mark.parametrize("scene", ["bowl", "plates"])
+def test_budgets_are_above_the_noise_and_add_up(result: dict[str, Any], scene: str, indirect: str) -> None:
+    (row,) = where(result["budgets"], scene=scene, indirect=indirect)
+    assert row["total"] > row["floor"]
+    assert sum(part["share"] for part in row["parts"]) == pytest.approx(1)
+    assert row["total"] == pytest.approx(sum(part["relmse"] for part in row["parts"]) + row["interaction"])
+    assert row["adds_up"]
+
+
+@pytest.mark.parametrize("scene", ["bowl", "plates"])
+def test_the_budget_takes_the_error_of_the_rule_apart(result: dict[str, Any], scene: str) -> None:
+    """Its reference differs from that of the rows by noise; the best harmonics beat no indirect light."""
+    error = errors_of(result, scene, "full")
+    total = {row["indirect"]: row["total"] for row in where(result["budgets"], scene=scene)}
+    assert total["1 bounce"] == pytest.approx(error["mirror ray, 1 bounce"], rel=0.1)
+    assert total["harmonics"] < 0.5 * error["mirror ray"]
+
+
 # ---------- Its parts ----------
+
+
+def test_bounces_approach_the_path_tracer_at_full_depth() -> None:
+    """In a bowl, most of whose light comes by several reflections: the bias falls to less than 4 %."""
+    settings = replace(SMALL, spp=64)
+    stage = Stage(scenes.make_scene("bowl", settings.detail), settings)
+    stage.material(0.3)
+    reference = estimate(stage.reference(12))
+    found = [compare(stage.picture(Rule(64, bounces)), reference) for bounces in (0, 1, 2, 4, 8)]
+    bias, relmse = [x.bias for x in found], [x.relmse for x in found]
+    print(f"bias {np.round(bias, 3)}, relMSE {np.round(relmse, 3)}")
+    assert bias == sorted(bias) and bias[0] < -0.3 and abs(bias[-1]) < 0.04
+    assert relmse == sorted(relmse, reverse=True) and relmse[-1] < 0.15 * relmse[0]
 
 
 def test_payoff_is_the_best_within_the_budget() -> None:

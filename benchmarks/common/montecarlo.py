@@ -167,6 +167,16 @@ def _visible(occluder: Any, origin: Any, direction: Any) -> Any:
     return True if occluder is None else ~occluder.ray_test(mi.Ray3f(origin, direction))
 
 
+def predecessor(samples: int) -> int:
+    """The Fibonacci number before another."""
+    return round(samples / 1.618033988749895)
+
+
+def lattice(i: Any, count: Any, generator: Any) -> Any:
+    """Point i of `count` in the unit square; the generator is the count's predecessor."""
+    return mi.Point2f(mi.Float(i) + 0.5, mi.Float((i * generator) % count) + 0.5) / mi.Float(count)
+
+
 def integrate(
     make_lobe: Callable[[Points], Lobe],
     points: Points,
@@ -184,21 +194,20 @@ def integrate(
         samples: of the lobe, and as many of the light; a member of LATTICES.
         occluder: a scene that blocks light, or None.
     """
-    predecessor = round(samples / 1.618033988749895)
     lane = dr.arange(mi.UInt32, batches * points.count)
     every = points.gather(lane % points.count)
     lobe = make_lobe(every)
     state = dr.opaque(mi.UInt32, 1 + seed)
     rng = mi.PCG32(initstate=mi.UInt64(lane) + mi.UInt64(state) * GOLDEN, initseq=mi.UInt64(state))
     shift = [mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(2)]
-    count, generator = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, predecessor)
+    count, generator = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, predecessor(samples))
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
     si.p = every.position
     origin = every.position + RAY_OFFSET * every.offset
     sums = len(lobe.weights(mi.Vector3f(0, 0, 1)))
 
     def body(i: Any, *total: Any) -> tuple[Any, ...]:
-        lattice = mi.Point2f(mi.Float(i) + 0.5, mi.Float((i * generator) % count) + 0.5) / mi.Float(count)
+        at = lattice(i, count, generator)
         new = list(total)
 
         def add(light: Any, radiance_: Any, density: Any, free: Any) -> None:
@@ -206,7 +215,7 @@ def integrate(
                 share = dr.select(free & (density > 0), weight / density, 0)
                 new[k] = new[k] + radiance_ * share
 
-        light = lobe.sample(_wrap(lattice + shift[0]))
+        light = lobe.sample(_wrap(at + shift[0]))
         world = lobe.frame.to_world(light)
         si.wi = -world
         ds = dr.zeros(mi.DirectionSample3f)
@@ -214,7 +223,7 @@ def integrate(
         density = lobe.pdf(light) + emitter.pdf_direction(si, ds)
         add(light, radiance(emitter, world), density, _visible(occluder, origin, world))
 
-        ds, ratio = emitter.sample_direction(si, _wrap(lattice + shift[1]))
+        ds, ratio = emitter.sample_direction(si, _wrap(at + shift[1]))
         light = lobe.frame.to_local(ds.d)
         density = lobe.pdf(light) + ds.pdf
         add(light, ratio * ds.pdf, density, (ds.pdf > 0) & _visible(occluder, origin, ds.d))

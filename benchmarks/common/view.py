@@ -19,6 +19,9 @@ import numpy as np
 SENSOR = "pixel_centres"
 """Name under which the sensor is registered."""
 
+VIEW_BINS = ((0.0, 0.1), (0.1, 0.2), (0.2, 0.5), (0.5, 1.0))
+"""Ranges of n·v: 84° from the normal and beyond, 78° to 84°, 60° to 78°, and the rest."""
+
 
 @functools.cache
 def _register(variant: str) -> None:
@@ -123,3 +126,9 @@ def surface(scene: Any, sensor: Any, size: int) -> Points:
     found = every.gather(dr.compress(front))
     dr.eval(found.position, found.normal, found.view, found.offset)
     return found
+
+
+def view_bins(n_dot_v: np.ndarray) -> dict[str, np.ndarray]:
+    """Masks of the points (P,) in each range of VIEW_BINS that has any."""
+    masks = {f"{a:g}-{b:g}": (n_dot_v > a) & (n_dot_v <= b) for a, b in VIEW_BINS}
+    return {name: mask for name, mask in masks.items() if mask.any()}

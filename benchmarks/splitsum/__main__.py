@@ -11,19 +11,17 @@ the page and its pictures go to docs/ and the two others to runs/.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 
 import mitsuba as mi  # isort: skip
 
-from benchmarks.common.lights import BUILT_IN, ROOT
-from benchmarks.common.report import write_csv, write_json, write_text
-from mi_refgs.errors import InputError
+from benchmarks.common.command import make_parser, write_reports
+from benchmarks.common.lights import BUILT_IN
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -31,11 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     mi.set_variant("llvm_ad_rgb")
     from benchmarks.splitsum.settings import CONVEX, FULL, PAGE, SMALL
 
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.splitsum",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser("splitsum", __doc__)
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--small", action="store_true", help="a coarse instance, below a minute")
     size.add_argument("--full", action="store_true", help="more pixels and samples, about an hour")
@@ -47,11 +41,6 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--shape", action="append", choices=CONVEX, help="only these shapes; repeatable")
     parser.add_argument("--size", type=int, help="edge of the pictures whose error is measured, pixels")
-    parser.add_argument("-o", "--output", type=Path, help="folder; without it docs/ and runs/")
-    parser.add_argument(
-        "--json", type=Path, metavar="FILE", help="write page and pictures of this earlier run"
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
     options = parser.parse_args(arguments)
 
     from benchmarks.splitsum.measure import measure
@@ -64,20 +53,11 @@ def main(arguments: list[str] | None = None) -> int:
         settings = replace(settings, shapes=tuple(options.shape), budget_shapes=tuple(options.shape))
     if options.size:
         settings = replace(settings, size=options.size)
-    try:
-        if options.json:
-            result = json.loads(options.json.read_text(encoding="utf-8"))
-        else:
-            result = measure(settings, options.quiet)
-        folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", ROOT / "runs")
-        write_json(data / "splitsum.json", result)
-        write_csv(data / "splitsum.csv", result["rows"])
-        write_text(folder / "splitsum.md", page(result, plot(result, folder / "images"), folder))
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
-    print(folder / "splitsum.md")
-    return 0
+
+    def write(result: dict[str, Any], folder: Path) -> str:
+        return page(result, plot(result, folder / "images"), folder)
+
+    return write_reports("splitsum", options, lambda: measure(settings, options.quiet), write)
 
 
 if __name__ == "__main__":

@@ -10,8 +10,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from benchmarks.common.budget import Step, take_apart
-from benchmarks.common.errors import CLEAR, weight
+from benchmarks.common.budget import Step, noise_floor, take_apart
 from benchmarks.splitsum import methods
 from benchmarks.splitsum.exact import Stage, diffuse, reflectance
 from benchmarks.splitsum.settings import CONVEX
@@ -26,6 +25,8 @@ LOBE = "lobe with N = V = R"
 SCHLICK = "Schlick in the table"
 SHADOW = "no shadow"
 BOUNCES = "no inter-reflection"
+GROUPS = ((SHADOW, BOUNCES), (LOBE, SCHLICK))
+"""Pairs that may be looked at as one: what the shape itself does to the light, and the reflectance's lobe."""
 
 NODES = 700
 """Midpoints of the float64 quadrature: (A, B) to 1e-6."""
@@ -66,7 +67,7 @@ def budgets(stage: Stage) -> list[dict[str, Any]]:
                         "metallic": metallic,
                         "height": height,
                         "floor": _noise(stage, roughness, metallic),
-                        **take_apart(steps).record(),
+                        **take_apart(steps, stage.points.n_dot_v(), GROUPS).record(),
                     }
                 )
     return found
@@ -125,4 +126,4 @@ def _concave(stage: Stage, roughness: float, metallic: float) -> list[Step]:
 def _noise(stage: Stage, roughness: float, metallic: float) -> float:
     """relMSE below which a part or a whole cannot be told from the references' noise."""
     reference = stage.integrals(roughness).radiance(metallic)
-    return CLEAR * float((reference.error**2 * weight(reference.mean)).mean())
+    return noise_floor(reference.error, reference.mean)

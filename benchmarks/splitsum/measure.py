@@ -15,10 +15,10 @@ from tqdm import tqdm
 from benchmarks.common import errors, report, timing
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.lights import Light, make_light
-from benchmarks.common.view import Points
+from benchmarks.common.view import Points, view_bins
 from benchmarks.splitsum import decompose, methods, surfels
 from benchmarks.splitsum.exact import Stage
-from benchmarks.splitsum.settings import VIEW_BINS, Settings
+from benchmarks.splitsum.settings import Settings
 from benchmarks.splitsum.speedup import line, speed_ups
 
 ALL = "all"
@@ -56,11 +56,8 @@ class Run:
         flip, self.flip_reason = errors.flip(points.image(values), points.image(reference.mean))
         masks: dict[str, Any] = {ALL: None}
         if method.startswith("split_sum"):
-            cosine = points.n_dot_v()
-            masks |= {f"{a:g}-{b:g}": (cosine > a) & (cosine <= b) for a, b in VIEW_BINS}
+            masks |= view_bins(points.n_dot_v())
         for name, mask in masks.items():
-            if mask is not None and not mask.any():
-                continue
             found = errors.compare(values, reference, mask)
             self.rows.append(
                 {

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from benchmarks.common.report import number, percent, prose, table
+from benchmarks.common.page_budget import adding_up, budget_table, interactions
+from benchmarks.common.report import percent, prose
 from benchmarks.splitsum import decompose, select
 from benchmarks.splitsum.select import Row, where
 
@@ -25,10 +24,12 @@ def budget_section(result: dict[str, Any], picture: str) -> str:
         map, the mix of levels and their grids by the exact lobe average at this roughness, the lobe with
         N = V = R by the reflectance's own lobe without Fresnel's term, and the one average that F0·A and
         B share by one each. The signed differences add up to the whole error at every pixel. A percentage
-        is each one's projection on the whole error (they sum to 100 %; a negative one cancels others); in
-        brackets its relMSE alone. Those squares add up only where the parts are uncorrelated: the last
-        column says what is left, twice the covariances, and which two parts it is most due to."""
-    lines = ["## Where the error comes from", prose(how), picture]
+        is each one's projection on the whole error (a negative one cancels others); in brackets its relMSE
+        alone. The last column says what the sum of those misses, twice the products of the parts, and which
+        two parts it is most due to. How a mirror ray and spherical harmonics stand for visibility and
+        indirect light is taken apart by `python -m benchmarks.visibility`, in concave scenes."""
+    groups = decompose.GROUPS
+    lines = ["## Where the error comes from", adding_up(budgets, groups), prose(how), picture]
     roughness = sorted({min(result["settings"]["roughness"], key=lambda r: abs(r - x)) for x in BUDGET_SHOWN})
     lines.append("The tables show a part of what is in the JSON: other roughness, and metallic 0, are there.")
     for shape in dict.fromkeys(row["shape"] for row in budgets):
@@ -37,10 +38,15 @@ def budget_section(result: dict[str, Any], picture: str) -> str:
             cases = where(budgets, shape=shape, metallic=metallic, height=height, roughness=roughness)
             lines += [
                 f"**{shape}, metallic {metallic:g}, {height} rows of light**",
-                _budget_table(result, cases),
+                budget_table("case", _labelled(result, cases)),
             ]
-    lines += [_adding_up(budgets), *_surfels(result)]
-    return "\n\n".join(lines)
+    return "\n\n".join([*lines, interactions(budgets), *_surfels(result)])
+
+
+def _labelled(result: dict[str, Any], cases: list[Row]) -> list[tuple[str, Row]]:
+    order = select.lights(result)
+    ordered = sorted(cases, key=lambda row: (order.index(row["light"]), row["roughness"]))
+    return [(f"`{row['light']}`, r = {row['roughness']:g}", row) for row in ordered]
 
 
 def _surfels(result: dict[str, Any]) -> list[str]:
@@ -50,8 +56,6 @@ def _surfels(result: dict[str, Any]) -> list[str]:
         return []
     order = select.lights(result)
     cases = sorted(budgets, key=lambda row: order.index(row["light"]))
-    names = [part["name"] for part in cases[0]["parts"]]
-    rows = [[f"`{case['light']}`", *_budget_cells(case, names)] for case in cases]
     covered = min(case["covered"] for case in cases)
     text = f"""The same for the deferred picture of a sphere that {cases[0]["surfels"]:,} surfels cover
         ({percent(covered)} of its pixels), {result["settings"]["size"]}² pixels, with exact positions and
@@ -63,69 +67,6 @@ def _surfels(result: dict[str, Any]) -> list[str]:
     return [
         "### Surfels instead of a mesh",
         prose(text),
-        table(["light", *names, "total", "sum", "interaction"], rows),
+        adding_up(cases),
+        budget_table("light", [(f"`{case['light']}`", case) for case in cases]),
     ]
-
-
-def _budget_cells(case: Row, names: list[str]) -> list[str]:
-    """Parts, total, sum and interaction of a budget."""
-    if case["total"] < case["floor"]:
-        return [*["–"] * len(names), f"< {number(case['floor'], 2)}", "–", "noise"]
-    parts = [f"{100 * part['share']:.0f} % ({number(part['relmse'], 2)})" for part in case["parts"]]
-    left = f"{100 * case['interaction'] / case['total']:+.0f} %"
-    if not case["adds_up"]:
-        left += f": {case['pair'][0]} and {case['pair'][1]}, ρ = {case['correlation']:+.2f}"
-    return [*parts, number(case["total"], 2), number(case["sum"], 2), left]
-
-
-def _budget_table(result: dict[str, Any], cases: list[Row]) -> str:
-    names = [part["name"] for part in cases[0]["parts"]]
-    order = select.lights(result)
-    rows = [
-        [f"`{case['light']}`, r = {case['roughness']:g}", *_budget_cells(case, names)]
-        for case in sorted(cases, key=lambda row: (order.index(row["light"]), row["roughness"]))
-    ]
-    return table(["case", *names, "total", "sum", "interaction"], rows)
-
-
-def _adding_up(budgets: list[Row]) -> str:
-    clear = [row for row in budgets if row["total"] >= row["floor"]]
-    met = sum(row["adds_up"] for row in clear)
-    pairs: dict[tuple[str, str], list[float]] = {}
-    for row in clear:
-        if not row["adds_up"]:
-            pairs.setdefault(tuple(row["pair"]), []).append(row["correlation"])
-    text = f"Of {len(clear)} budgets above the noise, {met} add up to a fifth by their squares alone."
-    if pairs:
-        said = [
-            f"{a} with {b} in {len(values)} (median ρ {np.median(values):+.2f}): {_reason(a, b)}"
-            for (a, b), values in sorted(pairs.items(), key=lambda item: -len(item[1]))
-        ]
-        text += " In the others the interaction is due to\n\n" + "\n".join(f"- {item};" for item in said)
-        text = text[:-1] + "."
-    return text
-
-
-REASONS = {
-    frozenset(
-        (decompose.SHADOW, decompose.BOUNCES)
-    ): "what blocks the light also reflects some, so the two errors "
-    "have opposite signs at the same pixels, and leaving both out is better than leaving out one",
-    frozenset(
-        (decompose.RESOLUTION, decompose.LOBE)
-    ): "a coarse map and a lobe that is too wide at grazing angles blur the same edges",
-    frozenset(
-        (decompose.LEVELS, decompose.LOBE)
-    ): "both are errors of the lobe's width around the same features of the light",
-    frozenset((decompose.RESOLUTION, decompose.LEVELS)): "both blur the same features of the light",
-    frozenset(
-        (decompose.LOBE, decompose.SCHLICK)
-    ): "Fresnel's term favours the grazing side of the very lobe whose shape is replaced just before",
-    frozenset(
-        (decompose.LOBE, decompose.SHADOW)
-    ): "light from below the mirror direction is both what the lobe gets wrong and what the shape blocks",
-}
-
-
-def _reason(a: str, b: str) -> str:
-    return REASONS.get(frozenset((a, b)), "their patterns on the object are alike")

@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks.common import figures, report
 from benchmarks.common.errors import CLEAR
 from benchmarks.splitsum import select
+from benchmarks.splitsum.plot_budget import budget
 from benchmarks.splitsum.select import Row, where
 
 TARGET = 50.0
@@ -49,15 +50,7 @@ def pareto(result: dict[str, Any]) -> Any:
     figure, axes = figures.new(rows, columns, 3.0, 2.6, sharex=True, sharey=True)
     light, shape = pareto_light(result), select.convex(result)[0]
     for ax, r in zip(axes.flat, roughness, strict=False):
-        cases = where(
-            result["rows"],
-            shape=shape,
-            light=light,
-            roughness=r,
-            metallic=select.picture_metallic(result),
-            n_dot_v="all",
-        )
-        _front(ax, cases)
+        _front(ax, _cases(result, shape, light, r))
         ax.set_title(f"roughness {r:g}", fontsize=9)
     for ax in axes.flat[len(roughness) :]:
         ax.set_visible(False)
@@ -72,18 +65,18 @@ def over_lights(result: dict[str, Any]) -> Any:
     figure, axes = figures.new(1, len(names), 2.8, 2.7, sharex=True, sharey=True)
     shape = select.convex(result)[0]
     for ax, light in zip(axes.flat, names, strict=True):
-        cases = where(
-            result["rows"],
-            shape=shape,
-            light=light,
-            roughness=roughness,
-            metallic=select.picture_metallic(result),
-            n_dot_v="all",
-        )
-        _front(ax, cases)
+        _front(ax, _cases(result, shape, light, roughness))
         ax.set_title(light, fontsize=9)
     _finish(figure, axes, f"{shape}, roughness {roughness:g}, lights of rising frequency")
     return figure
+
+
+def _cases(result: dict[str, Any], shape: str, light: str, roughness: float) -> list[Row]:
+    """All methods on one surface."""
+    metallic = select.picture_metallic(result)
+    return where(
+        result["rows"], shape=shape, light=light, roughness=roughness, metallic=metallic, n_dot_v="all"
+    )
 
 
 def _front(ax: Any, cases: list[Row]) -> None:
@@ -263,45 +256,3 @@ def _times(row: Row) -> str:
     value = row["speed_up"]
     text = report.number(value, 2) if value < 1e4 else f"{value:.0e}".replace("e+0", "e")
     return (">" if row["lower_bound"] else "") + text
-
-
-# ---------------- why ----------------
-
-
-def budget(result: dict[str, Any]) -> Any:
-    """relMSE of each approximation alone over roughness, one panel a shape and light."""
-    budgets = result["budgets"]
-    if not budgets:
-        return None
-    shapes = list(dict.fromkeys(row["shape"] for row in budgets))
-    names = select.lights(result)
-    metallic, height = max(row["metallic"] for row in budgets), max(row["height"] for row in budgets)
-    figure, axes = figures.new(len(shapes), len(names), 2.7, 2.2, sharex=True, sharey=True)
-    parts = list(dict.fromkeys(part["name"] for row in budgets for part in row["parts"]))
-    colours = dict(zip(parts, (f"C{k}" for k in range(len(parts))), strict=True))
-    for line, shape in zip(axes, shapes, strict=True):
-        for ax, light in zip(line, names, strict=True):
-            cases = where(budgets, shape=shape, light=light, metallic=metallic, height=height)
-            x = [row["roughness"] for row in cases]
-            ax.plot(x, [row["total"] for row in cases], color="black", linewidth=2, label="whole error")
-            for name in parts:
-                y = [part["relmse"] for row in cases for part in row["parts"] if part["name"] == name]
-                if len(y) == len(x):
-                    ax.plot(x, y, "o-", markersize=2.5, linewidth=1, color=colours[name], label=name)
-            ax.plot(x, [row["floor"] for row in cases], ":", color="grey", linewidth=1, label="noise")
-            ax.set_yscale("log")
-            ax.set_title(f"{shape}, {light}", fontsize=9)
-        line[0].set_ylabel("relMSE", fontsize=8)
-    axes.flat[0].set_ylim(1e-8, 10)
-    for ax in axes[-1]:
-        ax.set_xlabel("roughness", fontsize=8)
-    handles: dict[str, Any] = {}
-    for ax in axes.flat:
-        handles |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(
-        handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize=8, frameon=False
-    )
-    figure.suptitle(
-        f"Error of each approximation alone, {height} rows of light, metallic {metallic:g}", fontsize=10
-    )
-    return figure

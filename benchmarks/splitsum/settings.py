@@ -22,9 +22,6 @@ SHAPES: dict[str, Look] = {
 """The cameras of the shapes. All are convex but the torus, which shadows and mirrors itself."""
 CONVEX = ("sphere", "rounded_cube", "patch")
 
-VIEW_BINS = ((0.0, 0.1), (0.1, 0.2), (0.2, 0.5), (0.5, 1.0))
-"""Ranges of n·v: 84° from the normal and beyond, 78° to 84°, 60° to 78°, and the rest."""
-
 
 def shape(name: str) -> dict[str, Any]:
     """Mitsuba's description of a shape."""

@@ -13,9 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.common import montecarlo as mc
-from benchmarks.common.budget import Step, take_apart
-from benchmarks.common.errors import CLEAR, weight
+from benchmarks.common.budget import Step, noise_floor, take_apart
 from benchmarks.common.view import Points
 from benchmarks.splitsum import methods
 from benchmarks.splitsum.exact import Stage
@@ -92,17 +90,16 @@ def budget(stage: Stage) -> dict[str, Any]:
         Step(COVERAGE, _chosen(by_mesh, here)),
         Step(SPLIT_SUM, _chosen([estimate.mean for estimate in exact], here)),
     ]
-    reference = mc.Estimate(
-        steps[-1].values[covered], _chosen([estimate.error for estimate in exact], here)[covered]
+    noise = _chosen([estimate.error for estimate in exact], here)[covered]
+    found = take_apart(
+        [Step(step.replaced, step.values[covered]) for step in steps], stage.points.n_dot_v()[covered]
     )
-    found = take_apart([Step(step.replaced, step.values[covered]) for step in steps])
-    floor = CLEAR * float((reference.error**2 * weight(reference.mean)).mean())
     return {
         "light": stage.light.name,
         "height": height,
         "surfels": settings.surfels,
         "covered": float(covered.mean()),
-        "floor": floor,
+        "floor": noise_floor(noise, steps[-1].values[covered]),
         **found.record(),
     }
 

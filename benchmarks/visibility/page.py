@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.report import number, prose, signed, table
+from benchmarks.visibility.page_budget import budget_section
 from benchmarks.visibility.payoff import BUDGET, PAPER, TARGET, where
 from benchmarks.visibility.settings import ALBEDO
 
@@ -20,6 +21,7 @@ def page(result: dict[str, Any], picture: Path, folder: Path) -> str:
         _opening(result, link),
         _how(result),
         _gains(result),
+        budget_section(result),
         _errors(result),
         _curve(result),
         _again(result),
@@ -111,40 +113,50 @@ def _gains(result: dict[str, Any]) -> str:
         lines.append(
             prose(
                 f"""Below {TARGET:g}× by the time of the frame: {names}. The next table says what is left with
-                traced light and the most rays, whatever their price: against the path tracer stopped after
-                one more reflection (`max_depth` 3), which is all that traced light stands for, and at full
-                depth. Where the second is much the larger, what is missing is light of further
-                reflections; the first is the split sum's own error, and that of the one mirror ray by which
-                the light at the hit is found."""
+                the most rays, whatever their price: with one bounce against the path tracer stopped after
+                one more reflection (`max_depth` 3), which is all that one bounce stands for, and with the
+                most bounces at full depth; the budgets below take the error with one mirror ray apart."""
             )
         )
-        head = ["case", "rays", "at depth 3: relMSE (bias)", "at full depth"]
+        most = max(result["settings"]["bounces"])
+        head = ["case", "rays", "1 bounce at depth 3: relMSE (bias)", f"{most} bounces at full depth"]
         lines.append(table(head, [_limit(result, row) for row in short]))
     return "\n\n".join(lines)
 
 
 def _blocked(result: dict[str, Any]) -> str:
     """Where blocking light without giving any back is worse than not blocking it."""
-    cases = where(result["rows"], depth="full", method=PAPER)
-    bare = where(result["rows"], depth="full", rays=0)
-    worse = [a for a, b in zip(cases, bare, strict=True) if a["relmse"] > b["relmse"]]
-    names = ", ".join(_case(row) for row in worse) or "none"
+    rays = max(result["settings"]["rays"])
+
+    def further(depth: str, method: str) -> list[dict[str, Any]]:
+        rows = where(result["rows"], depth=depth)
+        pairs = zip(where(rows, method=method), where(rows, rays=0), strict=True)
+        return [row for row, bare in pairs if row["relmse"] > bare["relmse"]]
+
+    worse = [_case(row) for row in further("full", PAPER)]
+    if not worse:
+        return "The mirror ray alone is nearer to the full picture than no occlusion at all in every case."
+    direct, many = (
+        sum(_case(row) in worse for row in further(*key))
+        for key in (("direct", PAPER), ("full", f"{rays} rays"))
+    )
+    cases = len(where(result["rows"], depth="full", method=PAPER))
     return prose(
-        f"""Cases in which the mirror ray alone is further from the full picture than no occlusion at all, as
-        what blocks light also reflects some: {names}. Rays of the lobe without traced light cannot mend
-        that."""
+        f"""The mirror ray alone is further from the full picture than no occlusion at all in {len(worse)} of
+        {cases} cases: {", ".join(worse)}. Without reflected light in the reference (depth 2) it is so in
+        {direct} of them: what blocks light also reflects some. With {rays} rays of the lobe, and no traced
+        light either, it is so in {many}."""
     )
 
 
 def _limit(result: dict[str, Any], case: dict[str, Any]) -> list[str]:
-    rows = where(
-        result["rows"], scene=case["scene"], roughness=case["roughness"], traced=True, dominant=False
-    )
-    rays = max(int(row["rays"]) for row in rows)
+    rows = where(result["rows"], scene=case["scene"], roughness=case["roughness"], dominant=False)
+    rays = max(int(row["rays"]) for row in rows if row["bounces"])
+    ends = (("bounce", 1), ("full", max(result["settings"]["bounces"])))
     return [
         _case(case),
         str(rays),
-        *(_cell(where(rows, rays=rays, depth=depth)[0]) for depth in ("bounce", "full")),
+        *(_cell(where(rows, rays=rays, depth=depth, bounces=bounces)[0]) for depth, bounces in ends),
     ]
 
 
@@ -153,7 +165,7 @@ def _errors(result: dict[str, Any]) -> str:
     depths = {
         "direct": (
             "Against the path tracer at depth 2, which has no light from other surfaces either",
-            {"traced": False},
+            {"bounces": 0},
         ),
         "full": ("Against the path tracer at full depth", {}),
     }

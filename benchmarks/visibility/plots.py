@@ -8,12 +8,11 @@ from typing import Any
 from benchmarks.common import figures
 from benchmarks.visibility.payoff import PAPER, where
 
-STYLES = {
-    (False, False): ("#c77b30", "o", "rays only"),
-    (True, False): ("#1f77b4", "o", "traced light"),
-    (True, True): ("#2a9d5c", "^", "traced light, dominant"),
-}
-"""By (traced, dominant): colour, marker, label."""
+RAYS_ONLY = "#c77b30"
+BOUNCES = ("#9ecae1", "#4292c6", "#08306b", "#6a51a3")
+"""Colours of rising numbers of bounces."""
+MARKERS = {False: "o", True: "^"}
+"""By `dominant`."""
 SHADES = ("#9ecae1", "#4292c6", "#08306b")
 
 
@@ -40,12 +39,13 @@ def _speed(ax: Any, result: dict[str, Any], scene: str, roughness: float) -> Non
 
     rows = where(result["rows"], scene=scene, roughness=roughness, depth="full")
     timed = [row for row in rows if row["ms"] is not None]
-    for (traced, dominant), (colour, marker, label) in STYLES.items():
-        found = [row for row in where(timed, traced=traced, dominant=dominant) if row["rays"]]
-        if not found:
-            continue
+    for bounces, dominant in dict.fromkeys((row["bounces"], row["dominant"]) for row in timed):
+        found = [row for row in where(timed, bounces=bounces, dominant=dominant) if row["rays"]]
         x, y = [row["ms"] for row in found], [row["relmse"] for row in found]
-        ax.plot(x, y, marker, color=colour, label=label, ms=5)
+        rank = list(result["settings"]["bounces"]).index(bounces) if bounces else 0
+        colour = BOUNCES[rank % len(BOUNCES)] if bounces else RAYS_ONLY
+        label = f"{bounces} bounce{'s' * (bounces > 1)}" if bounces else "rays only"
+        ax.plot(x, y, MARKERS[dominant], color=colour, label=label + ", dominant" * dominant, ms=5)
         if not dominant:
             for row in found:
                 ax.annotate(

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 from benchmarks.common.view import Look
-from benchmarks.visibility.settings import ALBEDO, METALLIC
+from benchmarks.visibility.settings import METALLIC
 from mi_refgs.occlusion.mesh import read_mesh
 
 BOWLS = {"bowl": (60.0, -0.15), "deep_bowl": (90.0, -0.42)}
@@ -34,11 +34,11 @@ class Concave:
     mesh: Any  # trimesh.Trimesh
     look: Look
 
-    def load(self, emitter: dict[str, Any]) -> Any:
-        """Mitsuba's scene under a light."""
+    def load(self, emitter: dict[str, Any], albedo: tuple[float, float, float]) -> Any:
+        """Mitsuba's scene under a light; a metal of that albedo."""
         bsdf = {
             "type": "refgs_bsdf",
-            "albedo": {"type": "rgb", "value": list(ALBEDO)},
+            "albedo": {"type": "rgb", "value": list(albedo)},
             "metallic": METALLIC,
             "roughness": 0.3,
         }

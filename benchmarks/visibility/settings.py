@@ -20,8 +20,8 @@ class Settings:
     scenes: tuple[str, ...] = ("bowl", "deep_bowl", "plates")
     meshes: tuple[str, ...] = ()  # files
     roughness: tuple[float, ...] = (0.1, 0.3, 0.6)
-    rays: tuple[int, ...] = (2, 4, 8, 16, 64)  # of the lobe, measured and timed
-    more_rays: tuple[int, ...] = (256,)  # for the curve, not timed
+    rays: tuple[int, ...] = (3, 4, 8)  # of the lobe, measured and timed
+    more_rays: tuple[int, ...] = (16, 64, 256)  # for the curve, and the most for the errors; not timed
     limit: int = 2048  # rays that stand for infinitely many
     size: int = 48  # edge of the pictures whose error is measured
     timing_size: int = 192  # of those that are timed
@@ -29,6 +29,7 @@ class Settings:
     spp: int = 64  # of each batch of the references
     batches: int = 8
     lattice: int = 610  # points of each lattice of the exact visibility
+    bounces: tuple[int, ...] = (1, 2, 3, 4)  # of traced light
     dominant: tuple[bool, ...] = (False, True)  # for traced light: off, and on
     detail: int = 1  # 0: coarse meshes
     timing_seconds: float = 0.2  # spent on each time, at least
@@ -51,6 +52,7 @@ SMALL = Settings(
     light_height=64,
     spp=16,
     lattice=233,
+    bounces=(1, 4),
     dominant=(False,),
     detail=0,
     timing_seconds=0.02,

@@ -66,14 +66,15 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times light). (Default: ``sh`` if there
          is one)
 
-     * - dominant, multiscatter, traced_indirect
+     * - dominant, multiscatter
        - |bool|
        - Buy accuracy: look the light up along the GGX lobe's dominant direction; add what bounces between
-         facets; shade what blocked rays hit, in place of the surfels' indirect light. (Default: false)
+         facets. (Default: false)
 
-     * - visibility_rays
+     * - visibility_rays, traced_bounces
        - |int|
-       - Rays of the lobe that visibility is averaged over; 1 is the mirror ray. (Default: 1)
+       - Rays of the lobe that visibility is averaged over, 1 is the mirror ray; and how often what blocks
+         rays is shaded, in place of the surfels' indirect light. (Default: 1, 0)
 
      * - terms
        - |string|
@@ -173,7 +174,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def parameters_changed(self, keys: list[str]) -> None:
         self.check()
         moved = not keys or not {*keys}.isdisjoint(GEOMETRY)
-        if moved and self.occluder is not None and self.shading.accuracy.traced_indirect:
+        if moved and self.occluder is not None and self.shading.accuracy.traced_bounces:
             self.occluder.set_materials(self.surfels)
 
     def aov_names(self) -> list[str]:

@@ -81,21 +81,21 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     accuracy = _accuracy(props)
     if (accuracy.dominant or accuracy.multiscatter) and reflectance != "split_sum":
         raise InputError("refgs: dominant, multiscatter: need reflectance = split_sum; set it")
-    if (accuracy.visibility_rays > 1 or accuracy.traced_indirect) and not occlusion:
-        raise InputError("refgs: visibility_rays, traced_indirect: need occlusion; name a `mesh` to trace")
+    if (accuracy.visibility_rays > 1 or accuracy.traced_bounces) and not occlusion:
+        raise InputError("refgs: visibility_rays, traced_bounces: need occlusion; name a `mesh` to trace")
     # Radiance is blended linearly, so that both orders are one; the pipeline calls it shading at surfels.
     at = at if reflectance == "split_sum" else "surfel"
     shading = Shading(at, reflectance, diffuse, occlusion, accuracy)
     if not (occlusion and mesh):
         return shading, None
     occluder = Occluder(read_mesh(mesh))
-    if accuracy.traced_indirect:
+    if accuracy.traced_bounces:
         occluder.set_materials(surfels)
     return shading, occluder
 
 
 def _accuracy(props: Any) -> Accuracy:
-    """The knobs that buy accuracy, of which `Accuracy` refuses what is no bool or no number of rays."""
+    """The knobs that buy accuracy, of which `Accuracy` refuses what is no bool or no number."""
     return Accuracy(**{knob.name: props.get(knob.name, knob.default) for knob in fields(Accuracy)})
 
 

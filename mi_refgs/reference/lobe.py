@@ -8,11 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 Incoming = Callable[[np.ndarray], np.ndarray]
 """Radiance (n, 3), or any other quantity (n, c), that arrives from unit directions (n, 3)."""
+
+Hit = Callable[[np.ndarray, np.ndarray], "tuple[np.ndarray, np.ndarray, Any] | None"]
+"""Where a ray (origin, direction) first ends: place, unit normal against the ray, and any other thing."""
+
+Outgoing = Callable[[Any, np.ndarray, np.ndarray, float, np.ndarray], np.ndarray]
+"""Radiance (3,) that leaves: see `chain`."""
 
 HORIZON = 1e-4
 """|cosine| below which a walk inside the microsurface counts as horizontal, and keeps its height."""
@@ -82,6 +89,47 @@ def traced_fraction(
     direction, v_h, weight = lobe_nodes(normal, view, roughness, nodes, nodes)
     weight = weight * schlick(v_h, np.array([f0]))[:, 0]
     return float((weight * free(direction)[:, 0]).sum() / weight.sum())
+
+
+def chain(
+    hit: Hit, outgoing: Outgoing, origin: np.ndarray, direction: np.ndarray, bounces: int
+) -> np.ndarray | None:
+    """Radiance (3,) that arrives against a ray from what it meets; None if it meets nothing.
+
+    That is shaded with what its own mirror ray meets, and so on, `bounces` surfaces in all; what stops the
+    mirror ray of the last is black. `hit` says where a ray ends and what surface is there, `outgoing` what
+    leaves it: from a surface, its unit normal on the ray's side, the view, the visibility of the light along
+    the mirror direction (0 or 1), and the radiance that arrives there instead.
+    """
+    found = hit(origin, direction)
+    if found is None:
+        return None
+    point, normal, surface = found
+    mirror = direction - 2 * float(direction @ normal) * normal
+    if bounces == 1:
+        beyond = None if hit(point, mirror) is None else np.zeros(3)
+    else:
+        beyond = chain(hit, outgoing, point, mirror, bounces - 1)
+    free = beyond is None
+    return outgoing(surface, normal, -direction, float(free), np.zeros(3) if beyond is None else beyond)
+
+
+def blocked_mean(
+    radiance: np.ndarray, weight: np.ndarray, blocked: np.ndarray, free: np.ndarray, fading: float
+) -> np.ndarray:
+    """Mean (3,) of the radiance (k, 3) of those of k ≥ 2 rays that are `blocked` (k,), weighted.
+
+    In each colour, where the largest product of weight and radiance exceeds k times the mean of the other
+    rays' products, it loses the share `fading` of the excess; rays that are not blocked have the radiance
+    `free` (3,).
+    """
+    count, products = len(weight), weight[:, None] * np.where(blocked[:, None], radiance, free)
+    for channel in range(3):
+        first = int(np.argmax(np.where(blocked, products[:, channel], -1)))
+        if blocked[first]:
+            others = np.delete(products[:, channel], first)
+            products[first, channel] -= fading * max(products[first, channel] - count * others.mean(), 0)
+    return np.asarray(products[blocked].sum(0) / weight[blocked].sum())
 
 
 def microsurface_walk(

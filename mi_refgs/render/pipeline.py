@@ -75,7 +75,7 @@ def render(
     `light` is a `shade.PrefilteredLight`, needed unless `shading.reflectance` is "radiance". `sh_degree`
     limits the degree of the radiance channel, for coarse-to-fine schedules. `material_maps` asks for albedo,
     metallic and roughness even where shading does not need them per pixel. `shift`: see `splat.project`.
-    `shading.accuracy.traced_indirect` needs an occluder whose `set_materials` has seen these surfels.
+    `shading.accuracy.traced_bounces` needs an occluder whose `set_materials` has seen these surfels.
     """
     if shading.at == "surfel":
         return _shade_at_surfels(surfels, camera, shading, light, sh_degree, shift, material_maps)
@@ -177,7 +177,7 @@ def _shade_at_pixels(
     if shading.diffuse == "sh":
         features += [*_radiance(surfels, direction, sh_degree)]
     occluded = shading.occlusion and occluder is not None
-    if occluded and surfels.has("indirect_sh") and not shading.accuracy.traced_indirect:
+    if occluded and surfels.has("indirect_sh") and not shading.accuracy.traced_bounces:
         # The mirror direction of the surfel's centre [Ref-Gaussian, §3.3]; starts at exactly 0 and must train
         # from there.
         mirrored = reflect(view=-direction, normal=normal)

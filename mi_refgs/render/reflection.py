@@ -1,7 +1,7 @@
 """What pixels see in their mirrors: is the light free there, and what stands in its way?
 
 The paper's rule traces one mirror ray for the whole lobe and leaves what it hits to the indirect channel.
-`Accuracy.visibility_rays` averages over rays of the lobe instead, and `Accuracy.traced_indirect` shades what
+`Accuracy.visibility_rays` averages over rays of the lobe instead, and `Accuracy.traced_bounces` shades what
 blocked rays hit.
 """
 
@@ -21,6 +21,7 @@ from mi_refgs.shade.models import (
     Diffuse,
     ShadingPoints,
     base_reflectance,
+    lookup_direction,
     reflect,
     safe_normalize,
     shade,
@@ -28,6 +29,11 @@ from mi_refgs.shade.models import (
 from mi_refgs.shade.rays import Lobe
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
+
+WIDE = 1 / 3
+"""α of a lobe from which single bright rays are not held back. In the concave scenes of
+`benchmarks.visibility`, 4 rays and 6 bounces, holding all of them back takes 17 to 42 % off relMSE at
+α = 0.01, 0 to 33 % at 0.09, and adds up to 15 % at 0.36."""
 
 
 def mirror_visibility(occluder: Occluder, origin: Any, ray: Any, normal: Any, view: Any) -> Any:
@@ -58,27 +64,31 @@ def reflection(
     """`points` with the visibility (mi.Float, 0 … 1, detached) and indirect light that `accuracy` asks for.
 
     `origin` and `ray` lead from the camera to the points; `points.indirect` (of the indirect channel) stays
-    unless `accuracy.traced_indirect` replaces it by the mean radiance of what blocked rays hit, one bounce
-    (`MeshRadiance`). Its gradient goes to the light and to the materials of the surfels around the hits, in
-    both modes; rays and hits are detached, and so is what the pixel's own roughness does to the rays.
+    unless `accuracy.traced_bounces` replaces it by the mean radiance of what blocked rays hit
+    (`MeshRadiance`), single bright ones held back (`_held_back`). Its gradient goes to the light and to the
+    materials of the surfels around all hits, in both modes; rays and hits are detached, and so are what is
+    held back and what the pixel's own roughness does to the rays.
     """
     normal = dr.detach(points.normal)
-    if accuracy.visibility_rays == 1 and not accuracy.traced_indirect:
+    if accuracy.visibility_rays == 1 and not accuracy.traced_bounces:
         return replace(points, visibility=mirror_visibility(occluder, origin, ray, normal, points.view))
     if occluder.empty:
         visibility = dr.full(mi.Float, 1, dr.width(ray))
         return replace(points, visibility=visibility, indirect=None)
-    scene = MeshRadiance.of(occluder, surfels, light, accuracy, diffuse) if accuracy.traced_indirect else None
+    scene = MeshRadiance.of(occluder, surfels, light, accuracy, diffuse) if accuracy.traced_bounces else None
     with dr.suspend_grad():
         point, facing, seen = _start(occluder, origin, ray, normal)
     if accuracy.visibility_rays > 1:
         with dr.suspend_grad():
             lobe = Lobe.of(facing, points.view, points.roughness, base_reflectance(points))
-        visibility, indirect = _average(occluder, scene, lobe, accuracy.visibility_rays, point, facing, seen)
+            open_ = None if scene is None else scene.light_from(facing, points.view, points.roughness)
+        visibility, indirect = _average(
+            occluder, scene, lobe, accuracy.visibility_rays, point, facing, seen, open_
+        )
     else:
         assert scene is not None
         mirror = dr.detach(reflect(view=points.view, normal=facing))
-        hit = scene.trace(point, mirror, facing, seen)
+        hit = scene.trace(point, mirror, facing, seen, accuracy.traced_bounces)
         dr.eval(hit)  # now, once, as for the visibility alone
         visibility = dr.select(hit.valid, mi.Float(0), mi.Float(1))
         indirect = dr.select(hit.valid, scene.radiance(hit, mirror), 0)
@@ -92,34 +102,64 @@ def _start(occluder: Occluder, origin: Any, ray: Any, normal: Any) -> tuple[Any,
 
 
 def _average(
-    occluder: Occluder, scene: MeshRadiance | None, lobe: Lobe, rays: int, point: Any, facing: Any, seen: Any
+    occluder: Occluder,
+    scene: MeshRadiance | None,
+    lobe: Lobe,
+    rays: int,
+    point: Any,
+    facing: Any,
+    seen: Any,
+    open_: Any,
 ) -> tuple[Any, Any]:
     """Mean visibility over rays of the lobe, weighted as the specular integrand weights them, and the mean
-    radiance of the blocked ones (None without a `scene` to see there), in one loop."""
+    radiance of the blocked ones (None without a `scene` to see there), in one loop.
+
+    `open_` (mi.Color3f, detached): the mean radiance of the others.
+    """
     count = dr.opaque(mi.UInt32, rays)
 
-    def body(index: Any, free: Any, blocked: Any, total: Any) -> tuple[Any, Any, Any, Any]:
+    def body(index: Any, free: Any, blocked: Any, total: Any, largest: Any) -> tuple[Any, ...]:
         with dr.suspend_grad():
             direction, weight = lobe.sample(index, count)
             if scene is None:
                 stopped = occluder.visible(point, direction, facing, weight > 0) == 0
             else:
-                hit = scene.trace(point, direction, facing, weight > 0)
+                hit = scene.trace(point, direction, facing, weight > 0, scene.accuracy.traced_bounces)
                 stopped = hit.valid
         if scene is not None:
-            total = total + dr.select(stopped, weight * scene.radiance(hit, direction), 0)
-        return index + 1, free + dr.select(stopped, 0, weight), blocked + dr.select(stopped, weight, 0), total
+            found = dr.select(stopped, weight * scene.radiance(hit, direction), 0)
+            total = total + found
+            largest = dr.maximum(largest, dr.detach(found))
+        free, blocked = free + dr.select(stopped, 0, weight), blocked + dr.select(stopped, weight, 0)
+        return index + 1, free, blocked, total, largest
 
     # A sum over rays, whose derivative keeps no state of an iteration: Dr.Jit's max_iterations = -1.
-    start = (mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Color3f(0))
-    _, free, blocked, total = dr.while_loop(
+    start = (mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Color3f(0), mi.Color3f(0))
+    _, free, blocked, total, largest = dr.while_loop(
         start, lambda index, *_: seen & (index < count), body, max_iterations=-1, label="lobe"
     )
     every = free + blocked
     visibility = dr.select(every > 0, free / dr.select(every > 0, every, 1), 1)
+    if scene is None:
+        dr.eval(visibility)
+        return dr.detach(visibility), None
+    total = total * _held_back(dr.detach(total), largest, free * open_, mi.Float(count), lobe.α)
     indirect = total * dr.select(blocked > 0, dr.rcp(dr.select(blocked > 0, blocked, 1)), 0)
     dr.eval(visibility, indirect)
-    return dr.detach(visibility), None if scene is None else indirect
+    return dr.detach(visibility), indirect
+
+
+def _held_back(total: Any, largest: Any, free: Any, count: Any, α: Any) -> Any:
+    """What share (0 … 1, detached) of the sum over blocked rays counts, in each colour.
+
+    The `largest` of `count` rays counts for no more than all rays would at the mean of the others, `free`
+    ones included: of few rays of a narrow lobe, one that finds a lamp in a reflection speckles the picture.
+    In a wide lobe rays differ anyway, so this fades out with its α (see WIDE). The more rays, the less is
+    held back: the limit is the true mean.
+    """
+    others = dr.maximum(total - largest, 0)
+    excess = dr.maximum(largest - (others + free) * count / (count - 1), 0) * dr.maximum(1 - α / WIDE, 0)
+    return dr.select(total > 0, dr.maximum(1 - excess / dr.select(total > 0, total, 1), 0), 1)
 
 
 @dataclass(frozen=True)
@@ -130,6 +170,7 @@ class MeshHit:
     triangle: Any
     place: Any
     visibility: Any
+    next: MeshHit | None = None  # where it does not: what stands in its way, if that is shaded too
 
 
 @dataclass(frozen=True)
@@ -138,8 +179,11 @@ class MeshRadiance:
 
     Its specular light must arrive along its own mirror direction, which is traced once more: without that, a
     hit deep in a bowl shines as if it lay in the open, and the picture is worse than with no indirect light
-    at all (relMSE 4.7 against 1.0, at roughness 0.3; with it 0.2 at 0.4). What is blocked there is dark: one
-    bounce ends here.
+    at all (relMSE 4.7 against 1.0, at roughness 0.3; with it 0.2 at 0.4). What blocks it is another hit,
+    shaded likewise, `accuracy.traced_bounces` times in all; what is blocked at the last is dark. (No closing
+    term was better in every concave scene: with 64 rays, 2 bounces and roughness 0.1, relMSE in a bowl is
+    0.10 with none, 0.98 with the unblocked light and 3.8 with the irradiance.) The recursion is unrolled:
+    every number of bounces is a kernel of its own, and its length grows with them.
 
     With diffuse="sh" the diffuse part is the SH radiance of the surfel nearest to the hit, along the ray: the
     same quantity that pixels blend, and like it tied to the light it was fitted under; a picture to be relit
@@ -151,7 +195,8 @@ class MeshRadiance:
     light: Any
     accuracy: Accuracy
     diffuse: Diffuse
-    coefficients: list[Any]  # mi.Color3f of all surfels
+    harmonics: Any  # mi.Float (3 C N): the radiance channel by rows; empty unless diffuse="sh"
+    count: int  # C
 
     @staticmethod
     def of(
@@ -160,33 +205,52 @@ class MeshRadiance:
         """With the present values of everything, evaluated."""
         surface = occluder.surface(surfels)
         coefficients = surfels.radiance_sh() if diffuse == "sh" else []
-        dr.eval(surface.rows, coefficients)
-        return MeshRadiance(occluder, surface, light, accuracy, diffuse, coefficients)
+        # In rows: the adjoint of a hit's gather is then a table of its own. Columns themselves, whose adjoint
+        # writes packets, must not be written to in the same kernel.
+        harmonics = dr.ravel(mi.ArrayXf([x for c in coefficients for x in c])) if coefficients else mi.Float()
+        dr.eval(surface.rows, harmonics)
+        return MeshRadiance(occluder, surface, light, accuracy, diffuse, harmonics, len(coefficients))
 
-    def trace(self, point: Any, direction: Any, normal: Any, active: Any) -> MeshHit:
-        """What rays of `Occluder.visible` hit first."""
+    def light_from(self, normal: Any, view: Any, roughness: Any) -> Any:
+        """Radiance (mi.Color3f) of the light as `shade` looks it up at points of unit normals and views."""
+        return self.light.specular(lookup_direction(normal, view, roughness, self.accuracy), roughness)
+
+    def trace(self, point: Any, direction: Any, normal: Any, active: Any, bounces: int) -> MeshHit:
+        """What rays of `Occluder.visible` hit first, and what their mirror rays hit, `bounces` ≥ 1 times."""
         with dr.suspend_grad():
             hit = self.occluder.closest(point, direction, normal, active)
             outward = self._facing(self.surface.at(hit.triangle, hit.place, hit.valid), direction)
             mirror = reflect(view=-direction, normal=outward)
-            free = self.occluder.visible(hit.point, mirror, outward, hit.valid)
-            return MeshHit(hit.valid, hit.triangle, hit.place, free)
+            if bounces == 1:
+                free = self.occluder.visible(hit.point, mirror, outward, hit.valid)
+                return MeshHit(hit.valid, hit.triangle, hit.place, free)
+            further = self.trace(hit.point, mirror, outward, hit.valid, bounces - 1)
+            free = dr.select(further.valid, mi.Float(0), mi.Float(1))
+            return MeshHit(hit.valid, hit.triangle, hit.place, free, further)
 
     def radiance(self, hit: MeshHit, direction: Any) -> Any:
         """Radiance (mi.Color3f) that leaves the hits against the rays, under AD."""
         sample = self.surface.at(hit.triangle, hit.place, hit.valid)
+        normal = self._facing(sample, direction)
         own = None
-        if self.coefficients:
-            gathered = [dr.gather(mi.Color3f, c, sample.surfel, hit.valid) for c in self.coefficients]
-            own = clamp_positive(eval_sh(gathered, direction) + 0.5)
+        if self.count:
+            row = sample.surfel * self.count
+            coefficients = [
+                dr.gather(mi.Color3f, self.harmonics, row + i, hit.valid) for i in range(self.count)
+            ]
+            own = clamp_positive(eval_sh(coefficients, direction) + 0.5)
+        indirect = None
+        if hit.next is not None:
+            indirect = self.radiance(hit.next, reflect(view=-direction, normal=normal))
         points = ShadingPoints(
-            normal=self._facing(sample, direction),
+            normal=normal,
             view=-direction,
             albedo=sample.albedo,
             metallic=sample.metallic,
             roughness=sample.roughness,
             radiance=own,
             visibility=hit.visibility,
+            indirect=indirect,
         )
         return shade(points, self.light, self.diffuse, self.accuracy).total()
 

@@ -40,15 +40,17 @@ class Accuracy:
     dominant: bool = False  # look light up along the lobe's dominant direction, not the mirror direction
     multiscatter: bool = False  # add the light that leaves after several bounces between facets
     visibility_rays: int = 1  # rays of the GGX lobe that the visibility is averaged over; 1: the mirror ray
-    traced_indirect: bool = False  # shade what blocked rays hit, in place of the indirect channel
+    traced_bounces: int = 0  # times that what a blocked ray hits is shaded, in place of the indirect channel
 
     def __post_init__(self) -> None:
-        for name in ("dominant", "multiscatter", "traced_indirect"):
+        for name in ("dominant", "multiscatter"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"accuracy: {name}: {getattr(self, name)!r} is neither True nor False")
-        rays: Any = self.visibility_rays
-        if isinstance(rays, bool) or not isinstance(rays, int) or rays < 1:
-            raise InputError(f"accuracy: visibility_rays: {rays!r} is no number of rays; use 1, 2, 3, …")
+        for name, what, least in (("visibility_rays", "rays", 1), ("traced_bounces", "bounces", 0)):
+            number: Any = getattr(self, name)
+            if isinstance(number, bool) or not isinstance(number, int) or number < least:
+                some = ", ".join(str(least + i) for i in range(3))
+                raise InputError(f"accuracy: {name}: {number!r} is no number of {what}; use {some}, …")
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,14 @@ def dominant_direction(normal: mi.Vector3f, mirror: mi.Vector3f, roughness: mi.F
     return safe_normalize(dr.lerp(normal, mirror, mirrored))
 
 
+def lookup_direction(
+    normal: mi.Vector3f, view: mi.Vector3f, roughness: mi.Float, accuracy: Accuracy
+) -> mi.Vector3f:
+    """Where the prefiltered light is looked up: mirror direction, or the dominant one. Unit vectors in."""
+    mirror = reflect(view, normal)
+    return dominant_direction(normal, mirror, roughness) if accuracy.dominant else mirror
+
+
 def multiple_scattering(f0: mi.Color3f, single: mi.Color3f, energy: mi.Float) -> mi.Color3f:
     """What light that bounced more than once between facets adds to the reflectance under diffuse light.
 
@@ -148,9 +158,7 @@ def shade(
     f0 = base_reflectance(points)
     scale, bias = split_sum(dr.dot(normal, view), points.roughness)
     reflectance = dr.fma(f0, scale, bias)
-    direction = reflect(view, normal)
-    if accuracy.dominant:
-        direction = dominant_direction(normal, direction, points.roughness)
+    direction = lookup_direction(normal, view, points.roughness, accuracy)
     specular = light.specular(direction, points.roughness) * reflectance
     if accuracy.multiscatter:
         further = multiple_scattering(f0, reflectance, scale + bias)

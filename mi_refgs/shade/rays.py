@@ -1,4 +1,4 @@
-"""Rays of the GGX lobe: visible normals at points that every pixel shifts by a hash of its own index.
+"""Rays of the GGX lobe: visible normals at points that every pixel turns by a hash of its own index.
 
 The points repeat from render to render, differ between neighbouring pixels, and are spread evenly for any
 number of rays: a spiral of the golden ratio. Everything here is detached.
@@ -24,18 +24,20 @@ HORIZON = 1e-6
 """Smallest n·l of a ray: what goes below leaves no light, and 1/(n·l)² fits float32."""
 
 
-def lobe_points(index: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-    """The two shifts (32-bit fractions) of the points of pixels `index`: a hash and nothing else."""
-    first, second = mi.sample_tea_32(index, dr.zeros(mi.UInt32, dr.width(index)))
-    return first, second
+def lobe_turn(index: mi.UInt32) -> mi.UInt32:
+    """By how much pixels `index` turn their points, as a 32-bit fraction: a hash and nothing else."""
+    return mi.UInt32(mi.sample_tea_32(index, dr.zeros(mi.UInt32, dr.width(index)))[0])
 
 
-def lobe_point(shift: tuple[Any, Any], ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Point `ray` of `count` in the unit square, shifted around it; below 1 in either coordinate."""
-    first, second = (mi.UInt32(x) for x in shift)
-    turn = mi.Float((ray * GOLDEN + second) >> 8) * 2.0**-24
-    along = (mi.Float(ray) + mi.Float(first >> 8) * 2.0**-24) / mi.Float(count)
-    return dr.minimum(along, 1 - 2.0**-24), turn
+def lobe_point(turn: mi.UInt32, ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    """Point `ray` of `count` in the unit square, turned along its second coordinate; below 1 in either.
+
+    The first coordinates are the middles of `count` equal steps, not jittered: a lobe has a long tail, and of
+    few rays one that falls far out there, where another lamp is seen, spoils its pixel. (In the concave
+    scenes of `benchmarks.visibility`, roughness 0.1, relMSE of 4 rays is 1.3 to 8 times larger with jitter.)
+    """
+    turned = mi.Float((ray * GOLDEN + turn) >> 8) * 2.0**-24
+    return (mi.Float(ray) + 0.5) / mi.Float(count), turned
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Lobe:
     view: Any  # mi.Vector3f, local, unit, above the horizon
     α: Any
     f0: Any  # mean of the channels
-    shift: tuple[Any, Any]  # of the points, see `lobe_points`
+    turn: Any  # of the points, see `lobe_turn`
 
     @staticmethod
     def of(normal: mi.Vector3f, view: mi.Vector3f, roughness: mi.Float, f0: mi.Color3f) -> Lobe:
@@ -59,7 +61,7 @@ class Lobe:
             safe_normalize(local),
             dr.square(dr.clip(roughness, 0, 1)),
             dr.clip((f0.x + f0.y + f0.z) * (1 / 3), 0, 1),
-            lobe_points(dr.arange(mi.UInt32, dr.width(normal))),
+            lobe_turn(dr.arange(mi.UInt32, dr.width(normal))),
         )
 
     def sample(self, ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
@@ -68,11 +70,11 @@ class Lobe:
         Visible normals by a cap of the sphere. [Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with
         Spherical Caps"; weight F G / G₁: Heitz 2018, "Sampling the GGX Distribution of Visible Normals"]
         """
-        along, turn = lobe_point(self.shift, ray, count)
+        along, around = lobe_point(self.turn, ray, count)
         stretched = dr.normalize(mi.Vector3f(self.α * self.view.x, self.α * self.view.y, self.view.z))
         z = dr.fma(1 - along, 1 + stretched.z, -stretched.z)
         ring = dr.sqrt(dr.maximum(1 - z * z, 0))
-        sin, cos = dr.sincos(dr.two_pi * turn)
+        sin, cos = dr.sincos(dr.two_pi * around)
         cap = mi.Vector3f(ring * cos, ring * sin, z) + stretched
         half = safe_normalize(mi.Vector3f(self.α * cap.x, self.α * cap.y, dr.maximum(cap.z, HORIZON)))
         v_h = dr.clip(dr.dot(self.view, half), 0, 1)
