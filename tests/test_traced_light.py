@@ -387,7 +387,8 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
         light = EnvironmentLight(changed.pop("light")).prefilter()
         return seen(points, place, accuracy, Surfels(changed), light, diffuse, occluder, LOW_EYE).indirect
 
-    kept, held_back = [], reflection._held_back
+    kept: list[Any] = []
+    held_back = reflection._held_back
 
     def keep(*arguments: Any) -> Any:
         if not kept:

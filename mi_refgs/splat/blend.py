@@ -136,12 +136,6 @@ class _Lanes:
         return [[dr.gather(mi.Float, x, raster, inside) for x in images] for _, raster, inside in self.each()]
 
 
-def _surfel(op: _Blend, pair: Any, active: list[Any]) -> tuple[Any, Any]:
-    """The surfel of a pair, and whether any pixel of the lane still looks at it."""
-    goes_on = _any(active)
-    return dr.gather(mi.UInt32, op.lists.surfel_from_pair, pair, goes_on), goes_on
-
-
 def _any(flags: list[Any]) -> Any:
     return reduce(operator.or_, flags)
 
@@ -161,15 +155,36 @@ def _values(op: _Blend, row: Any, z: Any) -> list[Any]:
     return [*row[GEOMETRY_COLUMNS:][: op.features], z, mi.Float(1)]
 
 
-def _blend_primal(op: _Blend) -> list[Any]:
-    lanes = _Lanes.of(op)
-    maps = op.features + 2
+def _walk(op: _Blend, lanes: _Lanes, step: Any, start: list[tuple[Any, ...]], label: str) -> list[Any]:
+    """Take every surfel of its tile's list to each lane, until the lane's last pixel has ended.
+
+    `start` is the state of each block, first whether its pixel goes on; `step` maps a surfel, whether the
+    lane goes on, and the blocks' states (a list a quantity) to states in the form of `start`. Returns the
+    last states, a list a quantity.
+    """
 
     def condition(pair: Any, active: Any, *state: Any) -> Any:
         return _any(active) & (pair < lanes.end)
 
     def body(pair: Any, active: Any, *state: Any) -> Any:
-        surfel, some = _surfel(op, pair, active)
+        goes_on = _any(active)
+        surfel = dr.gather(mi.UInt32, op.lists.surfel_from_pair, pair, goes_on)
+        return pair + 1, *_transposed(step(surfel, goes_on, active, *state))
+
+    _, *state = dr.while_loop((lanes.begin, *_transposed(start)), condition, body, label=label)
+    return state
+
+
+def _transposed(rows: list[tuple[Any, ...]]) -> tuple[list[Any], ...]:
+    """One tuple a block to one list a quantity."""
+    return tuple(list(column) for column in zip(*rows, strict=True))
+
+
+def _blend_primal(op: _Blend) -> list[Any]:
+    lanes = _Lanes.of(op)
+    maps = op.features + 2
+
+    def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
         row = op.rows.fetch(surfel, some)
         after = []
         for pixel, _, _, active_here, transmittance, median, out in lanes.each(active, *state):
@@ -179,16 +194,11 @@ def _blend_primal(op: _Blend) -> list[Any]:
             values = _values(op, row, sample.z)
             out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
             after.append((goes_on, transmittance_after, dr.select(in_front, sample.z, median), out))
-        return pair + 1, *_transposed(after)
+        return after
 
     start = [(mi.Bool(inside), mi.Float(1), mi.Float(0), [mi.Float(0)] * maps) for inside in lanes.inside]
-    *_, median, out = dr.while_loop((lanes.begin, *_transposed(start)), condition, body, label="blend")
+    *_, median, out = _walk(op, lanes, step, start, "blend")
     return lanes.to_raster(op, [[*totals, last] for totals, last in zip(out, median, strict=True)])
-
-
-def _transposed(rows: list[tuple[Any, ...]]) -> tuple[list[Any], ...]:
-    """One tuple a block to one list a quantity."""
-    return tuple(list(column) for column in zip(*rows, strict=True))
 
 
 def _blend_backward(op: _Blend, δout: list[Any]) -> Rows:
@@ -200,11 +210,7 @@ def _blend_backward(op: _Blend, δout: list[Any]) -> Rows:
     ]
     δrows = Rows.zeros(op.rows.count, op.rows.width)
 
-    def condition(pair: Any, active: Any, *state: Any) -> Any:
-        return _any(active) & (pair < lanes.end)
-
-    def body(pair: Any, active: Any, *state: Any) -> Any:
-        surfel, some = _surfel(op, pair, active)
+    def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
         row = op.rows.fetch(surfel, some)
         after, weights = [], []
         geometry = FootprintAdjoint()
@@ -226,12 +232,12 @@ def _blend_backward(op: _Blend, δout: list[Any]) -> Rows:
                 δfeature = dr.fma(weight, δhere[k], δfeature)
             δrow.append(δfeature)
         δrows.add(surfel, δrow, _any([weight > 0 for weight in weights]))
-        return pair + 1, *_transposed(after)
+        return after
 
     start = [
         (mi.Bool(inside), mi.Float(1), total) for inside, total in zip(lanes.inside, behind, strict=True)
     ]
-    dr.while_loop((lanes.begin, *_transposed(start)), condition, body, label="blend_backward")
+    _walk(op, lanes, step, start, "blend_backward")
     dr.eval(δrows.data)
     return δrows
 
@@ -240,11 +246,7 @@ def _blend_forward(op: _Blend, drows: Rows) -> list[Any]:
     lanes = _Lanes.of(op)
     maps = op.features + 2
 
-    def condition(pair: Any, active: Any, *state: Any) -> Any:
-        return _any(active) & (pair < lanes.end)
-
-    def body(pair: Any, active: Any, *state: Any) -> Any:
-        surfel, some = _surfel(op, pair, active)
+    def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
         row, drow = op.rows.fetch(surfel, some), drows.fetch(surfel, some)
         after = []
         for pixel, _, _, active_here, transmittance, dtransmittance, dout in lanes.each(active, *state):
@@ -260,8 +262,8 @@ def _blend_forward(op: _Blend, drows: Rows) -> list[Any]:
             ]
             dafter = dtransmittance * (1 - sample.alpha) - transmittance * dalpha
             after.append((goes_on, transmittance_after, dr.select(hit, dafter, dtransmittance), dout))
-        return pair + 1, *_transposed(after)
+        return after
 
     start = [(mi.Bool(inside), mi.Float(1), mi.Float(0), [mi.Float(0)] * maps) for inside in lanes.inside]
-    *_, dout = dr.while_loop((lanes.begin, *_transposed(start)), condition, body, label="blend_forward")
+    *_, dout = _walk(op, lanes, step, start, "blend_forward")
     return lanes.to_raster(op, dout)
