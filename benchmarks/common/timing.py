@@ -21,17 +21,18 @@ def milliseconds(calls: Mapping[Key, Callable[[], Any]], seconds: float, most: i
     times stay true. Rounds go on until `seconds` have passed for each call, at least five and at most `most`.
     """
     for call in calls.values():
-        _once(call)
+        once(call)
     times: dict[Key, list[float]] = {key: [] for key in calls}
     begin, rounds = time.perf_counter(), 0
     while rounds < MIN_ROUNDS or (rounds < most and time.perf_counter() - begin < seconds * len(calls)):
         for key, call in calls.items():
-            times[key].append(_once(call))
+            times[key].append(once(call))
         rounds += 1
     return {key: 1e3 * float(np.median(found)) for key, found in times.items()}
 
 
-def _once(call: Callable[[], Any]) -> float:
+def once(call: Callable[[], Any]) -> float:
+    """Seconds of one call, its result evaluated and waited for."""
     dr.sync_thread()
     begin = time.perf_counter()
     dr.eval(call())

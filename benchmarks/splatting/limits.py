@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from benchmarks.splatting.turns import once
+from benchmarks.common.timing import once
 from mi_refgs.fit.counts import Counts
 from mi_refgs.splat.footprint import GEOMETRY_COLUMNS
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import drjit as dr
 import numpy as np
+
+from benchmarks.common.timing import once
 
 
 def turns(calls: Mapping[str, tuple[Callable[[], Any], int]], seconds: float) -> dict[str, float]:
@@ -26,12 +26,3 @@ def turns(calls: Mapping[str, tuple[Callable[[], Any], int]], seconds: float) ->
             if i < number and (i < 3 or number < most or spent < seconds):
                 times[name].append(once(call))
     return {name: 1e3 * float(np.median(found)) for name, found in times.items()}
-
-
-def once(call: Callable[[], Any]) -> float:
-    """Seconds of one call, its result evaluated and waited for."""
-    dr.sync_thread()
-    begin = time.perf_counter()
-    dr.eval(call())
-    dr.sync_thread()
-    return time.perf_counter() - begin
