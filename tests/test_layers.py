@@ -13,7 +13,7 @@ from helpers import ROOT, imported_packages
 
 PACKAGE = "mi_refgs"
 
-BOTTOM = {"constants", "errors", "files", "images"}
+BOTTOM = {"constants", "device", "errors", "files", "images"}
 """What everything may stand on."""
 
 LAYERS: dict[str, set[str]] = {
@@ -24,6 +24,7 @@ LAYERS: dict[str, set[str]] = {
     "files": {"errors"},
     "images": {"files", "errors"},
     "rows": set(),
+    "device": set(),
     "surfels": {"rows"} | BOTTOM,
     "splat": {"surfels", "rows"} | BOTTOM,
     "shade": {"splat.camera", "surfels"} | BOTTOM,

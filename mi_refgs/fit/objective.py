@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.device import upload
 from mi_refgs.fit import losses
 from mi_refgs.fit.config import LossWeights
 from mi_refgs.fit.data import Dataset, View
@@ -29,10 +30,10 @@ class Target:
     @staticmethod
     def of(view: View) -> Target:
         """Upload a view."""
-        planes = [mi.Float(np.ascontiguousarray(view.image[..., i].ravel())) for i in range(3)]
+        planes = [upload(view.image[..., i]) for i in range(3)]
         image = [losses.linear_to_srgb(plane) for plane in planes] if view.linear else planes
         clipped = None if view.linear else losses.saturated(image)
-        alpha = None if view.alpha is None else mi.Float(np.ascontiguousarray(view.alpha.ravel()))
+        alpha = None if view.alpha is None else upload(view.alpha)
         target = Target(view.camera(), image, clipped, alpha)
         dr.eval(target.image, target.clipped, target.alpha)
         return target

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.surfels.table import gather_rows
 
@@ -180,7 +181,7 @@ class Adam:
                     raise InputError(
                         f"checkpoint: {name}/{part}: found {found}, expected {size}; resume its own run"
                     )
-                moments[name] = mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel())
+                moments[name] = upload(values)
             self._steps[name] = int(state[f"{name}/steps"])
             factor = float(state[f"{name}/factor"])
             self.factors.pop(name, None)

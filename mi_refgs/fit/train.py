@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.device import upload
 from mi_refgs.fit import refine
 from mi_refgs.fit.config import Method, Stage
 from mi_refgs.fit.data import Dataset
@@ -269,7 +270,7 @@ class Trainer:
     def _restore(self, state: dict[str, np.ndarray]) -> None:
         self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
         self.params |= {
-            key.removeprefix("params/"): mi.TensorXf(value)
+            key.removeprefix("params/"): mi.TensorXf(upload(value), shape=value.shape)
             for key, value in state.items()
             if key.startswith("params/")
         }
@@ -281,8 +282,8 @@ class Trainer:
                 if key.startswith("optimiser/")
             }
         )
-        self.gradient_sum = mi.Float(state["gradient_sum"])
-        self.gradient_count = mi.Float(state["gradient_count"])
+        self.gradient_sum = upload(state["gradient_sum"])
+        self.gradient_count = upload(state["gradient_count"])
         self.held_until = int(state["held_until"])
         if "mesh/faces" in state:
             self.occluder.update(

@@ -15,6 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.device import upload
+
 BLOCK = 4
 """Output rows per lane of `mix_rows`: a gathered coefficient then serves four rows."""
 
@@ -57,7 +59,7 @@ class Mixing:
 
 
 def _device(*columns: np.ndarray) -> tuple[Any, ...]:
-    return tuple(mi.UInt32(np.ascontiguousarray(column, dtype=np.uint32)) for column in columns)
+    return tuple(upload(column, mi.UInt32) for column in columns)
 
 
 def row_limits(weights: list[np.ndarray]) -> np.ndarray:
@@ -99,7 +101,7 @@ def make_rows(firsts: list[int], limits: list[np.ndarray]) -> Rows:
         slots=_device(*np.concatenate(slots, 1)),
         exists=tuple(mi.Bool(row) for row in np.concatenate(exists, 1)),
         synthesis=_device(*np.concatenate(synthesis, 1)),
-        twiddles=mi.Float(np.concatenate(twiddles).astype(np.float32)),
+        twiddles=upload(np.concatenate(twiddles)),
     )
 
 
@@ -125,7 +127,7 @@ def make_mixing(blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarra
     lanes = np.argsort(begin - end, kind="stable")
     begin, end = begin[lanes], end[lanes]
     first, last, place, stride, origin = _device(begin, end, slot[begin], step[begin], source)
-    entries = mi.Float(weight.astype(np.float32).ravel())
+    entries = upload(weight)
     return Mixing(outputs, first, last, place, stride, origin, entries)
 
 

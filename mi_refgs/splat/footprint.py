@@ -154,24 +154,28 @@ def overlaps(row: list[Any], low: Any, high: Any) -> Any:
     """
     a_x, a_y, b_x, b_y, c_x, c_y, k, x, y, opacity = row[:GEOMETRY_COLUMNS]
     r2 = _reach(opacity) * 1.0005 + 1e-4  # rounding of q
+    low, high = mi.Vector2f(low.x - x, low.y - y), mi.Vector2f(high.x - x, high.y - y)
+    # Of thin ellipses the matrix of q keeps no digit of its determinant: that of a sum of squares of linear
+    # forms is the sum of squares of their cross products, and q itself is best left in squares.
+    a_b, a_c, b_c = a_x * b_y - a_y * b_x, a_x * c_y - a_y * c_x, b_x * c_y - b_y * c_x
+    determinant = dr.square(a_b) - r2 * dr.fma(a_c, a_c, b_c * b_c)
     xx = dr.fma(a_x, a_x, b_x * b_x) - r2 * c_x * c_x
     xy = dr.fma(a_x, a_y, b_x * b_y) - r2 * c_x * c_y
     yy = dr.fma(a_y, a_y, b_y * b_y) - r2 * c_y * c_y
+    ellipse = (determinant > 0) & (xx > 0) & (yy > 0)  # else the contour reaches behind the camera
     along_x, along_y = -r2 * k * c_x, -r2 * k * c_y
-    determinant = dr.fma(xx, yy, -xy * xy)
-    ellipse = (determinant > 0) & (xx > 0)  # else the contour reaches behind the camera
-    scale = dr.rcp(dr.select(ellipse, determinant, 1))
-    low, high = mi.Vector2f(low.x - x, low.y - y), mi.Vector2f(high.x - x, high.y - y)
-    near_x = dr.clip((xy * along_y - yy * along_x) * scale, low.x, high.x)
-    near_y = dr.clip((xy * along_x - xx * along_y) * scale, low.y, high.y)
+    scale = r2 * k / dr.select(ellipse, determinant, 1)
+    near_x = dr.clip(-scale * dr.fma(a_c, a_y, b_c * b_y), low.x, high.x)
+    near_y = dr.clip(scale * dr.fma(a_c, a_x, b_c * b_x), low.y, high.y)
     on_x = dr.clip(-dr.fma(xy, near_x, along_y) / dr.select(ellipse, yy, 1), low.y, high.y)
     on_y = dr.clip(-dr.fma(xy, near_y, along_x) / dr.select(ellipse, xx, 1), low.x, high.x)
 
-    def q(x: Any, y: Any) -> Any:
-        squares = dr.fma(xx * x, x, dr.fma(2 * xy * x, y, yy * y * y))
-        return squares + 2 * dr.fma(along_x, x, along_y * y) - r2 * k * k
+    def inside(x: Any, y: Any) -> Any:
+        delta = mi.Vector2f(x, y)
+        u, v = _linear(a_x, a_y, delta), _linear(b_x, b_y, delta)
+        return dr.fma(u, u, v * v) <= r2 * dr.square(k + _linear(c_x, c_y, delta))
 
-    by_plane = dr.minimum(q(near_x, on_x), q(on_y, near_y)) <= 0
+    by_plane = inside(near_x, on_x) | inside(on_y, near_y)
     beside_x, beside_y = dr.clip(0, low.x, high.x), dr.clip(0, low.y, high.y)
     by_screen = LOW_PASS_INV_VARIANCE * dr.fma(beside_x, beside_x, beside_y * beside_y) <= r2
     return ~ellipse | by_plane | by_screen

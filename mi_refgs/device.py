@@ -1,0 +1,26 @@
+"""NumPy arrays to the device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+def upload(values: np.ndarray, kind: Any = None) -> Any:
+    """A flat mi.Float (or another `kind` of array) with the values, in memory that Dr.Jit has allocated.
+
+    `mi.Float(values)` wraps NumPy's memory on the CPU, and that may be aligned to packets or not: each array
+    then has two kernels, and which one a training step needs, and compiles, changes from view to view.
+    """
+    kind = mi.Float if kind is None else kind
+    dtype = np.uint32 if kind is mi.UInt32 else np.float32
+    wrapped = kind(np.ascontiguousarray(values, dtype=dtype).ravel())
+    own = dr.empty(kind, dr.width(wrapped))
+    if dr.width(wrapped):
+        dr.scatter(own, wrapped, dr.arange(mi.UInt32, dr.width(wrapped)))
+        dr.eval(own)
+        dr.sync_thread()  # the kernel reads NumPy's memory, which may go with the caller's last reference
+    return own
