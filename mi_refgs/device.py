@@ -24,3 +24,8 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
         dr.eval(own)
         dr.sync_thread()  # the kernel reads NumPy's memory, which may go with the caller's last reference
     return own
+
+
+def upload_tensor(values: np.ndarray) -> Any:
+    """The same as an mi.TensorXf of their shape."""
+    return mi.TensorXf(upload(values), shape=values.shape)

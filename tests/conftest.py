@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Iterator
+from pathlib import Path
 
 import mi_refgs  # noqa: F401  (first: it chooses the libLLVM that Dr.Jit loads)
 
@@ -12,7 +13,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from tiny_scene import train_command, write_data, write_method
 
+from mi_refgs.cli import main
 from mi_refgs.images import MITSUBA_EXR_THREADS
 
 THREADS = max(dr.thread_count(), MITSUBA_EXR_THREADS)
@@ -59,3 +62,23 @@ def one_thread() -> Iterator[None]:
     yield
     dr.sync_thread()
     dr.set_thread_count(THREADS)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny data set."""
+    return write_data(tmp_path_factory.mktemp("data") / "ball")
+
+
+@pytest.fixture(scope="module")
+def method(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny method."""
+    return write_method(tmp_path_factory.mktemp("method"))
+
+
+@pytest.fixture(scope="module")
+def finished(data: Path, method: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of the two; do not change it."""
+    run = tmp_path_factory.mktemp("runs") / "run"
+    assert main(train_command(data, run, method)) == 0
+    return run

@@ -6,6 +6,7 @@ import ast
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -55,3 +56,25 @@ def imported_packages(source: str) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and not node.level:
             found.add((node.module or "").partition(".")[0])
     return found
+
+
+def check_slopes(
+    name: str, gradient: np.ndarray, values: Any, value: Callable[[str, int, Any], float], rng: Any
+) -> None:
+    """Gradients (N, …) of an input against one-sided differences of `value(name, point, x)` at random steps.
+
+    Where the two sides disagree, a kink is near and the point is left out: at most a fifth of them.
+    """
+    ε, checked = 1e-6, 0
+    for k, slopes in enumerate(gradient):
+        x = values[k]
+        step = rng.normal(size=np.shape(x))
+        middle = value(name, k, x)
+        left = (middle - value(name, k, x - ε * step)) / ε
+        right = (value(name, k, x + ε * step) - middle) / ε
+        if abs(left - right) > 1e-2 * (1 + abs(left)):
+            continue
+        checked += 1
+        slope = float(np.sum(slopes * step))
+        assert abs(slope - 0.5 * (left + right)) < 5e-3 * (1 + abs(slope)), f"{name} of point {k}"
+    assert checked > 0.8 * len(gradient), name

@@ -12,7 +12,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from tiny_scene import SETTINGS, SIZE, write_data, write_method
+from tiny_scene import SIZE, train_command
 
 from mi_refgs.cli import demo, main
 from mi_refgs.fit.config import load_resolved
@@ -23,33 +23,10 @@ COMMANDS = ("doctor", "demo", "dataset", "train", "eval", "render", "export", "p
 ARTEFACTS = ("surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "config.toml", "metrics.jsonl")
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_data(tmp_path_factory.mktemp("data") / "ball")
-
-
-@pytest.fixture(scope="module")
-def method(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_method(tmp_path_factory.mktemp("method"))
-
-
-@pytest.fixture(scope="module")
-def finished(data: Path, method: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run; do not change it."""
-    run = tmp_path_factory.mktemp("runs") / "run"
-    assert main(train_command(data, run, method)) == 0
-    return run
-
-
 @pytest.fixture
 def run(finished: Path, tmp_path: Path) -> Path:
     """A copy of the finished run, to be spoilt."""
     return Path(shutil.copytree(finished, tmp_path / "run"))
-
-
-def train_command(data: Path, run: Path, method: Path, *more: str) -> list[str]:
-    options = ["--variant", str(method), "--preset", "quick", *more]
-    return ["train", str(data), "-o", str(run), *options, "--set", *SETTINGS]
 
 
 # ---------- Help and output ----------

@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
-from tiny_scene import SETTINGS, SIZE, write_data, write_method
+from tiny_scene import SETTINGS, SIZE
 
 from mi_refgs import splat
 from mi_refgs.cli import main
@@ -27,24 +27,6 @@ from mi_refgs.shade import prefilter
 
 PAUSE = 0.25
 """Seconds that a planted sleep takes: far more than any stage of the tiny scene, on a busy machine too."""
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_data(tmp_path_factory.mktemp("data") / "ball")
-
-
-@pytest.fixture(scope="module")
-def method(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_method(tmp_path_factory.mktemp("method"))
-
-
-@pytest.fixture(scope="module")
-def finished(data: Path, method: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = tmp_path_factory.mktemp("runs") / "run"
-    options = ["--variant", str(method), "--preset", "quick", "--set", *SETTINGS]
-    assert main(["train", str(data), "-o", str(run), *options]) == 0
-    return run
 
 
 @pytest.fixture

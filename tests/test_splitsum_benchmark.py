@@ -17,8 +17,8 @@ from benchmark_runs import read_result, run_benchmark, small_instance
 
 from benchmarks.common import budget, errors, lights, page_budget, view
 from benchmarks.common import montecarlo as mc
+from benchmarks.common.select import where
 from benchmarks.splitsum import decompose, methods, speedup, surfels
-from benchmarks.splitsum.select import where
 from mi_refgs.errors import InputError
 from mi_refgs.reference.shade import lobe_average, split_sum
 from mi_refgs.shade import lobe

@@ -17,9 +17,9 @@ from scipy.spatial import cKDTree
 
 from benchmarks.common.errors import compare
 from benchmarks.common.montecarlo import estimate
+from benchmarks.common.select import where
 from benchmarks.visibility import payoff, scenes
 from benchmarks.visibility.__main__ import main
-from benchmarks.visibility.payoff import where
 from benchmarks.visibility.rules import Rule
 from benchmarks.visibility.settings import SMALL
 from benchmarks.visibility.stage import Stage

@@ -46,6 +46,12 @@ def write_method(folder: Path) -> Path:
     return path
 
 
+def train_command(data: Path, run: Path, method: Path, *more: str) -> list[str]:
+    """Arguments of `refgs train` for the two."""
+    options = ["--variant", str(method), "--preset", "quick", *more]
+    return ["train", str(data), "-o", str(run), *options, "--set", *SETTINGS]
+
+
 def write_data(folder: Path, views: int = 3, truth: bool = True) -> Path:
     """Training and two test views of a ball coloured by its normals; `truth`: with normals and a light."""
     for split, count in (("train", views), ("test", 2)):

@@ -33,18 +33,20 @@ def write_reports(
     name: str,
     options: argparse.Namespace,
     measure: Callable[[], dict[str, Any]],
-    page: Callable[[dict[str, Any], Path], str],
+    plot: Callable[[dict[str, Any], Path], Any],
+    page: Callable[[dict[str, Any], Any, Path], str],
 ) -> int:
     """Measure, or read `options.json`; write JSON, CSV (of "rows") and page. The exit code: 2 for bad input.
 
-    `page` gets the result and the folder in which it may write its pictures, and returns Markdown.
+    `plot` writes its pictures of the result to a folder; `page` gets the result, what `plot` returned and the
+    page's folder, and returns Markdown.
     """
     folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", ROOT / "runs")
     try:
         result = json.loads(options.json.read_text(encoding="utf-8")) if options.json else measure()
         write_json(data / f"{name}.json", result)
         write_csv(data / f"{name}.csv", result["rows"])
-        write_text(folder / f"{name}.md", page(result, folder))
+        write_text(folder / f"{name}.md", page(result, plot(result, folder / "images"), folder))
     except InputError as error:
         print(error, file=sys.stderr)
         return 2

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 
@@ -45,10 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
         SMALL if options.small else FULL if options.full else PAGE, scenes=tuple(options.scene)
     )
 
-    def write(result: dict[str, Any], folder: Path) -> str:
-        return page(result, plot(result, folder / "images"), folder)
-
-    return write_reports("splatting", options, lambda: measure(settings, options.quiet), write)
+    return write_reports("splatting", options, lambda: measure(settings, options.quiet), plot, page)
 
 
 if __name__ == "__main__":

@@ -11,12 +11,12 @@ import numpy as np
 from benchmarks.common.errors import CLEAR
 from benchmarks.common.lights import SUN_ELEVATION
 from benchmarks.common.report import number, percent, prose, signed, table
+from benchmarks.common.select import Row, where
 from benchmarks.common.view import VIEW_BINS
 from benchmarks.splitsum import select
 from benchmarks.splitsum.page_budget import budget_section
 from benchmarks.splitsum.page_trust import cell, trust_section
 from benchmarks.splitsum.plots import TARGET, least_speed_up, pareto_light
-from benchmarks.splitsum.select import Row, where
 
 ASKED = (0.1, 0.6)
 """Roughness within which the speed-up is asked for."""

@@ -6,8 +6,8 @@ from typing import Any
 
 from benchmarks.common.page_budget import adding_up, budget_table, interactions
 from benchmarks.common.report import percent, prose
+from benchmarks.common.select import Row, where
 from benchmarks.splitsum import decompose, select
-from benchmarks.splitsum.select import Row, where
 
 BUDGET_SHOWN = (0.1, 0.3, 0.8)
 """Roughness of the tables, or the nearest ones measured."""

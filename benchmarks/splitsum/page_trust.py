@@ -8,8 +8,8 @@ import numpy as np
 
 from benchmarks.common.errors import CLEAR
 from benchmarks.common.report import floored, percent, signed, table
+from benchmarks.common.select import Row, where
 from benchmarks.splitsum import select
-from benchmarks.splitsum.select import Row, where
 
 TRUSTED, DOUBTFUL = 0.02, 0.10
 """Typical relative errors (√relMSE) up to which a picture passes for exact, and above which it is wrong."""

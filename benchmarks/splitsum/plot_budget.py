@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks.common import figures
+from benchmarks.common.select import where
 from benchmarks.splitsum import select
-from benchmarks.splitsum.select import where
 
 
 def budget(result: dict[str, Any]) -> Any:

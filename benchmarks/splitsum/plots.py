@@ -9,9 +9,9 @@ import numpy as np
 
 from benchmarks.common import figures, report
 from benchmarks.common.errors import CLEAR
+from benchmarks.common.select import Row, where
 from benchmarks.splitsum import select
 from benchmarks.splitsum.plot_budget import budget
-from benchmarks.splitsum.select import Row, where
 
 TARGET = 50.0
 """Speed-up that is asked for."""

@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 from benchmarks.common.errors import CLEAR
+from benchmarks.common.select import Row, where
 from benchmarks.splitsum.settings import CONVEX
-
-Row = dict[str, Any]
 
 PICTURE_METALLIC = 0.5
 """Plots of speed against error show this metal: half diffuse, half mirror."""
-
-
-def where(rows: Iterable[Row], **values: Any) -> list[Row]:
-    """Rows that have all these values; a tuple or list means any of them."""
-
-    def fits(row: Row) -> bool:
-        return all(row[k] in v if isinstance(v, tuple | list) else row[k] == v for k, v in values.items())
-
-    return [row for row in rows if fits(row)]
 
 
 def worst(rows: list[Row]) -> Row | None:

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 
@@ -37,10 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     settings = replace(SMALL if options.small else PAGE, meshes=tuple(options.mesh))
 
-    def write(result: dict[str, Any], folder: Path) -> str:
-        return page(result, plot(result, folder / "images"), folder)
-
-    return write_reports("visibility", options, lambda: measure(settings, options.quiet), write)
+    return write_reports("visibility", options, lambda: measure(settings, options.quiet), plot, page)
 
 
 if __name__ == "__main__":

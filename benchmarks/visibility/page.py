@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.report import number, prose, signed, table
+from benchmarks.common.select import where
 from benchmarks.visibility.page_budget import budget_section
-from benchmarks.visibility.payoff import BUDGET, PAPER, TARGET, where
+from benchmarks.visibility.payoff import BUDGET, PAPER, TARGET
 from benchmarks.visibility.settings import ALBEDO
 
 WHAT = {"ms": "shading the mesh", "frame_ms": "the product's frame"}

@@ -6,8 +6,8 @@ from typing import Any
 
 from benchmarks.common.page_budget import adding_up, budget_table, interactions, largest
 from benchmarks.common.report import prose
+from benchmarks.common.select import where
 from benchmarks.visibility.harmonics import DEGREE
-from benchmarks.visibility.payoff import where
 
 HARMONICS = f"""With V the visibility of the mirror direction, S the split sum's reflectance and I the
     indirect channel, the paper's picture is V × prefiltered light × S + (1 − V) × I × S (the rule `mirror

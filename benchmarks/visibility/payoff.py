@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-Row = dict[str, Any]
+from benchmarks.common.select import Row, where
 
 PAPER = "mirror ray"
 """The paper's rule: one mirror ray for the whole lobe, and no traced light."""
@@ -14,11 +12,6 @@ TARGET = 4.0
 """How many times smaller its relMSE is asked to be."""
 TIMES = ("ms", "frame_ms")
 """Of visibility and shading on a mesh; of the product's frame of surfels."""
-
-
-def where(rows: list[Row], **values: Any) -> list[Row]:
-    """Rows that have all these values."""
-    return [row for row in rows if all(row[key] == value for key, value in values.items())]
 
 
 def payoffs(rows: list[Row]) -> list[Row]:

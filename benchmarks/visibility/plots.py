@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import figures
-from benchmarks.visibility.payoff import PAPER, where
+from benchmarks.common.select import where
+from benchmarks.visibility.payoff import PAPER
 
 RAYS_ONLY = "#c77b30"
 BOUNCES = ("#9ecae1", "#4292c6", "#08306b", "#6a51a3")

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs.cli.command import Result, add_command, add_settings
-from mi_refgs.cli.train import DEFAULT_METHOD, DEFAULT_PRESET
+from mi_refgs.cli.train import DEFAULT_PRESET, load_method, training_views
 from mi_refgs.errors import InputError
-from mi_refgs.resources import resource_dir
 
 if TYPE_CHECKING:
     from mi_refgs.fit.profile import Profile
@@ -61,7 +60,6 @@ def run(args: argparse.Namespace) -> Result:
 
 def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
     """The trainer of a run or of a fresh fit, and the stages of the schedule to look at."""
-    from mi_refgs.fit import config, data
     from mi_refgs.fit.evaluate import load_split
     from mi_refgs.fit.record import Run
     from mi_refgs.fit.train import Trainer
@@ -80,18 +78,8 @@ def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
         return trainer, [method.stage_at(max(trainer.iteration, 1))[0]]
     if args.data is not None:
         raise InputError(f"--data: {args.path} is no run; drop --data")
-    path = args.variant or str(resource_dir("variants") / DEFAULT_METHOD)
-    method = config.load(path, args.preset or DEFAULT_PRESET, args.set)
-    options = method.data
-    views = data.load(
-        args.path,
-        "train",
-        downscale=options.downscale,
-        background=options.background,
-        images=options.images,
-        truth=False,
-    )
-    return Trainer(method, views), [name for name, _ in method.stages()]
+    method = load_method(args.variant, args.preset, args.set)
+    return Trainer(method, training_views(method, args.path)), [name for name, _ in method.stages()]
 
 
 def _threads() -> int:

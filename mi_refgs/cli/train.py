@@ -13,6 +13,7 @@ from mi_refgs.resources import resource_dir
 
 if TYPE_CHECKING:
     from mi_refgs.fit.config import Method
+    from mi_refgs.fit.data import Dataset
     from mi_refgs.fit.record import Run
     from mi_refgs.fit.train import Trainer
 
@@ -69,6 +70,29 @@ def run(args: argparse.Namespace) -> Result:
     return Result(data, text)
 
 
+def load_method(variant: str | None, preset: str | None, assignments: list[str] | None) -> Method:
+    """The method of the options, or the full one at the preset for everyday use."""
+    from mi_refgs.fit import config
+
+    path = variant or str(resource_dir("variants") / DEFAULT_METHOD)
+    return config.load(path, preset or DEFAULT_PRESET, assignments)
+
+
+def training_views(method: Method, data_path: Path) -> Dataset:
+    """The pictures to fit, as the method asks for them."""
+    from mi_refgs.fit import data
+
+    options = method.data
+    return data.load(
+        data_path,
+        "train",
+        downscale=options.downscale,
+        background=options.background,
+        images=options.images,
+        truth=False,
+    )
+
+
 def fit(
     data_path: Path,
     output: Path,
@@ -81,7 +105,6 @@ def fit(
 
     Raises InputError for bad input, and KeyboardInterrupt with a message that says how to go on.
     """
-    from mi_refgs.fit import config, data
     from mi_refgs.fit.evaluate import load_split, up_to_date
     from mi_refgs.fit.record import Run
     from mi_refgs.fit.train import Trainer
@@ -96,18 +119,8 @@ def fit(
             raise InputError(
                 f"{output}: holds a run already; add --resume to go on with it, or choose another -o"
             )
-        method = config.load(
-            variant or str(resource_dir("variants") / DEFAULT_METHOD), preset or DEFAULT_PRESET, assignments
-        )
-    options = method.data
-    views = data.load(
-        data_path,
-        "train",
-        downscale=options.downscale,
-        background=options.background,
-        images=options.images,
-        truth=False,
-    )
+        method = load_method(variant, preset, assignments)
+    views = training_views(method, data_path)
     warn_of_data(method, views)
     trainer = Trainer(method, views, folder)
     if resumed:

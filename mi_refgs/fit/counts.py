@@ -8,8 +8,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import TILE, TRANSMITTANCE_MIN
+from mi_refgs.constants import TILE
 from mi_refgs.splat import Camera, Footprints, TileLists
+from mi_refgs.splat.blend import advance
 from mi_refgs.splat.footprint import GEOMETRY_COLUMNS, evaluate
 
 TILE_PIXELS = TILE[0] * TILE[1]
@@ -61,12 +62,11 @@ def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
         surfel = dr.gather(mi.UInt32, lists.surfel_from_pair, pair, active)
         row = [dr.gather(mi.Float, column, surfel, active) for column in columns]
         sample = evaluate(row, pixel, camera.near)
-        after = transmittance * (1 - sample.alpha)
-        ends = sample.valid & (after < TRANSMITTANCE_MIN)
-        hit = active & sample.valid & ~ends
+        weight, after, goes_on = advance(sample, active, transmittance)
+        hit = weight > 0
         dr.scatter_add(pixels_of_surfel, mi.UInt32(1), surfel, hit)
         hits = hits + dr.select(hit, mi.UInt32(1), mi.UInt32(0))
-        return pair + 1, active & ~ends, dr.select(hit, after, transmittance), steps + 1, hits
+        return pair + 1, goes_on, after, steps + 1, hits
 
     inside = (x < camera.width) & (y < camera.height)
     state = (begin, inside, mi.Float(1), mi.UInt32(0), mi.UInt32(0))

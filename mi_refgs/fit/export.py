@@ -20,12 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.fit.config import Method
-from mi_refgs.fit.record import Run
+from mi_refgs.fit.record import PARAMS, Run, tensors
 from mi_refgs.fit.schedule import LIGHT
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
@@ -37,7 +36,6 @@ from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
 
 SURFELS, LIGHT_MAP, MESH, SCENE, MODEL = "surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "model.json"
-PARAMS = "params/"
 """Prefix of the surfels' channels and of the light in a checkpoint."""
 
 
@@ -55,11 +53,7 @@ class Fitted:
     @staticmethod
     def from_state(method: Method, state: Mapping[str, np.ndarray]) -> Fitted:
         """From the state of a `Trainer`, as a checkpoint holds it."""
-        params = {
-            key.removeprefix(PARAMS): mi.TensorXf(value)
-            for key, value in state.items()
-            if key.startswith(PARAMS)
-        }
+        params = tensors(state, PARAMS)
         light = params.pop(LIGHT, None)
         mesh = None
         if len(state.get("mesh/faces", ())):

@@ -9,17 +9,31 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
 from mi_refgs.fit.config import Method, dump, load_resolved
 
 CHECKPOINTS_KEPT = 2
 """One could be enough, since a checkpoint appears only when complete; two survive a disk that lies."""
+
+PARAMS = "params/"
+"""What the names of parameters begin with in a checkpoint."""
+
+
+def tensors(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, Any]:
+    """The tensors of a checkpoint whose names begin with a prefix, by the rest of their names."""
+    return {
+        name.removeprefix(prefix): upload_tensor(value)
+        for name, value in state.items()
+        if name.startswith(prefix)
+    }
 
 
 class Run:

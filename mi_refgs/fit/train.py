@@ -23,7 +23,7 @@ from mi_refgs.fit.initial import initial_surfels
 from mi_refgs.fit.interrupt import held_interrupts
 from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.optim import Adam, Group
-from mi_refgs.fit.record import Run
+from mi_refgs.fit.record import PARAMS, Run, tensors
 from mi_refgs.fit.schedule import LIGHT, Schedule
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
@@ -254,7 +254,7 @@ class Trainer:
     def state(self) -> dict[str, np.ndarray]:
         """Everything that a checkpoint holds."""
         mesh = self.occluder.mesh()
-        state = {f"params/{name}": tensor.numpy() for name, tensor in self.params.items()}
+        state = {f"{PARAMS}{name}": tensor.numpy() for name, tensor in self.params.items()}
         state |= {f"optimiser/{name}": value for name, value in self.optimiser.state_dict().items()}
         state |= {"gradient_sum": self.gradient_sum.numpy(), "gradient_count": self.gradient_count.numpy()}
         state |= {"iteration": np.array(self.iteration), "seconds": np.array(self.seconds)}
@@ -269,11 +269,7 @@ class Trainer:
 
     def _restore(self, state: dict[str, np.ndarray]) -> None:
         self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
-        self.params |= {
-            key.removeprefix("params/"): mi.TensorXf(upload(value), shape=value.shape)
-            for key, value in state.items()
-            if key.startswith("params/")
-        }
+        self.params |= tensors(state, PARAMS)
         self.optimiser = Adam(self.params, self._groups())
         self.optimiser.load_state_dict(
             {

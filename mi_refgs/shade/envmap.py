@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import upload
+from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.images import is_exr, read_exr_image, write_exr
 from mi_refgs.shade import lobe
@@ -169,8 +169,7 @@ class EnvironmentLight:
         radiance = np.asarray(radiance, np.float64)
         if not np.isfinite(radiance).all():
             raise InputError("EnvironmentLight: radiance: holds NaN or infinity; replace those texels")
-        raw = inverse_softplus(np.maximum(radiance, RADIANCE_FLOOR))
-        return cls(mi.TensorXf(upload(raw), shape=raw.shape))
+        return cls(upload_tensor(inverse_softplus(np.maximum(radiance, RADIANCE_FLOOR))))
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:

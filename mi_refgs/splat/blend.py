@@ -140,7 +140,7 @@ def _any(flags: list[Any]) -> Any:
     return reduce(operator.or_, flags)
 
 
-def _next(sample: Any, active: Any, transmittance: Any) -> tuple[Any, Any, Any]:
+def advance(sample: Any, active: Any, transmittance: Any) -> tuple[Any, Any, Any]:
     """Does this surfel contribute, with which weight, and does the pixel go on?"""
     hit = active & sample.valid
     after = transmittance * (1 - sample.alpha)
@@ -189,7 +189,7 @@ def _blend_primal(op: _Blend) -> list[Any]:
         after = []
         for pixel, _, _, active_here, transmittance, median, out in lanes.each(active, *state):
             sample = evaluate(row, pixel, op.camera.near)
-            weight, transmittance_after, goes_on = _next(sample, active_here, transmittance)
+            weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
             in_front = (weight > 0) & (transmittance > MEDIAN_TRANSMITTANCE)
             values = _values(op, row, sample.z)
             out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
@@ -216,7 +216,7 @@ def _blend_backward(op: _Blend, δout: list[Any]) -> Rows:
         geometry = FootprintAdjoint()
         for pixel, _, _, active_here, transmittance, behind_here, δhere in lanes.each(active, *state, δ):
             sample = evaluate(row, pixel, op.camera.near)
-            weight, transmittance_after, goes_on = _next(sample, active_here, transmittance)
+            weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
             g = mi.Float(0)
             for adjoint, value in zip(δhere, _values(op, row, sample.z), strict=True):
                 g = dr.fma(adjoint, value, g)
@@ -251,7 +251,7 @@ def _blend_forward(op: _Blend, drows: Rows) -> list[Any]:
         after = []
         for pixel, _, _, active_here, transmittance, dtransmittance, dout in lanes.each(active, *state):
             sample = evaluate(row, pixel, op.camera.near)
-            weight, transmittance_after, goes_on = _next(sample, active_here, transmittance)
+            weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
             hit = weight > 0
             dalpha, dz = evaluate_forward(row, sample, drow)
             dweight = dr.select(hit, dtransmittance * sample.alpha + transmittance * dalpha, 0)

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import upload
+from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.rows import columns_of
 
@@ -84,7 +84,7 @@ class Surfels:
         for name, values in arrays.items():
             table = np.asarray(values, dtype=np.float32)
             table = table[:, None] if table.ndim == 1 else table
-            raw[name] = mi.TensorXf(upload(table), shape=table.shape)
+            raw[name] = upload_tensor(table)
         return Surfels(raw)
 
     def to_numpy(self) -> dict[str, np.ndarray]:
