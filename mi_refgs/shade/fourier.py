@@ -30,7 +30,7 @@ class Rows:
     """Where the rows of some lat-long grids lie in a texel buffer and in a Fourier buffer.
 
     Analysis has one lane per four columns, to fold them, then one per four frequencies; synthesis has one per
-    eight columns that share their cosines.
+    sixteen columns, two times eight that share their cosines.
     """
 
     texels: int
@@ -90,7 +90,7 @@ def make_rows(firsts: list[int], limits: list[np.ndarray]) -> Rows:
         analysis.append(np.stack([first + w * i, 0 * i + w, m, 0 * i + at]))
         slots.append(np.where(there, slot[i] + others, 0))
         exists.append(there)
-        i, q = (a.ravel() for a in np.meshgrid(np.arange(h), np.arange(w // 8), indexing="ij"))
+        i, q = (a.ravel() for a in np.meshgrid(np.arange(h), np.arange(-(-w // 16)), indexing="ij"))
         synthesis.append(np.stack([first + w * i, 0 * i + w, q, 0 * i + at, slot[i], limit[i]]))
         at += 2 * w
     return Rows(
@@ -173,7 +173,7 @@ def _fold(rows: Rows, texels: Any) -> Any:
     half = w // 2
     columns = (j, w - 1 - j, half + j, half - 1 - j)
     colours = list(zip(*(_read(TEXEL, texels, start + column)[:3] for column in columns), strict=True))
-    out = dr.zeros(mi.Float, COEFFICIENT * (rows.texels // 2))
+    out = dr.empty(mi.Float, COEFFICIENT * (rows.texels // 2))
     for parity, sign in enumerate((1, -1)):
         cosines = [a + b + sign * (c + d) for a, b, c, d in colours]
         sines = [a - b + sign * (c - d) for a, b, c, d in colours]
@@ -210,7 +210,7 @@ def analyse(rows: Rows, texels: Any) -> Any:
         ((q, -q, -q, q), (q, q, -q, -q), -1),
         ((q, -q, -q, q), (q, q, -q, -q), 1),
     )
-    out = dr.zeros(mi.Float, COEFFICIENT * rows.coefficients)
+    out = dr.empty(mi.Float, COEFFICIENT * rows.coefficients)
     for (cos_γ, sin_γ, sign), slot, exists in zip(quarters, rows.slots, rows.exists, strict=True):
         cos = [
             sum(cos_γ[r] * by_cos[r][c] - sign * sin_γ[r] * by_sin[r][c] for r in range(4)) for c in range(3)
@@ -226,39 +226,56 @@ def analyse(rows: Rows, texels: Any) -> Any:
 def synthesise(rows: Rows, coefficients: Any, texels: Any) -> None:
     """Write Σ_m (a_m cos mφ_j + b_m sin mφ_j) of every row and column into the RGBA buffer `texels`."""
     start, w, q, at, slot, limit = rows.synthesis
+    columns = (q, q + (w // 8 + 1) // 2)  # one read of a coefficient serves both
 
-    def body(m: Any, turn: Any, *acc: Any) -> tuple[Any, ...]:
-        out = list(acc)
+    def body(m: Any, turns: Any, sums: Any) -> tuple[Any, ...]:
+        sums = [list(of_column) for of_column in sums]
+        turned = [
+            _four_turns(rows, at, turn, 2 * column + 1, w)
+            for turn, column in zip(turns, columns, strict=True)
+        ]
+        for r in range(4):
+            x = _read(COEFFICIENT, coefficients, slot + m + r, m + r < limit)
+            for (angles, _), out in zip(turned, sums, strict=True):
+                _add_frequency(out, r, x, *angles[r])
+        return m + 4, [turn for _, turn in turned], sums
 
-        def add(n: int, a: Any, b: Any) -> None:
-            out[n] = dr.fma(a, b, out[n])
+    def zeros(count: int) -> list[Any]:
+        return [dr.zeros(mi.Float, dr.width(q)) for _ in range(count)]
 
-        angles, turn = _four_turns(rows, at, turn, 2 * q + 1, w)
-        for r, (cos, sin) in enumerate(angles):
-            inside = m + r < limit
-            x = _read(COEFFICIENT, coefficients, slot + m + r, inside)
-            for c in range(3):
-                a, b = x[c], x[3 + c]
-                if r % 2 == 0:
-                    add(3 * r + c, a, cos)
-                    add(3 * r + 3 + c, b, sin)
-                else:
-                    sign = 2 - r
-                    add(12 + c, a, cos)
-                    add(15 + c, b, sin)
-                    add(18 + c, a, sign * sin)
-                    add(21 + c, b, sign * cos)
-        return (m + 4, turn, *out)
+    start_state = (dr.zeros(mi.UInt32, dr.width(q)), [mi.UInt32(0) for _ in columns], [zeros(24), zeros(24)])
+    _, _, sums = dr.while_loop(start_state, lambda m, *_: m < limit, body)
+    for column, of_column in zip(columns, sums, strict=True):
+        _unfold(texels, start, w, column, of_column)
 
-    n = dr.width(q)
-    zeros = [dr.zeros(mi.Float, n) for _ in range(24)]
-    state = dr.while_loop(
-        (dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n), *zeros), lambda m, *_: m < limit, body
-    )
+
+def _add_frequency(sums: list[Any], r: int, x: list[Any], cos: Any, sin: Any) -> None:
+    """Add the coefficients x of a frequency m ≡ r (mod 4) to the 24 sums of a column (see `_unfold`)."""
+
+    def add(n: int, a: Any, b: Any) -> None:
+        sums[n] = dr.fma(a, b, sums[n])
+
+    for c in range(3):
+        a, b = x[c], x[3 + c]
+        if r % 2 == 0:
+            add(3 * r + c, a, cos)
+            add(3 * r + 3 + c, b, sin)
+        else:
+            sign = 2 - r
+            add(12 + c, a, cos)
+            add(15 + c, b, sin)
+            add(18 + c, a, sign * sin)
+            add(21 + c, b, sign * cos)
+
+
+def _unfold(texels: Any, start: Any, w: Any, q: Any, sums: list[Any]) -> None:
+    """Write the eight columns at the azimuths kπ/2 ± φ, φ that of column q.
+
+    m ≡ 2 (mod 4) changes sign, odd m swaps cosine and sine when k is odd.
+    """
     even_cos, even_sin, two_cos, two_sin, odd_cos, odd_sin, cross_sin, cross_cos = (
-        state[2 + 3 * k : 5 + 3 * k] for k in range(8)
+        sums[3 * k : 3 * k + 3] for k in range(8)
     )
-    # The eight azimuths kπ/2 ± φ: m ≡ 2 (mod 4) changes sign, odd m swaps cosine and sine when k is odd.
     for k in range(4):
         for ε in (1, -1):
             column = q + k * (w // 4) if ε > 0 else ((k or 4) * (w // 4)) - 1 - q
@@ -267,7 +284,7 @@ def synthesise(rows: Rows, coefficients: Any, texels: Any) -> None:
                 value = even_cos[c] + ε * even_sin[c] + (-1) ** k * (two_cos[c] + ε * two_sin[c])
                 odd = cross_cos[c] - ε * cross_sin[c] if k % 2 else odd_cos[c] + ε * odd_sin[c]
                 colour.append(value + (odd if k < 2 else -odd))
-            write(texels, colour, start + column)
+            write(texels, colour, start + column, q < w // 8)
 
 
 def mix_rows(matrix: Mixing, coefficients: Any) -> Any:

@@ -22,13 +22,16 @@ LEVEL_ROUGHNESS = (0.1, 0.15, 0.22, 0.32, 0.45, 0.65, 1.0)
 """Roughness of the filtered levels (level 0 is the map itself): α about doubles from one to the next, so that
 a mixture of two neighbours is within 6 % (L1) of the lobe between them. [measured, docs/decisions.md]"""
 
-LEVEL_MAX_HEIGHT = (128, 128, 128, 128, 64, 64, 64)
-"""Rows of each level, at most: a quarter of the lobe's half width or finer, so that bilinear lookups stay
-within 2 %."""
+LEVEL_MAX_HEIGHT = (128, 128, 128, 64, 32, 32, 32)
+"""Rows of each level, at most. Bilinear lookups of a point light are then off by 1.2, 1.1, 1.4, 0.4 and 0.3 %
+(L1) from the third level on; the first two are as fine as the finest map that is filtered. [measured]"""
 
-DROP_BELOW = 5e-6
-"""Matrix entries below this fraction of their level's largest are dropped: 1e-4 of the lobe's peak at the
-worst."""
+DROP_BELOW = 1e-5
+"""Matrix entries below this fraction of their level's largest are dropped: 0.05 % of a lobe (L1), 1e-4 of its
+peak at the worst."""
+
+HORIZON_CUTS = 0.5
+"""Roughness from which a lobe ends at the horizon rather than before it."""
 
 MIN_SUBSAMPLES = 2
 """Quadrature points a texel side where the lobe is wider than a texel."""
@@ -145,7 +148,12 @@ def build_levels(h: int) -> list[Level]:
             offset = column_angles(2 * h) - column_angles(2 * h_in)[0]
             transfer = (first[:, None] * np.cos(m * offset[:, None])).sum(0) * (h_in / h)
             weights = np.einsum("ikm,kn,m->inm", weights, row_resampling(h, h_in), transfer, optimize=True)
-        weights = weights[:, :, : weights.shape[0] + 1]  # a level of w columns holds frequencies up to w/2
+        rows = weights.shape[0]
+        weights = weights[:, :, : rows + 1]  # a level of w columns holds frequencies up to w/2
+        if rows < h_in and roughness > HORIZON_CUTS:
+            # The edge at the horizon has a long series. Cut short, it rings: light would turn negative
+            # opposite a sun. Lanczos' factors fade it out.
+            weights = weights * np.sinc(np.arange(rows + 1) / (rows + 1))
         kept = np.abs(weights) > DROP_BELOW * np.abs(weights).max()
         kept[:, :, 0] = True  # the mean is never thinned: constants stay constant
         levels.append(Level(roughness, weights.shape[0], np.where(kept, weights, 0)))

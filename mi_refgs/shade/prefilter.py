@@ -81,7 +81,7 @@ def operator(height: int) -> Operator:
 
 def apply(op: Operator, radiance: Any) -> Any:
     """Flat RGBA levels, the map first, of flat radiance (3·h·w)."""
-    out = dr.zeros(mi.Float, 4 * op.levels.texels)
+    out = dr.empty(mi.Float, 4 * op.levels.texels)
     texel = dr.arange(mi.UInt32, op.base.texels)
     fourier.write(out, [dr.gather(mi.Float, radiance, 3 * texel + c) for c in range(3)], texel)
     dr.eval(out)
@@ -92,7 +92,7 @@ def apply(op: Operator, radiance: Any) -> Any:
 def apply_transposed(op: Operator, δlevels: Any) -> Any:
     """Adjoint of `apply`: flat δradiance (3·h·w) of flat RGBA δlevels."""
     dr.eval(δlevels)
-    out = dr.zeros(mi.Float, 4 * op.base.texels)
+    out = dr.empty(mi.Float, 4 * op.base.texels)
     fourier.synthesise(op.base, fourier.mix_rows(op.adjoint, fourier.analyse(op.levels, δlevels)), out)
     n = dr.arange(mi.UInt32, 3 * op.base.texels)
     texel = 4 * (n // 3) + n % 3
