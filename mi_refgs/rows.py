@@ -34,10 +34,12 @@ class Rows:
     @staticmethod
     def pack(columns: list[Any]) -> Rows:
         """Rows of columns (mi.Float, width N)."""
-        rows = Rows.zeros(dr.width(columns[0]), len(columns))
+        count, width = dr.width(columns[0]), len(columns)
+        rows = Rows(dr.empty(mi.Float, count * -(-width // PACKET) * PACKET), count, width)
         values = [dr.detach(column) for column in columns]
-        for place, packet in rows._packets(dr.arange(mi.UInt32, rows.count), values):
-            dr.scatter(rows.data, packet, place)
+        for place, packet in rows._packets(dr.arange(mi.UInt32, count), values):
+            # Without the promise of no conflicts every packet would be a kernel of its own.
+            dr.scatter(rows.data, packet, place, mode=dr.ReduceMode.NoConflicts)
         return rows
 
     def columns(self) -> list[Any]:

@@ -84,7 +84,7 @@ def test_mitsuba_renders_the_exported_scene_as_the_trainer_does(run: Run, folder
     frame = Trainer(run.method(), data.load(folder / "ball", "train"), run).view(
         data.load(folder / "ball", "test").views[0].camera()
     )
-    planes = [*frame.radiance(), frame.alpha]
+    planes = [*frame.radiance, frame.alpha]
     expected = np.stack([np.array(plane).reshape(SIZE, SIZE) for plane in planes], axis=-1)
     assert frame.alpha[SIZE * SIZE // 2 + SIZE // 2] > 0.5
     np.testing.assert_allclose(image, expected, atol=1e-5)

@@ -58,9 +58,7 @@ def test_exported_scene_renders_the_same_view(tmp_path: Path) -> None:
     occluder = loaded.integrator().occluder
     light = EnvironmentLight.from_radiance(sky()).prefilter()
     frame = render(surfels, camera, Shading(occlusion=True), light, occluder)
-    expected = np.concatenate([frame.radiance().numpy(), frame.alpha.numpy()[None]]).T.reshape(
-        HEIGHT, WIDTH, 4
-    )
+    expected = np.concatenate([frame.radiance.numpy(), frame.alpha.numpy()[None]]).T.reshape(HEIGHT, WIDTH, 4)
     result = image(loaded)
     assert expected[..., 3].max() > 0.5
     assert np.ptp(loaded.integrator().occluder.mesh().vertices) > 0

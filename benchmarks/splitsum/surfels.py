@@ -67,9 +67,7 @@ def budget(stage: Stage) -> dict[str, Any]:
     surfels = sphere_surfels(settings.surfels)
     camera = Camera.from_sensor(stage.sensor.inner)
     shading = Shading(at="pixel", reflectance="split_sum", diffuse="irradiance")
-    shipped = stage.points.of_image(
-        methods.picture_values(render(surfels, camera, shading, light).radiance())
-    )
+    shipped = stage.points.of_image(methods.picture_values(render(surfels, camera, shading, light).radiance))
 
     group = mi.Float(band(surfels.to_numpy()["position"][:, 1]).astype(np.float32))
     blended = splat(surfels, [*surfels.frame()[2], group], camera)

@@ -151,4 +151,4 @@ class Stage:
         """The product's own frame: the surfels splatted, visibility, shading."""
         camera = Camera.from_sensor(self.timing_sensor.inner)
         shading = Shading(diffuse="irradiance", occlusion=rule.rays > 0, accuracy=rule.accuracy())
-        return lambda: render(self.surfels, camera, shading, self.light, self.occluder).radiance()
+        return lambda: render(self.surfels, camera, shading, self.light, self.occluder).radiance

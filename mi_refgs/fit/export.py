@@ -104,7 +104,7 @@ class Fitted:
 
         def view(camera: Camera) -> Frame:
             with dr.suspend_grad():
-                return render(self.surfels, camera, self.shading, light, occluder, material_maps=True)
+                return render(self.surfels, camera, self.shading, light, occluder, aovs=True)
 
         return view
 

@@ -45,7 +45,7 @@ def displayed(frame: Frame, background: np.ndarray, linear: bool) -> list[Any]:
     Pictures with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it.
     """
     behind = [float(x) for x in background]
-    radiance = list(frame.radiance())
+    radiance = list(frame.radiance)
     if not linear:
         return losses.display_image(radiance, frame.alpha, behind)
     return [

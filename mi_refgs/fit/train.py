@@ -77,7 +77,7 @@ class Trainer:
         _, stage = self.method.stage_at(iteration or max(self.iteration, 1))
         return self._shading(stage)
 
-    def view(self, camera: Camera, material_maps: bool = True) -> Frame:
+    def view(self, camera: Camera, aovs: bool = True) -> Frame:
         """Render a view of the present state, without derivatives."""
         with dr.suspend_grad():
             light = self.light.prefilter() if self.light is not None else None
@@ -88,7 +88,7 @@ class Trainer:
                 light,
                 self.occluder,
                 sh_degree=self.schedule.sh_degree(self.iteration),
-                material_maps=material_maps,
+                aovs=aovs,
             )
 
     # ---------------- the loop ----------------

@@ -15,7 +15,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.plugins import require_supported_variant
 from mi_refgs.plugins.aovs import MATERIALS, aov_values, parse_aovs
 from mi_refgs.plugins.light import TurnedLight, emitter_light
-from mi_refgs.plugins.properties import read_light, read_shading, read_surfels, read_terms
+from mi_refgs.plugins.properties import TERMS, read_light, read_shading, read_surfels, read_terms
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import GEOMETRY, Surfels
@@ -241,12 +241,12 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def _channels(self, scene: Any, camera: Camera, alpha: bool) -> list[Any]:
         """R, G, B, (A), W and the AOVs, as the film's blocks have them."""
         frame = self._frame(scene, camera)
-        rgb = mi.Color3f(0)
-        for name in self.terms:
-            rgb += getattr(frame.terms, name)
+        rgb = frame.radiance
+        if len(self.terms) < len(TERMS):
+            rgb = sum((getattr(frame.terms, name) for name in self.terms), start=mi.Color3f(0))
         coverage = frame.alpha
         if self.background is not None:
-            rgb += (1 - frame.alpha) * self.background
+            rgb = rgb + (1 - frame.alpha) * self.background
             coverage = mi.Float(1)
         channels = [*rgb, *([coverage] if alpha else []), mi.Float(1)]
         for aov in self.aovs:
@@ -257,8 +257,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         light = None
         if self.shading.reflectance == "split_sum":
             light = self._prefiltered(scene)
-        material_maps = any(aov.type in MATERIALS for aov in self.aovs)
-        return render(self.surfels, camera, self.shading, light, self.occluder, material_maps=material_maps)
+        needs_aovs = any(aov.type in (*MATERIALS, *TERMS) for aov in self.aovs)
+        needs_aovs |= len(self.terms) < len(TERMS)
+        return render(self.surfels, camera, self.shading, light, self.occluder, aovs=needs_aovs)
 
     def _prefiltered(self, scene: Any) -> Any:
         if self.light is None:

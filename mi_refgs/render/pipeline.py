@@ -45,19 +45,17 @@ class Shading:
 class Frame:
     """One rendered view: mi arrays of H·W values in raster order.
 
-    Radiance terms are linear and premultiplied by alpha; maps are divided by it and 0 where nothing is seen.
+    Radiance and its terms are linear and premultiplied by alpha; maps are divided by it and 0 where nothing
+    is seen.
     """
 
     alpha: Any  # accumulated opacity
     depth: Any  # expected camera-z depth, 0 where nothing is seen
     median_depth: Any  # detached
     normal: Any  # mi.Vector3f: blended world normal towards the camera, not normalised
-    terms: Terms  # diffuse, specular, indirect
+    radiance: Any  # mi.Color3f, over black
+    terms: Terms | None = None  # diffuse, specular, indirect, whose sum it is, where known apart
     maps: dict[str, Any] = field(default_factory=dict)  # albedo, metallic, roughness, visibility where known
-
-    def radiance(self) -> Any:
-        """Sum of the terms (mi.Color3f), linear, premultiplied by alpha, over black."""
-        return self.terms.total()
 
 
 def render(
@@ -68,17 +66,18 @@ def render(
     occluder: Occluder | None = None,
     sh_degree: int | None = None,
     shift: Any = None,
-    material_maps: bool = False,
+    aovs: bool = False,
 ) -> Frame:
     """Render a view.
 
     `light` is a `shade.PrefilteredLight`, needed unless `shading.reflectance` is "radiance". `sh_degree`
-    limits the degree of the radiance channel, for coarse-to-fine schedules. `material_maps` asks for albedo,
-    metallic and roughness even where shading does not need them per pixel. `shift`: see `splat.project`.
+    limits the degree of the radiance channel, for coarse-to-fine schedules. `aovs` asks for albedo, metallic,
+    roughness and the terms of the radiance even where the picture does not need them per pixel.
+    `shift`: see `splat.project`.
     `shading.accuracy.traced_bounces` needs an occluder whose `set_materials` has seen these surfels.
     """
     if shading.at == "surfel":
-        return _shade_at_surfels(surfels, camera, shading, light, sh_degree, shift, material_maps)
+        return _shade_at_surfels(surfels, camera, shading, light, sh_degree, shift, aovs)
     return _shade_at_pixels(surfels, camera, shading, light, occluder, sh_degree, shift)
 
 
@@ -127,11 +126,11 @@ def _shade_at_surfels(
     light: Any,
     sh_degree: int | None,
     shift: Any,
-    material_maps: bool,
+    aovs: bool,
 ) -> Frame:
     direction, normal = _facing(surfels, camera)
     if shading.reflectance == "radiance":
-        terms = [_radiance(surfels, direction, sh_degree)]
+        terms = Terms(_radiance(surfels, direction, sh_degree), *[dr.zeros(mi.Color3f, 1)] * 2)
     else:
         points = ShadingPoints(
             normal=normal,
@@ -141,25 +140,27 @@ def _shade_at_surfels(
             roughness=surfels.roughness(),
             radiance=_radiance(surfels, direction, sh_degree) if shading.diffuse == "sh" else None,
         )
-        shaded = shade(points, light, shading.diffuse, shading.accuracy)
-        terms = [shaded.diffuse, shaded.specular]
-    features = [x for term in terms for x in term] + [*normal]
-    show_materials = material_maps and surfels.has("albedo")
+        terms = shade(points, light, shading.diffuse, shading.accuracy)
+    # A feature costs time in every pair, so what is not asked for is not blended.
+    features = [*terms.total(), *normal]
+    if aovs:
+        features += [*terms.diffuse, *terms.specular]
+    show_materials = aovs and surfels.has("albedo")
     if show_materials:
         features += _materials(surfels)
     blended = splat(surfels, features, camera, shift)
 
     inverse = _inverse_alpha(blended)
-    maps = [blended.features[i : i + 3] for i in range(0, 3 * len(terms), 3)]
-    absent = [dr.zeros(mi.Color3f, 1)] * (3 - len(terms))
-    rest = blended.features[3 * len(terms) :]
+    triples = [blended.features[i : i + 3] for i in range(0, 3 * (len(features) // 3), 3)]
+    radiance, normal, *apart = (mi.Vector3f(*triple) for triple in triples)
     return Frame(
         alpha=blended.alpha,
         depth=blended.depth * inverse,
         median_depth=blended.median_depth,
-        normal=mi.Vector3f(*rest[0:3]),
-        terms=Terms(*(mi.Color3f(*colour) for colour in maps), *absent),
-        maps=_material_maps(rest[3:8], inverse) if show_materials else {},
+        normal=normal,
+        radiance=mi.Color3f(radiance),
+        terms=Terms(mi.Color3f(apart[0]), mi.Color3f(apart[1]), dr.zeros(mi.Color3f, 1)) if aovs else None,
+        maps=_material_maps(blended.features[12:17], inverse) if show_materials else {},
     )
 
 
@@ -209,13 +210,15 @@ def _shade_at_pixels(
             occluder, surfels, light, shading.accuracy, shading.diffuse, camera.origin, ray, points
         )
         maps["visibility"] = points.visibility
-    terms = shade(points, light, shading.diffuse, shading.accuracy)
+    shaded = shade(points, light, shading.diffuse, shading.accuracy)
+    terms = Terms(*(term * blended.alpha for term in (shaded.diffuse, shaded.specular, shaded.indirect)))
     return Frame(
         alpha=blended.alpha,
         depth=depth,
         median_depth=blended.median_depth,
         normal=normal,
-        terms=Terms(*(term * blended.alpha for term in (terms.diffuse, terms.specular, terms.indirect))),
+        radiance=terms.total(),
+        terms=terms,
         maps=maps,
     )
 
