@@ -14,6 +14,10 @@ from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.footprint import Footprints, depth_near, overlaps
 
 
+MAX_PAIR_BITS = 30
+"""Log₂ of more pairs than memory holds."""
+
+
 @dataclass(frozen=True)
 class TileLists:
     """M surfel-tile pairs, sorted by tile, then by the surfel's depth there; no derivative."""
@@ -51,19 +55,63 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     kept = dr.compress(touches)
     if dr.width(kept) == 0:
         return _empty(tiles_x, tiles_y)
-    tile, surfel, depth = (dr.gather(type(x), x, kept) for x in (tile, surfel, depth))
+    pairs = _join(*(dr.gather(mi.UInt32, x, kept) for x in (tile, surfel)))
+    nearest_first = _nearest_first(dr.gather(mi.Float, depth, kept))
+    pairs = _sorted_by(dr.gather(mi.UInt64, pairs, nearest_first), 0, (tiles - 1).bit_length())
+    tile, surfel = _upper(pairs), _lower(pairs)
+    dr.eval(tile, surfel)
+    return TileLists(surfel, *_runs(tile, tiles), tiles_x, tiles_y)
 
-    nearest_first = dr.argsort(depth)
-    tile = dr.gather(mi.UInt32, tile, nearest_first)
-    dr.eval(tile)
-    # One pass of a counting sort, where `dr.argsort` would make three.
-    buckets = 1 << max(tiles - 1, 1).bit_length()
-    by_tile = dr.detail.block_mkperm(tile, dr.width(tile), buckets)
-    order = dr.gather(mi.UInt32, nearest_first, by_tile)
-    histogram = dr.zeros(mi.UInt32, tiles)
-    dr.scatter_add(histogram, mi.UInt32(1), tile)
-    pair_end = dr.prefix_reduce(dr.ReduceOp.Add, histogram, exclusive=False)
-    return TileLists(dr.gather(mi.UInt32, surfel, order), pair_end - histogram, pair_end, tiles_x, tiles_y)
+
+def _nearest_first(depth: Any) -> Any:
+    """Places in `depth` (mi.UInt32), the least depth first: 24 bits of a radix sort, `dr.argsort` does 32.
+
+    The bits of positive floats are in the order of the floats. What the largest is above the smallest fits
+    into 24 of them where it is up to four times as far; beyond, the last digits go.
+    """
+    key = dr.reinterpret_array(mi.UInt32, depth)
+    dr.eval(key)
+    least = dr.min(key)
+    key = (key - least) >> (8 - dr.minimum(dr.lzcnt(dr.max(key) - least), 8))
+    entries = _join(key, dr.arange(mi.UInt32, dr.width(key)))
+    for digit in range(3):
+        entries = _sorted_by(entries, 8 * digit, 8)
+    return _lower(entries)
+
+
+def _join(upper: Any, lower: Any) -> Any:
+    """Two mi.UInt32 in one mi.UInt64: half the random reads of two arrays."""
+    return mi.UInt64(upper) << 32 | mi.UInt64(lower)
+
+
+def _upper(joined: Any) -> Any:
+    return mi.UInt32(joined >> 32)
+
+
+def _lower(joined: Any) -> Any:
+    return mi.UInt32(joined & 0xFFFFFFFF)
+
+
+def _sorted_by(joined: Any, shift: int, bits: int) -> Any:
+    """In the order of some bits of the upper half; stable. One pass of a counting sort."""
+    digit = (_upper(joined) >> shift) & ((1 << bits) - 1)
+    dr.eval(joined, digit)
+    return dr.gather(mi.UInt64, joined, dr.detail.block_mkperm(digit, dr.width(digit), 1 << bits))
+
+
+def _runs(tile: Any, tiles: int) -> tuple[Any, Any]:
+    """Where the run of each tile begins and ends (mi.UInt32 (tiles,)) among sorted tiles (mi.UInt32 (M,))."""
+    pairs, wanted = dr.opaque(mi.UInt32, dr.width(tile)), dr.arange(mi.UInt32, tiles + 1)
+
+    def before(place: Any) -> Any:
+        inside = place < pairs
+        return inside & (dr.gather(mi.UInt32, tile, place, inside) < wanted)
+
+    # Always as many steps, so that another number of pairs is not another kernel.
+    edges = mi.UInt32(dr.binary_search(0, 1 << MAX_PAIR_BITS, before))
+    dr.eval(edges)
+    first = dr.arange(mi.UInt32, tiles)
+    return dr.gather(mi.UInt32, edges, first), dr.gather(mi.UInt32, edges, first + 1)
 
 
 def _empty(tiles_x: int, tiles_y: int) -> TileLists:
@@ -91,8 +139,8 @@ def _rectangles(footprints: Footprints, camera: Camera) -> tuple[Any, Any, Any]:
     dr.scatter(surfel, dr.arange(mi.UInt32, dr.width(count)), end - count, count > 0)
     surfel = dr.prefix_reduce(dr.ReduceOp.Max, surfel, exclusive=False)
     place = dr.arange(mi.UInt32, pairs) - dr.gather(mi.UInt32, end - count, surfel)
-    # The masked lanes that fill up the last packet divide too: dividing an integer by 0 kills the process.
-    span = dr.maximum(dr.gather(mi.UInt32, span, surfel), 1)
-    row = place // span
+    span = dr.gather(mi.UInt32, span, surfel)
+    # Exact below four million tiles, and in one instruction; integers are divided lane by lane.
+    row = mi.UInt32((mi.Float(place) + 0.5) / mi.Float(span))
     tile_x = mi.UInt32(dr.gather(mi.Int32, first[0], surfel)) + place - row * span
     return surfel, tile_x, mi.UInt32(dr.gather(mi.Int32, first[1], surfel)) + row
