@@ -46,15 +46,18 @@ SORT_DEPTH_RANGE = 5.0
 """Factor by which a surfel's depth in a tile may exceed that of its centre in the sort: a plane that turns
 away from the camera within its reach has no depth of its own there."""
 
-BLOCK = 4
-"""Edge in pixels of the block that one SIMD packet covers: 4×4 = the 16 lanes of AVX-512, which then share
-every surfel they read."""
-
-TILE = (8, 4)
-"""Width and height in pixels of a tile, whose pixels share a list of surfels. A lane does the pixel at its
-place in each block of the tile: what it reads of a surfel then serves them all, and what it adds to the
-surfel's gradient is their sum. Larger tiles are faster, but give one order to more pixels: measurements in
+TILE = (4, 4)
+"""Width and height in pixels of a tile, whose pixels share a list of surfels. Larger tiles need fewer lists,
+but give one order to more pixels and evaluate more surfels that they miss: measurements in
 docs/decisions.md."""
+
+TILE_LANES = (2, 2)
+"""SIMD lanes of a tile, along x and y. A lane does the pixel at its place in each block of this size: what it
+reads of a surfel then serves them all, and what it adds to the surfel's gradient is their sum."""
+
+PACKET_TILES = (2, 2)
+"""Tiles along x and y that stand side by side in the 16 lanes of AVX-512. A packet waits for the longest of
+their lists; those of neighbours are alike, and hold the same surfels."""
 
 # ---------------- surfels ----------------
 

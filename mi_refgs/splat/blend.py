@@ -10,9 +10,9 @@ what lies behind,
 
 needs neither a reversed list nor storage per pair.
 
-One packet works on one tile, so its lanes read the same rows; each lane has one pixel in every block of the
-tile and keeps their states side by side. Reading a row and adding to its gradient, most of the work with one
-pixel a lane, are then shared, and there are fewer pairs to list and sort.
+A packet works on a few tiles, and the lanes of a tile on one surfel at a time; each has one pixel in every
+block of its tile and keeps their states side by side. Reading a row and adding to its gradient, most of the
+work with one pixel a lane, are then shared.
 
 No derivative, on purpose: the sort order, the tile lists, the α < 1/255 cut and the end at T < 1e-4, the near
 plane, the clamp at α_max (zero), the median depth.
@@ -20,6 +20,7 @@ plane, the clamp at α_max (zero), the median depth.
 
 from __future__ import annotations
 
+import math
 import operator
 from dataclasses import dataclass
 from functools import reduce
@@ -28,7 +29,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import BLOCK, MEDIAN_TRANSMITTANCE, TILE, TRANSMITTANCE_MIN
+from mi_refgs.constants import MEDIAN_TRANSMITTANCE, PACKET_TILES, TILE, TILE_LANES, TRANSMITTANCE_MIN
 from mi_refgs.rows import Rows
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.footprint import (
@@ -92,7 +93,7 @@ class _Blend(dr.CustomOp):
 
 @dataclass(frozen=True)
 class _Lanes:
-    """Tile-major lanes, and their pixel in each block of the tile."""
+    """Lanes, packet by packet of tiles, and their pixel in each block of the tile."""
 
     pixel: list[Any]  # mi.Point2f: centre
     raster: list[Any]  # mi.UInt32: index in the image
@@ -103,19 +104,20 @@ class _Lanes:
     @staticmethod
     def of(op: _Blend) -> _Lanes:
         lists, camera = op.lists, op.camera
-        lane = dr.arange(mi.UInt32, lists.tiles_x * lists.tiles_y * BLOCK * BLOCK)
-        tile, local = lane // (BLOCK * BLOCK), lane % (BLOCK * BLOCK)
+        tile_x, tile_y, lane_x, lane_y = _lanes_of_tiles(lists.tiles_x, lists.tiles_y)
+        there = (tile_x < lists.tiles_x) & (tile_y < lists.tiles_y)
+        tile = tile_y * lists.tiles_x + tile_x
         # Pixels before the image wrap round to huge numbers, and are not inside either.
-        corner_x = (tile % lists.tiles_x) * TILE[0] + local % BLOCK - camera.phase[0]
-        corner_y = (tile // lists.tiles_x) * TILE[1] + local // BLOCK - camera.phase[1]
-        blocks_x, blocks_y = (range(0, size, BLOCK) for size in TILE)
+        corner_x = tile_x * TILE[0] + lane_x - camera.phase[0]
+        corner_y = tile_y * TILE[1] + lane_y - camera.phase[1]
+        blocks_x, blocks_y = (range(0, size, lanes) for size, lanes in zip(TILE, TILE_LANES, strict=True))
         places = [(corner_x + x, corner_y + y) for y in blocks_y for x in blocks_x]
         return _Lanes(
             [mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5) for x, y in places],
             [y * camera.width + x for x, y in places],
-            [(x < camera.width) & (y < camera.height) for x, y in places],
-            dr.gather(mi.UInt32, lists.pair_begin, tile),
-            dr.gather(mi.UInt32, lists.pair_end, tile),
+            [there & (x < camera.width) & (y < camera.height) for x, y in places],
+            dr.gather(mi.UInt32, lists.pair_begin, tile, there),
+            dr.gather(mi.UInt32, lists.pair_end, tile, there),
         )
 
     def each(self, *values: list[Any]) -> Any:
@@ -134,6 +136,21 @@ class _Lanes:
     def from_raster(self, images: list[Any]) -> list[list[Any]]:
         """Inverse of `to_raster`; 0 outside the image."""
         return [[dr.gather(mi.Float, x, raster, inside) for x in images] for _, raster, inside in self.each()]
+
+
+def _lanes_of_tiles(tiles_x: int, tiles_y: int) -> tuple[Any, Any, Any, Any]:
+    """Column and row of the tile, and place within its block, of each lane (mi.UInt32), packet by packet."""
+    packets_x = -(-tiles_x // PACKET_TILES[0])
+    packets = packets_x * -(-tiles_y // PACKET_TILES[1])
+    tiles, lanes = math.prod(PACKET_TILES), math.prod(TILE_LANES)
+    lane = dr.arange(mi.UInt32, packets * tiles * lanes)
+    packet, tile, lane = lane // (tiles * lanes), lane // lanes % tiles, lane % lanes
+    return (
+        packet % packets_x * PACKET_TILES[0] + tile % PACKET_TILES[0],
+        packet // packets_x * PACKET_TILES[1] + tile // PACKET_TILES[0],
+        lane % TILE_LANES[0],
+        lane // TILE_LANES[0],
+    )
 
 
 def _any(flags: list[Any]) -> Any:
