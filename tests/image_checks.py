@@ -6,8 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
+
+from mi_refgs.device import upload
 
 HEIGHT, WIDTH = 14, 17  # not square, and larger than SSIM's window in one axis only by a little
 STEP = 1e-5  # of the float64 definitions: truncation 1e-10, rounding 1e-11
@@ -17,9 +18,7 @@ GRADIENT = 2e-5  # relative L2 against float64 differences: observed 1e-6 (SSIM 
 
 def planes(image: np.ndarray) -> list[Any]:
     """(H, W, 3) array → three planes."""
-    return [
-        mi.Float(np.ascontiguousarray(image[..., c].ravel(), dtype=np.float32)) for c in range(image.shape[2])
-    ]
+    return [upload(image[..., c]) for c in range(image.shape[2])]
 
 
 def stack(planes_: list[Any]) -> np.ndarray:

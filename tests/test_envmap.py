@@ -226,13 +226,13 @@ def test_maps_finer_than_the_levels_are_averaged(
     monkeypatch.setattr(lobe, "LEVEL_MAX_HEIGHT", (16,) * 7)
     fine = lobe.resample(rng.uniform(0, 1, (8, 16, 3)), 64)
     prefilter._host_levels.cache_clear()
-    prefilter._build.cache_clear()
+    prefilter._prepare.cache_clear()
     try:
         got = level_maps(EnvironmentLight.from_radiance(fine).prefilter())[1:]
         expected = level_maps(EnvironmentLight.from_radiance(lobe.resample(fine, 16)).prefilter())[1:]
     finally:
         prefilter._host_levels.cache_clear()
-        prefilter._build.cache_clear()
+        prefilter._prepare.cache_clear()
     for a, b in zip(got, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=3e-3)
 

@@ -58,9 +58,9 @@ def sleepy_blend(footprints: Any, features: Any, *rest: Any) -> Any:
     return _blend(footprints, [dr.custom(Sleepy, features[0]), *features[1:]], *rest)
 
 
-def sleepy_apply(*arguments: Any) -> Any:
+def sleepy_prefilter(self: Any) -> None:
     time.sleep(PAUSE)
-    return _apply_transposed(*arguments)
+    _prefilter_backward(self)
 
 
 def sleepy_render(surfels: Any, *rest: Any, **options: Any) -> Any:
@@ -83,7 +83,7 @@ def sleepy_step(self: Any, iteration: int) -> None:
 
 
 _blend, _project, _render, _objective = splat.blend, splat.project, train.render, train.objective
-_apply_transposed, _step = prefilter.apply_transposed, optim.Adam.step
+_prefilter_backward, _step = prefilter._Prefilter.backward, optim.Adam.step
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,8 @@ _apply_transposed, _step = prefilter.apply_transposed, optim.Adam.step
         (splat, "blend", sleepy_blend, "splat backward", "initial"),
         (splat, "blend", sleepy_blend, "splat backward", "deferred"),
         (splat, "project", sleepy_project, "surfels backward", "deferred"),
-        (prefilter, "apply_transposed", sleepy_apply, "prefilter backward", "initial"),
-        (prefilter, "apply_transposed", sleepy_apply, "prefilter backward", "deferred"),
+        (prefilter._Prefilter, "backward", sleepy_prefilter, "prefilter backward", "initial"),
+        (prefilter._Prefilter, "backward", sleepy_prefilter, "prefilter backward", "deferred"),
         (train, "render", sleepy_render, "shade backward", "deferred"),
         (train, "objective", sleepy_objective, "loss backward", "deferred"),
         (optim.Adam, "step", sleepy_step, "optimiser", "deferred"),

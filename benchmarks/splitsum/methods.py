@@ -33,7 +33,7 @@ def level_set(name: str) -> Iterator[int]:
     A light must be looked up in the context that it was filtered in.
     """
     shipped = lobe.LEVEL_ROUGHNESS, lobe.LEVEL_MAX_HEIGHT
-    caches = (prefilter._host_levels, prefilter._build)
+    caches = (prefilter._host_levels, prefilter._prepare)
     if name == SHIPPED:
         yield len(shipped[0]) + 1
         return

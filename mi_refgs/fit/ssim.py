@@ -9,7 +9,7 @@ G is symmetric and reads zeros outside the image, hence Gᵀ = G and the adjoint
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -19,9 +19,15 @@ import mitsuba as mi
 WINDOW_RADIUS = 5
 # Standard deviation of the window, in pixels. [ibid.]
 WINDOW_SIGMA = 1.5
+# Pixels in a row that one lane blurs: they share most of what they read.
+RUN = 4
 # (0.01 L)² and (0.03 L)² for the dynamic range L = 1. [ibid.]
 C1 = 1e-4
 C2 = 9e-4
+
+
+# Image sizes whose kernels are kept ready: to trace them takes as long as to run them.
+RECORDINGS = 8
 
 
 def window() -> list[float]:
@@ -39,22 +45,45 @@ def ssim(x: Sequence[Any], y: Sequence[Any], width: int, height: int) -> Any:
     return dr.custom(_Ssim, list(x), [dr.detach(plane) for plane in y], width, height)
 
 
-def _blur_axis(sources: Sequence[Any], width: int, height: int, axis: int, derive: Any = None) -> list[Any]:
-    """Blur planes along x (axis 0) or y (axis 1); `derive` makes the values to blur under a tap."""
-    pixel = dr.arange(mi.UInt32, width * height)
-    place, size, stride = (pixel % width, width, 1) if axis == 0 else (pixel // width, height, width)
-    total: list[Any] = []
-    for k, weight in zip(range(-WINDOW_RADIUS, WINDOW_RADIUS + 1), window(), strict=True):
+def _blur(
+    sources: Sequence[Any],
+    width: int,
+    height: int,
+    axis: int,
+    derive: Callable[[list[Any]], list[Any]] = list,
+    finish: Callable[[list[Any], Any, Any], list[Any]] = lambda totals, pixel, inside: totals,
+) -> list[Any]:
+    """Blur planes along x (axis 0) or y (axis 1), evaluated.
+
+    `derive` makes the values to blur of what is read at a pixel; `finish` makes the planes to return of the
+    blurred values, their pixel (mi.UInt32), and whether it is one.
+    """
+    size, lines, stride = (width, height, 1) if axis == 0 else (height, width, width)
+    runs = -(-size // RUN)
+    lane = dr.arange(mi.UInt32, runs * lines)
+    run, line = (lane % runs, lane // runs) if axis == 0 else (lane // lines, lane % lines)
+    first = run * RUN
+    pixel = line * width + first if axis == 0 else first * width + line
+    weights = window()
+    totals: list[list[Any]] = [[] for _ in range(RUN)]
+    for k in range(-WINDOW_RADIUS, RUN + WINDOW_RADIUS):
         # A place left of the image wraps to a huge unsigned number, so one comparison guards both ends.
-        inside = place + mi.UInt32(k % 2**32) < size
+        inside = first + mi.UInt32(k % 2**32) < size
         index = pixel + mi.UInt32((k * stride) % 2**32)
-        values = [dr.gather(mi.Float, source, index, inside) for source in sources]
-        values = derive(values) if derive else values
-        if total:
-            total = [dr.fma(value, weight, partial) for value, partial in zip(values, total, strict=True)]
-        else:
-            total = [value * weight for value in values]
-    return total
+        values = derive([dr.gather(mi.Float, source, index, inside) for source in sources])
+        for r in range(max(0, k - WINDOW_RADIUS), min(RUN, k + WINDOW_RADIUS + 1)):
+            weight = weights[k - r + WINDOW_RADIUS]
+            before = totals[r] or [mi.Float(0)] * len(values)
+            totals[r] = [dr.fma(value, weight, total) for value, total in zip(values, before, strict=True)]
+    planes: list[Any] = []
+    for r in range(RUN):
+        here, inside = pixel + r * stride, first + r < size
+        results = finish(totals[r], here, inside)
+        planes = planes or [dr.empty(mi.Float, width * height) for _ in results]
+        for plane, value in zip(planes, results, strict=True):
+            dr.scatter(plane, value, here, inside, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(planes)
+    return planes
 
 
 def _moments(values: list[Any]) -> list[Any]:
@@ -64,45 +93,57 @@ def _moments(values: list[Any]) -> list[Any]:
     return [*x, *y, *squares, *(a * b for a, b in zip(x, y, strict=True))]
 
 
+def _similarity(blurred: list[Any], pixel: Any, inside: Any) -> list[Any]:
+    """S summed over planes, then ∂S/∂μx, ∂S/∂q and ∂S/∂p of each, from what `_moments` gives."""
+    planes = len(blurred) // 4
+    μx, μy, q, p = (blurred[i * planes : (i + 1) * planes] for i in range(4))
+    value, by_mean, by_square, by_product = mi.Float(0), [], [], []
+    for i in range(planes):
+        a1, a2 = 2 * μx[i] * μy[i] + C1, 2 * (p[i] - μx[i] * μy[i]) + C2
+        b1 = μx[i] * μx[i] + μy[i] * μy[i] + C1
+        b2 = q[i] - μx[i] * μx[i] - μy[i] * μy[i] + C2
+        similarity = a1 * a2 / (b1 * b2)
+        value += similarity
+        by_mean.append(2 * μy[i] * (a2 - a1) / (b1 * b2) - 2 * μx[i] * similarity * (1 / b1 - 1 / b2))
+        by_square.append(-similarity / b2)
+        by_product.append(2 * a1 / (b1 * b2))
+    return [value, *by_mean, *by_square, *by_product]
+
+
+@dr.freeze(limit=RECORDINGS, warn_after=10**9)
+def _forward(x: list[Any], y: list[Any], width: int, height: int) -> list[Any]:
+    """What `_similarity` gives at every pixel."""
+    rows = _blur([*x, *y], width, height, 0, derive=_moments)
+    return _blur(rows, width, height, 1, finish=_similarity)
+
+
+@dr.freeze(limit=RECORDINGS, warn_after=10**9)
+def _gradient(x: list[Any], y: list[Any], slopes: list[Any], width: int, height: int) -> list[Any]:
+    """∂(mean S)/∂x per plane, from the slopes of `_similarity`."""
+    planes = len(x)
+
+    def combine(blurred: list[Any], pixel: Any, inside: Any) -> list[Any]:
+        by_mean, by_square, by_product = (blurred[i * planes : (i + 1) * planes] for i in range(3))
+        a, b = ([dr.gather(mi.Float, plane, pixel, inside) for plane in image] for image in (x, y))
+        return [
+            (by_mean[i] + 2 * a[i] * by_square[i] + b[i] * by_product[i]) / (planes * width * height)
+            for i in range(planes)
+        ]
+
+    columns = _blur(slopes, width, height, 1)
+    return _blur(columns, width, height, 0, finish=combine)
+
+
 class _Ssim(dr.CustomOp):
     def eval(self, x: list[Any], y: list[Any], width: int, height: int) -> Any:
+        dr.make_opaque(x, y)  # a literal would be another recording
         self.x, self.y, self.size = x, y, (width, height)
-        planes = len(x)
-        dr.eval(x, y)
-        rows = _blur_axis([*x, *y], width, height, 0, _moments)
-        dr.eval(rows)
-        blurred = _blur_axis(rows, width, height, 1)
-        μx, μy, q, p = (blurred[i * planes : (i + 1) * planes] for i in range(4))
-        value, self.slopes = mi.Float(0), []
-        slopes: list[list[Any]] = [[], [], []]
-        for i in range(planes):
-            a1, a2 = 2 * μx[i] * μy[i] + C1, 2 * (p[i] - μx[i] * μy[i]) + C2
-            b1 = μx[i] * μx[i] + μy[i] * μy[i] + C1
-            b2 = q[i] - μx[i] * μx[i] - μy[i] * μy[i] + C2
-            similarity = a1 * a2 / (b1 * b2)
-            value += similarity
-            slopes[0].append(
-                2 * μy[i] * (a2 - a1) / (b1 * b2) - 2 * μx[i] * similarity * (1 / b1 - 1 / b2)
-            )  # ∂S/∂μx
-            slopes[1].append(-similarity / b2)  # ∂S/∂q
-            slopes[2].append(2 * a1 / (b1 * b2))  # ∂S/∂p
-        self.slopes = [*slopes[0], *slopes[1], *slopes[2]]
-        dr.eval(value, self.slopes)
-        return dr.sum(value) / (planes * width * height)
+        value, *self.slopes = _forward(x, y, width, height)
+        return dr.sum(value) / (len(x) * width * height)
 
     def gradient(self) -> list[Any]:
         """∂(mean S)/∂x per plane."""
-        width, height = self.size
-        planes = len(self.x)
-        columns = _blur_axis(self.slopes, width, height, 1)
-        dr.eval(columns)
-        blurred = _blur_axis(columns, width, height, 0)
-        by_mean, by_square, by_product = (blurred[i * planes : (i + 1) * planes] for i in range(3))
-        return [
-            (by_mean[i] + 2 * self.x[i] * by_square[i] + self.y[i] * by_product[i])
-            / (planes * width * height)
-            for i in range(planes)
-        ]
+        return _gradient(self.x, self.y, self.slopes, *self.size)
 
     def forward(self) -> None:
         products = [slope * δ for slope, δ in zip(self.gradient(), self.grad_in("x"), strict=True)]

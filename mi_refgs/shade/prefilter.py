@@ -10,6 +10,7 @@ packet.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,8 +39,7 @@ def _host_levels(height: int) -> list[lobe.Level]:
     return lobe.build_levels(height)
 
 
-@functools.lru_cache(maxsize=4)
-def _build(variant: str, height: int) -> Operator:
+def _build(height: int) -> Operator:
     matrices = [level.weights for level in _host_levels(height)]
     transposed = [np.ascontiguousarray(matrix.swapaxes(0, 1)) for matrix in matrices]
     heights = [height] + [len(matrix) for matrix in matrices]
@@ -74,11 +74,6 @@ def _build(variant: str, height: int) -> Operator:
     )
 
 
-def operator(height: int) -> Operator:
-    """The prefilter for maps (height, 2·height), built once per height and variant (1 s at 64 rows)."""
-    return _build(mi.variant(), height)
-
-
 def apply(op: Operator, radiance: Any) -> Any:
     """Flat RGBA levels, the map first, of flat radiance (3·h·w)."""
     out = dr.empty(mi.Float, 4 * op.levels.texels)
@@ -99,24 +94,63 @@ def apply_transposed(op: Operator, δlevels: Any) -> Any:
     return dr.gather(mi.Float, out, texel) + dr.gather(mi.Float, δlevels, texel)
 
 
+@dataclass(frozen=True)
+class _Prepared:
+    """An operator, and `apply` and `apply_transposed` of it, which are traced once and then replayed.
+
+    Tracing them takes as long as running them. All their sizes are the operator's own, so that a recording
+    holds for every call.
+    """
+
+    operator: Operator
+    forward: Callable[[Any], Any]
+    adjoint: Callable[[Any], Any]
+
+
+@functools.lru_cache(maxsize=4)
+def _prepare(variant: str, height: int) -> _Prepared:
+    op = _build(height)
+
+    @dr.freeze
+    def forward(radiance: Any) -> Any:
+        return apply(op, radiance)
+
+    @dr.freeze
+    def adjoint(δlevels: Any) -> Any:
+        return apply_transposed(op, δlevels)
+
+    return _Prepared(op, forward, adjoint)
+
+
+def operator(height: int) -> Operator:
+    """The prefilter for maps (height, 2·height), built once per height and variant (1 s at 64 rows)."""
+    return _prepare(mi.variant(), height).operator
+
+
 class _Prefilter(dr.CustomOp):
     """`apply` under automatic differentiation; linear, so its derivative is itself."""
 
-    def eval(self, op: Operator, radiance: Any) -> Any:
-        self.op = op
-        return apply(op, radiance)
+    def eval(self, prepared: _Prepared, radiance: Any) -> Any:
+        self.prepared = prepared
+        return prepared.forward(_opaque(radiance))
 
     def forward(self) -> None:
-        self.set_grad_out(apply(self.op, self.grad_in("radiance")))
+        self.set_grad_out(self.prepared.forward(_opaque(self.grad_in("radiance"))))
 
     def backward(self) -> None:
-        self.set_grad_in("radiance", apply_transposed(self.op, self.grad_out()))
+        self.set_grad_in("radiance", self.prepared.adjoint(_opaque(self.grad_out())))
 
     def name(self) -> str:
         return "prefilter"
 
 
+def _opaque(values: Any) -> Any:
+    """In memory: a literal would be another recording."""
+    dr.make_opaque(values)
+    return values
+
+
 def prefilter(radiance: Any) -> tuple[Operator, Any]:
     """Operator and levels (flat RGBA, under AD) of a radiance tensor (h, 2h, 3), h a multiple of 4."""
-    op = operator(radiance.shape[0])
-    return op, dr.custom(_Prefilter, op, radiance.array)
+    prepared = _prepare(mi.variant(), radiance.shape[0])
+    return prepared.operator, dr.custom(_Prefilter, prepared, radiance.array)

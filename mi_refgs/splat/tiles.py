@@ -13,7 +13,6 @@ from mi_refgs.rows import Rows
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.footprint import Footprints, depth_near, overlaps
 
-
 MAX_PAIR_BITS = 30
 """Log₂ of more pairs than memory holds."""
 
