@@ -69,7 +69,7 @@ def test_equals_drjit_on_a_quadratic(rng: np.random.Generator) -> None:
     assert np.abs(params["x"].numpy() - goal.numpy()).mean() < 0.1 < np.abs(start - goal.numpy()).mean()
 
 
-def test_gradients_are_cleared_and_absent_ones_count_zero() -> None:
+def test_gradients_are_cleared_and_a_tensor_without_one_rests() -> None:
     params = {"x": tensor(np.ones((2, 1))), "idle": tensor(np.ones((2, 1)))}
     optimiser = Adam(params, {"x": Group(0.1)})
     optimiser.step(0)
@@ -78,6 +78,15 @@ def test_gradients_are_cleared_and_absent_ones_count_zero() -> None:
     optimiser.step(1)
     assert np.all(dr.grad(params["x"]).numpy() == 0) and np.all(params["x"].numpy() < 1)
     assert np.all(params["idle"].numpy() == 1)
+    before, moved = optimiser.state_dict(), params["x"].numpy()
+    optimiser.step(2)
+    np.testing.assert_array_equal(params["x"].numpy(), moved)
+    assert before["x/steps"] == 1 and all(
+        np.array_equal(value, before[key]) for key, value in optimiser.state_dict().items()
+    )
+    give(optimiser, "x", np.zeros((2, 1)))  # a gradient that is zero is one
+    optimiser.step(3)
+    assert optimiser.state_dict()["x/steps"] == 2 and np.all(params["x"].numpy() < moved)
 
 
 def test_bad_gradients_are_dropped_and_counted() -> None:
@@ -152,6 +161,7 @@ def test_factor_freezes_a_tensor() -> None:
     optimiser.step(0)
     assert np.all(params["x"].numpy() == 0) and np.all(optimiser.state_dict()["x/first"] != 0)
     optimiser.set_factor("x", 1.0)
+    give(optimiser, "x", np.ones((2, 1)))
     optimiser.step(1)
     assert np.all(params["x"].numpy() < 0)
 

@@ -57,6 +57,18 @@ def test_large_hot_surfels_are_split_within_their_own_plane() -> None:
     assert 0 < np.abs(offsets).max() < 6 * 0.05
 
 
+def test_ordered_rows_keep_their_values_and_parents() -> None:
+    edited = densify(table(40), np.where(np.arange(40) % 3, 0, 1e-3))
+    ordered = edited.ordered()
+    place = [
+        np.flatnonzero((edited.parent == p) & (edited.fresh == f))[0]
+        for p, f in zip(ordered.parent, ordered.fresh)
+    ]
+    assert sorted(place) == list(range(len(edited.parent))) != place
+    for name, values in ordered.surfels.to_numpy().items():
+        assert np.array_equal(values, edited.surfels.to_numpy()[name][place]), name
+
+
 def test_transparent_and_oversized_surfels_go_even_when_hot() -> None:
     raw = table().to_numpy()
     raw["opacity"][0] = logit(0.01)

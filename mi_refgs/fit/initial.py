@@ -8,6 +8,7 @@ from mi_refgs.fit.config import Method
 from mi_refgs.fit.data import Dataset, View
 from mi_refgs.images import linear_from_srgb
 from mi_refgs.surfels import init
+from mi_refgs.surfels.order import along_curve
 from mi_refgs.surfels.table import GEOMETRY, Surfels
 
 
@@ -26,6 +27,8 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
         points, normals = init.visual_hull_points(views, options.count, bounds, rng)
     else:
         points = init.random_points(options.count, bounds, rng)
+    order = along_curve(points)
+    points, normals = points[order], None if normals is None else normals[order]
     return init.from_points(
         points,
         normals,

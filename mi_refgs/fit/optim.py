@@ -91,15 +91,20 @@ class Adam:
         return 0 if self._bad is None else int(self._bad[0])
 
     def step(self, iteration: int) -> None:
-        """Apply one update with the learning rates of this iteration (0-based), then clear the gradients."""
+        """Apply one update with the learning rates of this iteration (0-based), then clear the gradients.
+
+        A tensor that the loss does not depend on rests, as in PyTorch: its moments and step count stay.
+        """
         updated, bad = {}, dr.opaque(mi.UInt32, 0)
         for name, group in self.groups.items():
             tensor = self.params[name]
             shape = tuple(int(size) for size in tensor.shape)
             if math.prod(shape) == 0:
                 continue
-            self._steps[name] += 1
             g = dr.grad(tensor).array
+            if g.state == dr.VarState.Literal and float(g[0]) == 0:
+                continue
+            self._steps[name] += 1
             finite = dr.isfinite(g)
             # Almost never active, so a direct atomic costs nothing and needs no launch of its own.
             dr.scatter_reduce(dr.ReduceOp.Add, bad, mi.UInt32(1), mi.UInt32(0), ~finite, dr.ReduceMode.Direct)

@@ -13,6 +13,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.fit.config import Refine
 from mi_refgs.surfels.init import jittered_albedo, logit
+from mi_refgs.surfels.order import along_curve
 from mi_refgs.surfels.table import Surfels
 
 SPLIT_SHRINK = 1.6
@@ -31,6 +32,13 @@ class Edited:
     surfels: Surfels
     parent: np.ndarray  # (M,) uint32
     fresh: np.ndarray  # (M,) bool
+
+    def ordered(self) -> Edited:
+        """The same rows, those of neighbours next to each other: new ones stand at the end."""
+        raw = self.surfels.to_numpy()
+        order = along_curve(raw["position"])
+        table = {name: values[order] for name, values in raw.items()}
+        return Edited(Surfels.from_numpy(table), self.parent[order], self.fresh[order])
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:

@@ -206,7 +206,7 @@ class Trainer:
                 surfels.max_count,
                 self.schedule.rng(iteration),
                 since_reset=options.reset.since(iteration) if options.reset is not None else None,
-            )
+            ).ordered()
             self._replace(edited.surfels)
             names = list(edited.surfels.raw)
             self.optimiser.gather(mi.UInt32(edited.parent), names, mi.Bool(edited.fresh))

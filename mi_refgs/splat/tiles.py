@@ -41,6 +41,7 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     phase_x, phase_y = camera.phase
     tiles_x, tiles_y = -(-(camera.width + phase_x) // TILE[0]), -(-(camera.height + phase_y) // TILE[1])
     tiles = tiles_x * tiles_y
+    dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
     surfel, tile_x, tile_y = _rectangles(footprints, camera)
     if dr.width(surfel) == 0:
         return _empty(tiles_x, tiles_y)
