@@ -62,7 +62,7 @@ def test_ordered_rows_keep_their_values_and_parents() -> None:
     ordered = edited.ordered()
     place = [
         np.flatnonzero((edited.parent == p) & (edited.fresh == f))[0]
-        for p, f in zip(ordered.parent, ordered.fresh)
+        for p, f in zip(ordered.parent, ordered.fresh, strict=True)
     ]
     assert sorted(place) == list(range(len(edited.parent))) != place
     for name, values in ordered.surfels.to_numpy().items():
