@@ -4,7 +4,8 @@
 
 Surfels cover a unit sphere, so every one of them is on the surface, about half of them seen. Each stage is
 timed between barriers, in steps of their own; `step` is the wall time of undisturbed steps, which is less
-than the sum because kernels fuse across stages. `refgs profile` does the same for a scene of yours, and
+than the sum because kernels fuse across stages; `splat` is that of the step's own splat and its gradients by
+themselves, called as a user would. `refgs profile` does the same for a scene of yours, and
 `python -m benchmarks.splatting` measures the splatter alone, its errors included.
 """
 
@@ -60,7 +61,8 @@ def make_trainer(surfels: int, data: Any, variant: str = METHOD) -> tuple[Any, A
 
 def step_times(surfels: int, size: int, steps: int, variant: str = METHOD) -> dict[str, Any]:
     """For every stage of the schedule: a step's time, launches, cache misses, and where its time goes."""
-    from mi_refgs.fit.profile import profile_stage
+    from benchmarks.splatting.ours import Ours
+    from mi_refgs.fit.profile import held_in_stage, profile_stage
 
     trainer, method = make_trainer(surfels, sphere_data(size, 8, np.random.default_rng(0)), variant)
     result = {}
@@ -68,8 +70,12 @@ def step_times(surfels: int, size: int, steps: int, variant: str = METHOD) -> di
         if stage.at == "pixel" and method.mesh is not None:
             trainer.extract_mesh()
         found = profile_stage(trainer, name, steps)
+        with held_in_stage(trainer, name) as prepare:
+            prepare()
+            splat_ms = Ours.of_step(trainer).both_ms(steps)
         result[name] = {
             "step_ms": round(found.step_ms, 2),
+            "splat_ms": round(splat_ms, 2),
             "launches": found.launches,
             "cache_misses": found.misses,
             "stages_ms": {key: round(value, 2) for key, value in found.stages_ms.items()},

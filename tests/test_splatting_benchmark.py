@@ -140,7 +140,7 @@ def brute_force(workload: Workload) -> tuple[int, int]:
 @pytest.mark.parametrize("make", [opaque, sphere])
 def test_counts_are_those_of_brute_force(make: Any) -> None:
     workload = make(300, 30, 1.5)
-    counts = Ours(workload, 0).counts()
+    counts = Ours.of(workload, 0).counts()
     visited, contributing = brute_force(workload)
     assert counts.visited == pytest.approx(visited, abs=3)  # float32 may decide otherwise at a cut
     assert counts.contributing == pytest.approx(contributing, rel=1e-3)
@@ -154,7 +154,7 @@ def test_contributing_pairs_are_the_oracle_s() -> None:
     raw = {name: values.astype(float) for name, values in workload.raw.items()}
     weights = np.zeros((FEATURES + 2, workload.pixels))
     truth = exact.differentiate(raw, workload.features.astype(float), workload.pinhole, weights)
-    counts = Ours(workload, 0).counts()
+    counts = Ours.of(workload, 0).counts()
     assert counts.contributing == pytest.approx(truth.shown.sum(), rel=2e-3)
     assert counts.covered == pytest.approx(truth.shown.any(axis=0).sum(), abs=2)
 
@@ -181,7 +181,7 @@ def test_surfels_are_tangential_discs() -> None:
 
 def test_numpy_rasteriser_shows_our_picture() -> None:
     workload = opaque(400, 30)
-    out = Ours(workload, FEATURES).forward()
+    out = Ours.of(workload, FEATURES).forward()
     ours = np.stack([image.numpy() for image in out[:-1]], axis=1)
     plain = raster.forward(workload, FEATURES).reshape(ours.shape)
     assert np.abs(ours - plain).max() < 1e-4
@@ -191,7 +191,7 @@ def test_volprim_shows_the_same_object() -> None:
     """White surfels: its picture is the coverage, up to where in a pixel it samples and its own cut."""
     workload = sphere(500, 48, 1.5)
     white = replace(workload, features=np.ones_like(workload.features))
-    alpha = Ours(white, 3).forward()[-2].numpy().reshape(48, 48)
+    alpha = Ours.of(white, 3).forward()[-2].numpy().reshape(48, 48)
     picture = Volprim(white).forward().numpy().mean(axis=2)
     inner = alpha > 0.999
     assert inner.mean() > 0.3 and np.abs(alpha - picture)[inner].mean() < 0.01

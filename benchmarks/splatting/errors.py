@@ -40,7 +40,7 @@ def compare(workload: Workload, size: int) -> dict[str, float]:
     near = _reaching(part)
     raw = {name: values[near].astype(np.float64) for name, values in part.raw.items()}
     features = part.features[near].astype(np.float64)
-    ours = Ours(part, FEATURES)
+    ours = Ours.of(part, FEATURES)
     order = _order(ours, near, p)
     keep = np.logical_not(oracle.splat(raw, features[:, :1], p).band.ravel())
     weights = np.where(keep, part.weights(FEATURES + 2), 0).astype(np.float32)

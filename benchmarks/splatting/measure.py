@@ -83,7 +83,7 @@ def _shown(items: Iterable[Any], name: str, quiet: bool) -> Iterable[Any]:
 def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row:
     """One row: counts, times in turns, stages, launches, limits."""
     count, size = workload.count, workload.pinhole.width
-    full, colour = Ours(workload, FEATURES), Ours(workload, COLOUR)
+    full, colour = Ours.of(workload, FEATURES), Ours.of(workload, COLOUR)
     counts = full.counts()
     calls: dict[str, tuple[Callable[[], Any], int]] = {
         "forward": (full.forward, settings.repeats),

@@ -13,24 +13,50 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.splatting.workload import Workload
+from mi_refgs.device import upload
 from mi_refgs.fit.counts import Counts, count
+from mi_refgs.fit.train import Trainer
+from mi_refgs.render import pipeline
 from mi_refgs.splat import Blended, Camera, blend, list_by_tile, project, splat
-from mi_refgs.surfels.table import Surfels
+from mi_refgs.surfels.table import GEOMETRY, Surfels
 
 
 class Ours:
-    """One workload on the device."""
+    """One call of `splat`, on the device."""
 
-    def __init__(self, workload: Workload, features: int) -> None:
-        self.camera: Camera = workload.camera()
-        self.raw = workload.surfels().raw
-        self.columns = workload.columns(features)
-        self.set_weights(workload.weights(features + 2))
+    def __init__(self, surfels: Surfels, columns: list[Any], camera: Camera, weights: np.ndarray) -> None:
+        self.camera, self.raw, self.columns = camera, surfels.raw, columns
+        self.set_weights(weights)
         dr.eval(self.raw, self.columns)
+
+    @staticmethod
+    def of(workload: Workload, features: int) -> Ours:
+        """A workload with so many features."""
+        columns, weights = workload.columns(features), workload.weights(features + 2)
+        return Ours(workload.surfels(), columns, workload.camera(), weights)
+
+    @staticmethod
+    def of_step(trainer: Trainer) -> Ours:
+        """The call that a trainer's next step makes, which it takes."""
+        calls = []
+
+        def noted(surfels: Surfels, features: list[Any], camera: Camera, shift: Any = None) -> Blended:
+            calls.append((surfels.detach(), dr.detach(features), camera))
+            return splat(surfels, features, camera, shift)
+
+        pipeline.splat = noted
+        try:
+            trainer.step()
+        finally:
+            pipeline.splat = splat
+        surfels, columns, camera = calls[0]
+        geometry = Surfels({name: surfels.raw[name] for name in GEOMETRY})
+        shape = (len(columns) + 2, camera.width * camera.height)
+        return Ours(geometry, columns, camera, np.random.default_rng(0).normal(size=shape))
 
     def set_weights(self, weights: np.ndarray) -> None:
         """Adjoints (maps, H·W) of the maps: features, depth, alpha."""
-        self.weights = [mi.Float(np.ascontiguousarray(row)) for row in weights]
+        self.weights = [upload(row) for row in weights]
         dr.eval(self.weights)
 
     def forward(self) -> list[Any]:
@@ -47,6 +73,15 @@ class Ours:
         self._send_back(maps)
         gradients = [dr.grad(leaf) for leaf in [*raw.values(), *columns]]
         return [*maps, blended.median_depth, *gradients]
+
+    def both_ms(self, repeats: int) -> float:
+        """Median milliseconds of `both`, warm."""
+        found: dict[str, float] = {}
+        times = []
+        for _ in range(repeats + 2):
+            _timed(found, "both", self.both)
+            times.append(found["both"])
+        return float(np.median(times[2:]))
 
     def counts(self) -> Counts:
         """The work of a view."""

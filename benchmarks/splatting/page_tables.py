@@ -141,7 +141,11 @@ def step(result: dict[str, Any]) -> str:
     for name, stage in now.items():
         ms = stage["stages_ms"]
         ms = ms | {"other backward": sum(ms.get(key, 0.0) for key in BACKWARD)}
-        whole = {"**step**": stage["step_ms"], "launches": stage["launches"]}
+        whole = {
+            "**step**": stage["step_ms"],
+            "splat alone": stage["splat_ms"],
+            "launches": stage["launches"],
+        }
         columns.append(ms | whole)
         old = before.get(name, {"stages_ms": {}, "step_ms": None, "launches": None})
         columns.append(old["stages_ms"] | {"**step**": old["step_ms"], "launches": old["launches"]})

@@ -66,10 +66,10 @@ def _memory(count: int, size: int) -> dict[str, Any]:
     from benchmarks.splatting.ours import Ours
     from benchmarks.splatting.workload import FEATURES, sphere
 
-    dr.eval(Ours(sphere(*TINY, SPREAD), FEATURES).both())
+    dr.eval(Ours.of(sphere(*TINY, SPREAD), FEATURES).both())
     workload = sphere(count, size, SPREAD)
     before = _start()
-    ours = Ours(workload, FEATURES)
+    ours = Ours.of(workload, FEATURES)
     for _ in range(STEPS):
         dr.eval(ours.both())
         dr.sync_thread()
@@ -103,7 +103,7 @@ def _compile(count: int, size: int) -> dict[str, Any]:
     from benchmarks.splatting.ours import Ours
     from benchmarks.splatting.workload import FEATURES, sphere
 
-    ours = Ours(sphere(count, size, SPREAD), FEATURES)
+    ours = Ours.of(sphere(count, size, SPREAD), FEATURES)
     found: dict[str, Any] = {}
     for turn in ("first", "second"):
         found[turn] = {}

@@ -34,7 +34,7 @@ class StageProfile:
 
     name: str
     step_ms: float  # median of undisturbed steps
-    launches: float  # kernels a step
+    launches: int  # kernels a step
     misses: int  # kernels compiled in all warm steps together
     stages_ms: dict[str, float]  # by `fit.stages`, between barriers
 
@@ -95,12 +95,12 @@ def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
 
 def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
     """Times, launches and cache misses of steps in one stage of the schedule."""
-    with _held_in_stage(trainer, name) as prepare:
+    with held_in_stage(trainer, name) as prepare:
         for _ in range(WARM_UP):
             prepare()
             trainer.step()
         dr.sync_thread()
-        launches, _, misses = dr.detail.launch_stats()
+        misses = dr.detail.launch_stats()[2]
         times = []
         for _ in range(steps):
             prepare()
@@ -108,19 +108,30 @@ def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
             trainer.step()
             dr.sync_thread()
             times.append(time.perf_counter() - begin)
-        launches_after, _, misses_after = dr.detail.launch_stats()
+        misses = dr.detail.launch_stats()[2] - misses
+        prepare()
+        launches = _launches(trainer.step)
         stages = stage_times(trainer, max(steps // 3, 5), prepare)
     return StageProfile(
         name=name,
         step_ms=1e3 * float(np.median(times)),
-        launches=(launches_after - launches) / steps,
-        misses=misses_after - misses,
+        launches=launches,
+        misses=misses,
         stages_ms=stages,
     )
 
 
+def _launches(call: Callable[[], None]) -> int:
+    """Kernels that a call launches, replayed ones too (Dr.Jit's own count leaves those out)."""
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        call()
+        dr.sync_thread()
+    return len(dr.kernel_history([dr.KernelType.JIT]))
+
+
 @contextmanager
-def _held_in_stage(trainer: Trainer, name: str) -> Iterator[Callable[[], None]]:
+def held_in_stage(trainer: Trainer, name: str) -> Iterator[Callable[[], None]]:
     """Keep the iteration in a stage (by what is to be called before each step), and let nothing fall due."""
     method, before = trainer.method, trainer.iteration
     stages = method.stages()
