@@ -197,8 +197,8 @@ def _step(result: dict[str, Any]) -> str:
     text = f"""The full method at {step["surfels"]:,} surfels and {step["size"]}²
         (`python benchmarks/step.py`), milliseconds; stages between
         barriers. `start` is the starting point: 20,000 surfels, 200², the same machine.
-        `other backward` is the sum of the other rows of the backward pass. `splat alone` is a call of `splat` with
-        what the step gives it, lists and gradients included, and nothing around it."""
+        `other backward` is the sum of the other rows of the backward pass. `splat alone` is a call of `splat`
+        with what the step gives it, lists and gradients included, and nothing around it."""
     return "\n\n".join(["## The training step around it", prose(text), tables.step(result)])
 
 
