@@ -9,6 +9,10 @@ Letters     N surfels, M surfel-tile pairs, P pixels, K channels, α opacity aft
             T transmittance, w = αT, δx the adjoint of x, a_from_b an index map.
 """
 
+from __future__ import annotations
+
+import math
+
 # ---------------- cameras ----------------
 
 RIGID_TOLERANCE = 1e-3
@@ -46,18 +50,25 @@ SORT_DEPTH_RANGE = 5.0
 """Factor by which a surfel's depth in a tile may exceed that of its centre in the sort: a plane that turns
 away from the camera within its reach has no depth of its own there."""
 
-TILE = (4, 4)
-"""Width and height in pixels of a tile, whose pixels share a list of surfels. Larger tiles need fewer lists,
-but give one order to more pixels and evaluate more surfels that they miss: measurements in
-docs/decisions.md."""
+TILE_SIZES = ((512.0, (4, 4)), (1024.0, (8, 4)), (math.inf, (8, 8)))
+"""Focal lengths in pixels, and width and height in pixels of the tiles of cameras below them. The pixels of a
+tile share a list of surfels and its order: large tiles give one order to more of the picture, and evaluate
+more surfels that miss a pixel; small ones need more lists. [measured, docs/decisions.md]"""
 
-TILE_LANES = (2, 2)
-"""SIMD lanes of a tile, along x and y. A lane does the pixel at its place in each block of this size: what it
-reads of a surfel then serves them all, and what it adds to the surfel's gradient is their sum."""
+PACKET_EDGE = 8
+"""Pixels along each axis of what a SIMD packet works on: one tile, or as many as fit. 16 lanes, those of
+AVX-512, have 4 pixels each. A packet waits for the longest list of its tiles; those of neighbours are alike,
+and hold the same surfels."""
 
-PACKET_TILES = (2, 2)
-"""Tiles along x and y that stand side by side in the 16 lanes of AVX-512. A packet waits for the longest of
-their lists; those of neighbours are alike, and hold the same surfels."""
+LANE_EDGE = 2
+"""Blocks of a tile along each axis. A lane does the pixel at its place in every block: what it reads of a
+surfel then serves them all, and what it adds to the surfel's gradient is their sum."""
+
+
+def tile_size(focal: float) -> tuple[int, int]:
+    """Width and height in pixels of the tiles of a camera of this focal length (pixels)."""
+    return next(size for limit, size in TILE_SIZES if focal < limit)
+
 
 # ---------------- surfels ----------------
 

@@ -17,7 +17,7 @@ from integrator_scenes import (
     sensor,
 )
 
-from mi_refgs.constants import TILE
+from mi_refgs.constants import tile_size
 
 EVERY_AOV = "al:albedo,m:metallic,r:roughness,n:normal,dd.y:depth,a:alpha,v:visibility"
 EVERY_AOV += ",di:diffuse,sp:specular,ind:indirect"
@@ -93,7 +93,7 @@ def test_crop_window_is_part_of_the_whole() -> None:
 
 def test_principal_point_moves_the_image() -> None:
     # By whole tiles, in which surfels have an order.
-    dx, dy = TILE
+    dx, dy = tile_size(WIDTH)
     moved = image(scene(sensor(principal_point_offset_x=dx / WIDTH, principal_point_offset_y=dy / HEIGHT)))
     still = image(scene())
 

@@ -230,7 +230,7 @@ def test_work_is_counted_over_views(trainer: Trainer) -> None:
 def quiet_profile() -> Profile:
     """One that nothing can be said about."""
     stage = StageProfile("deferred", 10.0, 60, 0, dict.fromkeys(stages.STAGES, 1.0))
-    work = Work(8, 1000, 4e4, 2e4, 5e4, 8e5, 4e5, 0.1, 0.1, 0.1, 2.0, 40.0)
+    work = Work(8, 1000, 4e4, 16, 2e4, 5e4, 8e5, 4e5, 0.1, 0.1, 0.1, 2.0, 40.0)
     return Profile((stage,), work, 2**20, 2**34)
 
 

@@ -12,7 +12,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.constants import ALPHA_MIN, TILE
+from mi_refgs import constants
+from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.device import upload
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
@@ -88,8 +89,31 @@ def fast_maps(scene: Scene) -> Blended:
     return splat(scene.surfels(), scene.columns(), scene.fast_camera())
 
 
+@pytest.fixture
+def tile(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[int, int]:
+    """Tiles of this size, whatever the camera; smaller ones share a packet."""
+    monkeypatch.setattr(constants, "TILE_SIZES", ((np.inf, request.param),))
+    return request.param
+
+
+EVERY_TILE = pytest.mark.parametrize(
+    "tile", [size for _, size in constants.TILE_SIZES], indirect=True, ids=str
+)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_image_matches_oracle(seed: int) -> None:
+    compare_with_oracle(seed)
+
+
+@EVERY_TILE
+@pytest.mark.parametrize("seed", [1, 8])
+def test_image_matches_oracle_with_tiles_of_every_size(seed: int, tile: tuple[int, int]) -> None:
+    assert make_scene(seed).fast_camera().tile == tile
+    compare_with_oracle(seed)
+
+
+def compare_with_oracle(seed: int) -> None:
     scene = make_scene(seed)
     expected = oracle.splat(scene.raw, scene.features, scene.camera)
     got = fast_maps(scene)
@@ -176,6 +200,11 @@ def gradient_errors(
             errors[name] = float(np.linalg.norm(got[name][rows] - expected[name]) / scale)
         assert np.all(np.isfinite(got[name])), name
     return errors
+
+
+@EVERY_TILE
+def test_gradients_match_with_tiles_of_every_size(tile: tuple[int, int]) -> None:
+    test_gradients_match_finite_differences(5)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -384,7 +413,7 @@ def test_tile_lists_hold_what_contributes_and_little_else(seed: int, thinness: f
 
     y, x = np.mgrid[0 : camera.height, 0 : camera.width]
     pixel = mi.Point2f(mi.Float(x.ravel() + 0.5), mi.Float(y.ravel() + 0.5))
-    tile = (y // TILE[1] * lists.tiles_x + x // TILE[0]).ravel()
+    tile = (y // camera.tile[1] * lists.tiles_x + x // camera.tile[0]).ravel()
     columns = np.array([column.numpy() for column in footprints.columns])
     needed = set()
     for i in range(columns.shape[1]):
@@ -397,14 +426,17 @@ def test_tile_lists_hold_what_contributes_and_little_else(seed: int, thinness: f
         assert len(listed) <= 1.25 * len(needed) + 20
 
 
-def test_tile_lists_are_sorted_by_depth() -> None:
+@EVERY_TILE
+def test_tile_lists_are_sorted_by_depth(tile: tuple[int, int]) -> None:
     scene = make_scene(12)
     camera = scene.fast_camera()
     footprints = project(scene.surfels(), camera)
     lists = list_by_tile(footprints, camera)
     pair_tile = np.repeat(np.arange(len(lists.pair_begin)), lists.pair_end.numpy() - lists.pair_begin.numpy())
-    corner = np.array(TILE)[:, None] * np.stack([pair_tile % lists.tiles_x, pair_tile // lists.tiles_x])
-    centre = mi.Point2f(mi.Float(corner[0] + TILE[0] / 2), mi.Float(corner[1] + TILE[1] / 2))
+    corner = np.array(camera.tile)[:, None] * np.stack(
+        [pair_tile % lists.tiles_x, pair_tile // lists.tiles_x]
+    )
+    centre = mi.Point2f(mi.Float(corner[0] + camera.tile[0] / 2), mi.Float(corner[1] + camera.tile[1] / 2))
     row = [dr.gather(mi.Float, column, lists.surfel_from_pair) for column in footprints.columns]
     depth = tiles_module.depth_near(row, centre).numpy()
     same = pair_tile[1:] == pair_tile[:-1]

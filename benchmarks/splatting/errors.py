@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.splatting import exact, raster
 from benchmarks.splatting.ours import Ours
 from benchmarks.splatting.workload import FEATURES, Workload
-from mi_refgs.constants import TILE
+from mi_refgs.constants import tile_size
 from mi_refgs.reference import splat as oracle
 from mi_refgs.splat import list_by_tile, project
 from mi_refgs.surfels.table import Surfels
@@ -22,7 +22,8 @@ def crop(workload: Workload, size: int) -> Workload:
     """The same surfels in a part of the view, a third from its left and upper edge; tiles stay in place."""
     p = workload.pinhole
     size = min(size, p.width, p.height)
-    left, top = (step * (edge // 3 // step) for step, edge in zip(TILE, (p.width, p.height), strict=True))
+    tile = tile_size(abs(p.fx))
+    left, top = (step * (edge // 3 // step) for step, edge in zip(tile, (p.width, p.height), strict=True))
     part = replace(p, width=size, height=size, cx=p.cx - left, cy=p.cy - top)
     return replace(workload, pinhole=part)
 
@@ -69,9 +70,9 @@ def _relative(got: np.ndarray, expected: np.ndarray) -> float:
     return float(np.linalg.norm(got - expected)) / max(float(np.linalg.norm(expected)), 1e-30)
 
 
-def part_of(x: int, y: int) -> tuple[slice, slice]:
+def part_of(size: tuple[int, int], x: int, y: int) -> tuple[slice, slice]:
     """Rows and columns of the pixels of a tile."""
-    return slice(TILE[1] * y, TILE[1] * (y + 1)), slice(TILE[0] * x, TILE[0] * (x + 1))
+    return slice(size[1] * y, size[1] * (y + 1)), slice(size[0] * x, size[0] * (x + 1))
 
 
 def _reaching(workload: Workload) -> np.ndarray:
@@ -97,7 +98,7 @@ def _order(ours: Ours, near: np.ndarray, p: oracle.PinholeCamera) -> np.ndarray:
             listed = np.searchsorted(near, pairs[begin[tile] : end[tile]])
             rest = np.setdiff1d(np.arange(len(near)), listed)
             rows = np.concatenate([listed, rest])
-            order[:, *part_of(x, y)] = rows[:, None, None]
+            order[:, *part_of(ours.camera.tile, x, y)] = rows[:, None, None]
     return order.reshape(len(near), -1)
 
 
@@ -108,12 +109,13 @@ def _inversion(
     slopes, placed, _ = raster.project(raw, p)
     order, shown = order.reshape(-1, p.height, p.width), shown.reshape(-1, p.height, p.width)
     worst = 0.0
-    for y in range(-(-p.height // TILE[1])):
-        for x in range(-(-p.width // TILE[0])):
-            seen = np.any(shown[:, *part_of(x, y)], axis=(1, 2))
-            rows = order[:, y * TILE[1], x * TILE[0]]
+    width, height = size = tile_size(abs(p.fx))
+    for y in range(-(-p.height // height)):
+        for x in range(-(-p.width // width)):
+            seen = np.any(shown[:, *part_of(size, x, y)], axis=(1, 2))
+            rows = order[:, y * height, x * width]
             rows = rows[seen[rows]]
-            middle = np.array([(x + 0.5) * TILE[0], (y + 0.5) * TILE[1]])
+            middle = np.array([(x + 0.5) * width, (y + 0.5) * height])
             depth = raster.depth_near(slopes[rows], placed[rows], middle)
             late: np.ndarray = np.maximum.accumulate(depth) - depth
             worst = max(worst, float(np.max(late / depth, initial=0)))

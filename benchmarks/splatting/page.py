@@ -11,7 +11,6 @@ from benchmarks.splatting import page_tables as tables
 from benchmarks.splatting.limits import FLOPS, LISTED_BYTES
 from benchmarks.splatting.targets import WHAT, verdicts
 from benchmarks.splatting.workload import CHANNELS, COLOUR, FEATURES
-from mi_refgs.constants import TILE
 
 
 def page(result: dict[str, Any], pictures: list[Path], folder: Path) -> str:
@@ -105,7 +104,8 @@ def _stages_text() -> str:
 
 def _work_text(result: dict[str, Any]) -> str:
     return prose(
-        f"""A *listed* pair is a surfel and a tile of {TILE[0]} × {TILE[1]} pixels; it is *evaluated* at
+        f"""A *listed* pair is a surfel and a tile, whose size follows the focal length
+        (4² pixels up to 256², 8 × 4 at 512², 8² at 1024²); it is *evaluated* at
         all of them, unless all pixels of the tile have ended before; it *contributes* to a pixel where its
         opacity is at least 1/255 and the pixel has not ended. Bytes are a model of what must be loaded and
         stored, most of it from and to caches: {LISTED_BYTES} for a listed pair, an index and a row for each

@@ -50,7 +50,7 @@ def project(raw: dict[str, Array], p: PinholeCamera) -> tuple[Array, Array, Arra
 
 def list_by_tile(slopes: Array, placed: Array, radius: Array, p: PinholeCamera) -> tuple[Array, Array]:
     """Surfels (M,), sorted by tile and depth there, and the first pair of each tile (tiles + 1,)."""
-    size = np.array(c.TILE)
+    size = np.array(c.tile_size(abs(p.fx)))
     tiles = -(-np.array([p.width, p.height]) // size)
     first = np.clip(np.ceil(placed[:, 1:3] - radius[:, None] - 0.5), 0, None).astype(int) // size
     last = np.floor(np.minimum(placed[:, 1:3] + radius[:, None] - 0.5, [p.width - 1, p.height - 1]))
@@ -86,7 +86,7 @@ def forward(workload: Workload, features: int) -> Array:
         [workload.features[:, :features], np.zeros((workload.count, 1)), np.ones((workload.count, 1))], axis=1
     ).astype(np.float32)
     out = np.zeros((p.height, p.width, features + 2), np.float32)
-    width, height = c.TILE
+    width, height = c.tile_size(abs(p.fx))
     tiles_x = -(-p.width // width)
     for tile in range(len(begin) - 1):
         rows = surfel[begin[tile] : begin[tile + 1]]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mi_refgs.fit.config import Method
-from mi_refgs.fit.counts import TILE_PIXELS
 from mi_refgs.fit.profile import FAINT, Profile, StageProfile
 
 LOW_SHARE = 0.25
@@ -56,13 +55,13 @@ def _of_work(found: Profile) -> Iterator[str]:
     if work.aspect > THIN:
         yield (
             f"{low}, and the median surfel is {work.aspect:.0f} times as long as wide: it crosses many "
-            f"tiles of {TILE_PIXELS} pixels and fills none; a lower rate of scales (--set rates.scale) keeps "
-            "surfels rounder."
+            f"tiles of {work.tile_pixels:.0f} pixels and fills none; a lower rate of scales "
+            "(--set rates.scale) keeps surfels rounder."
         )
-    if work.footprint < TILE_PIXELS:
+    if work.footprint < work.tile_pixels:
         yield (
             f"{low}, and a surfel covers {work.footprint:.1f} pixels on average, less than a tile's "
-            f"{TILE_PIXELS}: fewer surfels would do (--set surfels.max_count)."
+            f"{work.tile_pixels:.0f}: fewer surfels would do (--set surfels.max_count)."
         )
 
 

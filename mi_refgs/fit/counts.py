@@ -8,12 +8,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import TILE
 from mi_refgs.splat import Camera, Footprints, TileLists
 from mi_refgs.splat.blend import advance
 from mi_refgs.splat.footprint import GEOMETRY_COLUMNS, evaluate
-
-TILE_PIXELS = TILE[0] * TILE[1]
 
 
 @dataclass(frozen=True)
@@ -22,6 +19,7 @@ class Counts:
 
     surfels: int
     pixels: int
+    tile_pixels: int  # of a tile
     pairs: int  # surfel-tile pairs listed
     visited: int  # of these, those that a tile came to before all of its pixels had ended
     contributing: int  # surfel-pixel pairs with α ≥ ALPHA_MIN, before the pixel's end
@@ -31,7 +29,7 @@ class Counts:
     @property
     def evaluated(self) -> int:
         """Surfel-pixel evaluations: a visited pair is evaluated at every pixel of its tile at once."""
-        return self.visited * TILE_PIXELS
+        return self.visited * self.tile_pixels
 
     @property
     def share(self) -> float:
@@ -45,12 +43,13 @@ def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
     surfels = dr.width(columns[0])
     pixels_of_surfel = dr.zeros(mi.UInt32, surfels)
     pixels = camera.width * camera.height
+    width, height = camera.tile
     if not lists.pairs:
-        return Counts(surfels, pixels, 0, 0, 0, 0, pixels_of_surfel)
-    lane = dr.arange(mi.UInt32, lists.tiles_x * lists.tiles_y * TILE_PIXELS)
-    tile, local = lane // TILE_PIXELS, lane % TILE_PIXELS
-    x = (tile % lists.tiles_x) * TILE[0] + local % TILE[0] - camera.phase[0]
-    y = (tile // lists.tiles_x) * TILE[1] + local // TILE[0] - camera.phase[1]
+        return Counts(surfels, pixels, width * height, 0, 0, 0, 0, pixels_of_surfel)
+    lane = dr.arange(mi.UInt32, lists.tiles_x * lists.tiles_y * width * height)
+    tile, local = lane // (width * height), lane % (width * height)
+    x = (tile % lists.tiles_x) * width + local % width - camera.phase[0]
+    y = (tile // lists.tiles_x) * height + local // width - camera.phase[1]
     pixel = mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5)
     begin = dr.gather(mi.UInt32, lists.pair_begin, tile)
     end = dr.gather(mi.UInt32, lists.pair_end, tile)
@@ -73,10 +72,11 @@ def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
     _, _, _, steps, hits = dr.while_loop(state, condition, body, label="count")
     dr.eval(steps, hits, pixels_of_surfel)
     # A tile goes on until the last of its pixels has ended.
-    visited = dr.sum(dr.block_reduce(dr.ReduceOp.Max, steps, TILE_PIXELS))
+    visited = dr.sum(dr.block_reduce(dr.ReduceOp.Max, steps, width * height))
     return Counts(
         surfels=surfels,
         pixels=pixels,
+        tile_pixels=width * height,
         pairs=lists.pairs,
         visited=int(visited[0]),
         contributing=int(dr.sum(hits)[0]),

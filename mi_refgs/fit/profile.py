@@ -46,6 +46,7 @@ class Work:
     views: int
     surfels: int
     pixels: float
+    tile_pixels: float  # of a tile
     covered: float  # pixels with a contribution
     pairs: float  # surfel-tile pairs listed
     evaluated: float  # surfel-pixel evaluations
@@ -179,6 +180,7 @@ def count_work(trainer: Trainer) -> Work:
         views=len(chosen),
         surfels=surfels.count,
         pixels=mean("pixels"),
+        tile_pixels=mean("tile_pixels"),
         covered=mean("covered"),
         pairs=mean("pairs"),
         evaluated=mean("evaluated"),

@@ -134,7 +134,7 @@ def _order(surfels: dict[str, np.ndarray], camera: PinholeCamera) -> np.ndarray:
     k = 1 / np.where(shown, p[:, 2], 1)
     pn = np.where(shown, np.sum(p * n, axis=1), 1)
     order = np.zeros((len(p), camera.height, camera.width), int)
-    width, height = c.TILE
+    width, height = c.tile_size(abs(camera.fx))
     for top in range(0, camera.height, height):
         for left in range(0, camera.width, width):
             x, y = left + width / 2, top + height / 2

@@ -20,7 +20,6 @@ plane, the clamp at α_max (zero), the median depth.
 
 from __future__ import annotations
 
-import math
 import operator
 from dataclasses import dataclass
 from functools import reduce
@@ -29,7 +28,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import MEDIAN_TRANSMITTANCE, PACKET_TILES, TILE, TILE_LANES, TRANSMITTANCE_MIN
+from mi_refgs.constants import LANE_EDGE, MEDIAN_TRANSMITTANCE, PACKET_EDGE, TRANSMITTANCE_MIN
 from mi_refgs.rows import Rows
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.footprint import (
@@ -104,14 +103,15 @@ class _Lanes:
     @staticmethod
     def of(op: _Blend) -> _Lanes:
         lists, camera = op.lists, op.camera
-        tile_x, tile_y, lane_x, lane_y = _lanes_of_tiles(lists.tiles_x, lists.tiles_y)
+        lanes = (camera.tile[0] // LANE_EDGE, camera.tile[1] // LANE_EDGE)
+        tile_x, tile_y, lane_x, lane_y = _lanes_of_tiles(lists, camera.tile, lanes)
         there = (tile_x < lists.tiles_x) & (tile_y < lists.tiles_y)
         tile = tile_y * lists.tiles_x + tile_x
         # Pixels before the image wrap round to huge numbers, and are not inside either.
-        corner_x = tile_x * TILE[0] + lane_x - camera.phase[0]
-        corner_y = tile_y * TILE[1] + lane_y - camera.phase[1]
-        blocks_x, blocks_y = (range(0, size, lanes) for size, lanes in zip(TILE, TILE_LANES, strict=True))
-        places = [(corner_x + x, corner_y + y) for y in blocks_y for x in blocks_x]
+        corner_x = tile_x * camera.tile[0] + lane_x - camera.phase[0]
+        corner_y = tile_y * camera.tile[1] + lane_y - camera.phase[1]
+        blocks = range(LANE_EDGE)
+        places = [(corner_x + x * lanes[0], corner_y + y * lanes[1]) for y in blocks for x in blocks]
         return _Lanes(
             [mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5) for x, y in places],
             [y * camera.width + x for x, y in places],
@@ -138,18 +138,22 @@ class _Lanes:
         return [[dr.gather(mi.Float, x, raster, inside) for x in images] for _, raster, inside in self.each()]
 
 
-def _lanes_of_tiles(tiles_x: int, tiles_y: int) -> tuple[Any, Any, Any, Any]:
-    """Column and row of the tile, and place within its block, of each lane (mi.UInt32), packet by packet."""
-    packets_x = -(-tiles_x // PACKET_TILES[0])
-    packets = packets_x * -(-tiles_y // PACKET_TILES[1])
-    tiles, lanes = math.prod(PACKET_TILES), math.prod(TILE_LANES)
-    lane = dr.arange(mi.UInt32, packets * tiles * lanes)
-    packet, tile, lane = lane // (tiles * lanes), lane // lanes % tiles, lane % lanes
+def _lanes_of_tiles(lists: TileLists, size: tuple[int, int], lanes: tuple[int, int]) -> tuple[Any, ...]:
+    """Column and row of the tile, and place within its block, of each lane (mi.UInt32), packet by packet.
+
+    `size` is that of a tile in pixels, `lanes` those of a tile along each axis.
+    """
+    side_x, side_y = PACKET_EDGE // size[0], PACKET_EDGE // size[1]  # tiles of a packet
+    packets_x = -(-lists.tiles_x // side_x)
+    packets = packets_x * -(-lists.tiles_y // side_y)
+    tiles, per_tile = side_x * side_y, lanes[0] * lanes[1]
+    lane = dr.arange(mi.UInt32, packets * tiles * per_tile)
+    packet, tile, lane = lane // (tiles * per_tile), lane // per_tile % tiles, lane % per_tile
     return (
-        packet % packets_x * PACKET_TILES[0] + tile % PACKET_TILES[0],
-        packet // packets_x * PACKET_TILES[1] + tile // PACKET_TILES[0],
-        lane % TILE_LANES[0],
-        lane // TILE_LANES[0],
+        packet % packets_x * side_x + tile % side_x,
+        packet // packets_x * side_y + tile // side_x,
+        lane % lanes[0],
+        lane // lanes[0],
     )
 
 

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.constants import RIGID_TOLERANCE, TILE
+from mi_refgs.constants import RIGID_TOLERANCE, tile_size
 from mi_refgs.errors import InputError
 
 
@@ -31,7 +31,18 @@ class Camera:
     rotation: mi.Matrix3f  # camera from world
     origin: mi.Point3f  # world
     near: mi.Float  # scene units along the camera's z axis
-    phase: tuple[int, int] = (0, 0)  # pixels, below TILE: a crop window keeps the tiles of the whole film
+    focal: float  # |fx| as a host number, which chooses the size of tiles
+    offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film, whose tiles it keeps
+
+    @property
+    def tile(self) -> tuple[int, int]:
+        """Width and height of a tile, pixels."""
+        return tile_size(self.focal)
+
+    @property
+    def phase(self) -> tuple[int, int]:
+        """Place of the first pixel in its tile."""
+        return self.offset[0] % self.tile[0], self.offset[1] % self.tile[1]
 
     @staticmethod
     def look(
@@ -72,6 +83,7 @@ class Camera:
             camera_from_world,
             origin,
             opaque(near),
+            abs(float(fx)),
         )
 
     @staticmethod
@@ -106,8 +118,8 @@ class Camera:
             matrix,
             near=float(params["near_clip"]),
         )
-        x, y = (int(offset) % size for offset, size in zip(sensor.film().crop_offset(), TILE, strict=True))
-        return replace(camera, phase=(x, y))
+        x, y = (int(offset) for offset in sensor.film().crop_offset())
+        return replace(camera, offset=(x, y))
 
     def to_camera(self, point: Any) -> Any:
         """World point to camera frame."""
@@ -136,5 +148,6 @@ class Camera:
             fy=self.fy * factor,
             cx=self.cx * factor,
             cy=self.cy * factor,
-            phase=(self.phase[0] * factor % TILE[0], self.phase[1] * factor % TILE[1]),
+            focal=self.focal * factor,
+            offset=(self.offset[0] * factor, self.offset[1] * factor),
         )

@@ -8,7 +8,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import TILE
 from mi_refgs.rows import Rows
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.footprint import Footprints, depth_near, overlaps
@@ -39,14 +38,15 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     Both sorts are stable, so surfels of equal depth keep the order of the table.
     """
     phase_x, phase_y = camera.phase
-    tiles_x, tiles_y = -(-(camera.width + phase_x) // TILE[0]), -(-(camera.height + phase_y) // TILE[1])
+    tiles_x = -(-(camera.width + phase_x) // camera.tile[0])
+    tiles_y = -(-(camera.height + phase_y) // camera.tile[1])
     tiles = tiles_x * tiles_y
     dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
     surfel, tile_x, tile_y = _rectangles(footprints, camera)
     if dr.width(surfel) == 0:
         return _empty(tiles_x, tiles_y)
     row = Rows.pack(footprints.columns).fetch(surfel)
-    tile_size = mi.Vector2f(*TILE)
+    tile_size = mi.Vector2f(*camera.tile)
     corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(phase_x, phase_y)
     touches = overlaps(row, corner + 0.5, corner + (tile_size - 0.5))  # centres of the outermost pixels
     tile = mi.UInt32(tile_y * tiles_x + tile_x)
@@ -122,7 +122,7 @@ def _empty(tiles_x: int, tiles_y: int) -> TileLists:
 def _rectangles(footprints: Footprints, camera: Camera) -> tuple[Any, Any, Any]:
     """Surfel, tile column and tile row of every tile in the rectangles of footprints, surfel by surfel."""
     first, last = (
-        [mi.Int32((x + start) // size) for x, start, size in zip(corner, camera.phase, TILE, strict=True)]
+        [mi.Int32((x + at) // size) for x, at, size in zip(corner, camera.phase, camera.tile, strict=True)]
         for corner in (footprints.first, footprints.last)
     )
     covers = (footprints.last[0] >= footprints.first[0]) & (footprints.last[1] >= footprints.first[1])
