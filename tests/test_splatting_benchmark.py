@@ -161,7 +161,7 @@ def test_contributing_pairs_are_the_oracle_s() -> None:
 
 
 def test_bytes_and_bound_grow_with_what_they_stand_for() -> None:
-    counts = Counts(10, 16, 100, 50, 400, 16, None)
+    counts = Counts(10, 16, 16, 100, 50, 400, 16, None)
     forward = limits.bytes_moved(counts, 14)["forward"]
     assert forward == 24 * 100 + (4 + 4 * 24) * 50 + 4 * 16 * 16
     assert limits.lower_bound(counts, 1.0) == pytest.approx({"forward": 0.024, "both": 0.104})

@@ -1,6 +1,6 @@
 """Times, work, memory and errors of the splatter, against other renderers and the machine's limits.
 
-    python -m benchmarks.splatting                     the page docs/splatting.md, in 15 minutes on two cores
+    python -m benchmarks.splatting                     the page docs/splatting.md, in five minutes on 2 cores
     python -m benchmarks.splatting --scene runs/glossy the same, with the surfels of a fitted scene
     python -m benchmarks.splatting --small -o out      a small instance, below a minute
     python -m benchmarks.splatting --full              slow renderers in more cases, everything more often

@@ -257,9 +257,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         light = None
         if self.shading.reflectance == "split_sum":
             light = self._prefiltered(scene)
-        needs_aovs = any(aov.type in (*MATERIALS, *TERMS) for aov in self.aovs)
-        needs_aovs |= len(self.terms) < len(TERMS)
-        return render(self.surfels, camera, self.shading, light, self.occluder, aovs=needs_aovs)
+        aovs = len(self.terms) < len(TERMS) or any(aov.type in (*MATERIALS, *TERMS) for aov in self.aovs)
+        return render(self.surfels, camera, self.shading, light, self.occluder, aovs=aovs)
 
     def _prefiltered(self, scene: Any) -> Any:
         if self.light is None:

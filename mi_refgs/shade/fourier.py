@@ -1,8 +1,8 @@
-"""Azimuthal Fourier rows of lat-long grids in Dr.Jit: analysis, synthesis, block-sparse products.
+"""Azimuthal Fourier rows of lat-long grids in Dr.Jit: analysis and synthesis.
 
 A texel buffer is flat, four floats a texel (RGBA, A unused). A Fourier buffer has eight floats a coefficient:
 the cosine coefficients of R, G and B, the sine coefficients, and two unused, so that each is one packet. Rows
-keep only the frequencies they need. Analysis and synthesis are each other's transpose, and all three kernels
+keep only the frequencies they need. Analysis and synthesis are each other's transpose, and these kernels
 gather, so that adjoints are made of the same kernels and nothing is atomic.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 from mi_refgs.device import upload
 
 BLOCK = 4
-"""Output rows per lane of `mix_rows`: a gathered coefficient then serves four rows."""
+"""Rows that need as many frequencies as each other: `mixing` makes them in one lane."""
 
 COEFFICIENT = 8
 """Floats a coefficient, and TEXEL floats a texel: powers of two, as packets are."""
@@ -45,20 +45,7 @@ class Rows:
     twiddles: Any  # pairs of cos and sin of multiples of π/w
 
 
-@dataclass(frozen=True)
-class Mixing:
-    """A block-sparse matrix between Fourier buffers: a lane owns four outputs, entries [begin, end)."""
-
-    outputs: int
-    begin: Any
-    end: Any
-    slot: Any  # first of the four outputs
-    step: Any  # from one output to the next
-    source: Any  # input coefficient of each entry
-    weights: Any  # four floats an entry
-
-
-def _device(*columns: np.ndarray) -> tuple[Any, ...]:
+def to_device(*columns: np.ndarray) -> tuple[Any, ...]:
     return tuple(upload(column, mi.UInt32) for column in columns)
 
 
@@ -96,39 +83,13 @@ def make_rows(firsts: list[int], limits: list[np.ndarray]) -> Rows:
     return Rows(
         texels=firsts[-1] + 2 * len(limits[-1]) ** 2,
         coefficients=int(sum(limit.sum() for limit in limits)),
-        folding=_device(*np.concatenate(folding, 1)),
-        analysis=_device(*np.concatenate(analysis, 1)),
-        slots=_device(*np.concatenate(slots, 1)),
+        folding=to_device(*np.concatenate(folding, 1)),
+        analysis=to_device(*np.concatenate(analysis, 1)),
+        slots=to_device(*np.concatenate(slots, 1)),
         exists=tuple(mi.Bool(row) for row in np.concatenate(exists, 1)),
-        synthesis=_device(*np.concatenate(synthesis, 1)),
+        synthesis=to_device(*np.concatenate(synthesis, 1)),
         twiddles=upload(np.concatenate(twiddles)),
     )
-
-
-def make_mixing(blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]], outputs: int) -> Mixing:
-    """The matrix of pieces (rows, columns, M), each with slots of its columns, slots and limits of its rows.
-
-    Pieces that share output rows add up.
-    """
-    slots, steps, sources, weights = [], [], [], []
-    for matrix, slot_in, slot_out, limit_out in blocks:
-        quads = matrix.reshape(-1, BLOCK, *matrix.shape[1:])
-        b, m, k = np.nonzero((quads != 0).any(1).swapaxes(1, 2))
-        slots.append(slot_out[BLOCK * b] + m)
-        steps.append(limit_out[BLOCK * b])
-        sources.append(slot_in[k] + m)
-        weights.append(quads[b, :, k, m])
-    slot, step, source, weight = (np.concatenate(a) for a in (slots, steps, sources, weights))
-    order = np.lexsort((source, slot))
-    slot, step, source, weight = slot[order], step[order], source[order], weight[order]
-    begin = np.flatnonzero(np.diff(slot, prepend=-1))
-    end = np.append(begin[1:], len(slot))
-    # Equally long lanes side by side: a packet waits for its longest.
-    lanes = np.argsort(begin - end, kind="stable")
-    begin, end = begin[lanes], end[lanes]
-    first, last, place, stride, origin = _device(begin, end, slot[begin], step[begin], source)
-    entries = upload(weight)
-    return Mixing(outputs, first, last, place, stride, origin, entries)
 
 
 def write(target: Any, values: list[Any], place: Any, active: Any = True) -> None:
@@ -138,7 +99,7 @@ def write(target: Any, values: list[Any], place: Any, active: Any = True) -> Non
     dr.scatter(target, mi.ArrayXf(padded), place, active, mode=dr.ReduceMode.NoConflicts)
 
 
-def _read(size: int, source: Any, place: Any, active: Any = True) -> list[Any]:
+def read(size: int, source: Any, place: Any, active: Any = True) -> list[Any]:
     return list(dr.gather(mi.ArrayXf, source, place, active, shape=(size, dr.width(place))))
 
 
@@ -154,8 +115,8 @@ def _four_turns(rows: Rows, at: Any, turn: Any, step: Any, w: Any) -> tuple[list
     One is looked up and three are rotated from it: lookups are what the loops here spend their time on, and a
     longer chain of rotations would lose digits.
     """
-    cos, sin = _read(2, rows.twiddles, at + turn)
-    c, s = _read(2, rows.twiddles, at + step)  # the same in every turn of a loop: read once
+    cos, sin = read(2, rows.twiddles, at + turn)
+    c, s = read(2, rows.twiddles, at + step)  # the same in every turn of a loop: read once
     angles = [(cos, sin)]
     for _ in range(3):
         cos, sin = dr.fma(cos, c, -sin * s), dr.fma(cos, s, sin * c)
@@ -172,7 +133,7 @@ def _fold(rows: Rows, texels: Any) -> Any:
     start, w, j = rows.folding
     half = w // 2
     columns = (j, w - 1 - j, half + j, half - 1 - j)
-    colours = list(zip(*(_read(TEXEL, texels, start + column)[:3] for column in columns), strict=True))
+    colours = list(zip(*(read(TEXEL, texels, start + column)[:3] for column in columns), strict=True))
     out = dr.empty(mi.Float, COEFFICIENT * (rows.texels // 2))
     for parity, sign in enumerate((1, -1)):
         cosines = [a + b + sign * (c + d) for a, b, c, d in colours]
@@ -193,7 +154,7 @@ def analyse(rows: Rows, texels: Any) -> Any:
         out = []
         angles, turn = _four_turns(rows, at, turn, 2 * m, w)  # φ_j = π(2j+1)/w
         for r, (cos, sin) in enumerate(angles):
-            x = _read(COEFFICIENT, folded, place + 2 * (j + r), j + r < quarter)[:6]
+            x = read(COEFFICIENT, folded, place + 2 * (j + r), j + r < quarter)[:6]
             out += [dr.fma(x[c], cos, acc[12 * r + c]) for c in range(6)]
             out += [dr.fma(x[c], sin, acc[12 * r + 6 + c]) for c in range(6)]
         return (j + 4, turn, *out)
@@ -235,7 +196,7 @@ def synthesise(rows: Rows, coefficients: Any, texels: Any) -> None:
             for turn, column in zip(turns, columns, strict=True)
         ]
         for r in range(4):
-            x = _read(COEFFICIENT, coefficients, slot + m + r, m + r < limit)
+            x = read(COEFFICIENT, coefficients, slot + m + r, m + r < limit)
             for (angles, _), out in zip(turned, sums, strict=True):
                 _add_frequency(out, r, x, *angles[r])
         return m + 4, [turn for _, turn in turned], sums
@@ -285,23 +246,3 @@ def _unfold(texels: Any, start: Any, w: Any, q: Any, sums: list[Any]) -> None:
                 odd = cross_cos[c] - ε * cross_sin[c] if k % 2 else odd_cos[c] + ε * odd_sin[c]
                 colour.append(value + (odd if k < 2 else -odd))
             write(texels, colour, start + column, q < w // 8)
-
-
-def mix_rows(matrix: Mixing, coefficients: Any) -> Any:
-    """The block-sparse product of a `Mixing` and a Fourier buffer."""
-
-    def body(n: Any, *acc: Any) -> tuple[Any, ...]:
-        out = list(acc)
-        source = dr.gather(mi.UInt32, matrix.source, n)
-        weight = dr.gather(mi.Vector4f, matrix.weights, n)
-        for c, x in enumerate(_read(COEFFICIENT, coefficients, source)[:6]):
-            for row in range(BLOCK):
-                out[6 * row + c] = dr.fma(weight[row], x, out[6 * row + c])
-        return (n + 1, *out)
-
-    zeros = [dr.zeros(mi.Float, dr.width(matrix.begin)) for _ in range(6 * BLOCK)]
-    state = dr.while_loop((mi.UInt32(matrix.begin), *zeros), lambda n, *_: n < matrix.end, body)
-    out = dr.zeros(mi.Float, COEFFICIENT * matrix.outputs)
-    for row in range(BLOCK):
-        write(out, list(state[1 + 6 * row : 7 + 6 * row]), matrix.slot + row * matrix.step)
-    return out

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.shade import fourier, lobe
+from mi_refgs.shade import fourier, lobe, mixing
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Operator:
     height: int
     base: fourier.Rows
     levels: fourier.Rows
-    forward: fourier.Mixing
-    adjoint: fourier.Mixing
+    forward: mixing.Mixing
+    adjoint: mixing.Mixing
     info: Any  # 4 UInt32 a level: first texel, h, w, 0; level 0 is the map itself
     shapes: tuple[tuple[int, int], ...]  # (first texel, h) of each level, the same on the host
 
@@ -59,11 +59,11 @@ def _build(height: int) -> Operator:
         height=height,
         base=base,
         levels=levels,
-        forward=fourier.make_mixing(
+        forward=mixing.make_mixing(
             [(m, slot_in, s, n) for m, (s, n) in zip(matrices, out, strict=True)],
             levels.coefficients,
         ),
-        adjoint=fourier.make_mixing(
+        adjoint=mixing.make_mixing(
             [(m, s, slot_in, limit_in) for m, (s, _) in zip(transposed, out, strict=True)],
             base.coefficients,
         ),
@@ -80,7 +80,7 @@ def apply(op: Operator, radiance: Any) -> Any:
     texel = dr.arange(mi.UInt32, op.base.texels)
     fourier.write(out, [dr.gather(mi.Float, radiance, 3 * texel + c) for c in range(3)], texel)
     dr.eval(out)
-    fourier.synthesise(op.levels, fourier.mix_rows(op.forward, fourier.analyse(op.base, out)), out)
+    fourier.synthesise(op.levels, mixing.mix_rows(op.forward, fourier.analyse(op.base, out)), out)
     return out
 
 
@@ -88,7 +88,7 @@ def apply_transposed(op: Operator, δlevels: Any) -> Any:
     """Adjoint of `apply`: flat δradiance (3·h·w) of flat RGBA δlevels."""
     dr.eval(δlevels)
     out = dr.empty(mi.Float, 4 * op.base.texels)
-    fourier.synthesise(op.base, fourier.mix_rows(op.adjoint, fourier.analyse(op.levels, δlevels)), out)
+    fourier.synthesise(op.base, mixing.mix_rows(op.adjoint, fourier.analyse(op.levels, δlevels)), out)
     n = dr.arange(mi.UInt32, 3 * op.base.texels)
     texel = 4 * (n // 3) + n % 3
     return dr.gather(mi.Float, out, texel) + dr.gather(mi.Float, δlevels, texel)
