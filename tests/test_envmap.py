@@ -372,3 +372,11 @@ def test_finite_at_poles_and_extreme_roughness() -> None:
         dr.backward(colour)
         for array in (colour, dr.grad(direction), dr.grad(roughness), dr.grad(raw).array):
             assert dr.all(dr.isfinite(array), axis=None)
+
+
+def test_a_replayed_prefilter_follows_its_input(rng: np.random.Generator) -> None:
+    operator = prefilter.operator(16)
+    for _ in range(4):
+        light = EnvironmentLight.from_radiance(rng.uniform(0, 1, (16, 32, 3)))
+        expected = prefilter.apply(operator, light.radiance().array)
+        np.testing.assert_allclose(light.prefilter().levels.numpy(), expected.numpy(), rtol=1e-5, atol=1e-6)
