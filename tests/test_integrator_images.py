@@ -84,10 +84,11 @@ def test_supersampling_is_a_box_filter_over_pixel_centres() -> None:
     assert np.abs(image(of) - mean).max() > 1e-3
 
 
-def test_crop_window_is_part_of_the_whole() -> None:
+@pytest.mark.parametrize("spp", [1, 4])
+def test_crop_window_is_part_of_the_whole(spp: int) -> None:
     crop = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 9, "crop_height": 7}
     part = scene(sensor(film=crop))
-    np.testing.assert_allclose(image(part), image(scene())[2:9, 3:12], atol=2e-5)
+    np.testing.assert_allclose(image(part, spp=spp), image(scene(), spp=spp)[2:9, 3:12], atol=2e-5)
     assert list(part.sensors()[0].film().bitmap().size()) == [9, 7]
 
 
