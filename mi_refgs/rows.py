@@ -24,18 +24,18 @@ class Rows:
     @property
     def packets(self) -> int:
         """Packets per row."""
-        return -(-self.width // PACKET)
+        return _padded(self.width) // PACKET
 
     @staticmethod
     def zeros(count: int, width: int) -> Rows:
         """Rows of zeros."""
-        return Rows(dr.zeros(mi.Float, count * -(-width // PACKET) * PACKET), count, width)
+        return Rows(dr.zeros(mi.Float, count * _padded(width)), count, width)
 
     @staticmethod
     def pack(columns: list[Any]) -> Rows:
         """Rows of columns (mi.Float, width N)."""
         count, width = dr.width(columns[0]), len(columns)
-        rows = Rows(dr.empty(mi.Float, count * -(-width // PACKET) * PACKET), count, width)
+        rows = Rows(dr.empty(mi.Float, count * _padded(width)), count, width)
         values = [dr.detach(column) for column in columns]
         for place, packet in rows._packets(dr.arange(mi.UInt32, count), values):
             # Without the promise of no conflicts every packet would be a kernel of its own.
@@ -69,6 +69,11 @@ class Rows:
         padded = values + [mi.Float(0)] * (self.packets * PACKET - len(values))
         groups = [padded[i : i + PACKET] for i in range(0, len(padded), PACKET)]
         return [(row * self.packets + i, mi.ArrayXf(group)) for i, group in enumerate(groups)]
+
+
+def _padded(width: int) -> int:
+    """Floats of a row with its padding."""
+    return -(-width // PACKET) * PACKET
 
 
 def columns_of(array: Any, width: int) -> list[Any]:

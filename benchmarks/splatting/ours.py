@@ -74,15 +74,6 @@ class Ours:
         gradients = [dr.grad(leaf) for leaf in [*raw.values(), *columns]]
         return [*maps, blended.median_depth, *gradients]
 
-    def both_ms(self, repeats: int) -> float:
-        """Median milliseconds of `both`, warm."""
-        found: dict[str, float] = {}
-        times = []
-        for _ in range(repeats + 2):
-            _timed(found, "both", self.both)
-            times.append(found["both"])
-        return float(np.median(times[2:]))
-
     def counts(self) -> Counts:
         """The work of a view."""
         with dr.suspend_grad():

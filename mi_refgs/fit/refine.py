@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import mitsuba as mi
 import numpy as np
 
+from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.fit.config import Refine
 from mi_refgs.surfels.init import jittered_albedo, logit
@@ -34,11 +36,9 @@ class Edited:
     fresh: np.ndarray  # (M,) bool
 
     def ordered(self) -> Edited:
-        """The same rows, those of neighbours next to each other: new ones stand at the end."""
-        raw = self.surfels.to_numpy()
-        order = along_curve(raw["position"])
-        table = {name: values[order] for name, values in raw.items()}
-        return Edited(Surfels.from_numpy(table), self.parent[order], self.fresh[order])
+        """The same rows, those of neighbours next to each other; densifying leaves new ones at the end."""
+        order = along_curve(self.surfels.raw["position"].numpy())
+        return Edited(self.surfels.gather(upload(order, mi.UInt32)), self.parent[order], self.fresh[order])
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:

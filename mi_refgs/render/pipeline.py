@@ -151,16 +151,16 @@ def _shade_at_surfels(
     blended = splat(surfels, features, camera, shift)
 
     inverse = _inverse_alpha(blended)
-    triples = [blended.features[i : i + 3] for i in range(0, 3 * (len(features) // 3), 3)]
-    radiance, normal, *apart = (mi.Vector3f(*triple) for triple in triples)
+    maps = blended.features
+    apart = Terms(mi.Color3f(*maps[6:9]), mi.Color3f(*maps[9:12]), dr.zeros(mi.Color3f, 1)) if aovs else None
     return Frame(
         alpha=blended.alpha,
         depth=blended.depth * inverse,
         median_depth=blended.median_depth,
-        normal=normal,
-        radiance=mi.Color3f(radiance),
-        terms=Terms(mi.Color3f(apart[0]), mi.Color3f(apart[1]), dr.zeros(mi.Color3f, 1)) if aovs else None,
-        maps=_material_maps(blended.features[12:17], inverse) if show_materials else {},
+        normal=mi.Vector3f(*maps[3:6]),
+        radiance=mi.Color3f(*maps[0:3]),
+        terms=apart,
+        maps=_material_maps(maps[12:17], inverse) if show_materials else {},
     )
 
 
