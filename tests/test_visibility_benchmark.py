@@ -139,29 +139,29 @@ def test_bounces_approach_the_path_tracer_at_full_depth() -> None:
     assert relmse == sorted(relmse, reverse=True) and relmse[-1] < 0.15 * relmse[0]
 
 
-def test_payoff_is_the_best_within_the_budget() -> None:
-    methods: dict[str, tuple[float, float | None]] = {
-        "mirror ray": (1.0, 10.0),
-        "good": (0.2, 29.0),
-        "dear": (0.1, 31.0),
-        "untimed": (0.0, None),
-    }
-    rows = [
-        {
-            "scene": "s",
-            "roughness": 0.3,
-            "depth": "full",
-            "method": name,
-            "relmse": e,
-            "ms": t,
-            "frame_ms": 5.0,
-        }
-        for name, (e, t) in methods.items()
+def test_payoff_is_chosen_elsewhere_within_the_budget() -> None:
+    """`lucky` is best here, `steady` on the other scene, which decides; `dear` is over the budget."""
+    here = {"mirror ray": (1.0, 10.0), "lucky": (0.1, 29.0), "steady": (0.2, 20.0), "dear": (0.01, 31.0)}
+    there = {"mirror ray": 1.0, "lucky": 0.9, "steady": 0.3, "dear": 0.01, "untimed": 1e-3}
+    fixed = {"roughness": 0.3, "depth": "full"}
+    rows: list[Row] = [
+        {"scene": "here", "method": name, "relmse": error, "ms": time, "frame_ms": time, **fixed}
+        for name, (error, time) in here.items()
     ]
-    rows[-1]["frame_ms"] = None
-    shading, frame = payoff.payoffs(rows)
-    assert (shading["method"], frame["method"]) == ("good", "dear")
-    assert shading["gain"] == pytest.approx(5) and shading["price"] == pytest.approx(2.9)
+    rows += [
+        {"scene": "there", "method": name, "relmse": error, "ms": 10.0, "frame_ms": None, **fixed}
+        for name, error in there.items()
+    ]
+    rows.append(rows[0] | {"method": "untimed", "relmse": 0.0, "ms": None, "frame_ms": None})
+    rows[4]["frame_ms"] = 10.0
+    budgets: list[Row] = [
+        {"scene": name, "roughness": 0.3, "indirect": "harmonics", "total": 0.4} for name in ("here", "there")
+    ]
+    budgets += [row | {"indirect": "1 bounce", "total": 9.0} for row in budgets]
+    shading = payoff.payoffs(rows, budgets)[0]
+    assert (shading["scene"], shading["time"], shading["method"]) == ("here", "ms", "steady")
+    assert shading["gain"] == pytest.approx(2) and shading["price"] == pytest.approx(2)
+    assert shading["best_gain"] == pytest.approx(4) and shading["mirror_relmse"] == 1
 
 
 @pytest.mark.parametrize("name", ["bowl", "deep_bowl", "plates"])

@@ -53,7 +53,7 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
         "rows": rows,
         "curve": curve,
         "budgets": taken_apart,
-        "payoffs": payoffs(rows),
+        "payoffs": payoffs(rows, taken_apart),
     }
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.common import figures
 from benchmarks.common.select import where
-from benchmarks.visibility.payoff import PAPER
+from benchmarks.visibility.payoff import MIRROR
 
 RAYS_ONLY = "#c77b30"
 BOUNCES = ("#9ecae1", "#4292c6", "#08306b", "#6a51a3")
@@ -56,9 +56,9 @@ def _speed(ax: Any, result: dict[str, Any], scene: str, roughness: float) -> Non
                     xytext=(3, 3),
                     textcoords="offset points",
                 )
-    none, paper = where(timed, rays=0)[0], where(timed, method=PAPER)[0]
+    none, mirror = where(timed, rays=0)[0], where(timed, method=MIRROR)[0]
     ax.plot(none["ms"], none["relmse"], "x", color="#444444", label="no occlusion")
-    ax.axhline(paper["relmse"], color="#bbbbbb", lw=0.8, zorder=0)
+    ax.axhline(mirror["relmse"], color="#bbbbbb", lw=0.8, zorder=0)
     ax.set(xscale="log", yscale="log", xlabel="ms per frame", title=f"{scene}, roughness {roughness:g}")
     ax.set_ylabel("relMSE at full depth")
     for axis in (ax.xaxis, ax.yaxis):
