@@ -44,11 +44,15 @@ def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
 
 
 def box_downscale(image: np.ndarray, factor: int) -> np.ndarray:
-    """Mean over factor × factor blocks of an (H, W, C) image; H and W must be multiples of factor."""
+    """Mean over factor × factor blocks of an (H, W, C) image.
+
+    Rows below and columns right of the last whole block are left out: coordinates only divide by `factor`.
+    """
     if factor == 1:
         return image
-    height, width, channels = image.shape
-    blocks = image.reshape(height // factor, factor, width // factor, factor, channels)
+    height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
+    whole = image[: height * factor, : width * factor]
+    blocks = whole.reshape(height, factor, width, factor, channels)
     return blocks.mean(axis=(1, 3), dtype=np.float64).astype(image.dtype)
 
 

@@ -93,6 +93,16 @@ def test_downscale_averages_composited_pixels(folder: Path) -> None:
         assert half.fx == full.fx / 2 and half.cy == full.cy / 2
 
 
+def test_downscale_leaves_out_what_fills_no_block(folder: Path) -> None:
+    """The camera then only divides: the top left corner of the picture stays where it was."""
+    full, third = (load(folder, "train", downscale=scale).views[1] for scale in (1, 3))
+    assert (third.width, third.height) == (WIDTH // 3, HEIGHT // 3) == (2, 1)
+    np.testing.assert_allclose(third.image, box_downscale(full.image[:3], 3), atol=1e-6)
+    np.testing.assert_allclose(
+        [third.fx, third.fy, third.cx, third.cy], np.array([full.fx, full.fy, full.cx, full.cy]) / 3
+    )
+
+
 def test_camera_frame(folder: Path) -> None:
     """Mitsuba's frame: +z forward, +x left, +y up; what lies right of the axis lands right."""
     view = load(folder, "train").views[1]
@@ -245,7 +255,7 @@ def truncate(folder: Path) -> None:
         (resize, {}, ["r_5", "one size"]),
         (nan, {"images": "exr"}, ["r_4.exr", "NaN", "row 1, column 2"]),
         (lambda f: (f / "train/r_1.exr").write_text("no"), {"images": "exr"}, ["r_1.exr", "EXR"]),
-        (lambda f: None, {"downscale": 4}, ["r_0.png", "downscale", "divisor"]),
+        (lambda f: None, {"downscale": 5}, ["r_0.png", "downscale", "smaller"]),
         (lambda f: None, {"downscale": 0}, ["downscale"]),
         (lambda f: None, {"background": "green"}, ["background", "green"]),
         (lambda f: None, {"images": "tiff"}, ["images", "tiff"]),

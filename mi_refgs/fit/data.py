@@ -4,7 +4,8 @@ Colour: PNG targets stay as displayed, sRGB-encoded, composited in that space as
 A·rgb + (1 − A)·background. EXR targets are linear and premultiplied: radiance + (1 − A)·background.
 
 Keys: `camera_angle_x` (radians) or `fl_x`, and `camera_angle_y`, `fl_y`, `cx`, `cy`, `w`, `h` (pixels), each
-in a frame or for the whole file; `frames` with `file_path` (with or without extension) and `transform_matrix`
+in a frame or for the whole file; `k1` … `k4`, `p1`, `p2`, `is_fisheye`, `camera_model` (`fit.lens` undoes the
+distortion); `frames` with `file_path` (with or without extension) and `transform_matrix`
 (camera to world, OpenGL axes); optional `exr_path`, `normal_path` (X, Y, Z, world) and `depth_path` (along
 the viewing axis) as `fit.dataset` writes them.
 """
@@ -76,9 +77,10 @@ def load(
 ) -> Dataset:
     """Read one split ("train" or "test") of the data set in folder `path`.
 
-    `downscale` averages blocks of pixels, colour premultiplied by alpha. Without a `transforms_test.json`
-    every eighth picture, in the order of their paths, is a test view and no training view; a lone
-    `transforms.json` is split the same way. `truth` reads normals and depth where there are any.
+    `downscale` averages blocks of pixels, colour premultiplied by alpha; pixels at the right and the bottom
+    that fill no block are left out. Without a `transforms_test.json` every eighth picture,
+    in the order of their paths, is a test view and no training view; a lone `transforms.json` is split the
+    same way. `truth` reads normals and depth where there are any.
 
     Raises InputError for anything missing, unreadable or inconsistent: file, field and remedy are named.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import numpy as np
 
 from mi_refgs.constants import RIGID_TOLERANCE
 from mi_refgs.errors import InputError
+from mi_refgs.fit.lens import Lens, Undistortion, undistortion
 from mi_refgs.images import box_downscale, read_exr_image, read_png
 
 if TYPE_CHECKING:
@@ -18,6 +20,16 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 """File name endings that `file_path` may carry or leave out, in the order in which they are tried."""
+LENS_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
+CAMERA_MODELS = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), False),
+    **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), True),
+}
+"""Values of `camera_model`, as COLMAP and nerfstudio name them, and whether each is a fisheye."""
+OTHER_LENSES = ("k5", "k6", "ftheta_p0", "latlong", "equirectangular", "orthographic")
+"""Keys of lenses that are refused, unless they are 0 or false."""
+MAX_NUMBER = 1e9
+"""Largest absolute value of a number in a transforms file; no size, focal length or coefficient has more."""
 MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
 """OpenGL's camera looks along −z with +x right, Mitsuba's along +z with +x left; its own inverse."""
 
@@ -70,8 +82,13 @@ class FrameReader:
         premultiplied, alpha, source = self._picture(frame, name, stem)
         height, width = premultiplied.shape[:2]
         fx, fy, cx, cy = (x / self.downscale for x in self._intrinsics(index, frame, *source))
-        normal = self._map(index, frame, "normal_path", (height, width, 3))
-        depth = self._map(index, frame, "depth_path", (height, width, 1))
+        straight = self._undistortion(index, frame, (width, height, fx, fy, cx, cy))
+        if straight is not None:
+            fx, fy = fx * straight.zoom, fy * straight.zoom
+            premultiplied = straight.resample(premultiplied)
+            alpha = None if alpha is None else straight.resample(alpha[..., None])[..., 0]
+        normal = self._map(index, frame, "normal_path", (*source[:0:-1], 3), straight)
+        depth = self._map(index, frame, "depth_path", (*source[:0:-1], 1), straight)
         if normal is not None:
             length = np.linalg.norm(normal, axis=-1, keepdims=True)
             normal = np.where(length > 0, normal / np.maximum(length, 1e-12), 0).astype(np.float32)
@@ -114,33 +131,41 @@ class FrameReader:
             if pixels.shape[-1] == 4:
                 pixels[..., :3] *= pixels[..., 3:]
         height, width = pixels.shape[:2]
-        if width % self.downscale or height % self.downscale:
+        if min(width, height) < self.downscale:
             raise InputError(
-                f"{file}: downscale: {width} × {height} pixels cannot be divided by {self.downscale}; "
-                "give a divisor of both"
+                f"{file}: downscale: {width} × {height} pixels are less than a block of {self.downscale}²; "
+                "give a smaller number"
             )
         small = box_downscale(pixels, self.downscale)
         alpha = np.ascontiguousarray(small[..., 3]) if small.shape[-1] == 4 else None
         return np.ascontiguousarray(small[..., :3]), alpha, (file, width, height)
 
     def _map(
-        self, index: int, frame: dict[str, Any], key: str, shape: tuple[int, int, int]
+        self,
+        index: int,
+        frame: dict[str, Any],
+        key: str,
+        expected: tuple[int, int, int],
+        straight: Undistortion | None,
     ) -> np.ndarray | None:
-        """A ground-truth map at the wanted size, each pixel a mean over the surface in its block."""
+        """A ground-truth map at the wanted size, each pixel a mean over the surface in its block.
+
+        `expected` is the shape that the file must have: the picture's.
+        """
         if not self.truth or not frame.get(key):
             return None
         file = self.transforms.parent / str(frame[key])
         pixels = read_exr_image(file)
-        expected = (shape[0] * self.downscale, shape[1] * self.downscale, shape[2])
         if pixels.shape != expected:
             raise InputError(
                 f"{file}: frames[{index}].{key}: has shape {pixels.shape} but the picture needs {expected}; "
                 "export both at one size or remove the key"
             )
         covered = np.any(pixels != 0, axis=-1, keepdims=True).astype(np.float32)
-        share = box_downscale(covered, self.downscale)
-        mean = box_downscale(pixels, self.downscale) / np.maximum(share, 1e-12)
-        return mean.astype(np.float32)
+        share, total = box_downscale(covered, self.downscale), box_downscale(pixels, self.downscale)
+        if straight is not None:  # linear, so that no weight is negative
+            share, total = straight.resample(share, order=1), straight.resample(total, order=1)
+        return (total / np.maximum(share, 1e-12)).astype(np.float32)
 
     def _to_world(self, index: int, frame: dict[str, Any]) -> np.ndarray:
         field = f"{self.transforms}: frames[{index}].transform_matrix"
@@ -161,18 +186,56 @@ class FrameReader:
             raise InputError(f"{field}: not a rotation and a translation; remove scale, shear and mirroring")
         return matrix @ MITSUBA_FROM_OPENGL
 
+    def _given(self, frame: dict[str, Any], key: str) -> Any:
+        """The value of a key in the frame, or for the whole file; None where there is neither."""
+        return frame.get(key, self.content.get(key))
+
+    def _number(self, frame: dict[str, Any], key: str) -> float | None:
+        value = self._given(frame, key)
+        if value is None:
+            return None
+        if type(value) not in (int, float) or not abs(value) <= MAX_NUMBER:
+            raise InputError(f"{self.transforms}: {key}: {reprlib.repr(value)} is not a number; correct it")
+        return float(value)
+
+    def _undistortion(
+        self, index: int, frame: dict[str, Any], view: tuple[int, int, float, float, float, float]
+    ) -> Undistortion | None:
+        """How to undo the lens of a frame, whose size and intrinsics are given; None for a pinhole."""
+        model = self._given(frame, "camera_model") or "OPENCV"
+        fisheye = self._given(frame, "is_fisheye") or False
+        odd = [key for key in OTHER_LENSES if self._given(frame, key)]
+        if not isinstance(model, str) or model not in CAMERA_MODELS or not isinstance(fisheye, bool) or odd:
+            raise InputError(
+                f"{self.transforms}: {odd[0] if odd else 'camera_model'}: this lens is unknown here; "
+                "undistort the pictures, or give OpenCV's perspective or fisheye coefficients"
+            )
+        fisheye = fisheye or CAMERA_MODELS[model]
+        k1, k2, k3, k4, p1, p2 = (self._number(frame, key) or 0.0 for key in LENS_KEYS)
+        if (p1 or p2) if fisheye else k4:
+            field, kind = ("p1, p2", "fisheye") if fisheye else ("k4", "perspective")
+            raise InputError(
+                f"{self.transforms}: {field}: a {kind} lens has none here; undistort the pictures, "
+                "or set it to 0"
+            )
+        if not (fisheye or any((k1, k2, k3, p1, p2))):
+            return None
+        lens = Lens(fisheye, (k1, k2, k3, k4) if fisheye else (k1, k2, k3), (p1, p2))
+        try:
+            return undistortion(lens, *view)
+        except InputError as error:
+            raise InputError(f"{self.transforms}: frames[{index}]: k1 … p2: {error}") from None
+
     def _intrinsics(
         self, index: int, frame: dict[str, Any], file: Path, width: int, height: int
     ) -> tuple[float, float, float, float]:
         """fx, fy, cx, cy in pixels of the picture file."""
 
         def number(key: str) -> float | None:
-            value = frame.get(key, self.content.get(key))
-            if value is None:
-                return None
-            if type(value) not in (int, float) or not math.isfinite(value) or value <= 0:
+            value = self._number(frame, key)
+            if value is not None and value <= 0:
                 raise InputError(f"{self.transforms}: {key}: {value!r} is not a positive number; correct it")
-            return float(value)
+            return value
 
         for key, size in (("w", width), ("h", height)):
             wanted = number(key)

@@ -1,0 +1,120 @@
+"""Lens distortion: the models of OpenCV's documentation, and pictures resampled to those of a pinhole.
+
+With (x, y) = direction / depth and r² = x² + y², a lens moves the image of a point to
+
+    perspective   x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)
+                  y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p2 x y + p1 (r² + 2 y²)
+    fisheye       (x', y') = (x, y) θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) / r,  θ = atan r
+
+and to the pixel (fx x' + cx, fy y' + cy), where the centre of the first pixel is (½, ½).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy import ndimage
+
+from mi_refgs.errors import InputError
+
+MAX_ZOOM = 2.0
+"""Factor of the focal length beyond which less than a quarter of the picture would be left."""
+ZOOM_STEPS = 30
+"""Bisections: 1e-9 of the focal length, 1e-6 pixels."""
+GRID = 65
+"""Points along each side at which a zoom is tried; between them an edge's image bends by < 0.01 pixels."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Coefficients of one lens."""
+
+    fisheye: bool
+    radial: tuple[float, ...]  # k1, k2, k3, k4; a perspective lens has no k4
+    tangential: tuple[float, float] = (0.0, 0.0)  # p1, p2
+
+    def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where a pinhole's image points x, y (one unit before the eye) land, in the same unit."""
+        square = x * x + y * y
+        if self.fisheye:
+            r = np.sqrt(square)
+            angle = np.arctan(r)
+            factor = np.where(r > 0, angle / np.where(r > 0, r, 1), 1) * self._series(angle * angle)
+            return x * factor, y * factor
+        factor, (p1, p2) = self._series(square), self.tangential
+        return (
+            x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+            y * factor + 2 * p2 * x * y + p1 * (square + 2 * y * y),
+        )
+
+    def _series(self, square: np.ndarray) -> np.ndarray:
+        total = np.zeros_like(square)
+        for k in reversed(self.radial):
+            total = (total + k) * square
+        return 1 + total
+
+
+@dataclass(frozen=True, eq=False)
+class Undistortion:
+    """How to resample pictures of one lens: the same size and principal point, the focal length × zoom.
+
+    The zoom is the smallest from 1 on with which every pixel of the result has data. What the lens shows
+    beyond the result's edges (barrel distortion, fisheye) is left out.
+    """
+
+    zoom: float
+    rows: np.ndarray  # (H, W) row of each pixel in the distorted picture; the first pixel's centre is 0
+    columns: np.ndarray  # (H, W)
+
+    def resample(self, image: np.ndarray, order: int = 3) -> np.ndarray:
+        """An (H, W, C) image seen without the lens; splines of `order`, within the channel's own range."""
+        planes = []
+        for plane in np.moveaxis(image, -1, 0):
+            moved = ndimage.map_coordinates(plane, (self.rows, self.columns), order=order, mode="nearest")
+            planes.append(np.clip(moved, plane.min(), plane.max()))
+        return np.stack(planes, axis=-1)
+
+
+@lru_cache(maxsize=4)
+def undistortion(
+    lens: Lens, width: int, height: int, fx: float, fy: float, cx: float, cy: float
+) -> Undistortion:
+    """The resampling of pictures of width × height pixels; fx, fy, cx, cy as in `View`.
+
+    Raises InputError, without a file's name, where no zoom up to MAX_ZOOM gives every pixel data.
+    """
+
+    def source(columns: np.ndarray, rows: np.ndarray, zoom: float) -> tuple[np.ndarray, np.ndarray]:
+        x, y = lens.distort((columns + 0.5 - cx) / (zoom * fx), (rows + 0.5 - cy) / (zoom * fy))
+        return fx * x + cx - 0.5, fy * y + cy - 0.5
+
+    across, down = np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID))
+    step = 1e-3  # pixels, for the derivatives
+
+    def valid(zoom: float) -> bool:
+        """Whether the image lies inside the picture and the lens does not fold it."""
+        u, v = source(across, down, zoom)
+        right, below = source(across + step, down, zoom), source(across, down + step, zoom)
+        turn = (right[0] - u) * (below[1] - v) - (right[1] - v) * (below[0] - u)
+        inside = u.min() >= -step and v.min() >= -step
+        return bool(
+            inside and u.max() <= width - 1 + step and v.max() <= height - 1 + step and turn.min() > 0
+        )
+
+    with np.errstate(over="ignore", invalid="ignore"):  # coefficients may be anything; NaN is not valid
+        low, high = 1.0, MAX_ZOOM
+        if not valid(high):
+            raise InputError(
+                "the distortion moves the picture's edges more than half-way in, or folds it; "
+                "correct the coefficients"
+            )
+        if valid(low):
+            high = low
+        for _ in range(ZOOM_STEPS if high > low else 0):
+            middle = (low + high) / 2
+            low, high = (low, middle) if valid(middle) else (middle, high)
+    grid_columns, grid_rows = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    columns, rows = source(grid_columns, grid_rows, high)
+    return Undistortion(high, rows, columns)
