@@ -54,6 +54,7 @@ class SurfelOptions:
     channels: tuple[str, ...] = ("radiance_sh", "albedo", "metallic", "roughness", "indirect_sh")
     count: int = 20_000  # initial surfels
     max_count: int = 40_000  # densification stops here
+    inside: float = 0.0  # share of the initial surfels in the visual hull's volume; the others on its surface
     sh_degree: int = 3  # of the radiance channel
     indirect_degree: int = 3  # of the indirect channel, from the start
     sh_raise: Window = Window(0, 3, 1)  # one more degree each time it is due

@@ -1,9 +1,10 @@
-"""The surfels a fit starts from: on the visual hull where pictures have alpha, else at random."""
+"""The surfels a fit starts from: on and inside the visual hull where pictures have alpha, else at random."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from mi_refgs.errors import InputError
 from mi_refgs.fit.config import Method
 from mi_refgs.fit.data import Dataset, View
 from mi_refgs.images import linear_from_srgb
@@ -15,24 +16,34 @@ from mi_refgs.surfels.table import GEOMETRY, Surfels
 def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> Surfels:
     """A table of `method.surfels.count` surfels with the method's channels.
 
-    On the hull, surfels take its normals. Colours are the median over the views that see the point.
+    With alpha, a share `inside` of them is uniform in the hull's volume with normals at random, and the
+    others are uniform on its surface with its normals: the surface of what is concave lies inside the hull.
+    Colours are the median over the views that see the point.
 
-    Raises InputError where the masks have no point in common.
+    Raises InputError where the masks have no point in common, and for a share that is none.
     """
     options = method.surfels
+    if not 0 <= options.inside <= 1:
+        raise InputError(f"method: surfels.inside: {options.inside} is no share; give a number from 0 to 1")
     views = [_view(view, data) for view in data.views]
     bounds = init.camera_bounds(views)
-    normals = None
     if all(view.alpha is not None for view in data.views):
-        points, normals = init.visual_hull_points(views, options.count, bounds, rng)
+        hull = init.visual_hull(views, bounds)
+        inner = hull.inner_points(round(options.inside * options.count), rng)
+        outer, facing = hull.surface_points(options.count - len(inner), rng)
+        points = np.concatenate([outer, inner])
+        normals = np.concatenate([facing, init.random_normals(len(inner), rng)])
+        # What lies inside has no side to be seen from: every view of it votes.
+        colours = np.concatenate([init.mean_colours(outer, views, facing), init.mean_colours(inner, views)])
     else:
         points = init.random_points(options.count, bounds, rng)
+        normals = init.random_normals(options.count, rng)
+        colours = init.mean_colours(points, views)
     order = along_curve(points)
-    points, normals = points[order], None if normals is None else normals[order]
     return init.from_points(
-        points,
-        normals,
-        init.mean_colours(points, views, normals),
+        points[order],
+        normals[order],
+        colours[order],
         rng=rng,
         channels=(*GEOMETRY, *options.channels),
         sh_degree=options.sh_degree,

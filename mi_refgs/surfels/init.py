@@ -34,6 +34,8 @@ HULL_LEVEL = 0.5
 HULL_CARVED = 0.05
 # Share of the views that must see a point of the hull: what hardly any camera sees was never carved.
 HULL_SEEN = 0.25
+# Rounds of rejection for points inside the hull; a round of a voxel-thin sheet keeps about a quarter.
+HULL_DRAWS = 64
 # Views that vote for a point's colour: a median needs no more, and memory grows with points times views.
 COLOUR_VIEWS = 32
 # Singular value of the mean of (I - d dᵀ), 0 for parallel view axes, below which they do not meet.
@@ -92,28 +94,75 @@ def camera_bounds(views: Sequence[View]) -> np.ndarray:
     return np.stack([focus - half, focus + half])
 
 
+def random_normals(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Unit vectors (count, 3), uniform on the sphere."""
+    normals = rng.normal(size=(count, 3))
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
 def random_points(count: int, bounds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Points (count, 3) uniform in the box, for data without alpha."""
     low, high = np.asarray(bounds, dtype=np.float64)
     return rng.uniform(low, high, (count, 3))
 
 
-def visual_hull_points(
-    views: Sequence[View],
-    count: int,
-    bounds: np.ndarray,
-    rng: np.random.Generator,
-    resolution: int = HULL_RESOLUTION,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points (count, 3) uniform on the surface of the visual hull, and its outward unit normals (count, 3).
+@dataclass(frozen=True)
+class Hull:
+    """The visual hull of masks, as a field on a grid that is at most 0.5 on its border."""
 
-    The hull is the set of points inside every mask (alpha > 0.5, blurred by half a voxel); where a view does
-    not see a point it says nothing, but a quarter of the views must see it. Surface by marching cubes
-    (scikit-image) on the smallest mask value over the views. Raises InputError if nothing is inside every
-    mask.
+    field: np.ndarray  # (X, Y, Z) float32, smallest mask value over the views; inside is above 0.5
+    origin: np.ndarray  # (3,) world position of field[0, 0, 0]
+    voxel: np.ndarray  # (3,) world distance of two samples along each axis
+
+    def surface_points(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Points (count, 3) uniform on the surface (marching cubes), and outward unit normals (count, 3)."""
+        from skimage.measure import marching_cubes
+
+        vertices, faces, _, _ = marching_cubes(self.field, HULL_LEVEL)
+        corners = vertices[faces].astype(np.float64)
+        edges = [(corners[:, i] - corners[:, 0]) * self.voxel for i in (1, 2)]
+        area = np.linalg.norm(np.cross(*edges), axis=1)
+        face = rng.choice(len(faces), count, p=area / area.sum())
+        # Uniform in a triangle: fold the unit square along its diagonal.
+        first, second = rng.random((2, count))
+        fold = first + second > 1
+        first, second = np.where(fold, 1 - first, first), np.where(fold, 1 - second, second)
+        a, b, c = (corners[face, i] for i in range(3))
+        grid = a + first[:, None] * (b - a) + second[:, None] * (c - a)
+        smooth = gaussian_filter(self.field, 1.0)
+        slope = [map_coordinates(part, grid.T, order=1) for part in np.gradient(smooth)]
+        normals = -np.stack(slope, axis=-1) / self.voxel
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+        return self.origin + grid * self.voxel, normals
+
+    def inner_points(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Points (≤ count, 3) uniform in the volume where the field, trilinear between samples, is above 0.5.
+
+        Fewer than `count` where the hull fills hardly any of the cells that it touches.
+        """
+        steps = np.stack(np.meshgrid(*[(0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        shape = np.array(self.field.shape) - 1
+        parts = [self.field[tuple(slice(a, a + n) for a, n in zip(s, shape, strict=True))] for s in steps]
+        cells = np.argwhere(np.max(parts, axis=0) > HULL_LEVEL)
+        points = np.empty((0, 3))
+        # Uniform in the touched cells, then by rejection in the hull.
+        for _ in range(HULL_DRAWS):
+            missing = count - len(points)
+            if missing <= 0:
+                break
+            grid = cells[rng.integers(len(cells), size=2 * missing)] + rng.random((2 * missing, 3))
+            inside = map_coordinates(self.field, grid.T, order=1) > HULL_LEVEL
+            points = np.concatenate([points, grid[inside][:missing]])
+        return self.origin + points * self.voxel
+
+
+def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int = HULL_RESOLUTION) -> Hull:
+    """The set of points inside every mask (alpha > 0.5, blurred by half a voxel).
+
+    Where a view does not see a point it says nothing, but a quarter of the views must see it. Raises
+    InputError if nothing is inside every mask.
     """
-    from skimage.measure import marching_cubes
-
     low, high = np.asarray(bounds, dtype=np.float64)
     voxel = (high - low) / resolution
     centres = np.stack(np.meshgrid(*[np.arange(resolution)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -124,7 +173,8 @@ def visual_hull_points(
     for view in views:
         points = low + (centres[alive] + 0.5) * voxel
         row, column, seen = view.project(points)
-        distance = max(float(np.linalg.norm(middle - view.to_world[:3, 3])), 1e-6)
+        # No view is blurred as if it were nearer to the middle than a voxel.
+        distance = max(float(np.linalg.norm(middle - view.to_world[:3, 3])), float(voxel.max()))
         blur = 0.5 * float(voxel.max()) * abs(view.fx) / distance
         mask = gaussian_filter(np.asarray(view.alpha, dtype=np.float32), blur, mode="nearest")
         value = map_coordinates(mask, np.stack([row[seen], column[seen]]), order=1, mode="nearest")
@@ -134,29 +184,14 @@ def visual_hull_points(
         inside[alive[dead]] = 0
         alive = alive[~dead]
     inside[witnesses < HULL_SEEN * len(views)] = 0
+    # Padded by one voxel, so that a hull that touches the bounds is closed; sample 0 of the unpadded field
+    # lies half a voxel inside the box.
     field = np.pad(inside.reshape((resolution,) * 3), 1)
     if not np.any(field > HULL_LEVEL):
         raise InputError(
             "views: alpha: no point is inside every mask; check cameras and masks, or do not use alpha"
         )
-
-    vertices, faces, _, _ = marching_cubes(field, HULL_LEVEL)
-    corners = vertices[faces].astype(np.float64)
-    area = np.linalg.norm(np.cross(*(((corners[:, i] - corners[:, 0]) * voxel) for i in (1, 2))), axis=1)
-    face = rng.choice(len(faces), count, p=area / area.sum())
-    # Uniform in a triangle: fold the unit square along its diagonal.
-    first, second = rng.random((2, count))
-    fold = first + second > 1
-    first, second = np.where(fold, 1 - first, first), np.where(fold, 1 - second, second)
-    a, b, c = (corners[face, i] for i in range(3))
-    grid = a + first[:, None] * (b - a) + second[:, None] * (c - a)
-    smooth = gaussian_filter(field, 1.0)
-    slope = [map_coordinates(part, grid.T, order=1) for part in np.gradient(smooth)]
-    normals = -np.stack(slope, axis=-1) / voxel
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
-    # The field is padded by one voxel, and its sample 0 lies half a voxel inside the box.
-    return low + (grid - 0.5) * voxel, normals
+    return Hull(field, low - 0.5 * voxel, voxel)
 
 
 def mean_colours(points: np.ndarray, views: Sequence[View], normals: np.ndarray | None = None) -> np.ndarray:
