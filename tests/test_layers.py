@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import tomllib
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -43,9 +42,6 @@ LAYERS: dict[str, set[str]] = {
 
 Downwards only. `splat.camera` is the one thing that shade and occlusion share with splat.
 """
-
-MANY_LINES = 300
-"""A longer file probably holds two concepts; a warning, no failure."""
 
 
 def module_name(path: Path) -> str:
@@ -147,14 +143,6 @@ def test_no_code_knows_a_variant_by_name() -> None:
     names = variant_names()
     for module, source in sources().items():
         assert not names & strings_outside_docstrings(source), module
-
-
-@pytest.mark.filterwarnings("always")
-def test_files_are_short() -> None:
-    for module, source in sources().items():
-        lines = source.count("\n")
-        if lines > MANY_LINES:
-            warnings.warn(f"{module} has {lines} lines: does it hold two concepts?", stacklevel=1)
 
 
 # ---------- The rules hold what they say ----------

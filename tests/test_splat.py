@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,19 +11,20 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from benchmarks.splatting.exact import differentiate, footprint
 from mi_refgs import constants
 from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.device import upload
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.splat import Blended, Camera, list_by_tile, project, splat
-from mi_refgs.splat.footprint import FootprintAdjoint, evaluate
+from mi_refgs.splat.footprint import FootprintAdjoint
 from mi_refgs.surfels.table import Surfels
 
-blend_module = importlib.import_module("mi_refgs.splat.blend")
-tiles_module = importlib.import_module("mi_refgs.splat.tiles")
 IMAGE_TOLERANCE = 1e-4  # the product's promise; observed 2e-6 … 3e-5
-GRADIENT_TOLERANCE = 1e-3  # relative L2; observed 1e-5 … 3e-4 (float32 of the smallest surfels)
+GRADIENT_TOLERANCE = 3e-4  # relative L2; observed 1e-6 … 1.4e-4 (float32 of the smallest surfels)
+MAX_LEFT_OUT = 0.05
+"""Share of the covered pixels that may lie in the band around declared discontinuities."""
 Mutation = Callable[[pytest.MonkeyPatch], None]
 PARAMETERS = ("position", "rotation", "scale", "opacity", "features")
 
@@ -118,8 +118,7 @@ def compare_with_oracle(seed: int) -> None:
     expected = oracle.splat(scene.raw, scene.features, scene.camera)
     got = fast_maps(scene)
     shape = (scene.camera.height, scene.camera.width)
-    keep = ~expected.band
-    assert keep.mean() > 0.4
+    keep = outside_band(expected)
     for k in range(4):
         error = np.abs(got.features[k].numpy().reshape(shape) - expected.features[..., k])
         assert error[keep].max() <= IMAGE_TOLERANCE
@@ -132,20 +131,20 @@ def compare_with_oracle(seed: int) -> None:
     assert median.max() <= IMAGE_TOLERANCE * depth_scale
 
 
+def outside_band(maps: oracle.Maps) -> np.ndarray:
+    """Pixels (H, W) away from the declared discontinuities: nearly all that are covered, or a test of them
+    would prove little. Observed: at least 96 %."""
+    covered = maps.alpha > 0
+    assert np.count_nonzero(maps.band & covered) <= MAX_LEFT_OUT * np.count_nonzero(covered)
+    return ~maps.band
+
+
 def loss_weights(scene: Scene, seed: int) -> np.ndarray:
-    """Random weights (H, W, 6), zero in the declared band (2 % wide: no difference step may meet it)."""
-    band = oracle.splat(scene.raw, scene.features, scene.camera, band=2e-2).band
-    weights = np.random.default_rng(seed + 100).normal(size=(*band.shape, 6))
-    return np.where(band[..., None], 0, weights).astype(np.float32).astype(np.float64)
-
-
-def oracle_losses(
-    raw: dict[str, np.ndarray], features: np.ndarray, scene: Scene, weights: np.ndarray
-) -> np.ndarray:
-    """What each map, the features' first, adds to the loss (6,)."""
-    maps = oracle.splat(raw, features, scene.camera)
-    images = np.concatenate([maps.features, maps.depth[..., None], maps.alpha[..., None]], axis=-1)
-    return np.sum(weights * images, axis=(0, 1))
+    """Random weights (H, W, 6), zero in the declared band: a step of the differences changes α by up to 3e-4
+    of it."""
+    keep = outside_band(oracle.splat(scene.raw, scene.features, scene.camera))
+    weights = np.random.default_rng(seed + 100).normal(size=(*keep.shape, 6))
+    return np.where(keep[..., None], weights, 0).astype(np.float32).astype(np.float64)
 
 
 def fast_loss(scene: Scene, surfels: Surfels, features: list, weights: np.ndarray) -> mi.Float:
@@ -165,62 +164,37 @@ def fast_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
     return gradients
 
 
-def finite_differences(scene: Scene, weights: np.ndarray, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Central differences of the oracle's loss for these rows of every parameter class."""
-    step = 1e-6
-
-    def slope(name: str, row: int, column: int | slice) -> np.ndarray:
-        sides = []
-        for sign in (1, -1):
-            values = {**scene.raw, "features": scene.features}
-            values[name] = values[name].copy()
-            values[name][row, column] += sign * step
-            features = values.pop("features")
-            sides.append(oracle_losses(values, features, scene, weights))
-        return (sides[0] - sides[1]) / (2 * step)
-
-    result = {
-        name: np.array([[slope(name, row, c).sum() for c in range(values.shape[1])] for row in rows])
-        for name, values in scene.raw.items()
-    }
-    # A feature shows in its own map only, so one step moves all of a surfel's features.
-    result["features"] = np.array([slope("features", row, slice(None))[:4] for row in rows])
-    return result
+def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
+    """Derivatives of the oracle's loss in float64, themselves tested against its differences."""
+    adjoints = np.moveaxis(weights, 2, 0).reshape(6, -1)
+    return differentiate(scene.raw, scene.features, scene.camera, adjoints).gradients
 
 
-def gradient_errors(
-    got: dict[str, np.ndarray], expected: dict[str, np.ndarray], rows: np.ndarray
-) -> dict[str, float]:
+def gradient_errors(got: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> dict[str, float]:
     """Relative L2 error per parameter class."""
     errors = {}
     for name in PARAMETERS:
-        scale = np.linalg.norm(expected[name])
-        errors[name] = 0.0
-        if scale > 1e-9:
-            errors[name] = float(np.linalg.norm(got[name][rows] - expected[name]) / scale)
         assert np.all(np.isfinite(got[name])), name
+        scale = np.linalg.norm(expected[name])
+        errors[name] = float(np.linalg.norm(got[name] - expected[name]) / scale) if scale > 1e-9 else 0.0
     return errors
 
 
 @EVERY_TILE
-def test_gradients_match_with_tiles_of_every_size(tile: tuple[int, int]) -> None:
-    test_gradients_match_finite_differences(5)
+def test_gradients_match_the_oracle_with_tiles_of_every_size(tile: tuple[int, int]) -> None:
+    test_gradients_match_the_oracle(5)
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_gradients_match_finite_differences(seed: int) -> None:
+def test_gradients_match_the_oracle(seed: int) -> None:
     scene = make_scene(seed)
     weights = loss_weights(scene, seed)
-    count = len(scene.features)
-    # The oracle draws every surfel for each difference; five scenes have more than 100.
-    rows = np.random.default_rng(seed).permutation(count)[: 10 if count <= 100 else 4]
-    expected = finite_differences(scene, weights, rows)
-    got = fast_gradients(scene, weights)
-    errors = gradient_errors(got, expected, rows)
+    expected, got = exact_gradients(scene, weights), fast_gradients(scene, weights)
+    errors = gradient_errors(got, expected)
     assert max(errors.values()) <= GRADIENT_TOLERANCE, errors
     for name in PARAMETERS:  # none missing: a non-zero derivative never comes back as zero
         strong = np.abs(expected[name]).max(axis=1) > 1e-3 * max(np.abs(expected[name]).max(), 1e-9)
-        assert np.all(np.abs(got[name][rows]).max(axis=1)[strong] > 0), name
+        assert np.all(np.abs(got[name]).max(axis=1)[strong] > 0), name
 
 
 @pytest.mark.parametrize("seed", [3, 9, 14])
@@ -289,15 +263,14 @@ def _scale_column(index: int) -> Mutation:
     return mutate
 
 
-Case = tuple[Scene, np.ndarray, np.ndarray, dict[str, np.ndarray]]
+Case = tuple[Scene, np.ndarray, dict[str, np.ndarray]]
 
 
 @pytest.fixture(scope="module")
 def mutant_case() -> Case:
     scene = make_scene(8)
     weights = loss_weights(scene, 8)
-    rows = np.arange(len(scene.features))
-    return scene, weights, rows, finite_differences(scene, weights, rows)
+    return scene, weights, exact_gradients(scene, weights)
 
 
 @pytest.mark.parametrize(
@@ -309,10 +282,10 @@ def test_mutants_of_the_adjoint_are_caught(
     mutate: Mutation, monkeypatch: pytest.MonkeyPatch, mutant_case: Case
 ) -> None:
     """The gradient check must fail for each of these planted errors; otherwise it proves nothing."""
-    scene, weights, rows, expected = mutant_case
-    assert max(gradient_errors(fast_gradients(scene, weights), expected, rows).values()) <= GRADIENT_TOLERANCE
+    scene, weights, expected = mutant_case
+    assert max(gradient_errors(fast_gradients(scene, weights), expected).values()) <= GRADIENT_TOLERANCE
     mutate(monkeypatch)
-    assert max(gradient_errors(fast_gradients(scene, weights), expected, rows).values()) > GRADIENT_TOLERANCE
+    assert max(gradient_errors(fast_gradients(scene, weights), expected).values()) > GRADIENT_TOLERANCE
 
 
 def test_order_of_the_table_is_irrelevant_and_culled_surfels_change_nothing() -> None:
@@ -393,6 +366,12 @@ def test_second_view_compiles_nothing() -> None:
     assert dr.detail.launch_stats()[2] == misses
 
 
+def oracle_surfels(scene: Scene) -> dict[str, np.ndarray]:
+    """The surfels in the camera frame, in float64; opacity 0 where culled."""
+    to_camera, origin = scene.camera.to_world[:3, :3].T, scene.camera.to_world[:3, 3]
+    return oracle._surfels(scene.raw, (scene.raw["position"] - origin) @ to_camera.T, to_camera, scene.camera)
+
+
 @pytest.mark.parametrize("thinness", [1.0, 1e-5])
 @pytest.mark.parametrize("seed", range(0, 20, 3))
 def test_tile_lists_hold_what_contributes_and_little_else(seed: int, thinness: float) -> None:
@@ -411,15 +390,13 @@ def test_tile_lists_hold_what_contributes_and_little_else(seed: int, thinness: f
     listed = {(int(i), tile) for tile in range(len(begin)) for i in surfel[begin[tile] : end[tile]]}
     assert len(listed) == lists.pairs, "a pair is listed twice"
 
-    y, x = np.mgrid[0 : camera.height, 0 : camera.width]
-    pixel = mi.Point2f(mi.Float(x.ravel() + 0.5), mi.Float(y.ravel() + 0.5))
-    tile = (y // camera.tile[1] * lists.tiles_x + x // camera.tile[0]).ravel()
-    columns = np.array([column.numpy() for column in footprints.columns])
-    needed = set()
-    for i in range(columns.shape[1]):
-        sample = evaluate([mi.Float(v) for v in columns[:, i]], pixel, camera.near)
-        strong = (sample.alpha >= ALPHA_MIN).numpy() & (columns[9, i] > 0)
-        needed |= {(i, int(t)) for t in np.unique(tile[strong])}
+    y, x = (v.ravel() for v in np.mgrid[0 : camera.height, 0 : camera.width])
+    tile = y // camera.tile[1] * lists.tiles_x + x // camera.tile[0]
+    alpha, _ = footprint(scene.raw, scene.camera, x + 0.5, y + 0.5)
+    alpha[oracle_surfels(scene)["opacity"] == 0] = 0
+    # Float32 may lose what is at the threshold itself.
+    strong = alpha >= ALPHA_MIN * (1 + 1e-3)
+    needed = {(int(i), int(tile[pixel])) for i, pixel in zip(*np.nonzero(strong), strict=True)}
     assert needed <= listed
     if thinness == 1:  # needles lie between pixels
         # A tile may see a footprint between its pixels only, or beyond the near plane.
@@ -427,18 +404,17 @@ def test_tile_lists_hold_what_contributes_and_little_else(seed: int, thinness: f
 
 
 @EVERY_TILE
-def test_tile_lists_are_sorted_by_depth(tile: tuple[int, int]) -> None:
-    scene = make_scene(12)
+@pytest.mark.parametrize("seed", [12, 16])
+def test_tile_lists_are_in_the_oracles_order(seed: int, tile: tuple[int, int]) -> None:
+    scene = make_scene(seed)
     camera = scene.fast_camera()
-    footprints = project(scene.surfels(), camera)
-    lists = list_by_tile(footprints, camera)
-    pair_tile = np.repeat(np.arange(len(lists.pair_begin)), lists.pair_end.numpy() - lists.pair_begin.numpy())
-    corner = np.array(camera.tile)[:, None] * np.stack(
-        [pair_tile % lists.tiles_x, pair_tile // lists.tiles_x]
-    )
-    centre = mi.Point2f(mi.Float(corner[0] + camera.tile[0] / 2), mi.Float(corner[1] + camera.tile[1] / 2))
-    row = [dr.gather(mi.Float, column, lists.surfel_from_pair) for column in footprints.columns]
-    depth = tiles_module.depth_near(row, centre).numpy()
-    same = pair_tile[1:] == pair_tile[:-1]
-    assert np.count_nonzero(same) > 30
-    assert np.all(depth[1:][same] >= depth[:-1][same])
+    lists = list_by_tile(project(scene.surfels(), camera), camera)
+    order = oracle._order(oracle_surfels(scene), scene.camera)
+    surfel, compared = lists.surfel_from_pair.numpy(), 0
+    for i, (begin, end) in enumerate(zip(lists.pair_begin.numpy(), lists.pair_end.numpy(), strict=True)):
+        y, x = (k * size for k, size in zip(divmod(i, lists.tiles_x), camera.tile[::-1], strict=True))
+        listed = surfel[begin:end]
+        expected = [k for k in order[:, y, x] if k in set(listed)]
+        np.testing.assert_array_equal(listed, expected)
+        compared += len(listed)
+    assert compared > 100

@@ -45,7 +45,7 @@ def differentiate(
         order = oracle._order(surfels, camera).reshape(len(features), -1)
     culled = surfels["opacity"] == 0
 
-    alpha, z = (values.real for values in _footprint(raw, camera, x, y))
+    alpha, z = (values.real for values in footprint(raw, camera, x, y))
     alpha = np.where((alpha >= c.ALPHA_MIN) & (z > camera.near) & ~culled[:, None], alpha, 0)
     alpha, z = (np.take_along_axis(values, order, axis=0) for values in (alpha, z))
     after = np.cumprod(1 - alpha, axis=0)
@@ -67,7 +67,7 @@ def differentiate(
         for column in range(raw[name].shape[1]):
             moved = raw | {name: raw[name].astype(complex)}
             moved[name][:, column] += 1j * STEP
-            dalpha, dz = (values.imag / STEP for values in _footprint(moved, camera, x, y))
+            dalpha, dz = (values.imag / STEP for values in footprint(moved, camera, x, y))
             gradients[name][:, column] = np.sum(δalpha * dalpha + δz * dz, axis=1)
     return Exact(maps, gradients, weight > 0)
 
@@ -78,9 +78,7 @@ def _unsort(values: Array, order: Array) -> Array:
     return out
 
 
-def _footprint(
-    raw: dict[str, Array], camera: oracle.PinholeCamera, x: Array, y: Array
-) -> tuple[Array, Array]:
+def footprint(raw: dict[str, Array], camera: oracle.PinholeCamera, x: Array, y: Array) -> tuple[Array, Array]:
     """α before the cut, and depth (surfels, pixels), of real or complex channels."""
     to_camera, origin = camera.to_world[:3, :3].T, camera.to_world[:3, 3]
     p = (raw["position"] - origin) @ to_camera.T
