@@ -1,4 +1,4 @@
-"""Initial surfels: from points, at random, and from the visual hull of alpha masks."""
+"""Initial surfels from points."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import pytest
 from scipy.stats import kstest
 
 from mi_refgs.errors import InputError
-from mi_refgs.reference.camera import look_at
 from mi_refgs.surfels import init
 
 
@@ -63,108 +62,8 @@ def test_bad_points_are_refused(change: dict[str, object], message: str, rng: np
         init.from_points(**({"points": np.zeros((4, 3)), "rng": rng} | change))  # type: ignore[arg-type]
 
 
-def sphere_views(
-    count: int, size: int, centre: np.ndarray, radius: float, rng: np.random.Generator
-) -> list[init.View]:
-    """Exact masks of a sphere from cameras at distance 4 around it; the picture shows the view's number."""
-    views = []
-    focal = -1.6 * size
-    for number in range(count):
-        forward = rng.normal(size=3)
-        forward /= np.linalg.norm(forward)
-        to_world = look_at(centre - 4 * forward, centre, (0.3, 0.5, 0.8))
-        column, row = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
-        rays = np.stack([(column - size / 2) / focal, (row - size / 2) / focal, np.ones_like(row)], axis=-1)
-        cosine = rays[..., 2] / np.linalg.norm(rays, axis=-1)
-        alpha = (4 * np.sqrt(1 - cosine**2) < radius).astype(np.float32)
-        colour = np.full((size, size, 3), number / count, dtype=np.float32)
-        views.append(init.View(focal, focal, size / 2, size / 2, to_world, alpha, colour))
-    return views
-
-
-def test_visual_hull_of_a_sphere(rng: np.random.Generator) -> None:
-    """Off-centre sphere: points within a voxel of its surface, normals outward within 12° on average."""
-    centre = np.array([0.4, -0.3, 0.2])
-    views = sphere_views(40, 64, centre, 0.8, rng)
-    bounds = init.camera_bounds(views)
-    np.testing.assert_allclose(bounds.mean(axis=0), centre, atol=1e-6)
-    assert bounds[1, 0] - bounds[0, 0] == pytest.approx(2 * 4 / 1.6 / 2)
-    hull = init.visual_hull(views, bounds, resolution=40)
-    points, normals = hull.surface_points(4000, rng)
-    assert points.shape == normals.shape == (4000, 3)
-    # Half a voxel off in each axis would be 0.054; the mean of 4000 points scatters by 0.013.
-    assert np.linalg.norm(points.mean(axis=0) - centre) < 0.035
-    outward = points - centre
-    distance = np.linalg.norm(outward, axis=1)
-    voxel = 2.5 / 40
-    assert abs(distance.mean() - 0.8) < voxel / 2 and np.abs(distance - 0.8).max() < 2 * voxel
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
-    cosine = np.sum(normals * outward, axis=1) / distance
-    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean() < 12
-    colours = init.mean_colours(points, views)
-    assert np.all((colours > 0.3) & (colours < 0.7))
-    facing = init.mean_colours(points, views[:1], normals)
-    seen = np.sum(normals * (views[0].to_world[:3, 3] - points), axis=1) > 0
-    # At the silhouette a mask of whole pixels may miss the point, which then stays grey.
-    assert np.all(facing[~seen] == 0.5) and np.mean(facing[seen] == 0) > 0.8
-
-
-def test_points_inside_the_hull_of_a_sphere(rng: np.random.Generator) -> None:
-    """Uniform in the ball: (distance / radius)³ is uniform, whatever the unit; nothing outside the hull."""
-    centre = np.array([0.4, -0.3, 0.2])
-    views = sphere_views(40, 64, centre, 0.8, rng)
-    hull = init.visual_hull(views, init.camera_bounds(views), resolution=40)
-    points = hull.inner_points(4000, np.random.default_rng(1))
-    distance = np.linalg.norm(points - centre, axis=1)
-    assert points.shape == (4000, 3) and distance.max() < 0.8 + 2 * 2.5 / 40
-    volume = distance**3
-    assert kstest(volume / volume.max(), "uniform").statistic < 0.05
-    tiny = init.Hull(hull.field, hull.origin * 1e-6, hull.voxel * 1e-6)
-    np.testing.assert_allclose(
-        tiny.inner_points(4000, np.random.default_rng(1)) * 1e6, points, rtol=0, atol=1e-12
-    )
-    # Every view sees every point, whatever its side: colours are the median of all views.
-    assert np.all(np.abs(init.mean_colours(points[distance < 0.7], views) - 0.5) < 0.06)
-
-
-def test_points_inside_a_hull_are_uniform_across_voxels(rng: np.random.Generator) -> None:
-    """A field that falls by 1/2 over 4.3 voxels in the sum of |x|, |y|, |z| bounds an octahedron exactly."""
-    radius, voxel = 4.3, np.array([0.1, 0.2, 0.3])
-    grid = np.stack(np.meshgrid(*[np.arange(-6, 7)] * 3, indexing="ij"), axis=-1)
-    field = 1 - np.abs(grid).sum(axis=-1) / (2 * radius)
-    hull = init.Hull(field, np.array([5.0, 6.0, 7.0]) - 6 * voxel, voxel)
-    points = (hull.inner_points(50_000, rng) - (5.0, 6.0, 7.0)) / voxel
-    size = np.abs(points).sum(axis=1) / radius
-    assert size.max() < 1
-    assert kstest(size**3, "uniform").pvalue > 1e-3
-    for axis in points.T:  # a coordinate of an octahedron has density (1 - |x| / r)²
-        cumulative = 0.5 + 0.5 * np.sign(axis) * (1 - (1 - np.abs(axis) / radius) ** 3)
-        assert kstest(cumulative, "uniform").pvalue > 1e-3
-
-
-def test_a_hull_of_hardly_any_volume_ends_the_search(rng: np.random.Generator) -> None:
-    field = np.zeros((5, 5, 5), dtype=np.float32)
-    field[2, 2, 2] = 0.500001
-    hull = init.Hull(field, np.zeros(3), np.ones(3))
-    assert len(hull.inner_points(10, rng)) < 10
-    assert len(hull.surface_points(10, rng)[0]) == 10
-
-
 def test_random_normals_are_uniform(rng: np.random.Generator) -> None:
     normals = init.random_normals(20_000, rng)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-12)
     np.testing.assert_allclose(normals.T @ normals / 20_000, np.eye(3) / 3, atol=0.02)
     assert all(kstest(axis, "uniform", (-1, 2)).pvalue > 1e-3 for axis in normals.T)  # Archimedes
-
-
-def test_empty_hull_and_parallel_cameras_are_refused(rng: np.random.Generator) -> None:
-    views = sphere_views(4, 16, np.zeros(3), 0.8, rng)
-    nothing = [init.View(v.fx, v.fy, v.cx, v.cy, v.to_world, v.alpha * 0) for v in views]
-    with pytest.raises(InputError, match="inside every mask"):
-        init.visual_hull(nothing, init.camera_bounds(views), resolution=8)
-    for few in ([], views[:1]):
-        with pytest.raises(InputError, match="do not look at one point"):
-            init.camera_bounds(few)
-    points = init.random_points(100, np.array([[-1, 0, 2], [1, 1, 2.5]]), rng)
-    assert points.shape == (100, 3) and np.all((points >= [-1, 0, 2]) & (points <= [1, 1, 2.5]))
-    assert np.all(init.mean_colours(points, nothing) == 0.5)

@@ -12,7 +12,7 @@ from tiny_scene import RADIUS, write_data
 from mi_refgs.errors import InputError
 from mi_refgs.fit import config, data
 from mi_refgs.fit.initial import initial_surfels
-from mi_refgs.surfels import init
+from mi_refgs.surfels import hull
 
 COUNT = 2_000
 
@@ -20,7 +20,7 @@ COUNT = 2_000
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """A hull of fewer voxels: pictures of 20² show no more."""
-    monkeypatch.setattr(init, "visual_hull", functools.partial(init.visual_hull, resolution=32))
+    monkeypatch.setattr(hull, "visual_hull", functools.partial(hull.visual_hull, resolution=32))
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fit.config import Method
 from mi_refgs.fit.data import Dataset, View
 from mi_refgs.images import linear_from_srgb
-from mi_refgs.surfels import init
+from mi_refgs.surfels import hull, init
 from mi_refgs.surfels.order import along_curve
 from mi_refgs.surfels.table import GEOMETRY, Surfels
 
@@ -26,19 +26,19 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
     if not 0 <= options.inside <= 1:
         raise InputError(f"method: surfels.inside: {options.inside} is no share; give a number from 0 to 1")
     views = [_view(view, data) for view in data.views]
-    bounds = init.camera_bounds(views)
+    bounds = hull.camera_bounds(views)
     if all(view.alpha is not None for view in data.views):
-        hull = init.visual_hull(views, bounds)
-        inner = hull.inner_points(round(options.inside * options.count), rng)
-        outer, facing = hull.surface_points(options.count - len(inner), rng)
+        shape = hull.visual_hull(views, bounds)
+        inner = shape.inner_points(round(options.inside * options.count), rng)
+        outer, facing = shape.surface_points(options.count - len(inner), rng)
         points = np.concatenate([outer, inner])
         normals = np.concatenate([facing, init.random_normals(len(inner), rng)])
         # What lies inside has no side to be seen from: every view of it votes.
-        colours = np.concatenate([init.mean_colours(outer, views, facing), init.mean_colours(inner, views)])
+        colours = np.concatenate([hull.mean_colours(outer, views, facing), hull.mean_colours(inner, views)])
     else:
-        points = init.random_points(options.count, bounds, rng)
+        points = hull.random_points(options.count, bounds, rng)
         normals = init.random_normals(options.count, rng)
-        colours = init.mean_colours(points, views)
+        colours = hull.mean_colours(points, views)
     order = along_curve(points)
     return init.from_points(
         points[order],
@@ -54,9 +54,9 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
     )
 
 
-def _view(view: View, data: Dataset) -> init.View:
+def _view(view: View, data: Dataset) -> hull.View:
     alpha = np.ones(view.image.shape[:2], np.float32) if view.alpha is None else view.alpha
     covered = np.maximum(alpha, 1e-3)[..., None]
     colour = np.clip((view.image - (1 - alpha[..., None]) * data.background) / covered, 0, None)
     colour = colour if data.linear else linear_from_srgb(np.clip(colour, 0, 1))
-    return init.View(-view.fx, -view.fy, view.cx, view.cy, view.to_world, alpha, colour.astype(np.float32))
+    return hull.View(-view.fx, -view.fy, view.cx, view.cy, view.to_world, alpha, colour.astype(np.float32))

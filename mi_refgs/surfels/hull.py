@@ -1,0 +1,202 @@
+"""Points to start from: on and in the visual hull of alpha masks, or in a box, and the colours there.
+
+World positions in scene units; cameras in Mitsuba's frame (+z forward, +x left, +y up), hence signed focal
+lengths. `bounds` is a (2, 3) array: the lowest and highest corner of a box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from mi_refgs.errors import InputError
+
+# Voxels per edge of the visual hull's grid: at 200² a voxel of the cube the views span is two pixels wide.
+HULL_RESOLUTION = 96
+# Mask level that bounds the hull, and the level below which a voxel of the blurred masks is given up.
+HULL_LEVEL = 0.5
+HULL_CARVED = 0.05
+# Share of the views that must see a point of the hull: what hardly any camera sees was never carved.
+HULL_SEEN = 0.25
+# Rounds of rejection for points inside the hull; a round of a voxel-thin sheet keeps about a quarter.
+HULL_DRAWS = 64
+# Views that vote for a point's colour: a median needs no more, and memory grows with points times views.
+COLOUR_VIEWS = 32
+# Singular value of the mean of (I - d dᵀ), 0 for parallel view axes, below which they do not meet.
+FOCUS_CONDITION = 1e-3
+
+
+@dataclass(frozen=True)
+class View:
+    """One training view, in NumPy."""
+
+    fx: float  # pixels, signed
+    fy: float  # pixels, signed
+    cx: float  # pixels
+    cy: float  # pixels
+    to_world: np.ndarray  # (4, 4) world from camera, rigid
+    alpha: np.ndarray  # (H, W) in [0, 1]
+    colour: np.ndarray | None = None  # (H, W, 3) linear, not premultiplied
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Array indices (row, column), integer at pixel centres, of world points (N, 3); and if seen."""
+        to_world = np.asarray(self.to_world, dtype=np.float64)
+        local = (points - to_world[:3, 3]) @ to_world[:3, :3]
+        depth = np.where(local[:, 2] > 0, local[:, 2], np.inf)
+        column = self.fx * local[:, 0] / depth + self.cx - 0.5
+        row = self.fy * local[:, 1] / depth + self.cy - 0.5
+        height, width = self.alpha.shape
+        seen = (
+            (local[:, 2] > 0)
+            & (abs(column - (width - 1) / 2) <= width / 2)
+            & (abs(row - (height - 1) / 2) <= height / 2)
+        )
+        return row, column, seen
+
+
+def camera_bounds(views: Sequence[View]) -> np.ndarray:
+    """A cube around the point all cameras look at, as wide as the widest view there: (2, 3).
+
+    Raises InputError if the view axes have no common point (one view, or parallel ones).
+    """
+    origins = np.array([view.to_world[:3, 3] for view in views], dtype=np.float64).reshape(-1, 3)
+    axes = np.array([view.to_world[:3, 2] for view in views], dtype=np.float64).reshape(-1, 3)
+    # The point nearest to all axes: Σ (I - d dᵀ)(p - o) = 0.
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    system = projectors.mean(axis=0) if len(views) else np.zeros((3, 3))
+    if np.linalg.svd(system, compute_uv=False)[-1] < FOCUS_CONDITION:
+        raise InputError(
+            "views: cameras: they do not look at one point from several sides; give the bounds of the scene"
+        )
+    focus = np.linalg.solve(system, np.einsum("nij,nj->i", projectors, origins) / len(views))
+    distance = np.linalg.norm(origins - focus, axis=1)
+    reach = [max(v.alpha.shape[1] / abs(v.fx), v.alpha.shape[0] / abs(v.fy)) / 2 for v in views]
+    half = min(float(np.max(distance * reach)), float(distance.max()))
+    return np.stack([focus - half, focus + half])
+
+
+def random_points(count: int, bounds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Points (count, 3) uniform in the box, for data without alpha."""
+    low, high = np.asarray(bounds, dtype=np.float64)
+    return rng.uniform(low, high, (count, 3))
+
+
+@dataclass(frozen=True)
+class Hull:
+    """The visual hull of masks, as a field on a grid that is at most 0.5 on its border."""
+
+    field: np.ndarray  # (X, Y, Z) float32, smallest mask value over the views; inside is above 0.5
+    origin: np.ndarray  # (3,) world position of field[0, 0, 0]
+    voxel: np.ndarray  # (3,) world distance of two samples along each axis
+
+    def surface_points(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Points (count, 3) uniform on the surface (marching cubes), and outward unit normals (count, 3)."""
+        from skimage.measure import marching_cubes
+
+        vertices, faces, _, _ = marching_cubes(self.field, HULL_LEVEL)
+        corners = vertices[faces].astype(np.float64)
+        edges = [(corners[:, i] - corners[:, 0]) * self.voxel for i in (1, 2)]
+        area = np.linalg.norm(np.cross(*edges), axis=1)
+        face = rng.choice(len(faces), count, p=area / area.sum())
+        # Uniform in a triangle: fold the unit square along its diagonal.
+        first, second = rng.random((2, count))
+        fold = first + second > 1
+        first, second = np.where(fold, 1 - first, first), np.where(fold, 1 - second, second)
+        a, b, c = (corners[face, i] for i in range(3))
+        grid = a + first[:, None] * (b - a) + second[:, None] * (c - a)
+        smooth = gaussian_filter(self.field, 1.0)
+        slope = [map_coordinates(part, grid.T, order=1) for part in np.gradient(smooth)]
+        normals = -np.stack(slope, axis=-1) / self.voxel
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+        return self.origin + grid * self.voxel, normals
+
+    def inner_points(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Points (≤ count, 3) uniform in the volume where the field, trilinear between samples, is above 0.5.
+
+        Fewer than `count` where the hull fills hardly any of the cells that it touches.
+        """
+        steps = np.stack(np.meshgrid(*[(0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        shape = np.array(self.field.shape) - 1
+        parts = [self.field[tuple(slice(a, a + n) for a, n in zip(s, shape, strict=True))] for s in steps]
+        cells = np.argwhere(np.max(parts, axis=0) > HULL_LEVEL)
+        points = np.empty((0, 3))
+        # Uniform in the touched cells, then by rejection in the hull.
+        for _ in range(HULL_DRAWS):
+            missing = count - len(points)
+            if missing <= 0:
+                break
+            grid = cells[rng.integers(len(cells), size=2 * missing)] + rng.random((2 * missing, 3))
+            inside = map_coordinates(self.field, grid.T, order=1) > HULL_LEVEL
+            points = np.concatenate([points, grid[inside][:missing]])
+        return self.origin + points * self.voxel
+
+
+def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int = HULL_RESOLUTION) -> Hull:
+    """The set of points inside every mask (alpha > 0.5, blurred by half a voxel).
+
+    Where a view does not see a point it says nothing, but a quarter of the views must see it. Raises
+    InputError if nothing is inside every mask.
+    """
+    low, high = np.asarray(bounds, dtype=np.float64)
+    voxel = (high - low) / resolution
+    centres = np.stack(np.meshgrid(*[np.arange(resolution)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = np.ones(resolution**3, dtype=np.float32)
+    witnesses = np.zeros(resolution**3, dtype=np.int32)
+    alive = np.arange(resolution**3)
+    middle = (low + high) / 2
+    for view in views:
+        points = low + (centres[alive] + 0.5) * voxel
+        row, column, seen = view.project(points)
+        # No view is blurred as if it were nearer to the middle than a voxel.
+        distance = max(float(np.linalg.norm(middle - view.to_world[:3, 3])), float(voxel.max()))
+        blur = 0.5 * float(voxel.max()) * abs(view.fx) / distance
+        mask = gaussian_filter(np.asarray(view.alpha, dtype=np.float32), blur, mode="nearest")
+        value = map_coordinates(mask, np.stack([row[seen], column[seen]]), order=1, mode="nearest")
+        inside[alive[seen]] = np.minimum(inside[alive[seen]], value)
+        witnesses[alive[seen]] += 1
+        dead = inside[alive] < HULL_CARVED
+        inside[alive[dead]] = 0
+        alive = alive[~dead]
+    inside[witnesses < HULL_SEEN * len(views)] = 0
+    # Padded by one voxel, so that a hull that touches the bounds is closed; sample 0 of the unpadded field
+    # lies half a voxel inside the box.
+    field = np.pad(inside.reshape((resolution,) * 3), 1)
+    if not np.any(field > HULL_LEVEL):
+        raise InputError(
+            "views: alpha: no point is inside every mask; check cameras and masks, or do not use alpha"
+        )
+    return Hull(field, low - 0.5 * voxel, voxel)
+
+
+def mean_colours(points: np.ndarray, views: Sequence[View], normals: np.ndarray | None = None) -> np.ndarray:
+    """Median linear colour (N, 3) of the points over the views that show them with alpha > 0.5.
+
+    Points that no view shows are 0.5 grey. With `normals`, only views in front of a point vote. There is no
+    occlusion test: the median of many views forgives it. At most 32 views, evenly chosen, are read.
+    """
+    chosen = [view for view in views if view.colour is not None]
+    chosen = (
+        [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, COLOUR_VIEWS).astype(int))]
+        if chosen
+        else []
+    )
+    if not chosen or not len(points):
+        return np.full((len(points), 3), 0.5)
+    samples = np.full((len(chosen), len(points), 3), np.nan, dtype=np.float32)
+    for sample, view in zip(samples, chosen, strict=True):
+        row, column, seen = view.project(points)
+        if normals is not None:
+            seen = seen & (np.sum(normals * (view.to_world[:3, 3] - points), axis=1) > 0)
+        at = np.rint([row[seen], column[seen]]).astype(int)
+        row_index, column_index = np.clip(at, 0, np.array(view.alpha.shape)[:, None] - 1)
+        colour = np.asarray(view.colour)[row_index, column_index]
+        opaque = view.alpha[row_index, column_index] > 0.5
+        sample[np.flatnonzero(seen)[opaque]] = colour[opaque]
+    ordered = np.sort(samples, axis=0)  # NaN last
+    number = np.count_nonzero(~np.isnan(ordered[..., 0]), axis=0)
+    middle = ordered[np.maximum(number - 1, 0) // 2, np.arange(len(points))]
+    return np.where(number[:, None] > 0, middle, 0.5).astype(np.float64)
