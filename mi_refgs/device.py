@@ -1,7 +1,10 @@
-"""NumPy arrays to the device."""
+"""NumPy arrays to the device, and functions that are traced once."""
 
 from __future__ import annotations
 
+import functools
+import gc
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -29,3 +32,24 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
 def upload_tensor(values: np.ndarray) -> Any:
     """The same as an mi.TensorXf of their shape."""
     return mi.TensorXf(upload(values), shape=values.shape)
+
+
+def replayed(function: Callable[..., Any], limit: int | None = None) -> Callable[..., Any]:
+    """The function, traced by `dr.freeze` for each new kind of arguments (at most `limit` kept) and replayed.
+
+    Python's garbage collector waits meanwhile: it could meet a scene of the user's, whose release Dr.Jit
+    cannot record, and the process would be aborted.
+    """
+    frozen = dr.freeze(function, limit=limit, warn_after=10**9)
+
+    @functools.wraps(function)
+    def call(*args: Any) -> Any:
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return frozen(*args)
+        finally:
+            if collects:
+                gc.enable()
+
+    return call

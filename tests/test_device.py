@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import run_python
 
 from mi_refgs.device import upload
 
@@ -34,3 +37,33 @@ def test_other_shapes_types_and_nothing() -> None:
     assert isinstance(integers, mi.UInt32)
     np.testing.assert_array_equal(integers.numpy(), table.ravel())
     assert dr.width(upload(np.zeros((0, 3)))) == 0
+
+
+GARBAGE = """
+import gc
+import mi_refgs, mitsuba as mi, drjit as dr
+mi.set_variant("llvm_ad_rgb")
+from mi_refgs.device import replayed
+
+def drop_a_scene():
+    cycle = [mi.load_dict({"type": "scene", "plate": {"type": "rectangle"}})]
+    dr.eval(cycle[0].ray_test(mi.Ray3f(mi.Point3f(0, 0, 1), mi.Vector3f(0, 0, -1))))
+    cycle.append(cycle)
+
+def double(x):
+    gc.set_threshold(1, 1, 1)
+    kept = [[] for _ in range(100)]  # enough new objects for the collector to run
+    return 2 * x + len(kept) - 100
+
+gc.set_threshold(10**6)
+drop_a_scene()
+y = replayed(double)(dr.opaque(mi.Float, 1, 10))
+assert gc.isenabled()
+gc.collect()
+print(y[0])
+"""
+
+
+def test_garbage_is_not_collected_while_a_function_is_recorded(tmp_path: Path) -> None:
+    """To release a scene then would abort the process."""
+    assert run_python(GARBAGE, folder=tmp_path) == "2.0"

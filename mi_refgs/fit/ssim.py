@@ -8,12 +8,15 @@ G is symmetric and reads zeros outside the image, hence Gᵀ = G and the adjoint
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
+from mi_refgs.device import replayed
 
 # Half width of the 11-pixel window, in pixels. [Wang et al. 2004, §III.B]
 WINDOW_RADIUS = 5
@@ -28,6 +31,7 @@ C2 = 9e-4
 
 # Image sizes whose kernels are kept ready: to trace them takes as long as to run them.
 RECORDINGS = 8
+_replayed = functools.partial(replayed, limit=RECORDINGS)
 
 
 def window() -> list[float]:
@@ -110,14 +114,14 @@ def _similarity(blurred: list[Any], pixel: Any, inside: Any) -> list[Any]:
     return [value, *by_mean, *by_square, *by_product]
 
 
-@dr.freeze(limit=RECORDINGS, warn_after=10**9)
+@_replayed
 def _forward(x: list[Any], y: list[Any], width: int, height: int) -> list[Any]:
     """What `_similarity` gives at every pixel."""
     rows = _blur([*x, *y], width, height, 0, derive=_moments)
     return _blur(rows, width, height, 1, finish=_similarity)
 
 
-@dr.freeze(limit=RECORDINGS, warn_after=10**9)
+@_replayed
 def _gradient(x: list[Any], y: list[Any], slopes: list[Any], width: int, height: int) -> list[Any]:
     """∂(mean S)/∂x per plane, from the slopes of `_similarity`."""
     planes = len(x)

@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.device import replayed
 from mi_refgs.shade import fourier, lobe, mixing
 
 
@@ -111,15 +112,11 @@ class _Prepared:
 def _prepare(variant: str, height: int) -> _Prepared:
     op = _build(height)
 
-    @dr.freeze
-    def forward(radiance: Any) -> Any:
-        return apply(op, radiance)
-
-    @dr.freeze
-    def adjoint(δlevels: Any) -> Any:
-        return apply_transposed(op, δlevels)
-
-    return _Prepared(op, forward, adjoint)
+    return _Prepared(
+        op,
+        replayed(lambda radiance: apply(op, radiance)),
+        replayed(lambda δlevels: apply_transposed(op, δlevels)),
+    )
 
 
 def operator(height: int) -> Operator:
