@@ -3,28 +3,44 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import re
 import uuid
 from collections.abc import Callable
 from pathlib import Path
 
 from mi_refgs.errors import InputError
 
+TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp(\.[^.]*)?")
+"""Names that `replace_file` gives to files that are not whole yet."""
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+def cannot_write(path: Path, error: Exception) -> InputError:
+    """What to raise when `path` cannot be written, with the remedy that fits the error."""
+    reason = getattr(error, "strerror", None) or error
+    full = getattr(error, "errno", None) in NO_ROOM
+    remedy = "free some space there, or choose another folder" if full else "choose a writable folder"
+    return InputError(f"{path}: output: cannot be written ({reason}); {remedy}")
+
 
 def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
     """Let `write(temporary)` make a file beside `path`, then move it there: readers see the old or the new.
 
-    The temporary name has the suffix of `path`. A killed process may leave one behind, hidden by its dot.
-    Raises InputError if the folder is missing or the file cannot be written.
+    The data is on the disk before the move, so that a power cut leaves the old file or the new one, too. The
+    temporary name has the suffix of `path`. A killed process may leave one behind, hidden by its dot; see
+    `remove_temporaries`. Raises InputError if the folder is missing or the file cannot be written.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.tmp{path.suffix}")
     try:
         write(temporary)
+        with temporary.open("r+b") as file:
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:  # RuntimeError: what the EXR library and Mitsuba raise
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: output: cannot be written ({reason}); choose a writable folder") from error
+        raise cannot_write(path, error) from error
     finally:
         with contextlib.suppress(OSError):  # moved away, never made, or below a file that is no folder
             temporary.unlink()
@@ -33,3 +49,10 @@ def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
 def write_bytes(path: str | Path, data: bytes) -> None:
     """Write a file, whole or not at all; raises InputError as `replace_file` does."""
     replace_file(path, lambda temporary: temporary.write_bytes(data))
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Remove what processes that were killed while writing a file have left in a folder."""
+    for path in folder.iterdir():
+        if TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)

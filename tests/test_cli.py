@@ -90,7 +90,10 @@ def test_train_tells_what_is_unusual(
     assert (tmp_path / "run" / "checkpoints" / "0000001.npz").is_file()  # though none was due
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupt_says_how_to_resume_and_resuming_changes_nothing(
+    number: int,
+    code: int,
     data: Path,
     method: Path,
     tmp_path: Path,
@@ -102,13 +105,13 @@ def test_an_interrupt_says_how_to_resume_and_resuming_changes_nothing(
     def interrupted(self: Trainer) -> None:
         step(self)
         if self.iteration == 4:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
 
     straight, run, one = tmp_path / "straight", tmp_path / "run", ("--threads", "1")
     assert main(train_command(data, straight, method, *one)) == 0
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "step", interrupted)
-        assert main(train_command(data, run, method, *one)) == 130
+        assert main(train_command(data, run, method, *one)) == code
     said = capsys.readouterr().err
     assert f"interrupted at iteration 4; resume with: refgs train {data} -o {run} --resume" in said
     with (run / "metrics.jsonl").open("a") as log:  # as after a kill between a log line and its checkpoint

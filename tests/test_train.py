@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
+import resource
 import signal
+import tempfile
 from pathlib import Path
 
 import drjit as dr
@@ -15,6 +18,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fit import config
 from mi_refgs.fit.config import Method
 from mi_refgs.fit.data import Dataset, View
+from mi_refgs.fit.interrupt import TerminatedError, held_interrupts
 from mi_refgs.fit.record import Run
 from mi_refgs.fit.train import Trainer
 from mi_refgs.reference.camera import look_at
@@ -145,8 +149,13 @@ def test_a_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: 
     assert Trainer(method, ball(), run).iteration == 10
 
 
-def test_ctrl_c_waits_for_the_step_in_hand(
-    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("number", "raised"), [("SIGINT", KeyboardInterrupt), ("SIGTERM", TerminatedError)])
+def test_a_signal_waits_for_the_step_in_hand(
+    number: str,
+    raised: type[KeyboardInterrupt],
+    method: Method,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A signal inside iteration 7, before its refinement: the checkpoint holds the whole iteration."""
     run = run_folder(tmp_path / "run", method)
@@ -155,18 +164,103 @@ def test_ctrl_c_waits_for_the_step_in_hand(
 
     def interrupted_refine(iteration: int) -> None:
         if iteration == 7:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.Signals[number])
         refine(iteration)
 
     monkeypatch.setattr(trainer, "_refine", interrupted_refine)
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
+    before = signal.getsignal(signal.Signals[number])
+    with pytest.raises(KeyboardInterrupt) as caught:
         trainer.train()
-    assert signal.getsignal(signal.SIGINT) is before
+    assert caught.type is raised and signal.getsignal(signal.Signals[number]) is before
     state = run.load_checkpoint()
     assert state is not None and int(state["iteration"]) == 7
     for name, value in trainer.state().items():
         assert np.array_equal(state[name], value), name
+
+
+def test_a_second_signal_is_not_held(method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice within iteration 7, which ends it there; what was saved before is whole."""
+    run = run_folder(tmp_path / "run", method)
+    trainer = Trainer(method, ball(), run)
+    refine, after = trainer._refine, []
+
+    def interrupted_refine(iteration: int) -> None:
+        if iteration == 7:
+            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGINT)
+            after.append(iteration)
+        refine(iteration)
+
+    monkeypatch.setattr(trainer, "_refine", interrupted_refine)
+    with pytest.raises(TerminatedError):
+        trainer.train()
+    state = run.load_checkpoint()
+    assert not after and state is not None and int(state["iteration"]) == 5
+
+
+def test_a_signal_that_was_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as of a job that a script put in the background
+    try:
+        with held_interrupts() as release:
+            os.kill(os.getpid(), signal.SIGINT)
+            release()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("limit", ["file size", "disk"])
+def test_a_full_disk_leaves_what_was_saved(
+    limit: str, method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The checkpoint of iteration 10 does not fit: one sentence, no half file; that of 5 is still there."""
+    run = run_folder(tmp_path / "run", method)
+    trainer = Trainer(method, ball(), run)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(state: Trainer) -> None:
+        if state.iteration == 9 and limit == "file size":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
+        elif state.iteration == 9:
+            monkeypatch.setattr(os, "fsync", no_room)
+
+    def no_room(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    try:
+        with pytest.raises(
+            InputError, match=r"0000010\.npz: output: cannot be written \(.*\); free some space"
+        ):
+            trainer.train(fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    monkeypatch.undo()
+    assert [path.name for path in (run.path / "checkpoints").iterdir()] == ["0000005.npz"]
+    again = Trainer(method, ball(), run)
+    again.train()
+    assert again.iteration == method.iterations
+
+
+def test_a_log_that_cannot_be_written_is_one_sentence(method: Method, tmp_path: Path) -> None:
+    run = run_folder(tmp_path / "run", method)
+    (run.path / "metrics.jsonl").mkdir()
+    with pytest.raises(InputError, match=r"metrics\.jsonl: output: cannot be written \(.*\); choose"):
+        Trainer(method, ball(), run).train()
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_folder_that_cannot_be_written_is_refused_before_the_first_step(
+    resumed: bool, method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A read-only disk, imitated: file permissions mean nothing to root."""
+    run = run_folder(tmp_path / "run", method) if resumed else Run(tmp_path / "run")
+
+    def read_only(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", read_only)
+    with pytest.raises(InputError, match="Read-only file system"):
+        run.rewind(0) if resumed else run.create(method, "ball")
+    assert not (run.path / "metrics.jsonl").exists()
 
 
 def test_a_run_is_not_overwritten(method: Method, tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """`refgs …`: one module a command; here the parser, and what turns errors into sentences and exit codes.
 
-Exit codes: 0 done, 1 the installation is unusable, 2 bad input, 130 interrupted.
+Exit codes: 0 done, 1 the installation is unusable, 2 bad input, 130 interrupted, 143 terminated (SIGTERM).
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from mi_refgs import __version__
 from mi_refgs.cli import dataset, demo, doctor, evaluate, export, profile, render, train
 from mi_refgs.cli.command import Parser, Result, UnusableError, finite, prepare
 from mi_refgs.errors import InputError
+from mi_refgs.fit.interrupt import TerminatedError
 
-EXIT_UNUSABLE, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
-"""130 is what shells report for a program that Ctrl-C ended (128 + SIGINT)."""
+EXIT_UNUSABLE, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 2, 130, 143
+"""The last two are what shells report for a program that a signal ended: 128 + SIGINT, 128 + SIGTERM."""
 
 
 def build_parser() -> Parser:
@@ -43,6 +44,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _failed(str(error), EXIT_BAD_INPUT)
     except UnusableError as error:
         return _failed(str(error), EXIT_UNUSABLE)
+    except TerminatedError as error:
+        return _failed(str(error) or "terminated", EXIT_TERMINATED)
     except KeyboardInterrupt as error:
         return _failed(str(error) or "interrupted", EXIT_INTERRUPTED)
     print(json.dumps(finite(result.data), allow_nan=False) if args.json else result.text)

@@ -103,7 +103,8 @@ def fit(
 ) -> Trainer:
     """Train with a progress bar and previews, then write the artefacts; a finished run is only loaded.
 
-    Raises InputError for bad input, and KeyboardInterrupt with a message that says how to go on.
+    Raises InputError for bad input, and KeyboardInterrupt or TerminatedError with a message that says how to
+    go on.
     """
     from mi_refgs.fit.evaluate import load_split, up_to_date
     from mi_refgs.fit.record import Run
@@ -125,19 +126,23 @@ def fit(
     trainer = Trainer(method, views, folder)
     if resumed:
         say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
-        folder.truncate_log(trainer.iteration)
+        folder.rewind(trainer.iteration)
     else:
         folder.create(method, str(data_path.resolve()))
 
     try:
         with Progress(trainer, folder) as progress:
             trainer.train(progress)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         kept = "" if folder.checkpoints() else " (before the first iteration was done)"
-        raise KeyboardInterrupt(
+        raise type(error)(
             f"interrupted at iteration {trainer.iteration}{kept}; "
             f"resume with: refgs train {data_path} -o {output} --resume"
         ) from None
+    except InputError as error:  # a full disk, no surfel left
+        saved = folder.checkpoints()
+        kept = f" (saved up to iteration {int(saved[-1].stem)}; --resume goes on from there)" if saved else ""
+        raise InputError(f"{error}{kept}") from error
     if not any(path.stem == f"{trainer.iteration:07d}" for path in folder.checkpoints()):
         folder.save_checkpoint(trainer.iteration, trainer.state())
     try:

@@ -23,8 +23,9 @@ import drjit as dr
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.fit.checkpoint import PARAMS, tensors
 from mi_refgs.fit.config import Method
-from mi_refgs.fit.record import PARAMS, Run, tensors
+from mi_refgs.fit.record import Run
 from mi_refgs.fit.schedule import LIGHT
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
@@ -150,6 +151,8 @@ def newest(run: Run, method: Method) -> Fitted | None:
     if (run.path / SURFELS).is_file():
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             shown = int(json.loads((run.path / MODEL).read_text(encoding="utf-8"))["iteration"])
+    if not any(int(path.stem) > shown for path in run.checkpoints()):
+        return None
     state = run.load_checkpoint()
     if state is None or int(state["iteration"]) <= shown:
         return None

@@ -1,4 +1,4 @@
-"""Ctrl-C between two steps of a fit, never inside one."""
+"""Ctrl-C and SIGTERM between two steps of a fit, never inside one."""
 
 from __future__ import annotations
 
@@ -9,28 +9,39 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 
-@contextlib.contextmanager
-def held_interrupts() -> Iterator[Callable[[], bool]]:
-    """Hold back the first Ctrl-C and yield a function that says whether there was one; a second one is not
-    held.
+class TerminatedError(KeyboardInterrupt):
+    """SIGTERM, as `kill` and batch systems send it; ends what Ctrl-C ends."""
 
-    A state that is saved in the middle of a step (parameters moved, refinement or the mesh still due) could
-    not be resumed to the same result. Outside the main thread, where Python delivers no signals, nothing is
-    held.
+
+@contextlib.contextmanager
+def held_interrupts() -> Iterator[Callable[[], None]]:
+    """Hold back the first Ctrl-C or SIGTERM, and yield a function that raises it; a second one is not held.
+
+    Raised are KeyboardInterrupt and TerminatedError. A state that is saved in the middle of a step
+    (parameters moved, refinement or the mesh still due) could not be resumed to the same result. Outside the
+    main thread, where Python delivers no signals, nothing is held; nor is a signal that the process was
+    started to ignore.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
+        yield lambda: None
         return
-    pending = False
+    pending: list[KeyboardInterrupt] = []
 
     def hold(number: int, frame: FrameType | None) -> None:
-        nonlocal pending
         if pending:
-            raise KeyboardInterrupt
-        pending = True
+            raise pending[0]
+        pending.append(TerminatedError() if number == signal.SIGTERM else KeyboardInterrupt())
 
-    before = signal.signal(signal.SIGINT, hold)
+    def release() -> None:
+        if pending:
+            raise pending[0]
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
+    for number in before:
+        signal.signal(number, hold)
     try:
-        yield lambda: pending
+        yield release
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

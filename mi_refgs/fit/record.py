@@ -7,33 +7,22 @@ metrics.json  contact_sheet.png  eval/                                 by `fit.e
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Mapping
+import math
+import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
-from mi_refgs.files import write_bytes
+from mi_refgs.files import cannot_write, remove_temporaries, write_bytes
+from mi_refgs.fit import checkpoint
 from mi_refgs.fit.config import Method, dump, load_resolved
 
 CHECKPOINTS_KEPT = 2
 """One could be enough, since a checkpoint appears only when complete; two survive a disk that lies."""
-
-PARAMS = "params/"
-"""What the names of parameters begin with in a checkpoint."""
-
-
-def tensors(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, Any]:
-    """The tensors of a checkpoint whose names begin with a prefix, by the rest of their names."""
-    return {
-        name.removeprefix(prefix): upload_tensor(value)
-        for name, value in state.items()
-        if name.startswith(prefix)
-    }
 
 
 class Run:
@@ -48,13 +37,7 @@ class Run:
             raise InputError(
                 f"{self.path}: holds a run already; add --resume to go on with it, or choose another -o"
             )
-        try:
-            for folder in ("checkpoints", "previews"):
-                (self.path / folder).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"{self.path}: cannot be created ({error.strerror}); choose a writable folder with -o"
-            ) from error
+        self._make_folders()
         write_bytes(self.path / "dataset.json", json.dumps({"path": dataset}).encode())
         write_bytes(self.path / "config.toml", dump(method).encode())
 
@@ -77,38 +60,84 @@ class Run:
         return sorted((self.path / "checkpoints").glob("[0-9]*.npz"))
 
     def save_checkpoint(self, iteration: int, state: dict[str, np.ndarray]) -> None:
-        """Save a state, then drop all but the newest CHECKPOINTS_KEPT."""
-        buffer = io.BytesIO()
-        np.savez(buffer, **state)  # type: ignore[arg-type]
-        write_bytes(self.path / "checkpoints" / f"{iteration:07d}.npz", buffer.getvalue())
+        """Save a state, then drop all but the newest CHECKPOINTS_KEPT; raises InputError if it cannot be
+        written."""
+        write_bytes(self.path / "checkpoints" / f"{iteration:07d}.npz", checkpoint.encode(state))
         for old in self.checkpoints()[:-CHECKPOINTS_KEPT]:
-            old.unlink()
+            old.unlink(missing_ok=True)
 
     def load_checkpoint(self) -> dict[str, np.ndarray] | None:
-        """The newest readable checkpoint, or None if there is none yet."""
+        """The newest checkpoint that is whole, or None if there is none yet; names damaged ones on stderr.
+
+        Raises InputError if there are checkpoints and all are damaged: a fit is never begun anew unasked.
+        """
+        damaged = []
         for path in reversed(self.checkpoints()):
             try:
-                with np.load(path) as archive:
-                    return {name: archive[name] for name in archive.files}
-            except (OSError, ValueError, EOFError):
-                continue
+                return checkpoint.read(path)
+            except checkpoint.DamagedError as error:
+                damaged.append(f"{path}: damaged ({error})")
+                print(f"refgs: warning: {damaged[-1]}; trying the one before", file=sys.stderr)
+        if damaged:
+            raise InputError(
+                f"{damaged[0]}, and no checkpoint before it is whole; put a copy back, or remove "
+                f"{self.path / 'checkpoints'} to begin anew"
+            )
         return None
+
+    def rewind(self, iteration: int) -> None:
+        """Make the folder ready to go on after `iteration`: drops later checkpoints (`load_checkpoint` found
+        them damaged), later lines of the log, which a resumed run writes again, and what killed processes
+        left behind.
+
+        Raises InputError if the folder cannot be written.
+        """
+        self._make_folders()
+        for folder in (self.path, self.path / "checkpoints", self.path / "previews"):
+            remove_temporaries(folder)
+        for path in self.checkpoints():
+            if int(path.stem) > iteration:
+                path.unlink()
+        log = self.path / "metrics.jsonl"
+        text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+        kept = [line for line in text.splitlines() if _logged(line) <= iteration]
+        write_bytes(log, "".join(f"{line}\n" for line in kept).encode())
 
     # ---------------- logs ----------------
 
     def log(self, line: dict[str, Any]) -> None:
-        """Append one JSON line to metrics.jsonl."""
-        with (self.path / "metrics.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line) + "\n")
+        """Append one JSON line to metrics.jsonl, with null for a number that is not finite.
 
-    def truncate_log(self, iteration: int) -> None:
-        """Drop the lines after `iteration`, which a resumed run writes again."""
+        Raises InputError if it cannot be written.
+        """
         path = self.path / "metrics.jsonl"
-        if path.exists():
-            lines = [line for line in path.read_text().splitlines() if line.endswith("}")]
-            kept = [line for line in lines if json.loads(line)["iteration"] <= iteration]
-            write_bytes(path, "".join(f"{line}\n" for line in kept).encode())
+        line = {
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in line.items()
+        }
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(line) + "\n")
+        except OSError as error:
+            raise cannot_write(path, error) from error
 
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write a JSON file of the run."""
         write_bytes(self.path / name, (json.dumps(content, indent=2) + "\n").encode())
+
+    def _make_folders(self) -> None:
+        try:
+            for folder in (self.path / "checkpoints", self.path / "previews"):
+                folder.mkdir(parents=True, exist_ok=True)
+                with tempfile.TemporaryFile(dir=folder):  # fails now, not at the first checkpoint
+                    pass
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
+
+
+def _logged(line: str) -> float:
+    """The iteration of a line of the log; infinity for half a line, which a killed process may leave."""
+    try:
+        return float(json.loads(line)["iteration"])
+    except (ValueError, TypeError, KeyError):
+        return math.inf

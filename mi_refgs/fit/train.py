@@ -16,14 +16,16 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.device import upload
+from mi_refgs.errors import InputError
 from mi_refgs.fit import refine
+from mi_refgs.fit.checkpoint import OPTIMISER, PARAMS, part, tensors
 from mi_refgs.fit.config import Method, Stage
 from mi_refgs.fit.data import Dataset
 from mi_refgs.fit.initial import initial_surfels
 from mi_refgs.fit.interrupt import held_interrupts
 from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.optim import Adam, Group
-from mi_refgs.fit.record import PARAMS, Run, tensors
+from mi_refgs.fit.record import Run
 from mi_refgs.fit.schedule import LIGHT, Schedule
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
@@ -31,7 +33,17 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, Shading, render, render_depth
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.table import Surfels
+from mi_refgs.surfels.table import CHANNELS, GEOMETRY, Surfels, sh_columns
+
+
+def _shapes(method: Method) -> dict[str, tuple[int, ...]]:
+    """The shape of every parameter of a method, without the first axis."""
+    options = method.surfels
+    degrees = {"radiance_sh": options.sh_degree, "indirect_sh": options.indirect_degree}
+    shapes: dict[str, tuple[int, ...]] = {
+        name: (CHANNELS[name] or sh_columns(degrees[name]),) for name in (*GEOMETRY, *options.channels)
+    }
+    return shapes if method.light is None else shapes | {LIGHT: (2 * method.light.height, 3)}
 
 
 class Trainer:
@@ -94,8 +106,11 @@ class Trainer:
     # ---------------- the loop ----------------
 
     def train(self, progress: Callable[[Trainer], None] | None = None) -> None:
-        """Run to the last iteration; an interrupt ends it after the step in hand, saved, and is passed on."""
-        with held_interrupts() as interrupted:
+        """Run to the last iteration; an interrupt ends it after the step in hand, saved, and is passed on.
+
+        Raises InputError when the run folder cannot be written: a checkpoint interval is lost at most.
+        """
+        with held_interrupts() as release:
             while self.iteration < self.method.iterations:
                 begin = time.perf_counter()
                 self.step()
@@ -106,8 +121,7 @@ class Trainer:
                 try:
                     if progress is not None:
                         progress(self)
-                    if interrupted():
-                        raise KeyboardInterrupt
+                    release()
                 except KeyboardInterrupt:
                     if self.run is not None:
                         self.run.save_checkpoint(self.iteration, self.state())
@@ -255,7 +269,7 @@ class Trainer:
         """Everything that a checkpoint holds."""
         mesh = self.occluder.mesh()
         state = {f"{PARAMS}{name}": tensor.numpy() for name, tensor in self.params.items()}
-        state |= {f"optimiser/{name}": value for name, value in self.optimiser.state_dict().items()}
+        state |= {f"{OPTIMISER}{name}": value for name, value in self.optimiser.state_dict().items()}
         state |= {"gradient_sum": self.gradient_sum.numpy(), "gradient_count": self.gradient_count.numpy()}
         state |= {"iteration": np.array(self.iteration), "seconds": np.array(self.seconds)}
         state["held_until"] = np.array(self.held_until)
@@ -268,16 +282,19 @@ class Trainer:
         return state
 
     def _restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go on from a checkpoint; raises InputError if the method has changed since it was written."""
+        expected = _shapes(self.method)
+        found = {name: value.shape[1:] for name, value in part(state, PARAMS).items()}
+        for name in expected.keys() | found.keys():
+            if found.get(name) != expected.get(name):
+                raise InputError(
+                    f"config.toml: {name}: the checkpoint has {found.get(name, 'none')}, the method "
+                    f"{expected.get(name, 'none')}; undo the change, or start another run"
+                )
         self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
         self.params |= tensors(state, PARAMS)
         self.optimiser = Adam(self.params, self._groups())
-        self.optimiser.load_state_dict(
-            {
-                key.removeprefix("optimiser/"): value
-                for key, value in state.items()
-                if key.startswith("optimiser/")
-            }
-        )
+        self.optimiser.load_state_dict(part(state, OPTIMISER))
         self.gradient_sum = upload(state["gradient_sum"])
         self.gradient_count = upload(state["gradient_count"])
         self.held_until = int(state["held_until"])

@@ -1,0 +1,122 @@
+"""A checkpoint: named arrays in an .npz file that NumPy reads, with a checksum of all its bytes.
+
+The comment of the archive is "sha256 " and the SHA-256 of every byte before the digest: the checksum is
+written with the content, and a change of any bit is found. A file without it does not count as a checkpoint.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.device import upload_tensor
+from mi_refgs.errors import InputError
+from mi_refgs.fit.schedule import LIGHT
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.surfels.table import GEOMETRY, Surfels
+
+PARAMS, OPTIMISER, MESH = "params/", "optimiser/", "mesh/"
+"""What the names of parameters, of Adam's moments and of the occluder begin with."""
+_MARK = b"sha256 "
+_DIGITS = 64
+
+
+class DamagedError(Exception):
+    """The file is no checkpoint of ours, or not all of one; the message says what is wrong with it."""
+
+
+def encode(state: Mapping[str, np.ndarray]) -> bytes:
+    """The bytes of a checkpoint."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **state)  # type: ignore[arg-type]
+    with zipfile.ZipFile(buffer, "a") as archive:
+        archive.comment = _MARK + b"0" * _DIGITS
+    content = buffer.getvalue()[:-_DIGITS]
+    return content + hashlib.sha256(content).hexdigest().encode()
+
+
+def decode(data: bytes) -> dict[str, np.ndarray]:
+    """The state in the bytes of a checkpoint; raises DamagedError for what `encode` cannot have written."""
+    content, digest = data[:-_DIGITS], data[-_DIGITS:]
+    if not content.endswith(_MARK) or hashlib.sha256(content).hexdigest().encode() != digest:
+        raise DamagedError("its checksum is wrong or missing")
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            state = {name: archive[name] for name in archive.files}
+    except (ValueError, EOFError, KeyError, OSError, MemoryError, zipfile.BadZipFile) as error:
+        raise DamagedError(f"no .npz of arrays: {error}") from error
+    check(state)
+    return state
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    """The state in a file; raises DamagedError, also for a file that cannot be read."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DamagedError(f"cannot be read: {error.strerror}") from error
+    return decode(data)
+
+
+def tensors(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, Any]:
+    """The tensors of a checkpoint whose names begin with a prefix, by the rest of their names."""
+    return {name: upload_tensor(value) for name, value in part(state, prefix).items()}
+
+
+def part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays of a checkpoint whose names begin with a prefix, by the rest of their names."""
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+
+
+def check(state: Mapping[str, np.ndarray]) -> None:
+    """Raise DamagedError unless every array that a fit goes on from is there, finite and of its shape."""
+    params = part(state, PARAMS)
+    try:
+        table = Surfels({name: value for name, value in params.items() if name != LIGHT})
+        if LIGHT in params:
+            EnvironmentLight(params[LIGHT])
+    except InputError as error:
+        raise DamagedError(str(error)) from error
+    scalars = ["iteration", "seconds", "held_until"]
+    rows = ["gradient_sum", "gradient_count"]
+    signed = [f"{PARAMS}{name}" for name in {*GEOMETRY, *params}]
+    for tensor, values in params.items():
+        _check(state, [f"{OPTIMISER}{tensor}/first"], (values.size,), signed=True)
+        _check(state, [f"{OPTIMISER}{tensor}/second"], (values.size,))
+        scalars += [f"{OPTIMISER}{tensor}/{name}" for name in ("steps", "factor")]
+    _check(state, scalars, ())
+    _check(state, rows, (table.count,))
+    _check(state, signed, signed=True)
+    if part(state, MESH):
+        _check(state, [f"{MESH}voxel"], ())
+        _check(state, [f"{MESH}vertices", f"{MESH}faces"], (None, 3), signed=True)
+        faces, vertices = state[f"{MESH}faces"], state[f"{MESH}vertices"]
+        if faces.dtype.kind != "u" or (faces.size and faces.max() >= len(vertices)):
+            raise DamagedError(f"{MESH}faces: names vertices that are not there")
+
+
+def _check(
+    state: Mapping[str, np.ndarray],
+    names: Iterable[str],
+    shape: tuple[int | None, ...] | None = None,
+    signed: bool = False,
+) -> None:
+    """Numbers, finite, of the shape if one is given (None: any size), and not negative unless `signed`."""
+    for name in names:
+        values = state.get(name)
+        if values is None:
+            raise DamagedError(f"{name}: missing")
+        fits = shape is None or (
+            len(shape) == values.ndim
+            and all(size in (None, found) for size, found in zip(shape, values.shape, strict=True))
+        )
+        if values.dtype.kind not in "fiu" or not fits:
+            raise DamagedError(f"{name}: found {values.dtype} of shape {values.shape}")
+        if not np.all(np.isfinite(values)) or (not signed and np.any(values < 0)):
+            raise DamagedError(f"{name}: has a value that is not finite or out of range")
