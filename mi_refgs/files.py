@@ -1,14 +1,16 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and JSON that may hold anything."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
 import re
 import uuid
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from mi_refgs.errors import InputError
 
@@ -56,3 +58,18 @@ def remove_temporaries(folder: Path) -> None:
     for path in folder.iterdir():
         if TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises InputError for a file that is missing, no JSON, nested too deeply, or holds anything but an object.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: JSON: cannot be read ({error}); mend it or export it again") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: JSON: the outermost value is not an object; export the file again")
+    return content

@@ -6,6 +6,8 @@ Mitsuba's own EXR files are left to it only where it loads or saves a scene (`mi
 from __future__ import annotations
 
 import contextlib
+import struct
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,18 @@ SRGB_ENCODED_LIMIT = 0.04045
 """The same point after encoding."""
 EXR_MAGIC = b"\x76\x2f\x31\x01"
 """First bytes of every EXR file."""
+EXR_OTHER_FLAGS = 0x1800
+"""Bits of the version for deep data and for several parts."""
+EXR_BYTES = (4, 2, 4)
+"""Bytes of a sample by pixel type: UINT, HALF, FLOAT."""
+EXR_CHANNEL = 17
+"""Bytes of an entry of the list of channels after its name, the name's zero included."""
+MAX_EXR_HEADER = 2**20
+"""Bytes; headers with a preview picture have tens of kilobytes."""
+ANY_FILE = 2**24
+"""Bytes of pixels that any file may promise."""
+MAX_EXPANSION = 1100
+"""Bytes of pixels that a byte of a larger file may promise: DEFLATE cannot expand by more than 1,032."""
 SRGB_CHROMATICITIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 """x, y of red, green, blue and white (ITU-R BT.709), which an EXR file without the attribute has."""
 CHROMATICITY_TOLERANCE = 1e-3
@@ -56,26 +70,59 @@ def box_downscale(image: np.ndarray, factor: int) -> np.ndarray:
     return blocks.mean(axis=(1, 3), dtype=np.float64).astype(image.dtype)
 
 
+def image_size(path: str | Path) -> tuple[int, int]:
+    """Width and height, pixels, of a PNG, JPEG or EXR file, from its header.
+
+    Raises InputError as the file's reader does.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".exr":
+        return _exr_size(path)
+    with _open_picture(path) as picture:
+        width, height = picture.size
+        return int(width), int(height)
+
+
 def read_png(path: str | Path) -> np.ndarray:
     """8-bit image file (PNG, JPEG) as float32 (H, W, 3 or 4) in [0, 1], still sRGB encoded, alpha straight.
 
     Raises InputError if the file is missing, unreadable or has more than 8 bits per channel.
     """
+    path = Path(path)
+    with _open_picture(path) as picture:
+        if picture.mode.startswith(("I", "F")):
+            raise InputError(f"{path}: pixels: more than 8 bits per channel; save it as 8-bit PNG or EXR")
+        transparent = picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
+        pixels = np.asarray(picture.convert("RGBA" if transparent else "RGB"))
+    return pixels.astype(np.float32) / np.float32(255)
+
+
+@contextlib.contextmanager
+def _open_picture(path: Path) -> Iterator[Any]:
+    """A PNG or JPEG file whose header is read and whose size is believable."""
     from PIL import Image
 
-    path = Path(path)
     _require_file(path)
     try:
-        with Image.open(path) as image:
-            if image.mode.startswith(("I", "F")):
-                raise InputError(f"{path}: pixels: more than 8 bits per channel; save it as 8-bit PNG or EXR")
-            transparent = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
-            pixels = np.asarray(image.convert("RGBA" if transparent else "RGB"))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `_check_size` asks for more
+            picture = Image.open(path, formats=("PNG", "JPEG"))
+        with picture:
+            _check_size(path, *picture.size, len(picture.getbands()))
+            yield picture
     except InputError:
         raise
     except Exception as error:  # Pillow raises half a dozen types for broken files
         raise InputError(f"{path}: pixels: not a readable image ({error}); export it again") from error
-    return pixels.astype(np.float32) / np.float32(255)
+
+
+def _check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:
+    """Raise InputError for a size that no file of this length can hold, before memory is asked for."""
+    promised = width * height * bytes_per_pixel
+    if promised > max(ANY_FILE, MAX_EXPANSION * path.stat().st_size):
+        raise InputError(
+            f"{path}: size: {width} × {height} pixels are more than the file can hold; export it again"
+        )
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:
@@ -122,11 +169,47 @@ def read_exr_image(path: str | Path) -> np.ndarray:
     raise InputError(f"{path}: channels: found {found}; export R, G, B (and A), or X, Y, Z, or one channel")
 
 
+def _exr_size(path: Path) -> tuple[int, int]:
+    """Width and height of an EXR file's data window; raises InputError for a header that makes no sense.
+
+    Only one part of flat pixels passes. Layout: OpenEXR's file format (magic, version, attributes of name,
+    type, length and value up to an empty name).
+    """
+    _require_file(path)
+    try:
+        with path.open("rb") as file:
+            header = file.read(MAX_EXR_HEADER)
+        magic, version = struct.unpack_from("<4sI", header)
+        if magic != EXR_MAGIC or version & EXR_OTHER_FLAGS:
+            raise ValueError("no EXR file, or one of several parts or of deep pixels")
+        position, found = 8, {}
+        while header[position] != 0:
+            name, kind, rest = header[position:].split(b"\0", 2)
+            position += len(name) + len(kind) + 2
+            (length,) = struct.unpack_from("<I", rest)
+            found[name] = header[position + 4 : position + 4 + length]
+            position += 4 + length
+        left, top, right, bottom = struct.unpack("<4i", found[b"dataWindow"])
+        size, channels, pixel = (right - left + 1, bottom - top + 1), found[b"channels"], 0
+        while channels[0] != 0:
+            name, channels = channels.split(b"\0", 1)
+            pixel += EXR_BYTES[struct.unpack_from("<I", channels)[0]]
+            channels = channels[EXR_CHANNEL - 1 :]
+        if min(size) < 1:
+            raise ValueError("an empty data window")
+    except OSError as error:
+        raise InputError(f"{path}: file: cannot be read ({error.strerror}); check the path") from error
+    except (ValueError, KeyError, IndexError, struct.error) as error:
+        raise InputError(f"{path}: header: not a readable EXR file ({error}); export it again") from error
+    _check_size(path, *size, pixel)
+    return size
+
+
 def _read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Channels and header of the first part."""
     import OpenEXR
 
-    _require_file(path)
+    _exr_size(path)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(c.pixels, dtype=np.float32) for name, c in file.channels().items()}
@@ -179,6 +262,14 @@ def mitsuba_exr() -> Iterator[None]:
         dr.set_thread_count(before)
 
 
+def is_file(path: Path) -> bool:
+    """Whether a file exists; no for a name that no file can have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def _require_file(path: Path) -> None:
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"{path}: file: missing; restore it, or remove what refers to it")

@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -15,7 +16,8 @@ import pytest
 from tiny_scene import SIZE, train_command
 
 from mi_refgs.cli import demo, main
-from mi_refgs.fit.config import load_resolved
+from mi_refgs.cli.train import load_method, sized
+from mi_refgs.fit.config import PRESETS, load_resolved
 from mi_refgs.fit.train import Trainer
 from mi_refgs.images import read_exr, read_png, srgb_from_linear, write_png
 
@@ -88,6 +90,31 @@ def test_train_tells_what_is_unusual(
     assert main([*train_command(data, tmp_path / "run", method), "iterations=1", "--threads", "1"]) == 0
     assert "only 3 training views" in capsys.readouterr().err
     assert (tmp_path / "run" / "checkpoints" / "0000001.npz").is_file()  # though none was due
+
+
+def test_large_pictures_are_read_smaller_unless_told_otherwise(
+    data: Path,
+    method: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The size is chosen once: config.toml records it, and evaluation reads the same."""
+    monkeypatch.setitem(PRESETS, "quick", replace(PRESETS["quick"], pixels=SIZE * SIZE // 3))
+    run = tmp_path / "run"
+    assert main([*train_command(data, run, method), "iterations=2"]) == 0
+    said = [
+        line for line in capsys.readouterr().err.splitlines() if "20 × 20 pixels are read as 10 × 10" in line
+    ]
+    assert len(said) == 1 and "data.downscale=1" in said[0] and "quick" in said[0]
+    assert load_resolved(run / "config.toml").data.downscale == 2
+    monkeypatch.undo()
+    assert main(["eval", str(run)]) == 0
+    assert json.loads((run / "metrics.json").read_text())["image_size"] == [SIZE // 2, SIZE // 2]
+    chosen = sized(load_method(str(method), "quick", ["data.downscale=1"]), data)
+    assert chosen.data.downscale == 1
+    assert sized(load_method(str(method), "quick", []), data).data.downscale == 1
+    capsys.readouterr()
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

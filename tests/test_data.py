@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit.data import Dataset, load
+from mi_refgs.fit.data import Dataset, fitting_downscale, load
 from mi_refgs.images import box_downscale, read_exr_image, read_png, write_exr, write_png
 
 ANGLE = 0.7  # camera_angle_x, radians
@@ -103,6 +103,21 @@ def test_downscale_leaves_out_what_fills_no_block(folder: Path) -> None:
     )
 
 
+def test_the_size_that_a_budget_of_pixels_affords(folder: Path) -> None:
+    """Photographs of 1080 × 1920 and their like, read no larger than asked for."""
+    Image.new("RGB", (1080, 1920)).save(folder / "large.jpg")
+    write_exr(folder / "large.exr", np.zeros((30, 21, 3)))
+    content = read(folder)
+    content["frames"] = [content["frames"][0] | {"file_path": "large.jpg"}]
+    write(folder, "train", content)
+    for pixels, factor in ((65536, 6), (1080 * 1920, 1), (1080 * 1920 - 1, 2), (1, 961)):
+        assert fitting_downscale(folder, "png", pixels) == (factor, 1080, 1920)
+    assert fitting_downscale(folder, "exr", 70) == (3, 21, 30)
+    view = load(folder, "train", downscale=7).views[0]
+    assert (view.width, view.height) == (1080 // 7, 1920 // 7)
+    assert view.cx == pytest.approx(1080 / 2 / 7) and view.cy == pytest.approx(1920 / 2 / 7)
+
+
 def test_camera_frame(folder: Path) -> None:
     """Mitsuba's frame: +z forward, +x left, +y up; what lies right of the axis lands right."""
     view = load(folder, "train").views[1]
@@ -161,6 +176,17 @@ def test_holdout_without_a_test_file(folder: Path) -> None:
     assert [v.name for v in load(folder, "test").views] == names["test"]
 
 
+def test_names_that_turn_back_inside_the_folder(folder: Path) -> None:
+    content = read(folder)
+    content["frames"][0]["file_path"] = "./test/../train/r_1.png"
+    write(folder, "train", content)
+    (folder / "links").symlink_to(folder / "train")  # followed: whoever made the folder made it
+    content["frames"][1]["file_path"] = "links/r_1.png"
+    write(folder, "train", content)
+    views = load(folder, "train").views
+    np.testing.assert_array_equal(views[0].image, views[1].image)
+
+
 def test_extension_may_be_given(folder: Path) -> None:
     content = read(folder)
     content["frames"][0]["file_path"] += ".png"
@@ -202,6 +228,11 @@ def edit(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
         write(folder, "train", content)
 
     return damage
+
+
+def named(key: str, value: Any) -> Callable[[Path], None]:
+    """Another value of a key of the first frame."""
+    return edit(lambda content: content["frames"][0].update({key: value}))
 
 
 def diagonal(x: float, y: float, z: float) -> list[list[float]]:
@@ -250,6 +281,20 @@ def truncate(folder: Path) -> None:
         (edit(lambda c: c["frames"][2].update(transform_matrix=diagonal(1, math.nan, 1))), {}, ["rotation"]),
         (edit(lambda c: c["frames"][0].update(depth_path="train/r_1.exr")), {}, ["[0].depth_path", "size"]),
         (edit(lambda c: c["frames"][0].update(normal_path="none.exr")), {}, ["none.exr", "missing"]),
+        (named("file_path", "../r_0.png"), {}, ["frames[0].file_path", "'../r_0.png'", "folder"]),
+        (named("file_path", "train/../../r_0.png"), {}, ["frames[0].file_path", "folder"]),
+        (named("file_path", "/etc/passwd"), {}, ["frames[0].file_path", "folder"]),
+        (named("file_path", "."), {}, ["frames[0].file_path", "folder"]),
+        (named("file_path", 7), {}, ["frames[0].file_path", "7"]),
+        (named("file_path", "a" * 5000), {}, ["missing"]),
+        (named("file_path", "a\0b"), {}, ["missing"]),
+        (named("file_path", "\ud800"), {}, ["missing"]),
+        (named("exr_path", "../a.exr"), {"images": "exr"}, ["frames[0].exr_path", "folder"]),
+        (named("depth_path", "/a.exr"), {}, ["frames[0].depth_path", "folder"]),
+        (named("transform_matrix", [[10**400] * 4] * 4), {}, ["frames[0].transform_matrix"]),
+        (named("fl_x", 10**400), {}, ["fl_x", "number"]),
+        (named("cx", math.inf), {}, ["cx", "inf"]),
+        (lambda f: (f / "transforms_train.json").write_text("[" * 10**5), {}, ["JSON", "recursion"]),
         (truncate, {}, ["r_0.png", "readable"]),
         (sixteen_bits, {}, ["r_0.png", "8-bit"]),
         (resize, {}, ["r_5", "one size"]),

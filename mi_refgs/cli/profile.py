@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs.cli.command import Result, add_command, add_settings
-from mi_refgs.cli.train import DEFAULT_PRESET, load_method, training_views
+from mi_refgs.cli.train import DEFAULT_PRESET, load_method, sized, training_views
 from mi_refgs.errors import InputError
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
         return trainer, [method.stage_at(max(trainer.iteration, 1))[0]]
     if args.data is not None:
         raise InputError(f"--data: {args.path} is no run; drop --data")
-    method = load_method(args.variant, args.preset, args.set)
+    method = sized(load_method(args.variant, args.preset, args.set), args.path)
     return Trainer(method, training_views(method, args.path)), [name for name, _ in method.stages()]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,6 +79,24 @@ def load_method(variant: str | None, preset: str | None, assignments: list[str] 
     return config.load(path, preset or DEFAULT_PRESET, assignments)
 
 
+def sized(method: Method, data_path: Path) -> Method:
+    """The method with the size of pictures decided: where it says none, what its preset can afford."""
+    from mi_refgs.fit import data
+    from mi_refgs.fit.config import PRESETS
+
+    if method.data.downscale is not None:
+        return method
+    budget = PRESETS[method.preset].pixels
+    factor, width, height = data.fitting_downscale(data_path, method.data.images, budget)
+    if factor > 1:
+        say(
+            f"{data_path}: pictures of {width} × {height} pixels are read as {width // factor} × "
+            f"{height // factor}, so that preset {method.preset} takes its time and not more; "
+            "--set data.downscale=1 reads them whole"
+        )
+    return replace(method, data=replace(method.data, downscale=factor))
+
+
 def training_views(method: Method, data_path: Path) -> Dataset:
     """The pictures to fit, as the method asks for them."""
     from mi_refgs.fit import data
@@ -120,7 +139,7 @@ def fit(
             raise InputError(
                 f"{output}: holds a run already; add --resume to go on with it, or choose another -o"
             )
-        method = load_method(variant, preset, assignments)
+        method = sized(load_method(variant, preset, assignments), data_path)
     views = training_views(method, data_path)
     warn_of_data(method, views)
     trainer = Trainer(method, views, folder)

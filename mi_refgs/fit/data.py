@@ -12,7 +12,6 @@ the viewing axis) as `fit.dataset` writes them.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.files import read_json
 from mi_refgs.fit.frames import FrameReader, View
 
 HOLDOUT = 8
@@ -70,17 +70,17 @@ def load(
     path: str | Path,
     split: str,
     *,
-    downscale: int = 1,
+    downscale: int | None = None,
     background: str = "white",
     images: str = "png",
     truth: bool = True,
 ) -> Dataset:
     """Read one split ("train" or "test") of the data set in folder `path`.
 
-    `downscale` averages blocks of pixels, colour premultiplied by alpha; pixels at the right and the bottom
-    that fill no block are left out. Without a `transforms_test.json` every eighth picture,
-    in the order of their paths, is a test view and no training view; a lone `transforms.json` is split the
-    same way. `truth` reads normals and depth where there are any.
+    `downscale` averages blocks of so many pixels squared, colour premultiplied by alpha; without it pictures
+    are read whole. Pixels at the right and the bottom that fill no block are left out. Without a
+    `transforms_test.json` every eighth picture, in the order of their paths, is a test view and no training
+    view; a lone `transforms.json` is split the same way. `truth` reads normals and depth where there are any.
 
     Raises InputError for anything missing, unreadable or inconsistent: file, field and remedy are named.
     """
@@ -89,6 +89,7 @@ def load(
         raise InputError(f"{path}: background: unknown value '{background}'; give white or black")
     if images not in IMAGE_KINDS:
         raise InputError(f"{path}: images: unknown value '{images}'; give png or exr")
+    downscale = 1 if downscale is None else downscale
     if downscale < 1:
         raise InputError(f"{path}: downscale: {downscale} is out of range; give a whole number from 1")
     transforms, content, frames = _frames(path, split)
@@ -106,6 +107,19 @@ def load(
     return Dataset(path, split, views, colour, images == "exr", light if light.is_file() else None)
 
 
+def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, int, int]:
+    """The smallest `downscale` with which the first training picture has at most so many pixels.
+
+    Returns it with the picture's own width and height. Raises InputError as `load` does.
+    """
+    transforms, content, frames = _frames(Path(path), "train")
+    width, height = FrameReader(transforms, content, 1, 0.0, images, False).size(*frames[0])
+    factor = 1
+    while factor < min(width, height) and (width // factor) * (height // factor) > pixels:
+        factor += 1
+    return factor, width, height
+
+
 def _frames(path: Path, split: str) -> tuple[Path, dict[str, Any], list[tuple[int, Any]]]:
     """The file that holds a split, its content, and the split's frames with their index in it."""
     if not path.is_dir():
@@ -119,7 +133,7 @@ def _frames(path: Path, split: str) -> tuple[Path, dict[str, Any], list[tuple[in
             f"{path}: transforms_{split}.json: missing; give a complete data set in the Blender convention"
         )
     transforms = own if whole else shared[0]
-    content = _read_json(transforms)
+    content = read_json(transforms)
     frames = content.get("frames")
     if not isinstance(frames, list):
         raise InputError(f"{transforms}: frames: missing or not a list; add one entry for each picture")
@@ -135,13 +149,3 @@ def _frames(path: Path, split: str) -> tuple[Path, dict[str, Any], list[tuple[in
 
 def _file_path(frame: Any) -> str:
     return str(frame.get("file_path", "")) if isinstance(frame, dict) else ""
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: JSON: cannot be read ({error}); mend it or export it again") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: JSON: the outermost value is not an object; export the file again")
-    return content

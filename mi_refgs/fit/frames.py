@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import reprlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 from mi_refgs.constants import RIGID_TOLERANCE
 from mi_refgs.errors import InputError
 from mi_refgs.fit.lens import Lens, Undistortion, undistortion
-from mi_refgs.images import box_downscale, read_exr_image, read_png
+from mi_refgs.images import box_downscale, image_size, is_file, read_exr_image, read_png
 
 if TYPE_CHECKING:
     from mi_refgs.splat.camera import Camera
@@ -71,31 +72,25 @@ class FrameReader:
     truth: bool
 
     def read(self, index: int, frame: Any) -> View:
-        if not isinstance(frame, dict):
-            raise InputError(f"{self.transforms}: frames[{index}]: not an object; give it a file_path")
-        name = frame.get("file_path")
-        if not isinstance(name, str) or not name:
-            raise InputError(f"{self.transforms}: frames[{index}].file_path: missing; name the picture")
-        known = Path(name).suffix.lower() in SUFFIXES  # any other dot is part of the name
-        stem = str(Path(name).with_suffix("") if known else Path(name))
+        file = self._file(index, frame)
         to_world = self._to_world(index, frame)
-        premultiplied, alpha, source = self._picture(frame, name, stem)
+        premultiplied, alpha, source = self._picture(file)
         height, width = premultiplied.shape[:2]
-        fx, fy, cx, cy = (x / self.downscale for x in self._intrinsics(index, frame, *source))
+        fx, fy, cx, cy = (x / self.downscale for x in self._intrinsics(frame, file, *source))
         straight = self._undistortion(index, frame, (width, height, fx, fy, cx, cy))
         if straight is not None:
             fx, fy = fx * straight.zoom, fy * straight.zoom
             premultiplied = straight.resample(premultiplied)
             alpha = None if alpha is None else straight.resample(alpha[..., None])[..., 0]
-        normal = self._map(index, frame, "normal_path", (*source[:0:-1], 3), straight)
-        depth = self._map(index, frame, "depth_path", (*source[:0:-1], 1), straight)
+        normal = self._map(index, frame, "normal_path", (*source, 3), straight)
+        depth = self._map(index, frame, "depth_path", (*source, 1), straight)
         if normal is not None:
             length = np.linalg.norm(normal, axis=-1, keepdims=True)
             normal = np.where(length > 0, normal / np.maximum(length, 1e-12), 0).astype(np.float32)
         if alpha is not None:
             premultiplied += (1 - alpha[..., None]) * np.float32(self.background)
         return View(
-            name=stem,
+            name=_stem(str(Path(frame["file_path"]))),
             width=width,
             height=height,
             fx=fx,
@@ -110,23 +105,49 @@ class FrameReader:
             linear=self.images == "exr",
         )
 
-    def _picture(
-        self, frame: dict[str, Any], name: str, stem: str
-    ) -> tuple[np.ndarray, np.ndarray | None, tuple[Path, int, int]]:
-        """Premultiplied colour and alpha at the wanted size, and the file with its own width and height."""
-        folder = self.transforms.parent
+    def size(self, index: int, frame: Any) -> tuple[int, int]:
+        """Width and height of a frame's picture as it lies in the file."""
+        return image_size(self._file(index, frame))
+
+    def _file(self, index: int, frame: Any) -> Path:
+        """The picture of a frame."""
+        if not isinstance(frame, dict):
+            raise InputError(f"{self.transforms}: frames[{index}]: not an object; give it a file_path")
+        named = self._path(index, frame, "file_path")
+        if named is None:
+            raise InputError(f"{self.transforms}: frames[{index}].file_path: missing; name the picture")
         if self.images == "exr":
-            file = folder / str(frame.get("exr_path", f"{stem}.exr"))
+            return self._path(index, frame, "exr_path") or named.with_name(f"{_stem(named.name)}.exr")
+        candidates = [named.with_name(_stem(named.name) + suffix) for suffix in SUFFIXES[:-1]]
+        file = next((c for c in (named, *candidates) if is_file(c)), candidates[0])
+        if file.suffix.lower() == ".exr":
+            raise InputError(f"{file}: images: the picture is an EXR file; read this data set as 'exr'")
+        return file
+
+    def _path(self, index: int, frame: dict[str, Any], key: str) -> Path | None:
+        """The file that a key names; None where the frame has no such key, or an empty name.
+
+        Names are relative to the transforms file and stay in its folder. Symbolic links are followed: they
+        belong to whoever made the folder, not to the file.
+        """
+        name = frame.get(key)
+        if name is None or name == "":
+            return None
+        inside = os.path.normpath(name) if isinstance(name, str) else os.pardir
+        if os.path.isabs(inside) or inside.split(os.sep)[0] in (os.pardir, os.curdir):
+            raise InputError(
+                f"{self.transforms}: frames[{index}].{key}: {reprlib.repr(name)} names no file in the "
+                "data set's folder; move the file there and give its relative path"
+            )
+        return self.transforms.parent / inside
+
+    def _picture(self, file: Path) -> tuple[np.ndarray, np.ndarray | None, tuple[int, int]]:
+        """Premultiplied colour and alpha at the wanted size, and the rows and columns of the file."""
+        if self.images == "exr":
             pixels = read_exr_image(file)
             if pixels.shape[-1] < 3:
                 raise InputError(f"{file}: channels: no R, G, B; export a colour picture")
         else:
-            candidates = [folder / f"{stem}{suffix}" for suffix in SUFFIXES[:-1]]
-            file = folder / name
-            if not file.is_file():
-                file = next((c for c in candidates if c.is_file()), candidates[0])
-            if file.suffix.lower() == ".exr":
-                raise InputError(f"{file}: images: the picture is an EXR file; read this data set as 'exr'")
             pixels = read_png(file)
             if pixels.shape[-1] == 4:
                 pixels[..., :3] *= pixels[..., 3:]
@@ -138,7 +159,7 @@ class FrameReader:
             )
         small = box_downscale(pixels, self.downscale)
         alpha = np.ascontiguousarray(small[..., 3]) if small.shape[-1] == 4 else None
-        return np.ascontiguousarray(small[..., :3]), alpha, (file, width, height)
+        return np.ascontiguousarray(small[..., :3]), alpha, (height, width)
 
     def _map(
         self,
@@ -152,9 +173,9 @@ class FrameReader:
 
         `expected` is the shape that the file must have: the picture's.
         """
-        if not self.truth or not frame.get(key):
+        file = self._path(index, frame, key) if self.truth else None
+        if file is None:
             return None
-        file = self.transforms.parent / str(frame[key])
         pixels = read_exr_image(file)
         if pixels.shape != expected:
             raise InputError(
@@ -171,7 +192,7 @@ class FrameReader:
         field = f"{self.transforms}: frames[{index}].transform_matrix"
         try:
             matrix = np.array(frame["transform_matrix"], dtype=np.float64)
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             matrix = np.empty(0)
         if matrix.shape != (4, 4):
             raise InputError(f"{field}: missing or not 4 × 4 numbers; give the camera-to-world matrix")
@@ -227,7 +248,7 @@ class FrameReader:
             raise InputError(f"{self.transforms}: frames[{index}]: k1 … p2: {error}") from None
 
     def _intrinsics(
-        self, index: int, frame: dict[str, Any], file: Path, width: int, height: int
+        self, frame: dict[str, Any], file: Path, height: int, width: int
     ) -> tuple[float, float, float, float]:
         """fx, fy, cx, cy in pixels of the picture file."""
 
@@ -256,3 +277,9 @@ class FrameReader:
         if fx is None:
             raise InputError(f"{self.transforms}: camera_angle_x: missing; give radians, or fl_x in pixels")
         return fx, focal[1] or fx, number("cx") or width / 2, number("cy") or height / 2
+
+
+def _stem(name: str) -> str:
+    """A file's name without an ending of SUFFIXES; any other dot is part of the name."""
+    path = Path(name)
+    return str(path.with_suffix("")) if path.suffix.lower() in SUFFIXES else name
