@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_train import ball
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit import config
+from mi_refgs.fit import config, refine
+from mi_refgs.fit.train import Trainer
+from mi_refgs.surfels.table import Surfels
 
 
 @pytest.mark.parametrize("variant", config.names())
@@ -40,6 +50,97 @@ def test_stages_and_windows_meet_without_gap_or_overlap() -> None:
     assert [window.since(i) for i in (3, 4, 6, 7, 9, 20)] == [None, 1, 3, 1, 3, 14]
 
 
+@settings(deadline=None)
+@given(
+    st.integers(0, 500),
+    st.integers(0, 3000),
+    st.integers(1, 400),
+    st.sampled_from([2_000 / 6_000, 4_000 / 6_000, 50_000 / 6_000, 1.0]) | st.floats(0.1, 20),
+)
+def test_a_scaled_window_keeps_its_events(start: int, length: int, every: int, factor: float) -> None:
+    """The k-th event of the file is the k-th of the preset, at its own time times the factor, rounded."""
+    until = start + length
+    events = [k for k in range(1, until // every + 1) if k * every > start]
+    scaled = config._scale(config.Window(start, until, every), factor)
+    last = math.ceil(factor * until) + 1
+    assert scaled.count(last) == len(events)
+    due = [i for i in range(last + 1) if scaled.due(i)]
+    if factor * every >= 1:
+        np.testing.assert_allclose(due, [factor * every * k for k in events], atol=0.5 + 1e-6)
+        expected = [None, *np.diff(due).tolist()]
+        assert [scaled.since(i) for i in due] == expected[: len(due)]
+
+
+MANY_EVENTS = """
+iterations = 7_000
+[surfels]
+channels = ["radiance_sh", "albedo", "metallic", "roughness"]
+sh_raise = { start = 0, until = 1_000, every = 333 }
+[light]
+[stage.one]
+until = 1_111
+at = "surfel"
+diffuse = "irradiance"
+[stage.two]
+until = 7_000
+reset_materials = true
+[mesh]
+extract = { start = 1_111, until = 5_001, every = 567 }
+[refine]
+densify = { start = 200, until = 3_001, every = 130 }
+reset = { start = 0, until = 1_999, every = 444 }
+propagate = { start = 0, until = 2_601, every = 650 }
+"""
+"""Few of these numbers are whole, or multiples of each other, once a preset has scaled them."""
+
+
+@pytest.mark.parametrize("variant", [*config.names(), "many"])
+def test_every_preset_has_the_same_events_in_the_same_order(
+    variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a trainer does over the whole fit, its steps left out."""
+    (tmp_path / "many.toml").write_text(MANY_EVENTS)
+    path = str(tmp_path / "many.toml") if variant == "many" else variant
+    done: list[str] = []
+
+    def recorder(name: str, result: Callable[[Surfels], Any]) -> Callable[..., Any]:
+        def record(surfels: Surfels, *_: object, **__: object) -> Any:
+            done.append(name)
+            return result(surfels)
+
+        return record
+
+    def same(surfels: Surfels) -> refine.Edited:
+        rows = np.arange(surfels.count, dtype=np.uint32)
+        return refine.Edited(surfels, rows, rows < 0)
+
+    monkeypatch.setattr(refine, "densify_and_prune", recorder("densify", same))
+    for name in ("reset_opacity", "propagate_normals", "reset_materials"):
+        monkeypatch.setattr(refine, name, recorder(name, lambda surfels: surfels))
+    monkeypatch.setattr(Trainer, "extract_mesh", lambda self: done.append("mesh"))
+    monkeypatch.setattr(Trainer, "_gradient_step", lambda self, iteration, stage: None)
+    sequences = {}
+    for preset in config.PRESETS:
+        method = config.load(path, preset, ["surfels.count=20", "surfels.max_count=20"])
+        trainer = Trainer(method, ball())
+        done.clear()
+        while trainer.iteration < method.iterations:
+            degree = trainer.schedule.sh_degree(trainer.iteration)
+            trainer.step()
+            done += ["degree"] * (trainer.schedule.sh_degree(trainer.iteration) - degree)
+        sequences[preset] = list(done)
+    counts = {name: Counter(done) for name, done in sequences.items()}
+    assert counts["quick"] == counts["standard"] == counts["paper"], counts
+    assert sequences["quick"] == sequences["standard"] == sequences["paper"]
+    expected = {
+        "ref_gaussian": {"degree": 2, "densify": 14, "reset_opacity": 2, "mesh": 8},
+        "base_2dgs": {"degree": 3, "densify": 14, "reset_opacity": 2},
+        "many": {"degree": 3, "densify": 22, "reset_opacity": 4, "propagate_normals": 4, "mesh": 7}
+        | {"reset_materials": 1},
+    }
+    assert counts["quick"] == expected[variant]
+
+
 def test_assignments_are_applied_unscaled() -> None:
     method = config.load(
         "ref_gaussian", "quick", ["loss.ssim=0.3", "mesh.resolution=64", "refine.densify.until=7"]
@@ -63,6 +164,10 @@ def test_assignments_are_applied_unscaled() -> None:
         ("iterations = 10", ["own.toml", "missing key 'stage'"]),
         ("[stage.a]\nuntil = 10", ["own.toml", "missing key 'iterations'"]),
         ("iterations = [", ["own.toml", "not valid TOML"]),
+        (
+            "iterations = 10\n[stage.a]\nuntil = 10\n[refine]\nreset = {start = 0, until = 9, every = 0}",
+            ["own.toml", "refine: reset", "'every' above 0"],
+        ),
     ],
 )
 def test_bad_files_are_named(text: str, words: list[str], tmp_path: Path) -> None:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from mi_refgs.errors import InputError
 from mi_refgs.fit import refine
 from mi_refgs.fit.config import Refine
+from mi_refgs.fit.optim import Adam, Group
 from mi_refgs.surfels.init import logit
 from mi_refgs.surfels.table import Surfels
 
@@ -79,11 +84,27 @@ def test_transparent_and_oversized_surfels_go_even_when_hot() -> None:
 
 def test_opacities_get_time_to_grow_back_after_a_reset() -> None:
     surfels = table(opacity=0.02)
-    gradient = np.zeros(6)
-    limits = (gradient, 1.0, OPTIONS, 100, np.random.default_rng(1))
-    assert len(refine.densify_and_prune(surfels, *limits, since_reset=refine.PRUNE_WAIT - 1).parent) == 6
+    limits = (np.zeros(6), 1.0, OPTIONS, 100, np.random.default_rng(1))
+    assert len(refine.densify_and_prune(surfels, *limits, prune_transparent=False).parent) == 6
     with pytest.raises(InputError, match=r"refine\.prune_opacity"):
-        refine.densify_and_prune(surfels, *limits, since_reset=refine.PRUNE_WAIT)
+        refine.densify_and_prune(surfels, *limits)
+
+
+def test_the_wait_follows_the_rate_that_lifts_opacities() -> None:
+    """As many steps as Adam needs under a constant gradient, times the patience; 150 as shipped."""
+    options, rate = Refine(), 0.05
+    params = {"opacity": mi.TensorXf(np.full((1, 1), logit(options.reset_opacity), np.float32))}
+    optimiser = Adam(params, {"opacity": Group(rate)})
+    steps = 0
+    while refine.sigmoid(params["opacity"].numpy())[0, 0] < options.prune_opacity:
+        dr.set_grad(params["opacity"], -1e-6)
+        optimiser.step(steps)
+        steps += 1
+    wait = refine.prune_wait(options, rate)
+    assert wait == pytest.approx(refine.PRUNE_PATIENCE * steps, rel=0.05) == pytest.approx(150, rel=0.02)
+    assert refine.prune_wait(options, rate / 2) == pytest.approx(2 * wait)
+    raised = dataclasses.replace(options, prune_opacity=options.reset_opacity)
+    assert refine.prune_wait(raised, rate) == 0 and refine.prune_wait(options, 0.0) == np.inf
 
 
 @pytest.mark.parametrize("scale", [0.005, 0.05])

@@ -7,6 +7,7 @@ every window, stage and interval is scaled with it. No other module opens a TOML
 from __future__ import annotations
 
 import dataclasses
+import math
 import tomllib
 import types
 import typing
@@ -19,23 +20,44 @@ import tomli_w
 from mi_refgs.errors import InputError
 from mi_refgs.resources import resource_dir
 
+TIE = 1e-6
+"""Intervals by which a scaled window may miss a multiple of its interval for the rounding of floats."""
+
 
 @dataclass(frozen=True)
 class Window:
-    """Due at multiples of `every` with start < iteration ≤ until."""
+    """Events at the multiples of `every` with start < multiple ≤ until, each at the nearest iteration.
 
-    start: int
-    until: int
-    every: int
+    In iterations, but not whole ones: a preset scales them, and rounded they would hold another number of
+    events. Events that fall on one iteration (`every` below 1) happen once.
+    """
+
+    start: float
+    until: float
+    every: float
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for an interval that is not positive, and for infinities and NaN."""
+        if not self.every > 0 or not math.isfinite(self.start + self.until + self.every):
+            raise ValueError("expected finite numbers and an 'every' above 0; correct the window")
 
     def due(self, iteration: int) -> bool:
-        """Whether the action falls on this (1-based) iteration."""
-        return self.start < iteration <= self.until and iteration % self.every == 0
+        """Whether an event falls on this (1-based) iteration."""
+        return self.count(iteration) > self.count(iteration - 1)
+
+    def count(self, iteration: int) -> int:
+        """Events up to and including this iteration."""
+        return max(self._newest(iteration) - math.floor(self.start / self.every + TIE), 0)
 
     def since(self, iteration: int) -> int | None:
-        """Iterations since the action last fell due before this one; None if it has not yet."""
-        last = min(iteration - 1, self.until) // self.every * self.every
-        return iteration - last if last > self.start else None
+        """Iterations since the last event before this one; None if there was none yet."""
+        if not self.count(iteration - 1):
+            return None
+        return iteration - math.floor(self._newest(iteration - 1) * self.every + 0.5)
+
+    def _newest(self, iteration: int) -> int:
+        """The largest k ≤ until / every for which k · every rounds to this iteration or one before."""
+        return min(math.ceil((iteration + 0.5) / self.every) - 1, math.floor(self.until / self.every + TIE))
 
 
 @dataclass(frozen=True)
@@ -87,7 +109,7 @@ class Refine:
     """Adaptive control of the table [3DGS §5.2, 2DGS; Ref-Gaussian §3.4]."""
 
     densify: Window | None = None
-    gradient: float = 2e-4  # mean screen-translation gradient, NDC units
+    gradient: float = 2e-4  # NDC units; a mean over views, which no number of iterations changes
     dense_extent: float = 0.01  # clone below, split above, in scene extents
     prune_opacity: float = 0.05
     prune_extent: float = 0.1  # scene extents; larger surfels go
@@ -198,8 +220,8 @@ PRESETS = {
     "paper": Preset(50_000, 30_000, 100_000, 800 * 800),
 }
 
-# Fields that count iterations, and so scale with the preset.
-_SCALED = {"iterations", "until", "start", "every", "normal_from", "smooth_until", "propagate_hold"}
+# Fields that count iterations, and so scale with the preset, as windows do.
+_SCALED = {"iterations", "until", "normal_from", "smooth_until", "propagate_hold"}
 
 
 def load(variant: str, preset: str = "standard", assignments: list[str] | None = None) -> Method:
@@ -295,9 +317,11 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
 
 
 def _scale(value: Any, factor: float, key: str = "") -> Any:
-    """Scale every field that counts iterations; intervals and windows stay at least one iteration long."""
+    """Scale every field that counts iterations: windows exactly, others to a whole number of at least 1."""
     if isinstance(value, dict):
         return {name: _scale(inner, factor) for name, inner in value.items()}
+    if isinstance(value, Window):
+        return Window(factor * value.start, factor * value.until, factor * value.every)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {f.name: _scale(getattr(value, f.name), factor, f.name) for f in dataclasses.fields(value)}
         return dataclasses.replace(value, **fields)
@@ -323,7 +347,11 @@ def _build(kind: Any, value: Any, where: str) -> Any:
         if missing:
             raise InputError(f"{where}: missing key '{missing[0]}'; add it")
         make: Any = kind
-        return make(**{key: _build(hints[key], inner, f"{where}: {key}") for key, inner in value.items()})
+        fields = {key: _build(hints[key], inner, f"{where}: {key}") for key, inner in value.items()}
+        try:
+            return make(**fields)
+        except ValueError as error:
+            raise InputError(f"{where}: {error}") from error
     if origin in (types.UnionType, typing.Union):
         return _build(next(option for option in arguments if option is not type(None)), value, where)
     if origin is dict:

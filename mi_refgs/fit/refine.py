@@ -6,6 +6,7 @@ Letters: s scale, o opacity, extent the size of the camera rig [3DGS §5.2].
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -22,9 +23,20 @@ SPLIT_SHRINK = 1.6
 """A split surfel's two children have its scale divided by this. [3DGS §5.2: φ = 1.6, found by experiment]"""
 
 
-PRUNE_WAIT = 150
-"""Iterations that opacities get to grow back after a reset. Adam lifts a logit by at most its rate a step, so
-0.01 to 0.05 takes 33 steps at 0.05; 67 were too few on a diffuse scene, which lost every surfel."""
+PRUNE_PATIENCE = 4.5
+"""Times the fewest steps in which an opacity can grow back after a reset: 150 iterations as shipped. Twice
+the fewest (67 iterations) were too few on a diffuse scene, which lost every surfel."""
+
+
+def prune_wait(options: Refine, rate: float) -> float:
+    """Iterations that opacities get to grow back after a reset, from the learning rate of their logits.
+
+    Adam lifts a logit by about its rate a step, so reset_opacity to prune_opacity takes at least logit
+    (prune_opacity) - logit(reset_opacity) over the rate: 33 steps of 0.05 from 0.01 to 0.05. These are steps
+    of the optimiser: a preset, which does not scale the rate, does not scale them either.
+    """
+    lift = max(logit(options.prune_opacity) - logit(options.reset_opacity), 0.0)
+    return PRUNE_PATIENCE * lift / rate if rate > 0 else math.inf
 
 
 @dataclass(frozen=True)
@@ -53,13 +65,13 @@ def densify_and_prune(
     options: Refine,
     max_count: int,
     rng: np.random.Generator,
-    since_reset: int | None = None,
+    prune_transparent: bool = True,
 ) -> Edited:
     """Clone small and split large surfels with a high screen gradient; drop transparent and oversized ones.
 
     `gradient` (N,) is the mean length of the screen-translation gradient in NDC units over the views that saw
     a surfel. At most max_count surfels result: those with the highest gradient grow first. Transparent ones
-    stay while the last opacity reset is less than PRUNE_WAIT iterations ago.
+    stay unless `prune_transparent`: wait `prune_wait` iterations after an opacity reset.
 
     Raises InputError if no surfel would be left.
     """
@@ -67,7 +79,7 @@ def densify_and_prune(
     count = len(gradient)
     size = np.exp(raw["scale"]).max(axis=1)
     keep = size <= options.prune_extent * extent
-    if since_reset is None or since_reset >= PRUNE_WAIT:
+    if prune_transparent:
         keep &= sigmoid(raw["opacity"][:, 0]) >= options.prune_opacity
     if not keep.any():
         raise InputError(

@@ -34,9 +34,7 @@ class Schedule:
 
     def sh_degree(self, iteration: int) -> int:
         """Degree of the radiance channel that is in use."""
-        window = self.method.surfels.sh_raise
-        raised = max(min(iteration, window.until) - window.start, 0) // window.every
-        return min(raised, self.method.surfels.sh_degree)
+        return min(self.method.surfels.sh_raise.count(iteration), self.method.surfels.sh_degree)
 
     def groups(self, extent: float) -> dict[str, Group]:
         """Learning rates of every parameter that a method may have; `extent` in scene units."""

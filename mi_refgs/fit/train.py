@@ -211,6 +211,10 @@ class Trainer:
     def _refine(self, iteration: int) -> None:
         options, surfels = self.method.refine, self.method.surfels
         if options.densify is not None and options.densify.due(iteration):
+            since_reset = options.reset.since(iteration) if options.reset is not None else None
+            grown_back = since_reset is None or since_reset >= refine.prune_wait(
+                options, self.method.rates.opacity
+            )
             mean = self.gradient_sum.numpy() / np.maximum(self.gradient_count.numpy(), 1)
             edited = refine.densify_and_prune(
                 self.surfels,
@@ -219,7 +223,7 @@ class Trainer:
                 options,
                 surfels.max_count,
                 self.schedule.rng(iteration),
-                since_reset=options.reset.since(iteration) if options.reset is not None else None,
+                prune_transparent=grown_back,
             ).ordered()
             self._replace(edited.surfels)
             names = list(edited.surfels.raw)
