@@ -72,6 +72,11 @@ def tile_size(focal: float) -> tuple[int, int]:
 
 # ---------------- surfels ----------------
 
+RAW_LIMIT = 1e18
+"""Bound of |raw value| where an activation has none, in positions (scene units), harmonics and the light: its
+square still fits float32. A surfel with a value beyond it, an infinite one or a NaN in any channel covers no
+pixel and gets zero gradient; such a texel of the light is black."""
+
 NORM_FLOOR = 1e-20
 """Squared length below which a vector has no direction; the caller then takes a named fallback."""
 

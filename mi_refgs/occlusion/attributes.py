@@ -68,12 +68,16 @@ class Neighbourhood:
                 )
         if not surfels.count:
             raise InputError("occluder: surfels: there are none to take materials from")
-        surfels = surfels.detach()
+        surfels = surfels.detach().cleaned()
         position, opacity = surfels.position().numpy().T, surfels.opacity().numpy()
         scale = surfels.scale().numpy().T
         axes = [axis.numpy().T for axis in surfels.frame()]
-        count = min(NEIGHBOURS, surfels.count)
-        _, found = cKDTree(position).query(mesh.vertices, k=np.arange(1, count + 1))
+        usable = np.flatnonzero(surfels.usable().numpy())
+        if not len(usable):
+            raise InputError("occluder: surfels: none has finite values; mend them, or trace nothing")
+        count = min(NEIGHBOURS, len(usable))
+        _, found = cKDTree(position[usable]).query(mesh.vertices, k=np.arange(1, count + 1))
+        found = usable[found]
         offset = mesh.vertices[:, None] - position[found]
         u, v, w = ((offset * axis[found]).sum(-1) for axis in axes)
         across = scale[found]

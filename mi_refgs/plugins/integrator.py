@@ -6,11 +6,14 @@ Imported or reloaded for each variant: see `mi_refgs.plugins`.
 from __future__ import annotations
 
 import math
+import time
+import warnings
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.plugins import require_supported_variant
 from mi_refgs.plugins.aovs import MATERIALS, aov_values, parse_aovs
@@ -19,6 +22,9 @@ from mi_refgs.plugins.properties import TERMS, read_light, read_shading, read_su
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import GEOMETRY, Surfels
+
+CHECK_SECONDS = 1.0
+"""Least time between two looks for values that cannot be used: each waits for the device."""
 
 
 class RefGSIntegrator(mi.SamplingIntegrator):
@@ -112,6 +118,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     environment, but not to sensors, background or mesh; `mi_refgs.splat.blend` lists the derivatives that
     are absent.
 
+    A surfel with a value that is NaN or infinite in any channel, or beyond 1e18 in position or harmonics,
+    covers no pixel and gets zero gradient; such a value of the light is black. A warning names the channel,
+    once.
+
     .. tabs::
         .. code-tab:: xml
 
@@ -145,6 +155,11 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.background = None if background is None else mi.Color3f(background)
         self.aovs = parse_aovs(str(props.get("aovs", "")))
         self.check()
+        self.changed, self.next_look = (
+            False,
+            -math.inf,
+        )  # since the last look for unusable values; and its time
+        self._warn_of_unusable()
 
     def check(self) -> None:
         """Raise InputError for shapes that do not fit and for channels that are needed but absent."""
@@ -173,9 +188,24 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     def parameters_changed(self, keys: list[str]) -> None:
         self.check()
+        self.changed = True
         moved = not keys or not {*keys}.isdisjoint(GEOMETRY)
         if moved and self.occluder is not None and self.shading.accuracy.traced_bounces:
             self.occluder.set_materials(self.surfels)
+
+    def _warn_of_unusable(self) -> None:
+        """Warn, once, of surfels that are left out and of texels that are black."""
+        found = [f"{n} surfels in {name} (first: {i})" for name, (n, i) in self.surfels.unusable().items()]
+        black = self.light.unusable() if self.light is not None else 0
+        found += [f"{black} values of light"] if black else []
+        if found:
+            self.next_look = math.inf
+            warnings.warn(
+                f"refgs: values are NaN, infinite or beyond {RAW_LIMIT:g}: {', '.join(found)}; these surfels "
+                "are left out, and such light is black",
+                RuntimeWarning,
+                stacklevel=2,
+            )
 
     def aov_names(self) -> list[str]:
         return [channel for aov in self.aovs for channel in aov.channels()]
@@ -192,6 +222,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         evaluate: bool = True,
     ) -> Any:
         """The image (h, w, c) of a sensor; see the class for its channels."""
+        now = time.monotonic()
+        if self.changed and now >= self.next_look:
+            self.changed, self.next_look = False, now + CHECK_SECONDS
+            self._warn_of_unusable()
         image = self._image(scene, sensor, spp)
         if evaluate:
             dr.eval(image)

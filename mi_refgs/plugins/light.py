@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.shade.envmap import DEFAULT_HEIGHT, MIN_HEIGHT, EnvironmentLight, PrefilteredLight
+from mi_refgs.shade.envmap import DEFAULT_HEIGHT, MIN_HEIGHT, EnvironmentLight, PrefilteredLight, bounded
 from mi_refgs.shade.lobe import resample
 from mi_refgs.shade.prefilter import prefilter
 
@@ -82,7 +82,8 @@ def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
     texel = dr.arange(mi.UInt32, rows * width * 3)
     source = ((texel // (3 * width)) * columns + (texel // 3) % width + 1) * channels + texel % 3
     scale = mi.Float(params["scale"])
-    radiance = mi.TensorXf(dr.gather(mi.Float, data.array, source) * scale, (rows, width, 3))
+    texels = dr.gather(mi.Float, data.array, source) * scale
+    radiance = mi.TensorXf(bounded(texels, texels), (rows, width, 3))
     if width == 2 * rows and rows % 4 == 0 and MIN_HEIGHT <= rows <= MAX_HEIGHT:
         return radiance, ""
     height = min(MAX_HEIGHT, max(MIN_HEIGHT, 4 * (width // 8)))
@@ -96,7 +97,8 @@ def _constant_radiance(params: Any, emitter: Any) -> Any:
             f"emitter '{emitter.id()}': type: refgs takes an `envmap` or a `constant` environment, not a "
             f"{emitter.class_name()}; use one of these"
         )
-    return mi.Color3f(params["radiance.value"])
+    colour = mi.Color3f(params["radiance.value"])
+    return bounded(colour, colour)
 
 
 def _rotation(params: Any) -> Any:

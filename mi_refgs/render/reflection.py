@@ -203,6 +203,7 @@ class MeshRadiance:
         occluder: Occluder, surfels: Surfels, light: Any, accuracy: Accuracy, diffuse: Diffuse
     ) -> MeshRadiance:
         """With the present values of everything, evaluated."""
+        surfels = surfels.cleaned()  # one that became unusable after `set_materials` may still be looked up
         surface = occluder.surface(surfels)
         coefficients = surfels.radiance_sh() if diffuse == "sh" else []
         # In rows: the adjoint of a hit's gather is then a table of its own. Columns themselves, whose adjoint

@@ -112,7 +112,8 @@ def split_sum(n_dot_v: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Floa
 
     def place(x: Any) -> tuple[Any, Any]:
         x = dr.clip(x, 0, 1) * RESOLUTION - 0.5
-        first = mi.UInt32(dr.clip(dr.floor(dr.detach(x)), 0, RESOLUTION - 2))
+        # The last bound is one of integers: a NaN passes those of floats.
+        first = dr.minimum(mi.UInt32(dr.maximum(dr.detach(x), 0)), RESOLUTION - 2)
         return first, x - mi.Float(first)
 
     column, u = place(n_dot_v)

@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.images import is_exr, read_exr_image, write_exr
@@ -54,6 +55,11 @@ def softplus(x: Any) -> Any:
     return 0.5 * x + 0.5 * dr.abs(x) + 2 * s * series  # not max(0, x), whose slope at 0 is not ½
 
 
+def bounded(value: Any, raw: Any) -> Any:
+    """The value, or 0 with gradient 0 where |raw| is not < RAW_LIMIT: a NaN would spread over all levels."""
+    return dr.select(dr.abs(dr.detach(raw)) < RAW_LIMIT, value, 0)
+
+
 def inverse_softplus(radiance: np.ndarray) -> np.ndarray:
     """Raw value of a positive radiance, float64."""
     y = np.asarray(radiance, np.float64)
@@ -86,7 +92,7 @@ class PrefilteredLight:
         spread. Derivative in light, direction and roughness. [split sum, Karis 2013]
         """
         place = _level(roughness)
-        lower = mi.UInt32(dr.clip(dr.detach(place), 0, len(lobe.LEVEL_ROUGHNESS) - 1))
+        lower = dr.minimum(mi.UInt32(dr.detach(place)), len(lobe.LEVEL_ROUGHNESS) - 1)
         at = _azimuth_polar(direction)
         return dr.lerp(self._bilinear(*at, lower), self._bilinear(*at, lower + 1), place - mi.Float(lower))
 
@@ -96,6 +102,7 @@ class PrefilteredLight:
         first, h, w = (dr.gather(mi.UInt32, info, 4 * level + k) for k in range(3))
         x, y = dr.fma(u, mi.Float(w), -0.5), v * mi.Float(h - 1)
         left = mi.Int32(dr.floor(dr.detach(x)))
+        # Bounded as integers: a NaN becomes some integer, and a bound in floats lets it pass.
         row = dr.minimum(mi.UInt32(dr.detach(y)), h - 2)
         s, t = x - mi.Float(left), y - mi.Float(row)
         column = mi.UInt32(dr.select(left < 0, mi.Int32(w) - 1, dr.minimum(left, mi.Int32(w) - 1)))
@@ -194,8 +201,12 @@ class EnvironmentLight:
         return int(self.raw.shape[0])
 
     def radiance(self) -> Any:
-        """Linear radiance (h, 2h, 3), a tensor under AD."""
-        return mi.TensorXf(softplus(self.raw.array), shape=tuple(self.raw.shape))
+        """Linear radiance (h, 2h, 3), a tensor under AD; 0 with gradient 0 where |raw| is not < RAW_LIMIT."""
+        return mi.TensorXf(bounded(softplus(self.raw.array), self.raw.array), shape=tuple(self.raw.shape))
+
+    def unusable(self) -> int:
+        """How many raw values are not < RAW_LIMIT, and black; waits for the device."""
+        return int(dr.count(~(dr.abs(dr.detach(self.raw.array)) < RAW_LIMIT))[0])
 
     def prefilter(self) -> PrefilteredLight:
         """The levels of this light, under AD; a fixed linear operator on the radiance (`prefilter`)."""

@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.rows import columns_of
@@ -37,6 +38,8 @@ CHANNELS: dict[str, int] = {
 }
 # The channels without which nothing can be splatted.
 GEOMETRY = ("position", "rotation", "scale", "opacity")
+# The channels whose activation has no bound of its own: their values are limited to RAW_LIMIT.
+UNBOUNDED = ("position", "radiance_sh", "indirect_sh")
 # Highest spherical-harmonic degree that the 3DGS family stores; shade.sh evaluates no more.
 MAX_SH_DEGREE = 3
 # Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is worthless.
@@ -133,6 +136,39 @@ class Surfels:
             if bad:
                 raise InputError(f"surfels: {name}: {bad} values are NaN or infinite; remove those surfels")
 
+    def usable(self) -> Any:
+        """Which surfels (mi.Bool, width N) have finite raw values, below RAW_LIMIT where UNBOUNDED.
+
+        The others cover no pixel and get zero gradient. Detached.
+        """
+        detached, rows = self.detach(), mi.Bool(True)
+        for name in self.raw:
+            rows &= dr.all(dr.abs(mi.ArrayXf(detached.columns(name))) < _limit(name))
+        return rows
+
+    def unusable(self) -> dict[str, tuple[int, int]]:
+        """The channels with values that `usable` rejects: number of such surfels, and the index of the first.
+
+        Waits for the device.
+        """
+        if not self.count or dr.all(self.usable()):
+            return {}
+        found = {}
+        for name, table in self.to_numpy().items():
+            rows = np.flatnonzero(~(np.abs(table) < _limit(name)).all(axis=1))
+            if len(rows):
+                found[name] = (len(rows), int(rows[0]))
+        return found
+
+    def cleaned(self) -> Surfels:
+        """The same table, under AD, with zeros for all values of the surfels that are not `usable`."""
+        usable, raw = self.usable(), {}
+        for name, tensor in self.raw.items():
+            row = dr.arange(mi.UInt32, dr.width(tensor.array)) // int(tensor.shape[1])
+            values = dr.select(dr.gather(mi.Bool, usable, row), tensor.array, 0)
+            raw[name] = mi.TensorXf(values, shape=tuple(tensor.shape))
+        return Surfels(raw)
+
     # ---------------- raw columns ----------------
 
     def columns(self, name: str) -> list[Any]:
@@ -177,8 +213,12 @@ class Surfels:
         return mi.Vector2f(u, v)
 
     def opacity(self) -> Any:
-        """Opacities in [0, 1] (mi.Float)."""
-        return sigmoid(self.columns("opacity")[0])
+        """Opacities in [0, 1] (mi.Float); 0 with gradient 0 where the surfel is not `usable`."""
+        if self.count == 0:
+            return mi.Float()
+        usable = self.usable()
+        dr.schedule(usable)  # with the footprints; the adjoint would read the whole table again
+        return dr.select(usable, sigmoid(self.columns("opacity")[0]), 0)
 
     def albedo(self) -> Any:
         """Albedo in [0, 1] (mi.Color3f), linear."""
@@ -231,6 +271,10 @@ class Surfels:
     def enable_grad(self) -> None:
         """Make every raw tensor a leaf of the AD graph."""
         dr.enable_grad(list(self.raw.values()))
+
+
+def _limit(name: str) -> float:
+    return RAW_LIMIT if name in UNBOUNDED else math.inf
 
 
 def gather_rows(tensor: Any, parent: Any) -> Any:
