@@ -41,6 +41,11 @@ EDGE_ON_COSINE = 1e-4
 MEDIAN_TRANSMITTANCE = 0.5
 """The median depth is that of the last surfel met while T is above one half. [2DGS, §5]"""
 
+SIZE_RANGE = 1e7
+"""A standard deviation counts as at least 1/SIZE_RANGE and at most SIZE_RANGE of the surfel's depth, and has
+no gradient beyond: 10⁻⁷ of a depth is below every pixel, so that the low-pass decides, and 10⁷ is a plane.
+The fourth powers of such ratios fit float32."""
+
 SORT_REACH = 1.0
 """Standard deviations from its centre up to which a surfel's plane tells its depth in a tile. Near-mirrors
 fitted with 0 (sorted by centres), 1 and 3 reach 26.0, 26.7 and 26.3 dB on test views: with a longer reach

@@ -148,7 +148,8 @@ def test_extent_and_focus(folder: Path) -> None:
     extent = 1.1 * max(np.linalg.norm(origins - origins.mean(axis=0), axis=1))
     assert data.scene_extent == pytest.approx(extent)
     lone = Dataset(folder, "train", data.views[:1], data.background, False, None)
-    assert lone.scene_extent == 1 and np.all(np.isfinite(lone.focus))
+    assert lone.scene_extent == pytest.approx(1.1 * np.linalg.norm(pose(0)[:3, 3]))
+    assert np.all(np.isfinite(lone.focus))
 
 
 def test_intrinsics_per_file_and_per_frame(folder: Path) -> None:

@@ -12,7 +12,7 @@ the viewing axis) as `fit.dataset` writes them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,9 @@ HOLDOUT = 8
 """Every eighth picture is a test view where no test file exists (LLFF's habit, kept by 3DGS and 2DGS)."""
 EXTENT_MARGIN = 1.1
 """Scene extent over the largest distance of a training camera to their mean (3DGS)."""
+NEAR_EXTENTS = 2e-3
+"""Depth of the near plane in scene extents, about 0.01 in the units of Blender's data sets: what is nearer
+stands in front of the lens."""
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
 IMAGE_KINDS = ("png", "exr")
 
@@ -44,10 +47,11 @@ class Dataset:
 
     @cached_property
     def scene_extent(self) -> float:
-        """1.1 × the largest distance of a camera to their mean, scene units (3DGS); 1 for a lone camera."""
-        origins = self._origins()
-        extent = EXTENT_MARGIN * float(np.linalg.norm(origins - origins.mean(axis=0), axis=1).max())
-        return extent if extent > 0 else 1.0
+        """1.1 × the largest distance of a camera to their mean, scene units (3DGS).
+
+        For a lone camera that to the world's origin; 1 if it stands there.
+        """
+        return _extent(self.views)
 
     @cached_property
     def focus(self) -> np.ndarray:
@@ -102,6 +106,8 @@ def load(
                 f"{transforms}: frames: '{view.name}' has {view.width} × {view.height} pixels but "
                 f"'{first.name}' has {first.width} × {first.height}; bring all pictures to one size"
             )
+    near = NEAR_EXTENTS * _extent(views)
+    views = tuple(replace(view, near=near) for view in views)
     colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
     light = path / "environment.exr"
     return Dataset(path, split, views, colour, images == "exr", light if light.is_file() else None)
@@ -118,6 +124,12 @@ def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, 
     while factor < min(width, height) and (width // factor) * (height // factor) > pixels:
         factor += 1
     return factor, width, height
+
+
+def _extent(views: tuple[View, ...]) -> float:
+    origins = np.array([view.to_world[:3, 3] for view in views])
+    middle = origins.mean(axis=0) if len(np.unique(origins, axis=0)) > 1 else 0
+    return EXTENT_MARGIN * float(np.linalg.norm(origins - middle, axis=1).max()) or 1.0
 
 
 def _frames(path: Path, split: str) -> tuple[Path, dict[str, Any], list[tuple[int, Any]]]:

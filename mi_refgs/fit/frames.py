@@ -52,12 +52,14 @@ class View:
     normal: np.ndarray | None  # (H, W, 3) float32, world space, 0 off the object
     depth: np.ndarray | None  # (H, W) float32 along the viewing axis, 0 off the object
     linear: bool  # whether `image` is linear radiance (EXR) or sRGB-encoded (PNG)
+    near: float = 0.0  # depth of the near plane, scene units; `load` derives it from all cameras
 
-    def camera(self, near: float = 0.01) -> Camera:
+    def camera(self) -> Camera:
         """The splatter's camera; in Mitsuba's frame both of its focal lengths are negative."""
         from mi_refgs.splat.camera import Camera
 
-        return Camera.look(self.width, self.height, -self.fx, -self.fy, self.cx, self.cy, self.to_world, near)
+        focal = (-self.fx, -self.fy)
+        return Camera.look(self.width, self.height, *focal, self.cx, self.cy, self.to_world, self.near)
 
 
 @dataclass(frozen=True)

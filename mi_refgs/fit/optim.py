@@ -40,6 +40,7 @@ class Group:
     steps: int = 1  # iterations
     head: int = 0  # columns; 0: every column
     tail: float = 1.0  # factor
+    unit: float = 1.0  # of the raw tensor, to which the moments refer: ε, and what float32 squares, have none
 
     def at(self, iteration: int) -> float:
         """Learning rate at this iteration (0-based)."""
@@ -108,7 +109,7 @@ class Adam:
             finite = dr.isfinite(g)
             # Almost never active, so a direct atomic costs nothing and needs no launch of its own.
             dr.scatter_reduce(dr.ReduceOp.Add, bad, mi.UInt32(1), mi.UInt32(0), ~finite, dr.ReduceMode.Direct)
-            g = dr.select(finite, g, 0.0)
+            g = dr.select(finite, g, 0.0) * dr.opaque(mi.Float, group.unit)
             m = BETA_1 * self._first[name] + (1 - BETA_1) * g
             v = BETA_2 * self._second[name] + (1 - BETA_2) * g * g
             t = self._steps[name]

@@ -48,7 +48,7 @@ class Schedule:
 
         steps = int(POSITION_STEPS * iterations)
         return {
-            "position": Group(rates.position * extent, rates.position_final * extent, steps),
+            "position": Group(rates.position * extent, rates.position_final * extent, steps, unit=extent),
             "rotation": group(rates.rotation),
             "scale": group(rates.scale),
             "opacity": group(rates.opacity),

@@ -44,6 +44,9 @@ BOX_QUANTILE = 0.02
 BOX_REACH = 0.25
 """The box may grow beyond those quantiles by this part of their distance: thin ends hold few points."""
 
+BOX_FLOOR = 1e-6
+"""Least margin, as part of the points' distance from the origin: some units in the last place of float32."""
+
 BOX_MARGIN = 0.05
 """Free space around the points, as part of the longest side: room for the truncation from 128 voxels up."""
 
@@ -71,8 +74,8 @@ def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     lo, hi = np.quantile(points, (BOX_QUANTILE, 1 - BOX_QUANTILE), axis=0)
     reach = BOX_REACH * (hi - lo)
     lo, hi = np.maximum(lo - reach, points.min(axis=0)), np.minimum(hi + reach, points.max(axis=0))
-    # The floor keeps a box around a single point: relative to its position, as float32 sees it.
-    margin = max(BOX_MARGIN * float((hi - lo).max()), 1e-3 * float(np.abs(points).max()), 1e-6)
+    # The floor keeps a box around a single point, which float32 can tell from its place; at the origin any.
+    margin = max(BOX_MARGIN * float((hi - lo).max()), BOX_FLOOR * float(np.abs(points).max())) or 1.0
     return lo - margin, hi + margin
 
 

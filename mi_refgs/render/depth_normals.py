@@ -32,19 +32,18 @@ def normals_from_depth(depth: Any, alpha: Any, camera: Camera) -> tuple[Any, Any
     """
     width, height = camera.width, camera.height
     steps = ((-1, 0), (1, 0), (0, -1), (0, 1))
-    left, right, up, down = neighbours(depth, width, height, steps)
     pixel = camera.pixel_centres()
+    ray = mi.Vector3f((pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy, 1)
+    # In units of the pixel's own depth, and of its width there: normals have no unit, so that it needs no
+    # derivative, and what is compared with a floor below is near 1 in scenes of any size.
+    unit = dr.detach(dr.select(depth > 0, dr.rcp(dr.select(depth > 0, depth, 1)), 0))
+    left, right, up, down = neighbours(depth, width, height, steps)
 
-    def point(z: Any, dx: int, dy: int) -> Any:
-        return (
-            mi.Vector3f((pixel.x + dx - camera.cx) / camera.fx, (pixel.y + dy - camera.cy) / camera.fy, 1) * z
-        )
-
-    # Camera-frame axes have signed focal lengths, so the orientation is settled by the view direction below.
-    along_x = point(right, 1, 0) - point(left, -1, 0)
-    along_y = point(down, 0, 1) - point(up, 0, -1)
+    # X(right) - X(left) = ray (z₁ - z₀) + (z₁ + z₀) x / f: written out, no large terms cancel. Camera-frame
+    # axes have signed focal lengths, so the orientation is settled by the view direction below.
+    along_x = unit * (right - left) * camera.fx * ray + mi.Vector3f(unit * (right + left), 0, 0)
+    along_y = unit * (down - up) * camera.fy * ray + mi.Vector3f(0, unit * (down + up), 0)
     normal = dr.cross(along_x, along_y)
-    ray = point(mi.Float(1), 0, 0)
     cosine = dr.detach(dr.dot(normal, ray))
     normal = dr.select(cosine > 0, -normal, normal)
 

@@ -20,7 +20,7 @@ import mitsuba as mi
 from mi_refgs.constants import COVERAGE_FLOOR, FACING_TOLERANCE
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.reflection import reflection
-from mi_refgs.shade.models import Accuracy, ShadingPoints, Terms, reflect, shade
+from mi_refgs.shade.models import Accuracy, ShadingPoints, Terms, reflect, safe_normalize, shade
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.splat import Blended, Camera, splat
 from mi_refgs.surfels.table import Surfels
@@ -97,9 +97,8 @@ def _facing(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
     silhouette, and shows there through the low-pass; turned round it would oppose its neighbours and leave
     the outline without a normal.
     """
-    offset = mi.Vector3f(surfels.position()) - mi.Vector3f(camera.origin)
-    # A surfel at the camera's own position has no direction; it is culled, so any finite one will do.
-    direction = offset * dr.rsqrt(dr.maximum(dr.squared_norm(offset), 1e-12))
+    # A surfel at the camera's own position has no direction; it is culled, so any will do.
+    direction = safe_normalize(camera.towards(surfels.position()))
     normal = surfels.frame()[2]
     return direction, dr.select(dr.detach(dr.dot(normal, direction)) > FACING_TOLERANCE, -normal, normal)
 

@@ -17,6 +17,9 @@ from mi_refgs.splat.camera import Camera
 
 # Mitsuba's perspective sensor has square pixels; float32 focal lengths of one camera agree far better.
 SQUARE_PIXEL_TOLERANCE = 1e-4
+# Mitsuba wants a near plane, and a far plane, which the splatter has no use for, behind it: in near planes.
+NEAR_CLIP_MIN = 1e-12
+CLIP_RANGE = 1e6
 
 
 def write_scene_xml(
@@ -79,12 +82,13 @@ def _add_sensor(scene: ElementTree.Element, camera: Camera) -> None:
         )
     to_world = np.eye(4)
     to_world[:3, :3] = np.array(camera.rotation, dtype=np.float64).reshape(3, 3).T
-    to_world[:3, 3] = np.array(camera.origin, dtype=np.float64).ravel()
+    to_world[:3, 3] = sum(np.array(x, np.float64).ravel() for x in (camera.origin, camera.origin_rest))
 
     sensor = ElementTree.SubElement(scene, "sensor", type="perspective", id="sensor")
     _put(sensor, "string", "fov_axis", "x")
     _put(sensor, "float", "fov", repr(math.degrees(2 * math.atan(camera.width / (2 * abs(fx))))))
-    _put(sensor, "float", "near_clip", repr(near))
+    _put(sensor, "float", "near_clip", repr(max(near, NEAR_CLIP_MIN)))
+    _put(sensor, "float", "far_clip", repr(max(CLIP_RANGE * near, 1.0)))
     _put(sensor, "float", "principal_point_offset_x", repr(0.5 - cx / camera.width))
     _put(sensor, "float", "principal_point_offset_y", repr(0.5 - cy / camera.height))
     transform = ElementTree.SubElement(sensor, "transform", name="to_world")

@@ -29,7 +29,8 @@ class Camera:
     cx: mi.Float  # pixels; the image centre is width / 2
     cy: mi.Float  # pixels
     rotation: mi.Matrix3f  # camera from world
-    origin: mi.Point3f  # world
+    origin: mi.Point3f  # world, rounded to float32
+    origin_rest: mi.Vector3f  # what rounding took off it: far from the world's origin more than a surfel
     near: mi.Float  # scene units along the camera's z axis
     focal: float  # |fx| as a host number, which chooses the size of tiles
     offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film, whose tiles it keeps
@@ -53,7 +54,7 @@ class Camera:
         cx: float,
         cy: float,
         to_world: np.ndarray,
-        near: float = 0.01,
+        near: float = 0.0,
     ) -> Camera:
         """Camera from signed focal lengths in pixels and a rigid (4, 4) world-from-camera matrix.
 
@@ -72,7 +73,8 @@ class Camera:
 
         columns = [opaque(x) for x in rotation.T.ravel()]
         camera_from_world = mi.Matrix3f([columns[0:3], columns[3:6], columns[6:9]])
-        origin = mi.Point3f(*(opaque(x) for x in matrix[:3, 3]))
+        origin = matrix[:3, 3].astype(np.float32)
+        rest = matrix[:3, 3] - origin
         return Camera(
             width,
             height,
@@ -81,7 +83,8 @@ class Camera:
             opaque(cx),
             opaque(cy),
             camera_from_world,
-            origin,
+            mi.Point3f(*(opaque(x) for x in origin)),
+            mi.Vector3f(*(opaque(x) for x in rest)),
             opaque(near),
             abs(float(fx)),
         )
@@ -121,9 +124,13 @@ class Camera:
         x, y = (int(offset) for offset in sensor.film().crop_offset())
         return replace(camera, offset=(x, y))
 
+    def towards(self, point: Any) -> Any:
+        """Vector (mi.Vector3f, world) from the camera to a world point, to float32 of the vector itself."""
+        return (mi.Vector3f(point) - mi.Vector3f(self.origin)) - self.origin_rest
+
     def to_camera(self, point: Any) -> Any:
         """World point to camera frame."""
-        return self.rotation @ (mi.Vector3f(point) - mi.Vector3f(self.origin))
+        return self.rotation @ self.towards(point)
 
     def pixel_centres(self) -> Any:
         """Centres (i + ½, j + ½) of all pixels in raster order, width·height values."""

@@ -4,13 +4,16 @@ A surfel has centre p, unit tangents t_u, t_v, normal n (camera frame) and stand
 ray through a pixel at offset δ from the projected centre meets its plane at depth z and tangent coordinates
 (u, v), in units of s:
 
-    1/z = k + c·δ        u = z a·δ        v = z b·δ                                       [2DGS, eq. 8-10]
+    w = 1 + c·δ        z = p_z / w        u = a·δ / w        v = b·δ / w                  [2DGS, eq. 8-10]
 
-with, per axis, c = n/(p·n)/f, a = (t_u - (p·t_u) n/(p·n))/(s_u f), b likewise, k = 1/p_z. Offsets from the
-centre, not pixel coordinates, enter: the two large terms that cancel in the textbook form are gone, so
-float32 holds. Opacity is
+With q = p/p_z and the projected tangents X_u = t_u.x - q.x t_u.z, Y_u = t_u.y - q.y t_u.z (X_v, Y_v
+likewise), a and b are the rows of the inverse of their matrix: a = (Y_v, -X_v) p_z/(s_u q·n), b = (-Y_u, X_u)
+p_z/(s_v q·n), and c = n/(q·n), each divided by the focal lengths. Offsets from the centre, not pixel
+coordinates, enter: the two large terms that cancel in the textbook form are gone. Lengths enter as ratios
+only, so the unit of the scene is free, and of two products no difference is rounded twice: float32 holds.
+Opacity is
 
-    α = min(α_max, o exp(-ρ/2)),   ρ = min(u² + v², 2 |δ|²)                                 [2DGS, eq. 11]
+    α = min(α_max, o exp(-ρ/2)),   ρ = min(u² + v², 12 |δ|²)                                [2DGS, eq. 11]
 
 and the sample lies at depth z, or at the centre's depth where the low-pass is the smaller (there the
 intersection may be anywhere along the ray).
@@ -30,13 +33,14 @@ from mi_refgs.constants import (
     EDGE_ON_COSINE,
     LOW_PASS_INV_VARIANCE,
     NORM_FLOOR,
+    SIZE_RANGE,
     SORT_DEPTH_RANGE,
     SORT_REACH,
 )
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 
-GEOMETRY_COLUMNS = 10  # a.x a.y b.x b.y c.x c.y k centre.x centre.y opacity
+GEOMETRY_COLUMNS = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
 
 
 @dataclass(frozen=True)
@@ -62,32 +66,34 @@ def project(surfels: Surfels, camera: Camera, shift: Any = None) -> Footprints:
     s = surfels.scale()
     opacity = surfels.opacity()
 
-    pn = dr.dot(p, n)
-    visible = dr.detach(
-        (p.z > camera.near)
-        & (dr.abs(pn) > EDGE_ON_COSINE * dr.norm(p))
-        & (opacity >= ALPHA_MIN)
-        & dr.isfinite(dr.sum(p) + pn + opacity + s.x + s.y)
-    )
+    ahead = dr.detach((p.z > camera.near) & (p.z > 0))
     # Divide by harmless numbers where culled: a masked Inf would still poison the adjoint.
-    pn = dr.select(visible, pn, 1)
-    z = dr.select(visible, p.z, 1)
-    s = dr.select(visible, s, 1)
+    z = dr.select(ahead, p.z, 1)
+    nearness = dr.rcp(z)
+    slope = mi.Vector2f(p.x, p.y) * nearness
+    qn = dr.fma(slope.x, n.x, dr.fma(slope.y, n.y, n.z))
+    visible = ahead & dr.detach(
+        (dr.abs(qn) > EDGE_ON_COSINE * dr.sqrt(dr.fma(slope.x, slope.x, dr.fma(slope.y, slope.y, 1))))
+        & (opacity >= ALPHA_MIN)
+        & dr.isfinite(dr.sum(slope) + qn + opacity + s.x + s.y + dr.square(nearness))
+    )
+    inverse = dr.rcp(dr.select(visible, qn, 1))
+    s = dr.clip(dr.select(visible, s * nearness, 1), 1 / SIZE_RANGE, SIZE_RANGE)
 
     focal = mi.Vector2f(camera.fx, camera.fy)
-    c = n / pn
-    a = (t_u - dr.dot(p, t_u) * c) / s.x
-    b = (t_v - dr.dot(p, t_v) * c) / s.y
-    slope = mi.Vector2f(p.x, p.y) / z
+    along_u, along_v = (mi.Vector2f(*(dr.fma(-slope[i], t.z, t[i]) for i in range(2))) for t in (t_u, t_v))
+    of_u, of_v = inverse / s.x, inverse / s.y
     centre = focal * slope + mi.Vector2f(camera.cx, camera.cy)
     if shift is not None:
         centre += mi.Vector2f(shift)
-    columns = [a.x / focal.x, a.y / focal.y, b.x / focal.x, b.y / focal.y, c.x / focal.x, c.y / focal.y]
-    columns += [dr.rcp(z), centre.x, centre.y, opacity]
+    columns = [of_u * along_v.y / focal.x, -of_u * along_v.x / focal.y]
+    columns += [-of_v * along_u.y / focal.x, of_v * along_u.x / focal.y]
+    columns += [inverse * n.x / focal.x, inverse * n.y / focal.y]
+    columns += [z, centre.x, centre.y, opacity]
     columns = [dr.select(visible, column, 0) for column in columns]
 
     with dr.suspend_grad():
-        low, high = _extent(t_u, t_v, s, slope, z, opacity, focal)
+        low, high = _extent(t_u.z * s.x, t_v.z * s.y, along_u * s.x * focal, along_v * s.y * focal, opacity)
         first, last = [], []
         for axis, size in enumerate((camera.width, camera.height)):
             # Clamped as floats first: a rectangle far outside must not overflow an integer.
@@ -98,23 +104,22 @@ def project(surfels: Surfels, camera: Camera, shift: Any = None) -> Footprints:
         return Footprints(columns, (first[0], first[1]), (last[0], last[1]))
 
 
-def _extent(t_u: Any, t_v: Any, s: Any, slope: Any, z: Any, opacity: Any, focal: Any) -> tuple[Any, Any]:
+def _extent(depth_u: Any, depth_v: Any, along_u: Any, along_v: Any, opacity: Any) -> tuple[Any, Any]:
     """Rectangle around the centre, in pixels, that holds every pixel with α ≥ ALPHA_MIN.
 
     The contour u² + v² = r², r² = 2 ln(o/α_min), projects to a conic; its bounds per axis follow from the
     tangent lines of the dual conic [2DGS, appendix A, with r for 3 and the origin at the projected centre]. A
-    contour that reaches behind the camera has no bounds: such a surfel is listed everywhere.
+    contour that reaches behind the camera has no bounds: such a surfel is listed everywhere. For σ along t_u
+    and t_v: depth (mi.Float) in depths of the centre, and the way across the screen (mi.Vector2f) in pixels.
     """
     r2 = _reach(opacity)
-    depth_u, depth_v = s.x * t_u.z, s.y * t_v.z
-    denominator = r2 * (dr.square(depth_u) + dr.square(depth_v)) - dr.square(z)
-    bounded = denominator < -1e-4 * dr.square(z)  # float32 margin: the bounds diverge at 0
+    denominator = r2 * (dr.square(depth_u) + dr.square(depth_v)) - 1
+    bounded = denominator < -1e-4  # float32 margin: the bounds diverge at 0
     f = r2 / dr.select(bounded, denominator, -1)
     low_pass = dr.sqrt(r2 / LOW_PASS_INV_VARIANCE)
     low, high = [], []
     for axis in range(2):
-        x_u = s.x * focal[axis] * (t_u[axis] - slope[axis] * t_u.z)
-        x_v = s.y * focal[axis] * (t_v[axis] - slope[axis] * t_v.z)
+        x_u, x_v = along_u[axis], along_v[axis]
         middle = f * (x_u * depth_u + x_v * depth_v)
         half = dr.sqrt(dr.maximum(dr.square(middle) - f * (dr.square(x_u) + dr.square(x_v)), 0))
         half = half * 1.0001 + 1e-3  # rounding of the contour itself, in pixels
@@ -137,22 +142,21 @@ def depth_near(row: list[Any], pixel: Any) -> Any:
     their centres, those on the camera's side of it would always come first, and the picture would depend on
     the view as no surface does. [cf. StopThePop, Radl et al. 2024, §4: depth at the tile]
     """
-    a_x, a_y, b_x, b_y, c_x, c_y, k, x, y = row[:9]
+    a_x, a_y, b_x, b_y, c_x, c_y, z, x, y = row[:9]
     delta = mi.Vector2f(pixel.x - x, pixel.y - y)
-    u, v = _linear(a_x, a_y, delta), _linear(b_x, b_y, delta)  # times k
-    inside = dr.minimum(1, SORT_REACH * k * dr.rsqrt(dr.maximum(dr.fma(u, u, v * v), NORM_FLOOR)))
-    inverse_depth = dr.fma(inside, _linear(c_x, c_y, delta), k)
-    return dr.rcp(dr.maximum(inverse_depth, k / SORT_DEPTH_RANGE))
+    u, v = _linear(a_x, a_y, delta), _linear(b_x, b_y, delta)
+    inside = dr.minimum(1, SORT_REACH * dr.rsqrt(dr.maximum(dr.fma(u, u, v * v), NORM_FLOOR)))
+    return z / dr.maximum(dr.fma(inside, _linear(c_x, c_y, delta), 1), 1 / SORT_DEPTH_RANGE)
 
 
 def overlaps(row: list[Any], low: Any, high: Any) -> Any:
     """Whether footprint rows may reach α ≥ ALPHA_MIN in screen rectangles [low, high] (mi.Point2f).
 
-    With r as in `_extent`, u² + v² ≤ r² is q ≤ 0 for the quadratic q(δ) = (a·δ)² + (b·δ)² - r² (k + c·δ)².
+    With r as in `_extent`, u² + v² ≤ r² is q ≤ 0 for the quadratic q(δ) = (a·δ)² + (b·δ)² - r² (1 + c·δ)².
     The least q of a rectangle lies at the minimum of q itself or on an edge that faces it, where q is a
     parabola. [cf. Speedy-Splat, Hanson et al. 2025, §4: tiles by the exact ellipse]
     """
-    a_x, a_y, b_x, b_y, c_x, c_y, k, x, y, opacity = row[:GEOMETRY_COLUMNS]
+    a_x, a_y, b_x, b_y, c_x, c_y, _, x, y, opacity = row[:GEOMETRY_COLUMNS]
     r2 = _reach(opacity) * 1.0005 + 1e-4  # rounding of q
     low, high = mi.Vector2f(low.x - x, low.y - y), mi.Vector2f(high.x - x, high.y - y)
     # Of thin ellipses the matrix of q keeps no digit of its determinant: that of a sum of squares of linear
@@ -163,8 +167,8 @@ def overlaps(row: list[Any], low: Any, high: Any) -> Any:
     xy = dr.fma(a_x, a_y, b_x * b_y) - r2 * c_x * c_y
     yy = dr.fma(a_y, a_y, b_y * b_y) - r2 * c_y * c_y
     ellipse = (determinant > 0) & (xx > 0) & (yy > 0)  # else the contour reaches behind the camera
-    along_x, along_y = -r2 * k * c_x, -r2 * k * c_y
-    scale = r2 * k / dr.select(ellipse, determinant, 1)
+    along_x, along_y = -r2 * c_x, -r2 * c_y
+    scale = r2 / dr.select(ellipse, determinant, 1)
     near_x = dr.clip(-scale * dr.fma(a_c, a_y, b_c * b_y), low.x, high.x)
     near_y = dr.clip(scale * dr.fma(a_c, a_x, b_c * b_x), low.y, high.y)
     on_x = dr.clip(-dr.fma(xy, near_x, along_y) / dr.select(ellipse, yy, 1), low.y, high.y)
@@ -173,7 +177,7 @@ def overlaps(row: list[Any], low: Any, high: Any) -> Any:
     def inside(x: Any, y: Any) -> Any:
         delta = mi.Vector2f(x, y)
         u, v = _linear(a_x, a_y, delta), _linear(b_x, b_y, delta)
-        return dr.fma(u, u, v * v) <= r2 * dr.square(k + _linear(c_x, c_y, delta))
+        return dr.fma(u, u, v * v) <= r2 * dr.square(1 + _linear(c_x, c_y, delta))
 
     by_plane = inside(near_x, on_x) | inside(on_y, near_y)
     beside_x, beside_y = dr.clip(0, low.x, high.x), dr.clip(0, low.y, high.y)
@@ -187,6 +191,7 @@ class Sample:
 
     alpha: Any  # after the clamp
     z: Any  # depth of the sample
+    ratio: Any  # of that to the depth of the centre
     valid: Any  # contributes: α ≥ ALPHA_MIN and beyond the near plane
     gaussian: Any  # exp(-ρ/2)
     clamped: Any  # α_max was reached: no derivative
@@ -199,11 +204,11 @@ class Sample:
 def evaluate(row: Any, pixel: Any, near: Any) -> Sample:
     """Evaluate footprint rows at pixel centres. `row[0:10]` are the geometry columns."""
     delta = mi.Vector2f(pixel.x - row[7], pixel.y - row[8])
-    inverse_depth = dr.fma(row[4], delta.x, dr.fma(row[5], delta.y, row[6]))
-    in_front = inverse_depth > 0
-    z = dr.rcp(dr.select(in_front, inverse_depth, 1))
-    u = z * _linear(row[0], row[1], delta)
-    v = z * _linear(row[2], row[3], delta)
+    w = dr.fma(row[4], delta.x, dr.fma(row[5], delta.y, 1))
+    in_front = w > 0
+    ratio = dr.rcp(dr.select(in_front, w, 1))
+    u = ratio * _linear(row[0], row[1], delta)
+    v = ratio * _linear(row[2], row[3], delta)
     rho_plane = dr.fma(u, u, v * v)
     rho_screen = LOW_PASS_INV_VARIANCE * dr.fma(delta.x, delta.x, delta.y * delta.y)
     low_pass = ~in_front | (rho_screen < rho_plane)
@@ -211,9 +216,10 @@ def evaluate(row: Any, pixel: Any, near: Any) -> Sample:
     alpha = row[9] * gaussian
     clamped = alpha > ALPHA_MAX
     alpha = dr.select(clamped, ALPHA_MAX, alpha)
-    z = dr.select(low_pass, dr.rcp(row[6]), z)
+    ratio = dr.select(low_pass, 1, ratio)
+    z = row[6] * ratio
     valid = (alpha >= ALPHA_MIN) & (z > near)
-    return Sample(alpha, z, valid, gaussian, clamped, low_pass, delta, u, v)
+    return Sample(alpha, z, ratio, valid, gaussian, clamped, low_pass, delta, u, v)
 
 
 def _linear(x: Any, y: Any, delta: Any) -> Any:
@@ -229,29 +235,28 @@ class FootprintAdjoint:
 
     def __init__(self) -> None:
         self.a, self.b, self.c = ([mi.Float(0)] * 3 for _ in range(3))
-        self.inverse_depth, self.opacity = mi.Float(0), mi.Float(0)
+        self.depth, self.opacity = mi.Float(0), mi.Float(0)
         self.screen = [mi.Float(0)] * 2
 
     def add(self, sample: Sample, δalpha: Any, δz: Any) -> None:
         """Take in a pixel, by the adjoints of its α and z."""
         plane = ~sample.low_pass
-        delta, u, v, z = sample.delta, sample.u, sample.v, sample.z
+        delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
         # α = o gaussian, unless clamped;  gaussian = exp(-ρ/2)
         δalpha = dr.select(sample.clamped, 0, δalpha)
         self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)
         minus_2δrho = δalpha * sample.alpha
-        # ρ = u² + v²,  u = z a·δ,  v = z b·δ
-        by_plane = dr.select(plane, -z * minus_2δrho, 0)
+        # ρ = u² + v²,  u = a·δ / w,  v = b·δ / w
+        by_plane = dr.select(plane, -ratio * minus_2δrho, 0)
         δa, δb = u * by_plane, v * by_plane  # of a·δ and b·δ
-        δz = dr.select(plane, dr.fma(z, δz, dr.fma(u, u, v * v) * -minus_2δrho), z * δz)
-        δinverse_depth = -z * δz  # z = 1/(k + c·δ), or 1/k under the low-pass
-        self.inverse_depth += δinverse_depth
+        self.depth = dr.fma(ratio, δz, self.depth)  # z = p_z / w, or p_z under the low-pass
+        δw = -ratio * dr.fma(sample.z, δz, dr.fma(u, u, v * v) * -minus_2δrho)
         # By the low-pass, ρ is a multiple of δ·δ.
         by_screen = dr.select(plane, 0, minus_2δrho)
         self.screen = [dr.fma(by_screen, d, total) for d, total in zip(delta, self.screen, strict=True)]
         self.a = _moments(self.a, δa, delta)
         self.b = _moments(self.b, δb, delta)
-        self.c = _moments(self.c, dr.select(plane, δinverse_depth, 0), delta)
+        self.c = _moments(self.c, dr.select(plane, δw, 0), delta)
 
     def columns(self, row: Any) -> list[Any]:
         """Adjoint of the ten geometry columns."""
@@ -261,7 +266,7 @@ class FootprintAdjoint:
             dr.fma(LOW_PASS_INV_VARIANCE, screen, -(a[0] * row[i] + b[0] * row[2 + i] + c[0] * row[4 + i]))
             for i, screen in enumerate(self.screen)
         ]
-        return [*a[1:], *b[1:], *c[1:], self.inverse_depth, *δcentre, self.opacity]
+        return [*a[1:], *b[1:], *c[1:], self.depth, *δcentre, self.opacity]
 
 
 def _moments(total: list[Any], x: Any, delta: Any) -> list[Any]:
@@ -271,22 +276,16 @@ def _moments(total: list[Any], x: Any, delta: Any) -> list[Any]:
 def evaluate_forward(row: Any, sample: Sample, drow: Any) -> tuple[Any, Any]:
     """Tangent of `evaluate`: tangents of the ten geometry columns to those of α and z."""
     plane = ~sample.low_pass
-    delta, u, v, z = sample.delta, sample.u, sample.v, sample.z
-    ddelta_x, ddelta_y = -drow[7], -drow[8]
-    dinverse_depth = drow[6] + dr.select(
-        plane, drow[4] * delta.x + drow[5] * delta.y + row[4] * ddelta_x + row[5] * ddelta_y, 0
-    )
-    dz = -dr.square(z) * dinverse_depth
-    du = (
-        z * (drow[0] * delta.x + drow[1] * delta.y + row[0] * ddelta_x + row[1] * ddelta_y)
-        - u * z * dinverse_depth
-    )
-    dv = (
-        z * (drow[2] * delta.x + drow[3] * delta.y + row[2] * ddelta_x + row[3] * ddelta_y)
-        - v * z * dinverse_depth
-    )
-    drho = dr.select(
-        plane, 2 * (u * du + v * dv), 2 * LOW_PASS_INV_VARIANCE * (delta.x * ddelta_x + delta.y * ddelta_y)
-    )
+    delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
+    ddelta = mi.Vector2f(-drow[7], -drow[8])
+
+    def linear(i: int) -> Any:
+        """Tangent of the linear form in columns i and i + 1."""
+        return _linear(drow[i], drow[i + 1], delta) + _linear(row[i], row[i + 1], ddelta)
+
+    dw = dr.select(plane, linear(4), 0)
+    dz = ratio * (drow[6] - sample.z * dw)
+    du, dv = ratio * (linear(0) - u * dw), ratio * (linear(2) - v * dw)
+    drho = dr.select(plane, 2 * (u * du + v * dv), 2 * LOW_PASS_INV_VARIANCE * dr.dot(delta, ddelta))
     dalpha = drow[9] * sample.gaussian - 0.5 * sample.alpha * drho
     return dr.select(sample.clamped, 0, dalpha), dz

@@ -13,8 +13,9 @@ from mi_refgs.surfels.table import CHANNELS, GEOMETRY, MAX_SH_DEGREE, Surfels, s
 
 # Y_0 = 1 / (2 √π): a DC coefficient c shows as the colour 0.5 + Y_0 c. [3DGS]
 SH_DC = 0.28209479177387814
-# Squared distance to the neighbours, scene units²: keeps the log scale of doubled points finite. [2DGS]
-SQUARED_DISTANCE_FLOOR = 1e-7
+# Least distance to the neighbours, as part of the points' extent: keeps the log scale of doubled points
+# finite. 2DGS has 3e-4 scene units, whatever the unit.
+DISTANCE_FLOOR = 1e-4
 # Neighbours whose mean squared distance gives the scale. [3DGS]
 NEIGHBOURS = 3
 # Uniform jitter of the initial albedo around its mean: breaks ties between surfels. [Ref-Gaussian]
@@ -79,12 +80,19 @@ def from_points(
 
 
 def neighbour_scale(points: np.ndarray) -> np.ndarray:
-    """Root mean squared distance (N,) of each point to its 3 nearest neighbours, at least √1e-7."""
+    """Root mean squared distance (N,) of each point to its 3 nearest neighbours.
+
+    It is at least DISTANCE_FLOOR of the points' extent, the longest side of their box; where they are all at
+    one place, of its distance from the origin, or of 1.
+    """
+    if not len(points):
+        return np.zeros(0)
+    extent = float(np.ptp(points, axis=0).max()) or float(np.linalg.norm(points[0])) or 1.0
     wanted = min(NEIGHBOURS, len(points) - 1)
-    if wanted < 1:
-        return np.full(len(points), np.sqrt(SQUARED_DISTANCE_FLOOR))
-    distance, _ = cKDTree(points).query(points, k=wanted + 1)
-    return np.sqrt(np.maximum(np.mean(distance[:, 1:] ** 2, axis=1), SQUARED_DISTANCE_FLOOR))
+    distance = np.zeros((len(points), 1))
+    if wanted:
+        distance = cKDTree(points).query(points, k=wanted + 1)[0][:, 1:]
+    return np.maximum(np.sqrt(np.mean(distance**2, axis=1)), DISTANCE_FLOOR * extent)
 
 
 def random_normals(count: int, rng: np.random.Generator) -> np.ndarray:

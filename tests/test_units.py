@@ -1,0 +1,180 @@
+"""The unit of length is free: a scene that is scaled as a whole, or moved far away, stays the same."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from integrator_scenes import COUNT, image, raw_channels, scene, sensor, sky
+from tiny_scene import write_data
+
+from mi_refgs.fit import config
+from mi_refgs.fit.data import Dataset, load
+from mi_refgs.fit.initial import initial_surfels
+from mi_refgs.fit.optim import Adam, Group
+from mi_refgs.fit.schedule import Schedule
+from mi_refgs.occlusion.mesh import Mesh, write_mesh
+from mi_refgs.occlusion.tsdf import bounds_from_points
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.reference import splat as oracle
+from mi_refgs.reference.camera import look_at
+from mi_refgs.render.depth_normals import normals_from_depth
+from mi_refgs.render.pipeline import Frame, Shading, render
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.splat import splat
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.init import neighbour_scale
+from mi_refgs.surfels.table import Surfels
+
+SCALES = (1e-6, 3e-3, 1e3, 1e6)
+TOLERANCE = 2e-5
+"""Of images; float32 rounds a scaled scene anew."""
+SIZE = 40
+EYE = np.array([3.0, 1, 2])
+ORDERS = {
+    "surfel": Shading("surfel", "split_sum", "irradiance"),
+    "pixel": Shading("pixel", "split_sum", "sh", occlusion=True),
+}
+
+
+def scaled(raw: dict[str, np.ndarray], scale: float) -> dict[str, np.ndarray]:
+    """Raw channels of the scene in another unit."""
+    scale_log = (raw["scale"].astype(np.float64) + np.log(scale)).astype(np.float32)
+    return raw | {"position": raw["position"] * np.float32(scale), "scale": scale_log}
+
+
+def wall(scale: float) -> Mesh:
+    """A box that some of the reflections meet."""
+    box = trimesh.creation.box((0.2, 8, 8))
+    box.apply_translation((-2.5, 4, 0))
+    vertices = (box.vertices * scale).astype(np.float32)
+    return Mesh(vertices, box.faces.astype(np.uint32), 0.05 * scale)
+
+
+def camera(scale: float) -> Camera:
+    to_world = look_at(EYE, np.zeros(3))
+    to_world[:3, 3] *= scale
+    return Camera.look(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world, 0.01 * scale)
+
+
+def rendered(scale: float, shading: Shading) -> tuple[Surfels, Frame, Any, Any]:
+    """Surfels with gradients, a view of them, and its depth normals with their mask."""
+    surfels = Surfels.from_numpy(scaled(raw_channels(), scale))
+    surfels.enable_grad()
+    light = EnvironmentLight.from_radiance(sky()).prefilter()
+    frame = render(surfels, camera(scale), shading, light, Occluder(wall(scale)))
+    return surfels, frame, *normals_from_depth(frame.depth, frame.alpha, camera(scale))
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_scaled_scene_has_the_same_picture_normals_and_gradients(scale: float, order: str) -> None:
+    def values(scale: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        surfels, frame, normal, valid = rendered(scale, ORDERS[order])
+        flat = [frame.alpha, frame.depth / scale, *frame.normal, *frame.radiance, *normal]
+        flat += [frame.maps["visibility"]] if "visibility" in frame.maps else []
+        weight = np.random.default_rng(0).normal(size=(len(flat), SIZE * SIZE)).astype(np.float32)
+        dr.backward(sum((dr.sum(x * mi.Float(w)) for x, w in zip(flat, weight, strict=True)), mi.Float(0)))
+        gradients = {name: dr.grad(raw).numpy() for name, raw in surfels.raw.items()}
+        gradients["position"] = gradients["position"] * scale
+        assert dr.count(valid)[0] > 300
+        return np.array([np.array(x) for x in flat]), gradients
+
+    (expected, slopes), (got, found) = values(1), values(scale)
+    np.testing.assert_allclose(got, expected, atol=TOLERANCE * max(1, np.abs(expected).max()))
+    for name, slope in slopes.items():
+        error = np.linalg.norm(found[name] - slope) / (np.linalg.norm(slope) + 1e-9)
+        assert error < 1e-3, (name, error)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_scaled_scene_is_the_same_through_the_plugin(scale: float, tmp_path: Path) -> None:
+    def picture(scale: float) -> np.ndarray:
+        write_mesh(tmp_path / f"{scale}.ply", wall(scale))
+        at = mi.ScalarTransform4f().look_at([float(scale * x) for x in EYE], [0, 0, 0], [0, 0, 1])
+        view = sensor(to_world=at, near_clip=0.01 * scale, far_clip=1e4 * scale)
+        raw = scaled(raw_channels(), scale)
+        return image(scene(view, raw, mesh=str(tmp_path / f"{scale}.ply"), aovs="n:normal,v:visibility"))
+
+    np.testing.assert_allclose(picture(scale), picture(1), atol=10 * TOLERANCE)
+
+
+@pytest.mark.parametrize("scale", [SCALES[0], SCALES[-1]])
+def test_initial_surfels_of_a_scaled_data_set_are_the_same(scale: float, tmp_path: Path) -> None:
+    scale = 2.0 ** round(np.log2(scale))  # exact, so that no point changes its place in the table
+    write_data(tmp_path, views=4)
+    small = load(tmp_path, "train")
+    for name in ("train", "test"):
+        file = tmp_path / f"transforms_{name}.json"
+        content = json.loads(file.read_text())
+        for frame in content["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, 3] *= scale
+            frame["transform_matrix"] = matrix.tolist()
+        file.write_text(json.dumps(content))
+    large = load(tmp_path, "train")
+    assert large.scene_extent == pytest.approx(scale * small.scene_extent)
+    assert large.views[0].camera().near[0] == pytest.approx(scale * small.views[0].camera().near[0])
+
+    def start(data: Dataset) -> dict[str, np.ndarray]:
+        method = config.load("ref_gaussian", "quick", ["surfels.count=100"])
+        return initial_surfels(method, data, np.random.default_rng(3)).to_numpy()
+
+    expected, got = scaled(start(small), scale), start(large)
+    for name, values in expected.items():
+        unit = scale if name == "position" else 1
+        np.testing.assert_allclose(got[name] / unit, values / unit, atol=2e-5, err_msg=name)
+
+
+def test_lengths_without_a_neighbour_follow_the_extent() -> None:
+    points = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [2.0, 0, 0]])
+    for scale in (1, *SCALES):
+        np.testing.assert_allclose(neighbour_scale(scale * points), scale * neighbour_scale(points))
+        assert neighbour_scale(scale * points[4:])[0] == pytest.approx(scale * neighbour_scale(points[4:])[0])
+        low, high = bounds_from_points(scale * points[3:])
+        np.testing.assert_allclose(high - low, scale * np.subtract(*bounds_from_points(points[3:])[::-1]))
+    assert neighbour_scale(points[:1])[0] > 0
+    assert np.all(np.subtract(*bounds_from_points(points[:1])[::-1]) > 0)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_step_moves_positions_by_the_same_part_of_the_scene(scale: float) -> None:
+    """Gradients of a length have the inverse unit, Adam's ε too."""
+
+    def step(scale: float) -> np.ndarray:
+        groups = Schedule(config.load("ref_gaussian", "quick"), 1).groups(scale)
+        params = {"position": mi.TensorXf(np.zeros((4, 3), np.float32))}
+        adam = Adam(params, {"position": groups["position"]})
+        slope = np.array([1e-7, 1e-12, 1e-15, 3e-17])[:, None] * np.ones(3)
+        dr.set_grad(params["position"], mi.TensorXf((slope / scale).astype(np.float32)))
+        adam.step(0)
+        return params["position"].numpy() / scale
+
+    np.testing.assert_allclose(step(scale), step(1), rtol=1e-4)
+    assert Group(1.0).unit == 1
+
+
+@pytest.mark.parametrize("shift", [1e3, 1e5])
+def test_far_from_the_origin_the_camera_is_as_exact_as_the_surfels(shift: float) -> None:
+    """Error against the oracle for positions that float32 holds exactly, and a camera that it does not."""
+    rng = np.random.default_rng(2)
+    away = shift * np.array([1, -0.7, 0.4])
+    raw = {
+        name: raw_channels()[name].astype(np.float64) for name in ("position", "rotation", "scale", "opacity")
+    }
+    raw["position"] = (raw["position"] + away).astype(np.float32).astype(np.float64)
+    to_world = look_at(EYE + away + 0.003 * rng.uniform(size=3), away)
+    pinhole = oracle.PinholeCamera(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world)
+    expected = oracle.splat(raw, np.zeros((COUNT, 0)), pinhole)
+    view = Camera.look(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world, 0.01)
+    maps = splat(Surfels.from_numpy(raw), [], view)
+    keep = ~expected.band
+    assert keep.mean() > 0.95 and np.abs(expected.alpha).max() > 0.5
+    assert np.abs(maps.alpha.numpy().reshape(SIZE, SIZE) - expected.alpha)[keep].max() < 2e-5
+    assert np.abs(maps.depth.numpy().reshape(SIZE, SIZE) - expected.depth)[keep].max() < 1e-4
