@@ -246,7 +246,7 @@ def test_mesh_file_round_trip(tmp_path: Path) -> None:
         mesh.faces
     )
     solid.export(tmp_path / "foreign.obj")
-    assert 0.1 < meshes.read_mesh(tmp_path / "foreign.obj").voxel < 0.5
+    assert meshes.read_mesh(tmp_path / "foreign.obj").voxel == pytest.approx(12**0.5 / 256, rel=0.2)
     with pytest.raises(InputError, match="no such file"):
         meshes.read_mesh(tmp_path / "none.ply")
     (tmp_path / "bad.ply").write_text("hello")

@@ -138,7 +138,9 @@ class Surface:
 
 def _normals(mesh: Mesh, neighbours: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Outward unit normals (V, 3): the weighted normals (V, K, 3) of the surfels where the mesh's agree."""
-    own = np.asarray(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals)
+    # In voxels: trimesh takes triangles of less than 1e-14 square units for points.
+    scaled = (mesh.vertices - mesh.vertices[0]) / mesh.voxel
+    own = np.asarray(trimesh.Trimesh(scaled, mesh.faces, process=False).vertex_normals)
     outward = np.where((neighbours * own[:, None]).sum(-1) < 0, -1.0, 1.0)
     mean = (neighbours * (weight * outward)[..., None]).sum(1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)

@@ -23,6 +23,11 @@ ZERO_NUDGE = 1e-3
 """Distances closer to 0 than this (truncation units; 1/200 voxel) are moved away from it: a corner exactly on
 the surface makes triangles without area."""
 
+FOREIGN_RESOLUTION = 256
+"""Voxels along the bounding box's diagonal that a mesh made elsewhere counts as: about those of a fit, whose
+grid has 128 along the longest side. Its triangles say nothing: two of them make an exact wall. Rays then
+start 0.8 % of the diagonal off the surface, and walls closer to each other than that do not occlude."""
+
 HEADER_BYTES = 4096
 """A PLY header of a mesh is a few hundred bytes."""
 
@@ -94,8 +99,8 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
 def read_mesh(path: Path | str) -> Mesh:
     """Read a triangle mesh (any format of trimesh).
 
-    The voxel size comes from the comment of `write_mesh`; for other files it is the median edge length.
-    Raises InputError if the file is missing or holds no mesh.
+    The voxel size comes from the comment of `write_mesh`; for other files see FOREIGN_RESOLUTION. Raises
+    InputError if the file is missing or holds no mesh.
     """
     path = Path(path)
     if not path.is_file():
@@ -107,11 +112,11 @@ def read_mesh(path: Path | str) -> Mesh:
     ]
     try:
         voxel = float(noted[0][0]) if noted else None
-        if voxel is not None and "\nelement face 0\n" in header:
-            return Mesh.empty(voxel)
+        if ["element", "face", "0"] in map(str.split, header.splitlines()):
+            return Mesh.empty() if voxel is None else Mesh.empty(voxel)
         mesh: Any = trimesh.load(path, force="mesh", process=False)
         if voxel is None:
-            voxel = float(np.median(mesh.edges_unique_length)) if len(mesh.faces) else 1.0
+            voxel = float(np.linalg.norm(mesh.extents)) / FOREIGN_RESOLUTION if len(mesh.faces) else 1.0
     except Exception as error:  # trimesh raises whatever its parsers meet
         raise InputError(
             f"{path}: mesh: not a readable triangle mesh; write it again as PLY or OBJ"

@@ -24,7 +24,7 @@ and it grows with the square of the rows. [measured]"""
 
 @dataclass(frozen=True)
 class TurnedLight:
-    """A prefiltered light seen through a rotation; the same lookups as `PrefilteredLight`."""
+    """A prefiltered light seen through a rotation or in a mirror; the same lookups as `PrefilteredLight`."""
 
     light: Any
     light_from_world: Any  # mi.Matrix3f, detached
@@ -40,14 +40,14 @@ class TurnedLight:
 
 
 def own_light(emitter: Any) -> tuple[Any, Any]:
-    """A trainable copy of an `envmap` or `constant` emitter, and its rotation as `_rotation` gives it.
+    """A trainable copy of an `envmap` or `constant` emitter, and its matrix as `_light_from_world` gives it.
 
     Raises InputError for any other emitter.
     """
     params = mi.traverse(emitter)
     if "data" in params:
         radiance, _ = _map_radiance(params, emitter)
-        return EnvironmentLight.from_radiance(radiance.numpy()), _rotation(params)
+        return EnvironmentLight.from_radiance(radiance.numpy()), _light_from_world(params)
     colour = np.array(_constant_radiance(params, emitter)).ravel()
     return EnvironmentLight.from_radiance(np.tile(colour, (DEFAULT_HEIGHT, 2 * DEFAULT_HEIGHT, 1))), None
 
@@ -70,8 +70,8 @@ def emitter_light(emitter: Any) -> Any:
             f"emitter '{emitter.id()}': data: a map of {resampled} cannot be differentiated; "
             f"use one of h x 2h, h a multiple of 4 from {MIN_HEIGHT} to {MAX_HEIGHT}"
         )
-    light, rotation = PrefilteredLight(*prefilter(radiance)), _rotation(params)
-    return light if rotation is None else TurnedLight(light, rotation)
+    light, matrix = PrefilteredLight(*prefilter(radiance)), _light_from_world(params)
+    return light if matrix is None else TurnedLight(light, matrix)
 
 
 def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
@@ -101,15 +101,14 @@ def _constant_radiance(params: Any, emitter: Any) -> Any:
     return bounded(colour, colour)
 
 
-def _rotation(params: Any) -> Any:
-    """Rotation from world to light (mi.Matrix3f, detached), None where it is the identity.
+def _light_from_world(params: Any) -> Any:
+    """Rotation or mirror image from world to light (mi.Matrix3f, detached), None where it is the identity.
 
-    Raises InputError if `to_world` is not a rotation.
+    Raises InputError if `to_world` has scale or shear, by which Mitsuba itself shows another picture.
     """
     matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
     if np.abs(matrix - np.eye(3)).max() < 1e-7:
         return None
-    matrix /= np.cbrt(np.linalg.det(matrix))
     if not np.abs(matrix.T @ matrix - np.eye(3)).max() < 1e-4:
-        raise InputError("emitter: to_world: must be a rotation; remove scale and shear")
-    return mi.Matrix3f(np.ascontiguousarray(matrix.T, dtype=np.float32))
+        raise InputError("emitter: to_world: must be a rotation or a mirror image; remove scale and shear")
+    return mi.Matrix3f(np.linalg.inv(matrix).astype(np.float32))
