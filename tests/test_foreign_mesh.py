@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -24,10 +25,13 @@ def sheet(height: float, scale: float) -> trimesh.Trimesh:
     return trimesh.Trimesh(scale * corners, [[0, 1, 2], [0, 2, 3]], process=False)
 
 
+def write(path: Path, mesh: Any) -> Path:
+    path.write_bytes(mesh.export(file_type="ply"))
+    return path
+
+
 def occluder(folder: Path, *parts: trimesh.Trimesh) -> Occluder:
-    path = folder / "elsewhere.ply"
-    path.write_bytes(trimesh.util.concatenate(parts).export(file_type="ply"))
-    return Occluder(read_mesh(path))
+    return Occluder(read_mesh(write(folder / "elsewhere.ply", trimesh.util.concatenate(parts))))
 
 
 def points(rng: np.random.Generator, height: float, scale: float) -> mi.Point3f:
@@ -65,11 +69,8 @@ def test_a_sheet_hides_nothing_from_its_own_points(
 @pytest.mark.parametrize("scale", SCALES)
 def test_vertices_keep_their_normals_and_materials_at_any_scale(tmp_path: Path, scale: float) -> None:
     ball = trimesh.creation.icosphere(2, 1.0)
-    path = tmp_path / "ball.ply"
-    path.write_bytes(
-        trimesh.Trimesh(scale * ball.vertices, ball.faces, process=False).export(file_type="ply")
-    )
-    made = Occluder(read_mesh(path))
+    scaled = trimesh.Trimesh(scale * ball.vertices, ball.faces, process=False)
+    made = Occluder(read_mesh(write(tmp_path / "ball.ply", scaled)))
     # Surfels that lie flat on the ball do not agree with its normals: the mesh's own must serve.
     count = len(ball.vertices)
     surfels = Surfels.from_numpy(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -12,7 +13,9 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.fit import metrics
 from mi_refgs.fit.ssim import ssim as training_ssim
+from mi_refgs.images import write_exr
 from mi_refgs.reference import losses as reference
+from mi_refgs.shade.envmap import EnvironmentLight
 
 
 def test_psnr(rng: np.random.Generator) -> None:
@@ -64,14 +67,24 @@ def test_environment_up_to_a_scale_per_channel(rng: np.random.Generator) -> None
     assert perfect["env_scale"] == pytest.approx(list(scale))
     assert perfect["env_mae"] == pytest.approx(0, abs=1e-12)
     assert perfect["env_psnr"] == 100 and perfect["env_correlation"] == pytest.approx(1)
-    # A larger truth is averaged down: repeated texels change nothing, at sizes that do not divide either.
-    repeated = np.repeat(np.repeat(truth, 3, axis=0), 3, axis=1)
-    assert metrics.environment(truth, repeated)["env_mae"] == pytest.approx(0, abs=1e-12)
     coarse = metrics.environment(np.ones((5, 7, 3)), np.full((8, 16, 3), 0.25))
     assert coarse["env_scale"] == pytest.approx([0.25] * 3) and coarse["env_correlation"] == 0
     noise = metrics.environment(rng.random((8, 16, 3)), truth)
     assert noise["env_psnr"] < 20 and abs(noise["env_correlation"]) < 0.3
     assert all(np.isfinite(list(metrics.environment(0 * truth, truth).values())[1:]))
+
+
+def test_a_perfect_light_scores_1(tmp_path: Path, rng: np.random.Generator) -> None:
+    """The true map itself, and read as a light of fewer rows, as a fit would have it."""
+    truth = (rng.random((64, 128, 3)) ** 4 + 0.01).astype(np.float32)
+    write_exr(tmp_path / "truth.exr", truth)
+    for height in (64, 24):
+        light = EnvironmentLight.from_file(tmp_path / "truth.exr", height).radiance().numpy()
+        scores = metrics.environment(light, truth)
+        assert scores["env_correlation"] == pytest.approx(1, abs=1e-6)
+        assert scores["env_psnr"] > 90 and scores["env_scale"] == pytest.approx([1] * 3, abs=1e-5)
+    # A row on a pole is as much of the sphere as Mitsuba's `envmap` shows of it.
+    assert metrics.environment(np.roll(light, 1, axis=0), truth)["env_correlation"] < 0.9
 
 
 def test_environment_weighs_by_solid_angle_and_clips_at_the_peak() -> None:

@@ -15,11 +15,14 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.fit.ssim import WINDOW_RADIUS, WINDOW_SIGMA
 from mi_refgs.images import srgb_from_linear
+from mi_refgs.shade import lobe
 
 # What identical images read, dB: JSON has no infinity, and float32 images cannot differ by less.
 PSNR_MAX = 100.0
 # A pixel is foreground where the true alpha is above this.
 FOREGROUND_ALPHA = 0.5
+# Variance of display-encoded values below which a map is constant but for rounding: it correlates with none.
+FLAT = 1e-12
 # The network of LPIPS: the one its authors recommend for comparing images ("forward" scores).
 LPIPS_NETWORK = "alex"
 
@@ -135,22 +138,24 @@ def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> 
 def environment(light: np.ndarray, truth: np.ndarray, peak: float | None = None) -> dict[str, Any]:
     """Recovered against true environment after one least-squares scale per channel, weighted by solid angle.
 
-    Photographs fix the light only up to such a scale, which the albedo takes up. Both maps are brought to the
-    recovered one's size by averaging; with `peak`, both are first clipped there (what no clipped photograph
-    could show). Keys: `env_scale` (three numbers), `env_mae` (linear, after the scale), `env_psnr` (dB, after
-    sRGB encoding and clamping to [0, 1]) and `env_correlation` (Pearson, of the same encoded values).
+    Photographs fix the light only up to such a scale, which the albedo takes up. The true map is resampled to
+    the recovered one's grid (`shade.lobe`: first and last row on the poles) by averaging; with `peak`, both
+    are first clipped there (what no clipped photograph could show). Keys: `env_scale` (three numbers),
+    `env_mae` (linear, after the scale), `env_psnr` (dB, after sRGB encoding and clamping to [0, 1]) and
+    `env_correlation` (Pearson, of the same encoded values).
     """
     light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
     for name, array in (("light", light), ("truth", truth)):
-        if array.ndim != 3 or array.shape[2] != 3 or not np.all(np.isfinite(array)):
+        if array.ndim != 3 or array.shape[2] != 3 or array.shape[0] < 2 or not np.all(np.isfinite(array)):
             raise InputError(
-                f"metrics: environment {name}: need finite (h, w, 3) values; write the map again"
+                f"metrics: environment {name}: need finite (h, w, 3) values, h ≥ 2; write the map again"
             )
     if peak is not None:
         light, truth = np.minimum(light, peak), np.minimum(truth, peak)
-    truth = _average_to(truth, light.shape[0], light.shape[1])
-    rows = np.sin((np.arange(light.shape[0]) + 0.5) / light.shape[0] * np.pi)
-    weight = np.broadcast_to(rows[:, None, None], light.shape)
+    rows = lobe.row_resampling(len(truth), len(light))
+    columns = lobe.column_resampling(truth.shape[1], light.shape[1])
+    truth = np.einsum("ih,jw,hwc->ijc", rows, columns, truth, optimize=True)
+    weight = np.broadcast_to(lobe.row_areas(len(light))[:, None, None], light.shape)
     scale = np.sum(weight * light * truth, axis=(0, 1)) / np.maximum(
         np.sum(weight * light**2, axis=(0, 1)), 1e-30
     )
@@ -163,24 +168,7 @@ def environment(light: np.ndarray, truth: np.ndarray, peak: float | None = None)
         "env_scale": [float(value) for value in scale],
         "env_mae": float(np.average(np.abs(fitted - truth), weights=weight)),
         "env_psnr": PSNR_MAX if error <= 0 else min(PSNR_MAX, -10 * float(np.log10(error))),
-        "env_correlation": float(np.sum(weight * shown * goal)) / spread if spread > 0 else 0.0,
+        "env_correlation": float(np.sum(weight * shown * goal)) / spread
+        if spread > FLAT * weight.sum()
+        else 0.0,
     }
-
-
-def _average_to(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resample an (h, w, C) map by area averages (exact box overlaps along each axis)."""
-    return np.einsum(
-        "ih,jw,hwc->ijc",
-        _overlap(height, image.shape[0]),
-        _overlap(width, image.shape[1]),
-        image,
-        optimize=True,
-    )
-
-
-def _overlap(target: int, source: int) -> np.ndarray:
-    """Share of each source interval in each target interval, rows summing to 1: (target, source)."""
-    edges, cells = np.linspace(0, 1, target + 1), np.linspace(0, 1, source + 1)
-    low = np.maximum(edges[:-1, None], cells[None, :-1])
-    high = np.minimum(edges[1:, None], cells[None, 1:])
-    return np.maximum(high - low, 0) * target

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from mi_refgs.shade import lobe
+
 SAMPLES_PER_LAUNCH = 1 << 24
 """Largest number of paths traced at once; the path tracer keeps about 100 bytes for each."""
 SURFACE_SAMPLES = 4096
 """Points on each shape that measure the scene's size; the farthest is found to about 1 %."""
 ENVIRONMENT_OVERSAMPLING = 4
-"""Directions per texel and axis of the exported environment, so that a small sun keeps its energy."""
+"""Directions per texel and axis of an environment that is turned, so that a small sun keeps its energy."""
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 """Azimuth between neighbours of a spherical Fibonacci lattice, radians."""
 
@@ -60,26 +62,33 @@ def camera_poses(
 
 
 def environment_image(scene: Any, height: int) -> np.ndarray:
-    """Radiance (height, 2·height, 3) of the scene's environment, each texel a mean over its solid angle.
+    """Radiance (height, 2·height, 3) of the scene's environment, on the grid of Mitsuba's `envmap`.
 
-    Orientation: Mitsuba's `envmap` with an identity `to_world`: row 0 at +y; column 0 at −z, turning to +x.
+    Shown by an `envmap` with an identity `to_world` it is the same light: first row at +y, last at -y;
+    column 0 beside −z, turning to +x. An `envmap` of this size that is not turned comes back unchanged; what
+    is finer is averaged (`shade.lobe.resample`).
     """
     import drjit as dr
     import mitsuba as mi
 
-    rows, columns = height * ENVIRONMENT_OVERSAMPLING, 2 * height * ENVIRONMENT_OVERSAMPLING
+    emitter = scene.environment()
+    params = mi.traverse(emitter)
+    if "data" in params and np.array_equal(np.array(params["to_world"].matrix).reshape(4, 4), np.eye(4)):
+        # Without the columns that Mitsuba adds on either side for its interpolation.
+        texels = np.array(params["data"], dtype=np.float64)[:, 1:-1, :3]
+        return (lobe.resample(texels, height) * np.array(params["scale"])).astype(np.float32)
+    rows = (height - 1) * ENVIRONMENT_OVERSAMPLING + 1
+    columns = 2 * height * ENVIRONMENT_OVERSAMPLING
     index = dr.arange(mi.UInt32, rows * columns)
     phi = (index % columns + 0.5) * (2 * dr.pi / columns)
-    theta = (index // columns + 0.5) * (dr.pi / rows)
+    theta = (index // columns) * (dr.pi / (rows - 1))
     si = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
     si.wi = -mi.Vector3f(dr.sin(theta) * dr.sin(phi), dr.cos(theta), -dr.sin(theta) * dr.cos(phi))
     # A constant emitter answers with one value for all directions.
-    radiance = np.array(scene.environment().eval(si) + dr.zeros(mi.Float, rows * columns))
-    radiance = radiance.T.reshape(rows, columns, 3)
-    weight = np.sin((np.arange(rows) + 0.5) * math.pi / rows).reshape(height, -1, 1, 1, 1)
-    blocks = radiance.reshape(height, ENVIRONMENT_OVERSAMPLING, 2 * height, ENVIRONMENT_OVERSAMPLING, 3)
-    mean = (blocks * weight).sum(axis=(1, 3)) / (weight.sum(axis=(1, 2)) * ENVIRONMENT_OVERSAMPLING)
-    return mean.astype(np.float32)
+    radiance = np.array(emitter.eval(si) + dr.zeros(mi.Float, rows * columns))
+    image = lobe.resample(radiance.T.reshape(rows, columns, 3), height)
+    image[[0, -1]] = image[[0, -1]].mean(axis=1, keepdims=True)  # a pole is one point
+    return image.astype(np.float32)
 
 
 class Tracer:
