@@ -38,9 +38,6 @@ EDGE_ON_COSINE = 1e-4
 """|cos| between a surfel's plane and the ray to its centre below which it is culled: it covers less than
 1/10000 of its area, and its ray-plane intersection loses every float32 digit."""
 
-MEDIAN_TRANSMITTANCE = 0.5
-"""The median depth is that of the last surfel met while T is above one half. [2DGS, §5]"""
-
 SIZE_RANGE = 1e7
 """A standard deviation counts as at least 1/SIZE_RANGE and at most SIZE_RANGE of the surfel's depth, and has
 no gradient beyond: 10⁻⁷ of a depth is below every pixel, so that the low-pass decides, and 10⁷ is a plane.
@@ -70,9 +67,14 @@ LANE_EDGE = 2
 surfel then serves them all, and what it adds to the surfel's gradient is their sum."""
 
 
+FOCAL_TOLERANCE = 1e-5
+"""Relative error of a focal length up to which its tiles stay the same: the float32 rays of a Mitsuba sensor
+give it back with an error of 5e-7, and common focal lengths are the limits themselves."""
+
+
 def tile_size(focal: float) -> tuple[int, int]:
     """Width and height in pixels of the tiles of a camera of this focal length (pixels)."""
-    return next(size for limit, size in TILE_SIZES if focal < limit)
+    return next(size for limit, size in TILE_SIZES if focal < limit * (1 - FOCAL_TOLERANCE))
 
 
 # ---------------- surfels ----------------

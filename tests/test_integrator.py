@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 import drjit as dr
 import mitsuba as mi
@@ -23,7 +24,9 @@ from integrator_scenes import (
 )
 from scipy.spatial.transform import Rotation
 
+from mi_refgs.constants import TILE_SIZES, tile_size
 from mi_refgs.errors import InputError
+from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Shading, render
 from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.shade.envmap import EnvironmentLight
@@ -234,6 +237,25 @@ def test_mirrored_cameras_cannot_be_exported(tmp_path: Path) -> None:
     good = Camera.look(8, 8, -10, -10, 4, 4, np.eye(4))
     with pytest.raises(InputError, match="cannot be written"):
         write_scene_xml(tmp_path / "no" / "scene.xml", ply="a.ply", shading=Shading(), camera=good)
+
+
+@pytest.mark.parametrize("factor", [1 - 1e-3, 1, 1 + 1e-3])
+@pytest.mark.parametrize("limit", [limit for limit, _ in TILE_SIZES[:-1]])
+@pytest.mark.parametrize("size", [(512, 512), (1024, 1024), (801, 333)])
+def test_an_exported_scene_has_the_trainers_tiles(
+    size: tuple[int, int], limit: float, factor: float, tmp_path: Path
+) -> None:
+    """Also at the focal lengths where tiles change size: a sensor's float32 rays give 511.9998 for 512."""
+    width, height = size
+    focal = limit * factor
+    pose = look_at(np.random.default_rng(1).normal(size=3), np.zeros(3))
+    camera = Camera.look(width, height, -focal, -focal, width / 2 + 3, height / 2 - 5, pose, 0.01)
+    write_scene_xml(tmp_path / "scene.xml", ply="a.ply", shading=Shading(), camera=camera)
+    root = ElementTree.parse(tmp_path / "scene.xml").getroot()
+    root.remove(root.find("integrator"))  # type: ignore[arg-type]
+    exported = Camera.from_sensor(mi.load_string(ElementTree.tostring(root, encoding="unicode")).sensors()[0])
+    assert exported.focal == pytest.approx(focal, rel=2e-6)
+    assert exported.tile == camera.tile == tile_size(focal)
 
 
 # ---------------- variants ----------------

@@ -15,9 +15,10 @@ from benchmarks.splatting.exact import differentiate, footprint
 from mi_refgs import constants
 from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.device import upload
+from mi_refgs.errors import InputError
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
-from mi_refgs.splat import Blended, Camera, list_by_tile, project, splat
+from mi_refgs.splat import Blended, Camera, list_by_tile, project, splat, tiles
 from mi_refgs.splat.footprint import FootprintAdjoint
 from mi_refgs.surfels.table import Surfels
 
@@ -127,8 +128,6 @@ def compare_with_oracle(seed: int) -> None:
     assert (
         np.abs(got.depth.numpy().reshape(shape) - expected.depth)[keep].max() <= IMAGE_TOLERANCE * depth_scale
     )
-    median = np.abs(got.median_depth.numpy().reshape(shape) - expected.median_depth)[keep]
-    assert median.max() <= IMAGE_TOLERANCE * depth_scale
 
 
 def outside_band(maps: oracle.Maps) -> np.ndarray:
@@ -346,7 +345,7 @@ def test_degenerate_surfels_stay_finite(values: str) -> None:
         raw = {k: v[:0] for k, v in raw.items()}
     degenerate = Scene(raw, scene.features[: len(raw["position"])], scene.camera)
     maps = fast_maps(degenerate)
-    for image in [*maps.features, maps.depth, maps.alpha, maps.median_depth]:
+    for image in [*maps.features, maps.depth, maps.alpha]:
         assert np.all(np.isfinite(image.numpy()))
     if values != "none":
         weights = np.ones((scene.camera.height, scene.camera.width, 6))
@@ -418,3 +417,36 @@ def test_tile_lists_are_in_the_oracles_order(seed: int, tile: tuple[int, int]) -
         np.testing.assert_array_equal(listed, expected)
         compared += len(listed)
     assert compared > 100
+
+
+def full_screen(count: int, size: int) -> tuple[Surfels, Camera]:
+    """Large discs, parallel to the picture, each on every tile."""
+    raw = {
+        "position": np.stack([0 * np.arange(count), 0 * np.arange(count), np.linspace(2, 3, count)], axis=1),
+        "rotation": np.tile([0.0, 0, 0, 1], (count, 1)),
+        "scale": np.full((count, 2), 4.0),
+        "opacity": np.zeros((count, 1)),
+    }
+    return Surfels.from_numpy(raw), Camera.look(size, size, -500, -500, size / 2, size / 2, np.eye(4))
+
+
+@pytest.mark.parametrize("chunk", [1, 100, 20_000])
+def test_candidates_in_parts_give_the_same_lists(chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = make_scene(13)
+    camera = scene.fast_camera()
+    footprints = project(scene.surfels(), camera)
+    whole = list_by_tile(footprints, camera)
+    monkeypatch.setattr(tiles, "CHUNK", chunk)
+    assert len(list(tiles._candidates(footprints, camera))) > (1 if chunk < 20_000 else 0)
+    parts = list_by_tile(footprints, camera)
+    for name in ("surfel_from_pair", "pair_begin", "pair_end"):
+        np.testing.assert_array_equal(getattr(parts, name).numpy(), getattr(whole, name).numpy())
+
+
+def test_more_pairs_than_32_bits_count_are_refused_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """2¹⁶ surfels on 2¹⁶ tiles: counted in 32 bits there are none, and the picture is blank."""
+    monkeypatch.setattr(tiles, "CHUNK", 1 << 20)
+    monkeypatch.setattr(tiles, "MAX_PAIR_BITS", 22)
+    surfels, camera = full_screen(1 << 16, 1024)
+    with pytest.raises(InputError, match=r"65,536 tiles of 1024 × 1024 pixels; render fewer pixels"):
+        splat(surfels, [], camera)

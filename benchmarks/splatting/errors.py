@@ -50,7 +50,7 @@ def compare(workload: Workload, size: int) -> dict[str, float]:
     ours.set_weights(weights)
     out = ours.both()
     dr.eval(out)
-    maps, gradients = out[: FEATURES + 2], out[FEATURES + 3 :]
+    maps, gradients = out[: FEATURES + 2], out[FEATURES + 2 :]
     found = dict(zip(ours.raw, (gradient.numpy() for gradient in gradients), strict=False))
     found["features"] = np.stack([gradient.numpy() for gradient in gradients[len(ours.raw) :]], axis=1)
     shown = [*range(FEATURES), FEATURES + 1]  # all but depth, which has another scale

@@ -63,7 +63,7 @@ class Ours:
         """Every map."""
         with dr.suspend_grad():
             blended = splat(Surfels(self.raw), self.columns, self.camera)
-        return [*_maps(blended), blended.median_depth]
+        return _maps(blended)
 
     def both(self) -> list[Any]:
         """Every map, and the gradients of every parameter for fixed adjoints of the maps."""
@@ -72,7 +72,7 @@ class Ours:
         maps = _maps(blended)
         self._send_back(maps)
         gradients = [dr.grad(leaf) for leaf in [*raw.values(), *columns]]
-        return [*maps, blended.median_depth, *gradients]
+        return [*maps, *gradients]
 
     def counts(self) -> Counts:
         """The work of a view."""

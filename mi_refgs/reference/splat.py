@@ -30,7 +30,6 @@ class Maps:
     features: np.ndarray
     depth: np.ndarray
     alpha: np.ndarray
-    median_depth: np.ndarray
     band: np.ndarray
 
 
@@ -59,7 +58,7 @@ def splat(
     surfels = _surfels(raw, centres, to_camera, camera)
     order = _order(surfels, camera)
     out = np.zeros((height, width, features.shape[1]))
-    depth, alpha, median = np.zeros((height, width)), np.zeros((height, width)), np.zeros((height, width))
+    depth, alpha = np.zeros((height, width)), np.zeros((height, width))
     transmittance = np.ones((height, width))
     alive = np.ones((height, width), bool)
     in_band = np.zeros((height, width), bool)
@@ -85,7 +84,6 @@ def splat(
         in_band |= shown & (np.abs(rho_screen - rho_plane) < band * rho_screen)  # depth jumps there
         in_band |= alive & (np.abs(z / camera.near - 1) < band)
         in_band |= shown & (np.abs(a - c.ALPHA_MAX) < band * (a < c.ALPHA_MAX))
-        in_band |= shown & (np.abs(transmittance - c.MEDIAN_TRANSMITTANCE) < band)
         ends = shown & (after < c.TRANSMITTANCE_MIN)
         alive &= ~ends
         shown &= ~ends
@@ -93,9 +91,8 @@ def splat(
         out += w[..., None] * features[i]
         depth += w * np.where(shown, z, 0)
         alpha += w
-        median = np.where(shown & (transmittance > c.MEDIAN_TRANSMITTANCE), z, median)
         transmittance = np.where(shown, after, transmittance)
-    return Maps(out, depth, alpha, median, in_band)
+    return Maps(out, depth, alpha, in_band)
 
 
 def _surfels(

@@ -51,7 +51,6 @@ class Frame:
 
     alpha: Any  # accumulated opacity
     depth: Any  # expected camera-z depth, 0 where nothing is seen
-    median_depth: Any  # detached
     normal: Any  # mi.Vector3f: blended world normal towards the camera, not normalised
     radiance: Any  # mi.Color3f, over black
     terms: Terms | None = None  # diffuse, specular, indirect, whose sum it is, where known apart
@@ -155,7 +154,6 @@ def _shade_at_surfels(
     return Frame(
         alpha=blended.alpha,
         depth=blended.depth * inverse,
-        median_depth=blended.median_depth,
         normal=mi.Vector3f(*maps[3:6]),
         radiance=mi.Color3f(*maps[0:3]),
         terms=apart,
@@ -214,7 +212,6 @@ def _shade_at_pixels(
     return Frame(
         alpha=blended.alpha,
         depth=depth,
-        median_depth=blended.median_depth,
         normal=normal,
         radiance=terms.total(),
         terms=terms,

@@ -22,7 +22,7 @@ def splat(surfels: Surfels, features: list[Any], camera: Camera, shift: Any = No
     `shift` is an optional zero mi.Point2f (N,) that receives the gradient of a screen translation, in pixels.
     """
     if surfels.count == 0:
-        blank = [dr.zeros(mi.Float, camera.width * camera.height) for _ in range(len(features) + 3)]
-        return Blended(blank[3:], *blank[:3])
+        blank = [dr.zeros(mi.Float, camera.width * camera.height) for _ in range(len(features) + 2)]
+        return Blended(blank[2:], *blank[:2])
     footprints = project(surfels, camera, shift)
     return blend(footprints, features, list_by_tile(footprints, camera), camera)

@@ -15,7 +15,7 @@ block of its tile and keeps their states side by side. Reading a row and adding 
 work with one pixel a lane, are then shared.
 
 No derivative, on purpose: the sort order, the tile lists, the α < 1/255 cut and the end at T < 1e-4, the near
-plane, the clamp at α_max (zero), the median depth.
+plane, the clamp at α_max (zero).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import LANE_EDGE, MEDIAN_TRANSMITTANCE, PACKET_EDGE, TRANSMITTANCE_MIN
+from mi_refgs.constants import LANE_EDGE, PACKET_EDGE, TRANSMITTANCE_MIN
 from mi_refgs.rows import Rows
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.footprint import (
@@ -48,17 +48,16 @@ class Blended:
     features: list[Any]  # K maps Σ w f
     depth: Any  # Σ w z
     alpha: Any  # Σ w
-    median_depth: Any  # depth of the last surfel met while T > ½; 0 where there is none; detached
 
 
 def blend(footprints: Footprints, features: list[Any], lists: TileLists, camera: Camera) -> Blended:
     """Composite per-surfel features (K × mi.Float (N,)); differentiable in features and footprint columns."""
     out = dr.custom(_Blend, footprints.columns + features, lists, camera)
-    return Blended(out[: len(features)], out[-3], out[-2], dr.detach(out[-1]))
+    return Blended(out[: len(features)], *out[-2:])
 
 
 class _Blend(dr.CustomOp):
-    """columns (N-wide) → [features…, depth, alpha, median depth] (pixel-wide)."""
+    """columns (N-wide) → [features…, depth, alpha] (pixel-wide)."""
 
     def eval(self, columns: list[Any], lists: TileLists, camera: Camera) -> list[Any]:
         self.lists, self.camera = lists, camera
@@ -72,13 +71,12 @@ class _Blend(dr.CustomOp):
         if not self.lists.pairs:
             self.set_grad_out(self._blank())
             return
-        tangents = _blend_forward(self, Rows.pack(self.grad_in("columns")))
-        self.set_grad_out([*tangents, dr.zeros(mi.Float, dr.width(self.out[-1]))])
+        self.set_grad_out(_blend_forward(self, Rows.pack(self.grad_in("columns"))))
 
     def backward(self) -> None:
         if not self.lists.pairs:  # Dr.Jit refuses to gather from an empty list, even fully masked
             return
-        δout = self.grad_out()[:-1]
+        δout = self.grad_out()
         dr.eval(δout)  # together: to gather from them would evaluate one by one what they have in common
         self.set_grad_in("columns", _blend_backward(self, δout).columns())
 
@@ -87,7 +85,7 @@ class _Blend(dr.CustomOp):
 
     def _blank(self) -> list[Any]:
         pixels = self.camera.width * self.camera.height
-        return [dr.zeros(mi.Float, pixels) for _ in range(self.features + 3)]
+        return [dr.zeros(mi.Float, pixels) for _ in range(self.features + 2)]
 
 
 @dataclass(frozen=True)
@@ -208,18 +206,17 @@ def _blend_primal(op: _Blend) -> list[Any]:
     def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
         row = op.rows.fetch(surfel, some)
         after = []
-        for pixel, _, _, active_here, transmittance, median, out in lanes.each(active, *state):
+        for pixel, _, _, active_here, transmittance, out in lanes.each(active, *state):
             sample = evaluate(row, pixel, op.camera.near)
             weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
-            in_front = (weight > 0) & (transmittance > MEDIAN_TRANSMITTANCE)
             values = _values(op, row, sample.z)
             out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
-            after.append((goes_on, transmittance_after, dr.select(in_front, sample.z, median), out))
+            after.append((goes_on, transmittance_after, out))
         return after
 
-    start = [(mi.Bool(inside), mi.Float(1), mi.Float(0), [mi.Float(0)] * maps) for inside in lanes.inside]
-    *_, median, out = _walk(op, lanes, step, start, "blend")
-    return lanes.to_raster(op, [[*totals, last] for totals, last in zip(out, median, strict=True)])
+    start = [(mi.Bool(inside), mi.Float(1), [mi.Float(0)] * maps) for inside in lanes.inside]
+    *_, out = _walk(op, lanes, step, start, "blend")
+    return lanes.to_raster(op, out)
 
 
 def _blend_backward(op: _Blend, δout: list[Any]) -> Rows:
@@ -227,7 +224,7 @@ def _blend_backward(op: _Blend, δout: list[Any]) -> Rows:
     δ = lanes.from_raster(δout)
     behind = [
         sum((a * b for a, b in zip(of_block, total, strict=True)), start=mi.Float(0))
-        for of_block, total in zip(δ, lanes.from_raster(op.out[:-1]), strict=True)
+        for of_block, total in zip(δ, lanes.from_raster(op.out), strict=True)
     ]
     δrows = Rows.zeros(op.rows.count, op.rows.width)
 

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from mi_refgs.errors import InputError
 from mi_refgs.rows import Rows
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.footprint import Footprints, depth_near, overlaps
 
-MAX_PAIR_BITS = 30
-"""Log₂ of more pairs than memory holds."""
+MAX_PAIR_BITS = 27
+"""Log₂ of the most pairs that are sorted: they take 40 bytes each, 5 GB in all."""
+
+CHUNK = 1 << 25
+"""Candidates, the tiles in the rectangles of footprints, that are looked at together: 20 bytes each, 0.7 GB.
+A view of 50,000 surfels at 1024² has a million."""
 
 
 @dataclass(frozen=True)
@@ -35,28 +43,39 @@ class TileLists:
 def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     """List every surfel in each tile that its footprint may touch.
 
-    Both sorts are stable, so surfels of equal depth keep the order of the table.
+    Both sorts are stable, so surfels of equal depth keep the order of the table. Raises InputError where more
+    than 2^MAX_PAIR_BITS pairs are left.
     """
     phase_x, phase_y = camera.phase
     tiles_x = -(-(camera.width + phase_x) // camera.tile[0])
     tiles_y = -(-(camera.height + phase_y) // camera.tile[1])
     tiles = tiles_x * tiles_y
     dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
-    surfel, tile_x, tile_y = _rectangles(footprints, camera)
-    if dr.width(surfel) == 0:
-        return _empty(tiles_x, tiles_y)
-    row = Rows.pack(footprints.columns).fetch(surfel)
+    rows = Rows.pack(footprints.columns)
     tile_size = mi.Vector2f(*camera.tile)
-    corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(phase_x, phase_y)
-    touches = overlaps(row, corner + 0.5, corner + (tile_size - 0.5))  # centres of the outermost pixels
-    tile = mi.UInt32(tile_y * tiles_x + tile_x)
-    depth = depth_near(row, corner + tile_size / 2)
-    dr.eval(touches, tile, surfel, depth)
-    kept = dr.compress(touches)
-    if dr.width(kept) == 0:
+    found: list[tuple[Any, Any]] = []
+    count = 0
+    for surfel, tile_x, tile_y in _candidates(footprints, camera):
+        row = rows.fetch(surfel)
+        corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(phase_x, phase_y)
+        touches = overlaps(row, corner + 0.5, corner + (tile_size - 0.5))  # centres of the outermost pixels
+        tile = mi.UInt32(tile_y * tiles_x + tile_x)
+        depth = depth_near(row, corner + tile_size / 2)
+        dr.eval(found, touches, tile, surfel, depth)
+        kept = dr.compress(touches)
+        count += dr.width(kept)
+        if count > 1 << MAX_PAIR_BITS:
+            raise InputError(
+                f"splat: surfels: more than {1 << MAX_PAIR_BITS:,} surfels on the {tiles:,} tiles of "
+                f"{camera.width} × {camera.height} pixels; render fewer pixels, or remove the largest surfels"
+            )
+        if dr.width(kept):
+            pairs = _join(*(dr.gather(mi.UInt32, x, kept) for x in (tile, surfel)))
+            found.append((pairs, dr.gather(mi.Float, depth, kept)))
+    if not found:
         return _empty(tiles_x, tiles_y)
-    pairs = _join(*(dr.gather(mi.UInt32, x, kept) for x in (tile, surfel)))
-    nearest_first = _nearest_first(dr.gather(mi.Float, depth, kept))
+    pairs, depth = found[0] if len(found) == 1 else (dr.concat(list(x)) for x in zip(*found, strict=True))
+    nearest_first = _nearest_first(depth)
     pairs = _sorted_by(dr.gather(mi.UInt64, pairs, nearest_first), 0, (tiles - 1).bit_length())
     tile, surfel = _upper(pairs), _lower(pairs)
     dr.eval(tile, surfel)
@@ -119,8 +138,11 @@ def _empty(tiles_x: int, tiles_y: int) -> TileLists:
     return TileLists(mi.UInt32(), none, none, tiles_x, tiles_y)
 
 
-def _rectangles(footprints: Footprints, camera: Camera) -> tuple[Any, Any, Any]:
-    """Surfel, tile column and tile row of every tile in the rectangles of footprints, surfel by surfel."""
+def _candidates(footprints: Footprints, camera: Camera) -> Iterator[tuple[Any, Any, Any]]:
+    """Surfel, tile column and tile row of every tile in the rectangles of footprints, surfel by surfel.
+
+    They come in parts of about CHUNK.
+    """
     first, last = (
         [mi.Int32((x + at) // size) for x, at, size in zip(corner, camera.phase, camera.tile, strict=True)]
         for corner in (footprints.first, footprints.last)
@@ -128,17 +150,33 @@ def _rectangles(footprints: Footprints, camera: Camera) -> tuple[Any, Any, Any]:
     covers = (footprints.last[0] >= footprints.first[0]) & (footprints.last[1] >= footprints.first[1])
     span = mi.UInt32(last[0] - first[0] + 1)
     count = dr.select(covers, span * mi.UInt32(last[1] - first[1] + 1), 0)
-    end = dr.prefix_reduce(dr.ReduceOp.Add, count, exclusive=False)
+    # 65,536 surfels on as many tiles are more than 32 bits count.
+    end = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt64(count), exclusive=False)
     dr.eval(count, span, first, end)
-    pairs = int(end[-1])
-    if pairs == 0:
-        return mi.UInt32(), mi.UInt32(), mi.UInt32()
+    total = int(end[-1])
+    if total == 0:
+        return
+    cuts = [0, total]
+    if total > CHUNK:
+        ends = end.numpy()
+        inner = ends[np.searchsorted(ends, np.arange(CHUNK, total, CHUNK, dtype=np.uint64))]
+        cuts = sorted({*cuts, *inner.tolist()})
+    for begin, stop in itertools.pairwise(cuts):
+        yield _part(first, span, count, end, begin, stop)
+
+
+def _part(first: list[Any], span: Any, count: Any, end: Any, begin: int, stop: int) -> tuple[Any, Any, Any]:
+    """Candidates number `begin` to `stop`, of whole surfels, which have `count` each and `end` in all."""
+    pairs, offset = stop - begin, dr.opaque(mi.UInt64, begin)
+    start = end - count - offset  # wraps round before the part, to numbers that are no place in it either
+    inside = (count > 0) & (start < dr.opaque(mi.UInt64, pairs))
+    start = mi.UInt32(start)
     # The index of a surfel at its first pair, and up to the next one's by a running maximum: `dr.repeat`
     # searches for every pair instead, and takes 6 times as long.
     surfel = dr.zeros(mi.UInt32, pairs)
-    dr.scatter(surfel, dr.arange(mi.UInt32, dr.width(count)), end - count, count > 0)
+    dr.scatter(surfel, dr.arange(mi.UInt32, dr.width(count)), start, inside)
     surfel = dr.prefix_reduce(dr.ReduceOp.Max, surfel, exclusive=False)
-    place = dr.arange(mi.UInt32, pairs) - dr.gather(mi.UInt32, end - count, surfel)
+    place = dr.arange(mi.UInt32, pairs) - dr.gather(mi.UInt32, start, surfel)
     span = dr.gather(mi.UInt32, span, surfel)
     # Exact below four million tiles, and in one instruction; integers are divided lane by lane.
     row = mi.UInt32((mi.Float(place) + 0.5) / mi.Float(span))
