@@ -131,3 +131,27 @@ def fuse_point(
     if covered and sightings <= unseen_vote * covered:
         return -1.0
     return total / weight if weight else 1.0
+
+
+def mesh_distance(
+    vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, direction: np.ndarray
+) -> np.ndarray:
+    """Distance (n,) along rays to the nearest of all triangles, either side; infinite for a miss.
+
+    [Möller and Trumbore 1997], every ray with every triangle.
+    """
+    a, b, c = (np.asarray(vertices, np.float64)[np.asarray(faces, int)[:, k]] for k in range(3))
+    best = np.full(len(origin), np.inf)
+    for ray in range(len(origin)):
+        o, d = origin[ray], direction[ray]
+        across = np.cross(d, c - a)
+        determinant = np.sum((b - a) * across, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = 1 / determinant
+            u = np.sum((o - a) * across, axis=1) * inverse
+            beside = np.cross(o - a, b - a)
+            v = (beside @ d) * inverse
+            t = np.sum((c - a) * beside, axis=1) * inverse
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & np.isfinite(t)
+        best[ray] = t[hit].min(initial=np.inf)
+    return best

@@ -23,7 +23,7 @@ from mi_refgs.render.reflection import reflection
 from mi_refgs.shade.models import Accuracy, ShadingPoints, Terms, reflect, safe_normalize, shade
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.splat import Blended, Camera, splat
-from mi_refgs.surfels.table import Surfels
+from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,8 @@ def render(
     `shift`: see `splat.project`.
     `shading.accuracy.traced_bounces` needs an occluder whose `set_materials` has seen these surfels.
     """
+    if surfels.count == 0:
+        surfels, shift = _nothing(surfels), None
     if shading.at == "surfel":
         return _shade_at_surfels(surfels, camera, shading, light, sh_degree, shift, aovs)
     return _shade_at_pixels(surfels, camera, shading, light, occluder, sh_degree, shift)
@@ -84,6 +86,14 @@ def render_depth(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
     """Expected camera-z depth (0 where nothing is seen) and alpha of a view, and nothing else."""
     blended = splat(surfels, [], camera)
     return blended.depth * _inverse_alpha(blended), blended.alpha
+
+
+def _nothing(surfels: Surfels) -> Surfels:
+    """One surfel that no camera sees, with the channels of an empty table: Dr.Jit refuses empty arrays."""
+    unseen = {"opacity": -LOGIT_LIMIT}
+    return Surfels(
+        {n: dr.full(mi.TensorXf, unseen.get(n, 0), (1, int(x.shape[1]))) for n, x in surfels.raw.items()}
+    )
 
 
 # ---------------- attributes of surfels ----------------

@@ -1,0 +1,172 @@
+"""Error of the method, not of its implementation: what each rule of sorting and cutting does to a picture.
+
+Everything here is float64: the same scene with one rule replaced by what it stands for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from benchmarks.stability.case import Array, Case, Raw, camera, facing, plain, sky, sphere
+from benchmarks.stability.measure import light_of
+from mi_refgs.reference import picture as oracle
+
+WIDTH, HEIGHT = 48, 40
+SAMPLES = 4
+"""Along each axis of a pixel, for the mean that the low-pass stands for."""
+NEARLY_ONE = 1 - 1e-9
+OPACITIES = (0.9, 0.3, 0.1, 0.05)
+
+
+def scenes() -> Iterator[Case]:
+    """Scenes whose surfels hide each other in different ways."""
+    eye = camera(width=WIDTH, height=HEIGHT)
+    flat: dict[str, Any] = {"camera": eye, "at": "surfel", "reflectance": "radiance"}
+    rng = np.random.default_rng(21)
+    ball = sphere(400)
+    ball["scale"] = np.log(rng.uniform(0.06, 0.16, (400, 2)))
+    yield plain("sphere of surfels", raw=ball, **flat)
+    mirror = sphere(600)
+    normal = mirror["position"]
+    mirror |= {
+        "position": normal * (1 + 0.004 * rng.normal(size=(600, 1))),
+        "rotation": facing(normal) + 0.02 * rng.normal(size=(600, 4)),
+        "scale": np.log(rng.uniform(0.05, 0.12, (600, 2))),
+        "opacity": rng.uniform(0, 7, (600, 1)),
+        "metallic": np.full((600, 1), 4.0),
+        "roughness": np.full((600, 1), -2.0),
+    }
+    yield plain("curved near-mirror", raw=mirror, camera=eye, light=sky(32))
+    yield plain("planes through each other", raw=_planes(rng), **flat)
+    mist = sphere(300)
+    mist |= {
+        "position": rng.uniform(-1, 1, (300, 3)),
+        "rotation": rng.normal(size=(300, 4)),
+        "scale": np.log(rng.uniform(0.1, 0.4, (300, 2))),
+        "opacity": rng.uniform(-3, -1, (300, 1)),
+    }
+    yield plain("mist of faint surfels", raw=mist, **flat)
+
+
+def _planes(rng: np.random.Generator) -> Raw:
+    """Two crossing sheets of opaque discs, each of one colour."""
+    raw = sphere(240)
+    normals = np.array([[0.6, 0, 0.8], [0.8, 0, -0.6]])[np.arange(240) % 2]
+    flat = rng.uniform(-1, 1, (240, 3))
+    raw["position"] = flat - np.sum(flat * normals, 1, keepdims=True) * normals
+    raw["rotation"] = facing(normals)
+    raw["scale"] = np.full((240, 2), np.log(0.15))
+    raw["opacity"] = np.full((240, 1), 8.0)
+    raw["radiance_sh"] = (
+        np.where(np.arange(27) < 3, 1.0, 0) * np.where(np.arange(240) % 2, 1.2, -1.2)[:, None]
+    )
+    return raw
+
+
+def measure() -> dict[str, Any]:
+    """Rows of every scene and rule, and the bias of the gradient that the cut at α_min has."""
+    rows = [row for case in scenes() for row in _rules(case.rounded())]
+    return {"rules": rows, "gradient": [_cut(opacity) for opacity in OPACITIES]}
+
+
+def _rules(case: Case) -> Iterator[dict[str, Any]]:
+    light = light_of(case.light) if case.reflectance == "split_sum" else None
+    base = _scene(case, light)
+    pixel_sorted = replace(base, order=_by_pixel(base))
+    depth = oracle.camera_frame(base.raw, base.camera)[0][:, 2]
+    by_centre = np.broadcast_to(np.argsort(depth, kind="stable")[:, None], base.order.shape)
+    exact = oracle.render(pixel_sorted)
+    pairs: list[tuple[str, Callable[[], oracle.Picture], Callable[[], oracle.Picture]]] = [
+        ("sorted by tile → by pixel", lambda: oracle.render(base), lambda: exact),
+        ("sorted by centre → by pixel", lambda: oracle.render(replace(base, order=by_centre)), lambda: exact),
+    ]
+    for name, change in (
+        ("ALPHA_MIN 1/255 → 0", {"alpha_min": 0.0}),
+        ("ALPHA_MAX 0.99 → 1", {"alpha_max": NEARLY_ONE}),
+        ("TRANSMITTANCE_MIN 1e-4 → 0", {"transmittance_min": 0.0}),
+        ("EDGE_ON_COSINE 1e-4 → 0", {"edge_on": 0.0}),
+    ):
+        other = replace(pixel_sorted, rules=replace(base.rules, **change))
+        pairs.append((name, lambda: exact, lambda other=other: oracle.render(other)))  # type: ignore[misc]
+    fine = _supersampled(case, light)
+    plain_rays = replace(pixel_sorted, rules=replace(base.rules, low_pass=None))
+    pairs.append(("low-pass → mean of the pixel", lambda: exact, lambda: fine))
+    pairs.append(("no low-pass → mean of the pixel", lambda: oracle.render(plain_rays), lambda: fine))
+    for name, ours, truth in pairs:
+        yield {"scene": case.name, "rule": name} | _difference(ours(), truth())
+
+
+def _difference(ours: oracle.Picture, truth: oracle.Picture) -> dict[str, float]:
+    a, b = ours.maps["radiance"], truth.maps["radiance"]
+    mean = float(np.mean(np.abs(b)))
+    return {
+        "bias": float(np.mean(a - b)) / mean,
+        "mean": float(np.mean(np.abs(a - b))) / mean,
+        "max": float(np.max(np.abs(a - b))) / float(np.abs(b).max()),
+        "alpha": float(np.mean(ours.maps["alpha"] - truth.maps["alpha"])),
+    }
+
+
+def _scene(case: Case, light: oracle.Light | None) -> oracle.Scene:
+    c = case.camera
+    pixels = np.arange(c.width * c.height)
+    raw = {n: np.asarray(x, np.float64) for n, x in case.raw.items()}
+    key = oracle.sort_key(raw, c, pixels, (0, 0))
+    order = np.argsort(key, axis=0, kind="stable")
+    return oracle.Scene(raw, c, pixels, order, case.at, case.reflectance, case.diffuse, light)
+
+
+def _by_pixel(scene: oracle.Scene) -> Array:
+    """Order (N, P) by the depth of each pixel's own sample."""
+    return np.argsort(oracle.sample_depth(scene), axis=0, kind="stable")
+
+
+def _supersampled(case: Case, light: oracle.Light | None) -> oracle.Picture:
+    """Means over SAMPLES² rays a pixel, without the low-pass."""
+    c = case.camera
+    fine = replace(
+        c, width=SAMPLES * c.width, height=SAMPLES * c.height, fx=SAMPLES * c.fx, fy=SAMPLES * c.fy,
+        cx=SAMPLES * c.cx, cy=SAMPLES * c.cy,
+    )  # fmt: skip
+    raw = {n: np.asarray(x, np.float64) for n, x in case.raw.items()}
+    maps: dict[str, list[Array]] = {"radiance": [], "alpha": []}
+    for row in range(c.height):  # a row of pixels at a time: memory
+        pixels = np.arange(SAMPLES * fine.width) + row * SAMPLES * fine.width
+        scene = oracle.Scene(
+            raw, fine, pixels, np.empty((0, 0), int), case.at, case.reflectance, case.diffuse, light,
+            rules=oracle.Rules(low_pass=None),
+        )  # fmt: skip
+        picture = oracle.render(replace(scene, order=_by_pixel(scene)))
+        for name, found in maps.items():
+            blocks = picture.maps[name].reshape(SAMPLES, c.width, SAMPLES, -1)
+            found.append(blocks.mean((0, 2)))
+    joined = {name: np.concatenate(found) for name, found in maps.items()}
+    return oracle.Picture(joined, np.zeros(c.width * c.height, bool), np.empty((0, 0), bool))
+
+
+def _cut(opacity: float) -> dict[str, float]:
+    """Relative error of d Σα / d log scale, and of d Σα / d logit, of one surfel: the cut's own derivative
+    is missing. Against differences of the sum over a fine grid."""
+    c = camera((0, 0, 4.0), width=200, height=200, fov=30)
+    raw = {n: x[:1].astype(np.float64) for n, x in sphere().items()} | {"position": np.zeros((1, 3))}
+    raw |= {"rotation": np.array([[0.1, 0.05, 0, 1.0]]), "scale": np.full((1, 2), np.log(0.25))}
+    raw["opacity"] = np.array([[np.log(opacity / (1 - opacity))]])
+    pixels = np.arange(c.width * c.height)
+    order = np.zeros((1, len(pixels)), int)
+    scene = oracle.Scene(raw, c, pixels, order, "surfel", "radiance")
+    weights = {"alpha": np.ones((len(pixels), 1))}
+    gradients = oracle.render(scene, weights).gradients
+
+    def total(name: str, step: float) -> float:
+        other = replace(scene, raw=raw | {name: raw[name] + step})
+        return float(oracle.render(other).maps["alpha"].sum())
+
+    row = {"opacity": opacity}
+    for name in ("scale", "opacity"):
+        slope = (total(name, 0.02) - total(name, -0.02)) / 0.04
+        row[f"{name}_bias"] = float(gradients[name].sum()) / slope - 1
+    return row

@@ -1,0 +1,349 @@
+"""The catalogue of hard cases: pictures and their gradients."""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from benchmarks.stability.case import (
+    HEIGHT,
+    WIDTH,
+    Array,
+    Case,
+    Raw,
+    camera,
+    facing,
+    plain,
+    raw_light,
+    sky,
+    sphere,
+)  # fmt: skip
+from mi_refgs.occlusion.mesh import Mesh, read_mesh
+from mi_refgs.reference.splat import PinholeCamera
+
+LN = np.log
+
+
+def catalogue() -> list[Case]:
+    """Every case, groups in the order of the page."""
+    groups = (_ends, _normals, _scales, _places, _many, _worlds, _lights, _pictures, _cameras, _meshes)
+    return [case for group in groups for case in group()]
+
+
+def where(mask: Any, values: Any, channel: str, raw: Raw | None = None) -> Raw:
+    """The plain channel with new values in some rows."""
+    out = (raw or sphere())[channel].copy()
+    out[mask] = values
+    return {channel: out}
+
+
+def every(n: int = 2, k: int = 0, count: int = 40) -> Array:
+    """Rows k, k + n, …"""
+    return np.arange(count) % n == k
+
+
+# ---------------- ends of ranges ----------------
+
+
+def _ends() -> Iterator[Case]:
+    yield plain("plain scene")
+    yield plain("plain scene, shaded at surfels", at="surfel", diffuse="irradiance")
+    for name, logit in (("0", -30.0), ("1", 30.0)):
+        yield plain(f"roughness {name}", raw={"roughness": np.full((40, 1), logit)})
+    yield plain("roughness 0 beside 1", raw=where(every(), 30.0, "roughness") | {})
+    for name, logit in (("0", -30.0), ("1", 30.0)):
+        yield plain(f"metallic {name}", raw={"metallic": np.full((40, 1), logit)})
+    yield plain("albedo 0 and 1", raw=where(every(), 30.0, "albedo", {"albedo": np.full((40, 3), -30.0)}))
+    yield plain("opacity logit +30", raw={"opacity": np.full((40, 1), 30.0)})
+    yield plain("opacity logit -30: all transparent", raw={"opacity": np.full((40, 1), -30.0)})
+    mixed = where(every(), 30.0, "opacity", {"opacity": np.full((40, 1), -30.0)})
+    yield plain("opacity logits ±30", raw=mixed)
+    yield plain("opacity just above 1/255", raw={"opacity": np.full((40, 1), LN(0.0045))})
+
+
+def _normals() -> Iterator[Case]:
+    eye = np.array([3.0, 1.0, 2.0])
+    rng = np.random.default_rng(2)
+    for name, slope in (("N·V → 0: 0.01", 0.01), ("N·V → 0: 0.001", 0.001), ("N·V negative: -0.1", -0.1)):
+        position = sphere()["position"]
+        view = eye - position
+        view /= np.linalg.norm(view, axis=1, keepdims=True)
+        side = np.cross(view, rng.normal(size=(40, 3)))
+        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        normal = np.sqrt(1 - slope**2) * side + slope * view
+        yield plain(name, raw={"rotation": facing(normal), "scale": np.full((40, 2), LN(0.4))})
+    # Two wide discs in one place, of the same weight everywhere: α₁ = α₂ (1 - α₁).
+    pair = {n: x[:2] for n, x in sphere().items()}
+    view, side = eye / np.linalg.norm(eye), np.cross(eye, [0.3, 0.2, 1.0])
+    side /= np.linalg.norm(side)
+    tilt = 0.2  # below FACING_TOLERANCE: the second normal stays turned away
+    first = np.sqrt(1 - tilt**2) * side + tilt * view
+    for name, angle in (("normals that cancel but for 1e-3", 1e-3), ("normals that cancel", 0.0)):
+        second = angle * np.cross(first, side) - first
+        normals = np.stack([first, second / np.linalg.norm(second)])
+        both = {"position": np.zeros((2, 3)), "rotation": facing(normals), "scale": np.full((2, 2), LN(100))}
+        opacity = np.array([[LN(0.3 / 0.7)], [LN((3 / 7) / (4 / 7))]])
+        yield plain(name, raw=pair | both | {"opacity": opacity})
+    for name, size in (("quaternions of length 1e-10", 1e-10), ("quaternions of length 1e10", 1e10)):
+        yield plain(name, raw={"rotation": size * sphere()["rotation"]})
+    yield plain("quaternions 0", raw=where(every(), 0.0, "rotation"))
+
+
+# ---------------- sizes and places ----------------
+
+
+def _scales() -> Iterator[Case]:
+    yield plain("scales 1e-8", raw={"scale": np.full((40, 2), LN(1e-8))})
+    yield plain("some scales 1e-8", raw=where(every(), LN(1e-8), "scale"))
+    yield plain("scales 0 (log scale -1000)", raw=where(every(), -1000.0, "scale"))
+    yield plain("scales 1e3", raw=where(every(4), LN(1e3), "scale"))
+    yield plain("scales 1e6", raw=where(every(4), LN(1e6), "scale"))
+    for ratio in (1e4, 1e6):
+        scale = np.tile([LN(0.5), LN(0.5 / ratio)], (40, 1))
+        yield plain(f"anisotropy {ratio:.0e}, length 0.5", raw={"scale": scale})
+        scale = np.tile([LN(0.05 * ratio), LN(0.05)], (40, 1))
+        yield plain(f"anisotropy {ratio:.0e}, width 0.05", raw={"scale": scale})
+        raw, eye, corner = _part_of_film(1024, 1.5)
+        raw["scale"] = raw["scale"] + [float(LN(ratio)), 0]
+        name = f"anisotropy {ratio:.0e}, width of 1.5 pixels in a film of 1024²"
+        yield plain(name, raw=raw, camera=eye, offset=corner)
+
+
+def _places() -> Iterator[Case]:
+    eye = np.array([3.0, 1.0, 2.0])
+    forward = -eye / np.linalg.norm(eye)
+    position = sphere()["position"]
+    view = eye - position
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    rng = np.random.default_rng(4)
+    side = np.cross(view, rng.normal(size=(40, 3)))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    for slope in (1e-5, 2e-4, 1e-3):
+        normal = side + slope * view
+        yield plain(f"edge-on, cosine {slope:g}", raw={"rotation": facing(normal)})
+    behind = where(every(), position[every()] + 6 * eye / np.linalg.norm(eye), "position")
+    yield plain("half of the surfels behind the camera", raw=behind)
+    for distance in (1e-1, 1e-3, 1e-6):
+        near = where(every(8), (eye + distance * forward + 0.01 * distance * side)[every(8)], "position")
+        yield plain(f"surfels {distance:g} before the eye", raw=near | {"opacity": np.full((40, 1), -1.0)})
+    yield plain("surfels at the eye", raw=where(every(8), np.float32(eye), "position"))
+    across = where(every(4), (eye + 0.5 * forward + 0.05 * side)[every(4)], "position")
+    raw = across | {"rotation": facing(side + 0.3 * view), "scale": np.full((40, 2), LN(0.6))}
+    yield plain("across the eye's plane", raw=raw)
+    yield plain("across the near plane", raw=raw, near=0.5)
+
+
+def _many() -> Iterator[Case]:
+    rng = np.random.default_rng(6)
+
+    def stack(count: int, opacity: float, step: float, spread: float = 0.0, size: float = 3.0) -> Raw:
+        raw = {n: np.repeat(x[:1], count, 0) for n, x in sphere(degree=0).items()}
+        z = step * np.arange(count)[:, None] * np.array([0, 0, -1.0])
+        raw["position"] = z + spread * rng.normal(size=(count, 3))
+        raw["rotation"] = np.tile([0.05, 0.02, 0, 1.0], (count, 1))
+        raw["scale"] = np.full((count, 2), LN(size))
+        raw["opacity"] = np.full((count, 1), LN(opacity / (1 - opacity)))
+        for name in ("radiance_sh", "albedo", "metallic", "roughness"):
+            raw[name] = raw[name] + 0.3 * rng.normal(size=raw[name].shape)
+        return raw
+
+    eye = camera((0.2, 0.1, 4.0))
+    yield Case("100 coincident surfels", stack(100, 0.05, 0), eye, sky())
+    for count, opacity in ((10_000, 0.01), (100_000, 0.005)):
+        name = f"{count:.0e} coincident surfels"
+        yield Case(name, stack(count, opacity, 0), eye, sky(), pixels=12, quick=False)
+    flat = stack(200, 0.3, 0, 0.4, 0.5)
+    flat["position"][:, 2] = 0
+    yield Case("200 surfels of identical depth", flat, camera((0, 0, 4.0)), sky())
+    yield Case("5,000 layers of opacity 0.005", stack(5000, 0.005, 2e-4), eye, sky(), pixels=64, quick=False)
+    yield Case("5,000 layers of opacity 0.5", stack(5000, 0.5, 2e-4), eye, sky(), pixels=64, quick=False)
+
+
+# ---------------- the world ----------------
+
+
+def scaled(case: Case, name: str, factor: float) -> Case:
+    """The case with every length times `factor`."""
+    size = float(LN(factor))
+    raw: Raw = {**case.raw, "position": factor * case.raw["position"], "scale": case.raw["scale"] + size}
+    pose = case.camera.to_world.copy()
+    pose[:3, 3] *= factor
+    return replace(case, name=name, raw=raw, camera=replace(case.camera, to_world=pose))
+
+
+def moved(case: Case, name: str, offset: Array) -> Case:
+    """The case elsewhere; positions are those that float32 has there."""
+    position = (case.raw["position"] + offset).astype(np.float32)
+    pose = case.camera.to_world.copy()
+    pose[:3, 3] += offset
+    raw: Raw = {**case.raw, "position": position}
+    return replace(case, name=name, raw=raw, camera=replace(case.camera, to_world=pose))
+
+
+def _worlds() -> Iterator[Case]:
+    for power in (-6, -4, -3, 3, 6):
+        yield scaled(plain("plain"), f"the scene times 1e{power:+d}", 10.0**power)
+    yield scaled(replace(_plates(), near=None), "mesh and scene times 1e-3", 1e-3)
+    for extents in (1e3, 1e5):
+        offset = extents * np.array([1.0, -0.7, 0.4])
+        yield moved(plain("plain"), f"the scene moved by {extents:.0e} extents", offset)
+
+
+def _lights() -> Iterator[Case]:
+    shiny = {"roughness": sphere()["roughness"] - 2, "metallic": np.full((40, 1), 2.0)}
+    yield plain("a light with a peak of 1e6", raw=shiny, light=sky(peak=1e6))
+    yield plain("a light of 1e6 everywhere", light=np.full((16, 32, 3), 1e6))
+    yield plain("a black light (1e-4, the floor)", light=raw_light(np.full((16, 32, 3), 1e-4)))
+    yield plain("a black light (raw -80)", light=np.full((16, 32, 3), -80.0))
+    yield plain("the smallest map", light=sky(8), raw=shiny)
+    below = np.full((16, 32, 3), 1.0)
+    below[13, 5] = 1e6
+    sheet = _level((0, 1, 0)) | {"roughness": np.full((40, 1), -1.0)}
+    above = camera((1.5, 4, 0.5))
+    yield plain("a sun of 1e6 below the horizon", raw=sheet, camera=above, light=raw_light(below))
+    poles = {"roughness": np.full((40, 1), -6.0), "metallic": np.full((40, 1), 3.0)}
+    # Seen from above, mirrors around the top reflect the pole; from -z, those before the camera the seam.
+    yield plain("mirrors that reflect a pole", raw=poles | _level((0, 1, 0)), camera=camera((0.05, 4, 0.02)))
+    yield plain("mirrors that reflect the seam", raw=poles | _level((0, 0, -1)), camera=camera((0, 0.4, -4)))
+    yield plain(
+        "mirrors that reflect the other half", raw=poles | _level((0, 0, 1)), camera=camera((0, 0.4, 4))
+    )
+
+
+def _level(normal: tuple[float, float, float]) -> Raw:
+    """Discs in a plane, their normals within some degrees of its own."""
+    rng = np.random.default_rng(8)
+    n = np.array(normal) + 0.03 * rng.normal(size=(40, 3))
+    flat = rng.uniform(-1, 1, (40, 3))
+    flat -= np.sum(flat * np.array(normal), 1, keepdims=True) * np.array(normal)
+    return {"position": flat, "rotation": facing(n / np.linalg.norm(n, axis=1, keepdims=True))}
+
+
+# ---------------- pictures and cameras ----------------
+
+
+def _pictures() -> Iterator[Case]:
+    for width, height in ((1, 1), (1, 17), (17, 1), (13, 7)):
+        focal = camera().fx * max(width, 4) / WIDTH
+        eye = replace(camera(width=width, height=height), fx=focal, fy=focal)
+        yield plain(f"a picture of {width} × {height}", camera=eye, quick=width == 1)
+    flat: dict[str, Any] = {"at": "surfel", "reflectance": "radiance"}
+    large = camera(width=4096, height=4096)
+    yield plain("a picture of 4096²", camera=large, pixels=600, quick=False, **flat)
+    one = {n: x[:1] for n, x in sphere().items()} | {"position": np.zeros((1, 3))}
+    yield plain("one surfel", raw=one)
+    none = {n: x[:0] for n, x in sphere().items()}
+    yield plain("no surfel", raw=none)
+    raw, eye, corner = _part_of_film(4096, 2)
+    name = "surfels of 2 pixels in a film of 4096²"
+    yield plain(name, raw=raw, camera=eye, offset=corner, band=5e-3)
+    full = camera()
+    crop = replace(full, width=11, height=9, cx=full.cx - 5, cy=full.cy - 6)
+    yield plain("a crop window", camera=crop, offset=(5, 6), quick=False)
+
+
+def _part_of_film(size: int, pixels: float) -> tuple[Raw, PinholeCamera, tuple[int, int]]:
+    """Surfels of so many pixels that fill a window near the corner of a film; its camera and its corner."""
+    far, corner = camera(width=size, height=size), (size * 7 // 8, size * 6 // 7)
+    part = replace(far, width=WIDTH, height=HEIGHT, cx=far.cx - corner[0], cy=far.cy - corner[1])
+    inside = np.random.default_rng(12).uniform(0, 1, (40, 2)) * [WIDTH, HEIGHT] - [part.cx, part.cy]
+    local = 4 * np.concatenate([inside / part.fx, np.ones((40, 1))], axis=1)
+    position = local @ part.to_world[:3, :3].T + part.to_world[:3, 3]
+    scale = np.full((40, 2), float(LN(4 * pixels / abs(part.fx))))
+    return {"position": position, "scale": scale}, part, corner
+
+
+def _cameras() -> Iterator[Case]:
+    eye = np.array([3.0, 1.0, 2.0])
+    yield plain("a field of view of 1°", camera=camera(tuple(40 * eye), fov=1.0))
+    yield plain("a field of view of 150°", camera=camera(tuple(0.35 * eye), fov=150.0))
+    yield plain("a camera at the object's centre", camera=camera((0, 0, 0), (1, 0.5, 0.2), 90))
+    yield plain("a camera inside, near the wall", camera=camera((0.7, 0.5, 0.1), (-1, 0.5, 0.2), 90))
+
+
+# ---------------- meshes ----------------
+
+
+def _grid(n: int, size: float, y: float) -> tuple[Array, Array]:
+    """A plate of n² × 2 triangles at height y, facing up."""
+    g = np.stack(np.meshgrid(np.linspace(-1, 1, n + 1), np.linspace(-1, 1, n + 1), indexing="ij"), -1)
+    x, z = size * g.reshape(-1, 2).T
+    i = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    a, b, c, d = (q.ravel() for q in (i[:-1, :-1], i[1:, :-1], i[:-1, 1:], i[1:, 1:]))
+    return np.stack([x, y + 0 * x, z], 1), np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
+
+
+def _discs_on_plate(y: float = 0.0, tilt: float = 0.05) -> Raw:
+    rng = np.random.default_rng(9)
+    normal = np.array([0, 1.0, 0]) + tilt * rng.normal(size=(40, 3))
+    position = np.stack([rng.uniform(-1, 1, 40), np.full(40, y), rng.uniform(-1, 1, 40)], 1)
+    return {
+        "position": position,
+        "rotation": facing(normal / np.linalg.norm(normal, axis=1, keepdims=True)),
+        "opacity": np.full((40, 1), 2.0),
+        "roughness": np.full((40, 1), -2.0),
+        "metallic": np.full((40, 1), 1.0),
+    }
+
+
+def _with_mesh(name: str, parts: list[tuple[Array, Array]], voxel: float, **changes: Any) -> Case:
+    vertices, faces = (np.zeros((0, 3)), np.zeros((0, 3), int)) if not parts else _joined(parts)
+    mesh = Mesh(vertices.astype(np.float32), faces.astype(np.uint32), voxel)
+    surface = (mesh.vertices.astype(np.float64), faces, 2 * voxel)
+    return plain(name, mesh=lambda: mesh, surface=surface, **changes)
+
+
+def _joined(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    starts = np.cumsum([0] + [len(v) for v, _ in parts])
+    return (
+        np.concatenate([v for v, _ in parts]),
+        np.concatenate([f + s for (_, f), s in zip(parts, starts, strict=False)]),
+    )
+
+
+def _plates() -> Case:
+    """A mirror below half a ceiling."""
+    ceiling = _grid(3, 0.8, 0.5)
+    return _with_mesh(
+        "two plates",
+        [_grid(3, 1.5, 0.0), ceiling],
+        1e-3,
+        raw=_discs_on_plate(),
+        camera=camera((2.5, 1.6, 1.5)),
+    )
+
+
+def _meshes() -> Iterator[Case]:
+    yield _with_mesh("an empty mesh", [], 1.0)
+    sheet: Any = {"raw": _discs_on_plate(), "quick": True}
+    wall = _grid(2, 1.5, 0.0)
+    wall = (wall[0] @ np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, 1]]) - [1.3, 0, 0], wall[1])
+    parts = [_grid(3, 1.5, 0.0), wall]
+    yield _with_mesh("an open sheet from above", parts, 1e-2, **sheet, camera=camera((2.5, 1.6, 1.5)))
+    yield _with_mesh("an open sheet from below", parts, 1e-2, **sheet, camera=camera((2.5, -1.6, 1.5)))
+    yield _plates()
+    foreign = functools.partial(_foreign, _plates())
+    yield replace(_plates(), name="the same mesh, made elsewhere", mesh=foreign, further=0.04)
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    grazing = _with_mesh(
+        "a grazing self-hit", [(np.asarray(ball.vertices), np.asarray(ball.faces))], 5e-3,
+        raw={"rotation": facing(sphere()["position"]), "opacity": np.full((40, 1), 2.0)},
+        camera=camera((3.0, 0.3, 2.0), (0.0, 1.0, 0.0), 20),
+    )  # fmt: skip
+    yield grazing
+
+
+def _foreign(case: Case) -> Mesh:
+    """The case's mesh through a file that says nothing about its making."""
+    vertices, faces, _ = case.surface
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.obj"
+        trimesh.Trimesh(vertices, faces, process=False).export(path)
+        return read_mesh(path)

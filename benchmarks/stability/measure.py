@@ -1,0 +1,412 @@
+"""One case by the product, by the float64 oracle, and by the textbook: errors, non-finite values, verdict."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from benchmarks.stability import textbook
+from benchmarks.stability.case import Array, Case
+from mi_refgs.device import upload, upload_tensor
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.reference import occlusion as trace
+from mi_refgs.reference import picture as oracle
+from mi_refgs.render.depth_normals import normals_from_depth
+from mi_refgs.render.pipeline import Shading, render
+from mi_refgs.shade import brdf, lobe
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.splat import Camera, list_by_tile, project
+from mi_refgs.surfels.table import Surfels
+
+IMAGE_LIMIT = 1e-4
+"""Largest error of a map's pixel, relative to the map's largest value: a fortieth of an 8-bit step."""
+GRADIENT_LIMIT = 1e-2
+"""Largest ‖g - g₆₄‖ / ‖g₆₄‖ of a class of parameters."""
+ORDER_LIMIT = 1e-5
+"""Largest relative difference of the depths of two surfels that show in the wrong order."""
+ULP = 2.0**-23
+ILL = 8.0
+"""An error of up to so many times what one unit in the last place of the inputs does to the exact answer is
+the input's own: no float32 formula could do better."""
+NEGLIGIBLE = 1e-5
+"""A class whose gradient is smaller than this share of the largest class's (positions in units of the
+scene's extent) is compared with that share: GRADIENT_LIMIT of it is float32's resolution of the largest."""
+KEPT = 0.4
+"""Share of the pixels that show something which must lie outside the oracle's declared bands."""
+LOSS_MAPS = ("radiance", "alpha", "depth", "normal")
+GRADIENTS = (
+    "position", "rotation", "scale", "opacity", "radiance_sh", "albedo", "metallic", "roughness",
+    "indirect_sh", "light",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is measured of a case. Errors are relative, see IMAGE_LIMIT and GRADIENT_LIMIT."""
+
+    name: str
+    image: float  # of radiance and alpha
+    maps: float  # of depth, normal and materials
+    gradients: dict[str, float]
+    non_finite: int
+    kept: float  # share of the pixels that show something, outside the declared bands
+    order: float
+    image_floor: float  # change of the exact answer by one ulp of the inputs
+    gradient_floor: dict[str, float]
+    textbook: float  # image error of the textbook formulas; inf where they are not finite
+    verdict: str
+    note: str = ""
+
+
+# ---------------- the product ----------------
+
+
+def fast_camera(case: Case) -> Camera:
+    """The product's camera, with its own near plane unless the case sets one."""
+    c = case.camera
+    near = {} if case.near is None else {"near": case.near}
+    found = Camera.look(c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.to_world, **near)
+    return replace(found, offset=case.offset)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the product made: maps (H·W, …), gradients, and how many values are not finite."""
+
+    maps: dict[str, Array]
+    gradients: dict[str, Array]
+    non_finite: int
+
+
+def occluder_of(case: Case) -> Occluder | None:
+    """The case's mesh as an occluder; None without one."""
+    return None if case.mesh is None else Occluder(case.mesh())
+
+
+def product(case: Case, weights: dict[str, Array]) -> Found:
+    """Render, and differentiate Σ weights · maps (H·W, …)."""
+    surfels = Surfels({name: upload_tensor(x) for name, x in case.raw.items()})
+    light = EnvironmentLight(upload_tensor(case.light))
+    surfels.enable_grad()
+    dr.enable_grad(light.raw)
+    camera = fast_camera(case)
+    shading: Any = Shading(case.at, case.reflectance, case.diffuse, case.mesh is not None)  # type: ignore[arg-type]
+    occluder = occluder_of(case)
+    used = light.prefilter() if case.reflectance == "split_sum" else None
+    frame = render(surfels, camera, shading, used, occluder, aovs=case.reflectance == "split_sum")
+    planes: dict[str, list[Any]] = {
+        "radiance": list(frame.radiance),
+        "alpha": [frame.alpha],
+        "depth": [frame.depth],
+        "normal": list(frame.normal),
+    }
+    for name, value in frame.maps.items():
+        planes[name] = list(value) if name == "albedo" else [value]
+    others: list[Any] = list(normals_from_depth(frame.depth, frame.alpha, camera)[0])
+    if frame.terms is not None:
+        others += [*frame.terms.diffuse, *frame.terms.specular, *frame.terms.indirect]
+    loss = mi.Float(0)
+    for name, weight in weights.items():
+        for plane, w in zip(planes[name], weight.reshape(len(weight), -1).T, strict=True):
+            loss += dr.sum(plane * upload(w))
+    attached = dr.grad_enabled(loss)
+    if attached:
+        dr.backward(loss)
+    gradients = {name: dr.grad(x).numpy() for name, x in surfels.raw.items()}
+    gradients["light"] = dr.grad(light.raw).numpy()
+    pixels = case.camera.width * case.camera.height
+    maps = {n: np.stack([_plane(x, pixels) for x in values], 1) for n, values in planes.items()}
+    arrays = [*maps.values(), *gradients.values(), *(_plane(x, pixels) for x in others)]
+    return Found(maps, gradients, sum(int(np.sum(~np.isfinite(x))) for x in arrays))
+
+
+def _plane(x: Any, pixels: int) -> Array:
+    return np.broadcast_to(np.array(dr.detach(x)), (pixels,)).astype(np.float64)
+
+
+# ---------------- the oracle's scene ----------------
+
+
+@functools.lru_cache(maxsize=8)
+def _operator(height: int) -> list[Array]:
+    """Dense prefilter matrices (h_out · 2h_out, h · 2h) of the product's levels, float64."""
+    matrices = []
+    φ = lobe.column_angles(2 * height)
+    for level in lobe.build_levels(height):
+        m = np.arange(level.weights.shape[2])
+        across = np.cos(m[:, None, None] * (lobe.column_angles(2 * level.height)[:, None] - φ))
+        dense = np.einsum("ikm,mab->iakb", level.weights, across, optimize=True)
+        matrices.append(dense.reshape(2 * level.height**2, 2 * height**2))
+    return matrices
+
+
+def softplus(raw: Array) -> Array:
+    """log(1 + exp x), float64."""
+    return np.logaddexp(0, np.asarray(raw, np.float64))
+
+
+def light_of(raw: Array) -> oracle.Light:
+    """The oracle's light."""
+    radiance = softplus(raw)
+    flat = radiance.reshape(-1, 3)
+    levels = [(m @ flat) for m in _operator(len(raw))]
+    shaped = [x.reshape(h := int(np.sqrt(len(x) / 2)), 2 * h, 3) for x in levels]
+    return oracle.Light([radiance, *shaped], lobe.LEVEL_ROUGHNESS, brdf.table().astype(np.float64))
+
+
+def light_gradient(raw: Array, light: oracle.Light, δflat: Array) -> Array:
+    """δraw of δ of the flat levels."""
+    first, *rest = light.split(δflat)
+    δradiance = first.reshape(-1, 3)
+    for matrix, δ in zip(_operator(len(raw)), rest, strict=True):
+        δradiance = δradiance + matrix.T @ δ.reshape(-1, 3)
+    return δradiance.reshape(raw.shape) / (1 + np.exp(-np.asarray(raw, np.float64)))
+
+
+def product_order(case: Case, pixels: Array) -> Array:
+    """The product's order (N, P) of surfels at pixels; those that the tile does not list come last."""
+    count = len(case.raw["position"])
+    camera = fast_camera(case)
+    surfels = Surfels({name: upload_tensor(x) for name, x in case.raw.items()})
+    lists = list_by_tile(project(surfels, camera), camera)
+    listed, begin, end = (
+        np.array(x).astype(int) for x in (lists.surfel_from_pair, lists.pair_begin, lists.pair_end)
+    )
+    (width, height), (left, top) = camera.tile, camera.phase
+    x, y = (pixels % camera.width + left) // width, (pixels // camera.width + top) // height
+    order = np.empty((count, len(pixels)), int)
+    for tile in np.unique(y * lists.tiles_x + x):
+        first = listed[begin[tile] : end[tile]]
+        rest = np.ones(count, bool)
+        rest[first] = False
+        order[:, y * lists.tiles_x + x == tile] = np.concatenate([first, np.nonzero(rest)[0]])[:, None]
+    return order
+
+
+def scene_of(case: Case, pixels: Array, order: Array, light: oracle.Light | None = None) -> oracle.Scene:
+    """The oracle's scene of a case."""
+    visibility = None
+    if case.surface is not None:
+        visibility = functools.partial(_visibility, case)
+    eye = replace(case.camera, near=0.0 if case.near is None else case.near)
+    light = light if light is not None or case.reflectance == "radiance" else light_of(case.light)
+    raw = {n: np.asarray(x, np.float64) for n, x in case.raw.items()}
+    return oracle.Scene(raw, eye, pixels, order, case.at, case.reflectance, case.diffuse, light, visibility)
+
+
+def _visibility(case: Case, normal: Array, ray: Array, further: float = 0.0) -> Array:
+    vertices, faces, offset = case.surface
+    offset += further
+    if not len(faces):
+        return np.ones(len(normal))
+    origin = np.broadcast_to(case.camera.to_world[:3, 3], ray.shape)
+    t = trace.mesh_distance(vertices, faces, origin, ray)
+    hit = np.isfinite(t)
+    point = origin + np.where(hit, t, 0)[:, None] * ray + offset * normal
+    mirror = ray - 2 * np.sum(normal * ray, 1, keepdims=True) * normal
+    return np.where(hit & np.isfinite(trace.mesh_distance(vertices, faces, point, mirror)), 0.0, 1.0)
+
+
+# ---------------- comparing ----------------
+
+
+def chosen_pixels(case: Case) -> Array:
+    """Raster indices that the oracle looks at."""
+    every = case.camera.width * case.camera.height
+    if case.pixels is None or case.pixels >= every:
+        return np.arange(every)
+    return np.sort(np.random.default_rng(5).choice(every, case.pixels, replace=False))
+
+
+def measure(case: Case, floors: bool = True, book: bool = True) -> Row:
+    """All numbers of a case.
+
+    `floors`: the condition of the answer even where nothing exceeds a limit; `book`: the textbook's error.
+    """
+    case = case.rounded()
+    pixels = chosen_pixels(case)
+    order = product_order(case, pixels) if len(case.raw["position"]) else np.empty((0, len(pixels)), int)
+    scene = scene_of(case, pixels, order)
+    truth = oracle.render(scene, band=case.band)
+    band = truth.band | _flips(case, scene, truth)
+    weights = _weights(truth, band)
+    truth = oracle.render(scene, weights)
+    exact = _gradients(case, scene, truth)
+    spread = {n: np.zeros((case.camera.width * case.camera.height, w.shape[1])) for n, w in weights.items()}
+    for name, values in weights.items():
+        spread[name][pixels] = values
+    found = product(case, spread)
+    maps = {name: values[pixels] for name, values in found.maps.items()}
+    image, others = map_errors(maps, truth.maps, ~band)
+    gradients = gradient_errors(found.gradients, exact, scene.raw)
+    worst = max(gradients.values(), default=0.0)
+    image_floor, gradient_floor = 0.0, dict.fromkeys(gradients, 0.0)
+    if floors or max(image, others) > IMAGE_LIMIT or worst > GRADIENT_LIMIT:
+        image_floor, gradient_floor = condition(case, scene, truth, exact, weights, band)
+    shown = truth.maps["alpha"][:, 0] > 0
+    kept = float(np.mean(~band[shown])) if shown.any() else 1.0
+    inverted = inversion(case, scene, truth) if len(order) else 0.0
+    verdict = judge(image, others, gradients, found.non_finite, kept, inverted, image_floor, gradient_floor)
+    return Row(
+        case.name, image, others, gradients, found.non_finite, kept, inverted, image_floor, gradient_floor,
+        textbook.image_error(case, scene, band) if book else 0.0, verdict, case.note,
+    )  # fmt: skip
+
+
+def judge(
+    image: float,
+    maps: float,
+    gradients: dict[str, float],
+    non_finite: int,
+    kept: float,
+    order: float,
+    image_floor: float,
+    gradient_floor: dict[str, float],
+) -> str:
+    """ "holds", "ill-conditioned", or what fails."""
+    failed: list[str] = []
+    ill: list[str] = []
+    if non_finite:
+        failed.append(f"{non_finite} values are not finite")
+    if kept < KEPT:
+        failed.append(f"only {kept:.0%} of the pixels are compared")
+    if order > ORDER_LIMIT:
+        failed.append(f"order wrong by {order:.1e}")
+    checks = [("image", image, IMAGE_LIMIT, image_floor), ("maps", maps, IMAGE_LIMIT, image_floor)]
+    checks += [(n, e, GRADIENT_LIMIT, gradient_floor[n]) for n, e in gradients.items()]
+    for name, error, limit, floor in checks:
+        if not error <= limit:
+            (ill if error <= ILL * floor else failed).append(f"{name} {error:.1e}")
+    if failed:
+        return "FAILS: " + ", ".join(failed)
+    return "ill-conditioned: " + ", ".join(ill) if ill else "holds"
+
+
+def map_errors(found: dict[str, Array], exact: dict[str, Array], keep: Array) -> tuple[float, float]:
+    """Largest errors, relative to the largest value of a map: radiance and alpha; the other maps."""
+    errors = {}
+    for name, values in exact.items():
+        if name in found and keep.any():
+            peak = float(np.abs(values).max())
+            error = float(np.abs(found[name] - values)[keep].max())
+            errors[name] = error / peak if peak > 0 else error
+    first = [errors.pop(name, 0.0) for name in ("radiance", "alpha")]
+    return max(first), max(errors.values(), default=0.0)
+
+
+def gradient_errors(
+    found: dict[str, Array], exact: dict[str, Array], raw: dict[str, Array]
+) -> dict[str, float]:
+    """‖g - g₆₄‖ / ‖g₆₄‖ of every class, ‖g₆₄‖ no smaller than NEGLIGIBLE says.
+
+    Columns are weighed by what they are measured in: positions by the scene's extent, quaternions
+     by their length.
+    """
+    units = {"position": _extent(raw["position"]), "rotation": np.linalg.norm(raw["rotation"], axis=1)}
+    units["rotation"] = np.maximum(units["rotation"], oracle.QUATERNION_FLOOR)[:, None]
+    sizes, errors = {}, {}
+    for name in GRADIENTS:
+        if name in exact and exact[name].size:
+            unit = units.get(name, 1.0)
+            sizes[name] = float(np.linalg.norm(unit * exact[name]))
+            errors[name] = float(np.linalg.norm(unit * (found[name].astype(np.float64) - exact[name])))
+    least = NEGLIGIBLE * max(sizes.values(), default=0.0)
+    return {n: e / s if (s := max(sizes[n], least)) > 0 else e for n, e in errors.items()}
+
+
+def _extent(position: Array) -> float:
+    """Root mean square distance of positions to their mean; 1 where they coincide."""
+    position = np.asarray(position, np.float64)
+    if not len(position):
+        return 1.0
+    return float(np.sqrt(np.mean(np.sum((position - position.mean(0)) ** 2, 1)))) or 1.0
+
+
+def _gradients(case: Case, scene: oracle.Scene, truth: oracle.Picture) -> dict[str, Array]:
+    gradients = dict(truth.gradients)
+    if scene.light is not None:
+        gradients["light"] = light_gradient(case.light, scene.light, gradients["light"])
+    return gradients
+
+
+def _weights(truth: oracle.Picture, band: Array) -> dict[str, Array]:
+    rng = np.random.default_rng(11)
+    weights = {}
+    for name in LOSS_MAPS:
+        values = truth.maps[name]
+        peak = float(np.abs(values).max()) or 1.0
+        random = rng.normal(size=values.shape) / (peak * len(values))
+        weights[name] = np.where(band[:, None], 0, random).astype(np.float32).astype(np.float64)
+    return weights
+
+
+def _flips(case: Case, scene: oracle.Scene, truth: oracle.Picture) -> Array:
+    """Pixels (P,) at a declared discontinuity: their visibility changes when normal and ray turn by 1e-4 and
+    1e-5, or with the offset of rays that a mesh made elsewhere may have."""
+    flips = np.zeros(len(scene.pixels), bool)
+    if scene.visibility is None:
+        return flips
+    x, y = scene.pixels % scene.camera.width + 0.5, scene.pixels // scene.camera.width + 0.5
+    c = scene.camera
+    ray = np.stack([(x - c.cx) / c.fx, (y - c.cy) / c.fy, np.ones_like(x)], 1) @ c.to_world[:3, :3].T
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    length = np.maximum(np.linalg.norm(truth.maps["normal"], axis=1, keepdims=True), 1e-30)
+    normal = truth.maps["normal"] / length
+    base, rng = scene.visibility(normal, ray), np.random.default_rng(3)
+    for _ in range(8):
+        moved = normal + 1e-4 * rng.normal(size=normal.shape)
+        turned = ray + 1e-5 * rng.normal(size=ray.shape)
+        flips |= scene.visibility(moved, turned) != base
+    if case.further:
+        flips |= _visibility(case, normal, ray, case.further) != base
+    return flips
+
+
+def condition(
+    case: Case,
+    scene: oracle.Scene,
+    truth: oracle.Picture,
+    exact: dict[str, Array],
+    weights: dict[str, Array],
+    band: Array,
+) -> tuple[float, dict[str, float]]:
+    """What one ulp of every input, up or down at random, does to the exact image and gradients: the larger
+    of two draws."""
+    images, gradients = [0.0], [dict.fromkeys(gradient_errors(exact, exact, scene.raw), 0.0)]
+    rng = np.random.default_rng(7)
+
+    def nudged(x: Array) -> Array:
+        return x * (1 + ULP * rng.choice([-1.0, 1.0], size=np.shape(x)))
+
+    for _ in range(2):
+        pose = scene.camera.to_world.copy()
+        pose[:3, 3] = nudged(pose[:3, 3])
+        raw_light = nudged(np.asarray(case.light, np.float64))
+        light = None if scene.light is None else light_of(raw_light)
+        moved = replace(
+            scene,
+            raw={name: nudged(x) for name, x in scene.raw.items()},
+            camera=replace(scene.camera, to_world=pose),
+            light=light,
+        )
+        picture = oracle.render(moved, weights)
+        images.append(max(map_errors(picture.maps, truth.maps, ~band)))
+        gradients.append(
+            gradient_errors(_gradients(replace(case, light=raw_light), moved, picture), exact, scene.raw)
+        )
+    return max(images), {n: max(g[n] for g in gradients) for n in gradients[0]}
+
+
+def inversion(case: Case, scene: oracle.Scene, truth: oracle.Picture) -> float:
+    """Largest relative difference of depths in the wrong order, among the surfels that a pixel shows."""
+    phase = fast_camera(case).phase
+    key = oracle.sort_key(scene.raw, scene.camera, scene.pixels, phase)
+    key, shown = (np.take_along_axis(x, scene.order, 0) for x in (key, truth.shown))
+    key = np.where(shown, key, 0)
+    late = np.where(shown, (np.maximum.accumulate(key) - key) / np.where(shown, key, 1), 0)
+    return float(late.max(initial=0))

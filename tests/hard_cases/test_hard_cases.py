@@ -1,0 +1,108 @@
+"""The cheap hard cases of `benchmarks.stability` with its limits, and tests of the measurement itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from benchmark_runs import ROOT  # first: it lets `benchmarks` be found
+
+from benchmarks.stability import measure as module
+from benchmarks.stability import response
+from benchmarks.stability.case import Case, plain
+from benchmarks.stability.cases import catalogue
+from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, judge, measure
+from mi_refgs.reference import picture as oracle
+from mi_refgs.splat.footprint import FootprintAdjoint
+
+assert ROOT
+CASES = [case for case in catalogue() if case.quick]
+ILL_CONDITIONED = {
+    "normals that cancel but for 1e-3",
+    "normals that cancel",
+    "edge-on, cosine 0.0002",
+    "edge-on, cosine 0.001",
+    "anisotropy 1e+04, width of 1.5 pixels in a film of 1024²",
+    "anisotropy 1e+06, width of 1.5 pixels in a film of 1024²",
+    "surfels of 2 pixels in a film of 4096²",
+}
+"""What may miss the limits, and then only by what one unit in the last place of the inputs explains."""
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_case(case: Case) -> None:
+    row = measure(case, floors=False, book=False)
+    assert row.verdict == "holds" or case.name in ILL_CONDITIONED, row
+    assert "FAILS" not in row.verdict, row
+
+
+@pytest.mark.parametrize("row", response.CURVE, ids=str)
+def test_response_curve(row: str) -> None:
+    found = response._curve(row, response.CURVE[row])
+    assert max(found["value"], found["slope"]) <= IMAGE_LIMIT
+
+
+@pytest.mark.parametrize("picture", response.pictures(), ids=lambda picture: picture[0])
+def test_losses_of_extreme_pictures(picture: Any) -> None:
+    found = response._loss(*picture)
+    assert not found["non_finite"] and max(found["value"], found["slope"]) <= IMAGE_LIMIT, found
+
+
+# ---------------- the measurement itself ----------------
+
+
+def test_gradients_of_the_oracle_are_its_own_differences() -> None:
+    """Complex steps and sums, against central differences of the loss, for every class of parameters."""
+    case = plain("plain").rounded()
+    pixels = module.chosen_pixels(case)
+    scene = module.scene_of(case, pixels, module.product_order(case, pixels))
+    truth = oracle.render(scene)
+    weights = module._weights(truth, oracle.render(scene, band=0.02).band)
+    exact = module._gradients(case, scene, oracle.render(scene, weights))
+    rng = np.random.default_rng(0)
+
+    def loss(raw: dict[str, np.ndarray], light: np.ndarray) -> float:
+        moved = module.replace(scene, raw=raw, light=module.light_of(light))
+        maps = oracle.render(moved).maps
+        return sum(float(np.sum(w * maps[name])) for name, w in weights.items())
+
+    for name in GRADIENTS:
+        step = 1e-8  # smaller than the way to the next texel of the light, where a slope jumps
+        values = {**scene.raw, "light": np.asarray(case.light, np.float64)}
+        direction = rng.normal(size=values[name].shape)
+        sides = []
+        for sign in (1, -1):
+            moved = values | {name: values[name] + sign * step * direction}
+            light = moved.pop("light")
+            sides.append(loss(moved, light))
+        expected = (sides[0] - sides[1]) / (2 * step)
+        assert np.sum(exact[name] * direction) == pytest.approx(expected, rel=1e-4, abs=1e-6), name
+
+
+def test_a_planted_mistake_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = FootprintAdjoint.columns
+
+    def wrong(self: FootprintAdjoint, row: list[Any]) -> list[Any]:
+        return [1.02 * column for column in original(self, row)]
+
+    monkeypatch.setattr(FootprintAdjoint, "columns", wrong)
+    verdict = measure(plain("plain"), floors=False).verdict
+    assert verdict.startswith("FAILS") and "position" in verdict and "image" not in verdict
+
+
+def test_verdicts() -> None:
+    def verdict(**changes: Any) -> str:
+        given: dict[str, Any] = {
+            "image": 1e-5, "maps": 1e-5, "gradients": {"scale": 1e-3}, "non_finite": 0, "kept": 1.0,
+            "order": 0.0, "image_floor": 0.0, "gradient_floor": {"scale": 0.0},
+        }  # fmt: skip
+        return judge(**(given | changes))
+
+    assert verdict() == "holds"
+    assert verdict(image=2e-4).startswith("FAILS: image")
+    assert verdict(image=2e-4, image_floor=1e-4).startswith("ill-conditioned: image")
+    assert verdict(image=float("nan"), image_floor=1e-4).startswith("FAILS: image")
+    assert verdict(gradients={"scale": 0.1}).startswith("FAILS: scale")
+    assert verdict(non_finite=1, image_floor=1.0).startswith("FAILS")
+    assert verdict(kept=0.1).startswith("FAILS") and verdict(order=1e-3).startswith("FAILS")
