@@ -137,7 +137,7 @@ class LossWeights:
 
     ssim: float = 0.2
     normal: float = 0.05
-    normal_from: int = 0  # iterations
+    normal_rise: int = 0  # iterations in which the weight of L_n rises linearly from 0
     smooth: float = 0.0
     smooth_until: int = 18_000
     alpha: float = 0.0
@@ -221,7 +221,7 @@ PRESETS = {
 }
 
 # Fields that count iterations, and so scale with the preset, as windows do.
-_SCALED = {"iterations", "until", "normal_from", "smooth_until", "propagate_hold"}
+_SCALED = {"iterations", "until", "normal_rise", "smooth_until", "propagate_hold"}
 
 
 def load(variant: str, preset: str = "standard", assignments: list[str] | None = None) -> Method:

@@ -59,7 +59,7 @@ def objective(
 ) -> tuple[Any, Any]:
     """Weighted sum of the losses of a frame (mi.Float of width 1), and its mean squared error, detached.
 
-    The terms are those of `LossWeights`, each between the iterations that it names; see `fit.losses`.
+    The terms are those of `LossWeights`, weighted as it says for this iteration; see `fit.losses`.
     """
     width, height = target.camera.width, target.camera.height
     image = displayed(frame, data.background, data.linear)
@@ -68,9 +68,12 @@ def objective(
     loss = (1 - weights.ssim) * losses.l1(image, target.image)
     if weights.ssim:
         loss += weights.ssim * losses.d_ssim(image, target.image, width, height)
-    if weights.normal and iteration > weights.normal_from:
+    if weights.normal:
+        risen = min(iteration / weights.normal_rise, 1) if weights.normal_rise else 1
+        # Opaque: it changes from step to step, and a literal would be compiled into each one's kernels.
+        weight = dr.opaque(mi.Float, weights.normal * risen)
         depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, target.camera)
-        loss += weights.normal * losses.normal_consistency(frame.normal, depth_normal, valid, frame.alpha)
+        loss += weight * losses.normal_consistency(frame.normal, depth_normal, valid, frame.alpha)
     if weights.smooth and iteration <= weights.smooth_until:
         loss += weights.smooth * losses.normal_smoothness(list(frame.normal), target.image, width, height)
     if weights.alpha and target.alpha is not None:
