@@ -10,7 +10,6 @@ that of the first by more than 0.1 dB, or normals by more than 0.1°.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import sys
 import tempfile
@@ -35,25 +34,25 @@ NORMAL_BOUND = 0.1
 """Degrees."""
 
 
-def in_units(data: Any, factor: float) -> Any:
-    """The same data set with positions multiplied by `factor`; depth is not read here."""
-    views = []
-    for view in data.views:
-        to_world = view.to_world.copy()
-        to_world[:3, 3] *= factor
-        views.append(dataclasses.replace(view, to_world=to_world, depth=None))
-    return dataclasses.replace(data, views=tuple(views))
+def move(folder: Path, factor: float) -> None:
+    """Multiply the cameras' positions in the transforms files; depth maps, which no fit reads, stay."""
+    for path in folder.glob("transforms_*.json"):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        for frame in content["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= factor
+        write_json(path, content)
 
 
-def fit(folder: Path, factor: float) -> dict[str, float]:
-    """PSNR and normal error on the test views after a fit in this unit."""
+def fit(folder: Path) -> dict[str, float]:
+    """PSNR and normal error on the test views after a fit."""
     from mi_refgs.fit import config, data, metrics, pictures
     from mi_refgs.fit.train import Trainer
 
     method = config.load("ref_gaussian", "quick", SETTINGS)
-    trainer = Trainer(method, in_units(data.load(folder, "train", truth=False), factor))
+    trainer = Trainer(method, data.load(folder, "train", truth=False))
     trainer.train()
-    test = in_units(data.load(folder, "test"), factor)
+    test: Any = data.load(folder, "test")
     scores: list[dict[str, Any]] = []
     for view in test.views:
         shot = pictures.Shot.of(trainer.view(view.camera()), test)
@@ -75,7 +74,9 @@ def measure(size: int, views: int) -> list[dict[str, Any]]:
         dr.set_thread_count(1)  # sums by scatter are then the same in every run
         rows = []
         for unit, factor in UNITS.items():
-            rows.append({"unit": unit} | fit(data, factor))
+            move(data, factor)
+            rows.append({"unit": unit} | fit(data))
+            move(data, 1 / factor)
             print(json.dumps(rows[-1]), flush=True)
     return rows
 
