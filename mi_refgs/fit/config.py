@@ -247,7 +247,27 @@ def load(variant: str, preset: str = "standard", assignments: list[str] | None =
     for assignment in assignments or []:
         _assign(table, assignment)
     where = "--set" if assignments else str(path)
-    return _build(Method, table | {"variant": path.stem, "preset": preset}, where)
+    return _shadable(_build(Method, table | {"variant": path.stem, "preset": preset}, where), str(path))
+
+
+def _shadable(method: Method, where: str) -> Method:
+    """The method; raises InputError naming the stage that its channels and its light cannot serve."""
+    from mi_refgs.render.pipeline import MATERIALS, Shading
+    from mi_refgs.surfels.table import CHANNELS, GEOMETRY
+
+    channels = {*GEOMETRY, *method.surfels.channels}
+    if unknown := [name for name in method.surfels.channels if name not in CHANNELS]:
+        raise InputError(
+            f"{where}: surfels.channels: '{unknown[0]}' is unknown; use some of {', '.join(CHANNELS)}"
+        )
+    for name, stage in method.stages():
+        try:
+            Shading.of(stage, method.mesh is not None).check(channels, method.light is not None)
+        except InputError as error:
+            raise InputError(f"{where}: stage.{name}: {error}") from error
+        if stage.reset_materials and not channels.issuperset(MATERIALS):
+            raise InputError(f"{where}: stage.{name}: reset_materials: there are no materials; remove it")
+    return method
 
 
 def load_resolved(path: Path) -> Method:

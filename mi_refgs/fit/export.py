@@ -61,13 +61,11 @@ class Fitted:
             mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
         iteration = int(state["iteration"])
         _, stage = method.stage_at(max(iteration, 1))
-        occlusion = mesh is not None and stage.at == "pixel" and stage.reflectance == "split_sum"
-        shading = Shading(stage.at, stage.reflectance, stage.diffuse, occlusion)
         return Fitted(
             Surfels(params),
             None if light is None else EnvironmentLight(light),
             mesh,
-            shading,
+            Shading.of(stage, mesh is not None),
             iteration,
             float(state["seconds"]),
         )
@@ -93,8 +91,10 @@ class Fitted:
             iteration,
             seconds,
         )
-        if shading.reflectance == "split_sum" and fitted.light is None:
-            raise InputError(f"{light}: light: missing; write it again with `refgs export {folder}`")
+        try:
+            shading.check(fitted.surfels.raw, fitted.light is not None)
+        except InputError as error:
+            raise InputError(f"{folder}: {error}; or write it again with `refgs export {folder}`") from error
         return fitted
 
     def renderer(self) -> Callable[[Camera], Frame]:

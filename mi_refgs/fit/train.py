@@ -145,7 +145,7 @@ class Trainer:
         self.iteration = iteration
         self._refine(iteration)
         mesh = self.method.mesh
-        if mesh is not None and stage.at == "pixel" and mesh.extract.due(iteration):
+        if mesh is not None and self._shading(stage).at == "pixel" and mesh.extract.due(iteration):
             self.extract_mesh()
 
     def statistics(self) -> dict[str, Any]:
@@ -256,7 +256,7 @@ class Trainer:
                 self.optimiser.reset(name)
 
     def _shading(self, stage: Stage) -> Shading:
-        return Shading(stage.at, stage.reflectance, stage.diffuse, self.occluder.mesh() is not None)
+        return Shading.of(stage, self.occluder.mesh() is not None)
 
     def _groups(self) -> dict[str, Group]:
         groups = self.schedule.groups(self.extent)

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR, NORM_FLOOR
 from mi_refgs.errors import InputError
-from mi_refgs.render.pipeline import Frame
+from mi_refgs.render.pipeline import MATERIALS, Frame
 from mi_refgs.splat.camera import Camera
 
 # Suffixes as Mitsuba's own `aov` integrator gives them; `Bitmap.split` makes a greyscale layer of a lone Y.
@@ -29,7 +29,6 @@ SUFFIXES = {
     "specular": "RGB",
     "indirect": "RGB",
 }
-MATERIALS = ("albedo", "metallic", "roughness")
 
 
 @dataclass(frozen=True)

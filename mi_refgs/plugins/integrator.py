@@ -16,10 +16,10 @@ import mitsuba as mi
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.plugins import require_supported_variant
-from mi_refgs.plugins.aovs import MATERIALS, aov_values, parse_aovs
+from mi_refgs.plugins.aovs import aov_values, parse_aovs
 from mi_refgs.plugins.light import TurnedLight, emitter_light
 from mi_refgs.plugins.properties import TERMS, read_light, read_shading, read_surfels, read_terms
-from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.pipeline import MATERIALS, Frame, render
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import GEOMETRY, Surfels
 
@@ -164,13 +164,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def check(self) -> None:
         """Raise InputError for shapes that do not fit and for channels that are needed but absent."""
         Surfels(self.surfels.raw)  # checks shapes; values are checked where a file is read
-        needed = [*GEOMETRY]
-        if self.shading.reflectance == "split_sum":
-            needed += MATERIALS
-        if self.shading.reflectance == "radiance" or self.shading.diffuse == "sh":
-            needed += ["radiance_sh"]
-        needed += [aov.type for aov in self.aovs if aov.type in MATERIALS]
-        for name in needed:
+        self.shading.check(self.surfels.raw)
+        for name in (aov.type for aov in self.aovs if aov.type in MATERIALS):
             if not self.surfels.has(name):
                 raise InputError(f"refgs: {name}: the surfels have no such channel; add it, or do without it")
         if self.light is not None:

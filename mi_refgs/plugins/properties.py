@@ -13,9 +13,8 @@ import mitsuba as mi
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.plugins.aovs import MATERIALS
 from mi_refgs.plugins.light import own_light
-from mi_refgs.render.pipeline import Shading
+from mi_refgs.render.pipeline import MATERIALS, Shading
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.models import Accuracy
 from mi_refgs.surfels.ply import read_ply
@@ -74,22 +73,12 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     mesh = _path(props, "mesh")
     deferred = at == "pixel" and reflectance == "split_sum"
     occlusion = bool(props.get("occlusion", mesh is not None and deferred))
-    if occlusion and mesh is None:
-        raise InputError("refgs: occlusion: there is no mesh to trace; name its PLY file in `mesh`")
-    if occlusion and not deferred:
-        raise InputError("refgs: occlusion: needs shade_at = pixel and reflectance = split_sum; set these")
-    accuracy = _accuracy(props)
-    if (accuracy.dominant or accuracy.multiscatter) and reflectance != "split_sum":
-        raise InputError("refgs: dominant, multiscatter: need reflectance = split_sum; set it")
-    if (accuracy.visibility_rays > 1 or accuracy.traced_bounces) and not occlusion:
-        raise InputError("refgs: visibility_rays, traced_bounces: need occlusion; name a `mesh` to trace")
-    # Radiance is blended linearly, so that both orders are one; the pipeline calls it shading at surfels.
-    at = at if reflectance == "split_sum" else "surfel"
-    shading = Shading(at, reflectance, diffuse, occlusion, accuracy)
+    shading = Shading(at, reflectance, diffuse, occlusion, _accuracy(props))
+    shading.check(surfels.raw, mesh=mesh is not None)
     if not (occlusion and mesh):
         return shading, None
     occluder = Occluder(read_mesh(mesh))
-    if accuracy.traced_bounces:
+    if shading.accuracy.traced_bounces:
         occluder.set_materials(surfels)
     return shading, occluder
 

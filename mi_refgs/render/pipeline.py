@@ -10,25 +10,33 @@ camera.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR, FACING_TOLERANCE
+from mi_refgs.errors import InputError
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.reflection import reflection
 from mi_refgs.shade.models import Accuracy, ShadingPoints, Terms, reflect, safe_normalize, shade
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.splat import Blended, Camera, splat
-from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
+from mi_refgs.surfels.table import GEOMETRY, LOGIT_LIMIT, Surfels
+
+MATERIALS = ("albedo", "metallic", "roughness")
+"""Channels of what is shaded by a light."""
 
 
 @dataclass(frozen=True)
 class Shading:
-    """How a method turns surfels into radiance: data, chosen per stage."""
+    """How a method turns surfels into radiance: data, chosen per stage. The one place of its rules.
+
+    Radiance is blended linearly, so that the two orders are one for reflectance "radiance"; `at` is then
+    "surfel", which blends less. Raises InputError for what is not allowed together.
+    """
 
     at: Literal["surfel", "pixel"] = "pixel"  # shade before or after blending
     reflectance: Literal["radiance", "split_sum"] = "split_sum"  # SH colour alone, or diffuse + GGX specular
@@ -39,6 +47,42 @@ class Shading:
     def __post_init__(self) -> None:
         if isinstance(self.accuracy, Mapping):  # as JSON keeps it
             object.__setattr__(self, "accuracy", Accuracy(**self.accuracy))
+        if self.reflectance == "radiance":
+            object.__setattr__(self, "at", "surfel")
+        accuracy = self.accuracy
+        if self.occlusion and self.at != "pixel":
+            raise InputError(
+                "shading: occlusion: needs shade_at = pixel and reflectance = split_sum; set these"
+            )
+        if (accuracy.dominant or accuracy.multiscatter) and self.reflectance != "split_sum":
+            raise InputError("shading: dominant, multiscatter: need reflectance = split_sum; set it")
+        if (accuracy.visibility_rays > 1 or accuracy.traced_bounces) and not self.occlusion:
+            raise InputError("shading: visibility_rays, traced_bounces: need occlusion; trace a `mesh`")
+
+    @staticmethod
+    def of(stage: Any, mesh: bool) -> Shading:
+        """Of a stage of a method (`at`, `reflectance`, `diffuse`), occluded by its mesh where that can be."""
+        shading = Shading(stage.at, stage.reflectance, stage.diffuse)
+        return replace(shading, occlusion=mesh and shading.at == "pixel")
+
+    def check(self, channels: Collection[str], light: bool = True, mesh: bool = True) -> None:
+        """Raise InputError if surfels with these channels, and what is there beside them, lack something."""
+        needed = [*GEOMETRY]
+        if self.reflectance == "split_sum":
+            needed += MATERIALS
+        if self.reflectance == "radiance" or self.diffuse == "sh":
+            needed += ["radiance_sh"]
+        for name in needed:
+            if name not in channels:
+                raise InputError(
+                    f"shading: {name}: the surfels have no such channel; add it, or do without it"
+                )
+        if self.reflectance == "split_sum" and not light:
+            raise InputError(
+                "shading: light: reflectance = split_sum needs one; add it, or set reflectance = radiance"
+            )
+        if self.occlusion and not mesh:
+            raise InputError("shading: occlusion: there is no mesh to trace; give one, or trace nothing")
 
 
 @dataclass(frozen=True)
@@ -74,7 +118,9 @@ def render(
     roughness and the terms of the radiance even where the picture does not need them per pixel.
     `shift`: see `splat.project`.
     `shading.accuracy.traced_bounces` needs an occluder whose `set_materials` has seen these surfels.
+    Raises InputError for what `shading.check` refuses.
     """
+    shading.check(surfels.raw, light is not None, occluder is not None)
     if surfels.count == 0:
         surfels, shift = _nothing(surfels), None
     if shading.at == "surfel":
@@ -184,8 +230,7 @@ def _shade_at_pixels(
     features = [*normal, *_materials(surfels)]
     if shading.diffuse == "sh":
         features += [*_radiance(surfels, direction, sh_degree)]
-    occluded = shading.occlusion and occluder is not None
-    if occluded and surfels.has("indirect_sh") and not shading.accuracy.traced_bounces:
+    if shading.occlusion and surfels.has("indirect_sh") and not shading.accuracy.traced_bounces:
         # The mirror direction of the surfel's centre [Ref-Gaussian, §3.3]; starts at exactly 0 and must train
         # from there.
         mirrored = reflect(view=-direction, normal=normal)
@@ -211,8 +256,8 @@ def _shade_at_pixels(
         radiance=radiance,
         indirect=mi.Color3f(*rest) if rest else None,
     )
-    if occluded:
-        assert occluder is not None
+    if shading.occlusion:
+        assert occluder is not None  # see `Shading.check`
         points = reflection(
             occluder, surfels, light, shading.accuracy, shading.diffuse, camera.origin, ray, points
         )

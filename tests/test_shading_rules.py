@@ -1,0 +1,121 @@
+"""What can be shaded how: one sentence from one place, whoever asks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from integrator_scenes import image, raw_channels, scene
+
+from mi_refgs.errors import InputError
+from mi_refgs.fit.config import load
+from mi_refgs.render.pipeline import Shading, render
+from mi_refgs.shade.models import Accuracy
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.table import CHANNELS, Surfels
+
+LIGHT = "[light]\nheight = 16\n"
+STAGE = "[stage.only]\nuntil = 100\n"
+
+IMPOSSIBLE = {
+    "no light": (STAGE, ["stage.only", "light", "add it"]),
+    "no light in a later stage": (
+        f"[stage.first]\nuntil = 50\nreflectance = 'radiance'\n{STAGE}",
+        ["stage.only", "light"],
+    ),
+    "no roughness": (
+        f"[surfels]\nchannels = ['radiance_sh', 'albedo', 'metallic']\n{LIGHT}{STAGE}",
+        ["stage.only", "roughness", "no such channel"],
+    ),
+    "no harmonics": (
+        f"[surfels]\nchannels = ['albedo', 'metallic', 'roughness']\n{LIGHT}{STAGE}",
+        ["stage.only", "radiance_sh", "no such channel"],
+    ),
+    "no harmonics for radiance": (
+        f"[surfels]\nchannels = ['albedo']\n{STAGE}reflectance = 'radiance'",
+        ["stage.only", "radiance_sh"],
+    ),
+    "a channel misspelt": (f"[surfels]\nchannels = ['albdeo']\n{STAGE}", ["'albdeo' is unknown", "albedo"]),
+    "materials reset that are none": (
+        f"[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nreset_materials = true",
+        ["stage.only", "reset_materials"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", IMPOSSIBLE)
+def test_impossible_methods_are_refused_when_they_are_read(case: str, tmp_path: Path) -> None:
+    text, words = IMPOSSIBLE[case]
+    path = tmp_path / "own.toml"
+    path.write_text(f"iterations = 100\n{text}")
+    with pytest.raises(InputError) as info:
+        load(str(path))
+    assert all(word in str(info.value) for word in ["own.toml", *words])
+    assert "\n" not in str(info.value)
+
+
+def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
+    """`at` keeps its default, "pixel": blending is linear, so that it is the same picture."""
+    path = tmp_path / "own.toml"
+    path.write_text(
+        f"iterations = 100\n[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'"
+    )
+    stage = load(str(path)).stage["only"]
+    assert stage.at == "pixel" and Shading.of(stage, mesh=True) == Shading("surfel", "radiance")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"at": "surfel", "occlusion": True}, "occlusion: needs shade_at = pixel"),
+        ({"reflectance": "radiance", "occlusion": True}, "occlusion: needs shade_at = pixel"),
+        ({"reflectance": "radiance", "accuracy": Accuracy(dominant=True)}, "dominant, multiscatter: need"),
+        ({"accuracy": Accuracy(visibility_rays=4)}, "visibility_rays, traced_bounces: need occlusion"),
+        ({"accuracy": {"traced_bounces": 1}}, "visibility_rays, traced_bounces: need occlusion"),
+    ],
+)
+def test_what_is_not_allowed_together_is_refused(options: dict, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        Shading(**options)
+    keys = {"at": "shade_at"}
+    accuracy = options.pop("accuracy", {})
+    accuracy = accuracy if isinstance(accuracy, dict) else vars(accuracy)
+    with pytest.raises(Exception, match=words if "occlusion" not in options else "occlusion"):
+        scene(**{keys.get(name, name): value for name, value in options.items()}, **accuracy)
+
+
+def test_rendering_without_what_it_needs_is_refused() -> None:
+    surfels = Surfels.from_numpy(raw_channels())
+    camera = Camera.look(4, 4, -4, -4, 2, 2, np.eye(4))
+    with pytest.raises(InputError, match="light: reflectance = split_sum needs one"):
+        render(surfels, camera, Shading())
+    with pytest.raises(InputError, match="there is no mesh to trace"):
+        render(surfels, camera, Shading(occlusion=True), SimpleNamespace())
+    del surfels.raw["metallic"]
+    with pytest.raises(InputError, match="metallic: the surfels have no such channel"):
+        render(surfels, camera, Shading(), SimpleNamespace())
+
+
+def test_every_mode_that_is_not_refused_renders() -> None:
+    """Each reflectance, order and diffuse with the channels that `check` asks for, and no other."""
+    raw = raw_channels()
+    for reflectance in ("radiance", "split_sum"):
+        for diffuse in ("sh", "irradiance"):
+            for at in ("pixel", "surfel"):
+                shading = Shading(at, reflectance, diffuse)  # type: ignore[arg-type]
+                few = {name: values for name, values in raw.items() if name not in needless(shading)}
+                options = {"shade_at": at, "reflectance": reflectance, "diffuse": diffuse}
+                assert image(scene(raw=few, **options)).max() > 0.05
+
+
+def needless(shading: Shading) -> set[str]:
+    found = set()
+    for name in CHANNELS:
+        try:
+            shading.check([other for other in CHANNELS if other != name])
+            found.add(name)
+        except InputError:
+            pass
+    return found
