@@ -25,7 +25,6 @@ from integrator_scenes import (
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.constants import TILE_SIZES, tile_size
-from mi_refgs.errors import InputError
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Shading, render
 from mi_refgs.render.scene_xml import write_scene_xml
@@ -228,15 +227,6 @@ def test_nesting_in_stock_integrators_is_refused() -> None:
     nested = {"type": "aov", "aovs": "d:depth", "inner": integrator()}
     outer = mi.load_dict({"type": "scene", "integrator": nested, "sensor": sensor()})
     refused("whole images only", lambda: image(outer))
-
-
-def test_mirrored_cameras_cannot_be_exported(tmp_path: Path) -> None:
-    camera = Camera.look(8, 8, 10, -10, 4, 4, np.eye(4))
-    with pytest.raises(InputError, match="fx, fy"):
-        write_scene_xml(tmp_path / "scene.xml", ply="a.ply", shading=Shading(), camera=camera)
-    good = Camera.look(8, 8, -10, -10, 4, 4, np.eye(4))
-    with pytest.raises(InputError, match="cannot be written"):
-        write_scene_xml(tmp_path / "no" / "scene.xml", ply="a.ply", shading=Shading(), camera=good)
 
 
 @pytest.mark.parametrize("factor", [1 - 1e-3, 1, 1 + 1e-3])

@@ -104,9 +104,9 @@ def test_every_mode_that_is_not_refused_renders() -> None:
     for reflectance in ("radiance", "split_sum"):
         for diffuse in ("sh", "irradiance"):
             for at in ("pixel", "surfel"):
-                shading = Shading(at, reflectance, diffuse)  # type: ignore[arg-type]
+                shading = Shading(at, reflectance, diffuse)
                 few = {name: values for name, values in raw.items() if name not in needless(shading)}
-                options = {"shade_at": at, "reflectance": reflectance, "diffuse": diffuse}
+                options: dict = {"shade_at": at, "reflectance": reflectance, "diffuse": diffuse}
                 assert image(scene(raw=few, **options)).max() > 0.05
 
 

@@ -102,6 +102,8 @@ class Fitted:
         with dr.suspend_grad():
             light = None if self.light is None else self.light.prefilter()
         occluder = Occluder(self.mesh)
+        if self.shading.accuracy.traced_bounces:
+            occluder.set_materials(self.surfels)
 
         def view(camera: Camera) -> Frame:
             with dr.suspend_grad():

@@ -256,7 +256,7 @@ class Trainer:
                 self.optimiser.reset(name)
 
     def _shading(self, stage: Stage) -> Shading:
-        return Shading.of(stage, self.occluder.mesh() is not None)
+        return Shading.of(stage, not self.occluder.empty)
 
     def _groups(self) -> dict[str, Group]:
         groups = self.schedule.groups(self.extent)

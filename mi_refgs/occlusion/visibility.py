@@ -120,14 +120,14 @@ class Occluder:
             )
             return Hit(stopped, ray(distance), triangle, place)
 
-    def first_hit(self, origin: Any, direction: Any) -> tuple[Any, Any]:
+    def first_hit(self, origin: Any, direction: Any, active: Any = True) -> tuple[Any, Any]:
         """Distance to the mesh in lengths of `direction` (0 without a hit), and if it is hit; detached."""
         width = max(dr.width(origin), dr.width(direction))
         if self.empty:
             return dr.zeros(mi.Float, width), dr.zeros(mi.Bool, width)
         with dr.suspend_grad():
             ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
-            hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+            hit = self._scene.ray_intersect_preliminary(ray, coherent=True, active=active)
             valid = hit.is_valid()
             return dr.select(valid, hit.t, 0), valid
 

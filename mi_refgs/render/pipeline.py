@@ -258,8 +258,9 @@ def _shade_at_pixels(
     )
     if shading.occlusion:
         assert occluder is not None  # see `Shading.check`
+        covered = dr.detach(blended.alpha) > COVERAGE_FLOOR
         points = reflection(
-            occluder, surfels, light, shading.accuracy, shading.diffuse, camera.origin, ray, points
+            occluder, surfels, light, shading.accuracy, shading.diffuse, camera.origin, ray, points, covered
         )
         maps["visibility"] = points.visibility
     shaded = shade(points, light, shading.diffuse, shading.accuracy)

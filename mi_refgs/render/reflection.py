@@ -36,16 +36,18 @@ WIDE = 1 / 3
 α = 0.01, 0 to 33 % at 0.09, and adds up to 15 % at 0.36."""
 
 
-def mirror_visibility(occluder: Occluder, origin: Any, ray: Any, normal: Any, view: Any) -> Any:
+def mirror_visibility(
+    occluder: Occluder, origin: Any, ray: Any, normal: Any, view: Any, covered: Any = True
+) -> Any:
     """Is the mirror direction free, seen from where the pixel's ray meets the mesh itself?
 
     Not from the blended depth: at a silhouette, and between two layers, that lies inside the object and every
-    ray from there is blocked, which draws a dark outline. A ray that misses the mesh sees the light.
+    ray from there is blocked, which draws a dark outline. A ray that misses the mesh sees the light, and so
+    do pixels that are not `covered`, for which nothing is traced.
     """
     with dr.suspend_grad():
-        point, facing, hit = _start(occluder, origin, ray, normal)
-        free = occluder.visible(point, reflect(view=view, normal=facing), facing)
-        visibility = dr.select(hit, free, 1)
+        point, facing, hit = _start(occluder, origin, ray, normal, covered)
+        visibility = occluder.visible(point, reflect(view=view, normal=facing), facing, hit)
         # Now, once: every kernel of the adjoint that reads it would trace the rays again.
         dr.eval(visibility)
         return visibility
@@ -60,24 +62,27 @@ def reflection(
     origin: Any,
     ray: Any,
     points: ShadingPoints,
+    covered: Any = True,
 ) -> ShadingPoints:
     """`points` with the visibility (mi.Float, 0 … 1, detached) and indirect light that `accuracy` asks for.
 
-    `origin` and `ray` lead from the camera to the points; `points.indirect` (of the indirect channel) stays
-    unless `accuracy.traced_bounces` replaces it by the mean radiance of what blocked rays hit
+    `origin` and `ray` lead from the camera to the points; nothing is traced for those that are not `covered`
+    (mi.Bool). `points.indirect` (of the indirect channel) stays unless `accuracy.traced_bounces` replaces it
+    by the mean radiance of what blocked rays hit
     (`MeshRadiance`), single bright ones held back (`_held_back`). Its gradient goes to the light and to the
     materials of the surfels around all hits, in both modes; rays and hits are detached, and so are what is
     held back and what the pixel's own roughness does to the rays.
     """
     normal = dr.detach(points.normal)
     if accuracy.visibility_rays == 1 and not accuracy.traced_bounces:
-        return replace(points, visibility=mirror_visibility(occluder, origin, ray, normal, points.view))
+        visibility = mirror_visibility(occluder, origin, ray, normal, points.view, covered)
+        return replace(points, visibility=visibility)
     if occluder.empty:
         visibility = dr.full(mi.Float, 1, dr.width(ray))
         return replace(points, visibility=visibility, indirect=None)
     scene = MeshRadiance.of(occluder, surfels, light, accuracy, diffuse) if accuracy.traced_bounces else None
     with dr.suspend_grad():
-        point, facing, seen = _start(occluder, origin, ray, normal)
+        point, facing, seen = _start(occluder, origin, ray, normal, covered)
     if accuracy.visibility_rays > 1:
         with dr.suspend_grad():
             lobe = Lobe.of(facing, points.view, points.roughness, base_reflectance(points))
@@ -95,9 +100,9 @@ def reflection(
     return replace(points, visibility=visibility, indirect=points.indirect if scene is None else indirect)
 
 
-def _start(occluder: Occluder, origin: Any, ray: Any, normal: Any) -> tuple[Any, Any, Any]:
+def _start(occluder: Occluder, origin: Any, ray: Any, normal: Any, covered: Any) -> tuple[Any, Any, Any]:
     """Where the pixels' rays meet the mesh, the unit normals there, and whether they do."""
-    distance, hit = occluder.first_hit(origin, ray)
+    distance, hit = occluder.first_hit(origin, ray, covered)
     return mi.Point3f(mi.Vector3f(origin) + distance * ray), safe_normalize(normal), hit
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,10 +14,9 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
 from mi_refgs.render.pipeline import Shading
+from mi_refgs.shade.models import Accuracy
 from mi_refgs.splat.camera import Camera
 
-# Mitsuba's perspective sensor has square pixels; float32 focal lengths of one camera agree far better.
-SQUARE_PIXEL_TOLERANCE = 1e-4
 # Mitsuba wants a near plane, and a far plane, which the splatter has no use for, behind it: in near planes.
 NEAR_CLIP_MIN = 1e-12
 CLIP_RANGE = 1e6
@@ -38,9 +38,14 @@ def write_scene_xml(
     background: linear radiance (r, g, b) composited under alpha, or None for a transparent image. The scene
     has a parameter `spp`, as in `mi.load_file(path, spp=4)`, 1 by default: pixel centres, as in training.
 
-    Raises InputError if the camera is none that Mitsuba has (mirrored, or without square pixels), or if the
-    path cannot be written.
+    Mitsuba's `perspective` sensor has square pixels. Where those of the camera are not (fx ≠ fy), the film
+    has more of them along one axis, and a comment says so: the same view, to half a pixel at that border.
+
+    Raises InputError if the camera is mirrored, if there is no mesh for the occlusion, or if the path cannot
+    be written.
     """
+    if shading.occlusion and mesh is None:
+        raise InputError(f"{path}: mesh: there is none to trace; give one, or shade without occlusion")
     scene = ElementTree.Element("scene", version="3.0.0")
     scene.append(ElementTree.Comment(" needs `import mi_refgs` before mi.load_file "))
     _put(scene, "default", "spp", "1")
@@ -49,9 +54,12 @@ def write_scene_xml(
     _put(integrator, "string", "shade_at", shading.at)
     _put(integrator, "string", "reflectance", shading.reflectance)
     _put(integrator, "string", "diffuse", shading.diffuse)
-    deferred = shading.at == "pixel" and shading.reflectance == "split_sum"
-    occlusion = shading.occlusion and deferred and mesh is not None
-    _put(integrator, "boolean", "occlusion", str(occlusion).lower())
+    _put(integrator, "boolean", "occlusion", str(shading.occlusion).lower())
+    for option in fields(Accuracy):
+        value = getattr(shading.accuracy, option.name)
+        if value != option.default:
+            kind = "boolean" if isinstance(value, bool) else "integer"
+            _put(integrator, kind, option.name, str(value).lower())
     if mesh is not None:
         _put(integrator, "string", "mesh", mesh)
     if background is not None:
@@ -75,29 +83,39 @@ def _numbers(values: Any) -> str:
 
 def _add_sensor(scene: ElementTree.Element, camera: Camera) -> None:
     fx, fy, cx, cy, near = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy, camera.near))
-    if not (fx < 0 and fy < 0 and abs(fx - fy) < SQUARE_PIXEL_TOLERANCE * abs(fx)):
+    if not fx * fy > 0:
         raise InputError(
-            f"camera: fx, fy: {fx:g} and {fy:g} pixels are no Mitsuba `perspective` sensor, whose pixels are "
-            "square and not mirrored; choose another view"
+            f"camera: fx, fy: {fx:g} and {fy:g} pixels mirror the picture, as no Mitsuba sensor does; choose "
+            "another view"
         )
     to_world = np.eye(4)
     to_world[:3, :3] = np.array(camera.rotation, dtype=np.float64).reshape(3, 3).T
     to_world[:3, 3] = sum(np.array(x, np.float64).ravel() for x in (camera.origin, camera.origin_rest))
+    if fx > 0:  # both axes point the other way: the camera stands on its head
+        to_world[:3, :2] *= -1
+    focal = max(abs(fx), abs(fy))
+    per_pixel = focal / abs(fx), focal / abs(fy)
+    width, height = (
+        max(1, round(n * ratio)) for n, ratio in zip((camera.width, camera.height), per_pixel, strict=True)
+    )
+    if (width, height) != (camera.width, camera.height):
+        size = f"{camera.width} x {camera.height} pixels of focal lengths {abs(fx):g} and {abs(fy):g}"
+        scene.append(ElementTree.Comment(f" the view of {size}, with square pixels "))
 
     sensor = ElementTree.SubElement(scene, "sensor", type="perspective", id="sensor")
     _put(sensor, "string", "fov_axis", "x")
-    _put(sensor, "float", "fov", repr(math.degrees(2 * math.atan(camera.width / (2 * abs(fx))))))
+    _put(sensor, "float", "fov", repr(math.degrees(2 * math.atan(width / (2 * focal)))))
     _put(sensor, "float", "near_clip", repr(max(near, NEAR_CLIP_MIN)))
     _put(sensor, "float", "far_clip", repr(max(CLIP_RANGE * near, 1.0)))
-    _put(sensor, "float", "principal_point_offset_x", repr(0.5 - cx / camera.width))
-    _put(sensor, "float", "principal_point_offset_y", repr(0.5 - cy / camera.height))
+    _put(sensor, "float", "principal_point_offset_x", repr(0.5 - cx * per_pixel[0] / width))
+    _put(sensor, "float", "principal_point_offset_y", repr(0.5 - cy * per_pixel[1] / height))
     transform = ElementTree.SubElement(sensor, "transform", name="to_world")
     ElementTree.SubElement(transform, "matrix", value=_numbers(to_world.ravel()))
     sampler = ElementTree.SubElement(sensor, "sampler", type="independent")
     _put(sampler, "integer", "sample_count", "$spp")
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
-    _put(film, "integer", "width", str(camera.width))
-    _put(film, "integer", "height", str(camera.height))
+    _put(film, "integer", "width", str(width))
+    _put(film, "integer", "height", str(height))
     _put(film, "string", "pixel_format", "rgba")
     _put(film, "string", "component_format", "float32")
     ElementTree.SubElement(film, "rfilter", type="box")
