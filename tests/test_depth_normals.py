@@ -75,6 +75,24 @@ def test_depth_normals_of_a_plane_are_exact() -> None:
     assert np.all(found[~mask] == 0)
 
 
+def test_steps_between_surfaces_have_no_normal(rng: np.random.Generator) -> None:
+    """Steps of every size on a wavy surface: the oracle's normals, and none exactly where it has none."""
+    depth = (
+        3 + 0.1 * rng.random((HEIGHT, WIDTH)) + np.linspace(0, 4, WIDTH) * (np.arange(HEIGHT) > 6)[:, None]
+    )
+    depth = depth.astype(np.float32).astype(np.float64)
+    alpha = np.ones((HEIGHT, WIDTH))
+    expected, wanted = reference.normals_from_depth(depth, alpha, *INTRINSICS, ROTATION)
+    normal, valid = normals_from_depth(
+        mi.Float(depth.ravel().astype(np.float32)), dr.ones(mi.Float, WIDTH * HEIGHT), camera()
+    )
+    np.testing.assert_array_equal(np.array(valid).reshape(HEIGHT, WIDTH), wanted)
+    found = np.stack([np.array(c) for c in normal], axis=-1).reshape(HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+    edge = wanted[6:8, 1:-1]
+    assert edge[:, :2].all() and not edge[:, -5:].any()  # small steps are slopes, large ones are not
+
+
 def test_normal_consistency_through_the_depth(rng: np.random.Generator) -> None:
     """Value and gradients to N, D and A of the whole chain; two holes in the alpha switch their
     neighbourhoods off."""

@@ -73,7 +73,10 @@ def normals_from_depth(
     cy: float,
     world_from_camera: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """World normals (H, W, 3) of a camera-depth map and their validity (H, W), by central differences."""
+    """World normals (H, W, 3) of a camera-depth map and their validity (H, W), by central differences.
+
+    Steps between two surfaces, which the viewing ray meets at a cosine of at most 0.2, are not valid.
+    """
     height, width = depth.shape
     normals, valid = np.zeros((height, width, 3)), np.zeros((height, width), dtype=bool)
 
@@ -96,6 +99,9 @@ def normals_from_depth(
                 point(row + 1, column) - point(row - 1, column),
             )
             if np.dot(normal, normal) <= 1e-20:
+                continue
+            ray = np.array([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, 1.0])
+            if abs(np.dot(normal, ray)) <= 0.2 * np.linalg.norm(normal) * np.linalg.norm(ray):
                 continue
             normal = -normal if np.dot(normal, point(row, column)) > 0 else normal
             normals[row, column] = world_from_camera @ (normal / np.linalg.norm(normal))
