@@ -13,10 +13,24 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, Phase, settings
 from tiny_scene import train_command, write_data, write_method
 
 from mi_refgs.cli import main
 from mi_refgs.images import MITSUBA_EXR_THREADS
+
+# The same examples in every run. Kernels are compiled in the first, so that no deadline holds; failures are not
+# simplified: examples are mostly seeds.
+settings.register_profile(
+    "mi_refgs",
+    max_examples=25,
+    derandomize=True,
+    database=None,
+    deadline=None,
+    phases=[Phase.explicit, Phase.generate],
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile("mi_refgs")
 
 THREADS = max(dr.thread_count(), MITSUBA_EXR_THREADS)
 """Tests let Mitsuba read EXR files, on machines of one core too."""

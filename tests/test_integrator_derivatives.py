@@ -20,18 +20,16 @@ from integrator_scenes import (
 )
 
 from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.splat import footprint
 from mi_refgs.surfels.table import CHANNELS
 
-STEPS = (5e-3, 5e-4, 1e-4)
-"""The order of surfels and the kinks of lookups spoil differences over large steps, rounding over small."""
-TANGENT_TOLERANCE = 1e-2  # relative L2 at the best step; observed 4e-5 … 7e-3
-
-
-@pytest.fixture
-def smooth(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the declared step at α = 1/255, differences of the whole renderer have a meaning."""
-    monkeypatch.setattr(footprint, "ALPHA_MIN", 1e-8)
+STEPS = (2e-3, 2e-4)
+"""Of the differences, of which the better counts: rounding spoils the small one, curvature the large one."""
+JUMP = 0.1
+"""Of the root mean square of the differences: where the two sides differ by more, a surfel has crossed the cut
+at α = 1/255, another surfel of its tile, or the kink of a lookup, which have no derivative."""
+MAX_LEFT_OUT = 0.2
+"""Share of the seen pixels in which that may happen; observed up to 2 % at the better step."""
+TANGENT_TOLERANCE = 5e-3  # relative L2; observed 8e-5 … 3e-3
 
 
 def check_derivatives(of: mi.Scene, key: str, spp: int = 1) -> None:
@@ -53,9 +51,16 @@ def check_derivatives(of: mi.Scene, key: str, spp: int = 1) -> None:
     tangent = dr.forward_to(rendered).numpy()
     errors = []
     for step in STEPS:
-        difference = (at(mi.Float(step)).numpy() - at(mi.Float(-step)).numpy()) / (2 * step)
-        errors.append(np.linalg.norm(tangent - difference) / np.linalg.norm(difference))
-    assert np.linalg.norm(difference) > 1e-3, f"{key}: no influence on the image"
+        before, middle, after = (at(mi.Float(t)).numpy().astype(np.float64) for t in (-step, 0, step))
+        left, right = (middle - before) / step, (after - middle) / step
+        difference, seen = (left + right) / 2, np.any(middle != 0, axis=2)
+        typical = np.sqrt(np.mean(difference[seen] ** 2))
+        assert typical > 1e-3, f"{key}: no influence on the image"
+        smooth = np.all(np.abs(right - left) < JUMP * (typical + np.abs(difference)), axis=2)
+        if np.mean(~smooth[seen]) <= MAX_LEFT_OUT:
+            error = np.linalg.norm((tangent - difference)[smooth])
+            errors.append(error / np.linalg.norm(difference[smooth]))
+    assert errors, f"{key}: too many jumps at every step"
     assert min(errors) < TANGENT_TOLERANCE, f"{key}: {min(errors):.1e} from central differences"
 
     leaf = mi.TensorXf(base)
@@ -69,23 +74,23 @@ def check_derivatives(of: mi.Scene, key: str, spp: int = 1) -> None:
 
 
 @pytest.mark.parametrize("key", [*(name for name in CHANNELS if name != "indirect_sh"), "light"])
-def test_derivatives_of_every_channel(key: str, smooth: None) -> None:
+def test_derivatives_of_every_channel(key: str) -> None:
     check_derivatives(scene(), f"integrator.{key}")
 
 
 @pytest.mark.parametrize("key", ["position", "albedo", "light"])
-def test_derivatives_with_irradiance_and_supersampling(key: str, smooth: None) -> None:
+def test_derivatives_with_irradiance_and_supersampling(key: str) -> None:
     of = scene(diffuse="irradiance", aovs="nn:normal,d:depth,a:albedo")
     check_derivatives(of, f"integrator.{key}", spp=4)
 
 
 @pytest.mark.parametrize("key", ["rotation", "metallic", "light"])
-def test_derivatives_when_shading_at_surfels(key: str, smooth: None) -> None:
+def test_derivatives_when_shading_at_surfels(key: str) -> None:
     check_derivatives(scene(shade_at="surfel"), f"integrator.{key}")
 
 
 @pytest.mark.parametrize("key", ["indirect_sh", "opacity"])
-def test_derivatives_with_occlusion(key: str, smooth: None, tmp_path: Path) -> None:
+def test_derivatives_with_occlusion(key: str, tmp_path: Path) -> None:
     of = scene(mesh=plane_mesh(tmp_path))
     check_derivatives(of, f"integrator.{key}")
 

@@ -1,0 +1,190 @@
+"""What pictures do not depend on: the table's order, fronts of discs, culled surfels, tiles, units, views."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from law_scenes import (
+    COUNT,
+    SCENES,
+    SEEDS,
+    SHADINGS,
+    Scene,
+    View,
+    differing,
+    draw,
+    gradients,
+    random_scene,
+)
+from scipy.spatial.transform import Rotation
+
+from mi_refgs import constants
+from mi_refgs.constants import ALPHA_MIN
+from mi_refgs.device import upload
+from mi_refgs.render.pipeline import Shading
+from mi_refgs.splat import splat
+from mi_refgs.surfels.table import Surfels
+
+EXACT = 2e-6
+"""Between pictures of the same float32 arithmetic, but for fused operations and the order of equal sums."""
+GRADIENT = 1e-4
+"""Relative L2 between gradients: sums by scatter come in any order."""
+SILHOUETTE = 0.251
+"""|cos| to the ray up to which a normal may point away from the camera."""
+BOTH = pytest.mark.parametrize("shading", SHADINGS, ids=("pixel", "surfel"))
+
+
+def assert_same_rows(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:
+    """Gradients by channel."""
+    for name, values in a.items():
+        assert np.linalg.norm(values - b[name]) <= GRADIENT * np.linalg.norm(b[name]) + 1e-7, name
+
+
+@BOTH
+@given(scene=SCENES, seed=SEEDS)
+def test_the_order_of_the_table_does_not_matter(shading: Shading, scene: Scene, seed: int) -> None:
+    order = np.random.default_rng(seed).permutation(COUNT)
+    permuted = scene.with_rows(order)
+    assert differing(draw(permuted, shading), draw(scene, shading), EXACT) == 0
+    before, after = (gradients(s, shading, seed) for s in (scene, permuted))
+    assert_same_rows(after, {name: values[order] for name, values in before.items()})
+
+
+def culled(scene: Scene, kind: str, seed: int) -> dict[str, np.ndarray]:
+    """As many surfels again, none of which covers a pixel."""
+    rng = np.random.default_rng(seed)
+    raw = {name: values.copy() for name, values in scene.raw.items()}
+    forward, origin = scene.view.to_world[:3, 2], scene.view.to_world[:3, 3]
+    if kind == "behind":
+        depth = (raw["position"] - origin) @ forward
+        raw["position"] -= (depth + rng.uniform(0.5, 3, COUNT))[:, None] * forward
+    elif kind == "transparent":
+        raw["opacity"][:] = np.log(ALPHA_MIN) - rng.uniform(0.01, 20, (COUNT, 1))
+    elif kind == "edge-on":  # its normal is perpendicular to the ray to its centre, t_u along that ray
+        ray = raw["position"] - origin
+        across = np.cross(ray, rng.normal(size=(COUNT, 3)))
+        axes = np.stack([ray, np.cross(across, ray), across], axis=-1)
+        raw["rotation"][:] = Rotation.from_matrix(
+            axes / np.linalg.norm(axes, axis=1, keepdims=True)
+        ).as_quat()
+    else:  # outside the picture
+        side = scene.view.to_world[:3, 0] * rng.choice([-1, 1], (COUNT, 1))
+        raw["position"] += side * rng.uniform(50, 500, (COUNT, 1))
+        raw["scale"][:] = np.log(0.1)
+    return {name: values.astype(np.float32) for name, values in raw.items()}
+
+
+@BOTH
+@given(scene=SCENES, kind=st.sampled_from(["behind", "transparent", "edge-on", "beside"]), seed=SEEDS)
+def test_culled_surfels_change_nothing(shading: Shading, scene: Scene, kind: str, seed: int) -> None:
+    place = np.random.default_rng(seed).permutation(2 * COUNT)
+    more = Scene(
+        {n: np.concatenate([v, culled(scene, kind, seed)[n]])[place] for n, v in scene.raw.items()},
+        scene.view,
+    )
+    assert differing(draw(more, shading), draw(scene, shading), EXACT) == 0
+    before, after = (gradients(s, shading, seed) for s in (scene, more))
+    back = np.argsort(place)
+    assert_same_rows({name: values[back[:COUNT]] for name, values in after.items()}, before)
+    assert all(np.all(values[back[COUNT:]] == 0) for values in after.values())
+
+
+@BOTH
+@given(scene=SCENES, seed=SEEDS)
+def test_opacity_towards_zero_is_removal(shading: Shading, scene: Scene, seed: int) -> None:
+    """Exactly below α_min; and just above it by less than it shows, 1/255 a surfel."""
+    rng = np.random.default_rng(seed)
+    gone = rng.random(COUNT) < 0.5
+    removed = draw(scene.with_rows(np.flatnonzero(~gone)), shading)
+    opacity = scene.raw["opacity"].copy()
+    opacity[gone] = np.log(ALPHA_MIN) - rng.uniform(0, 20, (gone.sum(), 1))
+    assert differing(draw(scene.changed(opacity=opacity), shading), removed, EXACT) == 0
+    one = np.flatnonzero(gone)[:1]
+    opacity[one] = np.log(ALPHA_MIN) + 0.01
+    faint = draw(scene.changed(opacity=opacity), shading)["alpha"]
+    assert np.abs(faint - removed["alpha"]).max() <= 1.02 * ALPHA_MIN
+
+
+@BOTH
+@given(scene=SCENES, seed=SEEDS)
+def test_a_disc_has_no_front_and_no_first_axis(shading: Shading, scene: Scene, seed: int) -> None:
+    """Turned over, turned by a half about its normal, axes exchanged, quaternions of the other sign: the same
+    picture. Discs near the silhouette, whose normals stay as they are, are not turned over."""
+    rng = np.random.default_rng(seed)
+    turn, scale = Rotation.from_quat(scene.raw["rotation"]), scene.raw["scale"].copy()
+    ray = scene.raw["position"] - scene.view.to_world[:3, 3]
+    cosine = np.sum(turn.apply([0, 0, 1]) * ray, axis=1) / np.linalg.norm(ray, axis=1)
+    over = (np.abs(cosine) > SILHOUETTE) & (rng.random(COUNT) < 0.5)
+    turn = turn * Rotation.from_rotvec(np.pi * over[:, None] * [1, 0, 0])
+    quarters = rng.integers(0, 4, COUNT)
+    turn = turn * Rotation.from_rotvec(np.pi / 2 * quarters[:, None] * [0, 0, 1])
+    scale[quarters % 2 == 1] = scale[quarters % 2 == 1, ::-1]
+    rotation = turn.as_quat() * rng.choice([-1, 1], (COUNT, 1)) * rng.uniform(0.1, 10, (COUNT, 1))
+    other = draw(scene.changed(rotation=rotation, scale=scale), shading)
+    # Quaternions are rounded anew; at a cut a pixel may change sides.
+    assert differing(other, draw(scene, shading), 2e-4) <= 0.01
+
+
+@given(seed=SEEDS, tile=st.sampled_from([size for _, size in constants.TILE_SIZES]))
+def test_tiles_do_not_show(seed: int, tile: tuple[int, int]) -> None:
+    """Layers whose planes keep their order within the reach of the sort: any tile sorts them alike."""
+    rng = np.random.default_rng(seed)
+    z = 3 + 0.1 * rng.permutation(COUNT)
+    position = np.stack([*(0.15 * z * rng.normal(size=(2, COUNT))), z], axis=1)
+    tilt = rng.normal(size=(COUNT, 3)) * [0.04, 0.04, 1]  # σ sin θ is far below the layers' distance
+    scene = random_scene(seed, size=0.3, opacity=1.0).changed(
+        position=position, rotation=Rotation.from_rotvec(tilt).as_quat()
+    )
+    scene = Scene(scene.raw, View(np.eye(4)))
+    shipped = draw(scene)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(constants, "TILE_SIZES", ((np.inf, tile),))
+        assert scene.view.camera().tile == tile
+        assert differing(draw(scene), shipped, EXACT) == 0
+
+
+@BOTH
+@given(scene=SCENES, decades=st.floats(-3, 3))
+def test_units_do_not_matter(shading: Shading, scene: Scene, decades: float) -> None:
+    factor = 10**decades
+    pose = scene.view.to_world.copy()
+    pose[:3, 3] *= factor
+    larger = scene.changed(position=scene.raw["position"] * factor, scale=scene.raw["scale"] + np.log(factor))
+    scaled = draw(Scene(larger.raw, View(pose, scene.view.near * factor)), shading)
+    scaled["depth"] /= factor
+    # Positions and log scales are rounded anew; at a cut a pixel may change sides.
+    assert differing(scaled, draw(scene, shading), 2e-4) <= 0.01
+
+
+@given(scene=SCENES, seed=SEEDS)
+def test_alpha_is_the_channel_that_is_one(scene: Scene, seed: int) -> None:
+    """To the bit; and what is blended is linear in what surfels carry."""
+    f, g = np.random.default_rng(seed).normal(size=(2, COUNT)).astype(np.float32)
+    surfels, camera = Surfels.from_numpy(scene.raw), scene.view.camera()
+    columns = [dr.ones(mi.Float, COUNT), upload(f), upload(g), upload(2 * f - 3 * g)]
+    blended = splat(surfels, columns, camera)
+    one, by_f, by_g, mixed = (image.numpy() for image in blended.features)
+    np.testing.assert_array_equal(one, blended.alpha.numpy())
+    np.testing.assert_allclose(mixed, 2 * by_f - 3 * by_g, atol=2e-5)
+    assert one.min() >= 0 and one.max() <= 1
+
+
+@BOTH
+@settings(max_examples=8)
+@given(scene=SCENES, seed=SEEDS)
+def test_a_view_does_not_depend_on_its_company(shading: Shading, scene: Scene, seed: int) -> None:
+    """Gradients of views one by one add up to those of a set, and a picture is the same in any set."""
+    views = [scene.view]
+    for turn in Rotation.random(2, random_state=seed):
+        matrix = np.eye(4)
+        matrix[:3, :3] = turn.as_matrix()
+        views.append(scene.view.moved(matrix))
+    alone = draw(scene, shading)
+    parts = [gradients(scene, shading, seed, (view,)) for view in views]
+    together = gradients(scene, shading, seed, tuple(views))
+    assert_same_rows(together, {name: sum((part[name] for part in parts), 0) for name in together})
+    assert differing(draw(scene, shading), alone, 0) == 0
