@@ -19,8 +19,8 @@ from tiny_scene import train_command, write_data, write_method
 from mi_refgs.cli import main
 from mi_refgs.images import MITSUBA_EXR_THREADS
 
-# The same examples in every run. Kernels are compiled in the first, so that no deadline holds; failures are not
-# simplified: examples are mostly seeds.
+# The same examples in every run. Kernels are compiled in the first, so there is no deadline; failures are not
+# simplified, since examples are mostly seeds.
 settings.register_profile(
     "mi_refgs",
     max_examples=25,

@@ -53,6 +53,10 @@ class Scene:
     raw: Raw
     view: View
 
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        """What Hypothesis prints of a failure."""
+        printer.text(f"Scene(position[0]={self.raw['position'][0]}, {self.view})")
+
     def with_rows(self, parent: np.ndarray) -> Scene:
         """The scene of these rows of its table."""
         return replace(self, raw={name: values[parent] for name, values in self.raw.items()})

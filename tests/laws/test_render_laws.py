@@ -1,0 +1,167 @@
+"""What mi.render does not depend on, and what it may not exceed: adjoints, turned lights, energy."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from integrator_scenes import sky
+from law_scenes import COUNT, FOCAL, HEIGHT, LIGHT_ROWS, SCENES, SEEDS, WIDTH, Scene, random_scene, rotated
+from scipy.spatial.transform import Rotation
+
+from mi_refgs.shade import brdf
+from mi_refgs.shade.envmap import EnvironmentLight
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "deferred": {"aovs": "n:normal,d:depth,a:alpha,r:roughness"},
+    "at surfels": {"shade_at": "surfel", "diffuse": "irradiance"},
+    "colour": {"reflectance": "radiance"},
+}
+ADJOINT = 1e-5
+"""|⟨δ, Jv⟩ - ⟨Jᵀδ, v⟩| over |δ| |Jv|: float32 sums of a few hundred products."""
+
+
+def camera(scene: Scene) -> dict[str, Any]:
+    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "rgba"}
+    return {
+        "type": "perspective",
+        "fov": float(2 * np.degrees(np.arctan(WIDTH / 2 / FOCAL))),
+        "to_world": mi.ScalarTransform4f(scene.view.to_world),
+        "film": film | {"rfilter": {"type": "box"}},
+        "sampler": {"type": "independent", "sample_count": 1},
+    }
+
+
+def loaded(scene: Scene, light: Any, **changes: Any) -> mi.Scene:
+    channels = {name: mi.TensorXf(values) for name, values in scene.raw.items()}
+    integrator = {"type": "refgs", **channels, "light": light} | changes
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(scene)})
+
+
+def picture(*arguments: Any, **changes: Any) -> np.ndarray:
+    return mi.render(loaded(*arguments, **changes)).numpy().astype(np.float64)
+
+
+def envmap(radiance: np.ndarray, turn: np.ndarray | None = None) -> dict[str, Any]:
+    """An emitter of a map (h, 2h, 3), turned by a rotation matrix."""
+    to_world = np.eye(4)
+    to_world[:3, :3] = np.eye(3) if turn is None else turn
+    bitmap = mi.Bitmap(np.ascontiguousarray(radiance, np.float32))
+    return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(to_world)}
+
+
+@cache
+def shared(setting: str) -> mi.Scene:
+    """A scene whose parameters the examples replace."""
+    light = EnvironmentLight.from_radiance(sky(LIGHT_ROWS)).raw
+    return loaded(random_scene(0), light, **SETTINGS[setting])
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+@settings(max_examples=10)
+@given(scene=SCENES, seed=SEEDS)
+def test_reverse_mode_is_the_transpose_of_forward_mode(setting: str, scene: Scene, seed: int) -> None:
+    """⟨δ, Jv⟩ = ⟨Jᵀδ, v⟩ for every parameter that the setting reads, alone and all at once."""
+    of, rng = shared(setting), np.random.default_rng(seed)
+    params = mi.traverse(of)
+    values = {f"integrator.{name}": raw for name, raw in scene.raw.items()}
+    values["integrator.light"] = rng.normal(size=(LIGHT_ROWS, 2 * LIGHT_ROWS, 3)).astype(np.float32)
+    tangents = {key: rng.normal(size=value.shape).astype(np.float32) for key, value in values.items()}
+
+    def rendered() -> tuple[dict[str, Any], Any]:
+        leaves = {key: mi.TensorXf(value) for key, value in values.items()}
+        dr.enable_grad(list(leaves.values()))
+        for key, leaf in leaves.items():
+            params[key] = leaf
+        params.update()
+        return leaves, mi.render(of, params)
+
+    leaves, image = rendered()
+    δ = rng.normal(size=image.shape).astype(np.float32)
+    dr.backward(dr.sum(image * mi.TensorXf(δ), axis=None))
+    reverse = {
+        k: float(np.sum(dr.grad(leaf).numpy().astype(float) * tangents[k])) for k, leaf in leaves.items()
+    }
+
+    for keys in [*([key] for key in values), list(values)]:
+        leaves, image = rendered()
+        for key in keys:
+            dr.set_grad(leaves[key], mi.TensorXf(tangents[key]))
+        forward = dr.forward_to(image).numpy().astype(float)
+        error = abs(np.sum(forward * δ) - sum(reverse[key] for key in keys))
+        assert error <= ADJOINT * np.linalg.norm(δ) * np.linalg.norm(forward), keys
+
+
+@settings(max_examples=15)
+@given(scene=SCENES, seed=SEEDS)
+def test_the_world_has_no_preferred_direction(scene: Scene, seed: int) -> None:
+    """Surfels, camera and light turned together by any rotation."""
+    turn = Rotation.random(random_state=seed)
+    still = picture(scene, envmap(sky(LIGHT_ROWS)), diffuse="irradiance")
+    turned = picture(rotated(scene, turn), envmap(sky(LIGHT_ROWS), turn.as_matrix()), diffuse="irradiance")
+    # Positions, quaternions and camera are rounded anew; at a cut a pixel may change sides.
+    assert np.mean(np.any(np.abs(turned - still) > 5e-4, axis=2)) <= 0.01
+
+
+@settings(max_examples=15)
+@given(scene=SCENES, quarters=st.integers(1, 3))
+def test_a_light_turned_by_quarters_is_everything_else_turned_back(scene: Scene, quarters: int) -> None:
+    """To turn the light about the pole, to move its columns, and to turn surfels and camera back are one."""
+    turn = Rotation.from_rotvec([0, quarters * np.pi / 2, 0])
+    turned = picture(scene, envmap(sky(LIGHT_ROWS), turn.as_matrix()), diffuse="irradiance")
+    columns = np.roll(sky(LIGHT_ROWS), -quarters * LIGHT_ROWS // 2, axis=1)
+    moved = picture(scene, envmap(columns), diffuse="irradiance")
+    np.testing.assert_allclose(moved, turned, atol=1e-4)
+    back = picture(rotated(scene, turn.inv()), envmap(sky(LIGHT_ROWS)), diffuse="irradiance")
+    assert np.mean(np.any(np.abs(back - turned) > 5e-4, axis=2)) <= 0.01
+    assert np.abs(turned - picture(scene, envmap(sky(LIGHT_ROWS)), diffuse="irradiance")).max() > 1e-3
+
+
+@settings(max_examples=20)
+@given(
+    scene=SCENES,
+    albedo=st.floats(0, 1),
+    metallic=st.sampled_from([0.0, 0.5, 1.0]),
+    roughness=st.floats(0, 1),
+    multiscatter=st.booleans(),
+    shade_at=st.sampled_from(["pixel", "surfel"]),
+)
+def test_no_more_light_leaves_than_arrives(
+    scene: Scene, albedo: float, metallic: float, roughness: float, multiscatter: bool, shade_at: str
+) -> None:
+    """Under a constant light of 1 a metal shows at most 1, with all its bounces too.
+
+    The diffuse term does not yield to the specular one, so that others are bound by the sum of the two:
+    (1 - metallic) albedo, and what the split sum reflects at the worst angle.
+    """
+
+    def logit(x: float) -> float:
+        return float(np.log(max(x, 1e-12)) - np.log(max(1 - x, 1e-12)))
+
+    uniform = scene.changed(
+        albedo=np.full((COUNT, 3), logit(albedo)),
+        metallic=np.full((COUNT, 1), logit(metallic)),
+        roughness=np.full((COUNT, 1), logit(roughness)),
+    )
+    light = EnvironmentLight.constant(1.0, LIGHT_ROWS).raw
+    changes = {"diffuse": "irradiance", "multiscatter": multiscatter, "shade_at": shade_at}
+    rgba = picture(uniform, light, **changes)
+    rows = brdf.table().astype(np.float64)
+    place = roughness * len(rows) - 0.5
+    a, b = np.moveaxis(rows[max(int(place) - 1, 0) : int(place) + 3], 2, 0)
+    f0 = 0.04 * (1 - metallic) + albedo * metallic
+    reflected = f0 * a + b
+    if multiscatter:
+        mean = f0 + (1 - f0) / 21
+        reflected = reflected / (1 - mean * (1 - a - b))
+    bound = (1 - metallic) * albedo + reflected.max()
+    assert rgba.min() >= 0
+    # Lookups are bilinear, a prefiltered 1 is 1 ± 1e-4.
+    assert np.all(rgba[..., :3] <= rgba[..., 3:] * bound * (1 + 1e-3) + 1e-5)
+    assert metallic < 1 or bound <= 1 + 1e-3
