@@ -44,6 +44,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason="no CUDA device"))
 
 
+def pytest_collection_finish() -> None:
+    """Modules and tests stay till the end: the collection after each test need not look at them again."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True)
 def llvm_ad_rgb() -> Iterator[None]:
     """Set variant and threads; afterwards wait for kernels, restore the flags, return the test's memory.

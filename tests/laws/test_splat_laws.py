@@ -148,7 +148,7 @@ def test_tiles_do_not_show(seed: int, tile: tuple[int, int]) -> None:
 
 
 @BOTH
-@given(scene=SCENES, decades=st.floats(-3, 3))
+@given(scene=SCENES, decades=st.floats(-6, 6))
 def test_units_do_not_matter(shading: Shading, scene: Scene, decades: float) -> None:
     factor = 10**decades
     pose = scene.view.to_world.copy()
@@ -186,5 +186,5 @@ def test_a_view_does_not_depend_on_its_company(shading: Shading, scene: Scene, s
     alone = draw(scene, shading)
     parts = [gradients(scene, shading, seed, (view,)) for view in views]
     together = gradients(scene, shading, seed, tuple(views))
-    assert_same_rows(together, {name: sum((part[name] for part in parts), 0) for name in together})
+    assert_same_rows(together, {name: np.sum([part[name] for part in parts], axis=0) for name in together})
     assert differing(draw(scene, shading), alone, 0) == 0
