@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refgs import rows as rows_module
 from mi_refgs.rows import Rows, columns_of
 
 ROWS = 37
@@ -36,8 +37,10 @@ def test_columns_of_a_table_and_their_derivatives(width: int) -> None:
     np.testing.assert_allclose(moved, tangent, rtol=1e-6)
 
 
+@pytest.mark.parametrize("copies", [rows_module.COPIES_BYTES, 0])
 @pytest.mark.parametrize("width", [5, 8, 19])
-def test_rows_pack_fetch_and_add(width: int) -> None:
+def test_rows_pack_fetch_and_add(width: int, copies: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rows_module, "COPIES_BYTES", copies)
     rng = np.random.default_rng(width)
     table = rng.normal(size=(ROWS, width)).astype(np.float32)
     rows = Rows.pack([mi.Float(np.ascontiguousarray(column)) for column in table.T])
@@ -55,3 +58,17 @@ def test_rows_pack_fetch_and_add(width: int) -> None:
     expected = np.zeros_like(table)
     np.add.at(expected, picked[active], table[picked][active])
     np.testing.assert_allclose(sums.unpadded().numpy().reshape(ROWS, width), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("threads", "mode"), [(2, dr.ReduceMode.Expand), (64, dr.ReduceMode.Local)])
+def test_copies_of_a_gradient_are_bounded(
+    threads: int, mode: dr.ReduceMode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A million surfels of 24 floats would be 6 GB on 64 threads: no copies then."""
+    used = []
+    monkeypatch.setattr(dr, "thread_count", lambda: threads)
+    monkeypatch.setattr(dr, "scatter_add", lambda *_, mode: used.append(mode))
+    Rows(mi.Float(0) + dr.zeros(mi.Float, 24_000_000), 1_000_000, 24).add(
+        mi.UInt32(0), [mi.Float(1)] * 24, True
+    )
+    assert set(used) == {mode}

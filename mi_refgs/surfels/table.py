@@ -254,9 +254,19 @@ class Surfels:
             return dr.zeros(mi.Vector3f, 0), dr.zeros(mi.Vector3f, 0), dr.zeros(mi.Vector3f, 0)
         q = self.rotation()
         x, y, z, w = q.x, q.y, q.z, q.w
-        t_u = mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w))
-        t_v = mi.Vector3f(2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w))
-        n = mi.Vector3f(2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
+
+        # Squares of all four on the diagonal, no 1: what rounding does to the norm of q then changes lengths,
+        # by 1e-7, and no direction, on which the far end of a needle depends.
+        def entry(a: Any, b: Any, c: Any, d: Any) -> Any:
+            return dr.fma(a, b, c * d)
+
+        t_u = mi.Vector3f(
+            entry(w, w, x, x) - entry(y, y, z, z), 2 * entry(x, y, z, w), 2 * entry(x, z, -y, w)
+        )
+        t_v = mi.Vector3f(
+            2 * entry(x, y, -z, w), entry(w, w, y, y) - entry(x, x, z, z), 2 * entry(y, z, x, w)
+        )
+        n = mi.Vector3f(2 * entry(x, z, y, w), 2 * entry(y, z, -x, w), entry(w, w, z, z) - entry(x, x, y, y))
         return t_u, t_v, n
 
     # ---------------- rows ----------------
