@@ -34,7 +34,6 @@ class Case:
     pixels: int | None = None  # the oracle sees a random subset of this size; None: all
     offset: tuple[int, int] = (0, 0)  # of a crop window in its film
     quick: bool = True  # cheap enough for every test run
-    note: str = ""  # for the table
     near: float | None = None  # the camera's near plane, if the case is about it
     band: float = 1e-4  # relative width of the declared discontinuities, above what rounding does to α
 

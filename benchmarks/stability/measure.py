@@ -58,9 +58,9 @@ class Row:
     order: float
     image_floor: float  # change of the exact answer by one ulp of the inputs
     gradient_floor: dict[str, float]
+    negligible: list[str]  # classes of less than NEGLIGIBLE
     textbook: float  # image error of the textbook formulas; inf where they are not finite
     verdict: str
-    note: str = ""
 
 
 # ---------------- the product ----------------
@@ -254,7 +254,7 @@ def measure(case: Case, floors: bool = True, book: bool = True) -> Row:
     verdict = judge(image, others, gradients, found.non_finite, kept, inverted, image_floor, gradient_floor)
     return Row(
         case.name, image, others, gradients, found.non_finite, kept, inverted, image_floor, gradient_floor,
-        textbook.image_error(case, scene, band) if book else 0.0, verdict, case.note,
+        negligible(exact, scene.raw), textbook.image_error(case, scene, band) if book else 0.0, verdict,
     )  # fmt: skip
 
 
@@ -307,16 +307,23 @@ def gradient_errors(
     Columns are weighed by what they are measured in: positions by the scene's extent, quaternions
      by their length.
     """
-    units = {"position": _extent(raw["position"]), "rotation": np.linalg.norm(raw["rotation"], axis=1)}
-    units["rotation"] = np.maximum(units["rotation"], oracle.QUATERNION_FLOOR)[:, None]
-    sizes, errors = {}, {}
-    for name in GRADIENTS:
-        if name in exact and exact[name].size:
-            unit = units.get(name, 1.0)
-            sizes[name] = float(np.linalg.norm(unit * exact[name]))
-            errors[name] = float(np.linalg.norm(unit * (found[name].astype(np.float64) - exact[name])))
-    least = NEGLIGIBLE * max(sizes.values(), default=0.0)
+    sizes, difference = _sizes(exact, raw), {n: found[n].astype(np.float64) - x for n, x in exact.items()}
+    errors, least = _sizes(difference, raw), NEGLIGIBLE * max(sizes.values(), default=0.0)
     return {n: e / s if (s := max(sizes[n], least)) > 0 else e for n, e in errors.items()}
+
+
+def negligible(exact: dict[str, Array], raw: dict[str, Array]) -> list[str]:
+    """Classes with a gradient, but of less than NEGLIGIBLE."""
+    sizes = _sizes(exact, raw)
+    return [n for n, size in sizes.items() if 0 < size < NEGLIGIBLE * max(sizes.values())]
+
+
+def _sizes(gradients: dict[str, Array], raw: dict[str, Array]) -> dict[str, float]:
+    units: dict[str, Any] = {"position": _extent(raw["position"])}
+    length = np.linalg.norm(raw["rotation"], axis=1, keepdims=True)
+    units["rotation"] = np.maximum(length, oracle.QUATERNION_FLOOR)
+    names = [n for n in GRADIENTS if n in gradients and gradients[n].size]
+    return {n: float(np.linalg.norm(units.get(n, 1.0) * gradients[n])) for n in names}
 
 
 def _extent(position: Array) -> float:

@@ -85,11 +85,14 @@ def _cases(result: dict[str, Any]) -> str:
 
 
 def _gradients(result: dict[str, Any]) -> str:
-    rows = [
-        [row["case"], *("" if (e := row[f"gradient_{n}"]) is None else _e(e) for n in GRADIENTS)]
-        for row in result["rows"]
-    ]
-    return "## Gradients by class\n\n" + table(["case", *(SHORT[n] for n in GRADIENTS)], rows)
+    rows = [[row["case"], *(_class(row, name) for name in GRADIENTS)] for row in result["rows"]]
+    text = f"†: the exact gradient is below {_e(NEGLIGIBLE)} of the largest class, with which it is compared."
+    return f"## Gradients by class\n\n{text}\n\n" + table(["case", *(SHORT[n] for n in GRADIENTS)], rows)
+
+
+def _class(row: dict[str, Any], name: str) -> str:
+    error = row[f"gradient_{name}"]
+    return "" if error is None else _e(error) + " †" * (name in row["negligible"].split())
 
 
 def _response(result: dict[str, Any]) -> str:

@@ -27,7 +27,10 @@ def measure(quick: bool = False, only: list[str] | None = None, quiet: bool = Fa
         rows.append(record(measure_case(case, floors=case.quick)))
         dr.flush_malloc_cache()  # a picture of 4096² leaves gigabytes
     result: dict[str, Any] = {"machine": report.machine(), "rows": rows}
-    result |= {"curve": [], "losses": []} if only else response.measure()
+    if not only:
+        result |= {name: [_finite(row) for row in found] for name, found in response.measure().items()}
+    else:
+        result |= {"curve": [], "losses": []}
     more = not (only or quick)
     result["fits"] = fits.measure() if more else []
     result |= bias.measure() if more else {"rules": [], "gradient": []}
@@ -46,20 +49,30 @@ def record(row: Row) -> dict[str, Any]:
         "non_finite": row.non_finite,
         "kept": row.kept,
         "order": row.order,
+        "negligible": " ".join(row.negligible),
         "verdict": row.verdict,
     }
     flat |= {f"gradient_{name}": row.gradients.get(name) for name in GRADIENTS}
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in flat.items()}
+    return _finite(flat)
+
+
+def _finite(row: dict[str, Any]) -> dict[str, Any]:
+    """None for what is not finite."""
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
 
 
 def failures(result: dict[str, Any]) -> list[str]:
     """What does not hold, one line each."""
     lines = [f"{row['case']}: {row['verdict']}" for row in result["rows"] if "FAILS" in row["verdict"]]
     for row in result["curve"]:
-        if max(row["value"], row["slope"]) > IMAGE_LIMIT:
-            lines.append(f"sRGB at {row['at']}: value {row['value']:.1e}, slope {row['slope']:.1e}")
+        if _misses(row):
+            lines.append(f"sRGB at {row['at']}: value {row['value']}, slope {row['slope']}")
     for row in result["losses"]:
-        if row["non_finite"] or max(row["value"], row["slope"]) > IMAGE_LIMIT:
-            lines.append(f"loss, {row['name']}: value {row['value']:.1e}, slope {row['slope']:.1e}")
+        if row["non_finite"] or _misses(row):
+            lines.append(f"loss, {row['name']}: value {row['value']}, slope {row['slope']}")
     lines += [f"fit, {row['name']}: not finite" for row in result["fits"] if row["non_finite"]]
     return lines
+
+
+def _misses(row: dict[str, Any]) -> bool:
+    return not all(row[key] is not None and row[key] <= IMAGE_LIMIT for key in ("value", "slope"))

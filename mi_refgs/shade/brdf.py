@@ -120,5 +120,7 @@ def split_sum(n_dot_v: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Floa
     row, v = place(roughness)
     texel = row * RESOLUTION + column
     t00, t01, t10, t11 = (dr.gather(mi.Vector2f, data, texel + k) for k in (0, 1, RESOLUTION, RESOLUTION + 1))
-    pair = dr.lerp(dr.lerp(t00, t01, u), dr.lerp(t10, t11, u), v)
+    # Differences of texels first: where the table is flat, that of interpolated values is their rounding.
+    across, down = t01 - t00, t10 - t00
+    pair = t00 + u * across + v * dr.fma(u, (t11 - t10) - across, down)
     return pair.x, pair.y

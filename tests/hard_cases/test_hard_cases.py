@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from benchmark_runs import ROOT  # first: it lets `benchmarks` be found
 
 from benchmarks.stability import measure as module
 from benchmarks.stability import response
+from benchmarks.stability.__main__ import main
 from benchmarks.stability.case import Case, plain
 from benchmarks.stability.cases import catalogue
 from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, judge, measure
@@ -35,6 +38,14 @@ def test_case(case: Case) -> None:
     row = measure(case, floors=False, book=False)
     assert row.verdict == "holds" or case.name in ILL_CONDITIONED, row
     assert "FAILS" not in row.verdict, row
+
+
+@pytest.mark.parametrize("name", ["roughness 0", "mirrors that reflect a pole"])
+def test_slope_where_the_split_sum_table_is_flat(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gradient of a mirror's roughness is tiny, and right: not the rounding of interpolated values."""
+    monkeypatch.setattr(module, "NEGLIGIBLE", 0.0)
+    case = next(case for case in CASES if case.name == name)
+    assert measure(case, floors=False, book=False).gradients["roughness"] <= 1e-3
 
 
 @pytest.mark.parametrize("row", response.CURVE, ids=str)
@@ -89,6 +100,13 @@ def test_a_planted_mistake_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FootprintAdjoint, "columns", wrong)
     verdict = measure(plain("plain"), floors=False).verdict
     assert verdict.startswith("FAILS") and "position" in verdict and "image" not in verdict
+
+
+def test_page(tmp_path: Path) -> None:
+    assert main(["--only", "one surfel", "-o", str(tmp_path), "--quiet"]) == 0
+    page = (tmp_path / "stability.md").read_text()
+    assert "| one surfel |" in page and "1 hold, 0 are ill-conditioned, 0 fail. 0 values" in page
+    assert not re.search(r"\bnan\b|\binf\b|\bNone\b", page)
 
 
 def test_verdicts() -> None:
