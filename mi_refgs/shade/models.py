@@ -151,6 +151,10 @@ def shade(
     `multiple_scattering`, specular = V (L(r, roughness) S + irradiance(n) M) and
     indirect = (1 - V) L_indirect (S + M).
 
+    Under a constant light of 1 the specular term stays below 1. The diffuse term does not yield to it, so
+    that with "irradiance" the total reaches 1 + (1 - metallic) albedo at grazing incidence, and at most
+    albedo + 0.09 (0.13 with `multiscatter`), or 1, in the mean over the angles, weighted by their cosine.
+
     Differentiable in everything but the branches of the clamps. Finite for every finite input.
     Raises InputError for an unknown `diffuse`, or "sh" without a radiance.
     """
