@@ -91,6 +91,7 @@ WRONG = {
     "infinite light": replaced("params/light", spoilt(np.inf)),
     "infinite moments": replaced("optimiser/light/second", spoilt(np.inf)),
     "negative square": replaced("optimiser/light/second", spoilt(-1)),
+    "no usual gradient": without("optimiser/light/usual"),
     "NaN seconds": replaced("seconds", lambda x: np.nan),
     "negative iteration": replaced("iteration", lambda x: -1),
     "a face without its vertex": replaced("mesh/faces", spoilt(10**6)),

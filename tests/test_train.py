@@ -103,7 +103,7 @@ def test_the_loss_falls_and_everything_trains(method: Method) -> None:
         trainer.step()
         losses.append(float(trainer.loss[0]))
     assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:6])
-    assert trainer.optimiser.bad == 0
+    assert trainer.optimiser.report().count == 0
     for name, tensor in trainer.params.items():  # the indirect channel starts at exactly 0 and must leave it
         assert np.all(np.isfinite(tensor.numpy())), name
         assert not np.array_equal(before[name], tensor.numpy()), name

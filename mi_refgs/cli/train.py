@@ -182,7 +182,6 @@ class Progress:
 
         self.folder = folder
         self.psnr: float | None = None
-        self.warned = False
         self.bar = tqdm(
             total=trainer.method.iterations,
             initial=trainer.iteration,
@@ -202,6 +201,8 @@ class Progress:
 
     def __call__(self, trainer: Trainer) -> None:
         method = trainer.method
+        while trainer.notices:
+            warn(trainer.notices.pop(0))
         if trainer.iteration % method.log_every == 0:
             # The numbers wait for the device, as the log of this iteration did already.
             numbers = trainer.statistics()
@@ -211,9 +212,6 @@ class Progress:
                 f"loss {numbers['loss']:.4f}, PSNR {self.psnr:.1f} dB, {numbers['surfels']} surfels",
                 refresh=False,
             )
-            if numbers["non_finite_gradients"] and not self.warned:
-                self.warned = True
-                warn(f"{numbers['non_finite_gradients']} gradients were NaN or infinite and counted as 0")
         if trainer.iteration % method.preview_every == 0:
             self._preview(trainer)
         self.bar.update()

@@ -89,7 +89,7 @@ def check(state: Mapping[str, np.ndarray]) -> None:
     for tensor, values in params.items():
         _check(state, [f"{OPTIMISER}{tensor}/first"], (values.size,), signed=True)
         _check(state, [f"{OPTIMISER}{tensor}/second"], (values.size,))
-        scalars += [f"{OPTIMISER}{tensor}/{name}" for name in ("steps", "factor")]
+        scalars += [f"{OPTIMISER}{tensor}/{name}" for name in ("steps", "factor", "usual")]
     _check(state, scalars, ())
     _check(state, rows, (table.count,))
     _check(state, signed, signed=True)

@@ -2,8 +2,15 @@
 
 Letters: θ parameter, g gradient, m v first and second moment, t step count of a tensor, η learning rate.
     m ← β₁ m + (1 - β₁) g,   v ← β₂ v + (1 - β₂) g²,   θ ← θ - η √(1 - β₂ᵗ) / (1 - β₁ᵗ) · m / (√v + ε)
-[Kingman and Ba 2015, §2, the efficient order]. A NaN or infinite gradient entry counts as 0 and is reported
-by `bad`.
+[Kingman and Ba 2015, §2, the efficient order].
+
+Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing: the device decides, nobody
+waits for it, and `report` says later how many there were and which rows had such gradients. And |g| is cut to
+OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor, whichever is more. A
+step is at most (1 - β₁) / √(1 - β₂) = 3.2 η long however large g is, so the cut shortens the one in hand by
+less than 5 %. What it bounds is the memory of v: after one gradient of 10¹⁰, an entry of usual gradients 10⁻⁷
+would not move for 2 ln(10¹⁷ √(1 - β₂)) / (1 - β₂) = 71,000 steps; cut, it moves 3.3 times slower, or ten
+times if it happens in the first hundred steps.
 """
 
 from __future__ import annotations
@@ -25,6 +32,20 @@ from mi_refgs.surfels.table import gather_rows
 BETA_1 = 0.9
 BETA_2 = 0.999
 EPSILON = 1e-15
+OUTLIER = 100.0
+"""Gradients beyond this many times the usual are cut; see above."""
+
+SAMPLES = 10_000
+"""Entries that a median is taken of."""
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """Steps that changed nothing since the last report."""
+
+    count: int
+    iteration: int  # 0-based, of the last one
+    rows: dict[str, np.ndarray]  # rows whose gradient was not finite, by tensor; absent where there was none
 
 
 @dataclass(frozen=True)
@@ -72,10 +93,14 @@ class Adam:
         self._first: dict[str, Any] = {}
         self._second: dict[str, Any] = {}
         self._steps: dict[str, int] = {}
-        self._bad: Any = None
+        self._usual: dict[str, float] = {}  # median √(v / (1 - β₂ᵗ)); 0: not known yet
+        self._flags: dict[str, Any] = {}  # (rows,) 1 where a gradient was not finite
+        self._calls, self._iteration = 0, 0  # number and iteration of the last step
+        self._last = dr.opaque(mi.UInt32, 0)  # number of the last step that was skipped
+        self._skipped = dr.opaque(mi.UInt32, 0)
         for name in groups:
             self._clear(name)
-            self._steps[name] = 0
+            self._steps[name], self._usual[name] = 0, 0.0
             self._make_leaf(name)
 
     def set_factor(self, name: str, factor: float) -> None:
@@ -86,46 +111,87 @@ class Adam:
         """Learning rate of a tensor's head columns at this iteration."""
         return self.groups[name].at(iteration) * self.factors.get(name, 1.0)
 
-    @property
-    def bad(self) -> int:
-        """How many gradient entries of the last step were NaN or infinite; waits for the device."""
-        return 0 if self._bad is None else int(self._bad[0])
+    def report(self) -> Skipped:
+        """The steps that were skipped since the last call; waits for the device, so not for every step."""
+        count = int(self._skipped[0])
+        rows = {name: np.flatnonzero(flags.numpy()) for name, flags in self._flags.items()} if count else {}
+        last = self._iteration - (self._calls - int(self._last[0]))
+        found = Skipped(count, last, {name: at for name, at in rows.items() if len(at)})
+        if count:
+            self._skipped = dr.opaque(mi.UInt32, 0)
+            for name in self.groups:
+                self._clear_flags(name)
+        return found
 
-    def step(self, iteration: int) -> None:
+    def step(self, iteration: int, loss: Any = None) -> None:
         """Apply one update with the learning rates of this iteration (0-based), then clear the gradients.
 
-        A tensor that the loss does not depend on rests, as in PyTorch: its moments and step count stay.
+        Nothing changes if `loss` (a mi.Float) or a gradient is not finite. Tensors that the loss does not
+        depend on are skipped, as in PyTorch: their moments and step count stay.
         """
-        updated, bad = {}, dr.opaque(mi.UInt32, 0)
-        for name, group in self.groups.items():
-            tensor = self.params[name]
-            shape = tuple(int(size) for size in tensor.shape)
-            if math.prod(shape) == 0:
-                continue
-            g = dr.grad(tensor).array
-            if g.state == dr.VarState.Literal and float(g[0]) == 0:
-                continue
-            self._steps[name] += 1
-            finite = dr.isfinite(g)
-            # Almost never active, so a direct atomic costs nothing and needs no launch of its own.
-            dr.scatter_reduce(dr.ReduceOp.Add, bad, mi.UInt32(1), mi.UInt32(0), ~finite, dr.ReduceMode.Direct)
-            g = dr.select(finite, g, 0.0) * dr.opaque(mi.Float, group.unit)
+        gradients = {}
+        for name in self.groups:
+            g = dr.grad(self.params[name]).array
+            if dr.width(g) and not (g.state == dr.VarState.Literal and float(g[0]) == 0):
+                gradients[name] = g
+        self._calls, self._iteration = self._calls + 1, iteration
+        number = dr.opaque(mi.UInt32, self._calls)
+        for name, g in gradients.items():
+            bad, row = self._not_finite(name, g)
+            dr.scatter(self._flags[name], mi.UInt32(1), row, bad)
+            if loss is not None:
+                bad |= ~dr.isfinite(loss)
+            # Almost never active, so a direct atomic costs nothing.
+            dr.scatter_reduce(dr.ReduceOp.Max, self._last, number, mi.UInt32(0), bad, dr.ReduceMode.Direct)
+        dr.eval(self._last)
+        good = self._last < number
+        if gradients:
+            dr.scatter_reduce(dr.ReduceOp.Add, self._skipped, mi.UInt32(1), mi.UInt32(0), ~good)
+
+        updated = {}
+        for name, g in gradients.items():
+            shape, group = tuple(int(size) for size in self.params[name].shape), self.groups[name]
+            t = self._steps[name] + 1
+            g = self._cut(name, g, t)
             m = BETA_1 * self._first[name] + (1 - BETA_1) * g
             v = BETA_2 * self._second[name] + (1 - BETA_2) * g * g
-            t = self._steps[name]
             correction = math.sqrt(1 - BETA_2**t) / (1 - BETA_1**t)
             η = dr.opaque(mi.Float, self.rate(name, iteration) * correction)
             if 0 < group.head < shape[-1]:
                 column = dr.arange(mi.UInt32, math.prod(shape)) % shape[-1]
                 η = η * dr.select(column < group.head, 1.0, group.tail)
-            θ = dr.detach(tensor.array) - η * m / (dr.sqrt(v) + EPSILON)
-            self._first[name], self._second[name] = m, v
-            updated[name] = (θ, shape)
-        self._bad = bad
-        dr.eval(self._first, self._second, [θ for θ, _ in updated.values()], bad)
+            θ = dr.detach(self.params[name].array)
+            updated[name] = (dr.select(good, θ - η * m / (dr.sqrt(v) + EPSILON), θ), shape)
+            self._first[name] = dr.select(good, m, self._first[name])
+            self._second[name] = dr.select(good, v, self._second[name])
+            self._steps[name] = t
+        dr.eval(self._first, self._second, [θ for θ, _ in updated.values()])
         for name, (θ, shape) in updated.items():
             self.params[name] = mi.TensorXf(θ, shape=shape)
             self._make_leaf(name)
+
+    def _cut(self, name: str, g: Any, t: int) -> Any:
+        """The gradient of step t, without unit, cut where it is far beyond the usual, 0 where not finite."""
+        g = g * dr.opaque(mi.Float, self.groups[name].unit)
+        if t & (t - 1) == 0:  # at steps 1, 2, 4, …, since it waits for the device
+            square = _median(g) ** 2 if t == 1 else _median(self._second[name]) / (1 - BETA_2 ** (t - 1))
+            self._usual[name] = math.sqrt(square)
+        inverse = dr.opaque(mi.Float, 1 / (1 - BETA_2 ** max(t - 1, 1)))
+        usual = dr.opaque(mi.Float, self._usual[name] or math.inf)
+        limit = OUTLIER * dr.maximum(dr.sqrt(self._second[name] * inverse), usual)
+        return dr.select(dr.isfinite(g), dr.clip(g, -limit, limit), 0.0)
+
+    def _not_finite(self, name: str, g: Any) -> tuple[Any, Any]:
+        """Where entries of the head columns are not finite, and their rows.
+
+        It costs 1 % of a step to look at those, 2 % to look at all. The other columns are of spherical
+        harmonics: their gradient is that of a head column times a bounded function.
+        """
+        width = dr.width(g) // dr.width(self._flags[name])
+        head = self.groups[name].head or width
+        entry = dr.arange(mi.UInt32, dr.width(g) // width * head)
+        row = entry // head
+        return ~dr.isfinite(g if head == width else dr.gather(mi.Float, g, entry + row * (width - head))), row
 
     def gather(self, parent: Any, names: list[str], fresh: Any | None = None) -> None:
         """Let the moments of (N, D) tensors follow their rows: row i takes those of row parent[i].
@@ -147,6 +213,7 @@ class Adam:
                     rows = dr.select(dr.gather(mi.Bool, mi.Bool(fresh), row), 0.0, rows)
                 moments[name] = rows
             dr.eval(self._first[name], self._second[name])
+            self._clear_flags(name)
             self._make_leaf(name)
 
     def reset(self, name: str, rows: Any | None = None) -> None:
@@ -174,6 +241,7 @@ class Adam:
             state[f"{name}/second"] = np.array(self._second[name], dtype=np.float32)
             state[f"{name}/steps"] = np.array(self._steps[name])
             state[f"{name}/factor"] = np.array(self.factors.get(name, 1.0))
+            state[f"{name}/usual"] = np.array(self._usual[name])
         return state
 
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
@@ -189,6 +257,7 @@ class Adam:
                     )
                 moments[name] = upload(values)
             self._steps[name] = int(state[f"{name}/steps"])
+            self._usual[name] = float(state[f"{name}/usual"])
             factor = float(state[f"{name}/factor"])
             self.factors.pop(name, None)
             if factor != 1.0:
@@ -199,8 +268,20 @@ class Adam:
         # Opaque zeros: a literal would give the first step after a reset a kernel of its own.
         self._first[name] = dr.opaque(mi.Float, 0.0, size) if size else mi.Float()
         self._second[name] = dr.opaque(mi.Float, 0.0, size) if size else mi.Float()
+        self._clear_flags(name)
+
+    def _clear_flags(self, name: str) -> None:
+        rows = int(self.params[name].shape[0])
+        self._flags[name] = dr.opaque(mi.UInt32, 0, rows) if rows else mi.UInt32()
 
     def _make_leaf(self, name: str) -> None:
         tensor = dr.detach(self.params[name])
         dr.enable_grad(tensor)
         self.params[name] = tensor
+
+
+def _median(values: Any) -> float:
+    """Median |x| of the finite entries that are not 0, of at most SAMPLES; 0 if there are none."""
+    x = np.abs(values.numpy()[:: max(dr.width(values) // SAMPLES, 1)])
+    x = x[(x > 0) & np.isfinite(x)]
+    return float(np.median(x)) if len(x) else 0.0

@@ -17,7 +17,7 @@ import numpy as np
 
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
-from mi_refgs.fit import refine
+from mi_refgs.fit import health, refine
 from mi_refgs.fit.checkpoint import OPTIMISER, PARAMS, part, tensors
 from mi_refgs.fit.config import Method, Stage
 from mi_refgs.fit.data import Dataset
@@ -58,7 +58,12 @@ class Trainer:
         self.occluder = Occluder()
         self.iteration, self.seconds = 0, 0.0
         self.held_until = 0  # iteration before which opacities do not learn
+        self.skipped = 0  # steps that changed nothing, since their loss or gradient was not finite
+        self.notices: list[str] = []  # what a person should know; whoever shows it clears it
+        self._checked, self._failed = 0, 0  # iteration of the last check; failed steps in a row
         self.params: dict[str, Any] = {}
+        self.gradient_sum: Any = None  # of each surfel since it was densified last, and of how many views
+        self.gradient_count: Any = None
         state = run.load_checkpoint() if run is not None else None
         if state is None:
             self.params |= initial_surfels(method, data, self.schedule.rng(0)).raw
@@ -123,17 +128,43 @@ class Trainer:
                         progress(self)
                     release()
                 except KeyboardInterrupt:
-                    if self.run is not None:
-                        self.run.save_checkpoint(self.iteration, self.state())
+                    self._save()
                     raise
+            self.check()
 
     def _record(self) -> None:
-        if self.run is None:
-            return
         if self.iteration % self.method.log_every == 0:
-            self.run.log(self.statistics())
+            self.check()
+            if self.run is not None:
+                self.run.log(self.statistics())
         if self.iteration % self.method.checkpoint_every == 0:
+            self._save()
+
+    def _save(self) -> None:
+        self.check()
+        if self.run is not None:
             self.run.save_checkpoint(self.iteration, self.state())
+
+    def check(self) -> None:
+        """Remove the surfels that made steps fail since the last check, and leave a notice of it.
+
+        Raises InputError if the light is not finite, if no surfel is left, or if nothing helps. Waits for the
+        device, and so is called on intervals only.
+        """
+        skipped, steps = self.optimiser.report(), self.iteration - self._checked
+        self._checked, self.skipped = self.iteration, self.skipped + skipped.count
+        self._failed = self._failed + steps if skipped.count >= steps else 0
+        health.check_light(self.light)
+        rows = health.culprits(self.surfels, skipped)
+        if not rows and not skipped.count:
+            return
+        view = self.data.views[self.schedule.view(skipped.iteration + 1)].name if skipped.count else ""
+        said = health.sentence(rows, skipped, view)
+        self.notices.append(said)
+        if self._failed >= health.PATIENCE * self.method.log_every:
+            raise health.gave_up(said, self._failed)
+        if rows:
+            self._remove(health.together(rows))
 
     def step(self) -> None:
         """One iteration: enter a stage if it begins, one gradient step, then what falls due."""
@@ -158,11 +189,12 @@ class Trainer:
             "loss": float(self.loss[0]),
             "psnr": round(-10 * float(np.log10(max(mse, 1e-10))), 3),
             "surfels": self.surfels.count,
-            "non_finite_gradients": self.optimiser.bad,
+            "skipped_steps": self.skipped,
         }
 
     def extract_mesh(self) -> Mesh:
         """Fuse the rendered depth of all training views into a mesh and make it the occluder."""
+        self.check()
         surfels = self.surfels.detach()
         views = tee(render_depth(surfels, target.camera) for target in self.targets)
         assert self.method.mesh is not None
@@ -201,16 +233,18 @@ class Trainer:
 
         if self.method.refine.densify is not None and iteration <= self.method.refine.densify.until:
             length = dr.norm(dr.grad(shift) * mi.Vector2f(0.5 * camera.width, 0.5 * camera.height))
-            self.gradient_sum += length
-            self.gradient_count += dr.select(length > 0, mi.Float(1), 0)
+            seen = (length > 0) & dr.isfinite(length)
+            self.gradient_sum += dr.select(seen, length, 0.0)
+            self.gradient_count += dr.select(seen, mi.Float(1), 0)
             dr.schedule(self.gradient_sum, self.gradient_count)
         if iteration % self.method.log_every == 0:
             dr.schedule(self.loss, self.error)
-        self.optimiser.step(iteration - 1)
+        self.optimiser.step(iteration - 1, self.loss)
 
     def _refine(self, iteration: int) -> None:
         options, surfels = self.method.refine, self.method.surfels
         if options.densify is not None and options.densify.due(iteration):
+            self.check()
             since_reset = options.reset.since(iteration) if options.reset is not None else None
             grown_back = since_reset is None or since_reset >= refine.prune_wait(
                 options, self.method.rates.opacity
@@ -239,6 +273,17 @@ class Trainer:
             self.held_until = iteration + options.propagate_hold
         if iteration >= self.held_until:
             self.optimiser.set_factor("opacity", 1.0)
+
+    def _remove(self, rows: np.ndarray) -> None:
+        """Take surfels out of the table."""
+        parent = np.delete(np.arange(self.surfels.count), rows)
+        if not len(parent):
+            raise InputError("surfels: none of them is finite; lower the rates (--set rates.…)")
+        index = upload(parent, mi.UInt32)
+        self._replace(self.surfels.gather(index))
+        self.optimiser.gather(index, list(self.surfels.raw))
+        self.gradient_sum = dr.gather(mi.Float, self.gradient_sum, index)
+        self.gradient_count = dr.gather(mi.Float, self.gradient_count, index)
 
     def _reset_materials(self, iteration: int) -> None:
         options = self.method.surfels
@@ -296,6 +341,7 @@ class Trainer:
                     f"{expected.get(name, 'none')}; undo the change, or start another run"
                 )
         self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
+        self._checked = self.iteration
         self.params |= tensors(state, PARAMS)
         self.optimiser = Adam(self.params, self._groups())
         self.optimiser.load_state_dict(part(state, OPTIMISER))

@@ -1,0 +1,278 @@
+"""Whether fits survive: killed at random moments, and over a hundred thousand steps.
+
+    python -m benchmarks.survival kill --times 50       kills a fit by SIGKILL again and again, and resumes it
+    python -m benchmarks.survival soak --steps 100000   one long fit: memory, step time, values not finite
+
+Both fit the full method to a few pictures of 32² pixels with a few hundred surfels, on one thread, so that
+checkpoints, logs, densifying, resets of opacity and mesh extraction recur within seconds. The exit code is 1
+if a fit could not be resumed, lost more than an interval or left a half-written file, or if the long one grew
+by more than 1 MB in 10,000 steps or met a value that is not finite.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
+
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
+
+ROOT = Path(__file__).parents[1]
+SIZE, VIEWS = 32, 5
+CHECKPOINT_EVERY = 4
+"""Iterations between the checkpoints of the fits that are killed: most kills fall near one."""
+WAIT = 1.5
+"""A fit is killed at a random moment within so many seconds of its first log line."""
+START_LIMIT = 300.0
+"""Seconds in which a fit must get to its first step."""
+GROWTH_LIMIT = 1.0
+"""MB in 10,000 steps."""
+INTERVAL = 1_000
+"""Steps between the records of the soak."""
+WARM_UP = 0.2
+"""Share of the soak that slopes leave out: kernels are compiled and pools filled."""
+
+COMMON = [
+    "surfels.count=200",
+    "surfels.max_count=300",
+    "light.height=8",
+    "mesh.resolution=16",
+    "stage.initial.until=8",
+    "refine.gradient=1e-5",
+    "log_every=1",
+]
+
+
+def settings(**windows: int) -> list[str]:
+    """Assignments for a fit without end in which these events recur, each after so many iterations."""
+    found = ["iterations=100_000_000", *COMMON]
+    for name, every in windows.items():
+        key = "mesh.extract" if name == "extract" else f"refine.{name}"
+        found += [f"{key}.start=0", f"{key}.until=100_000_000", f"{key}.every={every}"]
+    return found
+
+
+def write_data(folder: Path) -> Path:
+    """The pictures as a data set on disk."""
+    from benchmarks.step import sphere_data
+    from mi_refgs.fit.frames import MITSUBA_FROM_OPENGL
+    from mi_refgs.images import write_png
+
+    folder.mkdir(parents=True)
+    views = sphere_data(SIZE, VIEWS, np.random.default_rng(0)).views
+    frames = []
+    for i, view in enumerate(views):
+        write_png(folder / f"{i}.png", np.concatenate([view.image, view.alpha[..., None]], axis=-1))
+        pose = view.to_world @ MITSUBA_FROM_OPENGL
+        frames.append({"file_path": f"./{i}.png", "transform_matrix": pose.tolist()})
+    content = {"fl_x": views[0].fx, "fl_y": views[0].fy, "w": SIZE, "h": SIZE, "frames": frames}
+    (folder / "transforms_train.json").write_text(json.dumps(content))
+    return folder
+
+
+# ---------------- killed ----------------
+
+
+def kill(times: int, seed: int, folder: Path) -> dict[str, Any]:
+    """Start or resume a fit, kill it at a random moment, look at what it left; `times` times."""
+    from mi_refgs.files import TEMPORARY
+    from mi_refgs.fit import checkpoint
+    from mi_refgs.fit.record import Run
+
+    draw, run = random.Random(seed), Run(folder / "run")
+    data = write_data(folder / "data")
+    command = [sys.executable, "-m", "mi_refgs", "train", str(data), "-o", str(run.path), "--resume"]
+    windows = settings(densify=7, extract=9, reset=50)
+    first = [*command, "--threads", "1", "--preset", "quick", "--set", *windows]
+    first += [f"checkpoint_every={CHECKPOINT_EVERY}", "preview_every=6"]
+    outcomes: list[dict[str, Any]] = []
+    for number in range(times + 1):
+        begun = (run.path / "config.toml").exists()
+        before = _logged(run)
+        process = subprocess.Popen(
+            [*command, "--threads", "1"] if begun else first,
+            cwd=ROOT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+        )
+        deadline = time.monotonic() + START_LIMIT
+        resumed = _checkpoint(run)
+        while process.poll() is None and time.monotonic() < deadline and not _goes_on(run, before, resumed):
+            time.sleep(0.01)
+        wait = draw.uniform(0, WAIT)
+        if process.poll() is None:
+            time.sleep(wait)
+        last = number == times
+        process.send_signal(signal.SIGTERM if last else signal.SIGKILL)
+        _, said = process.communicate()
+        killed = process.returncode == (143 if last else -signal.SIGKILL)
+        reached, damaged = _logged(run), []
+        for path in run.checkpoints():
+            try:
+                checkpoint.read(path)
+            except checkpoint.DamagedError as error:
+                damaged.append(f"{path.name}: {error}")
+        outcomes.append(
+            {
+                "kill": number,
+                "signal": "SIGTERM" if last else "SIGKILL",
+                "seconds": round(wait, 3),
+                "resumed_at": resumed,
+                "reached": reached,
+                "lost": reached - _checkpoint(run),
+                "damaged": damaged,
+                "temporary": sum(1 for path in run.path.rglob(".*") if TEMPORARY.fullmatch(path.name)),
+                "ok": killed and not damaged and reached > resumed,
+                "said": "" if killed else said.decode(errors="replace")[-500:],
+            }
+        )
+        print(json.dumps(outcomes[-1]), file=sys.stderr, flush=True)
+    lost = max(outcome["lost"] for outcome in outcomes)
+    left = outcomes[-1]["temporary"]
+    return {
+        "seed": seed,
+        "kills": times,
+        "resumed": sum(outcome["ok"] for outcome in outcomes[1:]),
+        "most_iterations_lost": lost,
+        "checkpoint_every": CHECKPOINT_EVERY,
+        "damaged_checkpoints": sum(len(outcome["damaged"]) for outcome in outcomes),
+        "temporary_files_left_by_kills": sum(outcome["temporary"] for outcome in outcomes[:-1]),
+        "temporary_files_at_the_end": left,
+        "ok": all(outcome["ok"] for outcome in outcomes) and lost <= CHECKPOINT_EVERY and not left,
+    }
+
+
+def _logged(run: Any) -> int:
+    """Iteration of the last whole line of the log; 0 without one."""
+    try:
+        lines = (run.path / "metrics.jsonl").read_bytes().split(b"\n")[:-1]
+        return int(json.loads(lines[-1])["iteration"])
+    except (OSError, ValueError, IndexError):
+        return 0
+
+
+def _checkpoint(run: Any) -> int:
+    """Iteration of the newest checkpoint; 0 without one."""
+    return max((int(path.stem) for path in run.checkpoints()), default=0)
+
+
+def _goes_on(run: Any, before: int, resumed: int) -> bool:
+    """Whether a fit has made a step since it was started: the log was cut back to `resumed`, then grew."""
+    now = _logged(run)
+    return resumed < now != before or (now > resumed == before)
+
+
+# ---------------- soaked ----------------
+
+
+def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
+    """One fit of so many steps; a record every INTERVAL steps is printed and, at the end, all are written."""
+    from benchmarks.step import sphere_data
+    from mi_refgs.fit import config
+    from mi_refgs.fit.record import Run
+    from mi_refgs.fit.train import Trainer
+
+    mi.set_variant("llvm_ad_rgb")
+    dr.set_thread_count(1)
+    assignments = settings(densify=100, extract=500, reset=2_000)
+    assignments += [f"iterations={steps}", "log_every=50", "checkpoint_every=1_000"]
+    method = config.load("ref_gaussian", "quick", assignments)
+    run = Run(folder / "run")
+    run.create(method, "none")
+    trainer = Trainer(method, sphere_data(SIZE, VIEWS, np.random.default_rng(0)), run)
+    records: list[dict[str, Any]] = []
+    wall, cpu = [time.perf_counter()], [time.process_time()]
+
+    def record(state: Trainer) -> None:
+        wall.append(time.perf_counter())
+        cpu.append(time.process_time())
+        if state.iteration % INTERVAL:
+            return
+        state.view(state.targets[0].camera)  # as a preview does
+        bad = sum(int((~np.isfinite(x)).sum()) for x in state.state().values())
+        records.append(
+            {
+                "step": state.iteration,
+                "rss_mb": round(_resident() / 2**20, 3),
+                "wall_ms": round(1e3 * float(np.median(np.diff(wall))), 3),
+                "cpu_ms": round(1e3 * float(np.median(np.diff(cpu))), 3),
+                "surfels": state.surfels.count,
+                "skipped": state.skipped,
+                "not_finite": bad,
+                "loss": round(float(state.loss[0]), 5),
+            }
+        )
+        print(json.dumps(records[-1]), file=sys.stderr, flush=True)
+        wall[:], cpu[:] = [time.perf_counter()], [time.process_time()]
+
+    trainer.train(record)
+    kept = records[int(WARM_UP * len(records)) :]
+    step = np.array([r["step"] for r in kept], np.float64)
+
+    def slope(name: str) -> float:
+        """Change in 10,000 steps, by least squares."""
+        return float(1e4 * np.polyfit(step, [r[name] for r in kept], 1)[0]) if len(kept) > 1 else 0.0
+
+    third = max(len(kept) // 3, 1)
+    early, late = (float(np.median([r["cpu_ms"] for r in part])) for part in (kept[:third], kept[-third:]))
+    result = {
+        "steps": trainer.iteration,
+        "rss_mb": [kept[0]["rss_mb"], kept[-1]["rss_mb"]],
+        "rss_mb_per_10000_steps": round(slope("rss_mb"), 3),
+        "cpu_ms_first_and_last_third": [round(early, 2), round(late, 2)],
+        "step_time_drift": round(late / early - 1, 4),
+        "skipped_steps": trainer.skipped,
+        "not_finite": sum(r["not_finite"] for r in records),
+        "notices": trainer.notices[:10],
+    }
+    result["ok"] = (
+        result["rss_mb_per_10000_steps"] <= GROWTH_LIMIT and not trainer.skipped and not result["not_finite"]
+    )
+    if output is not None:
+        output.write_text(json.dumps({"result": result, "records": records}, indent=1) + "\n")
+    return result
+
+
+def _resident() -> int:
+    """Bytes of this process in memory."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one of the two and print its result as JSON."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.survival",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("what", choices=("kill", "soak"))
+    parser.add_argument("--times", type=int, default=50, help="kills")
+    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=0, help="of the moments of the kills")
+    parser.add_argument("-o", "--output", type=Path, help="file for all records of the soak")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as folder:
+        if options.what == "kill":
+            result = kill(options.times, options.seed, Path(folder))
+        else:
+            result = soak(options.steps, Path(folder), options.output)
+    print(json.dumps(result, indent=2))
+    return 0 if result["ok"] else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
