@@ -1,6 +1,6 @@
 """Whether fits survive: killed at random moments, and over a hundred thousand steps.
 
-    python -m benchmarks.survival kill --times 50       kills a fit by SIGKILL again and again, and resumes it
+    python -m benchmarks.survival kill --times 50       kills a fit again and again, and resumes it
     python -m benchmarks.survival soak --steps 100000   one long fit: memory, step time, values not finite
 
 Both fit the full method to a few pictures of 32² pixels with a few hundred surfels, on one thread, so that
@@ -87,7 +87,10 @@ def write_data(folder: Path) -> Path:
 
 
 def kill(times: int, seed: int, folder: Path) -> dict[str, Any]:
-    """Start or resume a fit, kill it at a random moment, look at what it left; `times` times."""
+    """Start or resume a fit, kill it at a random moment, look at what it left; `times` times.
+
+    Every second kill waits, after its random moment, for the next checkpoint that is being written.
+    """
     from mi_refgs.files import TEMPORARY
     from mi_refgs.fit import checkpoint
     from mi_refgs.fit.record import Run
@@ -113,10 +116,12 @@ def kill(times: int, seed: int, folder: Path) -> dict[str, Any]:
         resumed = _checkpoint(run)
         while process.poll() is None and time.monotonic() < deadline and not _goes_on(run, before, resumed):
             time.sleep(0.01)
-        wait = draw.uniform(0, WAIT)
+        wait, last = draw.uniform(0, WAIT), number == times
         if process.poll() is None:
             time.sleep(wait)
-        last = number == times
+        aimed = number % 2 == 1 and not last
+        while aimed and process.poll() is None and time.monotonic() < deadline and not _writing(run):
+            pass
         process.send_signal(signal.SIGTERM if last else signal.SIGKILL)
         _, said = process.communicate()
         killed = process.returncode == (143 if last else -signal.SIGKILL)
@@ -131,6 +136,7 @@ def kill(times: int, seed: int, folder: Path) -> dict[str, Any]:
                 "kill": number,
                 "signal": "SIGTERM" if last else "SIGKILL",
                 "seconds": round(wait, 3),
+                "while_writing": aimed,
                 "resumed_at": resumed,
                 "reached": reached,
                 "lost": reached - _checkpoint(run),
@@ -168,6 +174,11 @@ def _logged(run: Any) -> int:
 def _checkpoint(run: Any) -> int:
     """Iteration of the newest checkpoint; 0 without one."""
     return max((int(path.stem) for path in run.checkpoints()), default=0)
+
+
+def _writing(run: Any) -> bool:
+    """Whether a checkpoint is being written."""
+    return any(entry.name.startswith(".") for entry in os.scandir(run.path / "checkpoints"))
 
 
 def _goes_on(run: Any, before: int, resumed: int) -> bool:

@@ -13,12 +13,13 @@ import pytest
 from tiny_scene import SETTINGS, SIZE, write_data, write_method
 
 from mi_refgs.fit import config, data, metrics, pictures
-from mi_refgs.fit.evaluate import evaluate
+from mi_refgs.fit.evaluate import TIMED_FRAMES, WARM_UP_FRAMES, evaluate
 from mi_refgs.fit.export import Fitted, export
 from mi_refgs.fit.objective import displayed
 from mi_refgs.fit.record import Run
 from mi_refgs.fit.train import Trainer
 from mi_refgs.images import read_png
+from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.surfels.ply import write_ply
 
 KEYS = (
@@ -111,6 +112,19 @@ def test_the_artefacts_are_what_is_measured(run: Run) -> None:
     note = json.loads((run.path / "model.json").read_text())
     (run.path / "model.json").write_text(json.dumps(note | {"iteration": 3}))
     assert evaluate(run)["psnr"] == pytest.approx(before["psnr"], abs=1e-6)
+
+
+def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Test views are rendered with materials and normals, the timed frames without."""
+    asked: list[bool] = []
+
+    def rendered(*arguments: object, aovs: bool, **more: object) -> Frame:
+        asked.append(aovs)
+        return render(*arguments, aovs=aovs, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("mi_refgs.fit.export.render", rendered)
+    evaluate(run)
+    assert asked == [True] * 2 + [False] * (WARM_UP_FRAMES + TIMED_FRAMES)
 
 
 def test_an_export_without_light_or_mesh_leaves_no_stale_one(run: Run, folder: Path) -> None:

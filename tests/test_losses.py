@@ -11,6 +11,8 @@ import pytest
 from image_checks import GRADIENT, HEIGHT, STEP, VALUE, WIDTH, check, gradient, planes, stack
 
 from mi_refgs.fit import losses
+from mi_refgs.fit.data import View
+from mi_refgs.fit.objective import Target
 from mi_refgs.fit.ssim import ssim
 from mi_refgs.images import srgb_from_linear
 from mi_refgs.reference import losses as reference
@@ -55,6 +57,32 @@ def test_l1_of_clipped_highlights(images: tuple[np.ndarray, np.ndarray]) -> None
 def test_saturated_is_the_last_8_bit_value() -> None:
     (mask,) = losses.saturated([mi.Float(254 / 255, 254.4 / 255, 1.0, 1.7)])
     assert list(np.array(mask)) == [False, False, True, True]
+
+
+def test_only_the_objects_own_colour_is_a_highlight() -> None:
+    """Composites of 8-bit colours: white behind empty pixels and edges is none, a white edge on black is."""
+    alpha = np.float32([0, 1 / 255, 0.2, 0.5, 1, 0, 1 / 255, 0.2, 0.5, 1])
+    own = np.float32([0.3, 254 / 255, 0.3, 254 / 255, 254 / 255, 1, 1, 1, 1, 1])
+    for background in (0.0, 1.0):
+        image = own * alpha + (1 - alpha) * np.float32(background)
+        (mask,) = losses.saturated([mi.Float(image)], mi.Float(alpha), [background])
+        assert np.array(mask).tolist() == [False] * 6 + [True] * 4
+
+
+@pytest.mark.parametrize("covered", [0.0, 1.0])
+def test_a_floater_brighter_than_a_white_background_costs(covered: float) -> None:
+    """Over the background it does, over a highlight of the object it does not."""
+    image, alpha = np.ones((4, 4, 3), np.float32), np.full((4, 4), covered, np.float32)
+    view = View("a", 4, 4, 4, 4, 2, 2, np.eye(4), image, alpha, None, None, linear=False)
+    target = Target.of(view, np.ones(3))
+    radiance = [mi.Float(np.full(16, 3.0)) for _ in range(3)]
+    dr.enable_grad(radiance)
+    shown = losses.display_image(radiance, mi.Float(np.full(16, 0.5)), [1.0, 1.0, 1.0])
+    assert target.clipped is not None
+    loss = losses.l1(losses.clip_highlights(shown, target.image, target.clipped), target.image)
+    dr.backward(loss)
+    slope = np.abs(dr.grad(radiance[0]).numpy())
+    assert (float(loss[0]) > 0.1 and slope.min() > 0) if not covered else (float(loss[0]) == slope.max() == 0)
 
 
 def test_ssim(images: tuple[np.ndarray, np.ndarray]) -> None:

@@ -47,7 +47,7 @@ def fit(name: str) -> dict[str, Any]:
     if "view" in case:
         views = tuple(replace(view, **case["view"](view)) for view in trainer.data.views)
         trainer.data = replace(trainer.data, views=views, linear=views[0].linear)
-        trainer.targets = [Target.of(view) for view in views]
+        trainer.targets = [Target.of(view, trainer.data.background) for view in views]
     if "light" in case:
         raw = trainer.params[LIGHT].numpy()
         trainer.params[LIGHT] = upload_tensor(case["light"](raw.ravel()).reshape(raw.shape))

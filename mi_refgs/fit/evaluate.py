@@ -67,8 +67,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict
 
     Evaluates the artefacts as they lie in the folder, after writing what a newer checkpoint makes stale.
     Every key is always there: null, with a `…_reason`, where it does not apply. Normals count where the true
-    alpha is above ½ and there is a true normal. `ms_per_frame` is the median over single synchronised frames,
-    light filtered beforehand.
+    alpha is above ½ and there is a true normal. `ms_per_frame` is the median over single synchronised frames
+    of the displayed picture alone, light filtered beforehand.
 
     Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, and for data
     that is gone.
@@ -128,7 +128,7 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict
         "train_seconds": fitted.seconds,
         "iterations": fitted.iteration,
         "surfels": fitted.surfels.count,
-        "ms_per_frame": _milliseconds(view, [v.camera() for v in views.views], views),
+        "ms_per_frame": _milliseconds(fitted.renderer(aovs=False), [v.camera() for v in views.views], views),
         "variant": method.variant,
         "preset": method.preset,
         "dataset": str(views.path),

@@ -97,8 +97,11 @@ class Fitted:
             raise InputError(f"{folder}: {error}; or write it again with `refgs export {folder}`") from error
         return fitted
 
-    def renderer(self) -> Callable[[Camera], Frame]:
-        """A function that renders views without derivatives; light and mesh are prepared once."""
+    def renderer(self, aovs: bool = True) -> Callable[[Camera], Frame]:
+        """A function that renders views without derivatives, with materials and normals if `aovs`.
+
+        Light and mesh are prepared once.
+        """
         with dr.suspend_grad():
             light = None if self.light is None else self.light.prefilter()
         occluder = Occluder(self.mesh)
@@ -107,7 +110,7 @@ class Fitted:
 
         def view(camera: Camera) -> Frame:
             with dr.suspend_grad():
-                return render(self.surfels, camera, self.shading, light, occluder, aovs=True)
+                return render(self.surfels, camera, self.shading, light, occluder, aovs=aovs)
 
         return view
 

@@ -52,9 +52,20 @@ def display_image(radiance: Iterable[Any], alpha: Any, background: Iterable[Any]
     ]
 
 
-def saturated(target: Iterable[Any]) -> list[Any]:
-    """Masks (mi.Bool planes) where a display-encoded target is clipped: at least 254.5/255."""
-    return [plane >= SATURATED for plane in target]
+def saturated(
+    target: Iterable[Any], alpha: Any | None = None, background: Iterable[float] = (0, 0, 0)
+) -> list[Any]:
+    """Masks (mi.Bool planes) where the object's own colour is clipped in a display-encoded target.
+
+    That is (target - (1 - A) background) / A ≥ 254.5/255, and A > 0: a white background is no highlight. With
+    `alpha` None, every pixel is the object's.
+    """
+    if alpha is None:
+        return [plane >= SATURATED for plane in target]
+    return [
+        (alpha > 0) & (plane - (1 - alpha) * behind >= SATURATED * alpha)
+        for plane, behind in zip(target, background, strict=True)
+    ]
 
 
 def clip_highlights(render: Iterable[Any], target: Iterable[Any], clipped: Iterable[Any]) -> list[Any]:

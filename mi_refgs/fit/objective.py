@@ -28,12 +28,12 @@ class Target:
     alpha: Any | None
 
     @staticmethod
-    def of(view: View) -> Target:
-        """Upload a view."""
+    def of(view: View, background: np.ndarray) -> Target:
+        """Upload a view; `background` (3,) in the space of its picture."""
         planes = [upload(view.image[..., i]) for i in range(3)]
         image = [losses.linear_to_srgb(plane) for plane in planes] if view.linear else planes
-        clipped = None if view.linear else losses.saturated(image)
         alpha = None if view.alpha is None else upload(view.alpha)
+        clipped = None if view.linear else losses.saturated(image, alpha, map(float, background))
         target = Target(view.camera(), image, clipped, alpha)
         dr.eval(target.image, target.clipped, target.alpha)
         return target

@@ -54,7 +54,7 @@ class Trainer:
         self.method, self.data, self.run = method, data, run
         self.extent = data.scene_extent
         self.schedule = Schedule(method, len(data.views))
-        self.targets = [Target.of(view) for view in data.views]
+        self.targets = [Target.of(view, data.background) for view in data.views]
         self.occluder = Occluder()
         self.iteration, self.seconds = 0, 0.0
         self.held_until = 0  # iteration before which opacities do not learn
