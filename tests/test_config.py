@@ -198,3 +198,40 @@ def test_extends_changes_only_what_it_says(tmp_path: Path) -> None:
     assert changed.loss == dataclasses.replace(base.loss, ssim=0.5)
     assert dataclasses.replace(changed, loss=base.loss, variant=base.variant) == base
     assert Path(child).stem == changed.variant
+
+
+@pytest.mark.parametrize("base", config.names())
+def test_extends_takes_every_shipped_method_and_own_files(base: str, tmp_path: Path) -> None:
+    """A shipped method that extends another one, and an own file beside or below the one that names it."""
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "own.toml").write_text(f'extends = "{base}"\n[loss]\nssim = 0.5\n')
+    grandchild = tmp_path / "grandchild.toml"
+    grandchild.write_text('extends = "below/own.toml"\ndrop = ["refine"]\n[loss]\nnormal = 0.3\n')
+    shipped, changed = config.load(base), config.load(str(grandchild))
+    assert changed.loss == dataclasses.replace(shipped.loss, ssim=0.5, normal=0.3)
+    assert changed.refine.densify is None and changed.refine.reset is None
+    same = dataclasses.replace(changed, loss=shipped.loss, refine=shipped.refine, variant=base)
+    assert same == shipped
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('extends = "own.toml"', ["own.toml: extends: the file extends itself", "break"]),
+        ('extends = "other.toml"', ["own.toml: extends: the file extends itself"]),
+        ('extends = "gone.toml"', ["own.toml: extends: gone.toml: no such method", "ref_gaussian"]),
+        ('extends = "ref_gausian"', ["own.toml: extends: ref_gausian: no such method", "ref_gaussian"]),
+        ("extends = 3", ["own.toml: extends: expected a name", "3"]),
+        ('extends = "ref_gaussian"\ndrop = "mesh"', ["own.toml: drop: expected a list"]),
+        ('extends = "ref_gaussian"\ndrop = ["seed.x"]', ["own.toml: drop: no key 'seed.x'"]),
+        ('drop = ["mesh"]', ["own.toml: extends: expected a name", "None"]),
+        ('extends = "wrong.toml"', ["wrong.toml: not valid TOML"]),
+    ],
+)
+def test_wrong_extends_are_named(text: str, words: list[str], tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text(text + "\n")
+    (tmp_path / "other.toml").write_text('extends = "own.toml"\n')
+    (tmp_path / "wrong.toml").write_text("[")
+    with pytest.raises(InputError) as error:
+        config.load(str(tmp_path / "own.toml"))
+    assert all(word in str(error.value) for word in words), error.value

@@ -61,8 +61,8 @@ def test_saturated_is_the_last_8_bit_value() -> None:
 
 def test_only_the_objects_own_colour_is_a_highlight() -> None:
     """Composites of 8-bit colours: white behind empty pixels and edges is none, a white edge on black is."""
-    alpha = np.float32([0, 1 / 255, 0.2, 0.5, 1, 0, 1 / 255, 0.2, 0.5, 1])
-    own = np.float32([0.3, 254 / 255, 0.3, 254 / 255, 254 / 255, 1, 1, 1, 1, 1])
+    alpha = np.array([0, 1 / 255, 0.2, 0.5, 1, 0, 1 / 255, 0.2, 0.5, 1], np.float32)
+    own = np.array([0.3, 254 / 255, 0.3, 254 / 255, 254 / 255, 1, 1, 1, 1, 1], np.float32)
     for background in (0.0, 1.0):
         image = own * alpha + (1 - alpha) * np.float32(background)
         (mask,) = losses.saturated([mi.Float(image)], mi.Float(alpha), [background])

@@ -231,14 +231,8 @@ def load(variant: str, preset: str = "standard", assignments: list[str] | None =
     """
     if preset not in PRESETS:
         raise InputError(f"--preset: {preset}: unknown; use one of {', '.join(PRESETS)}")
-    path = _find(variant)
-    table = _read(path)
-    base = table.pop("extends", None)
-    if base is not None:
-        parent = _read(_find(str(base)))
-        for name in table.pop("drop", []):
-            _drop(parent, name, path)
-        table = _merge(parent, table)
+    path = _find(variant, "--variant", Path())
+    table = _extended(path, [])
     chosen = PRESETS[preset]
     method = _build(Method, table, str(path))
     method = _scale(method, chosen.iterations / method.iterations)
@@ -285,12 +279,34 @@ def names() -> list[str]:
     return sorted(path.stem for path in resource_dir("variants").glob("*.toml"))
 
 
-def _find(variant: str) -> Path:
-    path = Path(variant) if variant.endswith(".toml") else resource_dir("variants") / f"{variant}.toml"
+def _find(variant: str, where: str, folder: Path) -> Path:
+    """A shipped method by its name, or a path to a .toml from `folder`; `where` names what asks for it."""
+    path = folder / variant if variant.endswith(".toml") else resource_dir("variants") / f"{variant}.toml"
     if not path.is_file():
         known = ", ".join(names())
-        raise InputError(f"--variant: {variant}: no such method; use one of {known}, or a path to a .toml")
+        raise InputError(f"{where}: {variant}: no such method; use one of {known}, or a path to a .toml")
     return path
+
+
+def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
+    """The table of a file, with those that it `extends`; paths are relative to the file that names them.
+
+    `above` are the files that extend this one, resolved.
+    """
+    if path.resolve() in above:
+        raise InputError(f"{path}: extends: the file extends itself, through others or not; break the circle")
+    table = _read(path)
+    base, dropped = table.pop("extends", None), table.pop("drop", [])
+    if base is None and not dropped:
+        return table
+    if not isinstance(base, str):
+        raise InputError(f"{path}: extends: expected a name or a path in quotes, found {base!r}; correct it")
+    if not isinstance(dropped, list) or not all(isinstance(name, str) for name in dropped):
+        raise InputError(f"{path}: drop: expected a list of keys, such as ['mesh', 'loss.alpha']; correct it")
+    parent = _extended(_find(base, f"{path}: extends", path.parent), [*above, path.resolve()])
+    for name in dropped:
+        _drop(parent, name, path)
+    return _merge(parent, table)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -313,7 +329,8 @@ def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 def _drop(table: dict[str, Any], name: str, path: Path) -> None:
     *parents, last = name.split(".")
     for parent in parents:
-        table = table.get(parent, {})
+        inner = table.get(parent)
+        table = inner if isinstance(inner, dict) else {}
     if last not in table:
         raise InputError(f"{path}: drop: no key '{name}' in the extended file; remove it from `drop`")
     del table[last]
