@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -82,6 +83,14 @@ def one_thread() -> Iterator[None]:
     yield
     dr.sync_thread()
     dr.set_thread_count(THREADS)
+
+
+@pytest.fixture
+def heard_interrupts() -> Iterator[None]:
+    """Python's own answer to Ctrl-C, which a process in the background is started to ignore."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="module")

@@ -121,6 +121,7 @@ def test_large_pictures_are_read_smaller_unless_told_otherwise(
 def test_an_interrupt_says_how_to_resume_and_resuming_changes_nothing(
     number: int,
     code: int,
+    heard_interrupts: None,
     data: Path,
     method: Path,
     tmp_path: Path,

@@ -17,7 +17,7 @@ from mi_refgs.fit import config
 from mi_refgs.fit.config import Method
 from mi_refgs.fit.optim import Adam
 from mi_refgs.fit.train import Trainer
-from mi_refgs.surfels.table import Surfels
+from mi_refgs.surfels.table import GEOMETRY, Surfels
 
 
 @pytest.fixture
@@ -105,8 +105,9 @@ def test_a_fit_in_which_every_step_fails_ends_with_one_sentence(
     with pytest.raises(InputError, match=r"view \d: scale not finite; .*look at that picture"):
         trainer.train()
     assert trainer.iteration == 3 * method.log_every
-    for name, found in trainer.surfels.to_numpy().items():
-        np.testing.assert_array_equal(found, before[name])
+    after = trainer.surfels.to_numpy()
+    for name in GEOMETRY:  # materials begin anew in iteration 9, with the deferred stage
+        np.testing.assert_array_equal(after[name], before[name])
 
 
 def test_a_light_that_is_not_finite_ends_a_fit_with_one_sentence(method: Method, tmp_path: Path) -> None:

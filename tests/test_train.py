@@ -153,6 +153,7 @@ def test_a_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: 
 def test_a_signal_waits_for_the_step_in_hand(
     number: str,
     raised: type[KeyboardInterrupt],
+    heard_interrupts: None,
     method: Method,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
