@@ -84,7 +84,8 @@ case "$mode" in
         .venv/bin/ruff check . || failed+=" ruff-check"
         .venv/bin/ruff format --check . || failed+=" ruff-format"
         .venv/bin/mypy || failed+=" mypy"
-        .venv/bin/python -m pytest -q || failed+=" pytest"
+        # Two workers, a file at a time: fixtures of a file are made once.
+        .venv/bin/python -m pytest -q -n 2 --dist loadfile || failed+=" pytest"
         [ -z "$failed" ] || fail "failed:$failed"
         echo "setup.sh: all checks passed"
         ;;

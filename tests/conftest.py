@@ -31,18 +31,11 @@ settings.register_profile(
     phases=[Phase.explicit, Phase.generate],
     suppress_health_check=[HealthCheck.too_slow],
 )
+settings.register_profile("thorough", settings.get_profile("mi_refgs"), max_examples=400, derandomize=False)
 settings.load_profile("mi_refgs")
 
 THREADS = max(dr.thread_count(), MITSUBA_EXR_THREADS)
 """Tests let Mitsuba read EXR files, on machines of one core too."""
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    if dr.has_backend(dr.JitBackend.CUDA):
-        return
-    for item in items:
-        if item.get_closest_marker("cuda"):
-            item.add_marker(pytest.mark.skip(reason="no CUDA device"))
 
 
 def pytest_collection_finish() -> None:
