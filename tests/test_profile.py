@@ -77,9 +77,9 @@ def sleepy_project(surfels: Any, *rest: Any) -> Any:
     return replace(found, columns=[dr.custom(Sleepy, found.columns[0]), *found.columns[1:]])
 
 
-def sleepy_step(self: Any, iteration: int) -> None:
+def sleepy_step(self: Any, iteration: int, loss: Any) -> None:
     time.sleep(PAUSE)
-    _step(self, iteration)
+    _step(self, iteration, loss)
 
 
 _blend, _project, _render, _objective = splat.blend, splat.project, train.render, train.objective
