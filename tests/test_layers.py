@@ -12,7 +12,7 @@ from helpers import ROOT, imported_packages
 
 PACKAGE = "mi_refgs"
 
-BOTTOM = {"constants", "device", "errors", "files", "images"}
+BOTTOM = {"constants", "device", "errors", "files", "images", "ply"}
 """What everything may stand on."""
 
 LAYERS: dict[str, set[str]] = {
@@ -22,6 +22,7 @@ LAYERS: dict[str, set[str]] = {
     "resources": {"errors"},
     "files": {"errors"},
     "images": {"files", "errors"},
+    "ply": {"errors"},
     "rows": set(),
     "device": set(),
     "surfels": {"rows"} | BOTTOM,

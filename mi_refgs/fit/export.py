@@ -75,10 +75,10 @@ class Fitted:
         """From the artefacts in a run folder; raises InputError for a file that cannot be used."""
         note = folder / MODEL
         try:
-            content = json.loads(note.read_text(encoding="utf-8"))
+            content = read_json(note)
             shading = Shading(**content["shading"])
             iteration, seconds = int(content["iteration"]), float(content["seconds"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise InputError(
                 f"{note}: cannot be read ({error}); write it again with `refgs export {folder}`"
             ) from error
@@ -154,8 +154,8 @@ def newest(run: Run, method: Method) -> Fitted | None:
     """What the newest checkpoint holds, if there is one that the artefacts do not already show."""
     shown = -1
     if (run.path / SURFELS).is_file():
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            shown = int(json.loads((run.path / MODEL).read_text(encoding="utf-8"))["iteration"])
+        with contextlib.suppress(ValueError, KeyError, TypeError, OverflowError):
+            shown = int(read_json(run.path / MODEL)["iteration"])
     if not any(int(path.stem) > shown for path in run.checkpoints()):
         return None
     state = run.load_checkpoint()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from skimage import measure
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
 from mi_refgs.occlusion.tsdf import TSDF
+from mi_refgs.ply import read_header
 
 COMPONENT_KEEP = 0.1
 """Area, relative to the largest connected component, from which a component is an object and not a floater.
@@ -30,6 +32,9 @@ start 0.8 % of the diagonal off the surface, and walls closer to each other than
 
 HEADER_BYTES = 4096
 """A PLY header of a mesh is a few hundred bytes."""
+
+FORMATS = ("ply", "obj", "stl", "off")
+"""Endings of the files that `read_mesh` takes."""
 
 VOXEL_COMMENT = "voxel_size"
 """Key of the PLY comment that holds the voxel the mesh was extracted with."""
@@ -97,7 +102,7 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
 
 
 def read_mesh(path: Path | str) -> Mesh:
-    """Read a triangle mesh (any format of trimesh).
+    """Read a triangle mesh: PLY, OBJ, STL or OFF. No file but this one is read.
 
     The voxel size comes from the comment of `write_mesh`; for other files see FOREIGN_RESOLUTION. Raises
     InputError if the file is missing or holds no mesh.
@@ -112,17 +117,42 @@ def read_mesh(path: Path | str) -> Mesh:
     ]
     try:
         voxel = float(noted[0][0]) if noted else None
+        if voxel is not None and not 0 < voxel < np.inf:
+            raise ValueError("a voxel without size")
         if ["element", "face", "0"] in map(str.split, header.splitlines()):
             return Mesh.empty() if voxel is None else Mesh.empty(voxel)
-        mesh: Any = trimesh.load(path, force="mesh", process=False)
+        mesh = _load(path)
         if voxel is None:
             voxel = float(np.linalg.norm(mesh.extents)) / FOREIGN_RESOLUTION if len(mesh.faces) else 1.0
+    except InputError:
+        raise
     except Exception as error:  # trimesh raises whatever its parsers meet
         raise InputError(
             f"{path}: mesh: not a readable triangle mesh; write it again as PLY or OBJ"
         ) from error
-    if not (voxel > 0 and np.isfinite(voxel) and np.isfinite(mesh.vertices).all()):
+    with np.errstate(over="ignore"):
+        vertices = np.asarray(mesh.vertices, np.float32)
+    if not (voxel > 0 and np.isfinite(voxel) and np.isfinite(vertices).all()):
         raise InputError(
             f"{path}: mesh: vertices or {VOXEL_COMMENT} not finite and positive; extract the mesh again"
         )
-    return Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32), voxel)
+    return Mesh(vertices, np.asarray(mesh.faces, np.uint32), voxel)
+
+
+def _load(path: Path) -> Any:
+    """What trimesh makes of a file, with the lengths and indices checked that it trusts."""
+    kind = path.suffix.lower().removeprefix(".")
+    with path.open("rb") as file:
+        if kind == "ply":
+            read_header(path, file)
+            file.seek(0)
+        elif kind not in FORMATS:
+            raise InputError(f"{path}: mesh: not one of {', '.join(FORMATS)}; write it again as PLY or OBJ")
+        # From memory, trimesh resolves no other names: textures, materials, archives.
+        data = io.BytesIO(file.read())
+    options = {"skip_materials": True} if kind in ("ply", "obj") else {}
+    mesh: Any = trimesh.load(data, file_type=kind, force="mesh", process=False, **options)
+    faces = np.asarray(mesh.faces)
+    if faces.size and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
+        raise InputError(f"{path}: mesh: a face names a vertex that is not there; write the file again")
+    return mesh

@@ -19,10 +19,9 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
+from mi_refgs.ply import read_header
 from mi_refgs.surfels.table import MAX_SH_DEGREE, Surfels, sh_columns
 
-# A header of ours has 124 lines at most; more than this without its end is no PLY header.
-MAX_HEADER_LINES = 1000
 # Property groups of the channels that are not spherical harmonics. Quaternion x, y, z, w: rot_1, 2, 3, 0.
 PROPERTIES: dict[str, tuple[str, ...]] = {
     "position": ("x", "y", "z"),
@@ -36,11 +35,6 @@ PROPERTIES: dict[str, tuple[str, ...]] = {
 REQUIRED = ("position", "rotation", "scale", "opacity")
 # Prefix of the properties of a spherical-harmonic channel.
 SH_PREFIX = {"radiance_sh": "f", "indirect_sh": "ind"}
-TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
-    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
-}
 
 
 # ---------------- reading ----------------
@@ -78,50 +72,20 @@ def read_ply(path: str | Path) -> Surfels:
 
 def _read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
     """The `vertex` element as a structured array."""
-    if file.readline().strip() != b"ply":
+    header = read_header(path, file)
+    vertex = header.elements[0]
+    if vertex.name != "vertex":
+        raise InputError(f"{path}: {vertex.name}: the vertices must come first; export it as a surfel PLY")
+    if vertex.lists:
         raise InputError(
-            f"{path}: header: not a PLY file; give the surfels.ply of a run or a 2DGS point_cloud.ply"
+            f"{path}: {vertex.lists[0][0]}: not a number property; export the vertices without lists"
         )
-    order, count, fields, in_vertex, skipped = "", -1, [], False, 0
-    for _ in range(MAX_HEADER_LINES):
-        words = file.readline().decode("ascii", errors="replace").split()
-        if words[:1] == ["format"] and len(words) > 1:
-            order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "a"}.get(words[1], "")
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
-            in_vertex = words[1] == "vertex"
-            if in_vertex:
-                count = int(words[2])
-            elif count < 0:
-                skipped += int(words[2])
-        elif words[:1] == ["property"] and in_vertex:
-            if len(words) != 3 or words[1] not in TYPES:
-                raise InputError(
-                    f"{path}: {words[-1]}: not a number property; export the vertices without lists"
-                )
-            fields.append((words[2], TYPES[words[1]]))
-        elif words == ["end_header"]:
-            break
-    else:
-        raise InputError(f"{path}: header: no end_header; the file is truncated, export it again")
-    if not order or count < 0 or not fields or skipped:
-        raise InputError(
-            f"{path}: header: no format or no leading vertex element; export it again as a surfel PLY"
-        )
-    if len({name for name, _ in fields}) < len(fields):
-        raise InputError(f"{path}: header: a vertex property occurs twice; export it again")
-
-    if order == "a":
-        values = _read_ascii(path, file, count, len(fields))
-        dtype = np.dtype([(name, "f8") for name, _ in fields])
-        return np.ascontiguousarray(values).view(dtype).reshape(count)
-    dtype = np.dtype([(name, order + code) for name, code in fields])
-    data = file.read(count * dtype.itemsize)
-    if len(data) < count * dtype.itemsize:
-        found = len(data) // dtype.itemsize
-        raise InputError(
-            f"{path}: vertex: {found} of {count} rows; the file is truncated, copy or export it again"
-        )
-    return np.frombuffer(data, dtype=dtype)
+    if header.order == "a":
+        values = _read_ascii(path, file, vertex.count, len(vertex.fields))
+        dtype = np.dtype([(name, "f8") for name, _ in vertex.fields])
+        return np.ascontiguousarray(values).view(dtype).reshape(vertex.count)
+    dtype = np.dtype([(name, header.order + code) for name, code in vertex.fields])
+    return np.frombuffer(file.read(vertex.count * dtype.itemsize), dtype=dtype)
 
 
 def _read_ascii(path: Path, file: BinaryIO, count: int, width: int) -> np.ndarray:
