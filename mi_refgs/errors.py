@@ -1,4 +1,4 @@
-"""The one exception for input a person can mend."""
+"""The one exception for input a person can mend, and values in its messages."""
 
 
 class InputError(ValueError):
@@ -6,3 +6,12 @@ class InputError(ValueError):
 
     The command line prints it as one sentence and exits with code 2.
     """
+
+
+def shown(value: object, limit: int = 80) -> str:
+    """A value as it may stand in a message: at most `limit` characters, whatever a file holds."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of more than 4,300 digits; lists in lists
+        text = f"a {type(value).__name__} without end"
+    return text if len(text) <= limit else f"{text[:limit]}…"

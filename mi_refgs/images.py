@@ -6,6 +6,7 @@ Mitsuba's own EXR files are left to it only where it loads or saves a scene (`mi
 from __future__ import annotations
 
 import contextlib
+import re
 import struct
 import warnings
 from collections.abc import Iterator
@@ -35,6 +36,8 @@ ANY_FILE = 2**24
 """Bytes of pixels that any file may promise."""
 MAX_EXPANSION = 1100
 """Bytes of pixels that a byte of a larger file may promise: DEFLATE cannot expand by more than 1,032."""
+MAX_HDR_HEADER = 2**16
+"""Bytes in which the size of a Radiance picture must stand."""
 SRGB_CHROMATICITIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 """x, y of red, green, blue and white (ITU-R BT.709), which an EXR file without the attribute has."""
 CHROMATICITY_TOLERANCE = 1e-3
@@ -136,12 +139,6 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
     replace_file(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG"))
 
 
-def is_exr(path: str | Path) -> bool:
-    """Whether a file starts as EXR files do, whatever its name; raises OSError if it cannot be read."""
-    with Path(path).open("rb") as file:
-        return file.read(len(EXR_MAGIC)) == EXR_MAGIC
-
-
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     """All channels of an EXR file's first part by name, float32 (H, W) each.
 
@@ -225,6 +222,56 @@ def _read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
                 f"column {column}; render the image again"
             )
     return channels, header
+
+
+def read_hdr(path: str | Path) -> np.ndarray:
+    """Radiance picture (.hdr) as linear float32 (H, W, 3); rows from the top, run lengths or none.
+
+    Written here because Mitsuba's reader writes beyond its memory where a run is longer than its row. Layout:
+    Ward, "Real Pixels", 1991. Raises InputError if the file is missing or no such picture.
+    """
+    path = Path(path)
+    _require_file(path)
+    data = path.read_bytes()
+    size = re.search(rb"\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", data[:MAX_HDR_HEADER])
+    if not data.startswith(b"#?") or b"32-bit_rle_xyze" in data[:MAX_HDR_HEADER] or size is None:
+        raise InputError(f"{path}: header: no Radiance picture of rows from the top; save it as EXR")
+    height, width = int(size.group(1)), int(size.group(2))
+    _check_size(path, width, height, 4)
+    rgbe, position = np.empty((height, width, 4), np.uint8), size.end()
+    marker = bytes((2, 2, width >> 8 & 255, width & 255))
+    try:
+        for row in rgbe:
+            if data[position : position + 4] != marker or not 8 <= width < 32768:
+                row[:] = np.frombuffer(data, np.uint8, 4 * width, position).reshape(width, 4)
+                position += 4 * width
+                continue
+            position += 4
+            for channel in range(4):
+                values, position = _runs(data, position, width)
+                row[:, channel] = np.frombuffer(values, np.uint8)
+    except (IndexError, ValueError) as error:
+        raise InputError(f"{path}: pixels: truncated or broken; export it again") from error
+    scale = np.where(rgbe[..., 3:] > 0, np.ldexp(1.0, rgbe[..., 3:].astype(int) - 136), 0)
+    return (rgbe[..., :3] * scale).astype(np.float32)
+
+
+def _runs(data: bytes, position: int, width: int) -> tuple[bytes, int]:
+    """One channel of a row of a Radiance picture, and where the next begins; ValueError if it is too long."""
+    values = bytearray()
+    while len(values) < width:
+        count = data[position]
+        if count > 128:
+            values += data[position + 1 : position + 2] * (count - 128)
+            position += 2
+        else:
+            values += data[position + 1 : position + 1 + count]
+            position += 1 + count
+        if not count:
+            raise ValueError("an empty run")
+    if len(values) > width:
+        raise ValueError("a run longer than its row")
+    return bytes(values), position
 
 
 def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, half: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""The header of a PLY file: what it promises, checked against the length of the file before memory is asked for."""
+"""The header of a PLY file, checked against the length of the file before memory is asked for."""
 
 from __future__ import annotations
 
@@ -84,10 +84,12 @@ def read_header(path: Path, file: BinaryIO) -> Header:
     for element in elements:
         names = [name for name, _ in (*element.fields, *element.lists)]
         if not names or len({*names}) < len(names):
-            what = f"a property of {element.name} occurs twice" if names else f"{element.name} has no property"
+            what = (
+                f"a property of {element.name} occurs twice" if names else f"{element.name} has no property"
+            )
             raise InputError(f"{path}: header: {what}; export it again")
         left -= element.count * element.row_bytes(order == "a")
-        if left < -1:  # text may end without a line break
+        if left < (-1 if order == "a" else 0):  # text may end without a line break
             raise InputError(
                 f"{path}: {element.name}: {element.count} rows are more than the file holds; the file is "
                 "truncated, copy or export it again"

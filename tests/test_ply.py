@@ -150,22 +150,22 @@ def test_broken_files_are_refused(tmp_path: Path, rng: np.random.Generator) -> N
     text = write_file(tmp_path / "t.ply", geometry(rng), "ascii").read_bytes()
     face_first = whole.replace(b"element vertex", b"element face 2\nproperty float q\nelement vertex")
     for data, message in [
-        (whole[:-1], "vertex: 3 of 4 rows; the file is truncated"),
+        (whole[:-1], "vertex: 4 rows are more than the file holds; the file is truncated"),
         (whole[:60], "no end_header; the file is truncated"),
         (b"", "not a PLY file"),
         (b"\x89PNG\r\n", "not a PLY file"),
-        (text[:-30], "row 3 is broken"),
+        (text[:-30], "row 3 is broken|rows are more than"),
         (text.replace(text.split()[-1], b"zero"), "row 3 is broken"),
         (
             whole.replace(b"format binary_little_endian", b"format pdp_endian"),
-            "no format or no leading vertex",
+            "no format or no element",
         ),
-        (face_first, "no format or no leading vertex"),
+        (face_first, "face: the vertices must come first"),
         (
             whole.replace(b"property float scale_1", b"property list uchar int scale_1"),
             "scale_1: not a number property",
         ),
-        (whole.replace(b"float scale_1", b"float scale_0"), "a vertex property occurs twice"),
+        (whole.replace(b"float scale_1", b"float scale_0"), "a property of vertex occurs twice"),
     ]:
         path.write_bytes(data)
         with pytest.raises(InputError, match=message):

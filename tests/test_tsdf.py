@@ -250,7 +250,7 @@ def test_mesh_file_round_trip(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         meshes.read_mesh(tmp_path / "none.ply")
     (tmp_path / "bad.ply").write_text("hello")
-    with pytest.raises(InputError, match="not a readable"):
+    with pytest.raises(InputError, match="not a PLY file"):
         meshes.read_mesh(tmp_path / "bad.ply")
     with pytest.raises(InputError, match="cannot be written"):
         meshes.write_mesh(tmp_path / "no" / "mesh.ply", mesh)

@@ -97,7 +97,7 @@ def load_scene(path: Path, aovs: list[str]) -> Any:
             integrators[0]["aovs"] = ",".join(aov if ":" in aov else f"{aov}:{aov}" for aov in aovs)
         with mitsuba_exr():
             loaded = mi.parser.instantiate(config, state)
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file
         raise InputError(f"{path}: scene: {_reason(error)}") from error
     finally:
         mi.set_file_resolver(before)

@@ -17,9 +17,14 @@ from typing import Any, Literal
 
 import tomli_w
 
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, shown
+from mi_refgs.images import is_file
 from mi_refgs.resources import resource_dir
 
+MAX_TEXT, MAX_LINE = 2**16, 2000
+"""Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
+MAX_NUMBER = 1e9
+"""Largest absolute value of a number in a method: no count, rate or weight has more, nor NaN or infinity."""
 TIE = 1e-6
 """Intervals by which a scaled window may miss a multiple of its interval for the rounding of floats."""
 
@@ -193,6 +198,10 @@ class Method:
     variant: str = ""  # filled in by `load`: the file's stem
     preset: str = ""
 
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError("iterations: less than 1; give how many to run")
+
     def stages(self) -> list[tuple[str, Stage]]:
         """Stages in the order of their `until`."""
         return sorted(self.stage.items(), key=lambda item: item[1].until)
@@ -282,7 +291,7 @@ def names() -> list[str]:
 def _find(variant: str, where: str, folder: Path) -> Path:
     """A shipped method by its name, or a path to a .toml from `folder`; `where` names what asks for it."""
     path = folder / variant if variant.endswith(".toml") else resource_dir("variants") / f"{variant}.toml"
-    if not path.is_file():
+    if not is_file(path):
         known = ", ".join(names())
         raise InputError(f"{where}: {variant}: no such method; use one of {known}, or a path to a .toml")
     return path
@@ -300,7 +309,9 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
     if base is None and not dropped:
         return table
     if not isinstance(base, str):
-        raise InputError(f"{path}: extends: expected a name or a path in quotes, found {base!r}; correct it")
+        raise InputError(
+            f"{path}: extends: expected a name or a path in quotes, found {shown(base)}; correct it"
+        )
     if not isinstance(dropped, list) or not all(isinstance(name, str) for name in dropped):
         raise InputError(f"{path}: drop: expected a list of keys, such as ['mesh', 'loss.alpha']; correct it")
     parent = _extended(_find(base, f"{path}: extends", path.parent), [*above, path.resolve()])
@@ -311,10 +322,13 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if len(text) > MAX_TEXT or max(map(len, text.splitlines()), default=0) > MAX_LINE:
+            raise ValueError("too long")
+        return tomllib.loads(text)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # of TOML, UTF-8, long numbers; deep nesting
         raise InputError(f"{path}: not valid TOML ({error}); correct that line") from error
 
 
@@ -342,7 +356,7 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
         raise InputError(f"--set: {assignment}: expected key=value, such as loss.ssim=0.1")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         value = text
     *parents, last = key.strip().split(".")
     for parent in parents:
@@ -373,7 +387,7 @@ def _build(kind: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
             raise InputError(
-                f"{where}: expected a table, found {value!r}; the files of variants/ show the form"
+                f"{where}: expected a table, found {shown(value)}; the files of variants/ show the form"
             )
         hints = typing.get_type_hints(kind)
         for key in value:
@@ -397,17 +411,19 @@ def _build(kind: Any, value: Any, where: str) -> Any:
         return {key: _build(arguments[1], inner, f"{where}.{key}") for key, inner in value.items()}
     if origin is tuple:
         if not isinstance(value, list):
-            raise InputError(f"{where}: expected a list, found {value!r}; write it in brackets")
+            raise InputError(f"{where}: expected a list, found {shown(value)}; write it in brackets")
         return tuple(_build(arguments[0], inner, where) for inner in value)
     if origin is Literal:
-        if value not in arguments:
+        if not isinstance(value, str) or value not in arguments:
             known = ", ".join(map(str, arguments))
-            raise InputError(f"{where}: {value!r} is not allowed; use one of {known}")
+            raise InputError(f"{where}: {shown(value)} is not allowed; use one of {known}")
         return value
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+    if type(value) in (int, float) and not abs(value) <= MAX_NUMBER:
+        raise InputError(f"{where}: {shown(value)} is out of range; correct the value")
+    if kind is float and type(value) is int:
         return float(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise InputError(f"{where}: expected {kind.__name__}, found {value!r}; correct the value")
+        raise InputError(f"{where}: expected {kind.__name__}, found {shown(value)}; correct the value")
     return value
 
 

@@ -15,6 +15,7 @@ Normals and depth are 0 off the object.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -27,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import write_bytes
+from mi_refgs.files import read_json, write_bytes
 from mi_refgs.fit.frames import MITSUBA_FROM_OPENGL
 from mi_refgs.fit.pathtrace import Tracer, bounding_sphere, camera_poses, environment_image
 from mi_refgs.images import mitsuba_exr, read_exr, read_png, srgb_from_linear, write_exr, write_png
@@ -216,7 +217,7 @@ def _load_scene(scene: Path) -> Any:
     try:
         with mitsuba_exr():
             loaded = mi.load_file(str(scene))
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file
         raise InputError(f"{scene}: scene: Mitsuba cannot load it: {error}; mend the scene") from error
     if not loaded.shapes():
         raise InputError(f"{scene}: shapes: the scene has none; add an object to look at")
@@ -246,10 +247,8 @@ def _prepare_folder(out: Path, settings: Settings, overwrite: bool) -> None:
     wanted = json.loads(json.dumps(asdict(settings)))
     found: Any = None
     if record.is_file():
-        try:
-            found = json.loads(record.read_text(encoding="utf-8"))
-        except ValueError:
-            found = None
+        with contextlib.suppress(InputError):
+            found = read_json(record)
     stale = [f for pattern in VIEW_FILES for f in sorted(out.glob(pattern))] if found != wanted else []
     if stale and not overwrite:
         changed = [k for k in wanted if k not in found or found[k] != wanted[k]] if found else []

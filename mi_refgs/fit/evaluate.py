@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import re
@@ -17,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.files import read_json
 from mi_refgs.fit import metrics, pictures
 from mi_refgs.fit.config import Method
 from mi_refgs.fit.data import Dataset, load
@@ -48,11 +48,12 @@ def load_split(run: Run, method: Method, split: str, path: Path | None = None) -
     if path is None:
         try:
             path = run.dataset()
+            found = path.is_dir()
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(
                 f"{run.path / 'dataset.json'}: path: cannot be read ({error}); name the data with --data"
             ) from error
-        if not path.is_dir():
+        if not found:
             raise InputError(
                 f"{run.path / 'dataset.json'}: path: {path} is gone; name the data set's folder with --data"
             )
@@ -212,7 +213,6 @@ def _mean(per_view: list[dict[str, Any]], name: str) -> float | None:
 def read_metrics(run: Run) -> dict[str, Any] | None:
     """The metrics.json of a run, or None if it has none that can be read."""
     try:
-        content = json.loads((run.path / METRICS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return read_json(run.path / METRICS)
+    except InputError:
         return None
-    return content if isinstance(content, dict) else None

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.files import read_json
 from mi_refgs.fit.checkpoint import PARAMS, tensors
 from mi_refgs.fit.config import Method
 from mi_refgs.fit.record import Run
@@ -78,6 +79,8 @@ class Fitted:
             content = read_json(note)
             shading = Shading(**content["shading"])
             iteration, seconds = int(content["iteration"]), float(content["seconds"])
+            if iteration < 0 or not 0 <= seconds < math.inf:
+                raise ValueError("iteration or seconds out of range")
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise InputError(
                 f"{note}: cannot be read ({error}); write it again with `refgs export {folder}`"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mi_refgs.constants import RIGID_TOLERANCE
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, shown
 from mi_refgs.fit.lens import Lens, Undistortion, undistortion
 from mi_refgs.images import box_downscale, image_size, is_file, read_exr_image, read_png
 
@@ -138,7 +137,7 @@ class FrameReader:
         inside = os.path.normpath(name) if isinstance(name, str) else os.pardir
         if os.path.isabs(inside) or inside.split(os.sep)[0] in (os.pardir, os.curdir):
             raise InputError(
-                f"{self.transforms}: frames[{index}].{key}: {reprlib.repr(name)} names no file in the "
+                f"{self.transforms}: frames[{index}].{key}: {shown(name)} names no file in the "
                 "data set's folder; move the file there and give its relative path"
             )
         return self.transforms.parent / inside
@@ -218,7 +217,7 @@ class FrameReader:
         if value is None:
             return None
         if type(value) not in (int, float) or not abs(value) <= MAX_NUMBER:
-            raise InputError(f"{self.transforms}: {key}: {reprlib.repr(value)} is not a number; correct it")
+            raise InputError(f"{self.transforms}: {key}: {shown(value)} is not a number; correct it")
         return float(value)
 
     def _undistortion(
@@ -257,7 +256,9 @@ class FrameReader:
         def number(key: str) -> float | None:
             value = self._number(frame, key)
             if value is not None and value <= 0:
-                raise InputError(f"{self.transforms}: {key}: {value!r} is not a positive number; correct it")
+                raise InputError(
+                    f"{self.transforms}: {key}: {shown(value)} is not a positive number; correct it"
+                )
             return value
 
         for key, size in (("w", width), ("h", height)):

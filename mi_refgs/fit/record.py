@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import cannot_write, remove_temporaries, write_bytes
+from mi_refgs.files import cannot_write, read_json, remove_temporaries, write_bytes
 from mi_refgs.fit import checkpoint
 from mi_refgs.fit.config import Method, dump, load_resolved
 
@@ -51,7 +51,7 @@ class Run:
 
     def dataset(self) -> Path:
         """Folder of the data set that the run was fitted to."""
-        return Path(json.loads((self.path / "dataset.json").read_text())["path"])
+        return Path(read_json(self.path / "dataset.json")["path"])
 
     # ---------------- checkpoints ----------------
 
@@ -139,5 +139,5 @@ def _logged(line: str) -> float:
     """The iteration of a line of the log; infinity for half a line, which a killed process may leave."""
     try:
         return float(json.loads(line)["iteration"])
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         return math.inf

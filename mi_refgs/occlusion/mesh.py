@@ -13,6 +13,7 @@ from skimage import measure
 
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
+from mi_refgs.images import is_file
 from mi_refgs.occlusion.tsdf import TSDF
 from mi_refgs.ply import read_header
 
@@ -108,7 +109,7 @@ def read_mesh(path: Path | str) -> Mesh:
     InputError if the file is missing or holds no mesh.
     """
     path = Path(path)
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"{path}: mesh: no such file; give the mesh.ply of a run")
     with path.open("rb") as file:
         header = file.read(HEADER_BYTES).split(b"end_header")[0].decode("ascii", "replace")
@@ -150,7 +151,7 @@ def _load(path: Path) -> Any:
             raise InputError(f"{path}: mesh: not one of {', '.join(FORMATS)}; write it again as PLY or OBJ")
         # From memory, trimesh resolves no other names: textures, materials, archives.
         data = io.BytesIO(file.read())
-    options = {"skip_materials": True} if kind in ("ply", "obj") else {}
+    options: Any = {"skip_materials": True} if kind in ("ply", "obj") else {}
     mesh: Any = trimesh.load(data, file_type=kind, force="mesh", process=False, **options)
     faces = np.asarray(mesh.faces)
     if faces.size and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):

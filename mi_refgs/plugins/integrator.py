@@ -16,9 +16,17 @@ import mitsuba as mi
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.plugins import require_supported_variant
-from mi_refgs.plugins.aovs import aov_values, parse_aovs
+from mi_refgs.plugins.aovs import aov_values
 from mi_refgs.plugins.light import TurnedLight, emitter_light
-from mi_refgs.plugins.properties import TERMS, read_light, read_shading, read_surfels, read_terms
+from mi_refgs.plugins.properties import (
+    TERMS,
+    read_aovs,
+    read_background,
+    read_light,
+    read_shading,
+    read_surfels,
+    read_terms,
+)
 from mi_refgs.render.pipeline import MATERIALS, Frame, render
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import GEOMETRY, Surfels
@@ -151,9 +159,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.light, self.light_rotation = read_light(props)
         self.shading, self.occluder = read_shading(props, self.surfels)
         self.terms = read_terms(props)
-        background = props.get("background", None)
-        self.background = None if background is None else mi.Color3f(background)
-        self.aovs = parse_aovs(str(props.get("aovs", "")))
+        self.background = read_background(props)
+        self.aovs = read_aovs(props)
         self.check()
         self.changed, self.next_look = (
             False,

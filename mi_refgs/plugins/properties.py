@@ -10,9 +10,10 @@ from typing import Any
 
 import mitsuba as mi
 
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, shown
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.plugins.aovs import AOV, parse_aovs
 from mi_refgs.plugins.light import own_light
 from mi_refgs.render.pipeline import MATERIALS, Shading
 from mi_refgs.shade.envmap import EnvironmentLight
@@ -23,17 +24,64 @@ from mi_refgs.surfels.table import CHANNELS, Surfels
 TERMS = ("diffuse", "specular", "indirect")
 
 
+def _get(props: Any, name: str, default: Any) -> Any:
+    """A property, or the default where it is absent."""
+    try:
+        return props.get(name, default)
+    except UnicodeError as error:
+        raise InputError(f"refgs: {name}: not UTF-8; save the scene as UTF-8") from error
+
+
+def read_aovs(props: Any) -> list[AOV]:
+    """The maps that are asked for besides the image."""
+    return parse_aovs(str(_get(props, "aovs", "")))
+
+
 def _path(props: Any, name: str) -> str | None:
     """A file property, found beside the XML first; Mitsuba knows that folder only while it makes plugins."""
-    value = props.get(name, None)
+    value = _get(props, name, None)
     return None if value is None else str(mi.file_resolver().resolve(str(value)))
 
 
 def _choice(props: Any, name: str, default: str, options: tuple[str, ...]) -> Any:
-    value = str(props.get(name, default))
+    value = str(_get(props, name, default))
     if value not in options:
         raise InputError(f"refgs: {name}: '{value}' is unknown; use {' or '.join(options)}")
     return value
+
+
+def _flag(props: Any, name: str, default: bool) -> bool:
+    value = _get(props, name, default)
+    if not isinstance(value, bool):
+        raise InputError(f"refgs: {name}: {shown(value)} is neither true nor false; give a boolean")
+    return value
+
+
+def _tensor(props: Any, name: str) -> Any:
+    """A tensor property as mi.TensorXf; None where it is absent."""
+    value = _get(props, name, None)
+    if value is None:
+        return None
+    try:
+        if isinstance(value, str):  # Dr.Jit looks for the numbers of a string without end
+            raise TypeError("a string")
+        tensor = mi.TensorXf(value)
+        if not tensor.ndim:
+            raise TypeError("a single number")
+        return tensor
+    except Exception as error:  # what Dr.Jit raises depends on the type
+        raise InputError(f"refgs: {name}: {shown(value)} is no tensor; give an array of numbers") from error
+
+
+def read_background(props: Any) -> Any:
+    """The colour behind the surfels (mi.Color3f); None: transparent."""
+    value = _get(props, "background", None)
+    try:
+        if isinstance(value, str):
+            raise TypeError("a string")
+        return None if value is None else mi.Color3f(value)
+    except Exception as error:
+        raise InputError(f"refgs: background: {shown(value)} is no colour; give an rgb value") from error
 
 
 def read_surfels(props: Any) -> Surfels:
@@ -41,9 +89,9 @@ def read_surfels(props: Any) -> Surfels:
     path = _path(props, "filename")
     raw = {} if path is None else dict(read_ply(path).raw)
     for name in CHANNELS:
-        value = props.get(name, None)
+        value = _tensor(props, name)
         if value is not None:
-            raw[name] = mi.TensorXf(value)
+            raw[name] = value
     if not raw:
         raise InputError(
             "refgs: filename: there are no surfels; name a PLY file, or give the channels as tensors"
@@ -58,8 +106,8 @@ def read_light(props: Any) -> tuple[Any, Any]:
         raise InputError("refgs: light: two emitters are nested in the integrator; keep one")
     if emitters:
         return own_light(emitters[0])
-    raw = props.get("light", None)
-    return (None, None) if raw is None else (EnvironmentLight(mi.TensorXf(raw)), None)
+    raw = _tensor(props, "light")
+    return (None, None) if raw is None else (EnvironmentLight(raw), None)
 
 
 def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None]:
@@ -72,7 +120,7 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     at: Any = _choice(props, "shade_at", "pixel", ("pixel", "surfel"))
     mesh = _path(props, "mesh")
     deferred = at == "pixel" and reflectance == "split_sum"
-    occlusion = bool(props.get("occlusion", mesh is not None and deferred))
+    occlusion = _flag(props, "occlusion", mesh is not None and deferred)
     shading = Shading(at, reflectance, diffuse, occlusion, _accuracy(props))
     shading.check(surfels.raw, mesh=mesh is not None)
     if not (occlusion and mesh):
@@ -85,12 +133,12 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
 
 def _accuracy(props: Any) -> Accuracy:
     """The knobs that buy accuracy, of which `Accuracy` refuses what is no bool or no number."""
-    return Accuracy(**{knob.name: props.get(knob.name, knob.default) for knob in fields(Accuracy)})
+    return Accuracy(**{knob.name: _get(props, knob.name, knob.default) for knob in fields(Accuracy)})
 
 
 def read_terms(props: Any) -> list[str]:
     """The terms that the image sums, by their names in `shade.models.Terms`."""
-    text = str(props.get("terms", ",".join(TERMS)))
+    text = str(_get(props, "terms", ",".join(TERMS)))
     names = [name.strip() for name in text.split(",") if name.strip()]
     for name in names:
         if name not in TERMS or names.count(name) > 1:

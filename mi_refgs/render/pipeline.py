@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_type_hints
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR, FACING_TOLERANCE
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, shown
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.reflection import reflection
 from mi_refgs.shade.models import Accuracy, ShadingPoints, Terms, reflect, safe_normalize, shade
@@ -45,8 +45,13 @@ class Shading:
     accuracy: Accuracy = field(default_factory=Accuracy)  # what to pay for less error; rays need occlusion
 
     def __post_init__(self) -> None:
+        """Raise InputError, or TypeError for an unknown key of `accuracy`, for what JSON may hold."""
         if isinstance(self.accuracy, Mapping):  # as JSON keeps it
             object.__setattr__(self, "accuracy", Accuracy(**self.accuracy))
+        for name, kind in get_type_hints(Shading).items():
+            value, allowed = getattr(self, name), get_args(kind)
+            if not (value in allowed if allowed else isinstance(value, kind)):
+                raise InputError(f"shading: {name}: {shown(value)} is not allowed; correct it")
         if self.reflectance == "radiance":
             object.__setattr__(self, "at", "surfel")
         accuracy = self.accuracy

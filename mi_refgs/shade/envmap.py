@@ -23,7 +23,7 @@ import numpy as np
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
-from mi_refgs.images import is_exr, read_exr_image, write_exr
+from mi_refgs.images import EXR_MAGIC, linear_from_srgb, read_exr_image, read_hdr, read_png, write_exr
 from mi_refgs.shade import lobe
 from mi_refgs.shade.prefilter import Operator, prefilter
 
@@ -224,17 +224,17 @@ class EnvironmentLight:
 
 
 def _read_image(path: Path) -> np.ndarray:
-    """Linear radiance (H, W, 3) of an EXR file, or of another image that Mitsuba reads."""
+    """Linear radiance (H, W, 3) of an EXR, Radiance (.hdr), PNG or JPEG file, by its first bytes."""
     try:
-        if not is_exr(path):
-            bitmap = mi.Bitmap(str(path))
-            return np.array(
-                bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-            )
-    except Exception as error:  # Mitsuba raises RuntimeError for whatever is no image
-        reason = str(error).strip().splitlines()[-1]
+        with path.open("rb") as file:
+            first = file.read(4)
+    except OSError as error:
         raise InputError(
-            f"{path}: environment: not a readable image ({reason}); give an EXR or HDR file"
+            f"{path}: environment: cannot be read ({error.strerror}); give an EXR or HDR file"
         ) from error
+    if first[:2] == b"#?":
+        return read_hdr(path)
+    if first != EXR_MAGIC:
+        return linear_from_srgb(read_png(path)[..., :3])
     image = read_exr_image(path)
     return image[..., :3] if image.shape[-1] > 1 else np.repeat(image, 3, axis=-1)

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import NORM_FLOOR
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, shown
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.envmap import PrefilteredLight
 
@@ -26,6 +26,9 @@ SMOOTHNESS_FLOOR = 1e-12
 MEAN_FRESNEL_MAX = 1.25
 """The mean of Schlick's term is at most 1 for a colour in 0 … 1; this cap, out of its reach, keeps the series
 of bounces finite for any other colour: A + B ≥ 0.31 everywhere."""
+
+MAX_RAYS = 1024
+"""Rays of the lobe, or bounces, beyond which nothing changes but the time: the length of a kernel follows."""
 
 Diffuse = Literal["sh", "irradiance"]
 
@@ -45,12 +48,12 @@ class Accuracy:
     def __post_init__(self) -> None:
         for name in ("dominant", "multiscatter"):
             if not isinstance(getattr(self, name), bool):
-                raise InputError(f"accuracy: {name}: {getattr(self, name)!r} is neither True nor False")
+                raise InputError(f"accuracy: {name}: {shown(getattr(self, name))} is neither True nor False")
         for name, what, least in (("visibility_rays", "rays", 1), ("traced_bounces", "bounces", 0)):
             number: Any = getattr(self, name)
-            if isinstance(number, bool) or not isinstance(number, int) or number < least:
+            if type(number) is not int or not least <= number <= MAX_RAYS:
                 some = ", ".join(str(least + i) for i in range(3))
-                raise InputError(f"accuracy: {name}: {number!r} is no number of {what}; use {some}, …")
+                raise InputError(f"accuracy: {name}: {shown(number)} is no number of {what}; use {some}, …")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,440 @@
+"""The readers, each with files that it accepts and a call that reads one."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
+from mi_refgs.errors import InputError
+
+SEED = 0
+"""Of the numbers in the files to start from."""
+DIGITS = 64
+"""Hexadecimal digits of the checksum at the end of a checkpoint."""
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One way into the package."""
+
+    name: str
+    kind: str  # how `mutate` may change the files: "json", "toml", "xml", or "" for bytes alone
+    samples: Callable[
+        [Path], list[bytes]
+    ]  # files to start from; may put others that these name in the folder
+    read: Callable[[Path, bytes], None]  # writes the file into the folder and reads it
+    inside: bool = True  # whether it may open files in the folder only
+    finish: Callable[[bytes], bytes] = lambda data: data  # after the mutation, every second time
+
+
+def _read_file(read: Callable[[Path], Any], name: str) -> Callable[[Path, bytes], None]:
+    def run(folder: Path, data: bytes) -> None:
+        (folder / name).write_bytes(data)
+        read(folder / name)
+
+    return run
+
+
+def _finite(*arrays: Any) -> None:
+    """Fail for an answer that cannot be right."""
+    assert all(np.isfinite(array).all() for array in arrays if array is not None), (
+        "a value that is not finite"
+    )
+
+
+# ---------------- surfels and meshes ----------------
+
+
+def _table(rows: int = 7) -> dict[str, np.ndarray]:
+    from mi_refgs.surfels.table import CHANNELS
+
+    rng = np.random.default_rng(SEED)
+    return {name: rng.normal(size=(rows, columns or 12)) for name, columns in CHANNELS.items()}
+
+
+def _surfel_files(folder: Path) -> list[bytes]:
+    from mi_refgs.surfels.ply import write_ply
+    from mi_refgs.surfels.table import Surfels
+
+    write_ply(folder / "a.ply", Surfels.from_numpy(_table()))
+    binary = (folder / "a.ply").read_bytes()
+    names = ["x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3", "metallic"]
+    rows = np.random.default_rng(SEED).normal(size=(3, len(names)))
+    header = "element vertex 3\n" + "".join(f"property double {name}\n" for name in names) + "end_header\n"
+    text = "\n".join(" ".join(map(str, row)) for row in rows.tolist())
+    return [
+        binary,
+        f"ply\nformat ascii 1.0\ncomment c\n{header}{text}\n".encode(),
+        f"ply\nformat binary_big_endian 1.0\n{header}".encode() + rows.astype(">f8").tobytes(),
+    ]
+
+
+def _read_surfels(path: Path) -> None:
+    from mi_refgs.surfels.ply import read_ply
+
+    _finite(*read_ply(path).to_numpy().values())
+
+
+CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float32)
+QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+TRIANGLES = np.array([quad[:3] for quad in QUADS], dtype=np.uint32)
+
+
+def _meshes(folder: Path) -> list[bytes]:
+    import trimesh
+
+    from mi_refgs.occlusion.mesh import Mesh, write_mesh
+
+    solid = trimesh.creation.icosphere(1)
+    vertices, faces = np.asarray(solid.vertices, np.float32), np.asarray(solid.faces, np.uint32)
+    write_mesh(folder / "a.ply", Mesh(vertices, faces, 0.1))
+    corners = "\n".join(" ".join(map(str, corner)) for corner in CUBE)
+    quads = "\n".join("4 " + " ".join(map(str, quad)) for quad in QUADS)
+    header = "element vertex 8\nproperty float x\nproperty float y\nproperty float z\n"
+    header += "comment TextureFile ../secret.png\nelement face 6\n"
+    header += "property list uchar int vertex_indices\nend_header"
+    return [
+        (folder / "a.ply").read_bytes(),
+        solid.export(file_type="ply", encoding="ascii"),
+        f"ply\nformat ascii 1.0\n{header}\n{corners}\n{quads}\n".encode(),
+    ]
+
+
+def _foreign_meshes(folder: Path) -> list[bytes]:
+    import trimesh
+
+    solid = trimesh.Trimesh(CUBE, TRIANGLES, process=False)
+    obj = "mtllib ../../etc/passwd\n" + str(solid.export(file_type="obj"))
+    return [
+        b"obj" + obj.encode(),
+        b"stl" + _binary(solid.export(file_type="stl")),
+        b"stl" + str(solid.export(file_type="stl_ascii")).encode(),
+        b"off" + str(solid.export(file_type="off")).encode(),
+    ]
+
+
+def _binary(data: Any) -> bytes:
+    return bytes(data)
+
+
+def _read_mesh(path: Path) -> None:
+    """Rays through the mesh as well: Embree reads what a wrong index names."""
+    import mitsuba as mi
+
+    from mi_refgs.occlusion.mesh import read_mesh
+    from mi_refgs.occlusion.visibility import Occluder
+
+    mesh = read_mesh(path)
+    _finite(mesh.vertices, mesh.voxel)
+    points = np.random.default_rng(SEED).normal(size=(3, 64)).astype(np.float32)
+    Occluder(mesh).visible(mi.Point3f(points), mi.Vector3f(-points)).numpy()
+
+
+def _read_foreign_mesh(folder: Path, data: bytes) -> None:
+    """The first three bytes of the sample say what it is, and stay as they are told."""
+    ending = data[:3].decode("latin-1")
+    ending = ending if ending in ("obj", "stl", "off") else "obj"
+    path = folder / f"a.{ending}"
+    path.write_bytes(data[3:])
+    _read_mesh(path)
+
+
+# ---------------- pictures ----------------
+
+
+def _exr_files(folder: Path) -> list[bytes]:
+    import OpenEXR
+
+    from mi_refgs.images import write_exr
+
+    image = np.random.default_rng(SEED).random((5, 7, 4))
+    files = []
+    for kind in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "DWAA"):
+        header = {"compression": getattr(OpenEXR, f"{kind}_COMPRESSION"), "type": OpenEXR.scanlineimage}
+        for dtype in (np.float16, np.float32):
+            planes = {name: image[..., i].astype(dtype) for i, name in enumerate("RGBA")}
+            OpenEXR.File(header, planes).write(str(folder / "a.exr"))
+            files.append((folder / "a.exr").read_bytes())
+    tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
+    OpenEXR.File(tiles, {"Y": image[..., 0].astype(np.float32)}).write(str(folder / "a.exr"))
+    write_exr(folder / "b.exr", image[..., :3], names="XYZ")
+    return [*files, (folder / "a.exr").read_bytes(), (folder / "b.exr").read_bytes()]
+
+
+def _read_exr(path: Path) -> None:
+    from mi_refgs.images import read_exr_image
+
+    _finite(read_exr_image(path))
+
+
+def _picture_files(folder: Path) -> list[bytes]:
+    from PIL import Image
+
+    rgba = np.random.default_rng(SEED).integers(0, 256, (9, 11, 4), dtype=np.uint8)
+    picture, files = Image.fromarray(rgba), []
+    for mode in ("RGBA", "RGB", "L", "LA", "P", "1", "I;16"):
+        deep = Image.fromarray(rgba[..., 0].astype(np.uint16))
+        files.append(_saved(deep if mode == "I;16" else picture.convert(mode), "PNG"))
+    files.append(_saved(picture.convert("P"), "PNG", transparency=3, interlace=1))
+    for mode, progressive in (("RGB", False), ("RGB", True), ("L", False), ("CMYK", False)):
+        files.append(_saved(picture.convert(mode), "JPEG", progressive=progressive))
+    return [*files, _saved(picture, "GIF"), _saved(picture, "TIFF")]
+
+
+def _saved(picture: Any, kind: str, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    picture.save(buffer, format=kind, **options)
+    return buffer.getvalue()
+
+
+def _read_picture(path: Path) -> None:
+    from mi_refgs.images import read_png
+
+    pixels = read_png(path)
+    _finite(pixels)
+    assert pixels.min() >= 0 and pixels.max() <= 1
+
+
+def _light_files(folder: Path) -> list[bytes]:
+    import mitsuba as mi
+
+    bitmap = mi.Bitmap(np.random.default_rng(SEED).random((8, 16, 3)).astype(np.float32))
+    files = []
+    for ending in ("hdr", "exr", "pfm"):
+        bitmap.write(str(folder / f"a.{ending}"))
+        files.append((folder / f"a.{ending}").read_bytes())
+    return files + _picture_files(folder)[:2]
+
+
+def _read_light(path: Path) -> None:
+    from mi_refgs.shade.envmap import EnvironmentLight
+
+    _finite(EnvironmentLight.from_file(path).radiance().numpy())
+
+
+# ---------------- data sets and runs ----------------
+
+
+def _transforms(folder: Path) -> list[bytes]:
+    from mi_refgs.images import write_exr, write_png
+
+    rng, frames = np.random.default_rng(SEED), []
+    for i in range(3):
+        write_png(folder / f"r_{i}.png", rng.random((6, 8, 4)))
+        write_exr(folder / f"d_{i}.exr", rng.random((6, 8, 1)))
+        pose = np.eye(4)
+        pose[2, 3] = i
+        frames.append(
+            {"file_path": f"./r_{i}", "transform_matrix": pose.tolist(), "depth_path": f"d_{i}.exr"}
+        )
+    camera = {"fl_x": 9.0, "fl_y": 9.5, "cx": 4.2, "cy": 3.1, "w": 8, "h": 6, "aabb_scale": 4}
+    lens = {"k1": 0.03, "k2": -0.01, "p1": 1e-3, "p2": -1e-3, "camera_model": "OPENCV"}
+    contents = [
+        {**camera, **lens, "frames": frames},
+        {**camera, "k1": 0.1, "k4": 0.01, "is_fisheye": True, "frames": frames},
+        {"camera_angle_x": 0.7, "camera_angle_y": 0.6, "frames": [{**frames[0], "fl_x": 7}, *frames[1:]]},
+    ]
+    return [json.dumps(content).encode() for content in contents]
+
+
+def _read_transforms(path: Path) -> None:
+    from mi_refgs.fit.data import load
+
+    for view in load(path.parent, "train").views:
+        _finite(view.image, view.alpha, view.depth, view.to_world, [view.fx, view.fy, view.cx, view.cy])
+
+
+def _methods(folder: Path) -> list[bytes]:
+    from mi_refgs.fit import config
+    from mi_refgs.resources import resource_dir
+
+    shipped = [path.read_bytes() for path in sorted(resource_dir("variants").glob("*.toml"))]
+    own = b'extends = "ref_gaussian"\ndrop = ["mesh"]\niterations = 100\n[loss]\nssim = 0.1\n'
+    return [*shipped, config.dump(config.load("ref_gaussian")).encode(), own]
+
+
+def _read_method(path: Path) -> None:
+    from mi_refgs.fit import config
+
+    method = config.load(str(path), "quick", ["loss.ssim=0.3"])
+    assert config.dump(method)
+    method.stage_at(1)
+
+
+def _state() -> dict[str, np.ndarray]:
+    """What a checkpoint holds, with numbers of no meaning."""
+    state: dict[str, Any] = {f"params/{name}": np.float32(values) for name, values in _table().items()}
+    state["params/light"] = np.float32(np.random.default_rng(SEED).random((8, 16, 3)))
+    for name, values in list(state.items()):
+        moments = f"optimiser/{name.removeprefix('params/')}"
+        state |= {f"{moments}/first": np.zeros(values.size, np.float32), f"{moments}/steps": np.uint32(3)}
+        state |= {f"{moments}/second": np.zeros(values.size, np.float32), f"{moments}/factor": np.float32(1)}
+    state |= {"iteration": 3, "seconds": 1.5, "held_until": 0}
+    state |= {"gradient_sum": np.zeros(7, np.float32), "gradient_count": np.zeros(7, np.float32)}
+    state |= {
+        "mesh/vertices": CUBE,
+        "mesh/faces": TRIANGLES,
+        "mesh/voxel": 0.1,
+    }
+    return {name: np.asarray(value) for name, value in state.items()}
+
+
+def _checkpoints(folder: Path) -> list[bytes]:
+    from mi_refgs.fit import checkpoint
+
+    class Code:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return (exec, ("raise SystemExit('code was run')",))
+
+    buffer = io.BytesIO()
+    np.savez(buffer, code=np.array([Code()], dtype=object), iteration=np.array(3))
+    return [checkpoint.encode(_state()), buffer.getvalue() + b"sha256 " + b"0" * DIGITS]
+
+
+def _sign(data: bytes) -> bytes:
+    """With the right checksum, so that what is inside is read."""
+    return data[:-DIGITS] + hashlib.sha256(data[:-DIGITS]).hexdigest().encode()
+
+
+def _read_checkpoint(path: Path) -> None:
+    from mi_refgs.fit import config
+    from mi_refgs.fit.export import Fitted
+    from mi_refgs.fit.record import Run
+
+    (path.parent / "checkpoints").mkdir(exist_ok=True)
+    path.replace(path.parent / "checkpoints" / "0000003.npz")
+    state = Run(path.parent).load_checkpoint()
+    assert state is not None
+    Fitted.from_state(config.load("ref_gaussian"), state)
+
+
+def _models(folder: Path) -> list[bytes]:
+    from mi_refgs.occlusion.mesh import Mesh, write_mesh
+
+    (folder / "surfels.ply").write_bytes(_surfel_files(folder)[0])
+    write_mesh(folder / "mesh.ply", Mesh(CUBE, TRIANGLES, 0.1))
+    accuracy = {"dominant": False, "multiscatter": False, "visibility_rays": 1, "traced_bounces": 0}
+    shading = {
+        "at": "pixel",
+        "reflectance": "radiance",
+        "diffuse": "sh",
+        "occlusion": True,
+        "accuracy": accuracy,
+    }
+    return [json.dumps({"iteration": 3, "seconds": 1.5, "surfels": 7, "shading": shading}).encode()]
+
+
+def _read_model(path: Path) -> None:
+    from mi_refgs.fit.export import Fitted
+
+    fitted = Fitted.read(path.parent)
+    assert isinstance(fitted.iteration, int) and np.isfinite(fitted.seconds)
+
+
+def _read_data_place(path: Path) -> None:
+    """dataset.json of a run names a folder; only what lies there as a data set is read."""
+    from mi_refgs.fit import config
+    from mi_refgs.fit.evaluate import load_split
+    from mi_refgs.fit.record import Run
+
+    load_split(Run(path.parent), config.load("ref_gaussian"), "train")
+
+
+def _data_places(folder: Path) -> list[bytes]:
+    (folder / "transforms_train.json").write_bytes(_transforms(folder)[2])
+    return [json.dumps({"path": str(folder)}).encode()]
+
+
+def _settings(folder: Path) -> list[bytes]:
+    settings = {"scene": "a.xml", "scene_sha256": "0", "views": 3, "elevation": [-30.0, 80.0], "fov": 40.0}
+    return [json.dumps(settings).encode()]
+
+
+def _read_settings(path: Path) -> None:
+    """dataset.json of a data set, before it is written anew."""
+    from mi_refgs.fit.dataset import Settings, _prepare_folder
+
+    (path.parent / "transforms_train.json").write_text("{}")
+    _prepare_folder(path.parent, Settings("a.xml", "0", 3, 1, 8, 1, 0, 3, (-30.0, 80.0), 40.0, 0.9, 0), False)
+
+
+def _logs(folder: Path) -> list[bytes]:
+    lines = [json.dumps({"iteration": i, "loss": 0.5 / i, "psnr": None}) for i in range(1, 9)]
+    return ["\n".join(lines).encode(), lines[0].encode()]
+
+
+def _read_log(path: Path) -> None:
+    from mi_refgs.fit.record import Run
+
+    Run(path.parent).rewind(5)
+
+
+# ---------------- Mitsuba ----------------
+
+
+def _scenes(folder: Path) -> list[bytes]:
+    from mi_refgs.occlusion.mesh import Mesh, write_mesh
+
+    (folder / "s.ply").write_bytes(_surfel_files(folder)[0])
+    write_mesh(folder / "m.ply", Mesh(CUBE, TRIANGLES, 0.1))
+    strings = {"filename": "s.ply", "mesh": "m.ply", "shade_at": "pixel", "aovs": "n:normal,d:depth",
+               "terms": "diffuse,specular", "reflectance": "split_sum", "diffuse": "sh"}  # fmt: skip
+    inner = "".join(f'<string name="{name}" value="{value}"/>' for name, value in strings.items())
+    inner += '<integer name="traced_bounces" value="1"/><boolean name="dominant" value="true"/>'
+    inner += '<rgb name="background" value="1, 0.5, 0"/>'
+    light = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
+    plain = '<string name="filename" value="s.ply"/><boolean name="occlusion" value="false"/>'
+    return [
+        f'<scene version="3.0.0"><integrator type="refgs">{text}</integrator></scene>'.encode()
+        for text in (inner, inner + light, plain)
+    ]
+
+
+def _read_scene(path: Path) -> None:
+    """Mitsuba wraps what a plugin raises in a RuntimeError with the traceback's text."""
+    import mitsuba as mi
+
+    try:
+        mi.load_file(str(path))
+    except RuntimeError as error:
+        if "Traceback" in str(error) and "InputError: " not in str(error):
+            raise
+        message = str(error).rpartition("InputError: ")[2].strip()
+        raise InputError(message if "Traceback" in str(error) else f"{path}: Mitsuba: {message}") from error
+    except UnicodeDecodeError as error:  # Mitsuba's sentence quotes bytes of the file
+        raise InputError(f"{path}: Mitsuba: no UTF-8") from error
+
+
+def _file(name: str, kind: str, samples: Any, read: Callable[[Path], Any], file: str, **more: Any) -> Reader:
+    return Reader(name, kind, samples, _read_file(read, file), **more)
+
+
+READERS = {
+    reader.name: reader
+    for reader in (
+        _file("ply", "", _surfel_files, _read_surfels, "x.ply"),
+        _file("mesh", "", _meshes, _read_mesh, "x.ply"),
+        Reader("mesh-other", "", _foreign_meshes, _read_foreign_mesh),
+        _file("transforms", "json", _transforms, _read_transforms, "transforms_train.json"),
+        # A method may extend one elsewhere: it is the user's own file.
+        _file("method", "toml", _methods, _read_method, "x.toml", inside=False),
+        _file("exr", "", _exr_files, _read_exr, "x.exr"),
+        _file("picture", "", _picture_files, _read_picture, "x.png"),
+        _file("light", "", _light_files, _read_light, "x.hdr"),
+        _file("checkpoint", "", _checkpoints, _read_checkpoint, "x.npz", finish=_sign),
+        _file("model", "json", _models, _read_model, "model.json"),
+        _file("run-data", "json", _data_places, _read_data_place, "dataset.json", inside=False),
+        _file("dataset", "json", _settings, _read_settings, "dataset.json"),
+        _file("log", "json", _logs, _read_log, "metrics.jsonl"),
+        # A scene may name files anywhere, as every scene of Mitsuba's.
+        _file("scene", "xml", _scenes, _read_scene, "x.xml", inside=False),
+    )
+}
