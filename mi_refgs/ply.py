@@ -58,7 +58,10 @@ def read_header(path: Path, file: BinaryIO) -> Header:
     order, comments = "", []
     found: list[tuple[str, int, list[tuple[str, str]], list[tuple[str, str]]]] = []
     for _ in range(MAX_HEADER_LINES):
-        words = file.readline(MAX_LINE).decode("ascii", errors="replace").split()
+        line = file.readline(MAX_LINE)
+        words = line.decode("ascii", errors="replace").split()
+        if not line.endswith(b"\n") and words != ["end_header"]:
+            raise InputError(f"{path}: header: no end_header; the file is truncated, export it again")
         match words:
             case ["format", name, *_]:
                 order = ORDERS.get(name, "")
@@ -73,10 +76,10 @@ def read_header(path: Path, file: BinaryIO) -> Header:
             case ["end_header"]:
                 break
             case _:
-                line = " ".join(words)
-                raise InputError(f"{path}: header: '{line[:40]}' is no line of a PLY header; export it again")
+                text = " ".join(words)[:40]
+                raise InputError(f"{path}: header: '{text}' is no line of a PLY header; export it again")
     else:
-        raise InputError(f"{path}: header: no end_header; the file is truncated, export it again")
+        raise InputError(f"{path}: header: no end_header in {MAX_HEADER_LINES} lines; export it again")
     elements = tuple(Element(name, count, (*fields,), (*lists,)) for name, count, fields, lists in found)
     if not order or not elements:
         raise InputError(f"{path}: header: no format or no element; export it again")

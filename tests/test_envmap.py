@@ -104,7 +104,7 @@ def test_files_are_known_by_what_they_hold(tmp_path: Path) -> None:
 
 def test_bad_input(tmp_path: Path) -> None:
     (tmp_path / "text.exr").write_text("not an image")
-    with pytest.raises(InputError, match=r"text\.exr: environment"):
+    with pytest.raises(InputError, match=r"text\.exr: pixels"):
         EnvironmentLight.from_file(tmp_path / "text.exr")
     with pytest.raises(InputError, match="missing"):
         EnvironmentLight.from_file(tmp_path / "missing.exr")
