@@ -160,7 +160,7 @@ def test_broken_files_are_refused(tmp_path: Path, rng: np.random.Generator) -> N
             whole.replace(b"format binary_little_endian", b"format pdp_endian"),
             "no format or no element",
         ),
-        (face_first, "face: the vertices must come first"),
+        (face_first + bytes(8), "face: the vertices must come first"),
         (
             whole.replace(b"property float scale_1", b"property list uchar int scale_1"),
             "scale_1: not a number property",
