@@ -1,0 +1,94 @@
+"""Plant one mistake after another in a copy of the repository, and run the test that must catch it.
+
+    python -m benchmarks.mutation                    all, two at a time; exit code 1 if one goes unnoticed
+    python -m benchmarks.mutation --only splat       those whose name holds the word
+    python -m benchmarks.mutation --list             names, files and tests
+
+First every named test runs without a mistake: it must pass, or failing would prove nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import SimpleQueue
+
+from benchmarks.mutation.catalogue import MISTAKES, Mistake
+from benchmarks.mutation.planting import copy_repository, planted
+
+WORKERS = 2
+TIME_LIMIT = 300
+"""Seconds for one test, compiling its kernels included. A mistake that makes it hang is caught."""
+PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run, and print a line a mistake and the counts."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.mutation",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--only", default="", metavar="WORD", help="mistakes whose name holds the word")
+    parser.add_argument("--list", action="store_true", help="print the catalogue and stop")
+    parser.add_argument("--workers", type=int, default=WORKERS, metavar="N", help="copies tested at once")
+    options = parser.parse_args(arguments)
+    chosen = [mistake for mistake in MISTAKES if options.only in mistake.name]
+    if options.list or not chosen:
+        for mistake in chosen:
+            print(f"{mistake.name:40} {mistake.file:36} {mistake.test}")
+        return 0 if chosen else 2
+    with tempfile.TemporaryDirectory(prefix="mutation_") as folder:
+        copies: SimpleQueue[Path] = SimpleQueue()
+        for k in range(options.workers):
+            copies.put(copy_repository(Path(folder) / str(k)))
+
+        def run(mistake: Mistake) -> tuple[str, float]:
+            copy = copies.get()
+            begin = time.perf_counter()
+            try:
+                with planted(mistake, copy):
+                    return outcome(mistake.test, copy), time.perf_counter() - begin
+            finally:
+                copies.put(copy)
+
+        copy = copies.get()
+        for test in sorted({mistake.test for mistake in chosen}):
+            if (found := outcome(test, copy)) != "unnoticed":
+                print(f"{test}: {found} without any mistake")
+                return 1
+        copies.put(copy)
+        with ThreadPoolExecutor(options.workers) as pool:
+            outcomes = []
+            for mistake, (found, seconds) in zip(chosen, pool.map(run, chosen), strict=True):
+                outcomes.append(found)
+                print(f"{found:10} {seconds:4.0f} s  {mistake.name:40} {mistake.test}", flush=True)
+    missed = outcomes.count("unnoticed")
+    print(f"{len(chosen)} mistakes, {len(chosen) - missed} caught, {missed} unnoticed")
+    return 1 if missed else 0
+
+
+def outcome(test: str, copy: Path) -> str:
+    """What the test makes of the copy: failed, crashed, hung or unnoticed."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "pytest", *PYTEST, test],
+            cwd=copy,
+            env=os.environ | {"PYTHONPATH": str(copy)},
+            capture_output=True,
+            timeout=TIME_LIMIT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return "hung"
+    return {0: "unnoticed", 1: "failed"}.get(done.returncode, "crashed")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
