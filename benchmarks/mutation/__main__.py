@@ -4,7 +4,7 @@
     python -m benchmarks.mutation --only splat       those whose name holds the word
     python -m benchmarks.mutation --list             names, files and tests
 
-First every named test runs without a mistake: it must pass, or failing would prove nothing.
+First all named tests run without a mistake: they must pass, or failing would prove nothing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from benchmarks.mutation.planting import copy_repository, planted
 
 WORKERS = 2
 TIME_LIMIT = 300
-"""Seconds for one test, compiling its kernels included. A mistake that makes it hang is caught."""
+"""Seconds for a test, compiling its kernels included. A mistake that makes it hang is caught."""
 PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "")
 
 
@@ -54,15 +54,15 @@ def main(arguments: list[str] | None = None) -> int:
             begin = time.perf_counter()
             try:
                 with planted(mistake, copy):
-                    return outcome(mistake.test, copy), time.perf_counter() - begin
+                    return outcome([mistake.test], copy), time.perf_counter() - begin
             finally:
                 copies.put(copy)
 
+        tests = sorted({mistake.test for mistake in chosen})
         copy = copies.get()
-        for test in sorted({mistake.test for mistake in chosen}):
-            if (found := outcome(test, copy)) != "unnoticed":
-                print(f"{test}: {found} without any mistake")
-                return 1
+        if (found := outcome(tests, copy)) != "unnoticed":
+            print(f"the tests without a mistake: {found}; mend them first")
+            return 1
         copies.put(copy)
         with ThreadPoolExecutor(options.workers) as pool:
             outcomes = []
@@ -74,15 +74,15 @@ def main(arguments: list[str] | None = None) -> int:
     return 1 if missed else 0
 
 
-def outcome(test: str, copy: Path) -> str:
-    """What the test makes of the copy: failed, crashed, hung or unnoticed."""
+def outcome(tests: list[str], copy: Path) -> str:
+    """What the tests make of the copy: failed, crashed, hung or unnoticed."""
     try:
         done = subprocess.run(
-            [sys.executable, "-m", "pytest", *PYTEST, test],
+            [sys.executable, "-m", "pytest", *PYTEST, *tests],
             cwd=copy,
             env=os.environ | {"PYTHONPATH": str(copy)},
             capture_output=True,
-            timeout=TIME_LIMIT,
+            timeout=TIME_LIMIT * len(tests),
             check=False,
         )
     except subprocess.TimeoutExpired:

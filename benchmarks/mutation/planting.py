@@ -15,7 +15,7 @@ PARTS = ("mi_refgs", "variants", "scenes", "tests", "benchmarks", "pyproject.tom
 
 @dataclass(frozen=True)
 class Mistake:
-    """`before`, which stands once in `file`, is replaced by `after`; `test` (a pytest node) must then fail."""
+    """`before`, which stands once in `file`, becomes `after`; `test` (a pytest node) must then fail."""
 
     name: str
     file: str  # below the root of the repository
