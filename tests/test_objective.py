@@ -1,17 +1,81 @@
-"""The loss of a step: its terms, weighted as the method says."""
+"""What a step lowers: zero for the perfect picture, and the sum that the method's weights say."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
+import numpy as np
 import pytest
+from image_checks import HEIGHT, WIDTH
 
+from mi_refgs.device import upload
 from mi_refgs.fit import config
 from mi_refgs.fit.config import LossWeights
-from mi_refgs.fit.data import load
-from mi_refgs.fit.objective import objective
+from mi_refgs.fit.data import Dataset, View, load
+from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.train import Trainer
+from mi_refgs.images import linear_from_srgb
+from mi_refgs.reference import losses as reference
+from mi_refgs.render.pipeline import Frame
+
+BACKGROUND = np.array([1.0, 0.5, 0.25], np.float32)
+
+
+def made(linear: bool, radiance: np.ndarray, alpha: np.ndarray) -> tuple[Dataset, Target]:
+    """A data set of one picture of premultiplied linear radiance (H, W, 3), and its target."""
+    if linear:
+        image = radiance + (1 - alpha[..., None]) * BACKGROUND
+    else:
+        a = alpha[..., None]
+        encoded = np.vectorize(reference.srgb)(radiance / np.maximum(a, 1e-9))
+        image = a * encoded + (1 - a) * BACKGROUND
+    image, alpha = image.astype(np.float32), alpha.astype(np.float32)
+    view = View("a", WIDTH, HEIGHT, 20.0, 20.0, 8.0, 7.0, np.eye(4), image, alpha, None, None, linear)
+    return Dataset(Path("a"), "train", (view,), BACKGROUND, linear, None), Target.of(view)
+
+
+def frame_of(radiance: np.ndarray, alpha: np.ndarray) -> Frame:
+    flat = np.full(alpha.shape, 2.0, np.float32)
+    normal = mi.Vector3f(0, 0, upload(-alpha.astype(np.float32)))
+    planes = [upload(radiance[..., c].astype(np.float32)) for c in range(3)]
+    opacity = upload(alpha.astype(np.float32))
+    return Frame(alpha=opacity, depth=upload(flat), normal=normal, radiance=mi.Color3f(*planes))
+
+
+@pytest.fixture
+def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Premultiplied radiance below 1, and alpha with empty and full pixels."""
+    alpha = np.clip(rng.uniform(-0.5, 1.5, (HEIGHT, WIDTH)), 0, 1)
+    colour = linear_from_srgb(rng.uniform(0.05, 0.9, (HEIGHT, WIDTH, 3)))
+    return colour * alpha[..., None], alpha
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_a_perfect_picture_costs_nothing(linear: bool, picture: tuple[np.ndarray, np.ndarray]) -> None:
+    """8-bit pictures are composited as displayed, linear ones before they are encoded; either once."""
+    data, target = made(linear, *picture)
+    weights = LossWeights(ssim=0.2, normal=0.0, alpha=0.3)
+    loss, error = objective(frame_of(*picture), target, data, weights, 1)
+    assert abs(float(loss[0])) < 1e-5 and float(error[0]) < 1e-10
+
+
+def test_terms_are_weighed_as_the_method_says(
+    picture: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
+) -> None:
+    data, target = made(True, *picture)
+    radiance, alpha = rng.uniform(0, 0.5, (HEIGHT, WIDTH, 3)), rng.uniform(0, 1, (HEIGHT, WIDTH))
+    weights = LossWeights(ssim=0.3, normal=0.0, smooth=0.0, alpha=0.4)
+    loss, error = objective(frame_of(radiance, alpha), target, data, weights, 1)
+    shown, goal = (
+        np.vectorize(reference.srgb)(x + (1 - a[..., None]) * BACKGROUND)
+        for x, a in ((radiance, alpha), picture)
+    )
+    expected = 0.7 * reference.l1(shown, goal) + 0.3 * (1 - reference.ssim(shown, goal))
+    expected += 0.4 * reference.alpha_loss(alpha, picture[1], "l1")
+    assert float(loss[0]) == pytest.approx(expected, abs=2e-5)
+    assert float(error[0]) == pytest.approx(np.mean((shown - goal) ** 2), rel=1e-4)
 
 
 def test_the_weight_of_normals_rises_linearly(data: Path, method: Path) -> None:

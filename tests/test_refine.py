@@ -82,6 +82,17 @@ def test_transparent_and_oversized_surfels_go_even_when_hot() -> None:
     assert sorted(set(edited.parent.tolist())) == [2, 3, 4, 5]
 
 
+def test_sizes_are_shares_of_the_scene() -> None:
+    """In any unit the same surfels are cloned, split and dropped."""
+    gradient, sizes = np.array([1e-3, 1e-3, 1e-3, 0, 0, 0]), np.array([0.005, 0.05, 0.5, 0.005, 0.05, 0.5])
+    parents = []
+    for unit in (1e-3, 1.0, 1e3):
+        raw = table().to_numpy()
+        raw["scale"] = np.log(unit * sizes)[:, None] + np.zeros((1, 2))
+        parents.append(densify(Surfels.from_numpy(raw), gradient, extent=unit).parent.tolist())
+    assert parents == [[0, 3, 4, 0, 1, 1]] * 3
+
+
 def test_opacities_get_time_to_grow_back_after_a_reset() -> None:
     surfels = table(opacity=0.02)
     limits = (np.zeros(6), 1.0, OPTIONS, 100, np.random.default_rng(1))

@@ -9,13 +9,14 @@ import resource
 import signal
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import numpy as np
 import pytest
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit import config
+from mi_refgs.fit import config, train
 from mi_refgs.fit.config import Method
 from mi_refgs.fit.data import Dataset, View
 from mi_refgs.fit.interrupt import TerminatedError, held_interrupts
@@ -129,6 +130,35 @@ def test_resume_repeats_a_straight_run_bit_for_bit(method: Method, tmp_path: Pat
     for name in expected.keys() - {"seconds"}:
         assert np.array_equal(expected[name], got[name]), name
     assert "mesh/faces" in expected
+
+
+def test_an_edit_clears_the_moments_of_what_it_changed(method: Method) -> None:
+    """The propagation of iteration 5 changes opacities and scales."""
+    trainer = Trainer(method, ball())
+    trainer.step()
+
+    def moving() -> set[str]:
+        return {name for name, value in trainer.state().items() if name.endswith("first") and np.any(value)}
+
+    before = moving()
+    trainer._refine(5)
+    assert before - moving() == {"optimiser/opacity/first", "optimiser/scale/first"}
+
+
+def test_the_screen_gradient_is_in_half_pictures(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Normalised device coordinates: what densification compares then has no unit."""
+    shifts, original = [], train.render
+
+    def render(*arguments: Any, shift: Any, **more: Any) -> Any:
+        shifts.append(shift)
+        return original(*arguments, shift=shift, **more)
+
+    monkeypatch.setattr(train, "render", render)
+    trainer = Trainer(method, ball())
+    trainer.step()
+    expected = 0.5 * SIZE * np.linalg.norm(np.array(dr.grad(shifts[0])), axis=0)
+    assert expected.max() > 0
+    np.testing.assert_allclose(trainer.gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
 
 
 def test_a_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: Path) -> None:

@@ -1,0 +1,39 @@
+"""What a step takes from its iteration number: the view, random numbers, the degree of the harmonics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mi_refgs.fit.config import Method, Stage, SurfelOptions, Window
+from mi_refgs.fit.schedule import Schedule
+
+
+def schedule(seed: int = 0, views: int = 7) -> Schedule:
+    surfels = SurfelOptions(sh_degree=2, sh_raise=Window(start=10, until=100, every=10))
+    return Schedule(
+        Method(iterations=100, stage={"all": Stage(until=100)}, surfels=surfels, seed=seed), views
+    )
+
+
+def test_views_come_once_an_epoch_in_an_order_of_its_own() -> None:
+    epochs = [[schedule().view(7 * epoch + i + 1) for i in range(7)] for epoch in range(5)]
+    assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) == 5
+
+
+def test_draws_follow_seed_and_iteration() -> None:
+    draws = [schedule(seed).rng(i).random() for seed in (0, 1) for i in (0, 1, 2)]
+    assert len(set(draws)) == len(draws)
+    assert draws == [schedule(seed).rng(i).random() for seed in (0, 1) for i in (0, 1, 2)]
+    orders = [[schedule(seed).view(i + 1) for i in range(7)] for seed in range(4)]
+    assert len(set(map(tuple, orders))) > 1
+
+
+@pytest.mark.parametrize(
+    ("iteration", "degree"), [(1, 0), (10, 0), (19, 0), (20, 1), (29, 1), (30, 2), (99, 2)]
+)
+def test_the_degree_rises_with_its_window(iteration: int, degree: int) -> None:
+    """One more at each multiple of 10 after the first, up to that of the table."""
+    assert schedule().sh_degree(iteration) == degree
+    assert np.isscalar(schedule().sh_degree(iteration))
