@@ -149,9 +149,9 @@ def test_the_screen_gradient_is_in_half_pictures(method: Method, monkeypatch: py
     """Normalised device coordinates: what densification compares then has no unit."""
     shifts, original = [], train.render
 
-    def render(*arguments: Any, shift: Any, **more: Any) -> Any:
-        shifts.append(shift)
-        return original(*arguments, shift=shift, **more)
+    def render(*arguments: Any, **named: Any) -> Any:
+        shifts.append(named["shift"])
+        return original(*arguments, **named)
 
     monkeypatch.setattr(train, "render", render)
     trainer = Trainer(method, ball())
