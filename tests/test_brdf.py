@@ -123,6 +123,11 @@ def test_cache_is_written_read_and_survives_damage(tmp_path: Path, monkeypatch: 
     assert len(calls) == 3, "another array should not pass for the table"
 
 
+def test_the_cached_table_is_the_one_that_this_code_computes() -> None:
+    """Otherwise the cache of an earlier version hides from every other test what was changed since."""
+    np.testing.assert_allclose(brdf.table(), brdf.compute_table(), atol=1e-6)
+
+
 def test_unwritable_cache_is_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     computed = brdf.table()
     monkeypatch.setattr(brdf, "compute_table", lambda: computed)

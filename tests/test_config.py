@@ -40,11 +40,23 @@ def test_presets_scale_the_whole_schedule() -> None:
     assert standard.refine.densify.until == pytest.approx(quick.refine.densify.until * factor, abs=factor)
 
 
+def test_a_preset_scales_every_number_of_iterations(tmp_path: Path) -> None:
+    path = tmp_path / "long.toml"
+    path.write_text(
+        "iterations = 4000\n[stage.first]\nuntil = 1000\n[stage.last]\nuntil = 4000\n"
+        "[refine]\npropagate_hold = 200\n[loss]\nsmooth_until = 3000\n"
+    )
+    method = config.load(str(path), "quick")
+    assert method.iterations == 2000 and [stage.until for _, stage in method.stages()] == [500, 2000]
+    assert (method.refine.propagate_hold, method.loss.smooth_until) == (100, 1500)
+
+
 def test_stages_and_windows_meet_without_gap_or_overlap() -> None:
     method = config.load("ref_gaussian", "quick")
     names = [method.stage_at(i)[0] for i in range(1, method.iterations + 1)]
     order = [name for name, _ in method.stages()]
     assert sorted(set(names), key=names.index) == order
+    assert [names[stage.until - 1] for _, stage in method.stages()] == order
     window = config.Window(2, 8, 3)
     assert [i for i in range(12) if window.due(i)] == [3, 6]
     assert [window.since(i) for i in (3, 4, 6, 7, 9, 20)] == [None, 1, 3, 1, 3, 14]

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
@@ -42,8 +43,9 @@ def main(arguments: list[str] | None = None) -> int:
     chosen = [mistake for mistake in MISTAKES if options.only in mistake.name]
     if options.list or not chosen:
         for mistake in chosen:
-            print(f"{mistake.name:40} {mistake.file:36} {mistake.test}")
+            print(f"{mistake.name:52} {mistake.file:36} {mistake.test}")
         return 0 if chosen else 2
+    start = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="mutation_") as folder:
         copies: SimpleQueue[Path] = SimpleQueue()
         for k in range(options.workers):
@@ -60,22 +62,24 @@ def main(arguments: list[str] | None = None) -> int:
 
         tests = sorted({mistake.test for mistake in chosen})
         copy = copies.get()
-        if (found := outcome(tests, copy)) != "unnoticed":
+        if (found := outcome(tests, copy, show=True)) != "unnoticed":
             print(f"the tests without a mistake: {found}; mend them first")
             return 1
         copies.put(copy)
         with ThreadPoolExecutor(options.workers) as pool:
-            outcomes = []
+            outcomes: Counter[str] = Counter()
             for mistake, (found, seconds) in zip(chosen, pool.map(run, chosen), strict=True):
-                outcomes.append(found)
-                print(f"{found:10} {seconds:4.0f} s  {mistake.name:40} {mistake.test}", flush=True)
-    missed = outcomes.count("unnoticed")
-    print(f"{len(chosen)} mistakes, {len(chosen) - missed} caught, {missed} unnoticed")
-    return 1 if missed else 0
+                excused = found == "unnoticed" and mistake.reason
+                outcomes["excused" if excused else found] += 1
+                named = mistake.reason if excused else mistake.test
+                print(f"{found:10} {seconds:4.0f} s  {mistake.name:52} {named}", flush=True)
+    counts = ", ".join(f"{number} {found}" for found, number in sorted(outcomes.items()))
+    print(f"{len(chosen)} mistakes: {counts}; {(time.perf_counter() - start) / 60:.1f} minutes")
+    return 1 if outcomes["unnoticed"] else 0
 
 
-def outcome(tests: list[str], copy: Path) -> str:
-    """What the tests make of the copy: failed, crashed, hung or unnoticed."""
+def outcome(tests: list[str], copy: Path, show: bool = False) -> str:
+    """What the tests make of the copy: failed, crashed, hung or unnoticed; `show`: and what failed."""
     try:
         done = subprocess.run(
             [sys.executable, "-m", "pytest", *PYTEST, *tests],
@@ -87,6 +91,8 @@ def outcome(tests: list[str], copy: Path) -> str:
         )
     except subprocess.TimeoutExpired:
         return "hung"
+    if show and done.returncode:
+        print(done.stdout.decode())
     return {0: "unnoticed", 1: "failed"}.get(done.returncode, "crashed")
 
 

@@ -27,12 +27,6 @@ _CONSTANTS = _in(
         "LOW_PASS_INV_VARIANCE = 2.0",
         "test_pipeline.py::test_opacity_and_the_size_on_screen_have_their_bounds",
     ),
-    (
-        "footprint: opacity clamped at 0.9",
-        "ALPHA_MAX = 0.99",
-        "ALPHA_MAX = 0.9",
-        "test_pipeline.py::test_opacity_and_the_size_on_screen_have_their_bounds",
-    ),
 )
 
 _FOOTPRINT = _in(
@@ -53,12 +47,6 @@ _FOOTPRINT = _in(
         "footprint: samples before the near plane count",
         "(alpha >= ALPHA_MIN) & (z > near)",
         "(alpha >= ALPHA_MIN) & (z == z)",
-        "test_splat.py::test_image_matches_oracle",
-    ),
-    (
-        "footprint: surfels behind the camera are seen",
-        "dr.detach((p.z > camera.near) & (p.z > 0))",
-        "dr.detach(dr.abs(p.z) > camera.near)",
         "test_splat.py::test_image_matches_oracle",
     ),
     (
@@ -147,12 +135,6 @@ _TILES = _in(
         "sort: the upper digit is lost",
         "for digit in range(3)",
         "for digit in range(2)",
-        "test_splat.py::test_tile_lists_are_in_the_oracles_order",
-    ),
-    (
-        "sort: depth at the tile's corner",
-        "corner + tile_size / 2",
-        "corner - tile_size / 2",
         "test_splat.py::test_tile_lists_are_in_the_oracles_order",
     ),
     (
@@ -254,7 +236,7 @@ _RENDER = [
             "depth normals: edges are slopes",
             "DEPTH_EDGE_COSINE = 0.2",
             "DEPTH_EDGE_COSINE = 0.0",
-            "test_depth_normals.py",
+            "test_depth_normals.py::test_steps_between_surfaces_have_no_normal",
         ),
         (
             "depth normals: away from the camera",
@@ -302,7 +284,7 @@ _SHADE = [
             "split sum: Schlick's power is 4",
             "schlick = (1 - v_h) ** 5",
             "schlick = (1 - v_h) ** 4",
-            "test_brdf.py::test_cache_is_written_read_and_survives_damage",
+            "test_brdf.py::test_the_cached_table_is_the_one_that_this_code_computes",
         ),
     ),
     *_in(
@@ -350,12 +332,6 @@ _SHADE = [
             "prefilter: texels at the poles weigh as others",
             "@ transform * np.sin(θ[near])[:, None]",
             "@ transform",
-            "test_envmap.py::test_levels_against_brute_force",
-        ),
-        (
-            "prefilter: lobe without its cosine",
-            "np.maximum(cos_angle, 0) / (d * d)",
-            "(cos_angle > 0) / (d * d)",
             "test_envmap.py::test_levels_against_brute_force",
         ),
     ),
@@ -489,12 +465,6 @@ _LOSSES = [
             "dr.select(mask & (plane > goal)",
             "dr.select((plane > goal)",
             "test_losses.py::test_l1_of_clipped_highlights",
-        ),
-        (
-            "loss: half of 1 - SSIM",
-            "return 1 - ssim(",
-            "return 0.5 - 0.5 * ssim(",
-            "test_losses.py::test_ssim",
         ),
         (
             "loss: normals do not move the depth",
@@ -665,12 +635,6 @@ _CONFIGURATION = [
             "test_config.py::test_a_scaled_window_keeps_its_events",
         ),
         (
-            "schedule: events fall on the iteration before",
-            "math.ceil((iteration + 0.5) / self.every) - 1",
-            "math.ceil((iteration + 1.5) / self.every) - 1",
-            "test_config.py::test_a_scaled_window_keeps_its_events",
-        ),
-        (
             "schedule: a stage ends an iteration early",
             "if iteration <= item[1].until",
             "if iteration < item[1].until",
@@ -680,7 +644,7 @@ _CONFIGURATION = [
             "schedule: the hold after a propagation is not scaled",
             '"smooth_until", "propagate_hold"}',
             '"smooth_until"}',
-            "test_config.py::test_presets_scale_the_whole_schedule",
+            "test_config.py::test_a_preset_scales_every_number_of_iterations",
         ),
         (
             "configuration: extending replaces whole tables",
@@ -760,12 +724,6 @@ _FILES = [
     ),
     *_in(
         "surfels/init.py",
-        (
-            "start: colour without its ½",
-            "(count,)) - 0.5) / SH_DC",
-            "(count,))) / SH_DC",
-            "test_init.py::test_from_points",
-        ),
     ),
     *_in(
         "fit/frames.py",
@@ -800,12 +758,6 @@ _FILES = [
             "lens: p1 and p2 swapped",
             "factor, (p1, p2) = self._series(square)",
             "factor, (p2, p1) = self._series(square)",
-            "test_lens.py::test_points_land_where_a_pinhole_sees_them",
-        ),
-        (
-            "lens: radial coefficients in reverse",
-            "for k in reversed(self.radial)",
-            "for k in self.radial",
             "test_lens.py::test_points_land_where_a_pinhole_sees_them",
         ),
     ),
