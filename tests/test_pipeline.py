@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import level_maps
@@ -155,3 +158,21 @@ def test_layers_show_down_to_the_least_transmittance() -> None:
     layers = discs(opacity=np.zeros((20, 1)), scale=np.full((20, 2), np.log(100.0)))
     alpha = channel(render(layers, seen_from(0, 0, 4.0), COLOUR), "alpha")
     assert 1 - alpha == pytest.approx(2.0**-13, rel=1e-2)
+
+
+def test_samples_before_the_near_plane_are_cut() -> None:
+    """Of a disc that crosses the plane, though its centre lies beyond."""
+    tilted = np.array([[np.sin(0.5), 0, 0, np.cos(0.5)]])
+    leaning = discs(rotation=tilted, scale=np.full((1, 2), np.log(2.0)))
+    raw = {name: values.astype(np.float64) for name, values in leaning.to_numpy().items()}
+    covered = []
+    for near in (0.01, 3.5):
+        camera = replace(seen_from(0, 0, 4.0, size=12), near=dr.opaque(mi.Float, near))
+        view = oracle.PinholeCamera(
+            12, 12, -8.0, -8.0, 6, 6, look_at(np.array([0, 0, 4.0]), np.zeros(3), up=(0, 1, 0)), near
+        )
+        expected = oracle.splat(raw, np.zeros((1, 0)), view)
+        alpha = channel(render(leaning, camera, COLOUR), "alpha").reshape(12, 12)
+        np.testing.assert_allclose(alpha[~expected.band], expected.alpha[~expected.band], atol=1e-5)
+        covered.append(np.count_nonzero(alpha))
+    assert 0.2 * covered[0] < covered[1] < 0.8 * covered[0]

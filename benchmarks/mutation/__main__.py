@@ -26,7 +26,7 @@ from benchmarks.mutation.planting import copy_repository, planted
 WORKERS = 2
 TIME_LIMIT = 300
 """Seconds for a test, compiling its kernels included. A mistake that makes it hang is caught."""
-PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "")
+PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist")
 
 
 def main(arguments: list[str] | None = None) -> int:

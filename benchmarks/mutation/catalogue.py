@@ -47,7 +47,7 @@ _FOOTPRINT = _in(
         "footprint: samples before the near plane count",
         "(alpha >= ALPHA_MIN) & (z > near)",
         "(alpha >= ALPHA_MIN) & (z == z)",
-        "test_splat.py::test_image_matches_oracle",
+        "test_pipeline.py::test_samples_before_the_near_plane_are_cut",
     ),
     (
         "footprint: edge-on surfels go too early",
@@ -236,7 +236,7 @@ _RENDER = [
             "depth normals: edges are slopes",
             "DEPTH_EDGE_COSINE = 0.2",
             "DEPTH_EDGE_COSINE = 0.0",
-            "test_depth_normals.py",
+            "test_depth_normals.py::test_steps_between_surfaces_have_no_normal",
         ),
         (
             "depth normals: away from the camera",
@@ -722,9 +722,9 @@ _FILES = [
             "test_surfels.py::test_activations",
         ),
         (
-            "surfels: rotation transposed",
-            "2 * (x * y + z * w), 2 * (x * z - y * w))",
-            "2 * (x * y - z * w), 2 * (x * z + y * w))",
+            "surfels: a sign in the rotation",
+            "entry(x, z, -y, w)",
+            "entry(x, z, y, w)",
             "test_surfels.py::test_activations",
         ),
     ),
