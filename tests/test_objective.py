@@ -33,7 +33,7 @@ def made(linear: bool, radiance: np.ndarray, alpha: np.ndarray) -> tuple[Dataset
         image = a * encoded + (1 - a) * BACKGROUND
     image, alpha = image.astype(np.float32), alpha.astype(np.float32)
     view = View("a", WIDTH, HEIGHT, 20.0, 20.0, 8.0, 7.0, np.eye(4), image, alpha, None, None, linear)
-    return Dataset(Path("a"), "train", (view,), BACKGROUND, linear, None), Target.of(view)
+    return Dataset(Path("a"), "train", (view,), BACKGROUND, linear, None), Target.of(view, BACKGROUND)
 
 
 def frame_of(radiance: np.ndarray, alpha: np.ndarray) -> Frame:

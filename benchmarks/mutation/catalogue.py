@@ -467,6 +467,12 @@ _LOSSES = [
             "test_losses.py::test_display_image",
         ),
         (
+            "loss: a white background counts as a highlight",
+            "plane - (1 - alpha) * behind >= SATURATED * alpha",
+            "plane >= SATURATED",
+            "test_losses.py::test_only_the_objects_own_colour_is_a_highlight",
+        ),
+        (
             "loss: highlights are clipped everywhere",
             "dr.select(mask & (plane > goal)",
             "dr.select((plane > goal)",
