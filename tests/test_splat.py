@@ -482,3 +482,33 @@ def test_needles_are_as_exact_as_the_numbers_that_describe_them(aspect: float, l
         rounding.append((near.alpha - exact.alpha)[keep])
     error, condition = (float(np.sqrt(np.mean(np.concatenate(x) ** 2))) for x in (errors, rounding))
     assert error < 2.05 * condition  # observed: 1.5 to 1.9
+
+
+@pytest.mark.parametrize("opacity", [0.9, 0.3, 0.05])
+def test_the_cut_biases_gradients_by_what_is_documented(opacity: float) -> None:
+    """Gradients of a footprint's mass, averaged over places in a pixel, beside the mass's own slopes."""
+    scale, focal, size, places = 0.1, 60.0, 48, 6
+    mass, by_size, by_opacity = 0.0, 0.0, 0.0
+    for i in range(places * places):
+        x, y = (k + 0.5 for k in divmod(i, places))
+        raw = {
+            "position": np.array([[0.0, 0, 1]]),
+            "rotation": np.array([[0.0, 0, 0, 1]]),
+            "scale": np.full((1, 2), np.log(scale)),
+            "opacity": np.log([[opacity / (1 - opacity)]]),
+        }
+        surfels = Surfels.from_numpy(raw)
+        surfels.enable_grad()
+        centre = (size / 2 + x / places, size / 2 + y / places)
+        total = dr.sum(splat(surfels, [], Camera.look(size, size, -focal, -focal, *centre, np.eye(4))).alpha)
+        dr.backward(total)
+        mass += float(total[0]) / places**2
+        by_size += dr.grad(surfels.raw["scale"]).numpy().sum() / places**2
+        by_opacity += dr.grad(surfels.raw["opacity"]).numpy().sum() / places**2
+    # mass = 2π s² (o - ε), with s in pixels: its slopes by log s and by the logit of o.
+    area = 2 * np.pi * (scale * focal) ** 2
+    assert mass == pytest.approx(area * (opacity - ALPHA_MIN), rel=5e-3)
+    bias = ALPHA_MIN * np.log(opacity / ALPHA_MIN) / (opacity - ALPHA_MIN)
+    assert by_size / (2 * area * (opacity - ALPHA_MIN)) - 1 == pytest.approx(-bias, abs=5e-3)
+    slope = area * opacity * (1 - opacity)
+    assert by_opacity / slope - 1 == pytest.approx(-ALPHA_MIN / opacity, abs=5e-3)

@@ -15,7 +15,13 @@ block of its tile and keeps their states side by side. Reading a row and adding 
 work with one pixel a lane, are then shared.
 
 No derivative, on purpose: the sort order, the tile lists, the α < 1/255 cut and the end at T < 1e-4, the near
-plane, the clamp at α_max (zero).
+plane, the clamp at α_max (zero). Of these the cut has a bias of known size: the border of a footprint does
+not move. With ε = 1/255, mean gradients of size and position fall short by the part ε ln(o/ε) / (o - ε),
+those of opacity by ε/o:
+
+    opacity o             0.9     0.5     0.3     0.1    0.05
+    size, position      -2.4 %  -3.8 %  -5.7 %  -13 %  -22 %
+    opacity             -0.4 %  -0.8 %  -1.3 %  -3.9 %  -7.8 %
 """
 
 from __future__ import annotations
