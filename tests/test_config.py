@@ -43,7 +43,7 @@ def test_presets_scale_the_whole_schedule() -> None:
 def test_a_preset_scales_every_number_of_iterations(tmp_path: Path) -> None:
     path = tmp_path / "long.toml"
     path.write_text(
-        "iterations = 4000\n[stage.first]\nuntil = 1000\n[stage.last]\nuntil = 4000\n"
+        "iterations = 4000\n[light]\n[stage.first]\nuntil = 1000\n[stage.last]\nuntil = 4000\n"
         "[refine]\npropagate_hold = 200\n[loss]\nsmooth_until = 3000\n"
     )
     method = config.load(str(path), "quick")
