@@ -271,6 +271,7 @@ def truncate(folder: Path) -> None:
         (edit(lambda c: c.pop("camera_angle_x")), {}, ["camera_angle_x", "fl_x"]),
         (edit(lambda c: c.update(camera_angle_x="wide")), {}, ["camera_angle_x", "'wide'"]),
         (edit(lambda c: c.update(camera_angle_x=40)), {}, ["camera_angle_x", "radians"]),
+        (edit(lambda c: c.update(camera_angle_x=1e-320)), {}, ["camera_angle_x", "radians"]),
         (edit(lambda c: c.update(w=800)), {}, ["r_0.png", "w = 800"]),
         (edit(lambda c: c["frames"].insert(0, 3)), {}, ["frames[0]", "not an object"]),
         (edit(lambda c: c["frames"][1].pop("file_path")), {}, ["frames[1].file_path"]),

@@ -277,6 +277,7 @@ def _state() -> dict[str, np.ndarray]:
         moments = f"optimiser/{name.removeprefix('params/')}"
         state |= {f"{moments}/first": np.zeros(values.size, np.float32), f"{moments}/steps": np.uint32(3)}
         state |= {f"{moments}/second": np.zeros(values.size, np.float32), f"{moments}/factor": np.float32(1)}
+        state[f"{moments}/usual"] = 0.0
     state |= {"iteration": 3, "seconds": 1.5, "held_until": 0}
     state |= {"gradient_sum": np.zeros(7, np.float32), "gradient_count": np.zeros(7, np.float32)}
     state |= {
@@ -326,7 +327,7 @@ def _models(folder: Path) -> list[bytes]:
         "at": "pixel",
         "reflectance": "radiance",
         "diffuse": "sh",
-        "occlusion": True,
+        "occlusion": False,
         "accuracy": accuracy,
     }
     return [json.dumps({"iteration": 3, "seconds": 1.5, "surfels": 7, "shading": shading}).encode()]

@@ -272,8 +272,10 @@ class FrameReader:
         for length, angle, size in (("fl_x", "camera_angle_x", width), ("fl_y", "camera_angle_y", height)):
             pixels, radians = number(length), number(angle)
             if pixels is None and radians is not None:
-                if radians >= math.pi:
-                    raise InputError(f"{self.transforms}: {angle}: {radians:g} is not below π; give radians")
+                if not 1 / MAX_NUMBER < radians < math.pi:
+                    raise InputError(
+                        f"{self.transforms}: {angle}: {radians:g} is not between 0 and π; give radians"
+                    )
                 pixels = 0.5 * size / math.tan(radians / 2)
             focal.append(pixels)
         fx = focal[0]
