@@ -15,17 +15,13 @@ PARTS = ("mi_refgs", "variants", "scenes", "tests", "benchmarks", "pyproject.tom
 
 @dataclass(frozen=True)
 class Mistake:
-    """`before`, which stands once in `file`, becomes `after`; `test` (a pytest node) must then fail.
-
-    Unless there is a `reason` why no test can.
-    """
+    """`before`, which stands once in `file`, becomes `after`; `test` (a pytest node) must then fail."""
 
     name: str
     file: str  # below the root of the repository
     before: str
     after: str
     test: str
-    reason: str = ""
 
 
 def copy_repository(folder: Path) -> Path:
