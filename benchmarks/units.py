@@ -1,4 +1,4 @@
-"""A fit does not ask in which unit a scene is measured: the same pictures, with positions in several units.
+"""Fits do not depend on the unit of length: the same pictures, with positions in several units.
 
     python -m benchmarks.units [--size 64] [--views 32] [--json FILE]
 

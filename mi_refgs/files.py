@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and JSON that may hold anything."""
+"""Files that appear whole or not at all, names that may be none, and JSON that may hold anything."""
 
 from __future__ import annotations
 
@@ -58,6 +58,14 @@ def remove_temporaries(folder: Path) -> None:
     for path in folder.iterdir():
         if TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file exists; no for a name that no file can have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def read_json(path: str | Path) -> dict[str, Any]:

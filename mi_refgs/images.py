@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import replace_file
+from mi_refgs.files import is_file, replace_file
 
 SRGB_LINEAR_LIMIT = 0.0031308
 """Linear value below which the sRGB curve is a straight line (IEC 61966-2-1)."""
@@ -307,14 +307,6 @@ def mitsuba_exr() -> Iterator[None]:
     finally:
         dr.sync_thread()
         dr.set_thread_count(before)
-
-
-def is_file(path: Path) -> bool:
-    """Whether a file exists; no for a name that no file can have."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
 
 
 def _require_file(path: Path) -> None:

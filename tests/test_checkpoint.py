@@ -178,9 +178,11 @@ def test_resume_clears_what_a_killed_process_left(finished: Path, data: Path, tm
     for path in left:
         path.write_bytes(b"half")
     (run.path / ".notes").write_text("mine")
+    copy = run.path / "checkpoints" / "0000006 copy.npz"
+    copy.write_bytes(b"mine")
     run.checkpoints()[-1].unlink()
     assert main(["train", str(data), "-o", str(run.path), "--resume"]) == 0
-    assert [path.name for path in run.path.rglob(".*")] == [".notes"]
+    assert [path.name for path in run.path.rglob(".*")] == [".notes"] and copy.exists()
     lines = log.read_bytes().splitlines()
     assert lines[:1] == whole.splitlines()[:1] and len(lines) == 3
 

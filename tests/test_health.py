@@ -13,9 +13,9 @@ import pytest
 from test_train import METHOD, ball, run_folder
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit import config
+from mi_refgs.fit import config, health
 from mi_refgs.fit.config import Method
-from mi_refgs.fit.optim import Adam
+from mi_refgs.fit.optim import Adam, Skipped
 from mi_refgs.fit.train import Trainer
 from mi_refgs.surfels.table import GEOMETRY, Surfels
 
@@ -92,6 +92,14 @@ def test_surfels_that_are_not_finite_are_removed_and_the_fit_goes_on(
     assert trainer.iteration == 12 and np.isfinite(trainer.statistics()["loss"])
     for found in trainer.state().values():
         assert np.all(np.isfinite(found))
+
+
+def test_values_too_large_to_render_are_named_beside_those_that_are_not_finite(method: Method) -> None:
+    """The larger ones would stay, and be named by another channel, if the look were for NaN alone."""
+    raw = Trainer(method, ball()).surfels.to_numpy()
+    raw["indirect_sh"][4, 0], raw["roughness"][9, 0] = 1e30, np.nan
+    rows = health.culprits(Surfels.from_numpy(raw), Skipped(0, 0, {}))
+    assert {name: at.tolist() for name, at in rows.items()} == {"roughness": [9], "indirect_sh": [4]}
 
 
 def test_a_fit_in_which_every_step_fails_ends_with_one_sentence(

@@ -23,10 +23,10 @@ from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.surfels.table import CHANNELS
 
 STEPS = (2e-3, 2e-4)
-"""Of the differences, of which the better counts: rounding spoils the small one, curvature the large one."""
+"""Widths of differences; the better one counts: rounding spoils the small one, curvature the large one."""
 JUMP = 0.1
-"""Of the root mean square of the differences: where the two sides differ by more, a surfel has crossed the
-cut at α = 1/255, another surfel of its tile, or the kink of a lookup: there is no derivative."""
+"""Part of the root mean square of the differences: where the two sides differ by more, a surfel has crossed
+the cut at α = 1/255, another surfel of its tile, or the kink of a lookup: there is no derivative."""
 MAX_LEFT_OUT = 0.2
 """Share of the seen pixels in which that may happen; observed up to 2 % at the better step."""
 TANGENT_TOLERANCE = 5e-3  # relative L2; observed 8e-5 … 3e-3

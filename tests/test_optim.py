@@ -151,7 +151,7 @@ def test_a_harmonic_that_is_not_finite_alone_does_no_harm() -> None:
 def test_one_huge_gradient_slows_its_entry_but_does_not_stop_it(huge: float, at: int) -> None:
     """From 100 steps after it, the entry moves a tenth as far as its neighbours; with a history, a quarter.
 
-    Of plain Adam it would not move by a thousandth in a thousand steps.
+    With plain Adam it would not move by a thousandth in a thousand steps.
     """
     rng, rate, after = np.random.default_rng(1), 1e-3, 300
     params = {"x": tensor(np.zeros((300, 1)))}
@@ -170,6 +170,18 @@ def test_one_huge_gradient_slows_its_entry_but_does_not_stop_it(huge: float, at:
     assert np.median(moved) > 0.5 * rate * (after - 100)
     assert moved[7] > (0.25 if at == 1000 else 0.1) * np.median(moved)
     assert np.abs(positions[100] - positions[0])[7] < 100 * 3.2 * rate
+
+
+@pytest.mark.parametrize("before", [0.0, 1e25])
+def test_gradients_whose_square_is_no_float32_leave_finite_moments(before: float) -> None:
+    """A checkpoint with an infinite moment could not be resumed."""
+    params = {"x": tensor(np.zeros((5, 2)))}
+    optimiser = Adam(params, {"x": Group(0.1)})
+    for step, gradient in enumerate((before, 0.0, 1e25, 1e25)):
+        give(optimiser, "x", np.full((5, 2), gradient))
+        optimiser.step(step)
+    assert all(np.all(np.isfinite(x)) for x in optimiser.state_dict().values())
+    assert np.all(params["x"].numpy() < 0) and optimiser.report().count == 0
 
 
 def test_an_ordinary_fit_is_not_cut(rng: np.random.Generator) -> None:

@@ -154,14 +154,14 @@ def test_opacity_and_the_size_on_screen_have_their_bounds() -> None:
 
 
 def test_layers_show_down_to_the_least_transmittance() -> None:
-    """Of layers that each halve the light the 13th is the last before 1e-4."""
+    """Each layer halves the light; the 13th is the last before 1e-4."""
     layers = discs(opacity=np.zeros((20, 1)), scale=np.full((20, 2), np.log(100.0)))
     alpha = channel(render(layers, seen_from(0, 0, 4.0), COLOUR), "alpha")
     assert 1 - alpha == pytest.approx(2.0**-13, rel=1e-2)
 
 
 def test_samples_before_the_near_plane_are_cut() -> None:
-    """Of a disc that crosses the plane, though its centre lies beyond."""
+    """A disc crosses the plane, though its centre lies beyond."""
     tilted = np.array([[np.sin(0.5), 0, 0, np.cos(0.5)]])
     leaning = discs(rotation=tilted, scale=np.full((1, 2), np.log(2.0)))
     raw = {name: values.astype(np.float64) for name, values in leaning.to_numpy().items()}

@@ -25,7 +25,7 @@ from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 
 OTHER: dict[str, Any] = {"dominant": True, "multiscatter": True, "visibility_rays": 3, "traced_bounces": 1}
-"""Of each option a value that is not its default."""
+"""A value for each option that is not its default."""
 
 
 def fitted(folder: Path, shading: Shading) -> Fitted:

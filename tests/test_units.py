@@ -34,7 +34,7 @@ from mi_refgs.surfels.table import Surfels
 
 SCALES = (1e-6, 3e-3, 1e3, 1e6)
 TOLERANCE = 2e-5
-"""Of images; float32 rounds a scaled scene anew."""
+"""Largest error of images; float32 rounds a scaled scene anew."""
 SIZE = 40
 EYE = np.array([3.0, 1, 2])
 ORDERS = {

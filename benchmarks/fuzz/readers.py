@@ -16,7 +16,7 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 from mi_refgs.errors import InputError
 
 SEED = 0
-"""Of the numbers in the files to start from."""
+"""Seed of the numbers in the files to start from."""
 DIGITS = 64
 """Hexadecimal digits of the checksum at the end of a checkpoint."""
 

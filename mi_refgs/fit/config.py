@@ -18,7 +18,7 @@ from typing import Any, Literal
 import tomli_w
 
 from mi_refgs.errors import InputError, shown
-from mi_refgs.images import is_file
+from mi_refgs.files import is_file
 from mi_refgs.resources import resource_dir
 
 MAX_TEXT, MAX_LINE = 2**16, 2000

@@ -12,8 +12,9 @@ import numpy as np
 
 from mi_refgs.constants import RIGID_TOLERANCE
 from mi_refgs.errors import InputError, shown
+from mi_refgs.files import is_file
 from mi_refgs.fit.lens import Lens, Undistortion, undistortion
-from mi_refgs.images import box_downscale, image_size, is_file, read_exr_image, read_png
+from mi_refgs.images import box_downscale, image_size, read_exr_image, read_png
 
 if TYPE_CHECKING:
     from mi_refgs.splat.camera import Camera

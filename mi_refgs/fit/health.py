@@ -25,16 +25,13 @@ NAMED = 5
 
 
 def culprits(surfels: Surfels, skipped: Skipped) -> dict[str, np.ndarray]:
-    """Rows that spoil steps, by channel: those whose values are not finite, else those whose gradient is not.
+    """Rows that spoil steps, by channel: those with values that are not usable, else those whose gradient is
+    not finite.
 
     Empty if the fault is none of the surfels'.
     """
-    if surfels.count and not dr.all(surfels.usable()):
-        raw = surfels.to_numpy()
-        rows = np.flatnonzero(~surfels.usable().numpy())
-        wrong = {name: rows[~np.isfinite(raw[name][rows]).all(axis=1)] for name in raw}
-        found = {name: at for name, at in wrong.items() if len(at)}
-        return found or {"position": rows}
+    if unusable := surfels.unusable():
+        return unusable
     found = {name: rows for name, rows in skipped.rows.items() if name != LIGHT}
     return found if len(together(found)) <= CULL_SHARE * surfels.count else {}
 

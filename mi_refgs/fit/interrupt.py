@@ -15,12 +15,12 @@ class TerminatedError(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def held_interrupts() -> Iterator[Callable[[], None]]:
-    """Hold back the first Ctrl-C or SIGTERM, and yield a function that raises it; a second one is not held.
+    """Delay the first Ctrl-C or SIGTERM, and yield a function that raises it; a second one is not delayed.
 
     Raised are KeyboardInterrupt and TerminatedError. A state that is saved in the middle of a step
     (parameters moved, refinement or the mesh still due) could not be resumed to the same result. Outside the
-    main thread, where Python delivers no signals, nothing is held; nor is a signal that the process was
-    started to ignore.
+    main thread, where Python delivers no signals, nothing is delayed; nor is a signal that the process was
+    started to ignore, or that code outside Python handles.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
@@ -37,7 +37,7 @@ def held_interrupts() -> Iterator[Callable[[], None]]:
             raise pending[0]
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    before = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
+    before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
     for number in before:
         signal.signal(number, hold)
     try:

@@ -4,13 +4,14 @@ Letters: θ parameter, g gradient, m v first and second moment, t step count of 
     m ← β₁ m + (1 - β₁) g,   v ← β₂ v + (1 - β₂) g²,   θ ← θ - η √(1 - β₂ᵗ) / (1 - β₁ᵗ) · m / (√v + ε)
 [Kingman and Ba 2015, §2, the efficient order].
 
-Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing: the device decides, nobody
-waits for it, and `report` says later how many there were and which rows had such gradients. And |g| is cut to
-OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor, whichever is more. A
-step is at most (1 - β₁) / √(1 - β₂) = 3.2 η long however large g is, so the cut shortens the one in hand by
-less than 5 %. What it bounds is the memory of v: after one gradient of 10¹⁰, an entry of usual gradients 10⁻⁷
-would not move for 2 ln(10¹⁷ √(1 - β₂)) / (1 - β₂) = 71,000 steps; cut, it moves 3.3 times slower, or ten
-times if it happens in the first hundred steps.
+Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing: the device decides, the
+host does not wait for it, and `report` says later how many there were and which rows had such gradients. And
+|g| is cut to OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor,
+whichever is more, and to RAW_LIMIT, whose square float32 holds. A step is at most (1 - β₁) / √(1 - β₂) = 3.2
+η long however large g is, so the cut shortens the one in hand by less than 5 %. What it bounds is the memory
+of v: after one gradient of 10¹⁰, an entry of usual gradients 10⁻⁷ would not move for 2 ln(10¹⁷ √(1 - β₂)) /
+(1 - β₂) = 71,000 steps; cut, it moves 3.3 times slower, or ten times if it happens in the first hundred
+steps.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.surfels.table import gather_rows
@@ -179,6 +181,7 @@ class Adam:
         inverse = dr.opaque(mi.Float, 1 / (1 - BETA_2 ** max(t - 1, 1)))
         usual = dr.opaque(mi.Float, self._usual[name] or math.inf)
         limit = OUTLIER * dr.maximum(dr.sqrt(self._second[name] * inverse), usual)
+        limit = dr.minimum(limit, RAW_LIMIT)
         return dr.select(dr.isfinite(g), dr.clip(g, -limit, limit), 0.0)
 
     def _not_finite(self, name: str, g: Any) -> tuple[Any, Any]:

@@ -57,7 +57,8 @@ class Run:
 
     def checkpoints(self) -> list[Path]:
         """Complete checkpoints, oldest first."""
-        return sorted((self.path / "checkpoints").glob("[0-9]*.npz"))
+        found = (self.path / "checkpoints").glob("*.npz")
+        return sorted(path for path in found if path.stem.isdecimal())
 
     def save_checkpoint(self, iteration: int, state: dict[str, np.ndarray]) -> None:
         """Save a state, then drop all but the newest CHECKPOINTS_KEPT; raises InputError if it cannot be

@@ -59,7 +59,7 @@ class Trainer:
         self.iteration, self.seconds = 0, 0.0
         self.held_until = 0  # iteration before which opacities do not learn
         self.skipped = 0  # steps that changed nothing, since their loss or gradient was not finite
-        self.notices: list[str] = []  # what a person should know; whoever shows it clears it
+        self.notices: list[str] = []  # messages for people; who shows one removes it
         self._checked, self._failed = 0, 0  # iteration of the last check; failed steps in a row
         self.params: dict[str, Any] = {}
         self.gradient_sum: Any = None  # of each surfel since it was densified last, and of how many views

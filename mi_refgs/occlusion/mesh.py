@@ -12,8 +12,7 @@ import trimesh
 from skimage import measure
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import write_bytes
-from mi_refgs.images import is_file
+from mi_refgs.files import is_file, write_bytes
 from mi_refgs.occlusion.tsdf import TSDF
 from mi_refgs.ply import read_header
 

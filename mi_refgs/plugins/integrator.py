@@ -162,10 +162,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.background = read_background(props)
         self.aovs = read_aovs(props)
         self.check()
-        self.changed, self.next_look = (
-            False,
-            -math.inf,
-        )  # since the last look for unusable values; and its time
+        self.changed = False  # since the last look for unusable values
+        self.next_look = -math.inf  # seconds of the monotonic clock
         self._warn_of_unusable()
 
     def check(self) -> None:
@@ -197,7 +195,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     def _warn_of_unusable(self) -> None:
         """Warn, once, of surfels that are left out and of texels that are black."""
-        found = [f"{n} surfels in {name} (first: {i})" for name, (n, i) in self.surfels.unusable().items()]
+        unusable = self.surfels.unusable()
+        found = [f"{len(rows)} surfels in {name} (first: {rows[0]})" for name, rows in unusable.items()]
         black = self.light.unusable() if self.light is not None else 0
         found += [f"{black} values of light"] if black else []
         if found:

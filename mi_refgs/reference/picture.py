@@ -229,7 +229,7 @@ def _footprint(columns: Array, camera: PinholeCamera, rules: Rules, x: Array, y:
     ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)])
     with np.errstate(all="ignore"):
         t = np.sum(p * axes[:, 2], axis=1)[:, None] / (axes[:, 2] @ ray)
-        # Of the ray through the surfel's own centre, only the difference meets the axes: nothing cancels.
+        # Only the difference to the ray through the surfel's own centre meets the axes: nothing cancels.
         beside = ray[None] - (p / p[:, 2:])[:, :, None]
         plane = np.zeros_like(t)
         lift = np.einsum("nk,nkp->np", axes[:, 2], beside) / np.sum(p * axes[:, 2], 1)[:, None]

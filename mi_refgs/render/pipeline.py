@@ -66,7 +66,8 @@ class Shading:
 
     @staticmethod
     def of(stage: Any, mesh: bool) -> Shading:
-        """Of a stage of a method (`at`, `reflectance`, `diffuse`), occluded by its mesh where that can be."""
+        """The shading of a stage (`at`, `reflectance`, `diffuse`); occluded if pixels are shaded and a `mesh`
+        is there."""
         shading = Shading(stage.at, stage.reflectance, stage.diffuse)
         return replace(shading, occlusion=mesh and shading.at == "pixel")
 

@@ -15,7 +15,7 @@ block of its tile and keeps their states side by side. Reading a row and adding 
 work with one pixel a lane, are then shared.
 
 No derivative, on purpose: the sort order, the tile lists, the α < 1/255 cut and the end at T < 1e-4, the near
-plane, the clamp at α_max (zero). Of these the cut has a bias of known size: the border of a footprint does
+plane, the clamp at α_max (zero). The bias of the cut is known: the border of a footprint does
 not move. With ε = 1/255, mean gradients of size and position fall short by the part ε ln(o/ε) / (o - ε),
 those of opacity by ε/o:
 

@@ -147,8 +147,8 @@ class Surfels:
             rows &= dr.all(dr.abs(mi.ArrayXf(detached.columns(name))) < _limit(name))
         return rows
 
-    def unusable(self) -> dict[str, tuple[int, int]]:
-        """The channels with values that `usable` rejects: number of such surfels, and the index of the first.
+    def unusable(self) -> dict[str, np.ndarray]:
+        """The surfels (indices, in order) that `usable` rejects, by the channels with such values.
 
         Waits for the device.
         """
@@ -158,7 +158,7 @@ class Surfels:
         for name, table in self.to_numpy().items():
             rows = np.flatnonzero(~(np.abs(table) < _limit(name)).all(axis=1))
             if len(rows):
-                found[name] = (len(rows), int(rows[0]))
+                found[name] = rows
         return found
 
     def cleaned(self) -> Surfels:
