@@ -57,7 +57,8 @@ def _ends() -> Iterator[Case]:
     yield plain("plain scene, shaded at surfels", at="surfel", diffuse="irradiance")
     for name, logit in (("0", -30.0), ("1", 30.0)):
         yield plain(f"roughness {name}", raw={"roughness": np.full((40, 1), logit)})
-    yield plain("roughness 0 beside 1", raw=where(every(), 30.0, "roughness") | {})
+    mixed = where(every(), 30.0, "roughness", {"roughness": np.full((40, 1), -30.0)})
+    yield plain("roughness 0 beside 1", raw=mixed)
     for name, logit in (("0", -30.0), ("1", 30.0)):
         yield plain(f"metallic {name}", raw={"metallic": np.full((40, 1), logit)})
     yield plain("albedo 0 and 1", raw=where(every(), 30.0, "albedo", {"albedo": np.full((40, 3), -30.0)}))
@@ -175,7 +176,11 @@ def scaled(case: Case, name: str, factor: float) -> Case:
     raw: Raw = {**case.raw, "position": factor * case.raw["position"], "scale": case.raw["scale"] + size}
     pose = case.camera.to_world.copy()
     pose[:3, 3] *= factor
-    return replace(case, name=name, raw=raw, camera=replace(case.camera, to_world=pose))
+    found = replace(case, name=name, raw=raw, camera=replace(case.camera, to_world=pose))
+    if case.surface is None:
+        return found
+    vertices, faces, offset = case.surface
+    return _occluded(found, factor * vertices, faces, 0.5 * factor * offset)
 
 
 def moved(case: Case, name: str, offset: Array) -> Case:
@@ -190,7 +195,7 @@ def moved(case: Case, name: str, offset: Array) -> Case:
 def _worlds() -> Iterator[Case]:
     for power in (-6, -4, -3, 3, 6):
         yield scaled(plain("plain"), f"the scene times 1e{power:+d}", 10.0**power)
-    yield scaled(replace(_plates(), near=None), "mesh and scene times 1e-3", 1e-3)
+    yield scaled(_plates(), "mesh and scene times 1e-3", 1e-3)
     for extents in (1e3, 1e5):
         offset = extents * np.array([1.0, -0.7, 0.4])
         yield moved(plain("plain"), f"the scene moved by {extents:.0e} extents", offset)
@@ -295,9 +300,13 @@ def _discs_on_plate(y: float = 0.0, tilt: float = 0.05) -> Raw:
 
 def _with_mesh(name: str, parts: list[tuple[Array, Array]], voxel: float, **changes: Any) -> Case:
     vertices, faces = (np.zeros((0, 3)), np.zeros((0, 3), int)) if not parts else _joined(parts)
+    return _occluded(plain(name, **changes), vertices, faces, voxel)
+
+
+def _occluded(case: Case, vertices: Array, faces: Array, voxel: float) -> Case:
+    """The case with a mesh, whose rays start two voxels off it."""
     mesh = Mesh(vertices.astype(np.float32), faces.astype(np.uint32), voxel)
-    surface = (mesh.vertices.astype(np.float64), faces, 2 * voxel)
-    return plain(name, mesh=lambda: mesh, surface=surface, **changes)
+    return replace(case, mesh=lambda: mesh, surface=(mesh.vertices.astype(np.float64), faces, 2 * voxel))
 
 
 def _joined(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:

@@ -91,6 +91,15 @@ def test_gradients_of_the_oracle_are_its_own_differences() -> None:
         assert np.sum(exact[name] * direction) == pytest.approx(expected, rel=1e-4, abs=1e-6), name
 
 
+def test_a_scaled_case_takes_its_mesh_along() -> None:
+    small, plates = (
+        next(c for c in CASES if c.name == n) for n in ("mesh and scene times 1e-3", "two plates")
+    )
+    for one, other in zip(small.surface, plates.surface, strict=True):
+        np.testing.assert_allclose(one, other if one is small.surface[1] else 1e-3 * other, rtol=1e-6)
+    assert small.mesh is not None and small.mesh().voxel == pytest.approx(1e-6)
+
+
 def test_a_planted_mistake_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     original = FootprintAdjoint.columns
 
