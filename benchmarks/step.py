@@ -56,7 +56,7 @@ def make_trainer(surfels: int, data: Any, variant: str = METHOD) -> tuple[Any, A
     from mi_refgs.fit import config
     from mi_refgs.fit.train import Trainer
 
-    settings = [f"surfels.count={surfels}", f"surfels.max_count={surfels}", "refine={}"]
+    settings = [f"surfels.count={surfels}", f"surfels.max_count={surfels}", "surfels.inside=0", "refine={}"]
     method = config.load(variant, "standard", settings)
     return Trainer(method, data), method
 

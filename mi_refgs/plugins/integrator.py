@@ -293,7 +293,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         if self.shading.reflectance == "split_sum":
             light = self._prefiltered(scene)
         aovs = len(self.terms) < len(TERMS) or any(aov.type in (*MATERIALS, *TERMS) for aov in self.aovs)
-        return render(self.surfels, camera, self.shading, light, self.occluder, aovs=aovs)
+        return render(
+            Surfels(self.surfels.raw, screened=True), camera, self.shading, light, self.occluder, aovs=aovs
+        )
 
     def _prefiltered(self, scene: Any) -> Any:
         if self.light is None:

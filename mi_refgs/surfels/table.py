@@ -73,12 +73,18 @@ class Surfels:
 
     raw: dict[str, Any]
 
-    def __init__(self, raw: Mapping[str, Any]) -> None:
-        """Adopt raw tensors of shape (N, D); raises InputError for unknown names or wrong shapes."""
+    def __init__(self, raw: Mapping[str, Any], screened: bool = False) -> None:
+        """Adopt raw tensors of shape (N, D); raises InputError for unknown names or wrong shapes.
+
+        `screened`: opacities are 0 where the surfel is not `usable`, whatever its channel. To look at every
+        channel takes 3 % of a training step, whose optimiser keeps values finite; values that come from
+        elsewhere need it.
+        """
         unknown = [name for name in raw if name not in CHANNELS]
         if unknown:
             raise InputError(f"surfels: {unknown[0]}: unknown channel; use one of {', '.join(CHANNELS)}")
         self.raw = {name: raw[name] for name in CHANNELS if name in raw}
+        self.screened = screened
         self._check_shapes()
 
     @staticmethod
@@ -140,7 +146,7 @@ class Surfels:
     def usable(self) -> Any:
         """Which surfels (mi.Bool, width N) have finite raw values, below RAW_LIMIT where UNBOUNDED.
 
-        The others cover no pixel and get zero gradient. Detached.
+        In a `screened` table the others cover no pixel and get zero gradient. Detached.
         """
         detached, rows = self.detach(), mi.Bool(True)
         for name in self.raw:
@@ -214,12 +220,13 @@ class Surfels:
         return mi.Vector2f(u, v)
 
     def opacity(self) -> Any:
-        """Opacities in [0, 1] (mi.Float); 0 with gradient 0 where the surfel is not `usable`."""
-        if self.count == 0:
-            return mi.Float()
+        """Opacities in [0, 1] (mi.Float); `screened`: 0 with gradient 0 where the surfel is not `usable`."""
+        opacity = sigmoid(self.columns("opacity")[0])
+        if not self.screened or self.count == 0:
+            return opacity
         usable = self.usable()
         dr.schedule(usable)  # with the footprints; the adjoint would read the whole table again
-        return dr.select(usable, sigmoid(self.columns("opacity")[0]), 0)
+        return dr.select(usable, opacity, 0)
 
     def albedo(self) -> Any:
         """Albedo in [0, 1] (mi.Color3f), linear."""
