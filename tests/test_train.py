@@ -209,7 +209,9 @@ def test_a_signal_waits_for_the_step_in_hand(
         assert np.array_equal(state[name], value), name
 
 
-def test_a_second_signal_is_not_held(method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_signal_is_not_held(
+    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, heard_interrupts: None
+) -> None:
     """Twice within iteration 7, which ends it there; what was saved before is whole."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
