@@ -83,17 +83,30 @@ def test_eval_is_the_formula(rng: np.random.Generator, roughness: float, metalli
         ]
     )
     assert (expected[:, 0] > 0).mean() > 0.5 and (expected == 0).any()
-    np.testing.assert_allclose(np.array(got).T, expected, rtol=5e-3 if roughness < 0.1 else 2e-4, atol=1e-6)
+    limit = (5e-3 if roughness < 0.1 else 2e-4) * expected + 1e-6
+    # The table's own interpolation, in the diffuse term: up to 0.11 where its first texel ends.
+    table = np.where(wi[:, 2:] < 0.01, 0.12, 1e-3)
+    limit += table * (1 - metallic) * ALBEDO * np.maximum(wo[:, 2:], 0) / np.pi
+    assert np.all(np.abs(np.array(got).T - expected) <= limit)
 
 
 def test_reciprocity(rng: np.random.Generator) -> None:
+    """The specular term is reciprocal; the whole is not, but a path from a light sees what one to it sees."""
     count = 2000
     a, b = above(rng, count), above(rng, count)
+
+    def value(of: Any, ctx: Any, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
+        return np.array(of.eval(ctx, interaction(wi, count), vector(wo))) / wo[:, 2]
+
+    from_light = context()
+    from_light.mode = mi.TransportMode.Importance
     for roughness, metallic in ((0.1, 1.0), (0.4, 0.5), (1.0, 0.0)):
         of = mi.load_dict(bsdf(roughness, metallic))
-        forth = np.array(of.eval(context(), interaction(a, count), vector(b))) / b[:, 2]
-        back = np.array(of.eval(context(), interaction(b, count), vector(a))) / a[:, 2]
+        forth, back = value(of, context(SPECULAR), a, b), value(of, context(SPECULAR), b, a)
         np.testing.assert_allclose(forth, back, rtol=2e-4)
+        whole, transposed = value(of, context(), a, b), value(of, from_light, b, a)
+        np.testing.assert_allclose(whole, transposed, rtol=2e-4)
+        assert metallic == 1 or np.abs(whole - value(of, context(), b, a)).max() > 0.02
 
 
 # ---------- Energy ----------
@@ -110,7 +123,7 @@ def test_white_furnace_is_the_split_sum(roughness: float) -> None:
         assert white.x[0] <= 1 + 1e-5
         mixed = mi.load_dict(bsdf(roughness, 0.25))
         f0 = 0.04 * 0.75 + 0.25 * ALBEDO
-        diffuse = 0.75 * ALBEDO
+        diffuse = (1 - f0 * a - b) * 0.75 * ALBEDO
         for ctx, expected in (
             (context(SPECULAR), f0 * a + b),
             (context(DIFFUSE), diffuse),
@@ -120,14 +133,12 @@ def test_white_furnace_is_the_split_sum(roughness: float) -> None:
 
 
 @pytest.mark.parametrize("roughness", [0.02, 0.3, 1.0])
-def test_dielectrics_reflect_no_more_than_they_say(roughness: float) -> None:
-    """At most albedo + 0.09 in the mean over the angles of view with the cosine, and 1 + albedo at any."""
-    albedo = 0.9
-    of = mi.load_dict(bsdf(roughness, 0.0, albedo))
-    n_dot_v = np.sqrt((np.arange(12) + 0.5) / 12)
-    reflected = [mean_weight(of, seen_at(c), side=256).x[0] for c in n_dot_v]
-    assert np.mean(reflected) < albedo + 0.09
-    assert mean_weight(of, seen_at(0.01), side=256).x[0] < 1 + albedo
+@pytest.mark.parametrize("metallic", [0.0, 0.5])
+def test_no_material_reflects_more_than_it_receives(roughness: float, metallic: float) -> None:
+    of = mi.load_dict(bsdf(roughness, metallic, 1.0))
+    reflected = [mean_weight(of, seen_at(c)).x[0] for c in (0.01, 0.05, 0.2, 0.5, 1.0)]
+    assert max(reflected) <= 1 + 1e-3
+    assert metallic or min(reflected) > 1 - 1e-3  # a white base returns what the layer over it leaves
 
 
 # ---------- Samples ----------
@@ -307,13 +318,15 @@ def test_derivatives_of_sampled_weights(roughness: float) -> None:
         assert not dr.grad_enabled(detached)
     dr.backward(mean_weight(of, seen_at(n_dot_v)).y)
     got = [dr.grad(value) for value in values]
-    a, _ = reference.split_sum(n_dot_v, roughness)
+    a, b = reference.split_sum(n_dot_v, roughness)
     f0 = 0.04 * (1 - metallic) + ALBEDO[1] * metallic
+    left, base = 1 - f0 * a - b, (1 - metallic) * ALBEDO[1]  # the reflectance is f0 a + b + left base
     low, high = (np.array(reference.split_sum(n_dot_v, r)) for r in (roughness - ε, min(roughness + ε, 1)))
     slope = (high - low) @ [f0, 1] / (min(roughness + ε, 1) - roughness + ε)
-    assert abs(got[0][0] - slope) < 5e-3
-    assert abs(got[1][0] - ((ALBEDO[1] - 0.04) * a - ALBEDO[1])) < 5e-3
-    np.testing.assert_allclose(np.ravel(got[2]), [0, metallic * a + 1 - metallic, 0], atol=5e-3)
+    assert abs(got[0][0] - (1 - base) * slope) < 5e-3
+    assert abs(got[1][0] - ((1 - base) * (ALBEDO[1] - 0.04) * a - left * ALBEDO[1])) < 5e-3
+    to_albedo = (1 - base) * metallic * a + left * (1 - metallic)
+    np.testing.assert_allclose(np.ravel(got[2]), [0, to_albedo, 0], atol=5e-3)
 
 
 def test_everything_is_finite() -> None:
@@ -349,7 +362,7 @@ def test_derivatives_of_pictures(rng: np.random.Generator) -> None:
     starts = {key: type(params[key])(params[key]) for key in keys}
     weight = rng.uniform(0, 1, (24, 24, 3)).astype(np.float32)
     gradients, differences = [], []
-    for seed in range(8):
+    for seed in range(16):
         for key, start in starts.items():
             params[key] = type(start)(start)
             dr.enable_grad(params[key])
@@ -394,7 +407,10 @@ def test_parameters_and_text() -> None:
     params["roughness.data"] = mi.TensorXf(np.full((2, 2, 1), 0.5, np.float32))
     params.update()
     np.testing.assert_allclose(value(of), value(mi.load_dict(bsdf(0.5))), rtol=1e-5)
-    np.testing.assert_allclose(np.ravel(of.eval_diffuse_reflectance(si)), 0.7 * ALBEDO, rtol=1e-6)
+    expected = reference.diffuse_reflectance(ALBEDO, 0.3, 0.5, 0.6)
+    for side in (1, -1):
+        si.wi.z *= side
+        np.testing.assert_allclose(np.ravel(of.eval_diffuse_reflectance(si)), expected, atol=5e-4)
 
 
 def test_xml() -> None:

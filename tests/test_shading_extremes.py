@@ -88,7 +88,8 @@ LIGHTS = {
 def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.random.Generator) -> None:
     """Error ≤ 1e-4 of the brightest term, and gradients of albedo, metallic and radiance to 1 %.
 
-    The terms are linear in these three, so that the oracle's difference is their derivative.
+    The terms are at most quadratic in each of them up to S = 1, so that the oracle's central difference is
+    exact.
     """
     radiance = LIGHTS[light](rng)
     radiance[[0, -1]] = radiance[[0, -1]].mean(axis=1, keepdims=True)  # a pole has no azimuth, so one colour
@@ -114,11 +115,11 @@ def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.rand
                 continue
             for column in range(gradient.shape[1]):
                 slopes = []
-                for sign in (0.5, -0.5):
+                for step in (5e-3, -5e-3):
                     moved = {n: x.copy() for n, x in values.items()}
-                    moved[key].reshape(N, -1)[:, column] += sign
+                    moved[key].reshape(N, -1)[:, column] += step
                     slopes.append(np.array([oracle(moved, levels, diffuse, k).sum() for k in range(0, N, 8)]))
-                slope = slopes[0] - slopes[1]
+                slope = 100 * (slopes[0] - slopes[1])
                 scale = max(np.abs(slope).max(), 1e-3)
                 np.testing.assert_allclose(
                     gradient[::8, column], slope, atol=1e-2 * scale, err_msg=f"{name}, {light}: δ{key}"
@@ -128,10 +129,7 @@ def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.rand
 @pytest.mark.parametrize("dominant", [False, True])
 @pytest.mark.parametrize("multiscatter", [False, True])
 def test_energy_under_a_constant_light_of_1(dominant: bool, multiscatter: bool) -> None:
-    """Specular light alone never exceeds 1. A dielectric does: its diffuse term does not yield to the
-    specular one. The total reaches 1 + (1 - metallic) albedo at grazing angles; the mean over the angles,
-    weighted by their cosine, exceeds the albedo by 0.09. With harmonics the diffuse term is what was fitted.
-    """
+    """No more than 1 leaves any material at any angle, and a white one without absorption returns all."""
     cosine, roughness, metallic, albedo = (
         x.ravel()
         for x in np.meshgrid(
@@ -157,11 +155,7 @@ def test_energy_under_a_constant_light_of_1(dominant: bool, multiscatter: bool) 
     light = EnvironmentLight.constant(1.0, 16).prefilter()
     accuracy = Accuracy(dominant=dominant, multiscatter=multiscatter)
     terms = shade(points_of(values), light, "irradiance", accuracy)
-    specular, total = (x.numpy()[0] for x in (terms.specular, terms.total()))
-    assert specular.max() <= 1 + 1e-3
-    assert total[metallic == 1].max() <= 1 + 1e-3
-    assert np.all(total <= 1 + (1 - metallic) * albedo + 1e-3)
-    dielectric = (metallic == 0) & (albedo == 1)
-    assert total[dielectric].max() > 1.8  # the bound is reached
-    mean = (2 * cosine * total / 64).reshape(64, -1).sum(0)
-    assert np.all(mean <= np.maximum(1, albedo.reshape(64, -1)[0] + (0.13 if multiscatter else 0.09)) + 1e-3)
+    total = terms.total().numpy()[0]
+    assert total.min() >= 0 and total.max() <= 1 + 1e-3
+    white = (albedo == 1) & ((metallic == 0) | multiscatter & (metallic == 1))
+    assert total[white].min() >= 1 - 1e-3

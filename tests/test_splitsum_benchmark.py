@@ -107,7 +107,8 @@ def test_more_samples_are_better(result: dict[str, Any]) -> None:
 def test_more_rows_are_not_worse(result: dict[str, Any]) -> None:
     """They help where details show; elsewhere other errors are left, and may grow by a quarter at most.
 
-    But for the sun's glint on a floor: the lobe is wrong there by more than what it should show.
+    But for the sun's glint on a floor: the lobe is wrong there by more than what it should show; and where
+    a relMSE below 1e-5 is left, 0.3 %, of which few rows can cancel a part.
     """
     for key, by in cases(result, "split_sum").items():
         values = [by[height]["relmse"] for height in sorted(by)]
@@ -115,7 +116,7 @@ def test_more_rows_are_not_worse(result: dict[str, Any]) -> None:
         if key[1] == "checker" and key[2] == 0.1:
             assert values == sorted(values, reverse=True), key
         if key[:2] != ("patch", "sunsky"):
-            assert values[-1] < 1.25 * values[0] + floor, key
+            assert values[-1] < max(1.25 * values[0] + floor, 1e-5), key
 
 
 def test_a_constant_light_has_no_error(result: dict[str, Any]) -> None:
@@ -231,7 +232,7 @@ def test_integrals_of_a_constant_light_are_the_table(roughness: float) -> None:
         error = np.abs(estimate.mean[:, 0] - wanted[:, k])
         assert (error < 6 * estimate.error[:, 0] + 1e-4).all()
         assert error.max() < 2e-3
-    a, b = decompose.exact_table(points.n_dot_v(), roughness)
+    a, b = mc.exact_table(points.n_dot_v(), roughness)
     np.testing.assert_allclose(np.concatenate([a, b], axis=1), wanted, atol=3e-5)
 
 

@@ -10,13 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from benchmarks.common.view import Points
+from mi_refgs.reference.shade import split_sum
 
 LATTICES = (34, 55, 89, 144, 233, 377, 610, 987, 1597, 2584, 4181)
 """Fibonacci numbers: the good sizes of a rank-1 lattice with the predecessor as its generator."""
@@ -26,6 +29,12 @@ NORM_NODES = 20_000
 """Midpoints of the one-dimensional integral that normalises the prefilter's lobe: exact to 1e-8."""
 GOLDEN = 0x9E3779B9
 """Spreads the seeds of random streams."""
+TABLE_NODES = 700
+"""Midpoints of the float64 quadrature of (A, B): exact to 1e-6."""
+TABLE_COSINES = np.linspace(0.05, 1.0, 40) ** 2
+"""n·v at which the quadrature is done; a cubic spline in √(n·v) lies between."""
+TABLE_TEXELS = 256
+"""Steps in √(n·v) of the reflectance that plain Monte Carlo looks up: linear between them within 1e-4."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +68,23 @@ class Lobe:
 
 
 # ---------------- GGX, α = roughness² ----------------
+
+
+@cache
+def _table_spline(roughness: float) -> Any:
+    pairs = np.array([split_sum(float(c), roughness, TABLE_NODES) for c in TABLE_COSINES])
+    return CubicSpline(np.sqrt(TABLE_COSINES), pairs)
+
+
+def exact_table(n_dot_v: np.ndarray, roughness: float) -> tuple[np.ndarray, np.ndarray]:
+    """(A, B) (P, 1) each, by float64 quadrature of the reference implementation."""
+    a, b = _table_spline(roughness)(np.sqrt(np.clip(n_dot_v, TABLE_COSINES[0], 1))).T
+    return a[:, None], b[:, None]
+
+
+def left_by_specular(f0: Any, scale: Any, bias: Any) -> Any:
+    """Factor of the diffuse term: the part of a constant light that the specular one does not reflect."""
+    return 1 - f0 * scale - bias
 
 
 def smith_lambda(cosine: Any, α2: Any) -> Any:
@@ -247,16 +273,32 @@ class Material:
     metallic: Any
     roughness: Any
     f0: Any
+    diffuse: Any  # mi.Float (3 (TABLE_TEXELS + 1)): diffuse reflectance over √(n·v), by rows
+
+    def diffuse_reflectance(self, cosine: Any) -> Any:
+        """What the diffuse term (mi.Color3f) reflects of a constant light, seen at this cosine."""
+        x = dr.sqrt(dr.clip(cosine, 0, 1)) * TABLE_TEXELS
+        first = dr.minimum(mi.UInt32(x), TABLE_TEXELS - 1)
+        low, high = (dr.gather(mi.Color3f, self.diffuse, first + k) for k in (0, 1))
+        return dr.lerp(low, high, x - mi.Float(first))
 
 
 def device_material(albedo: tuple[float, float, float], metallic: float, roughness: float) -> Material:
     """Opaque values; F0 = 0.04 (1 - metallic) + albedo metallic."""
     f0 = [0.04 * (1 - metallic) + a * metallic for a in albedo]
+    table = exact_table(np.linspace(0, 1, TABLE_TEXELS + 1) ** 2, roughness)
+    diffuse = left_by_specular(np.array(f0), *table) * (1 - metallic) * np.array(albedo)
 
     def opaque(values: Any) -> Any:
         return mi.Color3f(*(dr.opaque(mi.Float, float(x)) for x in values))
 
-    return Material(opaque(albedo), dr.opaque(mi.Float, metallic), dr.opaque(mi.Float, roughness), opaque(f0))
+    return Material(
+        opaque(albedo),
+        dr.opaque(mi.Float, metallic),
+        dr.opaque(mi.Float, roughness),
+        opaque(f0),
+        mi.Float(diffuse.ravel().astype(np.float32)),
+    )
 
 
 def monte_carlo(points: Points, material: Material, emitter: Any, samples: Any, seed: Any) -> Any:
@@ -268,7 +310,7 @@ def monte_carlo(points: Points, material: Material, emitter: Any, samples: Any, 
     frame = mi.Frame3f(points.normal)
     view, α = frame.to_local(points.view), dr.square(material.roughness)
     α2 = dr.square(α)
-    diffuse = (1 - material.metallic) * material.albedo
+    diffuse = material.diffuse_reflectance(view.z)
     # Schlick at the view angle is close enough to choose a lobe by.
     grazing = dr.clip(1 - view.z, 0, 1)
     mirror = (

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from benchmarks.common.budget import Step, noise_floor, take_apart
 from benchmarks.splitsum import methods
 from benchmarks.splitsum.exact import Stage, diffuse, reflectance
 from benchmarks.splitsum.settings import CONVEX
-from mi_refgs.reference.shade import split_sum as exact_split_sum
 from mi_refgs.shade.models import reflect
 
 TABLE = "table lookup"
@@ -27,23 +24,6 @@ SHADOW = "no shadow"
 BOUNCES = "no inter-reflection"
 GROUPS = ((SHADOW, BOUNCES), (LOBE, SCHLICK))
 """Pairs that may be looked at as one: what the shape itself does to the light, and the reflectance's lobe."""
-
-NODES = 700
-"""Midpoints of the float64 quadrature: (A, B) to 1e-6."""
-COSINES = np.linspace(0.05, 1.0, 40) ** 2
-"""n·v at which the quadrature is done; a cubic spline in √(n·v) lies between."""
-
-
-@functools.cache
-def _exact_table(roughness: float) -> Any:
-    pairs = np.array([exact_split_sum(float(c), roughness, NODES) for c in COSINES])
-    return CubicSpline(np.sqrt(COSINES), pairs)
-
-
-def exact_table(n_dot_v: np.ndarray, roughness: float) -> tuple[np.ndarray, np.ndarray]:
-    """(A, B) (P, 1) each, by float64 quadrature of the reference implementation."""
-    a, b = _exact_table(roughness)(np.sqrt(np.clip(n_dot_v, COSINES[0], 1))).T
-    return a[:, None], b[:, None]
 
 
 def budgets(stage: Stage) -> list[dict[str, Any]]:
@@ -96,12 +76,10 @@ def _chain(
     values = methods.picture_values(
         methods.split_sum(stage.points, methods.material(metallic, roughness), shipped)
     )
-    a, b = exact_table(stage.points.n_dot_v(), roughness)
     integrals = stage.integrals(roughness)
-    looked_up, exact = (
-        diffuse(metallic) * lookups["irradiance"],
-        diffuse(metallic) * integrals.irradiance.mean,
-    )
+    a, b = integrals.table
+    base = diffuse(metallic, integrals.table)
+    looked_up, exact = base * lookups["irradiance"], base * integrals.irradiance.mean
     around = (integrals.scale.mean + integrals.bias.mean) / (a + b)
     table = f0 * a + b
     steps = [

@@ -23,10 +23,11 @@ class Integrals:
     scale: Estimate
     bias: Estimate
     irradiance: Estimate
+    table: tuple[np.ndarray, np.ndarray]  # (A, B), (P, 1) each: the first two under a constant light of 1
 
     def radiance(self, metallic: float) -> Estimate:
-        """Outgoing radiance: linear in F0 and in the diffuse albedo, so one set serves every metal."""
-        return self.specular(metallic) + self.irradiance.scaled(diffuse(metallic))
+        """Outgoing radiance: the integrals do not depend on F0 and albedo, so one set serves every metal."""
+        return self.specular(metallic) + self.irradiance.scaled(diffuse(metallic, self.table))
 
     def specular(self, metallic: float) -> Estimate:
         """The specular part. Both integrals come from the same samples: their errors add, not the squares."""
@@ -40,9 +41,9 @@ def reflectance(metallic: float) -> np.ndarray:
     return 0.04 * (1 - metallic) + np.array(ALBEDO) * metallic
 
 
-def diffuse(metallic: float) -> np.ndarray:
-    """Diffuse albedo (3,)."""
-    return (1 - metallic) * np.array(ALBEDO)
+def diffuse(metallic: float, table: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Diffuse reflectance (P, 3) of points with these (A, B): of what the specular term leaves."""
+    return mc.left_by_specular(reflectance(metallic), *table) * (1 - metallic) * np.array(ALBEDO)
 
 
 class Stage:
@@ -86,7 +87,8 @@ class Stage:
             α = dr.opaque(mi.Float, roughness**2)
             seed = 2 + round(1000 * roughness)
             scale, bias = self._integrate(lambda points: mc.brdf_lobe(points, α), seed, occluder)
-            self._integrals[key] = Integrals(scale, bias, self._irradiance[occluded])
+            table = mc.exact_table(self.points.n_dot_v(), roughness)
+            self._integrals[key] = Integrals(scale, bias, self._irradiance[occluded], table)
         return self._integrals[key]
 
     def prefiltered(self, roughness: float) -> Estimate:

@@ -160,7 +160,8 @@ def _shade(
     else:
         last = np.full(len(normal), len(light.levels) - 1)
         texel, share = oracle._bilinear(light, normal, last)
-        out = out + (1 - metallic) * albedo * np.einsum("nk,nkc->nc", share.astype(f), light.flat()[texel])
+        base = np.maximum(1 - reflectance, 0) * (1 - metallic) * albedo
+        out = out + base * np.einsum("nk,nkc->nc", share.astype(f), light.flat()[texel])
     if visibility is not None and indirect is not None:
         out = out + (1 - visibility[:, None]) * indirect * reflectance
     return out.astype(f)

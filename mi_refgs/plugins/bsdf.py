@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from mi_refgs.errors import InputError
 from mi_refgs.plugins import require_supported_variant
+from mi_refgs.shade.brdf import device_table, split_sum
 from mi_refgs.shade.models import DIELECTRIC_F0
 
 ROUGHNESS_FLOOR = 0.01
@@ -36,8 +37,22 @@ class Material:
     """The parameters at surface points, all of one width."""
 
     f0: Any  # mi.Color3f, reflectance at normal incidence
-    diffuse: Any  # mi.Color3f
-    α: Any  # mi.Float
+    base: Any  # mi.Color3f, (1 - metallic) albedo: what the diffuse base reflects of what reaches it
+    roughness: Any  # mi.Float
+
+    @property
+    def α(self) -> Any:
+        """mi.Float."""
+        return dr.square(self.roughness)
+
+    def specular(self, cosine: Any) -> Any:
+        """Reflectance (mi.Color3f) of the specular component under constant light, seen at this cosine."""
+        scale, bias = split_sum(cosine, self.roughness)
+        return dr.fma(self.f0, scale, bias)
+
+    def diffuse(self, cosine: Any) -> Any:
+        """Reflectance (mi.Color3f) of the diffuse component, seen at this cosine."""
+        return dr.maximum(1 - self.specular(cosine), 0) * self.base
 
     def distribution(self) -> Any:
         """GGX; Mitsuba's own shadowing, which is separable, is not used."""
@@ -78,22 +93,24 @@ class RefGSBSDF(mi.BSDF):
 
     .. math::
 
-        f = (1 - m) \frac{a}{\pi} + \frac{D\,G\,F}{4 (n \cdot v) (n \cdot l)}, \quad
+        f = (1 - E(n \cdot v)) (1 - m) \frac{a}{\pi} + \frac{D\,G\,F}{4 (n \cdot v) (n \cdot l)}, \quad
         F = F_0 + (1 - F_0) (1 - v \cdot h)^5, \quad F_0 = 0.04 (1 - m) + a\,m
 
     with GGX's D, and the height-correlated G of Smith [Heitz 2014, "Understanding the Masking-Shadowing
-    Function", eqs. 72, 99]. Metals never reflect more than they receive, but lose light between the
-    microfacets when rough. As the diffuse term is not reduced by what the specular one reflects, a dielectric
-    seen at grazing angles can reflect up to 1 + albedo; averaged over the angles (with the cosine) it stays
-    below albedo + 0.09.
+    Function", eqs. 72, 99]. E, for each channel, is what the specular term reflects of a constant light, from
+    the split-sum table: the diffuse base gets what the specular layer over it leaves (the albedo scaling of
+    layered models). No material reflects more than it receives, but for the table's error (1e-3; up to 0.11
+    at n · v below 0.005 and roughness below 0.15); rough metals lose light between the microfacets. The
+    diffuse term is not reciprocal, as E depends on the view v alone: on wi, or on wo for paths that start at
+    a light (``TransportMode.Importance``).
 
     It reflects on the side of the normal only, which is all that closed meshes need: nest it in a `twosided`
     for open ones. Component 0 is the specular reflection, 1 the diffuse one. Maps of metallic and roughness
     should be loaded with ``raw = true``, as numbers and not as sRGB.
 
-    Samples are drawn from the visible normals [Heitz 2018] or from the cosine, chosen in proportion to
-    Schlick's reflectance at (n · v) and to the diffuse albedo. `eval`, and the weight that `sample` returns,
-    carry derivatives with respect to the parameters and the directions; samples and densities carry none.
+    Samples are drawn from the visible normals [Heitz 2018] or from the cosine, chosen in proportion to what
+    the two terms reflect of a constant light at wi. `eval`, and the weight that `sample` returns, carry
+    derivatives with respect to the parameters and the directions; samples and densities carry none.
 
     .. tabs::
         .. code-tab:: xml
@@ -125,6 +142,7 @@ class RefGSBSDF(mi.BSDF):
         }
         self.m_components = list(FLAGS)
         self.m_flags = FLAGS[SPECULAR] | FLAGS[DIFFUSE]
+        device_table(mi.variant())  # loops and calls that are being recorded cannot make it
 
     def traverse(self, cb: Any) -> None:
         for name, texture in self.textures.items():
@@ -179,15 +197,15 @@ class RefGSBSDF(mi.BSDF):
             return value, dr.select(active, _density(ctx, material, wi, wo), 0)
 
     def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
-        """(1 - metallic) albedo; see mi.BSDF."""
-        return self._material(si, active).diffuse
+        """(1 - E) (1 - metallic) albedo, the same from behind; see mi.BSDF."""
+        return self._material(si, active).diffuse(dr.abs(si.wi.z))
 
     def _material(self, si: Any, active: Any) -> Material:
         albedo = mi.Color3f(self.textures["albedo"].eval(si, active))
         metallic = self.textures["metallic"].eval_1(si, active)
         roughness = dr.clip(self.textures["roughness"].eval_1(si, active), ROUGHNESS_FLOOR, 1)
         f0 = dr.fma(albedo - DIELECTRIC_F0, metallic, DIELECTRIC_F0)
-        return Material(f0, (1 - metallic) * albedo, dr.square(roughness))
+        return Material(f0, (1 - metallic) * albedo, roughness)
 
     def to_string(self) -> str:
         lines = ",\n".join(f"{name} = {texture}" for name, texture in self.textures.items())
@@ -240,7 +258,8 @@ def _value(ctx: Any, material: Material, wi: Any, wo: Any) -> Any:
         shadowing = 0.5 * wo.z / (wo.z * material.slope(wi.z) + wi.z * material.slope(wo.z))
         value += _schlick(material.f0, dr.dot(wi, h)) * (material.distribution().eval(h) * shadowing)
     if diffuse:
-        value += material.diffuse * (wo.z * (1 / math.pi))
+        view = wi if ctx.mode == mi.TransportMode.Radiance else wo
+        value += material.diffuse(view.z) * (wo.z * (1 / math.pi))
     return value
 
 
@@ -257,8 +276,8 @@ def _specular_probability(ctx: Any, material: Material, cosine: Any) -> Any:
     specular, diffuse = _enabled(ctx)
     if not (specular and diffuse):
         return mi.Float(specular)
-    reflected = dr.maximum(dr.mean(_schlick(material.f0, cosine)), 0)
-    scattered = dr.maximum(dr.mean(material.diffuse), 0)
+    reflected = dr.maximum(dr.mean(material.specular(cosine)), 0)
+    scattered = dr.maximum(dr.mean(material.diffuse(cosine)), 0)
     total = reflected + scattered
     return dr.select(total > 0, reflected / dr.select(total > 0, total, 1), 1)
 

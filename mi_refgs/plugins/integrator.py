@@ -77,8 +77,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
      * - diffuse
        - |string|
-       - ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times light). (Default: ``sh`` if there
-         is one)
+       - ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times the light that the specular term
+         leaves). (Default: ``sh`` if there is one)
 
      * - dominant, multiscatter
        - |bool|

@@ -393,8 +393,9 @@ def shade(
         out = out + (1 - metallic) * own
     else:
         texel, share = _bilinear(light, n, np.full(len(n), len(light.levels) - 1))
-        taps.append((texel, share, (1 - metallic) * albedo))
-        out = out + (1 - metallic) * albedo * np.einsum("nk,nkc->nc", share, flat[texel])
+        factor = _positive(1 - reflectance) * (1 - metallic) * albedo
+        taps.append((texel, share, factor))
+        out = out + factor * np.einsum("nk,nkc->nc", share, flat[texel])
     if visibility is not None and indirect is not None:
         out = out + (1 - free)[:, None] * indirect * reflectance
     return out

@@ -170,7 +170,9 @@ def shade(
         reflectance = reflectance + further
     visible = 1.0 if visibility is None else visibility
     out = np.zeros((3, 3))
-    out[0] = (1 - metallic) * (radiance if diffuse == "sh" else albedo * bilinear(levels[-1], n))
+    out[0] = (1 - metallic) * (
+        radiance if diffuse == "sh" else np.maximum(1 - reflectance, 0) * albedo * bilinear(levels[-1], n)
+    )
     out[1] = visible * reflected
     if visibility is not None and indirect is not None:
         out[2] = (1 - visible) * indirect * reflectance
@@ -191,6 +193,18 @@ def multiple_scattering(f0: np.ndarray, a: float, b: float, bounces: int = 400) 
     return (f0 * a + b) * sum((fresnel * (1 - a - b)) ** n for n in range(1, bounces))
 
 
+def diffuse_reflectance(
+    albedo: np.ndarray, metallic: float, roughness: float, n_dot_v: float, nodes: int = 400
+) -> np.ndarray:
+    """(1 - F0 A - B) (1 - metallic) albedo, (3,): what the base reflects of what the specular layer leaves;
+    0 from behind."""
+    if n_dot_v <= 0:
+        return np.zeros(3)
+    a, b = split_sum(n_dot_v, roughness, nodes)
+    f0 = 0.04 * (1 - metallic) + albedo * metallic
+    return (1 - f0 * a - b) * (1 - metallic) * albedo
+
+
 def brdf_cosine(
     albedo: np.ndarray,
     metallic: float,
@@ -199,8 +213,22 @@ def brdf_cosine(
     view: np.ndarray,
     lights: np.ndarray,
 ) -> np.ndarray:
-    """BRDF times n·l, (n, 3), for unit directions `lights` (n, 3): GGX α = roughness², correlated Smith,
-    Schlick, and (1 - metallic) albedo / π; zero below the horizon."""
+    """BRDF times n·l, (n, 3), for unit directions `lights` (n, 3): `specular_cosine`, and
+    `diffuse_reflectance` / π; zero below the horizon."""
+    base = diffuse_reflectance(albedo, metallic, roughness, float(normal @ view))
+    specular = specular_cosine(albedo, metallic, roughness, normal, view, lights)
+    return specular + np.maximum(lights @ normal, 0)[:, None] * base / math.pi
+
+
+def specular_cosine(
+    albedo: np.ndarray,
+    metallic: float,
+    roughness: float,
+    normal: np.ndarray,
+    view: np.ndarray,
+    lights: np.ndarray,
+) -> np.ndarray:
+    """The specular part: GGX α = roughness², correlated Smith, Schlick."""
     α2 = roughness**4
     n_l, n_v = lights @ normal, float(normal @ view)
     lit = (n_l > 0) & (n_v > 0)
@@ -217,7 +245,7 @@ def brdf_cosine(
     f0 = 0.04 * (1 - metallic) + albedo * metallic
     fresnel = f0 + (1 - f0) * (1 - v_h[:, None]) ** 5
     specular = fresnel * (d * g / (4 * safe * (n_v if n_v > 0 else 1)))[:, None]
-    return np.where(lit, n_l, 0)[:, None] * (specular + (1 - metallic) * albedo / math.pi)
+    return np.where(lit, n_l, 0)[:, None] * specular
 
 
 def reflected_radiance(
@@ -242,14 +270,14 @@ def reflected_radiance(
         return cosine[:, None] * normal + np.sqrt(1 - cosine**2)[:, None] * around
 
     lights = at(np.sqrt(s))
-    diffuse = (1 - metallic) * albedo * bilinear_many(radiance, lights).mean(0)
+    base = diffuse_reflectance(albedo, metallic, roughness, float(normal @ view))
+    diffuse = base * bilinear_many(radiance, lights).mean(0)
     α2 = roughness**4
     n_h = s / np.sqrt(s**2 + α2 * (1 - s**2))  # 1 - s² is uniform
     half = at(n_h)
     v_h = half @ view
     lights = 2 * v_h[:, None] * half - view
     density = α2 / (math.pi * (n_h**2 * (α2 - 1) + 1) ** 2) * n_h  # of half vectors; dω_l = 4 v·h dω_h
-    specular = brdf_cosine(albedo, metallic, roughness, normal, view, lights)
-    specular -= np.maximum(lights @ normal, 0)[:, None] * (1 - metallic) * albedo / math.pi
+    specular = specular_cosine(albedo, metallic, roughness, normal, view, lights)
     weight = (2 * s * np.where(v_h > 0, 4 * v_h, 0) / density)[:, None]
     return diffuse + (specular * weight * bilinear_many(radiance, lights)).mean(0)

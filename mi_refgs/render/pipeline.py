@@ -40,7 +40,7 @@ class Shading:
 
     at: Literal["surfel", "pixel"] = "pixel"  # shade before or after blending
     reflectance: Literal["radiance", "split_sum"] = "split_sum"  # SH colour alone, or diffuse + GGX specular
-    diffuse: Literal["sh", "irradiance"] = "sh"  # view-dependent SH colour, or albedo × prefiltered light
+    diffuse: Literal["sh", "irradiance"] = "sh"  # view-dependent SH colour, or of albedo and light
     occlusion: bool = False  # trace visibility along the mirror direction, and fill with the indirect channel
     accuracy: Accuracy = field(default_factory=Accuracy)  # what to pay for less error; rays need occlusion
 

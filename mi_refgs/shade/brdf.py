@@ -97,7 +97,8 @@ def table() -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=4)
-def _device_table(variant: str) -> Any:
+def device_table(variant: str) -> Any:
+    """The table as evaluated mi.Float of the variant that is set; made on the first call, kept for others."""
     return mi.Float(table().ravel())
 
 
@@ -108,7 +109,7 @@ def split_sum(n_dot_v: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Floa
     linearly: clamping there would be off by 0.002 at roughness 1. Differentiable in both arguments; the table
     is not.
     """
-    data = _device_table(mi.variant())
+    data = device_table(mi.variant())
 
     def place(x: Any) -> tuple[Any, Any]:
         x = dr.clip(x, 0, 1) * RESOLUTION - 0.5

@@ -129,8 +129,7 @@ def multiple_scattering(f0: mi.Color3f, single: mi.Color3f, energy: mi.Float) ->
     `single` = F0 A + B leaves after one bounce and `energy` = A + B would if nothing were absorbed; the rest
     bounces on, each time by the mean of Schlick's term, F0 + (1 - F0) / 21: single F E / (1 - F E) with
     E = 1 - energy. A white metal then returns all light. [Fdez-Agüera 2019, "A Multiple-Scattering Microfacet
-    Model for Real-Time Image Based Lighting"] Its weight of the diffuse term is left out: in this model the
-    diffuse term does not yield to the specular one.
+    Model for Real-Time Image Based Lighting"] Its diffuse term is that of `shade` here.
     """
     fresnel = dr.clip(dr.fma(f0, 20 / 21, 1 / 21), 0, MEAN_FRESNEL_MAX)
     again = (1 - energy) * fresnel
@@ -147,16 +146,16 @@ def shade(
 
     With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected direction
     r: specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, and diffuse = (1 - metallic) radiance
-    ("sh") or (1 - metallic) albedo irradiance(n) ("irradiance"). n·v is clamped to [0, 1]: a point seen from
-    behind keeps its mirror direction, with the reflectance at grazing incidence.
+    ("sh") or (1 - S) (1 - metallic) albedo irradiance(n) ("irradiance"). n·v is clamped to [0, 1]: a point
+    seen from behind keeps its mirror direction, with the reflectance at grazing incidence.
 
     `accuracy.dominant` turns r to `dominant_direction`; with `accuracy.multiscatter` and M of
-    `multiple_scattering`, specular = V (L(r, roughness) S + irradiance(n) M) and
-    indirect = (1 - V) L_indirect (S + M).
+    `multiple_scattering`, specular = V (L(r, roughness) S + irradiance(n) M),
+    indirect = (1 - V) L_indirect (S + M), and diffuse has the factor 1 - S - M.
 
-    Under a constant light of 1 the specular term stays below 1. The diffuse term does not yield to it, so
-    that with "irradiance" the total reaches 1 + (1 - metallic) albedo at grazing incidence, and at most
-    albedo + 0.09 (0.13 with `multiscatter`), or 1, in the mean over the angles, weighted by their cosine.
+    Under a constant light of 1 no more than 1 leaves with "irradiance": S + (1 - S) (1 - metallic) albedo.
+    This is the albedo scaling of layered models, a specular layer over a diffuse base; it is not reciprocal,
+    as 1 - S depends on the view and not on the light. A fitted radiance ("sh") is outgoing and is not scaled.
 
     Differentiable in everything but the branches of the clamps. Finite for every finite input.
     Raises InputError for an unknown `diffuse`, or "sh" without a radiance.
@@ -176,12 +175,16 @@ def shade(
         specular *= points.visibility
         if points.indirect is not None:
             indirect = (1 - points.visibility) * points.indirect * reflectance
-    return Terms(_diffuse(points, normal, light, diffuse), specular, indirect)
+    return Terms(_diffuse(points, normal, light, diffuse, reflectance), specular, indirect)
 
 
-def _diffuse(points: ShadingPoints, normal: Any, light: PrefilteredLight, diffuse: Diffuse) -> Any:
+def _diffuse(
+    points: ShadingPoints, normal: Any, light: PrefilteredLight, diffuse: Diffuse, reflectance: Any
+) -> Any:
     if diffuse == "irradiance":
-        return (1 - points.metallic) * points.albedo * light.irradiance(normal)
+        # The table, extrapolated, exceeds 1 by up to 1e-4: no negative light from that.
+        left = dr.maximum(1 - reflectance, 0)
+        return left * (1 - points.metallic) * points.albedo * light.irradiance(normal)
     if diffuse != "sh":
         raise InputError(f'shade: diffuse: "{diffuse}" is unknown; choose "sh" or "irradiance"')
     if points.radiance is None:
