@@ -73,11 +73,11 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"{found:10} {seconds:4.0f} s  {mistake.name:52} {mistake.test}", flush=True)
     counts = ", ".join(f"{number} {found}" for found, number in sorted(outcomes.items()))
     print(f"{len(chosen)} mistakes: {counts}; {(time.perf_counter() - start) / 60:.1f} minutes")
-    return 1 if outcomes["unnoticed"] else 0
+    return 1 if outcomes["unnoticed"] + outcomes["broken"] else 0
 
 
 def outcome(tests: list[str], copy: Path, show: bool = False) -> str:
-    """What the tests make of the copy: failed, crashed, hung or unnoticed; `show`: and what failed."""
+    """What the tests make of the copy: failed, crashed, hung, broken or unnoticed; `show` prints it, too."""
     try:
         done = subprocess.run(
             [sys.executable, "-m", "pytest", *PYTEST, *tests],
@@ -91,7 +91,8 @@ def outcome(tests: list[str], copy: Path, show: bool = False) -> str:
         return "hung"
     if show and done.returncode:
         print(done.stdout.decode())
-    return {0: "unnoticed", 1: "failed"}.get(done.returncode, "crashed")
+    # Other codes of pytest say that no test ran, which proves nothing.
+    return "crashed" if done.returncode < 0 else {0: "unnoticed", 1: "failed"}.get(done.returncode, "broken")
 
 
 if __name__ == "__main__":

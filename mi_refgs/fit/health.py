@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import drjit as dr
 import numpy as np
 
 from mi_refgs.errors import InputError
@@ -53,9 +52,11 @@ def sentence(rows: Mapping[str, np.ndarray], skipped: Skipped, view: str) -> str
 
 
 def check_light(light: EnvironmentLight | None) -> None:
-    """Raise InputError if the environment has a texel that is not finite: nothing can be rendered with it."""
-    if light is not None and not dr.all(dr.isfinite(dr.detach(light.raw.array))):
-        raise InputError("light: a texel is not finite; go on from a checkpoint with a lower rates.light")
+    """Raise InputError if the environment has a texel that renders black and learns no more."""
+    if light is not None and light.unusable():
+        raise InputError(
+            "light: a texel is not finite or too large; go on from a checkpoint with a lower rates.light"
+        )
 
 
 def gave_up(said: str, steps: int) -> InputError:
