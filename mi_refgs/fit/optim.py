@@ -17,8 +17,10 @@ steps.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -36,6 +38,12 @@ BETA_2 = 0.999
 EPSILON = 1e-15
 OUTLIER = 100.0
 """Gradients beyond this many times the usual are cut; see above."""
+
+WIDE_ROW = 64
+"""Columns beyond which rows are not told apart: harmonics have 48, a row of the light hundreds."""
+
+MEMORY = 4096
+"""Steps that `report` may come late."""
 
 SAMPLES = 10_000
 """Entries that a median is taken of."""
@@ -96,13 +104,17 @@ class Adam:
         self._second: dict[str, Any] = {}
         self._steps: dict[str, int] = {}
         self._usual: dict[str, float] = {}  # median √(v / (1 - β₂ᵗ)); 0: not known yet
-        self._flags: dict[str, Any] = {}  # (rows,) 1 where a gradient was not finite
+        self._least: dict[str, Any] = {}  # the same on the device; infinity: not known yet
+        # By number of rows, (rows,): bit i where a gradient of the i-th group was not finite.
+        self._marks: dict[int, Any] = {}
         self._calls, self._iteration = 0, 0  # number and iteration of the last step
-        self._last = dr.opaque(mi.UInt32, 0)  # number of the last step that was skipped
-        self._skipped = dr.opaque(mi.UInt32, 0)
+        self._reported = 0  # number of the last step that was reported
+        # At the number of a step modulo MEMORY: that number, if the step was skipped.
+        self._skipped = dr.opaque(mi.UInt32, 0, MEMORY)
         for name in groups:
             self._clear(name)
-            self._steps[name], self._usual[name] = 0, 0.0
+            self._steps[name] = 0
+            self._set_usual(name, 0.0)
             self._make_leaf(name)
 
     def set_factor(self, name: str, factor: float) -> None:
@@ -115,14 +127,17 @@ class Adam:
 
     def report(self) -> Skipped:
         """The steps that were skipped since the last call; waits for the device, so not for every step."""
-        count = int(self._skipped[0])
-        rows = {name: np.flatnonzero(flags.numpy()) for name, flags in self._flags.items()} if count else {}
-        last = self._iteration - (self._calls - int(self._last[0]))
-        found = Skipped(count, last, {name: at for name, at in rows.items() if len(at)})
-        if count:
-            self._skipped = dr.opaque(mi.UInt32, 0)
-            for name in self.groups:
-                self._clear_flags(name)
+        skipped = self._skipped.numpy()
+        skipped = skipped[skipped > self._reported]
+        rows = {}
+        for i, name in enumerate(self.groups if len(skipped) else ()):
+            marks = self._marks.get(self._marked(name))
+            rows[name] = np.flatnonzero(marks.numpy() >> i & 1) if marks is not None else np.zeros(0, int)
+        last = self._iteration - (self._calls - int(skipped.max(initial=0)))
+        found = Skipped(len(skipped), last, {name: at for name, at in rows.items() if len(at)})
+        self._reported = self._calls
+        if len(skipped):
+            self._marks.clear()
         return found
 
     def step(self, iteration: int, loss: Any = None) -> None:
@@ -137,24 +152,23 @@ class Adam:
             if dr.width(g) and not (g.state == dr.VarState.Literal and float(g[0]) == 0):
                 gradients[name] = g
         self._calls, self._iteration = self._calls + 1, iteration
-        number = dr.opaque(mi.UInt32, self._calls)
-        for name, g in gradients.items():
-            bad, row = self._not_finite(name, g)
-            dr.scatter(self._flags[name], mi.UInt32(1), row, bad)
+        number, place = dr.opaque(mi.UInt32, self._calls), dr.opaque(mi.UInt32, self._calls % MEMORY)
+        for skip in self._not_finite(gradients):
             if loss is not None:
-                bad |= ~dr.isfinite(loss)
-            # Almost never active, so a direct atomic costs nothing.
-            dr.scatter_reduce(dr.ReduceOp.Max, self._last, number, mi.UInt32(0), bad, dr.ReduceMode.Direct)
-        dr.eval(self._last)
-        good = self._last < number
-        if gradients:
-            dr.scatter_reduce(dr.ReduceOp.Add, self._skipped, mi.UInt32(1), mi.UInt32(0), ~good)
+                skip |= ~dr.isfinite(loss)
+            # Almost never active, so it costs nothing.
+            dr.scatter(self._skipped, number, place, skip)
+        dr.eval(self._skipped, self._marks)
+        good = dr.gather(mi.UInt32, self._skipped, place) != number
 
-        updated = {}
+        updated: dict[str, tuple[Any, Any]] = {}
+        inverse: dict[int, Any] = {}  # by step count, which tensors share: each number costs time to send
         for name, g in gradients.items():
             shape, group = tuple(int(size) for size in self.params[name].shape), self.groups[name]
             t = self._steps[name] + 1
-            g = self._cut(name, g, t)
+            if t not in inverse:
+                inverse[t] = dr.opaque(mi.Float, 1 / (1 - BETA_2 ** max(t - 1, 1)))
+            g = self._cut(name, g, t, inverse[t])
             m = BETA_1 * self._first[name] + (1 - BETA_1) * g
             v = BETA_2 * self._second[name] + (1 - BETA_2) * g * g
             correction = math.sqrt(1 - BETA_2**t) / (1 - BETA_1**t)
@@ -172,29 +186,55 @@ class Adam:
             self.params[name] = mi.TensorXf(θ, shape=shape)
             self._make_leaf(name)
 
-    def _cut(self, name: str, g: Any, t: int) -> Any:
-        """The gradient of step t, without unit, cut where it is far beyond the usual, 0 where not finite."""
-        g = g * dr.opaque(mi.Float, self.groups[name].unit)
+    def _cut(self, name: str, g: Any, t: int, inverse: Any) -> Any:
+        """The gradient of step t, without unit, cut where it is far beyond the usual, 0 where not finite.
+
+        `inverse` is 1 / (1 - β₂ᵗ⁻¹), of the steps so far.
+        """
+        if self.groups[name].unit != 1:
+            g = g * dr.opaque(mi.Float, self.groups[name].unit)
         if t & (t - 1) == 0:  # at steps 1, 2, 4, …, since it waits for the device
             square = _median(g) ** 2 if t == 1 else _median(self._second[name]) / (1 - BETA_2 ** (t - 1))
-            self._usual[name] = math.sqrt(square)
-        inverse = dr.opaque(mi.Float, 1 / (1 - BETA_2 ** max(t - 1, 1)))
-        usual = dr.opaque(mi.Float, self._usual[name] or math.inf)
-        limit = OUTLIER * dr.maximum(dr.sqrt(self._second[name] * inverse), usual)
+            self._set_usual(name, math.sqrt(square))
+        limit = OUTLIER * dr.maximum(dr.sqrt(self._second[name] * inverse), self._least[name])
         limit = dr.minimum(limit, RAW_LIMIT)
         return dr.select(dr.isfinite(g), dr.clip(g, -limit, limit), 0.0)
 
-    def _not_finite(self, name: str, g: Any) -> tuple[Any, Any]:
-        """Where entries of the head columns are not finite, and their rows.
+    def _set_usual(self, name: str, usual: float) -> None:
+        self._usual[name] = usual
+        self._least[name] = dr.opaque(mi.Float, usual or math.inf)
 
-        It costs 1 % of a step to look at those, 2 % to look at all. The other columns are of spherical
-        harmonics: their gradient is that of a head column times a bounded function.
+    def _marked(self, name: str) -> int:
+        """Rows of the marks that a tensor shares with others; 1 for one of wide rows, not told apart."""
+        rows, width = int(self.params[name].shape[0]), math.prod(self.params[name].shape[1:])
+        return rows if width <= WIDE_ROW else 1
+
+    def _not_finite(self, gradients: Mapping[str, Any]) -> list[Any]:
+        """Where something is not finite (mi.Bool), by rows or by entries; rows get bit i for the i-th group.
+
+        One look at a row serves all of its tensors. Only head columns are looked at: the others are of
+        spherical harmonics, whose gradient is that of a head column times a bounded function.
         """
-        width = dr.width(g) // dr.width(self._flags[name])
-        head = self.groups[name].head or width
-        entry = dr.arange(mi.UInt32, dr.width(g) // width * head)
-        row = entry // head
-        return ~dr.isfinite(g if head == width else dr.gather(mi.Float, g, entry + row * (width - head))), row
+        by_entry: list[Any] = []
+        by_row: dict[int, Any] = {}
+        for i, name in enumerate(self.groups):
+            if name not in gradients:
+                continue
+            g, rows, bit = gradients[name], self._marked(name), mi.UInt32(1 << i)
+            self._marks.setdefault(rows, dr.opaque(mi.UInt32, 0, rows))
+            if rows == 1:
+                bad = ~dr.isfinite(g)
+                dr.scatter_reduce(dr.ReduceOp.Or, self._marks[1], bit, 0, bad, dr.ReduceMode.Direct)
+                by_entry.append(bad)
+                continue
+            width = dr.width(g) // rows
+            first = dr.arange(mi.UInt32, rows) * width
+            columns = [dr.gather(mi.Float, g, first + c) for c in range(self.groups[name].head or width)]
+            found = dr.select(reduce(operator.and_, map(dr.isfinite, columns)), mi.UInt32(0), bit)
+            by_row[rows] = by_row.get(rows, mi.UInt32(0)) | found
+        for rows, found in by_row.items():
+            self._marks[rows] |= found
+        return by_entry + [found != 0 for found in by_row.values()]
 
     def gather(self, parent: Any, names: list[str], fresh: Any | None = None) -> None:
         """Let the moments of (N, D) tensors follow their rows: row i takes those of row parent[i].
@@ -216,8 +256,8 @@ class Adam:
                     rows = dr.select(dr.gather(mi.Bool, mi.Bool(fresh), row), 0.0, rows)
                 moments[name] = rows
             dr.eval(self._first[name], self._second[name])
-            self._clear_flags(name)
             self._make_leaf(name)
+        self._marks.clear()
 
     def reset(self, name: str, rows: Any | None = None) -> None:
         """Zero the moments of one tensor, or of the rows where `rows` (mi.Bool) holds; its step count stays.
@@ -260,7 +300,7 @@ class Adam:
                     )
                 moments[name] = upload(values)
             self._steps[name] = int(state[f"{name}/steps"])
-            self._usual[name] = float(state[f"{name}/usual"])
+            self._set_usual(name, float(state[f"{name}/usual"]))
             factor = float(state[f"{name}/factor"])
             self.factors.pop(name, None)
             if factor != 1.0:
@@ -271,11 +311,6 @@ class Adam:
         # Opaque zeros: a literal would give the first step after a reset a kernel of its own.
         self._first[name] = dr.opaque(mi.Float, 0.0, size) if size else mi.Float()
         self._second[name] = dr.opaque(mi.Float, 0.0, size) if size else mi.Float()
-        self._clear_flags(name)
-
-    def _clear_flags(self, name: str) -> None:
-        rows = int(self.params[name].shape[0])
-        self._flags[name] = dr.opaque(mi.UInt32, 0, rows) if rows else mi.UInt32()
 
     def _make_leaf(self, name: str) -> None:
         tensor = dr.detach(self.params[name])
