@@ -27,7 +27,7 @@ MEAN_FRESNEL_MAX = 1.25
 """The mean of Schlick's term is at most 1 for a colour in 0 … 1; this cap, out of its reach, keeps the series
 of bounces finite for any other colour: A + B ≥ 0.31 everywhere."""
 
-MAX_RAYS = 1024
+MAX_RAYS = 4096
 """Rays of the lobe, or bounces, beyond which nothing changes but the time: the length of a kernel follows."""
 
 Diffuse = Literal["sh", "irradiance"]
@@ -53,7 +53,9 @@ class Accuracy:
             number: Any = getattr(self, name)
             if type(number) is not int or not least <= number <= MAX_RAYS:
                 some = ", ".join(str(least + i) for i in range(3))
-                raise InputError(f"accuracy: {name}: {shown(number)} is no number of {what}; use {some}, …")
+                raise InputError(
+                    f"accuracy: {name}: {shown(number)} is no number of {what}; use {some}, … {MAX_RAYS}"
+                )
 
 
 @dataclass(frozen=True)
