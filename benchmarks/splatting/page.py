@@ -148,7 +148,9 @@ def _fits(result: dict[str, Any]) -> str:
 
 def _errors_text() -> str:
     return prose(
-        """Against the float64 oracle on a part of the view. *Order*: the largest relative difference of two
+        """Against the float64 oracle on a part of the view. The oracle sorts, cuts and filters by the same
+        rules: this is the precision of the implementation. What the rules themselves change is in
+        [stability.md](stability.md). *Order*: the largest relative difference of two
         depths that stand in the wrong order; the oracle then blends in our order, as float32 cannot tell such
         surfels apart. Image errors are absolute, of features and alpha between 0 and 1; gradient errors are
         relative, ‖g − g₆₄‖ / ‖g₆₄‖, for random adjoints of all maps. Pixels in the oracle's declared band, at
