@@ -13,6 +13,12 @@ from __future__ import annotations
 
 import math
 
+# ---------------- input files ----------------
+
+MAX_NUMBER = 1e9
+"""Largest absolute value of a number in a method or a transforms file: no size, focal length, rate or count
+has more, and its square fits float32."""
+
 # ---------------- cameras ----------------
 
 RIGID_TOLERANCE = 1e-3

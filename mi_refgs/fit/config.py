@@ -17,14 +17,13 @@ from typing import Any, Literal
 
 import tomli_w
 
+from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import is_file
 from mi_refgs.resources import resource_dir
 
 MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
-MAX_NUMBER = 1e9
-"""Largest absolute value of a number in a method: no count, rate or weight has more, nor NaN or infinity."""
 TIE = 1e-6
 """Intervals by which a scaled window may miss a multiple of its interval for the rounding of floats."""
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mi_refgs.constants import RIGID_TOLERANCE
+from mi_refgs.constants import MAX_NUMBER, RIGID_TOLERANCE
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import is_file
 from mi_refgs.fit.lens import Lens, Undistortion, undistortion
@@ -29,8 +29,6 @@ CAMERA_MODELS = {
 """Values of `camera_model`, as COLMAP and nerfstudio name them, and whether each is a fisheye."""
 OTHER_LENSES = ("k5", "k6", "ftheta_p0", "latlong", "equirectangular", "orthographic")
 """Keys of lenses that are refused, unless they are 0 or false."""
-MAX_NUMBER = 1e9
-"""Largest absolute value of a number in a transforms file; no size, focal length or coefficient has more."""
 MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
 """OpenGL's camera looks along −z with +x right, Mitsuba's along +z with +x left; its own inverse."""
 
