@@ -31,7 +31,7 @@ SECONDS = 1.0
 
 def sphere_data(size: int, views: int, rng: np.random.Generator) -> Any:
     """Views of a unit sphere with a smooth random picture on it."""
-    from mi_refgs.fit.data import Dataset, View
+    from mi_refgs.data.dataset import Dataset, View
     from mi_refgs.reference.camera import look_at
 
     focal = 0.5 * size / np.tan(np.radians(20))
@@ -53,8 +53,8 @@ def sphere_data(size: int, views: int, rng: np.random.Generator) -> Any:
 
 def make_trainer(surfels: int, data: Any, variant: str = METHOD) -> tuple[Any, Any]:
     """A trainer at the preset `standard` that keeps its number of surfels, and its method."""
-    from mi_refgs.fit import config
     from mi_refgs.fit.train import Trainer
+    from mi_refgs.methods import config
 
     settings = [f"surfels.count={surfels}", f"surfels.max_count={surfels}", "surfels.inside=0", "refine={}"]
     method = config.load(variant, "standard", settings)
@@ -65,7 +65,7 @@ def step_times(surfels: int, size: int, steps: int, variant: str = METHOD) -> di
     """For every stage of the schedule: a step's time, launches, cache misses, and where its time goes."""
     from benchmarks.common.timing import milliseconds
     from benchmarks.splatting.ours import Ours
-    from mi_refgs.fit.profile import held_in_stage, profile_stage
+    from mi_refgs.profiling.profile import held_in_stage, profile_stage
 
     trainer, method = make_trainer(surfels, sphere_data(size, 8, np.random.default_rng(0)), variant)
     result = {}

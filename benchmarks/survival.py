@@ -68,7 +68,7 @@ def settings(**windows: int) -> list[str]:
 def write_data(folder: Path) -> Path:
     """The pictures as a data set on disk."""
     from benchmarks.step import sphere_data
-    from mi_refgs.fit.frames import MITSUBA_FROM_OPENGL
+    from mi_refgs.data.transforms import MITSUBA_FROM_OPENGL
     from mi_refgs.images import write_png
 
     folder.mkdir(parents=True)
@@ -92,8 +92,8 @@ def kill(times: int, seed: int, folder: Path) -> dict[str, Any]:
     Every second kill waits, after its random moment, for the next checkpoint that is being written.
     """
     from mi_refgs.files import TEMPORARY
-    from mi_refgs.fit import checkpoint
-    from mi_refgs.fit.record import Run
+    from mi_refgs.runs import checkpoint
+    from mi_refgs.runs.run import Run
 
     draw, run = random.Random(seed), Run(folder / "run")
     data = write_data(folder / "data")
@@ -193,9 +193,9 @@ def _goes_on(run: Any, before: int, resumed: int) -> bool:
 def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
     """One fit of so many steps; a record every INTERVAL steps is printed and, at the end, all are written."""
     from benchmarks.step import sphere_data
-    from mi_refgs.fit import config
-    from mi_refgs.fit.record import Run
     from mi_refgs.fit.train import Trainer
+    from mi_refgs.methods import config
+    from mi_refgs.runs.run import Run
 
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)

@@ -48,16 +48,18 @@ def move(folder: Path, factor: float) -> None:
 
 def fit(folder: Path, seed: int) -> dict[str, float]:
     """PSNR and normal error on the test views after a fit."""
-    from mi_refgs.fit import config, data, metrics, pictures
+    from mi_refgs.data import dataset
+    from mi_refgs.evaluation import metrics, pictures
     from mi_refgs.fit.train import Trainer
+    from mi_refgs.methods import config
 
     method = config.load("ref_gaussian", "quick", [*SETTINGS, f"seed={seed}"])
-    trainer = Trainer(method, data.load(folder, "train", truth=False))
+    trainer = Trainer(method, dataset.read_dataset(folder, "train", truth=False))
     trainer.train()
-    test: Any = data.load(folder, "test")
+    test: Any = dataset.read_dataset(folder, "test")
     scores: list[dict[str, Any]] = []
     for view in test.views:
-        shot = pictures.Shot.of(trainer.view(view.camera()), test)
+        shot = pictures.RenderedView.of(trainer.view(view.camera()), test)
         psnr = metrics.psnr(shot.image, pictures.target(view))
         scores.append({"psnr": psnr} | metrics.normal_mae_deg(shot.normal, view.normal, view.alpha))
     means = {key: float(np.mean([s[key] for s in scores])) for key in ("psnr", "normal_mae_deg")}
@@ -66,14 +68,14 @@ def fit(folder: Path, seed: int) -> dict[str, float]:
 
 def measure(size: int, views: int, seeds: int) -> list[dict[str, Any]]:
     """One row for each fit."""
-    from mi_refgs.fit.dataset import generate
+    from mi_refgs.data.make_dataset import make_dataset
     from mi_refgs.resources import resource_dir
 
     jobs = [(unit, factor, seed) for seed in range(seeds) for unit, factor in UNITS.items()]
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         scene = resource_dir("scenes") / "glossy_demo.xml"
-        data = generate(scene, folder, views=views, test_views=TEST_VIEWS, size=size, spp=64)
+        data = make_dataset(scene, folder, views=views, test_views=TEST_VIEWS, size=size, spp=64)
         originals = {path: path.read_bytes() for path in data.glob("transforms_*.json")}
         dr.set_thread_count(1)  # sums by scatter are then the same in every run
         for unit, factor, seed in jobs:

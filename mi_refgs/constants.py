@@ -4,7 +4,7 @@ Frames      World is right-handed, in scene units. The camera frame is Mitsuba's
             data readers convert once, at the door.
 Pixels      The centre of pixel (i, j) is (i + ½, j + ½); only `splat.camera.pixel_centres` says so in code.
 Quaternions (x, y, z, w) everywhere but in PLY files, which store w first.
-Colour      Linear radiance everywhere; the sRGB curve is applied once, at the camera (`fit.losses`).
+Colour      Linear radiance everywhere; the sRGB curve is applied once, at the camera (`render.display`).
 Letters     N surfels, M surfel-tile pairs, P pixels, K channels, α opacity after the footprint,
             T transmittance, w = αT, δx the adjoint of x, a_from_b an index map.
 """
@@ -68,7 +68,7 @@ PACKET_EDGE = 8
 AVX-512, have 4 pixels each. A packet waits for the longest list of its tiles; those of neighbours are alike,
 and hold the same surfels."""
 
-LANE_EDGE = 2
+LANE_PIXELS_PER_AXIS = 2
 """Blocks of a tile along each axis. A lane does the pixel at its place in every block: what it reads of a
 surfel then serves them all, and what it adds to the surfel's gradient is their sum."""
 

@@ -13,12 +13,12 @@ PACKET = 8
 """Floats that one access moves: Dr.Jit's LLVM code for wider packets is made of these."""
 
 COPIES_BYTES = 1 << 30
-"""Most memory of the copies that `Rows.add` makes, one a thread; above it adds atomically. A gradient of a
-million surfels with 14 features, 24 floats a row, has 96 MB a copy: up to 11 threads have one each."""
+"""Most memory of the copies that `PackedRows.add` makes, one a thread; above it adds atomically. A gradient
+of a million surfels with 14 features, 24 floats a row, has 96 MB a copy: up to 11 threads have one each."""
 
 
 @dataclass(frozen=True)
-class Rows:
+class PackedRows:
     """N rows of `width` floats, each padded with zeros to whole packets; no derivative."""
 
     data: Any  # mi.Float (N · packets · PACKET,)
@@ -31,15 +31,15 @@ class Rows:
         return _padded(self.width) // PACKET
 
     @staticmethod
-    def zeros(count: int, width: int) -> Rows:
-        """Rows of zeros."""
-        return Rows(dr.zeros(mi.Float, count * _padded(width)), count, width)
+    def zeros(count: int, width: int) -> PackedRows:
+        """PackedRows of zeros."""
+        return PackedRows(dr.zeros(mi.Float, count * _padded(width)), count, width)
 
     @staticmethod
-    def pack(columns: list[Any]) -> Rows:
-        """Rows of columns (mi.Float, width N)."""
+    def pack(columns: list[Any]) -> PackedRows:
+        """PackedRows of columns (mi.Float, width N)."""
         count, width = dr.width(columns[0]), len(columns)
-        rows = Rows(dr.empty(mi.Float, count * _padded(width)), count, width)
+        rows = PackedRows(dr.empty(mi.Float, count * _padded(width)), count, width)
         values = [dr.detach(column) for column in columns]
         for place, packet in rows._packets(dr.arange(mi.UInt32, count), values):
             # Without the promise of no conflicts every packet would be a kernel of its own.
@@ -104,7 +104,7 @@ def _split(array: Any, width: int, packet: int, mode: Any = dr.ReduceMode.Auto) 
 
 
 class _OddColumns(dr.CustomOp):
-    """Rows that no packet divides → columns; the adjoint makes padded rows first, in packets.
+    """PackedRows that no packet divides → columns; the adjoint makes padded rows first, in packets.
 
     To add to memory column by column, 16 cache lines each time, takes four times as long.
     """
@@ -117,7 +117,7 @@ class _OddColumns(dr.CustomOp):
         self.set_grad_out(_split(self.grad_in("array"), self.width, 1))
 
     def backward(self) -> None:
-        self.set_grad_in("array", Rows.pack(self.grad_out()).unpadded())
+        self.set_grad_in("array", PackedRows.pack(self.grad_out()).unpadded())
 
     def name(self) -> str:
         return "columns"

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from mi_refgs.cli import main
-from mi_refgs.fit import checkpoint
-from mi_refgs.fit.record import Run
+from mi_refgs.runs import checkpoint
+from mi_refgs.runs.run import Run
 
 State = dict[str, np.ndarray]
 

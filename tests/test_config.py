@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from test_train import ball
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit import config, refine
+from mi_refgs.fit import refine
 from mi_refgs.fit.train import Trainer
+from mi_refgs.methods import config
 from mi_refgs.surfels.table import Surfels
 
 
@@ -122,9 +123,9 @@ def test_every_preset_has_the_same_events_in_the_same_order(
 
         return record
 
-    def same(surfels: Surfels) -> refine.Edited:
+    def same(surfels: Surfels) -> refine.TableEdit:
         rows = np.arange(surfels.count, dtype=np.uint32)
-        return refine.Edited(surfels, rows, rows < 0)
+        return refine.TableEdit(surfels, rows, rows < 0)
 
     monkeypatch.setattr(refine, "densify_and_prune", recorder("densify", same))
     for name in ("reset_opacity", "propagate_normals", "reset_materials"):

@@ -15,12 +15,12 @@ import pytest
 import trimesh
 from integrator_scenes import sky
 
+from mi_refgs.data import pathtrace
+from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.make_dataset import make_dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fit import pathtrace
-from mi_refgs.fit.data import Dataset, load
-from mi_refgs.fit.dataset import generate
 from mi_refgs.images import read_exr_image, srgb_from_linear
-from mi_refgs.shade import lobe
+from mi_refgs.shade import lobe_matrices
 
 SCENES = Path(__file__).parent.parent / "scenes"
 CENTRE, RADIUS = np.array([0.3, -0.2, 0.5]), 0.7
@@ -53,12 +53,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     mi.set_variant("llvm_ad_rgb")
     folder = tmp_path_factory.mktemp("dataset")
     (folder / "ball.xml").write_text(SCENE)
-    return generate(folder / "ball.xml", folder / "out", **OPTIONS)
+    return make_dataset(folder / "ball.xml", folder / "out", **OPTIONS)
 
 
 @pytest.fixture
 def train(made: Path) -> Dataset:
-    return load(made, "train")
+    return read_dataset(made, "train")
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -68,7 +68,7 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_depth_and_normals_lie_on_the_sphere(made: Path) -> None:
     """Through the reader's camera, so that file convention, pixel centres and maps are tested as one."""
     for split in ("train", "test"):
-        for view in load(made, split).views:
+        for view in read_dataset(made, split).views:
             assert view.depth is not None and view.normal is not None and view.alpha is not None
             rays = np.array(view.camera().rays()).T
             points = view.to_world[:3, 3] + rays * view.depth.reshape(-1, 1)
@@ -82,7 +82,7 @@ def test_depth_and_normals_lie_on_the_sphere(made: Path) -> None:
 
 
 def test_png_is_the_exr_as_displayed(made: Path, train: Dataset) -> None:
-    radiance = load(made, "train", images="exr", background="black")
+    radiance = read_dataset(made, "train", images="exr", background="black")
     for shown, linear in zip(train.views, radiance.views, strict=True):
         assert shown.alpha is not None and linear.alpha is not None
         alpha = linear.alpha[..., None]
@@ -97,10 +97,10 @@ def test_brightness_is_the_lit_sphere(train: Dataset) -> None:
     scene = mi.load_string(SCENE)
     light = pathtrace.environment_image(scene, 16).reshape(-1, 3)
     row, column = np.divmod(np.arange(16 * 32), 32)
-    theta, phi = lobe.row_angles(16)[row], lobe.column_angles(32)[column]
+    theta, phi = lobe_matrices.row_angles(16)[row], lobe_matrices.column_angles(32)[column]
     direction = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=1)
-    weight = lobe.row_areas(16)[row] * (np.pi / 16)
-    for view in load(train.path, "train", images="exr", background="black").views:
+    weight = lobe_matrices.row_areas(16)[row] * (np.pi / 16)
+    for view in read_dataset(train.path, "train", images="exr", background="black").views:
         assert view.normal is not None and view.alpha is not None
         inside = view.alpha == 1
         cosine = np.maximum(view.normal[inside] @ direction.T, 0)
@@ -188,12 +188,12 @@ def test_unfinished_folder_is_continued(made: Path, monkeypatch: pytest.MonkeyPa
         return trace(self, pose, seed)
 
     monkeypatch.setattr(pathtrace.Tracer, "trace", counted)
-    generate(scene, made, **OPTIONS)
+    make_dataset(scene, made, **OPTIONS)
     assert not traced
     (made / "train/r_001.png").unlink()
     (made / "test/r_000_depth.exr").write_bytes(b"cut short")
     (made / "transforms_train.json").unlink()
-    generate(scene, made, **OPTIONS)
+    make_dataset(scene, made, **OPTIONS)
     assert len(traced) == 2 and files(made) == before
 
 
@@ -201,17 +201,17 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
     scene = tmp_path / "ball.xml"
     scene.write_text(SCENE)
     tiny = {**OPTIONS, "views": 1, "test_views": 1, "size": 4, "environment_height": 0}
-    out = generate(scene, tmp_path / "out", **{**tiny, "views": 2})
+    out = make_dataset(scene, tmp_path / "out", **{**tiny, "views": 2})
     with pytest.raises(InputError, match=r"dataset.json: views: .*overwrite"):
-        generate(scene, out, **tiny)
+        make_dataset(scene, out, **tiny)
     scene.write_text(SCENE.replace("0.7", "0.6"))
     with pytest.raises(InputError, match="scene_sha256"):
-        generate(scene, out, **{**tiny, "views": 2})
-    generate(scene, out, **tiny, overwrite=True)
-    assert not (out / "train/r_001.png").exists() and len(load(out, "train").views) == 1
+        make_dataset(scene, out, **{**tiny, "views": 2})
+    make_dataset(scene, out, **tiny, overwrite=True)
+    assert not (out / "train/r_001.png").exists() and len(read_dataset(out, "train").views) == 1
     (out / "dataset.json").unlink()
     with pytest.raises(InputError, match="another data set"):
-        generate(scene, out, **tiny)
+        make_dataset(scene, out, **tiny)
 
 
 def test_passes_average(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -238,7 +238,7 @@ def test_passes_average(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_settings_out_of_range(made: Path, tmp_path: Path, options: dict, words: str) -> None:
     with pytest.raises(InputError, match=f"ball.xml: {words}.*out of range"):
-        generate(made.parent / "ball.xml", tmp_path / "out", **{**OPTIONS, **options})
+        make_dataset(made.parent / "ball.xml", tmp_path / "out", **{**OPTIONS, **options})
     assert not (tmp_path / "out").exists()
 
 
@@ -257,14 +257,14 @@ def test_bad_scene(tmp_path: Path, text: str | None, words: str) -> None:
     if text is not None:
         scene.write_text(text)
     with pytest.raises(InputError, match=words) as caught:
-        generate(scene, tmp_path / "out", **OPTIONS)
+        make_dataset(scene, tmp_path / "out", **OPTIONS)
     assert str(caught.value).startswith(str(scene))
 
 
 def test_unwritable_output(made: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match=r"file.*writable"):
-        generate(made.parent / "ball.xml", tmp_path / "file" / "out", **OPTIONS)
+        make_dataset(made.parent / "ball.xml", tmp_path / "file" / "out", **OPTIONS)
 
 
 @pytest.mark.parametrize("name", ["mirror_ring", "mixed", "diffuse", "glossy_demo"])

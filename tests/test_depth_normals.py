@@ -13,6 +13,7 @@ from image_checks import HEIGHT, STEP, VALUE, WIDTH, gradient, planes, stack
 from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.fit import losses
 from mi_refgs.reference import losses as reference
+from mi_refgs.render import display
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.splat.camera import Camera
@@ -53,7 +54,7 @@ def expected_depth(blended: Any, alpha: Any) -> Any:
 def camera() -> Camera:
     to_world = np.eye(4)
     to_world[:3, :3], to_world[:3, 3] = ROTATION, (1.0, 2.0, 3.0)
-    return Camera.look(WIDTH, HEIGHT, *INTRINSICS, to_world)
+    return Camera.from_pose(WIDTH, HEIGHT, *INTRINSICS, to_world)
 
 
 def test_depth_normals_of_a_plane_are_exact() -> None:
@@ -150,7 +151,7 @@ def test_empty_image_gives_finite_gradients() -> None:
     dr.enable_grad(leaves)
     z = expected_depth(leaves[3], leaves[4])
     depth_normal, valid = normals_from_depth(z, leaves[4], camera())
-    image = losses.display_image(leaves[:3], leaves[4], (1.0, 1.0, 1.0))
+    image = display.display_image(leaves[:3], leaves[4], (1.0, 1.0, 1.0))
     target = [dr.ones(mi.Float, size)] * 3
     total = (
         losses.l1(image, target)

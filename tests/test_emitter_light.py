@@ -9,7 +9,7 @@ import pytest
 from integrator_scenes import sky
 
 from mi_refgs.errors import InputError
-from mi_refgs.plugins.light import TurnedLight, emitter_light, own_light
+from mi_refgs.plugins.light import RotatedLight, emitter_light, own_light
 
 AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 
@@ -45,7 +45,7 @@ def test_radiance_is_that_of_mitsuba(turn: str, rng: np.random.Generator) -> Non
     truth = made.eval(si).numpy()
     np.testing.assert_allclose(emitter_light(made).mirror(world).numpy(), truth, rtol=1e-3)
     own, matrix = own_light(made)
-    light = own.prefilter() if matrix is None else TurnedLight(own.prefilter(), matrix)
+    light = own.prefilter() if matrix is None else RotatedLight(own.prefilter(), matrix)
     np.testing.assert_allclose(light.mirror(world).numpy(), truth, rtol=1e-3)
 
 

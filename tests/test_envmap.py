@@ -14,7 +14,7 @@ from helpers import level_maps, unit, vector
 from mi_refgs.errors import InputError
 from mi_refgs.images import write_exr
 from mi_refgs.reference import shade as reference
-from mi_refgs.shade import envmap, lobe, prefilter
+from mi_refgs.shade import envmap, lobe_matrices, prefilter
 from mi_refgs.shade.envmap import EnvironmentLight
 
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -27,12 +27,12 @@ def mitsuba_radiance(emitter: dict, d: np.ndarray) -> np.ndarray:
 
 
 def texel_direction(h: int, row: int, column: int) -> np.ndarray:
-    θ, φ = lobe.row_angles(h)[row], lobe.column_angles(2 * h)[column]
+    θ, φ = lobe_matrices.row_angles(h)[row], lobe_matrices.column_angles(2 * h)[column]
     return np.array([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)])
 
 
 def sun_and_gradient(h: int, radiance: float = 500.0) -> np.ndarray:
-    θ, φ = lobe.row_angles(h)[:, None, None], lobe.column_angles(2 * h)[None, :, None]
+    θ, φ = lobe_matrices.row_angles(h)[:, None, None], lobe_matrices.column_angles(2 * h)[None, :, None]
     sky = 1 + np.array([0.5, 0.3, -0.2]) * np.cos(θ) + np.array([0.3, -0.2, 0.1]) * np.sin(φ) * np.sin(θ)
     sky[h // 3, h // 4] = radiance
     sky[3, h] = 0.6 * radiance  # close to the pole, where texels are narrow
@@ -86,11 +86,13 @@ def test_the_six_axes_are_told_apart(tmp_path: Path) -> None:
 def test_import_at_another_resolution_keeps_the_energy(rng: np.random.Generator, tmp_path: Path) -> None:
     mi.Bitmap(rng.uniform(0, 1, (50, 90, 3)).astype(np.float32)).write(str(tmp_path / "odd.exr"))
     image = np.array(mi.Bitmap(str(tmp_path / "odd.exr")))
-    mean = np.tensordot(lobe.row_areas(50), image.mean(1), 1)
+    mean = np.tensordot(lobe_matrices.row_areas(50), image.mean(1), 1)
     for height in (16, 64):
         radiance = EnvironmentLight.from_file(tmp_path / "odd.exr", height).radiance().numpy()
         assert radiance.shape == (height, 2 * height, 3)
-        np.testing.assert_allclose(np.tensordot(lobe.row_areas(height), radiance.mean(1), 1), mean, rtol=0.02)
+        np.testing.assert_allclose(
+            np.tensordot(lobe_matrices.row_areas(height), radiance.mean(1), 1), mean, rtol=0.02
+        )
     assert EnvironmentLight.from_file(tmp_path / "odd.exr").height == 48
 
 
@@ -159,7 +161,7 @@ def test_levels_against_brute_force(rng: np.random.Generator) -> None:
     h = 32
     radiance = sun_and_gradient(h)
     light = EnvironmentLight.from_radiance(radiance).prefilter()
-    for roughness, level in zip(lobe.LEVEL_ROUGHNESS, level_maps(light)[1:], strict=True):
+    for roughness, level in zip(lobe_matrices.LEVEL_ROUGHNESS, level_maps(light)[1:], strict=True):
         rows = len(level)
         i, j = round((h // 3) * (rows - 1) / (h - 1)), int((h // 4 + 0.5) * rows / h)
         texels = [(i, j), (i, j + 1), (i + 1, j), (i - 2, j - 2), (0, 0), (1, rows), (3, rows), (rows - 1, 5)]
@@ -178,12 +180,12 @@ def test_wide_lobes_between_texels(rng: np.random.Generator) -> None:
     radiance = sun_and_gradient(h)
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     sun = texel_direction(h, h // 3, h // 4)
-    for roughness in lobe.LEVEL_ROUGHNESS[3:]:
+    for roughness in lobe_matrices.LEVEL_ROUGHNESS[3:]:
         d = unit(sun + 2 * roughness**2 * rng.normal(size=(6, 3)))
         expected = np.array([reference.lobe_average(radiance, x, roughness) for x in d])
         got = light.specular(vector(d), mi.Float(np.full(6, roughness, np.float32))).numpy().T
         assert np.abs(got - expected).max() < 0.03 * np.max(
-            level_maps(light)[1 + lobe.LEVEL_ROUGHNESS.index(roughness)]
+            level_maps(light)[1 + lobe_matrices.LEVEL_ROUGHNESS.index(roughness)]
         )
 
 
@@ -223,13 +225,15 @@ def test_maps_finer_than_the_levels_are_averaged(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With levels capped at 16 rows a map of 64 is filtered like its own average."""
-    monkeypatch.setattr(lobe, "LEVEL_MAX_HEIGHT", (16,) * 7)
-    fine = lobe.resample(rng.uniform(0, 1, (8, 16, 3)), 64)
+    monkeypatch.setattr(lobe_matrices, "LEVEL_MAX_HEIGHT", (16,) * 7)
+    fine = lobe_matrices.resample(rng.uniform(0, 1, (8, 16, 3)), 64)
     prefilter._host_levels.cache_clear()
     prefilter._prepare.cache_clear()
     try:
         got = level_maps(EnvironmentLight.from_radiance(fine).prefilter())[1:]
-        expected = level_maps(EnvironmentLight.from_radiance(lobe.resample(fine, 16)).prefilter())[1:]
+        expected = level_maps(EnvironmentLight.from_radiance(lobe_matrices.resample(fine, 16)).prefilter())[
+            1:
+        ]
     finally:
         prefilter._host_levels.cache_clear()
         prefilter._prepare.cache_clear()
@@ -295,10 +299,12 @@ def test_specular_against_the_oracle(rng: np.random.Generator) -> None:
     levels = [level.astype(np.float64) for level in level_maps(light)]
     d, r = (
         unit(rng.normal(size=(400, 3))),
-        np.concatenate([rng.uniform(0, 1, 390), [0, 1, *lobe.LEVEL_ROUGHNESS, 0.05]]),
+        np.concatenate([rng.uniform(0, 1, 390), [0, 1, *lobe_matrices.LEVEL_ROUGHNESS, 0.05]]),
     )
     got = light.specular(vector(d), mi.Float(r.astype(np.float32))).numpy().T
-    expected = [reference.specular(levels, lobe.LEVEL_ROUGHNESS, x, y) for x, y in zip(d, r, strict=True)]
+    expected = [
+        reference.specular(levels, lobe_matrices.LEVEL_ROUGHNESS, x, y) for x, y in zip(d, r, strict=True)
+    ]
     np.testing.assert_allclose(got, expected, atol=1e-4)
     np.testing.assert_allclose(
         light.irradiance(vector(d)).numpy().T, [reference.bilinear(levels[-1], x) for x in d], atol=1e-4
@@ -330,7 +336,7 @@ def test_lookup_derivatives(rng: np.random.Generator) -> None:
     dr.backward(dr.dot(mi.Vector3f(tracked.specular(direction, roughness)), vector(weight)))
 
     def value(x: np.ndarray, y: float, k: int) -> float:
-        return float(weight[k] @ reference.specular(levels, lobe.LEVEL_ROUGHNESS, unit(x), y))
+        return float(weight[k] @ reference.specular(levels, lobe_matrices.LEVEL_ROUGHNESS, unit(x), y))
 
     got, ε, checked = dr.grad(direction).numpy().T, 1e-6, 0
     for k in range(n):

@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 from tiny_scene import SETTINGS, SIZE, write_data, write_method
 
-from mi_refgs.fit import config, data, metrics, pictures
-from mi_refgs.fit.evaluate import TIMED_FRAMES, WARM_UP_FRAMES, evaluate
-from mi_refgs.fit.export import Fitted, export
-from mi_refgs.fit.objective import displayed
-from mi_refgs.fit.record import Run
+from mi_refgs.data import dataset
+from mi_refgs.evaluation import metrics, pictures
+from mi_refgs.evaluation.evaluate import TIMED_FRAMES, WARM_UP_FRAMES, evaluate
 from mi_refgs.fit.train import Trainer
 from mi_refgs.images import read_png
+from mi_refgs.methods import config
+from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.runs.run import Run
 from mi_refgs.surfels.ply import write_ply
 
 KEYS = (
@@ -39,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     method = config.load(str(write_method(folder)), "quick", SETTINGS)
     run = Run(folder / "run")
     run.create(method, str(folder / "ball"))
-    trainer = Trainer(method, data.load(folder / "ball", "train"), run)
+    trainer = Trainer(method, dataset.read_dataset(folder / "ball", "train"), run)
     trainer.train()
     return folder
 
@@ -68,8 +70,8 @@ def test_every_key_is_there_and_json_can_hold_it(run: Run) -> None:
 def test_the_numbers_are_those_of_the_trainer(run: Run, folder: Path) -> None:
     """Exported, read back and measured: the state of the trainer, view by view."""
     result = evaluate(run)
-    trainer = Trainer(run.method(), data.load(folder / "ball", "train"), run)
-    views = data.load(folder / "ball", "test")
+    trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
+    views = dataset.read_dataset(folder / "ball", "test")
     scores = []
     for view in views.views:
         planes = displayed(trainer.view(view.camera()), views.background, views.linear)
@@ -83,8 +85,8 @@ def test_mitsuba_renders_the_exported_scene_as_the_trainer_does(run: Run, folder
     evaluate(run)
     scene = mi.load_file(str(run.path / "scene.xml"))
     image = np.array(mi.render(scene))
-    frame = Trainer(run.method(), data.load(folder / "ball", "train"), run).view(
-        data.load(folder / "ball", "test").views[0].camera()
+    frame = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run).view(
+        dataset.read_dataset(folder / "ball", "test").views[0].camera()
     )
     planes = [*frame.radiance, frame.alpha]
     expected = np.stack([np.array(plane).reshape(SIZE, SIZE) for plane in planes], axis=-1)
@@ -105,7 +107,7 @@ def test_what_does_not_apply_is_null_with_a_reason(run: Run, tmp_path: Path) -> 
 def test_the_artefacts_are_what_is_measured(run: Run) -> None:
     """An edited PLY counts; a checkpoint that is newer than the artefacts replaces them."""
     before = evaluate(run)
-    fitted = Fitted.read(run.path)
+    fitted = TrainedScene.read(run.path)
     opacity = fitted.surfels.to_numpy() | {"opacity": np.full((fitted.surfels.count, 1), -20.0)}
     write_ply(run.path / "surfels.ply", type(fitted.surfels).from_numpy(opacity))
     empty = evaluate(run)
@@ -123,20 +125,20 @@ def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: 
         asked.append(aovs)
         return render(*arguments, aovs=aovs)  # type: ignore[misc]
 
-    monkeypatch.setattr("mi_refgs.fit.export.render", rendered)
+    monkeypatch.setattr("mi_refgs.runs.export.render", rendered)
     evaluate(run)
     assert asked == [True] * 2 + [False] * (WARM_UP_FRAMES + TIMED_FRAMES)
 
 
 def test_an_export_without_light_or_mesh_leaves_no_stale_one(run: Run, folder: Path) -> None:
     evaluate(run)
-    camera = data.load(folder / "ball", "test").views[0].camera()
+    camera = dataset.read_dataset(folder / "ball", "test").views[0].camera()
     state = run.load_checkpoint()
     assert state is not None
     bare = {key: value for key, value in state.items() if not key.startswith("mesh/")}
-    export(Fitted.from_state(run.method(), bare), run.path, camera)
+    export(TrainedScene.from_state(run.method(), bare), run.path, camera)
     assert not (run.path / "mesh.ply").exists()
-    assert not Fitted.read(run.path).shading.occlusion
+    assert not TrainedScene.read(run.path).shading.occlusion
 
 
 def test_pictures_of_the_run(run: Run) -> None:
@@ -147,10 +149,10 @@ def test_pictures_of_the_run(run: Run) -> None:
 
 
 def test_panels_show_what_there_is(run: Run, folder: Path) -> None:
-    trainer = Trainer(run.method(), data.load(folder / "ball", "train"), run)
-    views = data.load(folder / "ball", "test")
+    trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
+    views = dataset.read_dataset(folder / "ball", "test")
     view = views.views[0]
-    shot = pictures.Shot.of(trainer.view(view.camera()), views)
+    shot = pictures.RenderedView.of(trainer.view(view.camera()), views)
     panels = pictures.panels(shot, view)
     assert list(panels) == [
         "ground truth", "render", "true normals", "normals", "albedo", "roughness", "metallic", "visibility"

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from test_train import METHOD, ball
 
+from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
-from mi_refgs.fit import config
-from mi_refgs.fit.data import Dataset, View
 from mi_refgs.fit.train import Trainer
 from mi_refgs.images import linear_from_srgb
+from mi_refgs.methods import config
 
 STEPS = 14
 """Into the deferred stage, with the first mesh, a reset and two rounds of densifying."""

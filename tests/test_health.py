@@ -13,10 +13,11 @@ import pytest
 from test_train import METHOD, ball, run_folder
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit import config, health
-from mi_refgs.fit.config import Method
+from mi_refgs.fit import health
 from mi_refgs.fit.optim import Adam, Skipped
 from mi_refgs.fit.train import Trainer
+from mi_refgs.methods import config
+from mi_refgs.methods.config import Method
 from mi_refgs.surfels.table import GEOMETRY, Surfels
 
 

@@ -49,9 +49,9 @@ def test_visual_hull_of_a_sphere(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
     cosine = np.sum(normals * outward, axis=1) / distance
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean() < 12
-    colours = hull.mean_colours(points, views)
+    colours = hull.median_colours(points, views)
     assert np.all((colours > 0.3) & (colours < 0.7))
-    facing = hull.mean_colours(points, views[:1], normals)
+    facing = hull.median_colours(points, views[:1], normals)
     seen = np.sum(normals * (views[0].to_world[:3, 3] - points), axis=1) > 0
     # At the silhouette a mask of whole pixels may miss the point, which then stays grey.
     assert np.all(facing[~seen] == 0.5) and np.mean(facing[seen] == 0) > 0.8
@@ -72,7 +72,7 @@ def test_points_inside_the_hull_of_a_sphere(rng: np.random.Generator) -> None:
         tiny.inner_points(4000, np.random.default_rng(1)) * 1e6, points, rtol=0, atol=1e-12
     )
     # Every view sees every point, whatever its side: colours are the median of all views.
-    assert np.all(np.abs(hull.mean_colours(points[distance < 0.7], views) - 0.5) < 0.06)
+    assert np.all(np.abs(hull.median_colours(points[distance < 0.7], views) - 0.5) < 0.06)
 
 
 def test_points_inside_a_hull_are_uniform_across_voxels(rng: np.random.Generator) -> None:
@@ -108,4 +108,4 @@ def test_empty_hull_and_parallel_cameras_are_refused(rng: np.random.Generator) -
             hull.camera_bounds(few)
     points = hull.random_points(100, np.array([[-1, 0, 2], [1, 1, 2.5]]), rng)
     assert points.shape == (100, 3) and np.all((points >= [-1, 0, 2]) & (points <= [1, 1, 2.5]))
-    assert np.all(hull.mean_colours(points, nothing) == 0.5)
+    assert np.all(hull.median_colours(points, nothing) == 0.5)

@@ -91,7 +91,7 @@ from pathlib import Path
 import mi_refgs, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 dr.set_thread_count(1)
-from mi_refgs.fit.dataset import _load_scene
+from mi_refgs.data.make_dataset import _load_scene
 from mi_refgs.images import mitsuba_exr
 from mi_refgs.shade.envmap import EnvironmentLight
 folder = Path(sys.argv[1])

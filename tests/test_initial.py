@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from tiny_scene import RADIUS, write_data
 
+from mi_refgs.data import dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fit import config, data
 from mi_refgs.fit.initial import initial_surfels
+from mi_refgs.methods import config
 from mi_refgs.surfels import hull
 
 COUNT = 2_000
@@ -24,18 +25,20 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def ball(tmp_path_factory: pytest.TempPathFactory) -> data.Dataset:
+def ball(tmp_path_factory: pytest.TempPathFactory) -> dataset.Dataset:
     """Twelve views of a ball coloured by its normals, at RADIUS around the origin."""
-    return data.load(write_data(tmp_path_factory.mktemp("hull") / "ball", views=12, truth=False), "train")
+    return dataset.read_dataset(
+        write_data(tmp_path_factory.mktemp("hull") / "ball", views=12, truth=False), "train"
+    )
 
 
-def start(ball: data.Dataset, inside: float, seed: int = 0) -> dict[str, np.ndarray]:
+def start(ball: dataset.Dataset, inside: float, seed: int = 0) -> dict[str, np.ndarray]:
     method = config.load("ref_gaussian", "quick", [f"surfels.count={COUNT}", f"surfels.inside={inside}"])
     surfels = initial_surfels(method, ball, np.random.default_rng(seed))
     return surfels.to_numpy() | {"normal": np.array(surfels.frame()[2]).T}
 
 
-def test_the_share_inside_is_spread_over_the_volume(ball: data.Dataset) -> None:
+def test_the_share_inside_is_spread_over_the_volume(ball: dataset.Dataset) -> None:
     """Below 0.8 of the radius lies half of the volume of the ball, and nothing of its surface."""
     deep = {}
     for share in (0.0, 0.5, 1.0):
@@ -48,7 +51,7 @@ def test_the_share_inside_is_spread_over_the_volume(ball: data.Dataset) -> None:
     assert 0.35 < deep[1.0] < 0.55 and deep[0.5] == pytest.approx(deep[1.0] / 2, abs=0.04)
 
 
-def test_normals_and_colours_of_both_kinds(ball: data.Dataset) -> None:
+def test_normals_and_colours_of_both_kinds(ball: dataset.Dataset) -> None:
     table = start(ball, 0.5)
     distance = np.linalg.norm(table["position"], axis=1)
     outward = np.sum(table["normal"] * table["position"], axis=1) / distance
@@ -64,13 +67,13 @@ def init_colour(table: dict[str, np.ndarray]) -> np.ndarray:
     return table["radiance_sh"][:, :3] * 0.28209479
 
 
-def test_the_same_seed_gives_the_same_start(ball: data.Dataset) -> None:
+def test_the_same_seed_gives_the_same_start(ball: dataset.Dataset) -> None:
     one, two, other = start(ball, 0.5), start(ball, 0.5), start(ball, 0.5, seed=1)
     assert all(np.array_equal(one[name], two[name]) for name in one)
     assert not np.array_equal(one["position"], other["position"])
 
 
-def test_without_alpha_surfels_fill_the_box(ball: data.Dataset) -> None:
+def test_without_alpha_surfels_fill_the_box(ball: dataset.Dataset) -> None:
     bare = dataclasses.replace(
         ball, views=tuple(dataclasses.replace(view, alpha=None) for view in ball.views)
     )
@@ -79,7 +82,7 @@ def test_without_alpha_surfels_fill_the_box(ball: data.Dataset) -> None:
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.5, float("nan")])
-def test_a_share_out_of_range_is_refused(ball: data.Dataset, share: float) -> None:
+def test_a_share_out_of_range_is_refused(ball: dataset.Dataset, share: float) -> None:
     with pytest.raises(InputError, match=r"surfels(\.|: )inside"):
         start(ball, share)
 

@@ -239,7 +239,7 @@ def test_an_exported_scene_has_the_trainers_tiles(
     width, height = size
     focal = limit * factor
     pose = look_at(np.random.default_rng(1).normal(size=3), np.zeros(3))
-    camera = Camera.look(width, height, -focal, -focal, width / 2 + 3, height / 2 - 5, pose, 0.01)
+    camera = Camera.from_pose(width, height, -focal, -focal, width / 2 + 3, height / 2 - 5, pose, 0.01)
     write_scene_xml(tmp_path / "scene.xml", ply="a.ply", shading=Shading(), camera=camera)
     root = ElementTree.parse(tmp_path / "scene.xml").getroot()
     root.remove(root.find("integrator"))  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.reference import lobe as exact
 from mi_refgs.reference import shade as reference
 from mi_refgs.render.pipeline import Shading
-from mi_refgs.shade import brdf, lobe
+from mi_refgs.shade import brdf, lobe_matrices
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.models import Accuracy, multiple_scattering, reflect, shade
 
@@ -37,7 +37,7 @@ def oracle(
     return reference.shade(
         brdf.table().astype(np.float64),
         levels,
-        lobe.LEVEL_ROUGHNESS,
+        lobe_matrices.LEVEL_ROUGHNESS,
         diffuse=diffuse,
         dominant=knobs.dominant,
         multiscatter=knobs.multiscatter,
@@ -215,7 +215,7 @@ def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -
     """Under a gradient, split sum against brute force: nearer in sum, and over twice as near where lobes are
     wide."""
     h = 32
-    up, around = lobe.row_angles(h)[:, None, None], lobe.column_angles(2 * h)[None, :, None]
+    up, around = lobe_matrices.row_angles(h)[:, None, None], lobe_matrices.column_angles(2 * h)[None, :, None]
     map_ = np.tile(2 + np.cos(up) + 0.8 * np.sin(up) * np.sin(around), 3)
     cosines = [0.1, 0.3, 0.5, 0.7, 0.9]
     truth = [

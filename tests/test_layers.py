@@ -15,6 +15,9 @@ PACKAGE = "mi_refgs"
 BOTTOM = {"constants", "device", "errors", "files", "images", "ply"}
 """What everything may stand on."""
 
+RENDERER = {"render", "shade", "occlusion", "splat", "surfels"} | BOTTOM
+"""From surfels to an image."""
+
 LAYERS: dict[str, set[str]] = {
     "errors": set(),
     "constants": set(),
@@ -30,11 +33,16 @@ LAYERS: dict[str, set[str]] = {
     "shade": {"splat.camera", "surfels"} | BOTTOM,
     "occlusion": {"splat.camera", "surfels"} | BOTTOM,
     "render": {"shade", "occlusion", "splat", "surfels"} | BOTTOM,
-    "fit": {"render", "shade", "occlusion", "splat", "surfels", "resources", ""} | BOTTOM,
-    "plugins": {"fit", "render", "shade", "occlusion", "splat", "surfels"} | BOTTOM,
+    "plugins": RENDERER,
+    "methods": RENDERER | {"resources"},
+    "data": RENDERER,
+    "runs": RENDERER | {"methods"},
+    "fit": RENDERER | {"methods", "data", "runs"},
+    "evaluation": RENDERER | {"methods", "data", "runs", "fit"},
+    "profiling": RENDERER | {"methods", "data", "fit"},
     "doctor": {"llvm", "errors", ""},
-    "cli": {"fit", "render", "shade", "occlusion", "splat", "surfels", "resources", "llvm", "doctor", ""}
-    | BOTTOM,
+    "cli": RENDERER
+    | {"methods", "data", "runs", "fit", "evaluation", "profiling", "resources", "llvm", "doctor", ""},
     "__main__": {"cli"},
     "reference": {"constants"},
     "": {"llvm", "plugins"},
@@ -130,7 +138,7 @@ def test_only_the_configuration_opens_toml() -> None:
     readers = {
         module for module, source in sources().items() if {"tomllib", "toml"} & imported_packages(source)
     }
-    assert readers <= {"fit.config"}
+    assert readers <= {"methods.config"}
 
 
 def test_the_reference_is_plain_numpy() -> None:

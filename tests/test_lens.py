@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fit.data import load
 from mi_refgs.images import write_exr, write_png
 
 WIDTH, HEIGHT = 96, 120
@@ -80,7 +80,7 @@ def centroid(image: np.ndarray, u: float, v: float) -> tuple[float, float]:
 @pytest.mark.parametrize("name", LENSES)
 def test_points_land_where_a_pinhole_sees_them(tmp_path: Path, name: str) -> None:
     """Points of a straight line therefore land on one."""
-    data = load(dataset(tmp_path, LENSES[name]), "train", images="exr")
+    data = read_dataset(dataset(tmp_path, LENSES[name]), "train", images="exr")
     view = data.views[0]
     assert (view.width, view.height, view.cx, view.cy) == (WIDTH, HEIGHT, PINHOLE["cx"], PINHOLE["cy"])
     assert (
@@ -101,7 +101,7 @@ def test_points_land_where_a_pinhole_sees_them(tmp_path: Path, name: str) -> Non
 
 def test_every_pixel_has_data(tmp_path: Path) -> None:
     """At the smallest zoom the image of one edge touches the picture's, and none leaves it."""
-    view = load(dataset(tmp_path, LENSES["pincushion"]), "train", images="exr").views[0]
+    view = read_dataset(dataset(tmp_path, LENSES["pincushion"]), "train", images="exr").views[0]
     x = (np.array([0.5, WIDTH - 0.5]) - view.cx) / view.fx
     y = (np.array([0.5, HEIGHT - 0.5]) - view.cy) / view.fy
     corners = np.array([seen_by(LENSES["pincushion"], a, b) for a in x for b in y])
@@ -110,7 +110,7 @@ def test_every_pixel_has_data(tmp_path: Path) -> None:
 
 
 def test_alpha_and_maps_follow_the_picture(tmp_path: Path) -> None:
-    view = load(dataset(tmp_path, LENSES["barrel"], alpha=True), "train", images="exr").views[0]
+    view = read_dataset(dataset(tmp_path, LENSES["barrel"], alpha=True), "train", images="exr").views[0]
     assert view.alpha is not None and view.depth is not None
     np.testing.assert_allclose(view.image[..., 0] - (1 - view.alpha), view.alpha, atol=1e-6)
     for x, y in DOTS:
@@ -122,8 +122,8 @@ def test_alpha_and_maps_follow_the_picture(tmp_path: Path) -> None:
 
 def test_a_smaller_picture_has_the_same_camera(tmp_path: Path) -> None:
     folder = dataset(tmp_path, LENSES["pincushion"])
-    full = load(folder, "train", images="exr").views[0]
-    half = load(folder, "train", images="exr", downscale=2).views[0]
+    full = read_dataset(folder, "train", images="exr").views[0]
+    half = read_dataset(folder, "train", images="exr", downscale=2).views[0]
     np.testing.assert_allclose(
         [2 * half.fx, 2 * half.cx, 2 * half.cy], [full.fx, full.cx, full.cy], rtol=3e-3
     )
@@ -134,11 +134,11 @@ def test_a_smaller_picture_has_the_same_camera(tmp_path: Path) -> None:
 
 def test_zero_coefficients_change_no_pixel(tmp_path: Path) -> None:
     folder = dataset(tmp_path, {})
-    plain = load(folder, "train").views[0]
+    plain = read_dataset(folder, "train").views[0]
     zeros = dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0) | {"is_fisheye": False}
     content = json.loads((folder / "transforms_train.json").read_text()) | zeros
     (folder / "transforms_train.json").write_text(json.dumps(content))
-    view = load(folder, "train").views[0]
+    view = read_dataset(folder, "train").views[0]
     np.testing.assert_array_equal(view.image, plain.image)
     assert (view.fx, view.fy) == (plain.fx, plain.fy)
 
@@ -162,7 +162,7 @@ def test_zero_coefficients_change_no_pixel(tmp_path: Path) -> None:
 )
 def test_other_lenses_are_refused(tmp_path: Path, lens: dict[str, Any], words: list[str]) -> None:
     with pytest.raises(InputError) as caught:
-        load(dataset_of(tmp_path, lens), "train", images="exr")
+        read_dataset(dataset_of(tmp_path, lens), "train", images="exr")
     for word in (str(tmp_path / "transforms_train.json"), *words):
         assert word in str(caught.value)
 

@@ -17,8 +17,8 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import lobe as exact
 from mi_refgs.render.reflection import reflection
 from mi_refgs.shade import brdf
+from mi_refgs.shade.ggx_sampling import Lobe, lobe_point, lobe_turn
 from mi_refgs.shade.models import Accuracy, ShadingPoints
-from mi_refgs.shade.rays import Lobe, lobe_point, lobe_turn
 
 # ---------------- the points ----------------
 

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from image_checks import GRADIENT, HEIGHT, STEP, VALUE, WIDTH, check, gradient, planes, stack
 
+from mi_refgs.data.dataset import View
 from mi_refgs.fit import losses
-from mi_refgs.fit.data import View
 from mi_refgs.fit.objective import Target
 from mi_refgs.fit.ssim import ssim
 from mi_refgs.images import srgb_from_linear
 from mi_refgs.reference import losses as reference
+from mi_refgs.render import display
 
 
 @pytest.fixture
@@ -77,7 +78,7 @@ def test_a_floater_brighter_than_a_white_background_costs(covered: float) -> Non
     target = Target.of(view, np.ones(3))
     radiance = [mi.Float(np.full(16, 3.0)) for _ in range(3)]
     dr.enable_grad(radiance)
-    shown = losses.display_image(radiance, mi.Float(np.full(16, 0.5)), [1.0, 1.0, 1.0])
+    shown = display.display_image(radiance, mi.Float(np.full(16, 0.5)), [1.0, 1.0, 1.0])
     assert target.clipped is not None
     loss = losses.l1(losses.clip_highlights(shown, target.image, target.clipped), target.image)
     dr.backward(loss)
@@ -166,7 +167,7 @@ def test_srgb_matches_the_file_reader_and_has_a_slope_at_zero() -> None:
     linear = np.array([-0.1, 0, 1e-30, 0.001, 0.0031308, 0.0032, 0.5, 1, 4, 1000], dtype=np.float32)
     x = mi.Float(linear)
     dr.enable_grad(x)
-    y = losses.linear_to_srgb(x)
+    y = display.srgb_from_linear(x)
     dr.backward(y)
     np.testing.assert_allclose(np.array(y), srgb_from_linear(linear), rtol=2e-6, atol=1e-9)
     assert np.array(dr.grad(x))[1] == pytest.approx(12.92)
@@ -181,7 +182,7 @@ def test_display_image(rng: np.random.Generator) -> None:
     background = (1.0, 0.5, 0.0)
 
     def loss(x: list[Any]) -> Any:
-        image = losses.display_image(x[:3], x[3], background)
+        image = display.display_image(x[:3], x[3], background)
         return dr.sum(sum((a * b for a, b in zip(image, planes(weights), strict=True)), mi.Float(0)))
 
     rounded = weights.astype(np.float32)
@@ -195,7 +196,7 @@ def test_display_image(rng: np.random.Generator) -> None:
 def test_display_image_shows_the_background_of_empty_pixels() -> None:
     radiance, alpha = mi.Float(0, 0, 1e-9), mi.Float(0, 1e-7, 1e-8)
     dr.enable_grad(radiance, alpha)
-    (image,) = losses.display_image([radiance], alpha, (0.25,))
+    (image,) = display.display_image([radiance], alpha, (0.25,))
     dr.backward(image)
     np.testing.assert_allclose(np.array(image), 0.25, atol=1e-6)
     assert np.all(np.array(dr.grad(radiance)) == 0)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit import metrics
+from mi_refgs.evaluation import metrics
 from mi_refgs.fit.ssim import ssim as training_ssim
 from mi_refgs.images import write_exr
 from mi_refgs.reference import losses as reference

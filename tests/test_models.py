@@ -13,7 +13,7 @@ from helpers import check_slopes, level_maps, unit
 
 from mi_refgs.errors import InputError
 from mi_refgs.reference import shade as reference
-from mi_refgs.shade import brdf, lobe
+from mi_refgs.shade import brdf, lobe_matrices
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.models import ShadingPoints, reflect, safe_normalize, shade
 
@@ -58,7 +58,7 @@ def radiance() -> np.ndarray:
 def oracle(values: dict[str, Any], levels: list[np.ndarray], diffuse: str, k: int) -> np.ndarray:
     one: dict[str, Any] = {name: None if x is None else x[k] for name, x in values.items()}
     return reference.shade(
-        brdf.table().astype(np.float64), levels, lobe.LEVEL_ROUGHNESS, diffuse=diffuse, **one
+        brdf.table().astype(np.float64), levels, lobe_matrices.LEVEL_ROUGHNESS, diffuse=diffuse, **one
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mi_refgs.surfels.order import along_curve
+from mi_refgs.surfels.order import morton_order
 
 
 def steps(points: np.ndarray) -> float:
@@ -19,7 +19,7 @@ def test_neighbours_stand_together(rng: np.random.Generator, outlier: bool) -> N
     points = rng.uniform(-1, 3, (4096, 3)).astype(np.float32)
     if outlier:
         points[7] = 1e6
-    order = along_curve(points)
+    order = morton_order(points)
     assert sorted(order) == list(range(4096))
     kept = points[order][:-1] if outlier else points[order]
     assert steps(kept) < 0.15 * 4 < 0.4 * steps(rng.uniform(-1, 3, (4096, 3)))
@@ -27,4 +27,4 @@ def test_neighbours_stand_together(rng: np.random.Generator, outlier: bool) -> N
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.ones((1, 3)), np.ones((5, 3))])
 def test_points_without_extent_keep_their_order(points: np.ndarray) -> None:
-    np.testing.assert_array_equal(along_curve(points), np.arange(len(points)))
+    np.testing.assert_array_equal(morton_order(points), np.arange(len(points)))

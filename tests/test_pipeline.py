@@ -16,7 +16,7 @@ from mi_refgs.reference import shade as reference
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Frame, Shading, render
-from mi_refgs.shade import brdf, lobe
+from mi_refgs.shade import brdf, lobe_matrices
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
@@ -44,7 +44,7 @@ def discs(**channels: Any) -> Surfels:
 def seen_from(*origin: float, size: int = 1, focal: float = 8.0) -> Camera:
     """A camera of size × size pixels that looks at the origin."""
     pose = look_at(np.array(origin), np.zeros(3), up=(0, 1, 0))
-    return Camera.look(size, size, -focal, -focal, size / 2, size / 2, pose)
+    return Camera.from_pose(size, size, -focal, -focal, size / 2, size / 2, pose)
 
 
 def channel(frame: Frame, name: str) -> np.ndarray:
@@ -81,14 +81,20 @@ def test_pixels_are_shaded_by_the_oracle(at: Any, diffuse: Any) -> None:
 
     def shaded(**point: Any) -> np.ndarray:
         terms = reference.shade(
-            table, levels, lobe.LEVEL_ROUGHNESS, diffuse=diffuse, visibility=None, indirect=None, **point
+            table,
+            levels,
+            lobe_matrices.LEVEL_ROUGHNESS,
+            diffuse=diffuse,
+            visibility=None,
+            indirect=None,
+            **point,
         )
         return np.sum(terms, axis=0)
 
     raw = {name: values.astype(np.float64) for name, values in raw_channels().items()}
     to_world = look_at(np.array([3.0, 1, 2]), np.zeros(3))
     view = oracle.PinholeCamera(WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, to_world, near=0.01)
-    camera = Camera.look(WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, to_world, near=0.01)
+    camera = Camera.from_pose(WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, to_world, near=0.01)
     frame = render(Surfels.from_numpy(raw), camera, Shading(at=at, diffuse=diffuse), light)
 
     values = attributes(raw, to_world[:3, 3])

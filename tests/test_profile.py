@@ -17,12 +17,14 @@ from tiny_scene import SETTINGS, SIZE
 
 from mi_refgs import splat
 from mi_refgs.cli import main
-from mi_refgs.fit import config, optim, stages, train
-from mi_refgs.fit import data as data_module
-from mi_refgs.fit.advice import advice
-from mi_refgs.fit.config import LightOptions, Method
-from mi_refgs.fit.profile import Profile, StageProfile, Work, count_work, profile_stage
+from mi_refgs.data import dataset as data_module
+from mi_refgs.fit import optim, train
 from mi_refgs.fit.train import Trainer
+from mi_refgs.methods import config
+from mi_refgs.methods.config import LightOptions, Method
+from mi_refgs.profiling import phases
+from mi_refgs.profiling.advice import advice
+from mi_refgs.profiling.profile import Profile, StageProfile, Work, count_work, profile_stage
 from mi_refgs.shade import prefilter
 
 PAUSE = 0.25
@@ -34,7 +36,7 @@ def trainer(data: Path, method: Path) -> Trainer:
     """Stages up to iterations 30 and 60."""
     until = ["iterations=60", "stage.initial.until=30", "stage.deferred.until=60"]
     resolved = config.load(str(method), "quick", [*SETTINGS, *until])
-    return Trainer(resolved, data_module.load(data, "train"))
+    return Trainer(resolved, data_module.read_dataset(data, "train"))
 
 
 # ---------- Stages ----------
@@ -109,9 +111,9 @@ def test_time_is_booked_where_it_is_spent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(owner, name, planted)
-    monkeypatch.setattr(stages, "WARM_UP", 1)
+    monkeypatch.setattr(phases, "WARM_UP", 1)
     trainer.iteration = {"initial": 5, "deferred": 35}[at]
-    found = stages.stage_times(trainer, 3)
+    found = phases.phase_times(trainer, 3)
     assert found[stage] > 1e3 * PAUSE
     assert max(ms for other, ms in found.items() if other != stage) < 1e3 * PAUSE
 
@@ -128,14 +130,14 @@ def test_a_step_with_a_clock_is_the_same_step(
     data: Path, method: Path, one_thread: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Boundaries are identities: the table moves as in plain steps."""
-    monkeypatch.setattr(stages, "WARM_UP", 0)
+    monkeypatch.setattr(phases, "WARM_UP", 0)
     tables = []
     for timed in (False, True):
         resolved = config.load(str(method), "quick", [*SETTINGS, "iterations=40"])
-        trainer = Trainer(resolved, data_module.load(data, "train"))
+        trainer = Trainer(resolved, data_module.read_dataset(data, "train"))
         trainer.iteration = 1
         if timed:
-            stages.stage_times(trainer, 1)
+            phases.phase_times(trainer, 1)
         else:
             trainer.step()
         tables.append(trainer.surfels.to_numpy())
@@ -158,7 +160,7 @@ def test_of_a_run(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert files(finished) == before  # nothing is written
     (stage,) = found["stages"]
     assert stage["name"] == "deferred" and stage["misses"] >= 0 and stage["launches"] > 10
-    assert list(stage["stages_ms"]) == list(stages.STAGES)
+    assert list(stage["stages_ms"]) == list(phases.PHASES)
     assert 0 < stage["step_ms"] and all(ms >= 0 for ms in stage["stages_ms"].values())
     work = found["work"]
     assert work["views"] == 3 and work["pixels"] == SIZE**2 and 0 < work["covered"] <= SIZE**2
@@ -173,7 +175,7 @@ def test_of_a_data_set(data: Path, method: Path, capsys: pytest.CaptureFixture[s
     said = capsys.readouterr().out
     head = said.splitlines()[0].split()
     assert head[-2:] == ["initial", "deferred"]
-    for part in (*stages.STAGES, "undisturbed step", "kernel launches", "that contribute"):
+    for part in (*phases.PHASES, "undisturbed step", "kernel launches", "that contribute"):
         assert part in said
 
 
@@ -229,7 +231,7 @@ def test_work_is_counted_over_views(trainer: Trainer) -> None:
 
 def quiet_profile() -> Profile:
     """One that nothing can be said about."""
-    stage = StageProfile("deferred", 10.0, 60, 0, dict.fromkeys(stages.STAGES, 1.0))
+    stage = StageProfile("deferred", 10.0, 60, 0, dict.fromkeys(phases.PHASES, 1.0))
     work = Work(8, 1000, 4e4, 16, 2e4, 5e4, 8e5, 4e5, 0.1, 0.1, 0.1, 2.0, 40.0)
     return Profile((stage,), work, 2**20, 2**34)
 

@@ -11,8 +11,8 @@ import pytest
 
 from mi_refgs.errors import InputError
 from mi_refgs.fit import refine
-from mi_refgs.fit.config import Refine
 from mi_refgs.fit.optim import Adam, Group
+from mi_refgs.methods.config import Refine
 from mi_refgs.surfels.init import logit
 from mi_refgs.surfels.table import Surfels
 
@@ -36,7 +36,7 @@ def table(count: int = 6, scale: float = 0.005, opacity: float = 0.8) -> Surfels
 
 def densify(
     surfels: Surfels, gradient: np.ndarray, max_count: int = 100, extent: float = 1.0
-) -> refine.Edited:
+) -> refine.TableEdit:
     return refine.densify_and_prune(surfels, gradient, extent, OPTIONS, max_count, np.random.default_rng(1))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mi_refgs import rows as rows_module
-from mi_refgs.rows import Rows, columns_of
+from mi_refgs.rows import PackedRows, columns_of
 
 ROWS = 37
 
@@ -43,7 +43,7 @@ def test_rows_pack_fetch_and_add(width: int, copies: int, monkeypatch: pytest.Mo
     monkeypatch.setattr(rows_module, "COPIES_BYTES", copies)
     rng = np.random.default_rng(width)
     table = rng.normal(size=(ROWS, width)).astype(np.float32)
-    rows = Rows.pack([mi.Float(np.ascontiguousarray(column)) for column in table.T])
+    rows = PackedRows.pack([mi.Float(np.ascontiguousarray(column)) for column in table.T])
     np.testing.assert_array_equal(rows.unpadded().numpy().reshape(ROWS, width), table)
     np.testing.assert_array_equal(np.stack([c.numpy() for c in rows.columns()], axis=1), table)
 
@@ -53,7 +53,7 @@ def test_rows_pack_fetch_and_add(width: int, copies: int, monkeypatch: pytest.Mo
     expected = np.where(active[:, None], table[picked], 0)
     np.testing.assert_array_equal(np.stack([c.numpy() for c in fetched[:width]], axis=1), expected)
 
-    sums = Rows.zeros(ROWS, width)
+    sums = PackedRows.zeros(ROWS, width)
     sums.add(mi.UInt32(picked), [mi.Float(np.ascontiguousarray(c)) for c in table[picked].T], mi.Bool(active))
     expected = np.zeros_like(table)
     np.add.at(expected, picked[active], table[picked][active])
@@ -68,7 +68,7 @@ def test_copies_of_a_gradient_are_bounded(
     used = []
     monkeypatch.setattr(dr, "thread_count", lambda: threads)
     monkeypatch.setattr(dr, "scatter_add", lambda *_, mode: used.append(mode))
-    Rows(mi.Float(0) + dr.zeros(mi.Float, 24_000_000), 1_000_000, 24).add(
+    PackedRows(mi.Float(0) + dr.zeros(mi.Float, 24_000_000), 1_000_000, 24).add(
         mi.UInt32(0), [mi.Float(1)] * 24, True
     )
     assert set(used) == {mode}

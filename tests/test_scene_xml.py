@@ -13,12 +13,12 @@ import pytest
 from integrator_scenes import HEIGHT, WIDTH, image, plane_mesh, raw_channels, sensor, sky
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit.export import Fitted, export
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Shading
 from mi_refgs.render.reflection import mirror_visibility
 from mi_refgs.render.scene_xml import write_scene_xml
+from mi_refgs.runs.export import TrainedScene, export
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.models import Accuracy
 from mi_refgs.splat.camera import Camera
@@ -28,19 +28,19 @@ OTHER: dict[str, Any] = {"dominant": True, "multiscatter": True, "visibility_ray
 """A value for each option that is not its default."""
 
 
-def fitted(folder: Path, shading: Shading) -> Fitted:
+def fitted(folder: Path, shading: Shading) -> TrainedScene:
     mesh = read_mesh(plane_mesh(folder)) if shading.occlusion else None
     surfels = Surfels.from_numpy(raw_channels())
-    return Fitted(surfels, EnvironmentLight.from_radiance(sky()), mesh, shading, 7, 1.5)
+    return TrainedScene(surfels, EnvironmentLight.from_radiance(sky()), mesh, shading, 7, 1.5)
 
 
 def view(ratio: float = 1.0, sign: float = -1.0, cx: float = WIDTH / 2, cy: float = HEIGHT / 2) -> Camera:
     """Focal lengths of 18 · ratio and 18 pixels."""
     pose = np.array(sensor()["to_world"].matrix)
-    return Camera.look(WIDTH, HEIGHT, sign * 18 * ratio, sign * 18, cx, cy, pose)
+    return Camera.from_pose(WIDTH, HEIGHT, sign * 18 * ratio, sign * 18, cx, cy, pose)
 
 
-def shown(folder: Path, made: Fitted, camera: Camera) -> tuple[mi.Scene, np.ndarray, np.ndarray]:
+def shown(folder: Path, made: TrainedScene, camera: Camera) -> tuple[mi.Scene, np.ndarray, np.ndarray]:
     """The exported scene, its picture, and that of the fit."""
     export(made, folder, camera)
     scene = mi.load_file(str(folder / "scene.xml"))
@@ -55,7 +55,7 @@ def test_every_option_of_accuracy_goes_round(option: str, tmp_path: Path) -> Non
     shading = Shading(diffuse="irradiance", occlusion=True, accuracy=Accuracy(**{option: OTHER[option]}))
     made = fitted(tmp_path, shading)
     scene, seen, expected = shown(tmp_path, made, view())
-    assert scene.integrator().shading == shading and Fitted.read(tmp_path).shading == shading
+    assert scene.integrator().shading == shading and TrainedScene.read(tmp_path).shading == shading
     np.testing.assert_allclose(seen, expected, atol=1e-5)
     plain = replace(made, shading=replace(shading, accuracy=Accuracy())).renderer()(view())
     assert np.abs(plain.radiance.numpy().T.reshape(HEIGHT, WIDTH, 3) - seen[..., :3]).max() > 1e-3
@@ -101,7 +101,7 @@ def pixels(camera: Camera, point: Any) -> np.ndarray:
 
 
 def test_what_no_scene_can_say_is_refused(tmp_path: Path) -> None:
-    camera = Camera.look(8, 8, 10, -10, 4, 4, np.eye(4))
+    camera = Camera.from_pose(8, 8, 10, -10, 4, 4, np.eye(4))
     with pytest.raises(InputError, match="fx, fy: 10 and -10 pixels mirror"):
         write_scene_xml(tmp_path / "scene.xml", ply="a.ply", shading=Shading(), camera=camera)
     with pytest.raises(InputError, match="cannot be written"):

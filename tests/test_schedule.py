@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mi_refgs.fit.config import Method, Stage, SurfelOptions, Window
 from mi_refgs.fit.schedule import Schedule
+from mi_refgs.methods.config import Method, Stage, SurfelOptions, Window
 
 
 def schedule(seed: int = 0, views: int = 7) -> Schedule:

@@ -10,7 +10,7 @@ import pytest
 from integrator_scenes import image, raw_channels, scene
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit.config import load
+from mi_refgs.methods.config import load
 from mi_refgs.render.pipeline import Shading, render
 from mi_refgs.shade.models import Accuracy
 from mi_refgs.splat.camera import Camera
@@ -88,7 +88,7 @@ def test_what_is_not_allowed_together_is_refused(options: dict, words: str) -> N
 
 def test_rendering_without_what_it_needs_is_refused() -> None:
     surfels = Surfels.from_numpy(raw_channels())
-    camera = Camera.look(4, 4, -4, -4, 2, 2, np.eye(4))
+    camera = Camera.from_pose(4, 4, -4, -4, 2, 2, np.eye(4))
     with pytest.raises(InputError, match="light: reflectance = split_sum needs one"):
         render(surfels, camera, Shading())
     with pytest.raises(InputError, match="there is no mesh to trace"):

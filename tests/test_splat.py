@@ -38,7 +38,7 @@ class Scene:
 
     def fast_camera(self) -> Camera:
         c = self.camera
-        return Camera.look(c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.to_world, c.near)
+        return Camera.from_pose(c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.to_world, c.near)
 
     def surfels(self) -> Surfels:
         return Surfels.from_numpy(self.raw)
@@ -430,7 +430,7 @@ def full_screen(count: int, size: int) -> tuple[Surfels, Camera]:
         "scale": np.full((count, 2), 4.0),
         "opacity": np.zeros((count, 1)),
     }
-    return Surfels.from_numpy(raw), Camera.look(size, size, -500, -500, size / 2, size / 2, np.eye(4))
+    return Surfels.from_numpy(raw), Camera.from_pose(size, size, -500, -500, size / 2, size / 2, np.eye(4))
 
 
 @pytest.mark.parametrize("chunk", [1, 100, 20_000])
@@ -500,7 +500,9 @@ def test_the_cut_biases_gradients_by_what_is_documented(opacity: float) -> None:
         surfels = Surfels.from_numpy(raw)
         surfels.enable_grad()
         centre = (size / 2 + x / places, size / 2 + y / places)
-        total = dr.sum(splat(surfels, [], Camera.look(size, size, -focal, -focal, *centre, np.eye(4))).alpha)
+        total = dr.sum(
+            splat(surfels, [], Camera.from_pose(size, size, -focal, -focal, *centre, np.eye(4))).alpha
+        )
         dr.backward(total)
         mass += float(total[0]) / places**2
         by_size += dr.grad(surfels.raw["scale"]).numpy().sum() / places**2

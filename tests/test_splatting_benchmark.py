@@ -20,7 +20,7 @@ from benchmarks.splatting.turns import turns
 from benchmarks.splatting.volprim import Volprim
 from benchmarks.splatting.workload import FEATURES, Workload, sphere
 from mi_refgs.constants import ALPHA_MIN, TRANSMITTANCE_MIN
-from mi_refgs.fit.counts import Counts
+from mi_refgs.profiling.counts import Counts
 from mi_refgs.reference import splat as oracle
 from mi_refgs.splat import list_by_tile, project
 from mi_refgs.surfels.table import Surfels

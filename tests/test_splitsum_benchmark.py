@@ -21,7 +21,7 @@ from benchmarks.common.select import where
 from benchmarks.splitsum import decompose, methods, speedup, surfels
 from mi_refgs.errors import InputError
 from mi_refgs.reference.shade import lobe_average, split_sum
-from mi_refgs.shade import lobe
+from mi_refgs.shade import lobe_matrices
 
 Row = dict[str, Any]
 
@@ -272,12 +272,12 @@ def test_lights_have_a_mean_of_one_and_rise_in_frequency() -> None:
     made = [lights.make_light(name, 64) for name in lights.BUILT_IN]
     for light in made:
         assert light.radiance.shape == (64, 128, 3)
-        mean = np.average(light.radiance.mean((1, 2)), weights=lobe.row_areas(64))
+        mean = np.average(light.radiance.mean((1, 2)), weights=lobe_matrices.row_areas(64))
         assert mean == pytest.approx(1, rel=2e-3)
     sky = made[-1].radiance.mean(-1)
     row, column = np.unravel_index(sky.argmax(), sky.shape)
-    elevation = 90 - np.degrees(lobe.row_angles(64)[row])
-    azimuth = np.degrees(lobe.column_angles(128)[column])
+    elevation = 90 - np.degrees(lobe_matrices.row_angles(64)[row])
+    azimuth = np.degrees(lobe_matrices.column_angles(128)[column])
     assert elevation == pytest.approx(lights.SUN_ELEVATION, abs=3)
     assert azimuth == pytest.approx(lights.SUN_AZIMUTH % 360, abs=3)
     assert made[0].frequency() == 0 < made[1].frequency() < made[-1].frequency()
@@ -362,11 +362,11 @@ def test_other_levels_leave_nothing_behind() -> None:
             if fail:
                 raise KeyError
 
-    shipped = lobe.LEVEL_ROUGHNESS
+    shipped = lobe_matrices.LEVEL_ROUGHNESS
     use(False)
     with pytest.raises(KeyError):
         use(True)
-    assert lobe.LEVEL_ROUGHNESS == shipped
+    assert lobe_matrices.LEVEL_ROUGHNESS == shipped
     np.testing.assert_array_equal(np.array(light.prefilter().levels), before)
 
 

@@ -38,9 +38,9 @@ from mi_refgs.reference import shade as reference
 from mi_refgs.render import reflection
 from mi_refgs.shade import brdf
 from mi_refgs.shade.envmap import EnvironmentLight, PrefilteredLight
-from mi_refgs.shade.lobe import LEVEL_ROUGHNESS
+from mi_refgs.shade.ggx_sampling import Lobe
+from mi_refgs.shade.lobe_matrices import LEVEL_ROUGHNESS
 from mi_refgs.shade.models import Accuracy, ShadingPoints, shade
-from mi_refgs.shade.rays import Lobe
 from mi_refgs.surfels.table import Surfels
 
 # ---------------- materials on the mesh ----------------
@@ -75,7 +75,7 @@ def test_materials_of_the_surfels_reach_the_hits() -> None:
     hit = occluder.closest(origin, mi.Vector3f(-1, 0, 0), mi.Vector3f(1, 0, 0))
     assert dr.all(hit.valid)
     np.testing.assert_allclose(hit.point.numpy(), [0 * y, y, z], atol=1e-5)
-    found = occluder.surface(surfels).at(hit.triangle, hit.place, hit.valid)
+    found = occluder.surface(surfels).at(hit.triangle, hit.barycentric, hit.valid)
     expected = np.stack([0.2 + 0.4 * y, 0.5 + 0.2 * z, np.full(500, 0.3)])
     np.testing.assert_allclose(found.albedo.numpy(), expected, atol=0.02)
     np.testing.assert_allclose(found.metallic.numpy(), 1 / (1 + np.e), rtol=1e-5)
@@ -83,7 +83,11 @@ def test_materials_of_the_surfels_reach_the_hits() -> None:
     distance = np.linalg.norm(position[np.array(found.surfel)][:, 1:] - np.stack([y, z], 1), axis=1)
     assert distance.max() < 0.35  # half a cell's diagonal
     missed = occluder.closest(origin, mi.Vector3f(1, 0, 0), mi.Vector3f(1, 0, 0))
-    assert not dr.any(missed.valid) and dr.all(missed.triangle == 0) and dr.all(missed.place == 0, axis=None)
+    assert (
+        not dr.any(missed.valid)
+        and dr.all(missed.triangle == 0)
+        and dr.all(missed.barycentric == 0, axis=None)
+    )
 
 
 def test_vertices_mix_surfels_by_opacity_and_footprint() -> None:
@@ -388,7 +392,7 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
         return seen(points, place, accuracy, Surfels(changed), light, diffuse, occluder, LOW_EYE).indirect
 
     kept: list[Any] = []
-    held_back = reflection._held_back
+    held_back = reflection._firefly_clamp
 
     def keep(*arguments: Any) -> Any:
         if not kept:
@@ -397,7 +401,7 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
         return kept[0]
 
     assert max(lengths(place, mirrored(place, LOW_EYE)[:, 0])) > 1
-    monkeypatch.setattr(reflection, "_held_back", keep)
+    monkeypatch.setattr(reflection, "_firefly_clamp", keep)
 
     base = leaves[name].numpy().copy()
     step = rng.normal(size=base.shape).astype(np.float32)

@@ -15,14 +15,15 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
-from mi_refgs.fit import config, train
-from mi_refgs.fit.config import Method
-from mi_refgs.fit.data import Dataset, View
-from mi_refgs.fit.interrupt import TerminatedError, held_interrupts
-from mi_refgs.fit.record import Run
+from mi_refgs.fit import train
 from mi_refgs.fit.train import Trainer
+from mi_refgs.methods import config
+from mi_refgs.methods.config import Method
 from mi_refgs.reference.camera import look_at
+from mi_refgs.runs.interrupt import TerminatedError, held_interrupts
+from mi_refgs.runs.run import Run
 
 SIZE = 24
 

@@ -41,7 +41,7 @@ def ring_of_views(where: np.ndarray) -> list[np.ndarray]:
 
 
 def camera(pose: np.ndarray) -> Camera:
-    return Camera.look(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose)
+    return Camera.from_pose(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose)
 
 
 def fuse(
@@ -190,7 +190,7 @@ def test_all_views_share_one_kernel() -> None:
 
     def views(size: int, count: int) -> Iterator[Camera]:
         for p in pose[:count]:
-            yield Camera.look(size, size, -FOCAL, -FOCAL, size / 2, size / 2, p)
+            yield Camera.from_pose(size, size, -FOCAL, -FOCAL, size / 2, size / 2, p)
 
     def run(size: int, count: int, shift: float) -> None:
         image = [dr.full(mi.Float, 4, size * size)] * count

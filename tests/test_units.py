@@ -14,11 +14,11 @@ import trimesh
 from integrator_scenes import COUNT, image, raw_channels, scene, sensor, sky
 from tiny_scene import write_data
 
-from mi_refgs.fit import config
-from mi_refgs.fit.data import Dataset, load
+from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.fit.initial import initial_surfels
 from mi_refgs.fit.optim import Adam, Group
 from mi_refgs.fit.schedule import Schedule
+from mi_refgs.methods import config
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points
 from mi_refgs.occlusion.visibility import Occluder
@@ -60,7 +60,7 @@ def wall(scale: float) -> Mesh:
 def camera(scale: float) -> Camera:
     to_world = look_at(EYE, np.zeros(3))
     to_world[:3, 3] *= scale
-    return Camera.look(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world, 0.01 * scale)
+    return Camera.from_pose(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world, 0.01 * scale)
 
 
 def rendered(scale: float, shading: Shading) -> tuple[Surfels, Frame, Any, Any]:
@@ -109,7 +109,7 @@ def test_a_scaled_scene_is_the_same_through_the_plugin(scale: float, tmp_path: P
 def test_initial_surfels_of_a_scaled_data_set_are_the_same(scale: float, tmp_path: Path) -> None:
     scale = 2.0 ** round(np.log2(scale))  # exact, so that no point changes its place in the table
     write_data(tmp_path, views=4)
-    small = load(tmp_path, "train")
+    small = read_dataset(tmp_path, "train")
     for name in ("train", "test"):
         file = tmp_path / f"transforms_{name}.json"
         content = json.loads(file.read_text())
@@ -118,7 +118,7 @@ def test_initial_surfels_of_a_scaled_data_set_are_the_same(scale: float, tmp_pat
             matrix[:3, 3] *= scale
             frame["transform_matrix"] = matrix.tolist()
         file.write_text(json.dumps(content))
-    large = load(tmp_path, "train")
+    large = read_dataset(tmp_path, "train")
     assert large.scene_extent == pytest.approx(scale * small.scene_extent)
     assert large.views[0].camera().near[0] == pytest.approx(scale * small.views[0].camera().near[0])
 
@@ -172,7 +172,7 @@ def test_far_from_the_origin_the_camera_is_as_exact_as_the_surfels(shift: float)
     to_world = look_at(EYE + away + 0.003 * rng.uniform(size=3), away)
     pinhole = oracle.PinholeCamera(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world)
     expected = oracle.splat(raw, np.zeros((COUNT, 0)), pinhole)
-    view = Camera.look(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world, 0.01)
+    view = Camera.from_pose(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world, 0.01)
     maps = splat(Surfels.from_numpy(raw), [], view)
     keep = ~expected.band
     assert keep.mean() > 0.95 and np.abs(expected.alpha).max() > 0.5

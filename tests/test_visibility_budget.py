@@ -78,7 +78,7 @@ def random_chains(rng: np.random.Generator) -> list[list[Step]]:
 
     exact = budget.Exact(picture(), light(), light(), light())
     shipped = budget.Shipped(picture(), picture(), picture())
-    fitted = budget.Fitted(picture(), picture(), (picture(), picture()))
+    fitted = budget.TrainedScene(picture(), picture(), (picture(), picture()))
     traced = budget.Traced(picture(), picture(), picture())
     return [budget.by_harmonics(shipped, exact, fitted), budget.by_tracing(shipped, exact, traced)]
 
@@ -132,7 +132,7 @@ def test_inputs_that_agree_leave_nothing(rng: np.random.Generator) -> None:
 
     exact = budget.Exact(visibility, light(free), light(visibility * free), light(blocked))
     shipped = budget.Shipped(free, scale, whole)
-    fitted = budget.Fitted(sh, blocked, (sh, sh))
+    fitted = budget.TrainedScene(sh, blocked, (sh, sh))
     traced = budget.Traced(whole, whole, blocked)
     cases = {
         (): (shipped, exact, traced),

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.fit.config import PRESETS
-from mi_refgs.fit.frames import MITSUBA_FROM_OPENGL
+from mi_refgs.data.transforms import MITSUBA_FROM_OPENGL
 from mi_refgs.images import write_exr, write_png
+from mi_refgs.methods.config import PRESETS
 from mi_refgs.reference.camera import look_at
 
 SIZE = 20

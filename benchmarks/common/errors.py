@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.common.montecarlo import Estimate
-from mi_refgs.fit import metrics
+from mi_refgs.evaluation import metrics
 from mi_refgs.images import srgb_from_linear
 
 DARK = 0.01

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.shade import lobe
+from mi_refgs.shade import lobe_matrices
 from mi_refgs.shade.envmap import RADIANCE_FLOOR, EnvironmentLight
 
 ROOT = Path(__file__).parents[2]
@@ -42,7 +42,9 @@ class Light:
 
     def environment(self, height: int) -> EnvironmentLight:
         """The light as the product holds it, averaged down to `height` rows."""
-        rows = self.radiance if height == len(self.radiance) else lobe.resample(self.radiance, height)
+        rows = (
+            self.radiance if height == len(self.radiance) else lobe_matrices.resample(self.radiance, height)
+        )
         return EnvironmentLight.from_radiance(rows)
 
     def prefiltered(self, height: int) -> Any:
@@ -55,10 +57,10 @@ class Light:
         """Angular frequency: root mean square of the gradient over the mean radiance, 1/radian."""
         grey = self.radiance.mean(-1).astype(np.float64)
         h = len(grey)
-        sine = np.maximum(np.sin(lobe.row_angles(h)), 0.5 * np.pi / h)[:, None]
+        sine = np.maximum(np.sin(lobe_matrices.row_angles(h)), 0.5 * np.pi / h)[:, None]
         down = np.gradient(grey, axis=0) * (h - 1) / np.pi
         along = 0.5 * (np.roll(grey, -1, 1) - np.roll(grey, 1, 1)) * h / np.pi / sine
-        weight = lobe.row_areas(h)[:, None]
+        weight = lobe_matrices.row_areas(h)[:, None]
         return float(np.sqrt(np.sum(weight * (down**2 + along**2)) / np.sum(weight * np.ones_like(grey))))
 
 
@@ -121,6 +123,6 @@ def make_light(name: str, height: int) -> Light:
         raise InputError(
             f"{name}: light: neither one of {', '.join(BUILT_IN)} nor a file; give an EXR or HDR file"
         )
-    mean = float(np.average(radiance.mean((1, 2)), weights=lobe.row_areas(height)))
+    mean = float(np.average(radiance.mean((1, 2)), weights=lobe_matrices.row_areas(height)))
     radiance = np.maximum(radiance / mean, RADIANCE_FLOOR)
     return Light(Path(name).stem, radiance.astype(np.float32))

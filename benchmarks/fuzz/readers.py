@@ -246,14 +246,14 @@ def _transforms(folder: Path) -> list[bytes]:
 
 
 def _read_transforms(path: Path) -> None:
-    from mi_refgs.fit.data import load
+    from mi_refgs.data.dataset import read_dataset
 
-    for view in load(path.parent, "train").views:
+    for view in read_dataset(path.parent, "train").views:
         _finite(view.image, view.alpha, view.depth, view.to_world, [view.fx, view.fy, view.cx, view.cy])
 
 
 def _methods(folder: Path) -> list[bytes]:
-    from mi_refgs.fit import config
+    from mi_refgs.methods import config
     from mi_refgs.resources import resource_dir
 
     shipped = [path.read_bytes() for path in sorted(resource_dir("variants").glob("*.toml"))]
@@ -262,7 +262,7 @@ def _methods(folder: Path) -> list[bytes]:
 
 
 def _read_method(path: Path) -> None:
-    from mi_refgs.fit import config
+    from mi_refgs.methods import config
 
     method = config.load(str(path), "quick", ["loss.ssim=0.3"])
     assert config.dump(method)
@@ -289,7 +289,7 @@ def _state() -> dict[str, np.ndarray]:
 
 
 def _checkpoints(folder: Path) -> list[bytes]:
-    from mi_refgs.fit import checkpoint
+    from mi_refgs.runs import checkpoint
 
     class Code:
         def __reduce__(self) -> tuple[Any, ...]:
@@ -306,15 +306,15 @@ def _sign(data: bytes) -> bytes:
 
 
 def _read_checkpoint(path: Path) -> None:
-    from mi_refgs.fit import config
-    from mi_refgs.fit.export import Fitted
-    from mi_refgs.fit.record import Run
+    from mi_refgs.methods import config
+    from mi_refgs.runs.export import TrainedScene
+    from mi_refgs.runs.run import Run
 
     (path.parent / "checkpoints").mkdir(exist_ok=True)
     path.replace(path.parent / "checkpoints" / "0000003.npz")
     state = Run(path.parent).load_checkpoint()
     assert state is not None
-    Fitted.from_state(config.load("ref_gaussian"), state)
+    TrainedScene.from_state(config.load("ref_gaussian"), state)
 
 
 def _models(folder: Path) -> list[bytes]:
@@ -334,17 +334,17 @@ def _models(folder: Path) -> list[bytes]:
 
 
 def _read_model(path: Path) -> None:
-    from mi_refgs.fit.export import Fitted
+    from mi_refgs.runs.export import TrainedScene
 
-    fitted = Fitted.read(path.parent)
+    fitted = TrainedScene.read(path.parent)
     assert isinstance(fitted.iteration, int) and np.isfinite(fitted.seconds)
 
 
 def _read_data_place(path: Path) -> None:
     """dataset.json of a run names a folder; only what lies there as a data set is read."""
-    from mi_refgs.fit import config
-    from mi_refgs.fit.evaluate import load_split
-    from mi_refgs.fit.record import Run
+    from mi_refgs.evaluation.evaluate import load_split
+    from mi_refgs.methods import config
+    from mi_refgs.runs.run import Run
 
     load_split(Run(path.parent), config.load("ref_gaussian"), "train")
 
@@ -361,7 +361,7 @@ def _settings(folder: Path) -> list[bytes]:
 
 def _read_settings(path: Path) -> None:
     """dataset.json of a data set, before it is written anew."""
-    from mi_refgs.fit.dataset import Settings, _prepare_folder
+    from mi_refgs.data.make_dataset import Settings, _prepare_folder
 
     (path.parent / "transforms_train.json").write_text("{}")
     _prepare_folder(path.parent, Settings("a.xml", "0", 3, 1, 8, 1, 0, 3, (-30.0, 80.0), 40.0, 0.9, 0), False)
@@ -373,7 +373,7 @@ def _logs(folder: Path) -> list[bytes]:
 
 
 def _read_log(path: Path) -> None:
-    from mi_refgs.fit.record import Run
+    from mi_refgs.runs.run import Run
 
     Run(path.parent).rewind(5)
 

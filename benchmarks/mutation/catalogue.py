@@ -321,8 +321,8 @@ _SHADE = [
         ),
         (
             "light: irradiance is the level before the last",
-            "mi.UInt32(len(lobe.LEVEL_ROUGHNESS)))",
-            "mi.UInt32(len(lobe.LEVEL_ROUGHNESS) - 1))",
+            "mi.UInt32(len(lobe_matrices.LEVEL_ROUGHNESS)))",
+            "mi.UInt32(len(lobe_matrices.LEVEL_ROUGHNESS) - 1))",
             "test_envmap.py::test_irradiance_is_the_cosine_integral",
         ),
         (
@@ -333,7 +333,7 @@ _SHADE = [
         ),
     ),
     *_in(
-        "shade/lobe.py",
+        "shade/lobe_matrices.py",
         (
             "prefilter: texels at the poles weigh as others",
             "@ transform * np.sin(θ[near])[:, None]",
@@ -441,7 +441,7 @@ _LOSSES = [
         ),
     ),
     *_in(
-        "fit/losses.py",
+        "render/display.py",
         (
             "sRGB: exponent 2.2",
             "linear), 1 / 2.4) - 0.055",
@@ -456,16 +456,19 @@ _LOSSES = [
         ),
         (
             "sRGB: composited before it is encoded",
-            "alpha * linear_to_srgb(plane * inverse) + (1 - alpha) * behind",
-            "linear_to_srgb(plane + (1 - alpha) * behind)",
+            "alpha * srgb_from_linear(plane * inverse) + (1 - alpha) * behind",
+            "srgb_from_linear(plane + (1 - alpha) * behind)",
             "test_losses.py::test_display_image",
         ),
         (
             "alpha: display divides by it twice",
-            "linear_to_srgb(plane * inverse)",
-            "linear_to_srgb(plane * inverse * inverse)",
+            "srgb_from_linear(plane * inverse)",
+            "srgb_from_linear(plane * inverse * inverse)",
             "test_losses.py::test_display_image",
         ),
+    ),
+    *_in(
+        "fit/losses.py",
         (
             "loss: a white background counts as a highlight",
             "plane - (1 - alpha) * behind >= SATURATED * alpha",
@@ -633,7 +636,7 @@ _OPTIMISER = [
 
 _CONFIGURATION = [
     *_in(
-        "fit/config.py",
+        "methods/config.py",
         (
             "schedule: windows forget their start",
             "self._newest(iteration) - math.floor(self.start / self.every + TIE)",
@@ -672,7 +675,7 @@ _CONFIGURATION = [
         ),
     ),
     *_in(
-        "fit/checkpoint.py",
+        "runs/checkpoint.py",
         (
             "checkpoint: the checksum is not compared",
             " or hashlib.sha256(content).hexdigest().encode() != digest:",
@@ -687,7 +690,7 @@ _CONFIGURATION = [
         ),
     ),
     *_in(
-        "fit/record.py",
+        "runs/run.py",
         (
             "resume: the last line of the log is lost",
             "if _logged(line) <= iteration",
@@ -738,7 +741,7 @@ _FILES = [
         "surfels/init.py",
     ),
     *_in(
-        "fit/frames.py",
+        "data/transforms.py",
         (
             "data: axes of OpenCV's camera",
             "np.diag([-1.0, 1.0, -1.0, 1.0])",
@@ -765,7 +768,7 @@ _FILES = [
         ),
     ),
     *_in(
-        "fit/lens.py",
+        "data/lens.py",
         (
             "lens: p1 and p2 swapped",
             "factor, (p1, p2) = self._series(square)",
@@ -774,7 +777,7 @@ _FILES = [
         ),
     ),
     *_in(
-        "fit/pathtrace.py",
+        "data/pathtrace.py",
         (
             "environment.exr: columns run backwards",
             "dr.cos(theta), -dr.sin(theta) * dr.cos(phi))",
@@ -783,7 +786,7 @@ _FILES = [
         ),
     ),
     *_in(
-        "fit/metrics.py",
+        "evaluation/metrics.py",
         (
             "metrics: PSNR from the root of the error",
             "return PSNR_MAX if error <= 0 else min(PSNR_MAX, -10",

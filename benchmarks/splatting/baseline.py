@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.report import write_json
-from benchmarks.splatting.measure import BASELINE, STAGES
+from benchmarks.splatting.measure import BASELINE, PHASES
 from benchmarks.splatting.page_tables import BACKWARD
 
-KEPT = ("case", "surfels", "size", "spread", "forward_ms", "both_ms", *(f"{stage}_ms" for stage in STAGES))
+KEPT = ("case", "surfels", "size", "spread", "forward_ms", "both_ms", *(f"{stage}_ms" for stage in PHASES))
 
 
 def baseline(result: dict[str, Any]) -> dict[str, Any]:

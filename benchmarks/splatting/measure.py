@@ -22,7 +22,7 @@ from benchmarks.splatting.workload import COLOUR, FEATURES, Workload, fitted, sp
 from benchmarks.step import step_times
 
 BASELINE = Path(__file__).with_name("baseline.json")
-STAGES = ("project", "bin", "sort", "blend", "adjoint", "scatter", "project backward")
+PHASES = ("project", "bin", "sort", "blend", "adjoint", "scatter", "project backward")
 STAGE_REPEATS = 5
 MEMORY = ("surfels", "pairs", "pixels")
 """What peak memory is linear in."""
@@ -118,7 +118,7 @@ def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row
     kinds = ("forward", "both")
     for name in ("", "colour_", "volprim_", "raster_"):
         row |= {f"{name}{kind}_ms": times.get(f"{name}{kind}") for kind in kinds}
-    row |= {f"{stage}_ms": stages[stage] for stage in STAGES}
+    row |= {f"{stage}_ms": stages[stage] for stage in PHASES}
     row |= {f"bound_{kind}_ms": bound[kind] for kind in kinds}
     row |= {f"bytes_{kind}": moved[kind] for kind in kinds}
     row |= {f"launches_{kind}": launches[kind][0] for kind in kinds}

@@ -14,8 +14,8 @@ import numpy as np
 
 from benchmarks.splatting.workload import Workload
 from mi_refgs.device import upload
-from mi_refgs.fit.counts import Counts, count
 from mi_refgs.fit.train import Trainer
+from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.render import pipeline
 from mi_refgs.splat import Blended, Camera, blend, list_by_tile, project, splat
 from mi_refgs.surfels.table import GEOMETRY, Surfels

@@ -61,7 +61,7 @@ def _how(result: dict[str, Any]) -> str:
     settings, machine, peaks = result["settings"], result["machine"], result["peaks"]
     channels = ", ".join(f"{name} {width}" for name, width in CHANNELS.items())
     scenes = ", ".join(f"`{Path(name).name}`" for name in settings["scenes"])
-    fitted = f"Fitted scenes: {scenes}, their own surfels in their first test view." if scenes else ""
+    fitted = f"TrainedScene scenes: {scenes}, their own surfels in their first test view." if scenes else ""
     items = [
         f"""**Surfels** N random ones on the unit sphere, touching it, standard deviation k · √(4π/N), opacity
         0.8, random features; camera at distance 4, field of view 40°, one sample a pixel. {fitted}""",

@@ -6,7 +6,7 @@ from typing import Any
 
 from benchmarks.common.report import number, percent, table
 from benchmarks.splatting.errors import PARAMETERS
-from benchmarks.splatting.measure import STAGES
+from benchmarks.splatting.measure import PHASES
 from benchmarks.splatting.targets import cpp, label, where
 
 CASE = "surfels, image"
@@ -63,10 +63,10 @@ def _before(result: dict[str, Any], row: dict[str, Any]) -> float | None:
 def stages(result: dict[str, Any]) -> str:
     """Stages of every case."""
     rows = [
-        [label(row), *(_cell(row[f"{stage}_ms"]) for stage in STAGES), _cell(row["forward_ms"])]
+        [label(row), *(_cell(row[f"{stage}_ms"]) for stage in PHASES), _cell(row["forward_ms"])]
         for row in result["rows"]
     ]
-    return table([CASE, *STAGES, "forward, whole"], rows)
+    return table([CASE, *PHASES, "forward, whole"], rows)
 
 
 def work(result: dict[str, Any]) -> str:

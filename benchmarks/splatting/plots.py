@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.common import figures
 from benchmarks.splatting.limits import FLOPS
-from benchmarks.splatting.measure import STAGES
+from benchmarks.splatting.measure import PHASES
 from benchmarks.splatting.targets import cpp, label
 
 SHADES = ("#9ecae1", "#4292c6", "#2171b5", "#08306b")
@@ -94,7 +94,7 @@ def _stages(result: dict[str, Any], folder: Path) -> Path:
     ax = axes[0, 0]
     for i, row in enumerate(rows):
         left = 0.0
-        for stage in STAGES:
+        for stage in PHASES:
             if stage == "scatter":
                 continue
             width = row[f"{stage}_ms"]

@@ -74,7 +74,7 @@ class Workload:
 
 def device_camera(p: PinholeCamera) -> Camera:
     """The splatter's camera of the oracle's."""
-    return Camera.look(p.width, p.height, p.fx, p.fy, p.cx, p.cy, p.to_world, p.near)
+    return Camera.from_pose(p.width, p.height, p.fx, p.fy, p.cx, p.cy, p.to_world, p.near)
 
 
 def sphere(count: int, size: int, spread: float) -> Workload:
@@ -102,8 +102,8 @@ def sphere(count: int, size: int, spread: float) -> Workload:
 
 def fitted(folder: str) -> Workload:
     """The surfels of a run folder in its first test camera, with random features."""
-    from mi_refgs.fit.evaluate import load_split
-    from mi_refgs.fit.record import Run
+    from mi_refgs.evaluation.evaluate import load_split
+    from mi_refgs.runs.run import Run
 
     run = Run(folder)
     state = run.load_checkpoint()

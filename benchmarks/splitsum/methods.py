@@ -14,13 +14,13 @@ from benchmarks.common import montecarlo as mc
 from benchmarks.common.view import Points, first_hits
 from benchmarks.splitsum.exact import Stage
 from benchmarks.splitsum.settings import ALBEDO
-from mi_refgs.shade import lobe, prefilter
+from mi_refgs.shade import lobe_matrices, prefilter
 from mi_refgs.shade.models import Accuracy, ShadingPoints, shade
 
 SHIPPED = "shipped"
 LEVEL_SETS: dict[str, tuple[float, ...]] = {
     "few": (0.1, 0.32, 1.0),
-    SHIPPED: lobe.LEVEL_ROUGHNESS,
+    SHIPPED: lobe_matrices.LEVEL_ROUGHNESS,
     "many": (0.07, 0.1, 0.12, 0.15, 0.18, 0.22, 0.265, 0.32, 0.38, 0.45, 0.54, 0.65, 0.8, 1.0),
 }
 """Roughness of the filtered levels; the map itself is one more."""
@@ -32,7 +32,7 @@ def level_set(name: str) -> Iterator[int]:
 
     A light must be looked up in the context that it was filtered in.
     """
-    shipped = lobe.LEVEL_ROUGHNESS, lobe.LEVEL_MAX_HEIGHT
+    shipped = lobe_matrices.LEVEL_ROUGHNESS, lobe_matrices.LEVEL_MAX_HEIGHT
     caches = (prefilter._host_levels, prefilter._prepare)
     if name == SHIPPED:
         yield len(shipped[0]) + 1
@@ -43,10 +43,10 @@ def level_set(name: str) -> Iterator[int]:
         for cache in caches:
             cache.cache_clear()
         # The levels are constants of the product; only this experiment replaces them.
-        vars(lobe).update(LEVEL_ROUGHNESS=roughness, LEVEL_MAX_HEIGHT=heights)
+        vars(lobe_matrices).update(LEVEL_ROUGHNESS=roughness, LEVEL_MAX_HEIGHT=heights)
         yield len(roughness) + 1
     finally:
-        vars(lobe).update(LEVEL_ROUGHNESS=shipped[0], LEVEL_MAX_HEIGHT=shipped[1])
+        vars(lobe_matrices).update(LEVEL_ROUGHNESS=shipped[0], LEVEL_MAX_HEIGHT=shipped[1])
         for cache in caches:
             cache.cache_clear()
 

@@ -62,7 +62,7 @@ def _surfels(result: dict[str, Any]) -> list[str]:
         normals and two materials in bands (a metal of roughness 0.2, a dielectric of 0.6). First the
         materials are shaded one by one before they are blended, then the blended normals give way to the
         sphere's, then the surfels' coverage and the edges of their bands to the sphere's own, then the
-        split sum to the exact integral. Fitted surfels are less even than these: this is what the
+        split sum to the exact integral. TrainedScene surfels are less even than these: this is what the
         representation costs when the fit is perfect."""
     return [
         "### Surfels instead of a mesh",

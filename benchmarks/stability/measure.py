@@ -18,7 +18,7 @@ from mi_refgs.reference import occlusion as trace
 from mi_refgs.reference import picture as oracle
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.pipeline import Shading, render
-from mi_refgs.shade import brdf, lobe
+from mi_refgs.shade import brdf, lobe_matrices
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat import Camera, list_by_tile, project
 from mi_refgs.surfels.table import Surfels
@@ -70,7 +70,7 @@ def fast_camera(case: Case) -> Camera:
     """The product's camera, with its own near plane unless the case sets one."""
     c = case.camera
     near = {} if case.near is None else {"near": case.near}
-    found = Camera.look(c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.to_world, **near)
+    found = Camera.from_pose(c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.to_world, **near)
     return replace(found, offset=case.offset)
 
 
@@ -136,10 +136,10 @@ def _plane(x: Any, pixels: int) -> Array:
 def _operator(height: int) -> list[Array]:
     """Dense prefilter matrices (h_out · 2h_out, h · 2h) of the product's levels, float64."""
     matrices = []
-    φ = lobe.column_angles(2 * height)
-    for level in lobe.build_levels(height):
+    φ = lobe_matrices.column_angles(2 * height)
+    for level in lobe_matrices.build_levels(height):
         m = np.arange(level.weights.shape[2])
-        across = np.cos(m[:, None, None] * (lobe.column_angles(2 * level.height)[:, None] - φ))
+        across = np.cos(m[:, None, None] * (lobe_matrices.column_angles(2 * level.height)[:, None] - φ))
         dense = np.einsum("ikm,mab->iakb", level.weights, across, optimize=True)
         matrices.append(dense.reshape(2 * level.height**2, 2 * height**2))
     return matrices
@@ -156,7 +156,7 @@ def light_of(raw: Array) -> oracle.Light:
     flat = radiance.reshape(-1, 3)
     levels = [(m @ flat) for m in _operator(len(raw))]
     shaped = [x.reshape(h := int(np.sqrt(len(x) / 2)), 2 * h, 3) for x in levels]
-    return oracle.Light([radiance, *shaped], lobe.LEVEL_ROUGHNESS, brdf.table().astype(np.float64))
+    return oracle.Light([radiance, *shaped], lobe_matrices.LEVEL_ROUGHNESS, brdf.table().astype(np.float64))
 
 
 def light_gradient(raw: Array, light: oracle.Light, δflat: Array) -> Array:
@@ -177,7 +177,7 @@ def product_order(case: Case, pixels: Array) -> Array:
     listed, begin, end = (
         np.array(x).astype(int) for x in (lists.surfel_from_pair, lists.pair_begin, lists.pair_end)
     )
-    (width, height), (left, top) = camera.tile, camera.phase
+    (width, height), (left, top) = camera.tile, camera.tile_offset
     x, y = (pixels % camera.width + left) // width, (pixels // camera.width + top) // height
     order = np.empty((count, len(pixels)), int)
     for tile in np.unique(y * lists.tiles_x + x):
@@ -411,7 +411,7 @@ def condition(
 
 def inversion(case: Case, scene: oracle.Scene, truth: oracle.Picture) -> float:
     """Largest relative difference of depths in the wrong order, among the surfels that a pixel shows."""
-    phase = fast_camera(case).phase
+    phase = fast_camera(case).tile_offset
     key = oracle.sort_key(scene.raw, scene.camera, scene.pixels, phase)
     key, shown = (np.take_along_axis(x, scene.order, 0) for x in (key, truth.shown))
     key = np.where(shown, key, 0)

@@ -13,6 +13,7 @@ from benchmarks.stability.case import Array
 from mi_refgs.device import upload
 from mi_refgs.fit import losses
 from mi_refgs.reference import losses as oracle
+from mi_refgs.render import display
 
 SIZE = (11, 9)
 """Height and width of the pictures."""
@@ -42,7 +43,7 @@ def _curve(name: str, at: float) -> dict[str, Any]:
     x = float(np.float32(at))
     plane = mi.Float([x, x])
     dr.enable_grad(plane)
-    value = losses.linear_to_srgb(plane)
+    value = display.srgb_from_linear(plane)
     dr.backward(dr.sum(value))
     straight = np.float32(x) <= np.float32(JOINT)
     exact = 12.92 * x if straight else oracle.srgb(x)
@@ -100,7 +101,7 @@ def _loss(name: str, radiance: Array, alpha: Array, target: Array, target_alpha:
     planes, a = [upload(radiance[..., i]) for i in range(3)], upload(alpha)
     dr.enable_grad(planes, a)
     goal = [upload(target[..., i]) for i in range(3)]
-    image = losses.display_image(planes, a, [0.5] * 3)
+    image = display.display_image(planes, a, [0.5] * 3)
     image = losses.clip_highlights(image, goal, losses.saturated(goal))
     loss = 0.8 * losses.l1(image, goal) + 0.2 * losses.d_ssim(image, goal, SIZE[1], SIZE[0])
     loss += 0.2 * losses.alpha_loss(a, upload(target_alpha))

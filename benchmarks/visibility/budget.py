@@ -59,7 +59,7 @@ class Exact:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class TrainedScene:
     """Indirect light by harmonics: along the mirror direction, and ∫ w (1 - V) I over the lobe (P, 3)."""
 
     mirror: np.ndarray
@@ -85,7 +85,7 @@ class Traced:
     indirect: np.ndarray  # after as many further reflections
 
 
-def by_harmonics(shipped: Shipped, exact: Exact, fitted: Fitted) -> list[Step]:
+def by_harmonics(shipped: Shipped, exact: Exact, fitted: TrainedScene) -> list[Step]:
     """From the paper's rule to the reference."""
     visible = exact.visibility * shipped.free
     blocked = (1 - exact.visibility) * shipped.reflectance
@@ -177,7 +177,7 @@ def exact_light(stage: Stage, batches: Mapping[str, np.ndarray]) -> Exact:
     )
 
 
-def fit(stage: Stage, depth: int) -> Fitted:
+def fit(stage: Stage, depth: int) -> TrainedScene:
     """The best harmonics for the light of the path tracer's `max_depth`, looked up."""
     settings, points = stage.settings, stage.points
     parts = [
@@ -191,7 +191,7 @@ def fit(stage: Stage, depth: int) -> Fitted:
     )
     light = harmonics.Surroundings(whole)
     open_, free = (stage.reflected(light, scene).mean(0) for scene in (None, stage.scene))
-    return Fitted(looked_up, open_ - free, (first, second))
+    return TrainedScene(looked_up, open_ - free, (first, second))
 
 
 def reflectance(stage: Stage) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.view import Points
-from mi_refgs.fit.config import SurfelOptions
+from mi_refgs.methods.config import SurfelOptions
 from mi_refgs.shade.sh import clamp_positive, eval_sh, sh_basis
 
 DEGREE = SurfelOptions().indirect_degree

@@ -15,7 +15,7 @@ from mi_refgs import __version__
 from mi_refgs.cli import dataset, demo, doctor, evaluate, export, profile, render, train
 from mi_refgs.cli.command import Parser, Result, UnusableError, finite, prepare
 from mi_refgs.errors import InputError
-from mi_refgs.fit.interrupt import TerminatedError
+from mi_refgs.runs.interrupt import TerminatedError
 
 EXIT_UNUSABLE, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 2, 130, 143
 """The last two are what shells report for a program that a signal ended: 128 + SIGINT, 128 + SIGTERM."""

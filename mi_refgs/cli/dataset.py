@@ -55,9 +55,9 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Trace the views."""
-    from mi_refgs.fit.dataset import generate
+    from mi_refgs.data.make_dataset import make_dataset
 
-    folder = generate(
+    folder = make_dataset(
         args.scene,
         args.output,
         views=args.views,

@@ -27,13 +27,13 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Trace, fit, evaluate; what is finished already is not done again."""
-    from mi_refgs.fit.dataset import generate
-    from mi_refgs.fit.evaluate import SHEET, evaluate, read_metrics
-    from mi_refgs.fit.record import Run
+    from mi_refgs.data.make_dataset import make_dataset
+    from mi_refgs.evaluation.evaluate import SHEET, evaluate, read_metrics
+    from mi_refgs.runs.run import Run
 
     data, output = args.output / "data", args.output / args.preset
     say(f"1 of 3: tracing {VIEWS + TEST_VIEWS} views of {SCENE} into {data}")
-    generate(
+    make_dataset(
         resource_dir("scenes") / SCENE,
         data,
         views=VIEWS,

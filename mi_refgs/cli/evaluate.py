@@ -39,8 +39,8 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Evaluate."""
-    from mi_refgs.fit.evaluate import SHEET, evaluate
-    from mi_refgs.fit.record import Run
+    from mi_refgs.evaluation.evaluate import SHEET, evaluate
+    from mi_refgs.runs.run import Run
 
     result = evaluate(Run(args.run_folder), args.data, progress=True)
     return Result(result, f"{table(result)}\ncontact sheet: {args.run_folder / SHEET}")

@@ -25,15 +25,15 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> Result:
     """Export."""
     from mi_refgs.errors import InputError
-    from mi_refgs.fit.evaluate import load_split
-    from mi_refgs.fit.export import Fitted, export
-    from mi_refgs.fit.record import Run
+    from mi_refgs.evaluation.evaluate import load_split
+    from mi_refgs.runs.export import TrainedScene, export
+    from mi_refgs.runs.run import Run
 
     folder = Run(args.run_folder)
     method = folder.method()
     camera = load_split(folder, method, "test", args.data).views[0].camera()
     state = folder.load_checkpoint()
-    fitted = Fitted.read(folder.path) if state is None else Fitted.from_state(method, state)
+    fitted = TrainedScene.read(folder.path) if state is None else TrainedScene.from_state(method, state)
     target = args.output or folder.path
     try:
         target.mkdir(parents=True, exist_ok=True)

@@ -12,8 +12,8 @@ from mi_refgs.cli.train import DEFAULT_PRESET, load_method, sized, training_view
 from mi_refgs.errors import InputError
 
 if TYPE_CHECKING:
-    from mi_refgs.fit.profile import Profile
     from mi_refgs.fit.train import Trainer
+    from mi_refgs.profiling.profile import Profile
 
 DEFAULT_STEPS = 15
 MOST_STEPS = 1000
@@ -45,8 +45,8 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Measure, and advise. Nothing is written."""
-    from mi_refgs.fit.advice import advice
-    from mi_refgs.fit.profile import profile
+    from mi_refgs.profiling.advice import advice
+    from mi_refgs.profiling.profile import profile
 
     if not 1 <= args.steps <= MOST_STEPS:
         raise InputError(f"--steps: {args.steps} is out of range; give 1 to {MOST_STEPS}")
@@ -60,9 +60,9 @@ def run(args: argparse.Namespace) -> Result:
 
 def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
     """The trainer of a run or of a fresh fit, and the stages of the schedule to look at."""
-    from mi_refgs.fit.evaluate import load_split
-    from mi_refgs.fit.record import Run
+    from mi_refgs.evaluation.evaluate import load_split
     from mi_refgs.fit.train import Trainer
+    from mi_refgs.runs.run import Run
 
     if not args.path.is_dir():
         raise InputError(f"{args.path}: RUN|DATA: no such folder; give a run folder or a data set")

@@ -13,10 +13,10 @@ from mi_refgs.errors import InputError
 from mi_refgs.resources import resource_dir
 
 if TYPE_CHECKING:
-    from mi_refgs.fit.config import Method
-    from mi_refgs.fit.data import Dataset
-    from mi_refgs.fit.record import Run
+    from mi_refgs.data.dataset import Dataset
     from mi_refgs.fit.train import Trainer
+    from mi_refgs.methods.config import Method
+    from mi_refgs.runs.run import Run
 
 DEFAULT_METHOD = "ref_gaussian.toml"
 """File of `variants/` that is fitted when none is named: the full method."""
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> Result:
 
 def load_method(variant: str | None, preset: str | None, assignments: list[str] | None) -> Method:
     """The method of the options, or the full one at the preset for everyday use."""
-    from mi_refgs.fit import config
+    from mi_refgs.methods import config
 
     path = variant or str(resource_dir("variants") / DEFAULT_METHOD)
     return config.load(path, preset or DEFAULT_PRESET, assignments)
@@ -81,13 +81,13 @@ def load_method(variant: str | None, preset: str | None, assignments: list[str] 
 
 def sized(method: Method, data_path: Path) -> Method:
     """The method with the size of pictures decided: where it says none, what its preset can afford."""
-    from mi_refgs.fit import data
-    from mi_refgs.fit.config import PRESETS
+    from mi_refgs.data import dataset
+    from mi_refgs.methods.config import PRESETS
 
     if method.data.downscale is not None:
         return method
     budget = PRESETS[method.preset].pixels
-    factor, width, height = data.fitting_downscale(data_path, method.data.images, budget)
+    factor, width, height = dataset.fitting_downscale(data_path, method.data.images, budget)
     if factor > 1:
         say(
             f"{data_path}: pictures of {width} × {height} pixels are read as {width // factor} × "
@@ -99,10 +99,10 @@ def sized(method: Method, data_path: Path) -> Method:
 
 def training_views(method: Method, data_path: Path) -> Dataset:
     """The pictures to fit, as the method asks for them."""
-    from mi_refgs.fit import data
+    from mi_refgs.data import dataset
 
     options = method.data
-    return data.load(
+    return dataset.read_dataset(
         data_path,
         "train",
         downscale=options.downscale,
@@ -125,9 +125,9 @@ def fit(
     Raises InputError for bad input, and KeyboardInterrupt or TerminatedError with a message that says how to
     go on.
     """
-    from mi_refgs.fit.evaluate import load_split, up_to_date
-    from mi_refgs.fit.record import Run
+    from mi_refgs.evaluation.evaluate import load_split, up_to_date
     from mi_refgs.fit.train import Trainer
+    from mi_refgs.runs.run import Run
 
     folder = Run(output)
     resumed = resume and (output / "config.toml").is_file()
@@ -220,11 +220,11 @@ class Progress:
         """The first training view and the light, as previews/<iteration>.png."""
         import numpy as np
 
-        from mi_refgs.fit import pictures
+        from mi_refgs.evaluation import pictures
         from mi_refgs.images import write_png
 
         view = trainer.data.views[0]
-        shot = pictures.Shot.of(trainer.view(trainer.targets[0].camera), trainer.data)
+        shot = pictures.RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data)
         light = None
         if trainer.light is not None:
             radiance = trainer.light.radiance()

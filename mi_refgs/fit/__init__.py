@@ -1,1 +1,1 @@
-"""Fitting: data sets, losses, optimiser, adaptive control, training loop, metrics."""
+"""Fitting: where it starts, losses, optimiser, adaptive control, the training loop."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
-from mi_refgs.fit.config import Method
-from mi_refgs.fit.data import Dataset, View
 from mi_refgs.images import linear_from_srgb
+from mi_refgs.methods.config import Method
 from mi_refgs.surfels import hull, init
-from mi_refgs.surfels.order import along_curve
+from mi_refgs.surfels.order import morton_order
 from mi_refgs.surfels.table import GEOMETRY, Surfels
 
 
@@ -34,12 +34,14 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
         points = np.concatenate([outer, inner])
         normals = np.concatenate([facing, init.random_normals(len(inner), rng)])
         # What lies inside has no side to be seen from: every view of it votes.
-        colours = np.concatenate([hull.mean_colours(outer, views, facing), hull.mean_colours(inner, views)])
+        colours = np.concatenate(
+            [hull.median_colours(outer, views, facing), hull.median_colours(inner, views)]
+        )
     else:
         points = hull.random_points(options.count, bounds, rng)
         normals = init.random_normals(options.count, rng)
-        colours = hull.mean_colours(points, views)
-    order = along_curve(points)
+        colours = hull.median_colours(points, views)
+    order = morton_order(points)
     return init.from_points(
         points[order],
         normals[order],

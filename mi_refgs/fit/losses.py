@@ -14,42 +14,12 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.fit.ssim import ssim
-from mi_refgs.images import SRGB_LINEAR_LIMIT
 from mi_refgs.render.stencil import neighbours
 
 # An 8-bit target value of 255 stands for everything from here up: the sensor clipped.
 SATURATED = 254.5 / 255.0
-# Alpha below which a pixel is empty: radiance / A has no meaning and the background alone is seen.
-ALPHA_EMPTY = 1e-6
 # Alpha is kept this far from 0 and 1 in the cross-entropy, whose slope is then at most 10⁴ per pixel.
 ENTROPY_MARGIN = 1e-4
-
-
-# ---------------- camera response ----------------
-
-
-def linear_to_srgb(linear: Any) -> Any:
-    """sRGB encoding (IEC 61966-2-1) of a linear plane: straight below 0.0031308, else the curve.
-
-    Unbounded above 1. The slope is finite everywhere (12.92 at 0).
-    """
-    straight = linear <= SRGB_LINEAR_LIMIT
-    curve = 1.055 * dr.power(dr.select(straight, 1.0, linear), 1 / 2.4) - 0.055
-    return dr.select(straight, 12.92 * linear, curve)
-
-
-def display_image(radiance: Iterable[Any], alpha: Any, background: Iterable[Any]) -> list[Any]:
-    """What an 8-bit RGBA picture shows: A srgb(L / A) + (1 - A) background, per plane.
-
-    radiance: linear, premultiplied (L); background: display-encoded floats or planes. Pixels with A < 1e-6
-    show the background and give radiance no gradient.
-    """
-    seen = alpha >= ALPHA_EMPTY
-    inverse = dr.select(seen, dr.rcp(dr.select(seen, alpha, 1.0)), 0.0)
-    return [
-        alpha * linear_to_srgb(plane * inverse) + (1 - alpha) * behind
-        for plane, behind in zip(radiance, background, strict=True)
-    ]
 
 
 def saturated(

@@ -9,11 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.device import upload
 from mi_refgs.fit import losses
-from mi_refgs.fit.config import LossWeights
-from mi_refgs.fit.data import Dataset, View
+from mi_refgs.methods.config import LossWeights
 from mi_refgs.render.depth_normals import normals_from_depth
+from mi_refgs.render.display import displayed, srgb_from_linear
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.splat import Camera
 
@@ -31,7 +32,7 @@ class Target:
     def of(view: View, background: np.ndarray) -> Target:
         """Upload a view; `background` (3,) in the space of its picture."""
         planes = [upload(view.image[..., i]) for i in range(3)]
-        image = [losses.linear_to_srgb(plane) for plane in planes] if view.linear else planes
+        image = [srgb_from_linear(plane) for plane in planes] if view.linear else planes
         alpha = None if view.alpha is None else upload(view.alpha)
         clipped = None if view.linear else losses.saturated(image, alpha, map(float, background))
         target = Target(view.camera(), image, clipped, alpha)
@@ -39,27 +40,12 @@ class Target:
         return target
 
 
-def displayed(frame: Frame, background: np.ndarray, linear: bool) -> list[Any]:
-    """What the camera shows of a frame, display-encoded planes.
-
-    Pictures with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it.
-    """
-    behind = [float(x) for x in background]
-    radiance = list(frame.radiance)
-    if not linear:
-        return losses.display_image(radiance, frame.alpha, behind)
-    return [
-        losses.linear_to_srgb(plane + (1 - frame.alpha) * value)
-        for plane, value in zip(radiance, behind, strict=True)
-    ]
-
-
 def objective(
     frame: Frame, target: Target, data: Dataset, weights: LossWeights, iteration: int
 ) -> tuple[Any, Any]:
     """Weighted sum of the losses of a frame (mi.Float of width 1), and its mean squared error, detached.
 
-    The terms are those of `LossWeights`, weighted as it says for this iteration; see `fit.losses`.
+    The terms are those of `LossWeights`, weighted as it says for this iteration; see `render.display`.
     """
     width, height = target.camera.width, target.camera.height
     image = displayed(frame, data.background, data.linear)

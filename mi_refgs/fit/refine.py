@@ -14,9 +14,9 @@ import numpy as np
 
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
-from mi_refgs.fit.config import Refine
+from mi_refgs.methods.config import Refine
 from mi_refgs.surfels.init import jittered_albedo, logit
-from mi_refgs.surfels.order import along_curve
+from mi_refgs.surfels.order import morton_order
 from mi_refgs.surfels.table import Surfels
 
 SPLIT_SHRINK = 1.6
@@ -40,17 +40,17 @@ def prune_wait(options: Refine, rate: float) -> float:
 
 
 @dataclass(frozen=True)
-class Edited:
+class TableEdit:
     """A new table; row i descends from row parent[i] of the old one, and is `fresh` if it is a copy of it."""
 
     surfels: Surfels
     parent: np.ndarray  # (M,) uint32
     fresh: np.ndarray  # (M,) bool
 
-    def ordered(self) -> Edited:
+    def ordered(self) -> TableEdit:
         """The same rows, those of neighbours next to each other; densifying leaves new ones at the end."""
-        order = along_curve(self.surfels.raw["position"].numpy())
-        return Edited(self.surfels.gather(upload(order, mi.UInt32)), self.parent[order], self.fresh[order])
+        order = morton_order(self.surfels.raw["position"].numpy())
+        return TableEdit(self.surfels.gather(upload(order, mi.UInt32)), self.parent[order], self.fresh[order])
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
@@ -66,7 +66,7 @@ def densify_and_prune(
     max_count: int,
     rng: np.random.Generator,
     prune_transparent: bool = True,
-) -> Edited:
+) -> TableEdit:
     """Clone small and split large surfels with a high screen gradient; drop transparent and oversized ones.
 
     `gradient` (N,) is the mean length of the screen-translation gradient in NDC units over the views that saw
@@ -102,7 +102,7 @@ def densify_and_prune(
         table["position"][children] += _tangent_offsets(table, children, rng)
         table["scale"][children] -= np.float32(np.log(SPLIT_SHRINK))
     assert len(parent) <= max(max_count, count)
-    return Edited(Surfels.from_numpy(table), parent.astype(np.uint32), fresh)
+    return TableEdit(Surfels.from_numpy(table), parent.astype(np.uint32), fresh)
 
 
 def _tangent_offsets(table: dict[str, np.ndarray], rows: slice, rng: np.random.Generator) -> np.ndarray:

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_refgs.fit.config import Method
 from mi_refgs.fit.optim import Group
+from mi_refgs.methods.config import Method
+from mi_refgs.runs.checkpoint import LIGHT
 
-LIGHT = "light"
-"""Name of the environment among the parameters; the others are channels of the surfels."""
 POSITION_STEPS = 0.6
 """Share of the iterations after which positions learn at their final rate: 30,000 of 50,000 in the released
 Ref-Gaussian code."""

@@ -15,22 +15,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.data.dataset import Dataset
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.fit import health, refine
-from mi_refgs.fit.checkpoint import OPTIMISER, PARAMS, part, tensors
-from mi_refgs.fit.config import Method, Stage
-from mi_refgs.fit.data import Dataset
 from mi_refgs.fit.initial import initial_surfels
-from mi_refgs.fit.interrupt import held_interrupts
 from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.optim import Adam, Group
-from mi_refgs.fit.record import Run
-from mi_refgs.fit.schedule import LIGHT, Schedule
+from mi_refgs.fit.schedule import Schedule
+from mi_refgs.methods.config import Method, Stage
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, Shading, render, render_depth
+from mi_refgs.runs.checkpoint import LIGHT, OPTIMISER, PARAMS, part, tensors
+from mi_refgs.runs.interrupt import held_interrupts
+from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import CHANNELS, GEOMETRY, Surfels, sh_columns

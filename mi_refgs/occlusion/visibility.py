@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
-from mi_refgs.occlusion.attributes import Neighbourhood, Surface
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.mesh_compat import make_mesh, update_mesh
+from mi_refgs.occlusion.surface_materials import Surface, VertexSurfels
 from mi_refgs.surfels.table import Surfels
 
 OFFSET_VOXELS = 2.0
@@ -30,7 +30,7 @@ class Hit:
     valid: Any  # mi.Bool: something is hit
     point: Any  # mi.Point3f, world
     triangle: Any  # mi.UInt32
-    place: Any  # mi.Point2f on it: barycentric coordinates of its second and third corner
+    barycentric: Any  # mi.Point2f on it: barycentric coordinates of its second and third corner
 
 
 class Occluder:
@@ -48,7 +48,7 @@ class Occluder:
         self._scene: Any = None
         self._params: Any = None
         self._variant: str | None = None
-        self._around: Neighbourhood | None = None
+        self._around: VertexSurfels | None = None
         if mesh is not None:
             self.update(mesh)
 
@@ -82,7 +82,7 @@ class Occluder:
         """
         self._around = None
         if self._mesh is not None and not self.empty:
-            self._around = Neighbourhood.of(self._mesh, surfels)
+            self._around = VertexSurfels.of(self._mesh, surfels)
 
     def surface(self, surfels: Surfels) -> Surface:
         """The mesh with the present materials of `surfels`, to look up where `closest` hits it.
@@ -115,10 +115,10 @@ class Occluder:
             hit = self._scene.ray_intersect_preliminary(ray, coherent=False, active=valid & active)
             stopped = hit.is_valid()
             # Of a miss Embree leaves what was in its registers, NaN among it.
-            distance, triangle, place = (
+            distance, triangle, barycentric = (
                 dr.select(stopped, x, 0) for x in (hit.t, hit.prim_index, hit.prim_uv)
             )
-            return Hit(stopped, ray(distance), triangle, place)
+            return Hit(stopped, ray(distance), triangle, barycentric)
 
     def first_hit(self, origin: Any, direction: Any, active: Any = True) -> tuple[Any, Any]:
         """Distance to the mesh in lengths of `direction` (0 without a hit), and if it is hit; detached."""

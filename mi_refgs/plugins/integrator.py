@@ -17,7 +17,7 @@ from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.plugins import require_supported_variant
 from mi_refgs.plugins.aovs import aov_values
-from mi_refgs.plugins.light import TurnedLight, emitter_light
+from mi_refgs.plugins.light import RotatedLight, emitter_light
 from mi_refgs.plugins.properties import (
     TERMS,
     read_aovs,
@@ -306,7 +306,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
                 )
             return emitter_light(emitter)
         light = self.light.prefilter()
-        return light if self.light_rotation is None else TurnedLight(light, self.light_rotation)
+        return light if self.light_rotation is None else RotatedLight(light, self.light_rotation)
 
     def to_string(self) -> str:
         size = "x".join(str(x) for x in self.light.raw.shape[:2]) if self.light is not None else "the scene's"

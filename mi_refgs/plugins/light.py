@@ -14,7 +14,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.shade.envmap import DEFAULT_HEIGHT, MIN_HEIGHT, EnvironmentLight, PrefilteredLight, bounded
-from mi_refgs.shade.lobe import resample
+from mi_refgs.shade.lobe_matrices import resample
 from mi_refgs.shade.prefilter import prefilter
 
 MAX_HEIGHT = 512
@@ -23,7 +23,7 @@ and it grows with the square of the rows. [measured]"""
 
 
 @dataclass(frozen=True)
-class TurnedLight:
+class RotatedLight:
     """A prefiltered light seen through a rotation or in a mirror; the same lookups as `PrefilteredLight`."""
 
     light: Any
@@ -71,7 +71,7 @@ def emitter_light(emitter: Any) -> Any:
             f"use one of h x 2h, h a multiple of 4 from {MIN_HEIGHT} to {MAX_HEIGHT}"
         )
     light, matrix = PrefilteredLight(*prefilter(radiance)), _light_from_world(params)
-    return light if matrix is None else TurnedLight(light, matrix)
+    return light if matrix is None else RotatedLight(light, matrix)
 
 
 def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:

@@ -14,8 +14,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import FACING_TOLERANCE
-from mi_refgs.occlusion.attributes import Surface, SurfaceSample
+from mi_refgs.occlusion.surface_materials import Surface, SurfaceSample
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.shade.ggx_sampling import Lobe
 from mi_refgs.shade.models import (
     Accuracy,
     Diffuse,
@@ -26,14 +27,13 @@ from mi_refgs.shade.models import (
     safe_normalize,
     shade,
 )
-from mi_refgs.shade.rays import Lobe
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
 
-WIDE = 1 / 3
-"""α of a lobe from which single bright rays are not held back. In the concave scenes of
-`benchmarks.visibility`, 4 rays and 6 bounces, holding all of them back takes 17 to 42 % off relMSE at
-α = 0.01, 0 to 33 % at 0.09, and adds up to 15 % at 0.36."""
+CLAMP_MAX_ALPHA = 1 / 3
+"""α of a lobe from which single bright rays are not clamped. In the concave scenes of
+`benchmarks.visibility`, 4 rays and 6 bounces, the clamp takes 17 to 42 % off relMSE at α = 0.01, 0 to 33 % at
+0.09, and adds up to 15 % at 0.36."""
 
 
 def mirror_visibility(
@@ -68,10 +68,10 @@ def reflection(
 
     `origin` and `ray` lead from the camera to the points; nothing is traced for those that are not `covered`
     (mi.Bool). `points.indirect` (of the indirect channel) stays unless `accuracy.traced_bounces` replaces it
-    by the mean radiance of what blocked rays hit
-    (`MeshRadiance`), single bright ones held back (`_held_back`). Its gradient goes to the light and to the
-    materials of the surfels around all hits, in both modes; rays and hits are detached, and so are what is
-    held back and what the pixel's own roughness does to the rays.
+    by the mean radiance of what blocked rays hit (`MeshRadiance`), single bright ones clamped
+    (`_firefly_clamp`). Its gradient goes to the light and to the materials of the surfels around all hits, in
+    both modes; rays, hits and the clamp are detached, and so is what the pixel's own roughness does to the
+    rays.
     """
     normal = dr.detach(points.normal)
     if accuracy.visibility_rays == 1 and not accuracy.traced_bounces:
@@ -148,22 +148,24 @@ def _average(
     if scene is None:
         dr.eval(visibility)
         return dr.detach(visibility), None
-    total = total * _held_back(dr.detach(total), largest, free * open_, mi.Float(count), lobe.α)
+    total = total * _firefly_clamp(dr.detach(total), largest, free * open_, mi.Float(count), lobe.α)
     indirect = total * dr.select(blocked > 0, dr.rcp(dr.select(blocked > 0, blocked, 1)), 0)
     dr.eval(visibility, indirect)
     return dr.detach(visibility), indirect
 
 
-def _held_back(total: Any, largest: Any, free: Any, count: Any, α: Any) -> Any:
+def _firefly_clamp(total: Any, largest: Any, free: Any, count: Any, α: Any) -> Any:
     """What share (0 … 1, detached) of the sum over blocked rays counts, in each colour.
 
     The `largest` of `count` rays counts for no more than all rays would at the mean of the others, `free`
     ones included: of few rays of a narrow lobe, one that finds a lamp in a reflection speckles the picture.
-    In a wide lobe rays differ anyway, so this fades out with its α (see WIDE). The more rays, the less is
-    held back: the limit is the true mean.
+    In a wide lobe rays differ anyway, so this fades out with its α (see CLAMP_MAX_ALPHA). The more rays, the
+    less is clamped: the limit is the true mean.
     """
     others = dr.maximum(total - largest, 0)
-    excess = dr.maximum(largest - (others + free) * count / (count - 1), 0) * dr.maximum(1 - α / WIDE, 0)
+    excess = dr.maximum(largest - (others + free) * count / (count - 1), 0) * dr.maximum(
+        1 - α / CLAMP_MAX_ALPHA, 0
+    )
     return dr.select(total > 0, dr.maximum(1 - excess / dr.select(total > 0, total, 1), 0), 1)
 
 
@@ -173,7 +175,7 @@ class MeshHit:
 
     valid: Any
     triangle: Any
-    place: Any
+    barycentric: Any
     visibility: Any
     next: MeshHit | None = None  # where it does not: what stands in its way, if that is shaded too
 
@@ -225,18 +227,18 @@ class MeshRadiance:
         """What rays of `Occluder.visible` hit first, and what their mirror rays hit, `bounces` ≥ 1 times."""
         with dr.suspend_grad():
             hit = self.occluder.closest(point, direction, normal, active)
-            outward = self._facing(self.surface.at(hit.triangle, hit.place, hit.valid), direction)
+            outward = self._facing(self.surface.at(hit.triangle, hit.barycentric, hit.valid), direction)
             mirror = reflect(view=-direction, normal=outward)
             if bounces == 1:
                 free = self.occluder.visible(hit.point, mirror, outward, hit.valid)
-                return MeshHit(hit.valid, hit.triangle, hit.place, free)
+                return MeshHit(hit.valid, hit.triangle, hit.barycentric, free)
             further = self.trace(hit.point, mirror, outward, hit.valid, bounces - 1)
             free = dr.select(further.valid, mi.Float(0), mi.Float(1))
-            return MeshHit(hit.valid, hit.triangle, hit.place, free, further)
+            return MeshHit(hit.valid, hit.triangle, hit.barycentric, free, further)
 
     def radiance(self, hit: MeshHit, direction: Any) -> Any:
         """Radiance (mi.Color3f) that leaves the hits against the rays, under AD."""
-        sample = self.surface.at(hit.triangle, hit.place, hit.valid)
+        sample = self.surface.at(hit.triangle, hit.barycentric, hit.valid)
         normal = self._facing(sample, direction)
         own = None
         if self.count:

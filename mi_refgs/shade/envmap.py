@@ -24,7 +24,7 @@ from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.images import EXR_MAGIC, linear_from_srgb, read_exr_image, read_hdr, read_png, write_exr
-from mi_refgs.shade import lobe
+from mi_refgs.shade import lobe_matrices
 from mi_refgs.shade.prefilter import Operator, prefilter
 
 DEFAULT_HEIGHT = 64
@@ -82,7 +82,7 @@ class PrefilteredLight:
 
         At roughness 1 the lobe D is constant and only the cosine is left, so this is the last level.
         """
-        return self._bilinear(*_azimuth_polar(normal), mi.UInt32(len(lobe.LEVEL_ROUGHNESS)))
+        return self._bilinear(*_azimuth_polar(normal), mi.UInt32(len(lobe_matrices.LEVEL_ROUGHNESS)))
 
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
         """Radiance averaged over the GGX lobe around unit world directions.
@@ -92,7 +92,7 @@ class PrefilteredLight:
         spread. Derivative in light, direction and roughness. [split sum, Karis 2013]
         """
         place = _level(roughness)
-        lower = dr.minimum(mi.UInt32(dr.detach(place)), len(lobe.LEVEL_ROUGHNESS) - 1)
+        lower = dr.minimum(mi.UInt32(dr.detach(place)), len(lobe_matrices.LEVEL_ROUGHNESS) - 1)
         at = _azimuth_polar(direction)
         return dr.lerp(self._bilinear(*at, lower), self._bilinear(*at, lower + 1), place - mi.Float(lower))
 
@@ -134,12 +134,12 @@ def _azimuth_polar(direction: Any) -> tuple[Any, Any]:
 
 def _level(roughness: Any) -> Any:
     """Fractional level 0 … L of a roughness, clamped to [0, 1]."""
-    first = lobe.LEVEL_ROUGHNESS[0]
+    first = lobe_matrices.LEVEL_ROUGHNESS[0]
     r = dr.clip(roughness, 0, 1)
     sharp = dr.minimum(r, first) * (1 / first)
     level = dr.square(dr.square(sharp))
     inverse = dr.rcp(dr.maximum(r, first))
-    for a, b in zip(lobe.LEVEL_ROUGHNESS, lobe.LEVEL_ROUGHNESS[1:], strict=False):
+    for a, b in zip(lobe_matrices.LEVEL_ROUGHNESS, lobe_matrices.LEVEL_ROUGHNESS[1:], strict=False):
         level += dr.clip((inverse - 1 / a) * (1 / (1 / b - 1 / a)), 0, 1)
     return level
 
@@ -193,7 +193,7 @@ class EnvironmentLight:
         if not np.isfinite(image).all():
             raise InputError(f"{path}: environment: holds NaN or infinity; replace those texels")
         rows = height if height is not None else max(MIN_HEIGHT, image.shape[0] // 4 * 4)
-        return cls.from_radiance(lobe.resample(np.maximum(image, 0), rows))
+        return cls.from_radiance(lobe_matrices.resample(np.maximum(image, 0), rows))
 
     @property
     def height(self) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 from mi_refgs.device import upload
 
 BLOCK = 4
-"""Rows that need as many frequencies as each other: `mixing` makes them in one lane."""
+"""RowLayout that need as many frequencies as each other: `mixing` makes them in one lane."""
 
 COEFFICIENT = 8
 """Floats a coefficient, and TEXEL floats a texel: powers of two, as packets are."""
@@ -26,7 +26,7 @@ TEXEL = 4
 
 
 @dataclass(frozen=True)
-class Rows:
+class RowLayout:
     """Where the rows of some lat-long grids lie in a texel buffer and in a Fourier buffer.
 
     Analysis has one lane per four columns, to fold them, then one per four frequencies; synthesis has one per
@@ -61,7 +61,7 @@ def row_slots(limits: list[np.ndarray]) -> list[np.ndarray]:
     return np.split(ends - np.concatenate(limits), np.cumsum([len(m) for m in limits])[:-1])
 
 
-def make_rows(firsts: list[int], limits: list[np.ndarray]) -> Rows:
+def make_rows(firsts: list[int], limits: list[np.ndarray]) -> RowLayout:
     """Lanes for grids of len(limit) rows and twice as many columns, from texels `firsts` on."""
     folding, analysis, slots, exists, synthesis, twiddles, at = [], [], [], [], [], [], 0
     for first, limit, slot in zip(firsts, limits, row_slots(limits), strict=True):
@@ -80,7 +80,7 @@ def make_rows(firsts: list[int], limits: list[np.ndarray]) -> Rows:
         i, q = (a.ravel() for a in np.meshgrid(np.arange(h), np.arange(-(-w // 16)), indexing="ij"))
         synthesis.append(np.stack([first + w * i, 0 * i + w, q, 0 * i + at, slot[i], limit[i]]))
         at += 2 * w
-    return Rows(
+    return RowLayout(
         texels=firsts[-1] + 2 * len(limits[-1]) ** 2,
         coefficients=int(sum(limit.sum() for limit in limits)),
         folding=to_device(*np.concatenate(folding, 1)),
@@ -109,7 +109,7 @@ def _turn(turn: Any, step: Any, w: Any) -> Any:
     return dr.select(turn >= 2 * w, turn - 2 * w, turn)
 
 
-def _four_turns(rows: Rows, at: Any, turn: Any, step: Any, w: Any) -> tuple[list[tuple[Any, Any]], Any]:
+def _four_turns(rows: RowLayout, at: Any, turn: Any, step: Any, w: Any) -> tuple[list[tuple[Any, Any]], Any]:
     """(cos, sin) at `turn` and after one, two and three steps, and the turn after four.
 
     One is looked up and three are rotated from it: lookups are what the loops here spend their time on, and a
@@ -124,7 +124,7 @@ def _four_turns(rows: Rows, at: Any, turn: Any, step: Any, w: Any) -> tuple[list
     return angles, _turn(_turn(turn, 2 * step, w), 2 * step, w)
 
 
-def _fold(rows: Rows, texels: Any) -> Any:
+def _fold(rows: RowLayout, texels: Any) -> Any:
     """Four columns with the same cosines and sines, up to signs, as one.
 
     At 2 (row's start/4 + j) for even frequencies, and at the next place for odd ones: the sums that go with
@@ -143,7 +143,7 @@ def _fold(rows: Rows, texels: Any) -> Any:
     return out
 
 
-def analyse(rows: Rows, texels: Any) -> Any:
+def analyse(rows: RowLayout, texels: Any) -> Any:
     """Fourier buffer Σ_j x_j (cos mφ_j, sin mφ_j) of every row and frequency of a flat texel buffer."""
     start, w, m, at = rows.analysis
     folded = _fold(rows, texels)
@@ -184,7 +184,7 @@ def analyse(rows: Rows, texels: Any) -> Any:
     return out
 
 
-def synthesise(rows: Rows, coefficients: Any, texels: Any) -> None:
+def synthesise(rows: RowLayout, coefficients: Any, texels: Any) -> None:
     """Write Σ_m (a_m cos mφ_j + b_m sin mφ_j) of every row and column into the RGBA buffer `texels`."""
     start, w, q, at, slot, limit = rows.synthesis
     columns = (q, q + (w // 8 + 1) // 2)  # one read of a coefficient serves both

@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.device import replayed
-from mi_refgs.shade import fourier, lobe, mixing
+from mi_refgs.shade import fourier, lobe_matrices, mixing
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Operator:
     """The prefilter of maps with `height` rows: buffers, matrices, and where each level is in the result."""
 
     height: int
-    base: fourier.Rows
-    levels: fourier.Rows
+    base: fourier.RowLayout
+    levels: fourier.RowLayout
     forward: mixing.Mixing
     adjoint: mixing.Mixing
     info: Any  # 4 UInt32 a level: first texel, h, w, 0; level 0 is the map itself
@@ -36,8 +36,8 @@ class Operator:
 
 
 @functools.lru_cache(maxsize=4)
-def _host_levels(height: int) -> list[lobe.Level]:
-    return lobe.build_levels(height)
+def _host_levels(height: int) -> list[lobe_matrices.Level]:
+    return lobe_matrices.build_levels(height)
 
 
 def _build(height: int) -> Operator:

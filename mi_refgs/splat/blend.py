@@ -34,8 +34,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import LANE_EDGE, PACKET_EDGE, TRANSMITTANCE_MIN
-from mi_refgs.rows import Rows
+from mi_refgs.constants import LANE_PIXELS_PER_AXIS, PACKET_EDGE, TRANSMITTANCE_MIN
+from mi_refgs.rows import PackedRows
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.footprint import (
     GEOMETRY_COLUMNS,
@@ -67,7 +67,7 @@ class _Blend(dr.CustomOp):
 
     def eval(self, columns: list[Any], lists: TileLists, camera: Camera) -> list[Any]:
         self.lists, self.camera = lists, camera
-        self.rows = Rows.pack(columns)
+        self.rows = PackedRows.pack(columns)
         dr.eval(self.rows.data)
         self.features = len(columns) - GEOMETRY_COLUMNS
         self.out = _blend_primal(self) if lists.pairs else self._blank()
@@ -77,7 +77,7 @@ class _Blend(dr.CustomOp):
         if not self.lists.pairs:
             self.set_grad_out(self._blank())
             return
-        self.set_grad_out(_blend_forward(self, Rows.pack(self.grad_in("columns"))))
+        self.set_grad_out(_blend_forward(self, PackedRows.pack(self.grad_in("columns"))))
 
     def backward(self) -> None:
         if not self.lists.pairs:  # Dr.Jit refuses to gather from an empty list, even fully masked
@@ -107,14 +107,14 @@ class _Lanes:
     @staticmethod
     def of(op: _Blend) -> _Lanes:
         lists, camera = op.lists, op.camera
-        lanes = (camera.tile[0] // LANE_EDGE, camera.tile[1] // LANE_EDGE)
+        lanes = (camera.tile[0] // LANE_PIXELS_PER_AXIS, camera.tile[1] // LANE_PIXELS_PER_AXIS)
         tile_x, tile_y, lane_x, lane_y = _lanes_of_tiles(lists, camera.tile, lanes)
         there = (tile_x < lists.tiles_x) & (tile_y < lists.tiles_y)
         tile = tile_y * lists.tiles_x + tile_x
         # Pixels before the image wrap round to huge numbers, and are not inside either.
-        corner_x = tile_x * camera.tile[0] + lane_x - camera.phase[0]
-        corner_y = tile_y * camera.tile[1] + lane_y - camera.phase[1]
-        blocks = range(LANE_EDGE)
+        corner_x = tile_x * camera.tile[0] + lane_x - camera.tile_offset[0]
+        corner_y = tile_y * camera.tile[1] + lane_y - camera.tile_offset[1]
+        blocks = range(LANE_PIXELS_PER_AXIS)
         places = [(corner_x + x * lanes[0], corner_y + y * lanes[1]) for y in blocks for x in blocks]
         return _Lanes(
             [mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5) for x, y in places],
@@ -225,14 +225,14 @@ def _blend_primal(op: _Blend) -> list[Any]:
     return lanes.to_raster(op, out)
 
 
-def _blend_backward(op: _Blend, δout: list[Any]) -> Rows:
+def _blend_backward(op: _Blend, δout: list[Any]) -> PackedRows:
     lanes = _Lanes.of(op)
     δ = lanes.from_raster(δout)
     behind = [
         sum((a * b for a, b in zip(of_block, total, strict=True)), start=mi.Float(0))
         for of_block, total in zip(δ, lanes.from_raster(op.out), strict=True)
     ]
-    δrows = Rows.zeros(op.rows.count, op.rows.width)
+    δrows = PackedRows.zeros(op.rows.count, op.rows.width)
 
     def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
         row = op.rows.fetch(surfel, some)
@@ -266,7 +266,7 @@ def _blend_backward(op: _Blend, δout: list[Any]) -> Rows:
     return δrows
 
 
-def _blend_forward(op: _Blend, drows: Rows) -> list[Any]:
+def _blend_forward(op: _Blend, drows: PackedRows) -> list[Any]:
     lanes = _Lanes.of(op)
     maps = op.features + 2
 

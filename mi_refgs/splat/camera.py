@@ -41,12 +41,12 @@ class Camera:
         return tile_size(self.focal)
 
     @property
-    def phase(self) -> tuple[int, int]:
+    def tile_offset(self) -> tuple[int, int]:
         """Place of the first pixel in its tile."""
         return self.offset[0] % self.tile[0], self.offset[1] % self.tile[1]
 
     @staticmethod
-    def look(
+    def from_pose(
         width: int,
         height: int,
         fx: float,
@@ -111,7 +111,7 @@ class Camera:
         slope = local[:, :2] / local[:, 2:]
         fx = width / (slope[1, 0] - slope[0, 0])
         fy = height / (slope[2, 1] - slope[0, 1])
-        camera = Camera.look(
+        camera = Camera.from_pose(
             width,
             height,
             fx,

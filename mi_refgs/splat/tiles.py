@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.rows import Rows
+from mi_refgs.rows import PackedRows
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.footprint import Footprints, depth_near, overlaps
 
@@ -46,18 +46,18 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     Both sorts are stable, so surfels of equal depth keep the order of the table. Raises InputError where more
     than 2^MAX_PAIR_BITS pairs are left.
     """
-    phase_x, phase_y = camera.phase
-    tiles_x = -(-(camera.width + phase_x) // camera.tile[0])
-    tiles_y = -(-(camera.height + phase_y) // camera.tile[1])
+    offset_x, offset_y = camera.tile_offset
+    tiles_x = -(-(camera.width + offset_x) // camera.tile[0])
+    tiles_y = -(-(camera.height + offset_y) // camera.tile[1])
     tiles = tiles_x * tiles_y
     dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
-    rows = Rows.pack(footprints.columns)
+    rows = PackedRows.pack(footprints.columns)
     tile_size = mi.Vector2f(*camera.tile)
     found: list[tuple[Any, Any]] = []
     count = 0
     for surfel, tile_x, tile_y in _candidates(footprints, camera):
         row = rows.fetch(surfel)
-        corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(phase_x, phase_y)
+        corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(offset_x, offset_y)
         touches = overlaps(row, corner + 0.5, corner + (tile_size - 0.5))  # centres of the outermost pixels
         tile = mi.UInt32(tile_y * tiles_x + tile_x)
         depth = depth_near(row, corner + tile_size / 2)
@@ -144,7 +144,10 @@ def _candidates(footprints: Footprints, camera: Camera) -> Iterator[tuple[Any, A
     They come in parts of about CHUNK.
     """
     first, last = (
-        [mi.Int32((x + at) // size) for x, at, size in zip(corner, camera.phase, camera.tile, strict=True)]
+        [
+            mi.Int32((x + at) // size)
+            for x, at, size in zip(corner, camera.tile_offset, camera.tile, strict=True)
+        ]
         for corner in (footprints.first, footprints.last)
     )
     covers = (footprints.last[0] >= footprints.first[0]) & (footprints.last[1] >= footprints.first[1])

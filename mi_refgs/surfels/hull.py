@@ -172,7 +172,9 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int = HUL
     return Hull(field, low - 0.5 * voxel, voxel)
 
 
-def mean_colours(points: np.ndarray, views: Sequence[View], normals: np.ndarray | None = None) -> np.ndarray:
+def median_colours(
+    points: np.ndarray, views: Sequence[View], normals: np.ndarray | None = None
+) -> np.ndarray:
     """Median linear colour (N, 3) of the points over the views that show them with alpha > 0.5.
 
     Points that no view shows are 0.5 grey. With `normals`, only views in front of a point vote. There is no

@@ -11,7 +11,7 @@ OUTLIERS = 0.01
 """Share of points along an axis, at either end, that the cells leave out: they go to the outermost ones."""
 
 
-def along_curve(points: np.ndarray) -> np.ndarray:
+def morton_order(points: np.ndarray) -> np.ndarray:
     """Order (N,) in which points (N, 3) lie along a Z-shaped space-filling curve; stable. [Morton 1966]"""
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from mi_refgs.errors import InputError, shown
+from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.files import read_json
-from mi_refgs.fit import config
-from mi_refgs.fit.evaluate import load_split
-from mi_refgs.fit.export import Fitted
-from mi_refgs.fit.record import Run
 from mi_refgs.images import image_size, read_exr, read_png, write_exr
+from mi_refgs.methods import config
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.plugins.properties import read_background, read_light, read_shading, read_surfels
 from mi_refgs.render.pipeline import Shading
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.surfels.ply import read_ply
 
@@ -166,7 +166,7 @@ def test_methods_that_make_no_sense(text: str, tmp_path: Path) -> None:
 )
 def test_models_that_make_no_sense(content: dict[str, Any], tmp_path: Path) -> None:
     whole = {"iteration": 1, "seconds": 1.0, "shading": {"reflectance": "radiance"}} | content
-    refused(lambda path: Fitted.read(path.parent), tmp_path / "model.json", json.dumps(whole).encode())
+    refused(lambda path: TrainedScene.read(path.parent), tmp_path / "model.json", json.dumps(whole).encode())
 
 
 @pytest.mark.parametrize("place", [3, None, "a" * 5000, "a\0b", "\ud800", ["a"]])

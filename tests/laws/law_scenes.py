@@ -39,7 +39,7 @@ class View:
 
     def camera(self) -> Camera:
         centre = self.width / 2, self.height / 2
-        return Camera.look(self.width, self.height, -FOCAL, -FOCAL, *centre, self.to_world, self.near)
+        return Camera.from_pose(self.width, self.height, -FOCAL, -FOCAL, *centre, self.to_world, self.near)
 
     def moved(self, matrix: np.ndarray) -> View:
         """The view from the pose `matrix` (4, 4) takes it to."""

@@ -1,8 +1,8 @@
 """The run folder: readable without this package, written atomically, resumable.
 
 config.toml  dataset.json  metrics.jsonl  checkpoints/  previews/      written while it is fitted
-surfels.ply  envmap.exr  mesh.ply  scene.xml  model.json               by `fit.export`
-metrics.json  contact_sheet.png  eval/                                 by `fit.evaluate`
+surfels.ply  envmap.exr  mesh.ply  scene.xml  model.json               by `runs.export`
+metrics.json  contact_sheet.png  eval/                                 by `evaluation`
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.files import cannot_write, read_json, remove_temporaries, write_bytes
-from mi_refgs.fit import checkpoint
-from mi_refgs.fit.config import Method, dump, load_resolved
+from mi_refgs.runs import checkpoint
+from mi_refgs.methods.config import Method, dump, load_resolved
 
 CHECKPOINTS_KEPT = 2
 """One could be enough, since a checkpoint appears only when complete; two survive a disk that lies."""

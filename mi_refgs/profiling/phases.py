@@ -17,7 +17,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-STAGES = (
+PHASES = (
     "prefilter forward",
     "shade forward",
     "project",
@@ -40,7 +40,7 @@ WARM_UP = 4
 """Steps with barriers before the first that counts: a kernel that ends at a barrier is compiled anew."""
 
 
-class StageClock:
+class PhaseClock:
     """Wraps functions so that each call is evaluated, waited for and booked under a name."""
 
     def __init__(self) -> None:
@@ -169,8 +169,8 @@ def _map(value: Any, change: Callable[[Any], Any]) -> Any:
     return value
 
 
-def stage_times(trainer: Any, steps: int, before: Callable[[], None] = lambda: None) -> dict[str, float]:
-    """Median milliseconds a step by stage, in the order of STAGES; `before` is called ahead of every step.
+def phase_times(trainer: Any, steps: int, before: Callable[[], None] = lambda: None) -> dict[str, float]:
+    """Median milliseconds a step by stage, in the order of PHASES; `before` is called ahead of every step.
 
     With barriers between them: their sum is more than a step takes, as kernels otherwise fuse across stages.
     """
@@ -178,7 +178,7 @@ def stage_times(trainer: Any, steps: int, before: Callable[[], None] = lambda: N
     def module(name: str) -> Any:
         return importlib.import_module(f"mi_refgs.{name}")
 
-    clock = StageClock()
+    clock = PhaseClock()
     splat, optim = module("splat"), module("fit.optim")
     clock.wrap(splat, "project", "project")
     clock.wrap(splat, "list_by_tile", "sort")
@@ -206,5 +206,5 @@ def stage_times(trainer: Any, steps: int, before: Callable[[], None] = lambda: N
     finally:
         clock.restore()
     rows = rows[WARM_UP:]
-    named = [stage for stage in STAGES if any(stage in row for row in rows)]
+    named = [stage for stage in PHASES if any(stage in row for row in rows)]
     return {stage: 1e3 * float(np.median([row.get(stage, 0.0) for row in rows])) for stage in named}

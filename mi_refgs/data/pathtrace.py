@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.shade import lobe
+from mi_refgs.shade import lobe_matrices
 
 SAMPLES_PER_LAUNCH = 1 << 24
 """Largest number of paths traced at once; the path tracer keeps about 100 bytes for each."""
@@ -76,7 +76,7 @@ def environment_image(scene: Any, height: int) -> np.ndarray:
     if "data" in params and np.array_equal(np.array(params["to_world"].matrix).reshape(4, 4), np.eye(4)):
         # Without the columns that Mitsuba adds on either side for its interpolation.
         texels = np.array(params["data"], dtype=np.float64)[:, 1:-1, :3]
-        return (lobe.resample(texels, height) * np.array(params["scale"])).astype(np.float32)
+        return (lobe_matrices.resample(texels, height) * np.array(params["scale"])).astype(np.float32)
     rows = (height - 1) * ENVIRONMENT_OVERSAMPLING + 1
     columns = 2 * height * ENVIRONMENT_OVERSAMPLING
     index = dr.arange(mi.UInt32, rows * columns)
@@ -86,7 +86,7 @@ def environment_image(scene: Any, height: int) -> np.ndarray:
     si.wi = -mi.Vector3f(dr.sin(theta) * dr.sin(phi), dr.cos(theta), -dr.sin(theta) * dr.cos(phi))
     # A constant emitter answers with one value for all directions.
     radiance = np.array(emitter.eval(si) + dr.zeros(mi.Float, rows * columns))
-    image = lobe.resample(radiance.T.reshape(rows, columns, 3), height)
+    image = lobe_matrices.resample(radiance.T.reshape(rows, columns, 3), height)
     image[[0, -1]] = image[[0, -1]].mean(axis=1, keepdims=True)  # a pole is one point
     return image.astype(np.float32)
 

@@ -13,7 +13,7 @@ import numpy as np
 from mi_refgs.constants import MAX_NUMBER, RIGID_TOLERANCE
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import is_file
-from mi_refgs.fit.lens import Lens, Undistortion, undistortion
+from mi_refgs.data.lens import Lens, Undistortion, undistortion
 from mi_refgs.images import box_downscale, image_size, read_exr_image, read_png
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class View:
         from mi_refgs.splat.camera import Camera
 
         focal = (-self.fx, -self.fy)
-        return Camera.look(self.width, self.height, *focal, self.cx, self.cy, self.to_world, self.near)
+        return Camera.from_pose(self.width, self.height, *focal, self.cx, self.cy, self.to_world, self.near)
 
 
 @dataclass(frozen=True)

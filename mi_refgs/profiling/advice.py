@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mi_refgs.fit.config import Method
-from mi_refgs.fit.profile import FAINT, Profile, StageProfile
+from mi_refgs.methods.config import Method
+from mi_refgs.profiling.profile import FAINT, Profile, StageProfile
 
 LOW_SHARE = 0.25
 """Contributing share of the evaluations below which it is worth asking why."""

@@ -45,7 +45,7 @@ class SurfaceSample:
 
 
 @dataclass(frozen=True)
-class Neighbourhood:
+class VertexSurfels:
     """Of every vertex of a mesh, the surfels around it. V vertices, K neighbours, F faces."""
 
     count: int  # surfels
@@ -55,7 +55,7 @@ class Neighbourhood:
     normal: Any  # mi.Vector3f (V)
 
     @staticmethod
-    def of(mesh: Mesh, surfels: Surfels) -> Neighbourhood:
+    def of(mesh: Mesh, surfels: Surfels) -> VertexSurfels:
         """The NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint.
 
         The footprint is the surfel's Gaussian in its plane, and one of a voxel across it. Detached. Raises
@@ -87,7 +87,7 @@ class Neighbourhood:
         alone = np.arange(count) == 0
         weight = np.where(total > WEIGHT_FLOOR, weight / np.maximum(total, WEIGHT_FLOOR), alone)
         normal = _normals(mesh, axes[2][found], weight)
-        return Neighbourhood(
+        return VertexSurfels(
             surfels.count,
             mi.UInt32(mesh.faces.ravel()),
             [mi.UInt32(column.astype(np.uint32)) for column in found.T],
@@ -117,12 +117,12 @@ class Neighbourhood:
 class Surface:
     """A mesh with materials, to look up at hits."""
 
-    around: Neighbourhood
+    around: VertexSurfels
     rows: Any  # mi.Float (8 V): albedo, metallic, roughness, normal
 
-    def at(self, triangle: mi.UInt32, place: mi.Point2f, active: mi.Bool) -> SurfaceSample:
-        """Attributes at the barycentric coordinates `place` (of the second and third corner)."""
-        shares = (1 - place.x - place.y, place.x, place.y)
+    def at(self, triangle: mi.UInt32, barycentric: mi.Point2f, active: mi.Bool) -> SurfaceSample:
+        """Attributes at the barycentric coordinates `barycentric` (of the second and third corner)."""
+        shares = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)
         near, far = mi.Vector4f(0), mi.Vector4f(0)
         closest, largest = mi.UInt32(0), mi.Float(-1)
         for corner, share in enumerate(shares):

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.fit.data import Dataset
-from mi_refgs.fit.frames import View
-from mi_refgs.fit.metrics import environment
-from mi_refgs.fit.objective import displayed
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.transforms import View
+from mi_refgs.evaluation.metrics import environment
 from mi_refgs.images import srgb_from_linear
+from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
 
 LIGHT_KEY = 0.36
@@ -31,7 +31,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class RenderedView:
     """A rendered view as NumPy arrays."""
 
     image: np.ndarray  # (H, W, 3) display-encoded, over the data's background
@@ -40,7 +40,7 @@ class Shot:
     maps: dict[str, np.ndarray]  # (H, W) or (H, W, 3), linear
 
     @staticmethod
-    def of(frame: Frame, data: Dataset) -> Shot:
+    def of(frame: Frame, data: Dataset) -> RenderedView:
         """Copy a frame of the data set's size; waits for the device."""
         view = data.views[0]
 
@@ -54,7 +54,7 @@ class Shot:
         normal = planes(frame.normal)
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         maps = {name: planes(m) if name == "albedo" else plane(m) for name, m in frame.maps.items()}
-        return Shot(
+        return RenderedView(
             planes(displayed(frame, data.background, data.linear)),
             plane(frame.alpha),
             np.where(length > 1e-6, normal / np.maximum(length, 1e-6), 0),
@@ -67,7 +67,7 @@ def target(view: View) -> np.ndarray:
     return srgb_from_linear(view.image) if view.linear else view.image
 
 
-def panels(shot: Shot, view: View) -> dict[str, np.ndarray]:
+def panels(shot: RenderedView, view: View) -> dict[str, np.ndarray]:
     """Everything there is to see of a view, by title."""
     shown = {"ground truth": target(view), "render": shot.image}
     if view.normal is not None:

@@ -24,10 +24,10 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.files import read_json
-from mi_refgs.fit.checkpoint import PARAMS, tensors
-from mi_refgs.fit.config import Method
-from mi_refgs.fit.record import Run
-from mi_refgs.fit.schedule import LIGHT
+from mi_refgs.runs.checkpoint import PARAMS, tensors
+from mi_refgs.methods.config import Method
+from mi_refgs.runs.run import Run
+from mi_refgs.runs.checkpoint import LIGHT
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, Shading, render
@@ -42,7 +42,7 @@ SURFELS, LIGHT_MAP, MESH, SCENE, MODEL = "surfels.ply", "envmap.exr", "mesh.ply"
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class TrainedScene:
     """What a fit has found: enough to render, and nothing that only training needs."""
 
     surfels: Surfels
@@ -53,7 +53,7 @@ class Fitted:
     seconds: float  # spent training
 
     @staticmethod
-    def from_state(method: Method, state: Mapping[str, np.ndarray]) -> Fitted:
+    def from_state(method: Method, state: Mapping[str, np.ndarray]) -> TrainedScene:
         """From the state of a `Trainer`, as a checkpoint holds it."""
         params = tensors(state, PARAMS)
         light = params.pop(LIGHT, None)
@@ -62,7 +62,7 @@ class Fitted:
             mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
         iteration = int(state["iteration"])
         _, stage = method.stage_at(max(iteration, 1))
-        return Fitted(
+        return TrainedScene(
             Surfels(params),
             None if light is None else EnvironmentLight(light),
             mesh,
@@ -72,7 +72,7 @@ class Fitted:
         )
 
     @staticmethod
-    def read(folder: Path) -> Fitted:
+    def read(folder: Path) -> TrainedScene:
         """From the artefacts in a run folder; raises InputError for a file that cannot be used."""
         note = folder / MODEL
         try:
@@ -86,7 +86,7 @@ class Fitted:
                 f"{note}: cannot be read ({error}); write it again with `refgs export {folder}`"
             ) from error
         light, mesh = folder / LIGHT_MAP, folder / MESH
-        fitted = Fitted(
+        fitted = TrainedScene(
             read_ply(folder / SURFELS),
             EnvironmentLight.from_file(light) if light.is_file() else None,
             read_mesh(mesh) if shading.occlusion else None,
@@ -118,7 +118,7 @@ class Fitted:
         return view
 
 
-def export(fitted: Fitted, folder: Path, camera: Camera) -> list[Path]:
+def export(fitted: TrainedScene, folder: Path, camera: Camera) -> list[Path]:
     """Write the artefacts into `folder`, each whole or not at all; returns their paths.
 
     `camera` becomes the sensor of scene.xml. Raises InputError if a file cannot be written or a value is not
@@ -153,7 +153,7 @@ def export(fitted: Fitted, folder: Path, camera: Camera) -> list[Path]:
     return [folder / name for name in (SURFELS, light, mesh, SCENE, MODEL) if name is not None]
 
 
-def newest(run: Run, method: Method) -> Fitted | None:
+def load_if_newer(run: Run, method: Method) -> TrainedScene | None:
     """What the newest checkpoint holds, if there is one that the artefacts do not already show."""
     shown = -1
     if (run.path / SURFELS).is_file():
@@ -164,4 +164,4 @@ def newest(run: Run, method: Method) -> Fitted | None:
     state = run.load_checkpoint()
     if state is None or int(state["iteration"]) <= shown:
         return None
-    return Fitted.from_state(method, state)
+    return TrainedScene.from_state(method, state)

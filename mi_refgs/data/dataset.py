@@ -4,10 +4,10 @@ Colour: PNG targets stay as displayed, sRGB-encoded, composited in that space as
 A·rgb + (1 − A)·background. EXR targets are linear and premultiplied: radiance + (1 − A)·background.
 
 Keys: `camera_angle_x` (radians) or `fl_x`, and `camera_angle_y`, `fl_y`, `cx`, `cy`, `w`, `h` (pixels), each
-in a frame or for the whole file; `k1` … `k4`, `p1`, `p2`, `is_fisheye`, `camera_model` (`fit.lens` undoes the
+in a frame or for the whole file; `k1` … `k4`, `p1`, `p2`, `is_fisheye`, `camera_model` (`data.lens` undoes the
 distortion); `frames` with `file_path` (with or without extension) and `transform_matrix`
 (camera to world, OpenGL axes); optional `exr_path`, `normal_path` (X, Y, Z, world) and `depth_path` (along
-the viewing axis) as `fit.dataset` writes them.
+the viewing axis) as `data.make_dataset` writes them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.files import read_json
-from mi_refgs.fit.frames import FrameReader, View
+from mi_refgs.data.transforms import FrameReader, View
 
 HOLDOUT = 8
 """Every eighth picture is a test view where no test file exists (LLFF's habit, kept by 3DGS and 2DGS)."""
@@ -70,7 +70,7 @@ class Dataset:
         return np.array([view.to_world[:3, 3] for view in self.views])
 
 
-def load(
+def read_dataset(
     path: str | Path,
     split: str,
     *,
@@ -116,7 +116,7 @@ def load(
 def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, int, int]:
     """The smallest `downscale` with which the first training picture has at most so many pixels.
 
-    Returns it with the picture's own width and height. Raises InputError as `load` does.
+    Returns it with the picture's own width and height. Raises InputError as `read_dataset` does.
     """
     transforms, content, frames = _frames(Path(path), "train")
     width, height = FrameReader(transforms, content, 1, 0.0, images, False).size(*frames[0])

@@ -29,8 +29,8 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.files import read_json, write_bytes
-from mi_refgs.fit.frames import MITSUBA_FROM_OPENGL
-from mi_refgs.fit.pathtrace import Tracer, bounding_sphere, camera_poses, environment_image
+from mi_refgs.data.transforms import MITSUBA_FROM_OPENGL
+from mi_refgs.data.pathtrace import Tracer, bounding_sphere, camera_poses, environment_image
 from mi_refgs.images import mitsuba_exr, read_exr, read_png, srgb_from_linear, write_exr, write_png
 
 VIEW_FILES = (
@@ -59,7 +59,7 @@ class Settings:
     environment_height: int  # rows; 0 writes no environment
 
 
-def generate(
+def make_dataset(
     scene: str | Path,
     out: str | Path,
     *,

@@ -14,10 +14,10 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit.config import Refine
-from mi_refgs.fit.counts import Counts, count
-from mi_refgs.fit.stages import stage_times
 from mi_refgs.fit.train import Trainer
+from mi_refgs.methods.config import Refine
+from mi_refgs.profiling.counts import Counts, count
+from mi_refgs.profiling.phases import phase_times
 from mi_refgs.splat import list_by_tile, project
 
 WARM_UP = 4
@@ -36,7 +36,7 @@ class StageProfile:
     step_ms: float  # median of undisturbed steps
     launches: int  # kernels a step
     misses: int  # kernels compiled in all warm steps together
-    stages_ms: dict[str, float]  # by `fit.stages`, between barriers
+    stages_ms: dict[str, float]  # by `profiling.phases`, between barriers
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
         misses = dr.detail.launch_stats()[2] - misses
         prepare()
         launches = _launches(trainer.step)
-        stages = stage_times(trainer, max(steps // 3, 5), prepare)
+        stages = phase_times(trainer, max(steps // 3, 5), prepare)
     return StageProfile(
         name=name,
         step_ms=1e3 * float(np.median(times)),

@@ -15,7 +15,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.fit.ssim import WINDOW_RADIUS, WINDOW_SIGMA
 from mi_refgs.images import srgb_from_linear
-from mi_refgs.shade import lobe
+from mi_refgs.shade import lobe_matrices
 
 # What identical images read, dB: JSON has no infinity, and float32 images cannot differ by less.
 PSNR_MAX = 100.0
@@ -152,10 +152,10 @@ def environment(light: np.ndarray, truth: np.ndarray, peak: float | None = None)
             )
     if peak is not None:
         light, truth = np.minimum(light, peak), np.minimum(truth, peak)
-    rows = lobe.row_resampling(len(truth), len(light))
-    columns = lobe.column_resampling(truth.shape[1], light.shape[1])
+    rows = lobe_matrices.row_resampling(len(truth), len(light))
+    columns = lobe_matrices.column_resampling(truth.shape[1], light.shape[1])
     truth = np.einsum("ih,jw,hwc->ijc", rows, columns, truth, optimize=True)
-    weight = np.broadcast_to(lobe.row_areas(len(light))[:, None, None], light.shape)
+    weight = np.broadcast_to(lobe_matrices.row_areas(len(light))[:, None, None], light.shape)
     scale = np.sum(weight * light * truth, axis=(0, 1)) / np.maximum(
         np.sum(weight * light**2, axis=(0, 1)), 1e-30
     )

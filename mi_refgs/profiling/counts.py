@@ -48,8 +48,8 @@ def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
         return Counts(surfels, pixels, width * height, 0, 0, 0, 0, pixels_of_surfel)
     lane = dr.arange(mi.UInt32, lists.tiles_x * lists.tiles_y * width * height)
     tile, local = lane // (width * height), lane % (width * height)
-    x = (tile % lists.tiles_x) * width + local % width - camera.phase[0]
-    y = (tile // lists.tiles_x) * height + local // width - camera.phase[1]
+    x = (tile % lists.tiles_x) * width + local % width - camera.tile_offset[0]
+    y = (tile // lists.tiles_x) * height + local // width - camera.tile_offset[1]
     pixel = mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5)
     begin = dr.gather(mi.UInt32, lists.pair_begin, tile)
     end = dr.gather(mi.UInt32, lists.pair_end, tile)

@@ -15,16 +15,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.errors import InputError
+from mi_refgs.evaluation import metrics, pictures
 from mi_refgs.files import read_json
-from mi_refgs.fit import metrics, pictures
-from mi_refgs.fit.config import Method
-from mi_refgs.fit.data import Dataset, load
-from mi_refgs.fit.export import Fitted, export, newest
-from mi_refgs.fit.objective import displayed
-from mi_refgs.fit.record import Run
 from mi_refgs.images import read_exr_image, write_png
+from mi_refgs.methods.config import Method
+from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
+from mi_refgs.runs.export import TrainedScene, export, load_if_newer
+from mi_refgs.runs.run import Run
 from mi_refgs.splat import Camera
 
 FOLDER = "eval"
@@ -43,7 +43,7 @@ LIGHT_KEYS = ("env_scale", "env_mae", "env_psnr", "env_correlation")
 def load_split(run: Run, method: Method, split: str, path: Path | None = None) -> Dataset:
     """A split of the data set that a run was fitted to, or of the one at `path`, read as the method says.
 
-    Raises InputError as `fit.data.load` does, and if the run does not say where its data is or it is gone.
+    Raises InputError as `read_dataset` does, and if the run does not say where its data is or it is gone.
     """
     if path is None:
         try:
@@ -58,7 +58,7 @@ def load_split(run: Run, method: Method, split: str, path: Path | None = None) -
                 f"{run.path / 'dataset.json'}: path: {path} is gone; name the data set's folder with --data"
             )
     options = method.data
-    return load(
+    return read_dataset(
         path, split, downscale=options.downscale, background=options.background, images=options.images
     )
 
@@ -94,7 +94,7 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict
     for index, truth in enumerate(
         tqdm(views.views, desc="eval", unit="view", file=sys.stderr, disable=not progress)
     ):
-        shot = pictures.Shot.of(view(truth.camera()), views)
+        shot = pictures.RenderedView.of(view(truth.camera()), views)
         goal = pictures.target(truth)
         scores: dict[str, Any] = {
             "name": truth.name,
@@ -146,19 +146,19 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict
     return result
 
 
-def up_to_date(run: Run, method: Method, camera: Camera) -> Fitted:
+def up_to_date(run: Run, method: Method, camera: Camera) -> TrainedScene:
     """The artefacts of a run, written first if there are none or the newest checkpoint is newer.
 
     Raises InputError if there is nothing to write them from.
     """
-    fresh = newest(run, method)
+    fresh = load_if_newer(run, method)
     if fresh is not None:
         export(fresh, run.path, camera)
     elif not (run.path / "model.json").is_file():
         raise InputError(
             f"{run.path}: checkpoints: none yet; train it with `refgs train DATA -o {run.path} --resume`"
         )
-    return Fitted.read(run.path)
+    return TrainedScene.read(run.path)
 
 
 def machine() -> dict[str, Any]:
@@ -180,7 +180,7 @@ def machine() -> dict[str, Any]:
     }
 
 
-def _light(fitted: Fitted, data: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
+def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
     """The env_ keys, and the pictures of the light."""
     nothing: dict[str, Any] = dict.fromkeys(LIGHT_KEYS)
     if fitted.light is None:

@@ -1,0 +1,1 @@
+"""The quality of a finished fit: metrics and contact sheets."""

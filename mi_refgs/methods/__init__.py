@@ -1,0 +1,1 @@
+"""A method as data: what the TOML files of `variants/` say."""

@@ -1,0 +1,57 @@
+"""What a camera shows of linear radiance: the one place where the sRGB curve and the background come in.
+
+Images are planes: lists of mi.Float of width H·W in raster order (or a mi.Color3f).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refgs.images import SRGB_LINEAR_LIMIT
+from mi_refgs.render.pipeline import Frame
+
+# Alpha below which a pixel is empty: radiance / A has no meaning and the background alone is seen.
+ALPHA_EMPTY = 1e-6
+
+
+def srgb_from_linear(linear: Any) -> Any:
+    """sRGB encoding (IEC 61966-2-1) of a linear plane: straight below 0.0031308, else the curve.
+
+    Unbounded above 1. The slope is finite everywhere (12.92 at 0).
+    """
+    straight = linear <= SRGB_LINEAR_LIMIT
+    curve = 1.055 * dr.power(dr.select(straight, 1.0, linear), 1 / 2.4) - 0.055
+    return dr.select(straight, 12.92 * linear, curve)
+
+
+def display_image(radiance: Iterable[Any], alpha: Any, background: Iterable[Any]) -> list[Any]:
+    """What an 8-bit RGBA picture shows: A srgb(L / A) + (1 - A) background, per plane.
+
+    radiance: linear, premultiplied (L); background: display-encoded floats or planes. Pixels with A < 1e-6
+    show the background and give radiance no gradient.
+    """
+    seen = alpha >= ALPHA_EMPTY
+    inverse = dr.select(seen, dr.rcp(dr.select(seen, alpha, 1.0)), 0.0)
+    return [
+        alpha * srgb_from_linear(plane * inverse) + (1 - alpha) * behind
+        for plane, behind in zip(radiance, background, strict=True)
+    ]
+
+
+def displayed(frame: Frame, background: np.ndarray, linear: bool) -> list[Any]:
+    """What the camera shows of a frame, display-encoded planes.
+
+    Pictures with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it.
+    """
+    behind = [float(x) for x in background]
+    radiance = list(frame.radiance)
+    if not linear:
+        return display_image(radiance, frame.alpha, behind)
+    return [
+        srgb_from_linear(plane + (1 - frame.alpha) * value)
+        for plane, value in zip(radiance, behind, strict=True)
+    ]

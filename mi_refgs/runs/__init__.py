@@ -1,0 +1,1 @@
+"""The run folder: its files, checkpoints, interruption, and what is exported from it."""
