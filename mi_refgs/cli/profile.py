@@ -7,8 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mi_refgs.cli.command import Result, add_command, add_settings
-from mi_refgs.cli.train import DEFAULT_PRESET, load_method, sized, training_views
+from mi_refgs.cli.command import Result, add_command, add_settings, say
+from mi_refgs.cli.train import DEFAULT_PRESET, load_method
 from mi_refgs.errors import InputError
 
 if TYPE_CHECKING:
@@ -62,15 +62,16 @@ def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
     """The trainer of a run or of a fresh fit, and the stages of the schedule to look at."""
     from mi_refgs.evaluation.evaluate import load_split
     from mi_refgs.fit.train import Trainer
+    from mi_refgs.fit.whole import read_views, sized
     from mi_refgs.runs.run import Run
 
     if not args.path.is_dir():
         raise InputError(f"{args.path}: RUN|DATA: no such folder; give a run folder or a data set")
-    if (args.path / "config.toml").is_file():
+    folder = Run(args.path)
+    if folder.exists():
         for option, value in (("--variant", args.variant), ("--preset", args.preset), ("--set", args.set)):
             if value:
                 raise InputError(f"{option}: {args.path} is a run and keeps its method; drop {option}")
-        folder = Run(args.path)
         method = folder.method()
         if not folder.checkpoints():
             raise InputError(f"{args.path}: checkpoints: none yet; train on, or profile its data set")
@@ -78,8 +79,9 @@ def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
         return trainer, [method.stage_at(max(trainer.iteration, 1))[0]]
     if args.data is not None:
         raise InputError(f"--data: {args.path} is no run; drop --data")
-    method = sized(load_method(args.variant, args.preset, args.set), args.path)
-    return Trainer(method, training_views(method, args.path)), [name for name, _ in method.stages()]
+    method = sized(load_method(args.variant, args.preset, args.set), args.path, say)
+    views = read_views(method, args.path, "train", truth=False)
+    return Trainer(method, views), [name for name, _ in method.stages()]
 
 
 def _threads() -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,6 @@ from mi_refgs.errors import InputError
 from mi_refgs.resources import resource_dir
 
 if TYPE_CHECKING:
-    from mi_refgs.data.dataset import Dataset
     from mi_refgs.fit.train import Trainer
     from mi_refgs.methods.config import Method
     from mi_refgs.runs.run import Run
@@ -79,39 +77,6 @@ def load_method(variant: str | None, preset: str | None, assignments: list[str] 
     return config.load(path, preset or DEFAULT_PRESET, assignments)
 
 
-def sized(method: Method, data_path: Path) -> Method:
-    """The method with the size of pictures decided: where it says none, what its preset can afford."""
-    from mi_refgs.data import dataset
-    from mi_refgs.methods.config import PRESETS
-
-    if method.data.downscale is not None:
-        return method
-    budget = PRESETS[method.preset].pixels
-    factor, width, height = dataset.fitting_downscale(data_path, method.data.images, budget)
-    if factor > 1:
-        say(
-            f"{data_path}: pictures of {width} × {height} pixels are read as {width // factor} × "
-            f"{height // factor}, so that preset {method.preset} takes its time and not more; "
-            "--set data.downscale=1 reads them whole"
-        )
-    return replace(method, data=replace(method.data, downscale=factor))
-
-
-def training_views(method: Method, data_path: Path) -> Dataset:
-    """The pictures to fit, as the method asks for them."""
-    from mi_refgs.data import dataset
-
-    options = method.data
-    return dataset.read_dataset(
-        data_path,
-        "train",
-        downscale=options.downscale,
-        background=options.background,
-        images=options.images,
-        truth=False,
-    )
-
-
 def fit(
     data_path: Path,
     output: Path,
@@ -125,29 +90,22 @@ def fit(
     Raises InputError for bad input, and KeyboardInterrupt or TerminatedError with a message that says how to
     go on.
     """
-    from mi_refgs.evaluation.evaluate import load_split, up_to_date
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fit.whole import begin, finish, read_views, sized
     from mi_refgs.runs.run import Run
 
     folder = Run(output)
-    resumed = resume and (output / "config.toml").is_file()
+    resumed = resume and folder.exists()
     if resumed:
         method = folder.method()
         _require_same(folder, method, data_path, variant, preset, assignments)
     else:
-        if (output / "config.toml").exists():
-            raise InputError(
-                f"{output}: holds a run already; add --resume to go on with it, or choose another -o"
-            )
-        method = sized(load_method(variant, preset, assignments), data_path)
-    views = training_views(method, data_path)
+        folder.require_none()
+        method = sized(load_method(variant, preset, assignments), data_path, say)
+    views = read_views(method, data_path, "train", truth=False)
     warn_of_data(method, views)
-    trainer = Trainer(method, views, folder)
+    trainer = begin(method, views, folder)
     if resumed:
         say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
-        folder.rewind(trainer.iteration)
-    else:
-        folder.create(method, str(data_path.resolve()))
 
     try:
         with Progress(trainer, folder) as progress:
@@ -162,14 +120,8 @@ def fit(
         saved = folder.checkpoints()
         kept = f" (saved up to iteration {int(saved[-1].stem)}; --resume goes on from there)" if saved else ""
         raise InputError(f"{error}{kept}") from error
-    if not any(path.stem == f"{trainer.iteration:07d}" for path in folder.checkpoints()):
-        folder.save_checkpoint(trainer.iteration, trainer.state())
-    try:
-        first = load_split(folder, method, "test", data_path).views[0]
-    except InputError as error:
-        warn(f"{error} (scene.xml gets a training camera, and `refgs eval` will need test views)")
-        first = views.views[0]
-    up_to_date(folder, method, first.camera())
+    if warning := finish(trainer, folder):
+        warn(warning)
     warn_of_outcome(trainer)
     return trainer
 

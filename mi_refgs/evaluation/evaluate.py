@@ -15,15 +15,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.transforms import View
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics, pictures
 from mi_refgs.files import read_json
+from mi_refgs.fit.whole import read_views
 from mi_refgs.images import read_exr_image, write_png
 from mi_refgs.methods.config import Method
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.runs.export import TrainedScene, export, load_if_newer
+from mi_refgs.runs.export import TrainedScene, up_to_date
 from mi_refgs.runs.run import Run
 from mi_refgs.splat import Camera
 
@@ -57,10 +59,7 @@ def load_split(run: Run, method: Method, split: str, path: Path | None = None) -
             raise InputError(
                 f"{run.path / 'dataset.json'}: path: {path} is gone; name the data set's folder with --data"
             )
-    options = method.data
-    return read_dataset(
-        path, split, downscale=options.downscale, background=options.background, images=options.images
-    )
+    return read_views(method, path, split)
 
 
 def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict[str, Any]:
@@ -111,7 +110,7 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict
             covered = np.linalg.norm(truth.normal, axis=-1) if truth.alpha is None else truth.alpha
             scores |= metrics.normal_mae_deg(shot.normal, truth.normal, covered)
         per_view.append(scores)
-        write_png(folder / f"{re.sub(r'[^0-9A-Za-z]+', '_', truth.name).strip('_')}.png", shot.image)
+        write_png(run.path / render_name(truth), shot.image)
         if index in shown:
             rows.append(pictures.panels(shot, truth))
 
@@ -146,19 +145,9 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict
     return result
 
 
-def up_to_date(run: Run, method: Method, camera: Camera) -> TrainedScene:
-    """The artefacts of a run, written first if there are none or the newest checkpoint is newer.
-
-    Raises InputError if there is nothing to write them from.
-    """
-    fresh = load_if_newer(run, method)
-    if fresh is not None:
-        export(fresh, run.path, camera)
-    elif not (run.path / "model.json").is_file():
-        raise InputError(
-            f"{run.path}: checkpoints: none yet; train it with `refgs train DATA -o {run.path} --resume`"
-        )
-    return TrainedScene.read(run.path)
+def render_name(view: View) -> str:
+    """Path, below the run folder, of the picture that `evaluate` writes of a test view."""
+    return f"{FOLDER}/{re.sub(r'[^0-9A-Za-z]+', '_', view.name).strip('_')}.png"
 
 
 def machine() -> dict[str, Any]:

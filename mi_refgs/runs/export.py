@@ -165,3 +165,18 @@ def load_if_newer(run: Run, method: Method) -> TrainedScene | None:
     if state is None or int(state["iteration"]) <= shown:
         return None
     return TrainedScene.from_state(method, state)
+
+
+def up_to_date(run: Run, method: Method, camera: Camera) -> TrainedScene:
+    """The artefacts of a run, written first if there are none or the newest checkpoint is newer.
+
+    Raises InputError if there is nothing to write them from.
+    """
+    fresh = load_if_newer(run, method)
+    if fresh is not None:
+        export(fresh, run.path, camera)
+    elif not (run.path / "model.json").is_file():
+        raise InputError(
+            f"{run.path}: checkpoints: none yet; train it with `refgs train DATA -o {run.path} --resume`"
+        )
+    return TrainedScene.read(run.path)

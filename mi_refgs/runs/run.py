@@ -31,19 +31,27 @@ class Run:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
 
-    def create(self, method: Method, dataset: str) -> None:
-        """Start a run; raises InputError if the folder holds one already or cannot be written."""
+    def exists(self) -> bool:
+        """Whether the folder holds a run."""
+        return (self.path / "config.toml").is_file()
+
+    def require_none(self) -> None:
+        """Raise InputError if the folder holds a run already."""
         if (self.path / "config.toml").exists():
             raise InputError(
                 f"{self.path}: holds a run already; add --resume to go on with it, or choose another -o"
             )
+
+    def create(self, method: Method, dataset: str) -> None:
+        """Start a run; raises InputError if the folder holds one already or cannot be written."""
+        self.require_none()
         self._make_folders()
         write_bytes(self.path / "dataset.json", json.dumps({"path": dataset}).encode())
         write_bytes(self.path / "config.toml", dump(method).encode())
 
     def method(self) -> Method:
         """The resolved method; raises InputError if this is no run folder."""
-        if not (self.path / "config.toml").is_file():
+        if not self.exists():
             raise InputError(
                 f"{self.path}: config.toml: missing; give the folder that `refgs train -o` wrote"
             )

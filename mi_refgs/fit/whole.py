@@ -1,0 +1,79 @@
+"""A whole fit beside its loop: pictures read as the method says, a run begun or resumed, its artefacts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
+from mi_refgs.errors import InputError
+from mi_refgs.fit.train import Trainer
+from mi_refgs.methods.config import PRESETS, Method
+from mi_refgs.runs.export import up_to_date
+from mi_refgs.runs.run import Run
+
+
+def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> Method:
+    """The method with the size of pictures decided: where it says none, what its preset can afford.
+
+    `tell` hears when pictures are read smaller than they are. Raises InputError as `read_dataset` does.
+    """
+    if method.data.downscale is not None:
+        return method
+    budget = PRESETS[method.preset].pixels
+    factor, width, height = fitting_downscale(path, method.data.images, budget)
+    if factor > 1:
+        tell(
+            f"{path}: pictures of {width} × {height} pixels are read as {width // factor} × "
+            f"{height // factor}, so that preset {method.preset} takes its time and not more; "
+            "--set data.downscale=1 reads them whole"
+        )
+    return replace(method, data=replace(method.data, downscale=factor))
+
+
+def read_views(method: Method, path: Path, split: str, truth: bool = True) -> Dataset:
+    """A split of the data set at `path` as the method asks for its pictures; `truth` as in `read_dataset`.
+
+    Raises InputError as `read_dataset` does.
+    """
+    options = method.data
+    return read_dataset(
+        path,
+        split,
+        downscale=options.downscale,
+        background=options.background,
+        images=options.images,
+        truth=truth,
+    )
+
+
+def begin(method: Method, views: Dataset, run: Run) -> Trainer:
+    """A trainer that writes into `run`: from its newest checkpoint if the folder holds a run, else anew.
+
+    Raises InputError for checkpoints that are all damaged and a folder that cannot be written.
+    """
+    resumed = run.exists()
+    trainer = Trainer(method, views, run)
+    if resumed:
+        run.rewind(trainer.iteration)
+    else:
+        run.create(method, str(views.path.resolve()))
+    return trainer
+
+
+def finish(trainer: Trainer, run: Run) -> str | None:
+    """Save the state if no checkpoint holds it, and write the artefacts; returns a warning if there is one.
+
+    The first test view becomes the camera of scene.xml, and a training view where there are no test views.
+    """
+    if not any(int(path.stem) == trainer.iteration for path in run.checkpoints()):
+        run.save_checkpoint(trainer.iteration, trainer.state())
+    warning = None
+    try:
+        first = read_views(trainer.method, trainer.data.path, "test").views[0]
+    except InputError as error:
+        warning = f"{error} (scene.xml gets a training camera, and `refgs eval` will need test views)"
+        first = trainer.data.views[0]
+    up_to_date(run, trainer.method, first.camera())
+    return warning
