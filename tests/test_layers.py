@@ -15,7 +15,7 @@ PACKAGE = "mi_refgs"
 BOTTOM = {"constants", "device", "errors", "files", "images", "ply"}
 """What everything may stand on."""
 
-RENDERER = {"render", "shade", "occlusion", "splat", "surfels"} | BOTTOM
+RENDERER = {"render", "shade", "occlusion", "splat", "surfels", "primitives"} | BOTTOM
 """From surfels to an image."""
 
 LAYERS: dict[str, set[str]] = {
@@ -28,11 +28,12 @@ LAYERS: dict[str, set[str]] = {
     "ply": {"errors"},
     "rows": set(),
     "device": set(),
-    "surfels": {"rows"} | BOTTOM,
-    "splat": {"surfels", "rows"} | BOTTOM,
+    "primitives": BOTTOM,
+    "surfels": {"rows", "primitives"} | BOTTOM,
+    "splat": {"surfels", "primitives", "rows"} | BOTTOM,
     "shade": {"splat.camera", "surfels"} | BOTTOM,
-    "occlusion": {"splat.camera", "surfels"} | BOTTOM,
-    "render": {"shade", "occlusion", "splat", "surfels"} | BOTTOM,
+    "occlusion": {"splat.camera", "surfels", "primitives"} | BOTTOM,
+    "render": {"shade", "occlusion", "splat", "surfels", "primitives"} | BOTTOM,
     "plugins": RENDERER,
     "methods": RENDERER | {"resources"},
     "data": RENDERER,

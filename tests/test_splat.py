@@ -16,10 +16,10 @@ from mi_refgs import constants
 from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
+from mi_refgs.primitives.surfel import FootprintAdjoint
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.splat import Blended, Camera, list_by_tile, project, splat, tiles
-from mi_refgs.splat.footprint import FootprintAdjoint
 from mi_refgs.surfels.table import Surfels
 
 IMAGE_TOLERANCE = 1e-4  # the product's promise; observed 2e-6 … 3e-5

@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 
 from benchmarks.common.timing import once
+from mi_refgs.primitives.surfel import Surfel
 from mi_refgs.profiling.counts import Counts
-from mi_refgs.splat.footprint import GEOMETRY_COLUMNS
 
 FLOPS = {"forward": 60, "both": 260}
 CHAINS = 16
@@ -65,7 +65,7 @@ def bytes_moved(counts: Counts, features: int) -> dict[str, int]:
     Backward again the rows and the maps with their adjoints, and a read and a write of a row of adjoints for
     each visited pair (a bound from above: not every visited pair contributes).
     """
-    row = FLOAT * (GEOMETRY_COLUMNS + features)
+    row = FLOAT * (Surfel.columns + features)
     maps = FLOAT * (features + 2) * counts.pixels
     forward = LISTED_BYTES * counts.pairs + (FLOAT + row) * counts.visited + maps
     return {"forward": forward, "both": forward + (FLOAT + 3 * row) * counts.visited + 2 * maps}

@@ -70,7 +70,7 @@ def list_by_tile(slopes: Array, placed: Array, radius: Array, p: PinholeCamera) 
 
 
 def depth_near(slopes: Array, placed: Array, middle: Array) -> Array:
-    """Sort key of surfels (M,) in tiles with these centres, as `mi_refgs.splat.footprint` has it."""
+    """Sort key of surfels (M,) in tiles with these centres, as `mi_refgs.primitives.surfel` has it."""
     k, delta = placed[:, 0], middle - placed[:, 1:3]
     u, v, w = (slopes[:, 2 * i] * delta[:, 0] + slopes[:, 2 * i + 1] * delta[:, 1] for i in range(3))
     inside = np.minimum(1, c.SORT_REACH * k / np.sqrt(np.maximum(u * u + v * v, c.NORM_FLOOR)))

@@ -15,6 +15,7 @@ import numpy as np
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.methods.config import Refine
+from mi_refgs.primitives import Primitive, primitive_of, widths_of
 from mi_refgs.surfels.init import jittered_albedo, logit
 from mi_refgs.surfels.order import morton_order
 from mi_refgs.surfels.table import Surfels
@@ -77,7 +78,8 @@ def densify_and_prune(
     """
     raw = surfels.to_numpy()
     count = len(gradient)
-    size = np.exp(raw["scale"]).max(axis=1)
+    primitive = primitive_of(widths_of(raw))
+    size = primitive.extent(raw)[1].max(axis=1)
     keep = size <= options.prune_extent * extent
     if prune_transparent:
         keep &= sigmoid(raw["opacity"][:, 0]) >= options.prune_opacity
@@ -99,19 +101,19 @@ def densify_and_prune(
     table = {name: values[parent].copy() for name, values in raw.items()}
     children = slice(len(parent) - 2 * len(split), len(parent))
     if len(split):
-        table["position"][children] += _tangent_offsets(table, children, rng)
-        table["scale"][children] -= np.float32(np.log(SPLIT_SHRINK))
+        table["position"][children] += _offsets(primitive, table, children, rng)
+        primitive.resize(table, children, 1 / SPLIT_SHRINK)
     assert len(parent) <= max(max_count, count)
     return TableEdit(Surfels.from_numpy(table), parent.astype(np.uint32), fresh)
 
 
-def _tangent_offsets(table: dict[str, np.ndarray], rows: slice, rng: np.random.Generator) -> np.ndarray:
-    """Normal deviates in the tangent plane, with the surfels' own standard deviations."""
-    x, y, z, w = (table["rotation"][rows] / np.linalg.norm(table["rotation"][rows], axis=1, keepdims=True)).T
-    t_u = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], axis=1)
-    t_v = np.stack([2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)], axis=1)
-    local = rng.normal(size=(len(x), 2)) * np.exp(table["scale"][rows])
-    return (local[:, :1] * t_u + local[:, 1:] * t_v).astype(np.float32)
+def _offsets(
+    primitive: Primitive, table: dict[str, np.ndarray], rows: slice, rng: np.random.Generator
+) -> np.ndarray:
+    """Normal deviates of the primitives' own Gaussians (M, 3)."""
+    axes, deviations = primitive.extent({name: values[rows] for name, values in table.items()})
+    local = rng.normal(size=deviations.shape) * deviations
+    return sum(local[:, i : i + 1] * axes[:, i] for i in range(local.shape[1])).astype(np.float32)
 
 
 def reset_opacity(surfels: Surfels, options: Refine, metallic: float) -> Surfels:
@@ -136,7 +138,7 @@ def propagate_normals(surfels: Surfels, options: Refine) -> Surfels:
     raw["opacity"] = np.maximum(raw["opacity"], np.float32(logit(options.propagate_opacity)))
     metallic, roughness = sigmoid(raw["metallic"][:, 0]), sigmoid(raw["roughness"][:, 0])
     reflective = (metallic >= options.propagate_metallic) & (roughness <= options.propagate_roughness)
-    raw["scale"][reflective] += np.float32(np.log(options.propagate_scale))
+    primitive_of(widths_of(raw)).resize(raw, reflective, options.propagate_scale)
     return Surfels.from_numpy(raw)
 
 

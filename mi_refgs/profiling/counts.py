@@ -10,7 +10,6 @@ import mitsuba as mi
 
 from mi_refgs.splat import Camera, Footprints, TileLists
 from mi_refgs.splat.blend import advance
-from mi_refgs.splat.footprint import GEOMETRY_COLUMNS, evaluate
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class Counts:
 
 def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
     """Walk the lists as `splat.blend` does, and count; waits for the device."""
-    columns = [dr.detach(column) for column in footprints.columns[:GEOMETRY_COLUMNS]]
+    columns = [dr.detach(column) for column in footprints.columns]
     surfels = dr.width(columns[0])
     pixels_of_surfel = dr.zeros(mi.UInt32, surfels)
     pixels = camera.width * camera.height
@@ -60,7 +59,7 @@ def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
     def body(pair: Any, active: Any, transmittance: Any, steps: Any, hits: Any) -> Any:
         surfel = dr.gather(mi.UInt32, lists.surfel_from_pair, pair, active)
         row = [dr.gather(mi.Float, column, surfel, active) for column in columns]
-        sample = evaluate(row, pixel, camera.near)
+        sample = footprints.primitive.evaluate(row, pixel, camera.near)
         weight, after, goes_on = advance(sample, active, transmittance)
         hit = weight > 0
         dr.scatter_add(pixels_of_surfel, mi.UInt32(1), surfel, hit)

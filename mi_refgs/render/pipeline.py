@@ -20,6 +20,7 @@ import mitsuba as mi
 from mi_refgs.constants import COVERAGE_FLOOR, FACING_TOLERANCE
 from mi_refgs.errors import InputError, shown
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.primitives import primitive_of, widths_of
 from mi_refgs.render.reflection import reflection
 from mi_refgs.shade.models import Accuracy, ShadingPoints, Terms, reflect, safe_normalize, shade
 from mi_refgs.shade.sh import clamp_positive, eval_sh
@@ -160,7 +161,7 @@ def _facing(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
     """
     # A surfel at the camera's own position has no direction; it is culled, so any will do.
     direction = safe_normalize(camera.towards(surfels.position()))
-    normal = surfels.frame()[2]
+    normal = primitive_of(widths_of(surfels.raw)).normal(surfels)
     return direction, dr.select(dr.detach(dr.dot(normal, direction)) > FACING_TOLERANCE, -normal, normal)
 
 

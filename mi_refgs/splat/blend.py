@@ -35,15 +35,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import LANE_PIXELS_PER_AXIS, PACKET_EDGE, TRANSMITTANCE_MIN
+from mi_refgs.primitives import Footprints, Primitive
 from mi_refgs.rows import PackedRows
 from mi_refgs.splat.camera import Camera
-from mi_refgs.splat.footprint import (
-    GEOMETRY_COLUMNS,
-    FootprintAdjoint,
-    Footprints,
-    evaluate,
-    evaluate_forward,
-)
 from mi_refgs.splat.tiles import TileLists
 
 
@@ -58,18 +52,18 @@ class Blended:
 
 def blend(footprints: Footprints, features: list[Any], lists: TileLists, camera: Camera) -> Blended:
     """Composite per-surfel features (K × mi.Float (N,)); differentiable in features and footprint columns."""
-    out = dr.custom(_Blend, footprints.columns + features, lists, camera)
+    out = dr.custom(_Blend, footprints.columns + features, footprints.primitive, lists, camera)
     return Blended(out[: len(features)], *out[-2:])
 
 
 class _Blend(dr.CustomOp):
     """columns (N-wide) → [features…, depth, alpha] (pixel-wide)."""
 
-    def eval(self, columns: list[Any], lists: TileLists, camera: Camera) -> list[Any]:
-        self.lists, self.camera = lists, camera
+    def eval(self, columns: list[Any], primitive: Primitive, lists: TileLists, camera: Camera) -> list[Any]:
+        self.primitive, self.lists, self.camera = primitive, lists, camera
         self.rows = PackedRows.pack(columns)
         dr.eval(self.rows.data)
-        self.features = len(columns) - GEOMETRY_COLUMNS
+        self.features = len(columns) - primitive.columns
         self.out = _blend_primal(self) if lists.pairs else self._blank()
         return self.out
 
@@ -177,7 +171,7 @@ def advance(sample: Any, active: Any, transmittance: Any) -> tuple[Any, Any, Any
 
 def _values(op: _Blend, row: Any, z: Any) -> list[Any]:
     """What a surfel adds to each map: its features, its depth, and 1 for alpha."""
-    return [*row[GEOMETRY_COLUMNS:][: op.features], z, mi.Float(1)]
+    return [*row[op.primitive.columns :][: op.features], z, mi.Float(1)]
 
 
 def _walk(op: _Blend, lanes: _Lanes, step: Any, start: list[tuple[Any, ...]], label: str) -> list[Any]:
@@ -213,7 +207,7 @@ def _blend_primal(op: _Blend) -> list[Any]:
         row = op.rows.fetch(surfel, some)
         after = []
         for pixel, _, _, active_here, transmittance, out in lanes.each(active, *state):
-            sample = evaluate(row, pixel, op.camera.near)
+            sample = op.primitive.evaluate(row, pixel, op.camera.near)
             weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
             values = _values(op, row, sample.z)
             out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
@@ -237,9 +231,9 @@ def _blend_backward(op: _Blend, δout: list[Any]) -> PackedRows:
     def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
         row = op.rows.fetch(surfel, some)
         after, weights = [], []
-        geometry = FootprintAdjoint()
+        geometry = op.primitive.adjoint()
         for pixel, _, _, active_here, transmittance, behind_here, δhere in lanes.each(active, *state, δ):
-            sample = evaluate(row, pixel, op.camera.near)
+            sample = op.primitive.evaluate(row, pixel, op.camera.near)
             weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
             g = mi.Float(0)
             for adjoint, value in zip(δhere, _values(op, row, sample.z), strict=True):
@@ -274,12 +268,12 @@ def _blend_forward(op: _Blend, drows: PackedRows) -> list[Any]:
         row, drow = op.rows.fetch(surfel, some), drows.fetch(surfel, some)
         after = []
         for pixel, _, _, active_here, transmittance, dtransmittance, dout in lanes.each(active, *state):
-            sample = evaluate(row, pixel, op.camera.near)
+            sample = op.primitive.evaluate(row, pixel, op.camera.near)
             weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
             hit = weight > 0
-            dalpha, dz = evaluate_forward(row, sample, drow)
+            dalpha, dz = op.primitive.evaluate_forward(row, sample, drow)
             dweight = dr.select(hit, dtransmittance * sample.alpha + transmittance * dalpha, 0)
-            dvalues = [*drow[GEOMETRY_COLUMNS:][: op.features], dz, mi.Float(0)]
+            dvalues = [*drow[op.primitive.columns :][: op.features], dz, mi.Float(0)]
             dout = [
                 total + dweight * value + dr.select(hit, weight * dvalue, 0)
                 for total, value, dvalue in zip(dout, _values(op, row, sample.z), dvalues, strict=True)

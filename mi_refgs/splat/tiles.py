@@ -12,9 +12,9 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.primitives import Footprints
 from mi_refgs.rows import PackedRows
 from mi_refgs.splat.camera import Camera
-from mi_refgs.splat.footprint import Footprints, depth_near, overlaps
 
 MAX_PAIR_BITS = 27
 """Log₂ of the most pairs that are sorted: they take 40 bytes each, 5 GB in all."""
@@ -52,15 +52,17 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     tiles = tiles_x * tiles_y
     dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
     rows = PackedRows.pack(footprints.columns)
-    tile_size = mi.Vector2f(*camera.tile)
+    tile_size, primitive = mi.Vector2f(*camera.tile), footprints.primitive
     found: list[tuple[Any, Any]] = []
     count = 0
     for surfel, tile_x, tile_y in _candidates(footprints, camera):
         row = rows.fetch(surfel)
         corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(offset_x, offset_y)
-        touches = overlaps(row, corner + 0.5, corner + (tile_size - 0.5))  # centres of the outermost pixels
+        touches = primitive.overlaps(
+            row, corner + 0.5, corner + (tile_size - 0.5)
+        )  # centres of the outermost pixels
         tile = mi.UInt32(tile_y * tiles_x + tile_x)
-        depth = depth_near(row, corner + tile_size / 2)
+        depth = primitive.depth_near(row, corner + tile_size / 2)
         dr.eval(found, touches, tile, surfel, depth)
         kept = dr.compress(touches)
         count += dr.width(kept)

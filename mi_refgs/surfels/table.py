@@ -44,7 +44,7 @@ UNBOUNDED = ("position", "radiance_sh", "indirect_sh")
 MAX_SH_DEGREE = 3
 # Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is worthless.
 QUATERNION_FLOOR = 1e-12
-# e^±40 = 4e-18 … 2e17 scene units: float32 holds them and their squares. `splat.footprint` bounds the size of
+# e^±40 = 4e-18 … 2e17 scene units: float32 holds them and their squares. `primitives` bound the size of
 # a surfel relative to its depth, which is what pictures depend on.
 LOG_SCALE_LIMIT = 40.0
 # 1 / (1 + e^-40) is 1 in float32, and e^40 squared still fits float32 (the derivative needs it).

@@ -16,8 +16,8 @@ from benchmarks.stability.__main__ import main
 from benchmarks.stability.case import Case, plain
 from benchmarks.stability.cases import catalogue
 from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, judge, measure
+from mi_refgs.primitives.surfel import FootprintAdjoint
 from mi_refgs.reference import picture as oracle
-from mi_refgs.splat.footprint import FootprintAdjoint
 
 assert ROOT
 CASES = [case for case in catalogue() if case.quick]

@@ -1,0 +1,28 @@
+"""What is splatted: surfels and 3D Gaussians. A new primitive is one more file, registered here."""
+
+from mi_refgs.primitives.primitive import (
+    PRIMITIVES,
+    Adjoint,
+    Footprints,
+    Primitive,
+    Sample,
+    primitive_of,
+    register,
+    unregister,
+    widths_of,
+)
+from mi_refgs.primitives.surfel import Surfel
+
+__all__ = [
+    "PRIMITIVES",
+    "Adjoint",
+    "Footprints",
+    "Primitive",
+    "Sample",
+    "primitive_of",
+    "register",
+    "unregister",
+    "widths_of",
+]
+
+register(Surfel())
