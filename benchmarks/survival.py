@@ -193,15 +193,15 @@ def _goes_on(run: Any, before: int, resumed: int) -> bool:
 def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
     """One fit of so many steps; a record every INTERVAL steps is printed and, at the end, all are written."""
     from benchmarks.step import sphere_data
+    from mi_refgs import methods
     from mi_refgs.fit.train import Trainer
-    from mi_refgs.methods import config
     from mi_refgs.runs.run import Run
 
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
     assignments = settings(densify=100, extract=500, reset=2_000)
     assignments += [f"iterations={steps}", "log_every=50", "checkpoint_every=1_000"]
-    method = config.load("ref_gaussian", "quick", assignments)
+    method = methods.load("ref_gaussian", "quick", assignments)
     run = Run(folder / "run")
     run.create(method, "none")
     trainer = Trainer(method, sphere_data(SIZE, VIEWS, np.random.default_rng(0)), run)

@@ -48,12 +48,12 @@ def move(folder: Path, factor: float) -> None:
 
 def fit(folder: Path, seed: int) -> dict[str, float]:
     """PSNR and normal error on the test views after a fit."""
+    from mi_refgs import methods
     from mi_refgs.data import dataset
     from mi_refgs.evaluation import metrics, pictures
     from mi_refgs.fit.train import Trainer
-    from mi_refgs.methods import config
 
-    method = config.load("ref_gaussian", "quick", [*SETTINGS, f"seed={seed}"])
+    method = methods.load("ref_gaussian", "quick", [*SETTINGS, f"seed={seed}"])
     trainer = Trainer(method, dataset.read_dataset(folder, "train", truth=False))
     trainer.train()
     test: Any = dataset.read_dataset(folder, "test")

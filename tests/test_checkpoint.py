@@ -192,7 +192,10 @@ def test_a_method_that_changed_since_is_refused(
 ) -> None:
     run = Run(copytree(finished, tmp_path / "run"))
     config = run.path / "config.toml"
-    for old, new, name in (("height = 8", "height = 16", "light"), ("sh_degree = 1", "sh_degree = 2", "sh")):
+    for old, new, name in (
+        ("height = 8", "height = 16", "light"),
+        ("radiance_sh = 1", "radiance_sh = 2", "sh"),
+    ):
         text = config.read_text()
         assert old in text
         config.write_text(text.replace(old, new))

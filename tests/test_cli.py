@@ -20,7 +20,8 @@ from mi_refgs.cli.train import load_method
 from mi_refgs.fit.train import Trainer
 from mi_refgs.fit.whole import sized
 from mi_refgs.images import read_exr, read_png, srgb_from_linear, write_png
-from mi_refgs.methods.config import PRESETS, load_resolved
+from mi_refgs.methods.method import PRESETS
+from mi_refgs.methods.read import load_resolved
 
 COMMANDS = ("doctor", "demo", "dataset", "train", "eval", "render", "export", "profile")
 ARTEFACTS = ("surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "config.toml", "metrics.jsonl")
@@ -292,8 +293,8 @@ def test_unknown_key_in_a_method(
     data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wrong = tmp_path / "wrong.toml"
-    wrong.write_text(method.read_text().replace("sh_degree", "sh_degrees"))
-    refused(train_command(data, tmp_path / "run", wrong), capsys, "wrong.toml", "surfels", "sh_degrees")
+    wrong.write_text(method.read_text().replace("degree", "degrees"))
+    refused(train_command(data, tmp_path / "run", wrong), capsys, "wrong.toml", "surfels", "degrees")
     command = [*train_command(data, tmp_path / "run", method), "loss.sim=1"]
     refused(command, capsys, "--set", "loss", "sim")
     refused([*command[:-1], "loss.ssim"], capsys, "--set", "key=value")

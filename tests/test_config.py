@@ -15,25 +15,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_train import ball
 
+from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.fit import refine
 from mi_refgs.fit.train import Trainer
-from mi_refgs.methods import config
+from mi_refgs.methods import read
 from mi_refgs.surfels.table import Surfels
 
 
-@pytest.mark.parametrize("variant", config.names())
-@pytest.mark.parametrize("preset", config.PRESETS)
+@pytest.mark.parametrize("variant", methods.names())
+@pytest.mark.parametrize("preset", methods.PRESETS)
 def test_shipped_methods_load_and_read_back(variant: str, preset: str, tmp_path: Path) -> None:
-    method = config.load(variant, preset)
-    assert method.iterations == config.PRESETS[preset].iterations == method.stages()[-1][1].until
+    method = methods.load(variant, preset)
+    assert method.iterations == methods.PRESETS[preset].iterations == method.stages()[-1][1].until
     path = tmp_path / "config.toml"
-    path.write_text(config.dump(method))
-    assert config.load_resolved(path) == method
+    path.write_text(methods.dump(method))
+    assert methods.load_resolved(path) == method
 
 
 def test_presets_scale_the_whole_schedule() -> None:
-    quick, standard = config.load("ref_gaussian", "quick"), config.load("ref_gaussian", "standard")
+    quick, standard = methods.load("ref_gaussian", "quick"), methods.load("ref_gaussian", "standard")
     factor = standard.iterations / quick.iterations
     for name, stage in quick.stage.items():
         assert standard.stage[name].until == pytest.approx(stage.until * factor, abs=factor)
@@ -47,18 +48,18 @@ def test_a_preset_scales_every_number_of_iterations(tmp_path: Path) -> None:
         "iterations = 4000\n[light]\n[stage.first]\nuntil = 1000\n[stage.last]\nuntil = 4000\n"
         "[refine]\npropagate_hold = 200\n[loss]\nsmooth_until = 3000\n"
     )
-    method = config.load(str(path), "quick")
+    method = methods.load(str(path), "quick")
     assert method.iterations == 2000 and [stage.until for _, stage in method.stages()] == [500, 2000]
     assert (method.refine.propagate_hold, method.loss.smooth_until) == (100, 1500)
 
 
 def test_stages_and_windows_meet_without_gap_or_overlap() -> None:
-    method = config.load("ref_gaussian", "quick")
+    method = methods.load("ref_gaussian", "quick")
     names = [method.stage_at(i)[0] for i in range(1, method.iterations + 1)]
     order = [name for name, _ in method.stages()]
     assert sorted(set(names), key=names.index) == order
     assert [names[stage.until - 1] for _, stage in method.stages()] == order
-    window = config.Window(2, 8, 3)
+    window = methods.Window(2, 8, 3)
     assert [i for i in range(12) if window.due(i)] == [3, 6]
     assert [window.since(i) for i in (3, 4, 6, 7, 9, 20)] == [None, 1, 3, 1, 3, 14]
 
@@ -74,7 +75,7 @@ def test_a_scaled_window_keeps_its_events(start: int, length: int, every: int, f
     """The k-th event of the file is the k-th of the preset, at its own time times the factor, rounded."""
     until = start + length
     events = [k for k in range(1, until // every + 1) if k * every > start]
-    scaled = config._scale(config.Window(start, until, every), factor)
+    scaled = read._scale(methods.Window(start, until, every), factor)
     last = math.ceil(factor * until) + 1
     assert scaled.count(last) == len(events)
     due = [i for i in range(last + 1) if scaled.due(i)]
@@ -107,7 +108,7 @@ propagate = { start = 0, until = 2_601, every = 650 }
 """Few of these numbers are whole, or multiples of each other, once a preset has scaled them."""
 
 
-@pytest.mark.parametrize("variant", [*config.names(), "many"])
+@pytest.mark.parametrize("variant", [*methods.names(), "many"])
 def test_every_preset_has_the_same_events_in_the_same_order(
     variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -128,13 +129,13 @@ def test_every_preset_has_the_same_events_in_the_same_order(
         return refine.TableEdit(surfels, rows, rows < 0)
 
     monkeypatch.setattr(refine, "densify_and_prune", recorder("densify", same))
-    for name in ("reset_opacity", "propagate_normals", "reset_materials"):
+    for name in ("reset_opacity", "propagate_normals", "restart"):
         monkeypatch.setattr(refine, name, recorder(name, lambda surfels: surfels))
     monkeypatch.setattr(Trainer, "extract_mesh", lambda self: done.append("mesh"))
     monkeypatch.setattr(Trainer, "_gradient_step", lambda self, iteration, stage: None)
     sequences = {}
-    for preset in config.PRESETS:
-        method = config.load(path, preset, ["surfels.count=20", "surfels.max_count=20"])
+    for preset in methods.PRESETS:
+        method = methods.load(path, preset, ["surfels.count=20", "surfels.max_count=20"])
         trainer = Trainer(method, ball())
         done.clear()
         while trainer.iteration < method.iterations:
@@ -149,13 +150,13 @@ def test_every_preset_has_the_same_events_in_the_same_order(
         "ref_gaussian": {"degree": 2, "densify": 14, "reset_opacity": 2, "mesh": 8},
         "base_2dgs": {"degree": 3, "densify": 14, "reset_opacity": 2},
         "many": {"degree": 3, "densify": 22, "reset_opacity": 4, "propagate_normals": 4, "mesh": 7}
-        | {"reset_materials": 1},
+        | {"restart": 1},
     }
     assert counts["quick"] == expected[variant]
 
 
 def test_assignments_are_applied_unscaled() -> None:
-    method = config.load(
+    method = methods.load(
         "ref_gaussian", "quick", ["loss.ssim=0.3", "mesh.resolution=64", "refine.densify.until=7"]
     )
     assert method.mesh is not None and method.refine.densify is not None
@@ -187,40 +188,40 @@ def test_bad_files_are_named(text: str, words: list[str], tmp_path: Path) -> Non
     path = tmp_path / "own.toml"
     path.write_text(text)
     with pytest.raises(InputError) as error:
-        config.load(str(path))
+        methods.load(str(path))
     assert all(word in str(error.value) for word in words), error.value
 
 
 @pytest.mark.parametrize("assignment", ["loss.sim=1", "loss", "iterations.x=1"])
 def test_bad_assignments_are_named(assignment: str) -> None:
     with pytest.raises(InputError, match=r"--set|unknown key"):
-        config.load("ref_gaussian", "quick", [assignment])
+        methods.load("ref_gaussian", "quick", [assignment])
 
 
 def test_unknown_names_list_the_known_ones() -> None:
     with pytest.raises(InputError, match="ref_gaussian"):
-        config.load("no_such_method")
+        methods.load("no_such_method")
     with pytest.raises(InputError, match="standard"):
-        config.load("ref_gaussian", "slow")
+        methods.load("ref_gaussian", "slow")
 
 
 def test_extends_changes_only_what_it_says(tmp_path: Path) -> None:
     child = tmp_path / "child.toml"
     child.write_text('extends = "ref_gaussian"\n[loss]\nssim = 0.5\n')
-    base, changed = config.load("ref_gaussian"), config.load(str(child))
+    base, changed = methods.load("ref_gaussian"), methods.load(str(child))
     assert changed.loss == dataclasses.replace(base.loss, ssim=0.5)
     assert dataclasses.replace(changed, loss=base.loss, variant=base.variant) == base
     assert Path(child).stem == changed.variant
 
 
-@pytest.mark.parametrize("base", config.names())
+@pytest.mark.parametrize("base", methods.names())
 def test_extends_takes_every_shipped_method_and_own_files(base: str, tmp_path: Path) -> None:
     """A shipped method that extends another one, and an own file beside or below the one that names it."""
     (tmp_path / "below").mkdir()
     (tmp_path / "below" / "own.toml").write_text(f'extends = "{base}"\n[loss]\nssim = 0.5\n')
     grandchild = tmp_path / "grandchild.toml"
     grandchild.write_text('extends = "below/own.toml"\ndrop = ["refine"]\n[loss]\nnormal = 0.3\n')
-    shipped, changed = config.load(base), config.load(str(grandchild))
+    shipped, changed = methods.load(base), methods.load(str(grandchild))
     assert changed.loss == dataclasses.replace(shipped.loss, ssim=0.5, normal=0.3)
     assert changed.refine.densify is None and changed.refine.reset is None
     same = dataclasses.replace(changed, loss=shipped.loss, refine=shipped.refine, variant=base)
@@ -246,5 +247,5 @@ def test_wrong_extends_are_named(text: str, words: list[str], tmp_path: Path) ->
     (tmp_path / "other.toml").write_text('extends = "own.toml"\n')
     (tmp_path / "wrong.toml").write_text("[")
     with pytest.raises(InputError) as error:
-        config.load(str(tmp_path / "own.toml"))
+        methods.load(str(tmp_path / "own.toml"))
     assert all(word in str(error.value) for word in words), error.value

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from tiny_scene import SETTINGS, SIZE, write_data, write_method
 
+from mi_refgs import methods
 from mi_refgs.data import dataset
 from mi_refgs.evaluation import metrics, pictures
 from mi_refgs.evaluation.evaluate import TIMED_FRAMES, WARM_UP_FRAMES, evaluate
 from mi_refgs.fit.train import Trainer
 from mi_refgs.images import read_png
-from mi_refgs.methods import config
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.runs.export import TrainedScene, export
@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     mi.set_variant("llvm_ad_rgb")
     folder = tmp_path_factory.mktemp("evaluate")
     write_data(folder / "ball")
-    method = config.load(str(write_method(folder)), "quick", SETTINGS)
+    method = methods.load(str(write_method(folder)), "quick", SETTINGS)
     run = Run(folder / "run")
     run.create(method, str(folder / "ball"))
     trainer = Trainer(method, dataset.read_dataset(folder / "ball", "train"), run)

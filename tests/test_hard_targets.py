@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from test_train import METHOD, ball
 
+from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
 from mi_refgs.fit.train import Trainer
 from mi_refgs.images import linear_from_srgb
-from mi_refgs.methods import config
 
 STEPS = 14
 """Into the deferred stage, with the first mesh, a reset and two rounds of densifying."""
@@ -56,7 +56,7 @@ CASES: dict[str, Callable[[], Dataset]] = {
 @pytest.mark.parametrize("name", CASES)
 def test_a_fit_stays_finite(name: str, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(METHOD)
-    method = dataclasses.replace(config.load_resolved(tmp_path / "small.toml"), iterations=STEPS)
+    method = dataclasses.replace(methods.load_resolved(tmp_path / "small.toml"), iterations=STEPS)
     trainer = Trainer(method, CASES[name]())
     trainer.train()
     assert trainer.iteration == STEPS and trainer.skipped == 0 and not trainer.notices
@@ -77,4 +77,4 @@ def test_a_fit_stays_finite(name: str, tmp_path: Path) -> None:
 def test_what_cannot_be_begun_is_one_sentence(data: Dataset, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(METHOD)
     with pytest.raises(InputError, match=r"^\w+: [^.]*; [^.]*$"):
-        Trainer(config.load_resolved(tmp_path / "small.toml"), data)
+        Trainer(methods.load_resolved(tmp_path / "small.toml"), data)

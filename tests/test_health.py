@@ -12,20 +12,21 @@ import numpy as np
 import pytest
 from test_train import METHOD, ball, run_folder
 
+from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.fit import health
 from mi_refgs.fit.optim import Adam, Skipped
 from mi_refgs.fit.train import Trainer
-from mi_refgs.methods import config
-from mi_refgs.methods.config import Method
-from mi_refgs.surfels.table import GEOMETRY, Surfels
+from mi_refgs.methods.method import Method
+from mi_refgs.surfels.channels import geometry
+from mi_refgs.surfels.table import Surfels
 
 
 @pytest.fixture
 def method(tmp_path: Path) -> Method:
     path = tmp_path / "small.toml"
     path.write_text(METHOD)
-    return config.load_resolved(path)
+    return methods.load_resolved(path)
 
 
 def spoil_gradient(monkeypatch: pytest.MonkeyPatch, name: str, rows: list[int], views: set[int]) -> None:
@@ -55,7 +56,7 @@ def test_surfels_with_a_gradient_that_is_not_finite_are_removed_and_named(
 ) -> None:
     """Steps on view 2 fail until the next check, every third iteration; then the culprits are gone."""
     spoil_gradient(monkeypatch, "albedo", [17, 52], {2})
-    still = dataclasses.replace(method, refine=config.Refine(), iterations=9)
+    still = dataclasses.replace(method, refine=methods.Refine(), iterations=9)
     run = run_folder(tmp_path / "run", still)
     trainer = Trainer(still, ball(), run)
     before = trainer.surfels.to_numpy()["albedo"]
@@ -109,13 +110,13 @@ def test_a_fit_in_which_every_step_fails_ends_with_one_sentence(
     """Too many surfels to be the cause: nothing is removed, nothing changes, and the view is named."""
     spoil_gradient(monkeypatch, "scale", list(range(1000)), set(range(6)))
     run = run_folder(tmp_path / "run", method)
-    trainer = Trainer(dataclasses.replace(method, refine=config.Refine()), ball(), run)
+    trainer = Trainer(dataclasses.replace(method, refine=methods.Refine()), ball(), run)
     before = trainer.surfels.to_numpy()
     with pytest.raises(InputError, match=r"view \d: scale not finite; .*look at that picture"):
         trainer.train()
     assert trainer.iteration == 3 * method.log_every
     after = trainer.surfels.to_numpy()
-    for name in GEOMETRY:  # materials begin anew in iteration 9, with the deferred stage
+    for name in geometry():  # materials begin anew in iteration 9, with the deferred stage
         np.testing.assert_array_equal(after[name], before[name])
 
 

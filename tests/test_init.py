@@ -14,7 +14,8 @@ def test_from_points(rng: np.random.Generator) -> None:
     points, normals = rng.normal(size=(200, 3)), rng.normal(size=(200, 3))
     normals[0] = (0, 0, 5)
     colours = rng.random((200, 3))
-    surfels = init.from_points(points, normals, colours, rng=rng, sh_degree=1, opacity=0.2, roughness=0.3)
+    degree = {"radiance_sh": 1}
+    surfels = init.from_points(points, normals, colours, rng=rng, degree=degree, opacity=0.2, roughness=0.3)
     surfels.validate()
     np.testing.assert_allclose(
         np.array(surfels.frame()[2]).T, normals / np.linalg.norm(normals, axis=1)[:, None], atol=1e-6
@@ -53,7 +54,8 @@ def test_few_or_doubled_points_have_finite_scales(count: int, rng: np.random.Gen
     [
         ({"normals": np.zeros((3, 3))}, r"normals: shape \(3, 3\), expected \(4, 3\)"),
         ({"points": np.full((4, 3), np.nan)}, "points: 12 values are NaN"),
-        ({"sh_degree": 4}, "sh_degree: 4"),
+        ({"degree": {"radiance_sh": 4}}, "degree of radiance_sh: 4"),
+        ({"opacity": 1.5}, r"opacity: 1\.5"),
         ({"channels": ("albdeo",)}, "albdeo: unknown"),
     ],
 )

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from tiny_scene import RADIUS, write_data
 
+from mi_refgs import methods
 from mi_refgs.data import dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fit.initial import initial_surfels
-from mi_refgs.methods import config
 from mi_refgs.surfels import hull
 
 COUNT = 2_000
@@ -33,7 +33,7 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> dataset.Dataset:
 
 
 def start(ball: dataset.Dataset, inside: float, seed: int = 0) -> dict[str, np.ndarray]:
-    method = config.load("ref_gaussian", "quick", [f"surfels.count={COUNT}", f"surfels.inside={inside}"])
+    method = methods.load("ref_gaussian", "quick", [f"surfels.count={COUNT}", f"surfels.inside={inside}"])
     surfels = initial_surfels(method, ball, np.random.default_rng(seed))
     return surfels.to_numpy() | {"normal": np.array(surfels.frame()[2]).T}
 
@@ -87,8 +87,8 @@ def test_a_share_out_of_range_is_refused(ball: dataset.Dataset, share: float) ->
         start(ball, share)
 
 
-@pytest.mark.parametrize("variant", config.names())
+@pytest.mark.parametrize("variant", methods.names())
 def test_methods_start_alike(variant: str) -> None:
     """A method is compared with another one from the same surfels."""
-    full, other = (config.load(name, "quick").surfels for name in ("ref_gaussian", variant))
-    assert (full.inside, full.opacity) == (other.inside, other.opacity)
+    full, other = (methods.load(name, "quick").surfels for name in ("ref_gaussian", variant))
+    assert (full.inside, full.start("opacity")) == (other.inside, other.start("opacity"))

@@ -139,7 +139,7 @@ def test_only_the_configuration_opens_toml() -> None:
     readers = {
         module for module, source in sources().items() if {"tomllib", "toml"} & imported_packages(source)
     }
-    assert readers <= {"methods.config"}
+    assert readers <= {"methods.read"}
 
 
 def test_the_reference_is_plain_numpy() -> None:

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from image_checks import HEIGHT, WIDTH
 
+from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View, read_dataset
 from mi_refgs.device import upload
 from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.train import Trainer
 from mi_refgs.images import linear_from_srgb
-from mi_refgs.methods import config
-from mi_refgs.methods.config import LossWeights
+from mi_refgs.methods.method import LossWeights
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 
@@ -80,7 +80,7 @@ def test_terms_are_weighed_as_the_method_says(
 
 def test_the_weight_of_normals_rises_linearly(data: Path, method: Path) -> None:
     views = read_dataset(data, "train", truth=False)
-    trainer = Trainer(config.load(str(method), "quick", ["surfels.count=200", "loss.alpha=0"]), views)
+    trainer = Trainer(methods.load(str(method), "quick", ["surfels.count=200", "loss.alpha=0"]), views)
     target = trainer.targets[0]
     frame = trainer.view(target.camera)
 

@@ -9,14 +9,15 @@ import pytest
 import trimesh
 
 from mi_refgs.errors import InputError
+from mi_refgs.surfels.channels import CHANNELS
 from mi_refgs.surfels.ply import read_ply, write_ply
-from mi_refgs.surfels.table import CHANNELS, Surfels, sh_columns
+from mi_refgs.surfels.table import Surfels
 
 GEOMETRY = ["x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
 
 
 def table(count: int, rng: np.random.Generator, degree: int = 3) -> Surfels:
-    shape = {name: (count, width or sh_columns(degree)) for name, width in CHANNELS.items()}
+    shape = {name: (count, channel.width(degree)) for name, channel in CHANNELS.items()}
     return Surfels.from_numpy({name: rng.normal(size=size) for name, size in shape.items()})
 
 

@@ -15,13 +15,12 @@ import numpy as np
 import pytest
 from tiny_scene import SETTINGS, SIZE
 
-from mi_refgs import splat
+from mi_refgs import methods, splat
 from mi_refgs.cli import main
 from mi_refgs.data import dataset as data_module
 from mi_refgs.fit import optim, train
 from mi_refgs.fit.train import Trainer
-from mi_refgs.methods import config
-from mi_refgs.methods.config import LightOptions, Method
+from mi_refgs.methods.method import LightOptions, Method
 from mi_refgs.profiling import phases
 from mi_refgs.profiling.advice import advice
 from mi_refgs.profiling.profile import Profile, StageProfile, Work, count_work, profile_stage
@@ -35,7 +34,7 @@ PAUSE = 0.25
 def trainer(data: Path, method: Path) -> Trainer:
     """Stages up to iterations 30 and 60."""
     until = ["iterations=60", "stage.initial.until=30", "stage.deferred.until=60"]
-    resolved = config.load(str(method), "quick", [*SETTINGS, *until])
+    resolved = methods.load(str(method), "quick", [*SETTINGS, *until])
     return Trainer(resolved, data_module.read_dataset(data, "train"))
 
 
@@ -133,7 +132,7 @@ def test_a_step_with_a_clock_is_the_same_step(
     monkeypatch.setattr(phases, "WARM_UP", 0)
     tables = []
     for timed in (False, True):
-        resolved = config.load(str(method), "quick", [*SETTINGS, "iterations=40"])
+        resolved = methods.load(str(method), "quick", [*SETTINGS, "iterations=40"])
         trainer = Trainer(resolved, data_module.read_dataset(data, "train"))
         trainer.iteration = 1
         if timed:
@@ -241,7 +240,7 @@ def test_nothing_stands_out() -> None:
 
 
 def a_method() -> Method:
-    return replace(config.load("base_2dgs", "quick"), light=LightOptions(height=64))
+    return replace(methods.load("base_2dgs", "quick"), light=LightOptions(height=64))
 
 
 def cases() -> Iterator[tuple[dict[str, Any], dict[str, Any], str]]:

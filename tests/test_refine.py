@@ -12,8 +12,8 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.fit import refine
 from mi_refgs.fit.optim import Adam, Group
-from mi_refgs.methods.config import Refine
-from mi_refgs.surfels.init import logit
+from mi_refgs.methods.method import Refine
+from mi_refgs.surfels.channels import logit
 from mi_refgs.surfels.table import Surfels
 
 OPTIONS = Refine()
@@ -127,7 +127,7 @@ def test_growth_stops_at_the_limit_and_takes_the_hottest(scale: float) -> None:
 
 def test_reset_lowers_opacity_and_lifts_metallic_only() -> None:
     surfels = table()
-    edited = refine.reset_opacity(surfels, OPTIONS, metallic=0.6).to_numpy()
+    edited = refine.reset_opacity(surfels, OPTIONS, {"metallic": 0.6}).to_numpy()
     np.testing.assert_allclose(refine.sigmoid(edited["opacity"]), OPTIONS.reset_opacity, rtol=1e-5)
     np.testing.assert_allclose(refine.sigmoid(edited["metallic"]), 0.6, rtol=1e-5)
     assert np.array_equal(edited["scale"], surfels.to_numpy()["scale"])
@@ -147,9 +147,10 @@ def test_propagation_is_material_aware() -> None:
     )
 
 
-def test_material_reset_leaves_geometry() -> None:
+def test_a_restart_of_materials_leaves_geometry() -> None:
     surfels = table()
-    edited = refine.reset_materials(surfels, 0.01, 0.1, np.random.default_rng(0)).to_numpy()
+    starts = {"albedo": 0.5, "metallic": 0.01, "roughness": 0.1}
+    edited = refine.restart(surfels, starts, np.random.default_rng(0)).to_numpy()
     np.testing.assert_allclose(refine.sigmoid(edited["metallic"]), 0.01, rtol=1e-5)
     np.testing.assert_allclose(refine.sigmoid(edited["roughness"]), 0.1, rtol=1e-5)
     assert np.abs(refine.sigmoid(edited["albedo"]) - 0.5).max() <= 0.025 + 1e-6

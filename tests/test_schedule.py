@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from mi_refgs.fit.schedule import Schedule
-from mi_refgs.methods.config import Method, Stage, SurfelOptions, Window
+from mi_refgs.methods.method import Method, Stage, SurfelOptions
+from mi_refgs.methods.window import Window
 
 
 def schedule(seed: int = 0, views: int = 7) -> Schedule:
-    surfels = SurfelOptions(sh_degree=2, sh_raise=Window(start=10, until=100, every=10))
+    surfels = SurfelOptions(degree={"radiance_sh": 2}, sh_raise=Window(start=10, until=100, every=10))
     return Schedule(
         Method(iterations=100, stage={"all": Stage(until=100)}, surfels=surfels, seed=seed), views
     )

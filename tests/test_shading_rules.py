@@ -10,7 +10,7 @@ import pytest
 from integrator_scenes import image, raw_channels, scene
 
 from mi_refgs.errors import InputError
-from mi_refgs.methods.config import load
+from mi_refgs.methods.read import load
 from mi_refgs.render.pipeline import Shading, render
 from mi_refgs.shade.models import Accuracy
 from mi_refgs.splat.camera import Camera

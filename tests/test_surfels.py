@@ -9,13 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.errors import InputError
-from mi_refgs.surfels.table import CHANNELS, Surfels, sh_columns
+from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.table import Surfels
 
 
 def raw_table(count: int, rng: np.random.Generator, degree: int = 2) -> dict[str, np.ndarray]:
     return {
-        name: rng.normal(size=(count, width or sh_columns(degree))).astype(np.float32)
-        for name, width in CHANNELS.items()
+        name: rng.normal(size=(count, channel.width(degree))).astype(np.float32)
+        for name, channel in CHANNELS.items()
     }
 
 

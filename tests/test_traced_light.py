@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Any
 
@@ -78,7 +79,7 @@ def test_materials_of_the_surfels_reach_the_hits() -> None:
     found = occluder.surface(surfels).at(hit.triangle, hit.barycentric, hit.valid)
     expected = np.stack([0.2 + 0.4 * y, 0.5 + 0.2 * z, np.full(500, 0.3)])
     np.testing.assert_allclose(found.albedo.numpy(), expected, atol=0.02)
-    np.testing.assert_allclose(found.metallic.numpy(), 1 / (1 + np.e), rtol=1e-5)
+    np.testing.assert_allclose(found.metallic.numpy(), 1 / (1 + math.e), rtol=1e-5)
     np.testing.assert_allclose(found.normal.numpy().T, np.tile([1, 0, 0], (500, 1)), atol=1e-4)
     distance = np.linalg.norm(position[np.array(found.surfel)][:, 1:] - np.stack([y, z], 1), axis=1)
     assert distance.max() < 0.35  # half a cell's diagonal

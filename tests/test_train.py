@@ -15,12 +15,12 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
 from mi_refgs.fit import train
 from mi_refgs.fit.train import Trainer
-from mi_refgs.methods import config
-from mi_refgs.methods.config import Method
+from mi_refgs.methods.method import Method
 from mi_refgs.reference.camera import look_at
 from mi_refgs.runs.interrupt import TerminatedError, held_interrupts
 from mi_refgs.runs.run import Run
@@ -34,11 +34,9 @@ log_every = 3
 [surfels]
 count = 150
 max_count = 220
-sh_degree = 1
+degree = { radiance_sh = 1 }
 sh_raise = { start = 2, until = 4, every = 2 }
-opacity = 0.6
-metallic = 0.3
-roughness = 0.3
+initial = { opacity = 0.6, metallic = 0.3, roughness = 0.3 }
 [light]
 height = 8
 [stage.initial]
@@ -55,6 +53,7 @@ resolution = 24
 densify = { start = 3, until = 24, every = 6 }
 gradient = 1e-6
 reset = { start = 0, until = 24, every = 14 }
+reset_raise = ["metallic"]
 propagate = { start = 0, until = 24, every = 5 }
 propagate_hold = 4
 [loss]
@@ -87,7 +86,7 @@ def ball(size: int = SIZE, views: int = 6) -> Dataset:
 def method(tmp_path: Path) -> Method:
     path = tmp_path / "small.toml"
     path.write_text(METHOD)
-    return config.load_resolved(path)
+    return methods.load_resolved(path)
 
 
 def run_folder(path: Path, method: Method) -> Run:
@@ -98,7 +97,7 @@ def run_folder(path: Path, method: Method) -> Run:
 
 def test_the_loss_falls_and_everything_trains(method: Method) -> None:
     data = ball()
-    trainer = Trainer(dataclasses.replace(method, refine=config.Refine(), iterations=60), data)
+    trainer = Trainer(dataclasses.replace(method, refine=methods.Refine(), iterations=60), data)
     before = {name: tensor.numpy().copy() for name, tensor in trainer.params.items()}
     losses = []
     while trainer.iteration < 60:
@@ -304,7 +303,7 @@ def test_a_run_is_not_overwritten(method: Method, tmp_path: Path) -> None:
 
 
 def test_a_warm_step_compiles_nothing(method: Method) -> None:
-    trainer = Trainer(dataclasses.replace(method, refine=config.Refine()), ball())
+    trainer = Trainer(dataclasses.replace(method, refine=methods.Refine()), ball())
     while trainer.iteration < 22:  # into the deferred stage, with a mesh
         trainer.step()
     dr.sync_thread()

@@ -14,11 +14,11 @@ import trimesh
 from integrator_scenes import COUNT, image, raw_channels, scene, sensor, sky
 from tiny_scene import write_data
 
+from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.fit.initial import initial_surfels
 from mi_refgs.fit.optim import Adam, Group
 from mi_refgs.fit.schedule import Schedule
-from mi_refgs.methods import config
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points
 from mi_refgs.occlusion.visibility import Occluder
@@ -123,7 +123,7 @@ def test_initial_surfels_of_a_scaled_data_set_are_the_same(scale: float, tmp_pat
     assert large.views[0].camera().near[0] == pytest.approx(scale * small.views[0].camera().near[0])
 
     def start(data: Dataset) -> dict[str, np.ndarray]:
-        method = config.load("ref_gaussian", "quick", ["surfels.count=100"])
+        method = methods.load("ref_gaussian", "quick", ["surfels.count=100"])
         return initial_surfels(method, data, np.random.default_rng(3)).to_numpy()
 
     expected, got = scaled(start(small), scale), start(large)
@@ -148,7 +148,7 @@ def test_a_step_moves_positions_by_the_same_part_of_the_scene(scale: float) -> N
     """Gradients of a length have the inverse unit, Adam's ε too."""
 
     def step(scale: float) -> np.ndarray:
-        groups = Schedule(config.load("ref_gaussian", "quick"), 1).groups(scale)
+        groups = Schedule(methods.load("ref_gaussian", "quick"), 1).groups(scale)
         params = {"position": mi.TensorXf(np.zeros((4, 3), np.float32))}
         adam = Adam(params, {"position": groups["position"]})
         slope = np.array([1e-7, 1e-12, 1e-15, 3e-17])[:, None] * np.ones(3)

@@ -9,7 +9,7 @@ import numpy as np
 
 from mi_refgs.data.transforms import MITSUBA_FROM_OPENGL
 from mi_refgs.images import write_exr, write_png
-from mi_refgs.methods.config import PRESETS
+from mi_refgs.methods.method import PRESETS
 from mi_refgs.reference.camera import look_at
 
 SIZE = 20
@@ -21,7 +21,7 @@ iterations = {PRESETS["quick"].iterations}
 checkpoint_every = 3
 [surfels]
 channels = ["radiance_sh", "albedo", "metallic", "roughness", "indirect_sh"]
-sh_degree = 1
+degree = {{ radiance_sh = 1 }}
 [light]
 height = 8
 [stage.initial]

@@ -54,10 +54,10 @@ def _finite(*arrays: Any) -> None:
 
 
 def _table(rows: int = 7) -> dict[str, np.ndarray]:
-    from mi_refgs.surfels.table import CHANNELS
+    from mi_refgs.surfels.channels import CHANNELS
 
     rng = np.random.default_rng(SEED)
-    return {name: rng.normal(size=(rows, columns or 12)) for name, columns in CHANNELS.items()}
+    return {name: rng.normal(size=(rows, channel.width(1))) for name, channel in CHANNELS.items()}
 
 
 def _surfel_files(folder: Path) -> list[bytes]:
@@ -253,19 +253,19 @@ def _read_transforms(path: Path) -> None:
 
 
 def _methods(folder: Path) -> list[bytes]:
-    from mi_refgs.methods import config
+    from mi_refgs import methods
     from mi_refgs.resources import resource_dir
 
     shipped = [path.read_bytes() for path in sorted(resource_dir("variants").glob("*.toml"))]
     own = b'extends = "ref_gaussian"\ndrop = ["mesh"]\niterations = 100\n[loss]\nssim = 0.1\n'
-    return [*shipped, config.dump(config.load("ref_gaussian")).encode(), own]
+    return [*shipped, methods.dump(methods.load("ref_gaussian")).encode(), own]
 
 
 def _read_method(path: Path) -> None:
-    from mi_refgs.methods import config
+    from mi_refgs import methods
 
-    method = config.load(str(path), "quick", ["loss.ssim=0.3"])
-    assert config.dump(method)
+    method = methods.load(str(path), "quick", ["loss.ssim=0.3"])
+    assert methods.dump(method)
     method.stage_at(1)
 
 
@@ -306,7 +306,7 @@ def _sign(data: bytes) -> bytes:
 
 
 def _read_checkpoint(path: Path) -> None:
-    from mi_refgs.methods import config
+    from mi_refgs import methods
     from mi_refgs.runs.export import TrainedScene
     from mi_refgs.runs.run import Run
 
@@ -314,7 +314,7 @@ def _read_checkpoint(path: Path) -> None:
     path.replace(path.parent / "checkpoints" / "0000003.npz")
     state = Run(path.parent).load_checkpoint()
     assert state is not None
-    TrainedScene.from_state(config.load("ref_gaussian"), state)
+    TrainedScene.from_state(methods.load("ref_gaussian"), state)
 
 
 def _models(folder: Path) -> list[bytes]:
@@ -342,11 +342,11 @@ def _read_model(path: Path) -> None:
 
 def _read_data_place(path: Path) -> None:
     """dataset.json of a run names a folder; only what lies there as a data set is read."""
+    from mi_refgs import methods
     from mi_refgs.evaluation.evaluate import load_split
-    from mi_refgs.methods import config
     from mi_refgs.runs.run import Run
 
-    load_split(Run(path.parent), config.load("ref_gaussian"), "train")
+    load_split(Run(path.parent), methods.load("ref_gaussian"), "train")
 
 
 def _data_places(folder: Path) -> list[bytes]:

@@ -630,8 +630,8 @@ _OPTIMISER = [
         ),
         (
             "schedule: positions learn in scene units",
-            "Group(rates.position * extent,",
-            "Group(rates.position,",
+            'rates.of("position") * extent,',
+            'rates.of("position"),',
             "test_units.py::test_a_step_moves_positions_by_the_same_part_of_the_scene",
         ),
     ),
@@ -639,7 +639,16 @@ _OPTIMISER = [
 
 _CONFIGURATION = [
     *_in(
-        "methods/config.py",
+        "surfels/channels.py",
+        (
+            "PLY: quaternions with w last",
+            '("rot_1", "rot_2", "rot_3", "rot_0")',
+            '("rot_0", "rot_1", "rot_2", "rot_3")',
+            "test_ply.py::test_layout_is_that_of_2dgs",
+        ),
+    ),
+    *_in(
+        "methods/window.py",
         (
             "schedule: windows forget their start",
             "self._newest(iteration) - math.floor(self.start / self.every + TIE)",
@@ -652,12 +661,18 @@ _CONFIGURATION = [
             "math.floor(self.until / self.every + TIE) + 1)",
             "test_config.py::test_a_scaled_window_keeps_its_events",
         ),
+    ),
+    *_in(
+        "methods/method.py",
         (
             "schedule: a stage ends an iteration early",
             "if iteration <= item[1].until",
             "if iteration < item[1].until",
             "test_config.py::test_stages_and_windows_meet_without_gap_or_overlap",
         ),
+    ),
+    *_in(
+        "methods/read.py",
         (
             "schedule: the hold after a propagation is not scaled",
             '"smooth_until", "propagate_hold"}',
@@ -706,12 +721,6 @@ _CONFIGURATION = [
 _FILES = [
     *_in(
         "surfels/ply.py",
-        (
-            "PLY: quaternions with w last",
-            '("rot_1", "rot_2", "rot_3", "rot_0")',
-            '("rot_0", "rot_1", "rot_2", "rot_3")',
-            "test_ply.py::test_layout_is_that_of_2dgs",
-        ),
         (
             "PLY: harmonics coefficient-major",
             "_rest_{rgb * others + k}",

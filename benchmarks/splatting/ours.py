@@ -18,7 +18,8 @@ from mi_refgs.fit.train import Trainer
 from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.render import pipeline
 from mi_refgs.splat import Blended, Camera, blend, list_by_tile, project, splat
-from mi_refgs.surfels.table import GEOMETRY, Surfels
+from mi_refgs.surfels.channels import geometry
+from mi_refgs.surfels.table import Surfels
 
 
 class Ours:
@@ -50,9 +51,9 @@ class Ours:
         finally:
             pipeline.splat = splat
         surfels, columns, camera = calls[0]
-        geometry = Surfels({name: surfels.raw[name] for name in GEOMETRY})
+        bare = Surfels({name: surfels.raw[name] for name in geometry()})
         shape = (len(columns) + 2, camera.width * camera.height)
-        return Ours(geometry, columns, camera, np.random.default_rng(0).normal(size=shape))
+        return Ours(bare, columns, camera, np.random.default_rng(0).normal(size=shape))
 
     def set_weights(self, weights: np.ndarray) -> None:
         """Adjoints (maps, H·W) of the maps: features, depth, alpha."""

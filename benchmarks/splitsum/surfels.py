@@ -21,7 +21,8 @@ from benchmarks.splitsum.settings import ALBEDO
 from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.render.pipeline import Shading, render
 from mi_refgs.splat import Camera, splat
-from mi_refgs.surfels.init import from_points, logit
+from mi_refgs.surfels.channels import logit
+from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
 
 SHAPE = "sphere"

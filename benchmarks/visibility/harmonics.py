@@ -16,10 +16,10 @@ import numpy as np
 
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.view import Points
-from mi_refgs.methods.config import SurfelOptions
 from mi_refgs.shade.sh import clamp_positive, eval_sh, sh_basis
+from mi_refgs.surfels.channels import MAX_SH_DEGREE
 
-DEGREE = SurfelOptions().indirect_degree
+DEGREE = MAX_SH_DEGREE
 """Of the product's indirect channel, unless told otherwise."""
 RIDGE = 1e-3
 """Penalty on the coefficients, in multiples of what all directions of a hemisphere weigh: it decides where

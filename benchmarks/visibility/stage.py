@@ -22,7 +22,8 @@ from mi_refgs.render.pipeline import Shading, render
 from mi_refgs.render.reflection import reflection
 from mi_refgs.shade.models import ShadingPoints, shade
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.init import from_points, logit
+from mi_refgs.surfels.channels import logit
+from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
 
 EXTREME = 1e-6

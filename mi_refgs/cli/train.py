@@ -13,7 +13,7 @@ from mi_refgs.resources import resource_dir
 
 if TYPE_CHECKING:
     from mi_refgs.fit.train import Trainer
-    from mi_refgs.methods.config import Method
+    from mi_refgs.methods.method import Method
     from mi_refgs.runs.run import Run
 
 DEFAULT_METHOD = "ref_gaussian.toml"
@@ -71,10 +71,10 @@ def run(args: argparse.Namespace) -> Result:
 
 def load_method(variant: str | None, preset: str | None, assignments: list[str] | None) -> Method:
     """The method of the options, or the full one at the preset for everyday use."""
-    from mi_refgs.methods import config
+    from mi_refgs import methods
 
     path = variant or str(resource_dir("variants") / DEFAULT_METHOD)
-    return config.load(path, preset or DEFAULT_PRESET, assignments)
+    return methods.load(path, preset or DEFAULT_PRESET, assignments)
 
 
 def fit(

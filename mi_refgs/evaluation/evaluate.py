@@ -22,7 +22,7 @@ from mi_refgs.evaluation import metrics, pictures
 from mi_refgs.files import read_json
 from mi_refgs.fit.whole import read_views
 from mi_refgs.images import read_exr_image, write_png
-from mi_refgs.methods.config import Method
+from mi_refgs.methods.method import Method
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.export import TrainedScene, up_to_date

@@ -7,10 +7,10 @@ import numpy as np
 from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
 from mi_refgs.images import linear_from_srgb
-from mi_refgs.methods.config import Method
+from mi_refgs.methods.method import Method
 from mi_refgs.surfels import hull, init
 from mi_refgs.surfels.order import morton_order
-from mi_refgs.surfels.table import GEOMETRY, Surfels
+from mi_refgs.surfels.table import Surfels
 
 
 def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> Surfels:
@@ -47,12 +47,9 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
         normals[order],
         colours[order],
         rng=rng,
-        channels=(*GEOMETRY, *options.channels),
-        sh_degree=options.sh_degree,
-        indirect_degree=options.indirect_degree,
-        opacity=options.opacity,
-        metallic=options.metallic,
-        roughness=options.roughness,
+        channels=options.channels,
+        degree={name: options.degree_of(name) for name in options.channels},
+        **options.initial,
     )
 
 

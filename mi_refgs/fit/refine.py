@@ -7,6 +7,7 @@ Letters: s scale, o opacity, extent the size of the camera rig [3DGS §5.2].
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -14,9 +15,9 @@ import numpy as np
 
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
-from mi_refgs.methods.config import Refine
+from mi_refgs.methods.method import Refine
 from mi_refgs.primitives import Primitive, primitive_of, widths_of
-from mi_refgs.surfels.init import jittered_albedo, logit
+from mi_refgs.surfels.channels import channel, logit
 from mi_refgs.surfels.order import morton_order
 from mi_refgs.surfels.table import Surfels
 
@@ -116,15 +117,15 @@ def _offsets(
     return sum(local[:, i : i + 1] * axes[:, i] for i in range(local.shape[1])).astype(np.float32)
 
 
-def reset_opacity(surfels: Surfels, options: Refine, metallic: float) -> Surfels:
-    """Lower every opacity to at most reset_opacity, and lift every metallic to at least `metallic`.
+def reset_opacity(surfels: Surfels, options: Refine, floors: Mapping[str, float]) -> Surfels:
+    """Lower every opacity to at most reset_opacity, and lift the channels of `floors` to at least that value.
 
     What the pictures need grows back; what they do not is pruned. [3DGS §5.2; 3DGS-DR for the metallic]
     """
     raw = surfels.to_numpy()
     raw["opacity"] = np.minimum(raw["opacity"], np.float32(logit(options.reset_opacity)))
-    if "metallic" in raw:
-        raw["metallic"] = np.maximum(raw["metallic"], np.float32(logit(metallic)))
+    for name, floor in floors.items():
+        raw[name] = np.maximum(raw[name], np.float32(logit(floor)))
     return Surfels.from_numpy(raw)
 
 
@@ -142,10 +143,11 @@ def propagate_normals(surfels: Surfels, options: Refine) -> Surfels:
     return Surfels.from_numpy(raw)
 
 
-def reset_materials(surfels: Surfels, metallic: float, roughness: float, rng: np.random.Generator) -> Surfels:
-    """Albedo, metallic and roughness back to their initial values. [Ref-Gaussian, implementation details]"""
+def restart(surfels: Surfels, starts: Mapping[str, float], rng: np.random.Generator) -> Surfels:
+    """The channels of `starts` back to these initial values, activated. [Ref-Gaussian, implementation
+    details]"""
     raw = surfels.to_numpy()
-    raw["albedo"] = jittered_albedo(surfels.count, rng)
-    raw["metallic"] = np.full_like(raw["metallic"], logit(metallic))
-    raw["roughness"] = np.full_like(raw["roughness"], logit(roughness))
+    for name, value in starts.items():
+        count, width = raw[name].shape
+        raw[name] = channel(name).start(count, width, rng, value)
     return Surfels.from_numpy(raw)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refgs.fit.optim import Group
-from mi_refgs.methods.config import Method
+from mi_refgs.methods.method import Method
 from mi_refgs.runs.checkpoint import LIGHT
+from mi_refgs.surfels.channels import channel, geometry
 
 POSITION_STEPS = 0.6
 """Share of the iterations after which positions learn at their final rate: 30,000 of 50,000 in the released
@@ -33,28 +34,21 @@ class Schedule:
 
     def sh_degree(self, iteration: int) -> int:
         """Degree of the radiance channel that is in use."""
-        return min(self.method.surfels.sh_raise.count(iteration), self.method.surfels.sh_degree)
+        return min(
+            self.method.surfels.sh_raise.count(iteration), self.method.surfels.degree_of("radiance_sh")
+        )
 
     def groups(self, extent: float) -> dict[str, Group]:
-        """Learning rates of every parameter that a method may have; `extent` in scene units."""
+        """Learning rates of every parameter of the method; `extent` in scene units."""
         rates, iterations = self.method.rates, self.method.iterations
-
-        def group(rate: float, tail: float | None = None) -> Group:
-            final = rate * rates.decay
-            if tail is None:
-                return Group(rate, final, iterations)
-            return Group(rate, final, iterations, head=3, tail=tail)
-
+        groups = {}
+        for name in (*geometry(), *self.method.surfels.channels):
+            rate = rates.of(name)
+            head = 3 if channel(name).harmonics else 0
+            groups[name] = Group(rate, rate * rates.decay, iterations, head, rates.rest_of(name))
         steps = int(POSITION_STEPS * iterations)
-        return {
-            "position": Group(rates.position * extent, rates.position_final * extent, steps, unit=extent),
-            "rotation": group(rates.rotation),
-            "scale": group(rates.scale),
-            "opacity": group(rates.opacity),
-            "radiance_sh": group(rates.radiance_sh, rates.sh_rest),
-            "albedo": group(rates.albedo),
-            "metallic": group(rates.metallic),
-            "roughness": group(rates.roughness),
-            "indirect_sh": group(rates.indirect_sh, rates.indirect_rest),
-            LIGHT: group(rates.light),
-        }
+        start, final = rates.of("position") * extent, rates.position_final * extent
+        groups["position"] = Group(start, final, steps, unit=extent)
+        if self.method.light is not None:
+            groups[LIGHT] = Group(rates.light, rates.light * rates.decay, iterations)
+        return groups

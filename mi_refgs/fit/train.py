@@ -23,7 +23,7 @@ from mi_refgs.fit.initial import initial_surfels
 from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.optim import Adam, Group
 from mi_refgs.fit.schedule import Schedule
-from mi_refgs.methods.config import Method, Stage
+from mi_refgs.methods.method import Method, Stage
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
 from mi_refgs.occlusion.visibility import Occluder
@@ -33,15 +33,14 @@ from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.table import CHANNELS, GEOMETRY, Surfels, sh_columns
+from mi_refgs.surfels.channels import channel, geometry
+from mi_refgs.surfels.table import Surfels
 
 
 def _shapes(method: Method) -> dict[str, tuple[int, ...]]:
     """The shape of every parameter of a method, without the first axis."""
-    options = method.surfels
-    degrees = {"radiance_sh": options.sh_degree, "indirect_sh": options.indirect_degree}
     shapes: dict[str, tuple[int, ...]] = {
-        name: (CHANNELS[name] or sh_columns(degrees[name]),) for name in (*GEOMETRY, *options.channels)
+        name: (method.surfels.columns(name),) for name in (*geometry(), *method.surfels.channels)
     }
     return shapes if method.light is None else shapes | {LIGHT: (2 * method.light.height, 3)}
 
@@ -247,7 +246,7 @@ class Trainer:
             self.check()
             since_reset = options.reset.since(iteration) if options.reset is not None else None
             grown_back = since_reset is None or since_reset >= refine.prune_wait(
-                options, self.method.rates.opacity
+                options, self.method.rates.of("opacity")
             )
             mean = self.gradient_sum.numpy() / np.maximum(self.gradient_count.numpy(), 1)
             edited = refine.densify_and_prune(
@@ -264,9 +263,8 @@ class Trainer:
             self.optimiser.gather(mi.UInt32(edited.parent), names, mi.Bool(edited.fresh))
             self._clear_statistics()
         if options.reset is not None and options.reset.due(iteration):
-            self._replace(
-                refine.reset_opacity(self.surfels, options, surfels.metallic), cleared=("opacity", "metallic")
-            )
+            floors = {name: surfels.start(name) for name in options.reset_raise}
+            self._replace(refine.reset_opacity(self.surfels, options, floors), cleared=("opacity", *floors))
         elif options.propagate is not None and options.propagate.due(iteration) and "metallic" in self.params:
             self._replace(refine.propagate_normals(self.surfels, options), cleared=("opacity", "scale"))
             self.optimiser.set_factor("opacity", 0.0)
@@ -286,11 +284,9 @@ class Trainer:
         self.gradient_count = dr.gather(mi.Float, self.gradient_count, index)
 
     def _reset_materials(self, iteration: int) -> None:
-        options = self.method.surfels
-        edited = refine.reset_materials(
-            self.surfels, options.metallic, options.roughness, self.schedule.rng(iteration)
-        )
-        self._replace(edited, cleared=("albedo", "metallic", "roughness"))
+        rng, options = self.schedule.rng(iteration), self.method.surfels
+        starts = {name: options.start(name) for name in options.channels if channel(name).material}
+        self._replace(refine.restart(self.surfels, starts, rng), cleared=tuple(starts))
 
     def _replace(self, surfels: Surfels, cleared: tuple[str, ...] = ()) -> None:
         self.params.update(surfels.raw)
@@ -304,8 +300,7 @@ class Trainer:
         return Shading.of(stage, not self.occluder.empty)
 
     def _groups(self) -> dict[str, Group]:
-        groups = self.schedule.groups(self.extent)
-        return {name: group for name, group in groups.items() if name in self.params}
+        return self.schedule.groups(self.extent)
 
     # ---------------- state ----------------
 

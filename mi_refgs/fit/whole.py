@@ -9,7 +9,7 @@ from pathlib import Path
 from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fit.train import Trainer
-from mi_refgs.methods.config import PRESETS, Method
+from mi_refgs.methods.method import PRESETS, Method
 from mi_refgs.runs.export import up_to_date
 from mi_refgs.runs.run import Run
 

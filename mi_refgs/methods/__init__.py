@@ -1,1 +1,20 @@
-"""A method as data: what the TOML files of `variants/` say."""
+"""A method as data: what the TOML files of `variants/` say, read strictly, scaled to a preset."""
+
+from mi_refgs.methods.method import PRESETS, LightOptions, LossWeights, Method, Refine, Stage, SurfelOptions
+from mi_refgs.methods.read import dump, load, load_resolved, names
+from mi_refgs.methods.window import Window
+
+__all__ = [
+    "PRESETS",
+    "LightOptions",
+    "LossWeights",
+    "Method",
+    "Refine",
+    "Stage",
+    "SurfelOptions",
+    "Window",
+    "dump",
+    "load",
+    "load_resolved",
+    "names",
+]

@@ -29,7 +29,8 @@ from mi_refgs.plugins.properties import (
 )
 from mi_refgs.render.pipeline import MATERIALS, Frame, render
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.table import GEOMETRY, Surfels
+from mi_refgs.surfels.channels import geometry
+from mi_refgs.surfels.table import Surfels
 
 CHECK_SECONDS = 1.0
 """Least time between two looks for values that cannot be used: each waits for the device."""
@@ -189,7 +190,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def parameters_changed(self, keys: list[str]) -> None:
         self.check()
         self.changed = True
-        moved = not keys or not {*keys}.isdisjoint(GEOMETRY)
+        moved = not keys or not {*keys}.isdisjoint(geometry())
         if moved and self.occluder is not None and self.shading.accuracy.traced_bounces:
             self.occluder.set_materials(self.surfels)
 

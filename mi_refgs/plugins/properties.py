@@ -18,8 +18,9 @@ from mi_refgs.plugins.light import own_light
 from mi_refgs.render.pipeline import MATERIALS, Shading
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.models import Accuracy
+from mi_refgs.surfels.channels import CHANNELS
 from mi_refgs.surfels.ply import read_ply
-from mi_refgs.surfels.table import CHANNELS, Surfels
+from mi_refgs.surfels.table import Surfels
 
 TERMS = ("diffuse", "specular", "indirect")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mi_refgs.methods.config import Method
+from mi_refgs.methods.method import Method
 from mi_refgs.profiling.profile import FAINT, Profile, StageProfile
 
 LOW_SHARE = 0.25
@@ -56,7 +56,7 @@ def _of_work(found: Profile) -> Iterator[str]:
         yield (
             f"{low}, and the median surfel is {work.aspect:.0f} times as long as wide: it crosses many "
             f"tiles of {work.tile_pixels:.0f} pixels and fills none; a lower rate of scales "
-            "(--set rates.scale) keeps surfels rounder."
+            "(--set rates.channel.scale) keeps surfels rounder."
         )
     if work.footprint < work.tile_pixels:
         yield (
@@ -92,7 +92,7 @@ def _of_stage(stage: StageProfile, found: Profile, method: Method) -> Iterator[s
     if of("optimiser") > HEAVY * whole:
         yield (
             f"Stage {stage.name}: the optimiser takes {of('optimiser') / whole:.0%} of a step: lower the "
-            "degree of the spherical harmonics (--set surfels.sh_degree, surfels.indirect_degree)."
+            "degree of the spherical harmonics (--set surfels.degree.radiance_sh)."
         )
     if stage.misses:
         yield (

@@ -15,7 +15,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.fit.train import Trainer
-from mi_refgs.methods.config import Refine
+from mi_refgs.methods.method import Refine
 from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.profiling.phases import phase_times
 from mi_refgs.splat import list_by_tile, project

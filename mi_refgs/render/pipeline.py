@@ -25,7 +25,8 @@ from mi_refgs.render.reflection import reflection
 from mi_refgs.shade.models import Accuracy, ShadingPoints, Terms, reflect, safe_normalize, shade
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.splat import Blended, Camera, splat
-from mi_refgs.surfels.table import GEOMETRY, LOGIT_LIMIT, Surfels
+from mi_refgs.surfels.channels import geometry
+from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
 
 MATERIALS = ("albedo", "metallic", "roughness")
 """Channels of what is shaded by a light."""
@@ -74,7 +75,7 @@ class Shading:
 
     def check(self, channels: Collection[str], light: bool = True, mesh: bool = True) -> None:
         """Raise InputError if surfels with these channels, and what is there beside them, lack something."""
-        needed = [*GEOMETRY]
+        needed = [*geometry()]
         if self.reflectance == "split_sum":
             needed += MATERIALS
         if self.reflectance == "radiance" or self.diffuse == "sh":

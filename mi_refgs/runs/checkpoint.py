@@ -18,7 +18,8 @@ import numpy as np
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.surfels.table import GEOMETRY, Surfels
+from mi_refgs.surfels.channels import geometry
+from mi_refgs.surfels.table import Surfels
 
 PARAMS, OPTIMISER, MESH = "params/", "optimiser/", "mesh/"
 """What the names of parameters, of Adam's moments and of the occluder begin with."""
@@ -86,7 +87,7 @@ def check(state: Mapping[str, np.ndarray]) -> None:
         raise DamagedError(str(error)) from error
     scalars = ["iteration", "seconds", "held_until"]
     rows = ["gradient_sum", "gradient_count"]
-    signed = [f"{PARAMS}{name}" for name in {*GEOMETRY, *params}]
+    signed = [f"{PARAMS}{name}" for name in {*geometry(), *params}]
     for tensor, values in params.items():
         _check(state, [f"{OPTIMISER}{tensor}/first"], (values.size,), signed=True)
         _check(state, [f"{OPTIMISER}{tensor}/second"], (values.size,))

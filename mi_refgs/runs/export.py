@@ -25,7 +25,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.files import read_json
 from mi_refgs.runs.checkpoint import PARAMS, tensors
-from mi_refgs.methods.config import Method
+from mi_refgs.methods.method import Method
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.checkpoint import LIGHT
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh

@@ -19,7 +19,8 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.files import cannot_write, read_json, remove_temporaries, write_bytes
 from mi_refgs.runs import checkpoint
-from mi_refgs.methods.config import Method, dump, load_resolved
+from mi_refgs.methods.method import Method
+from mi_refgs.methods.read import dump, load_resolved
 
 CHECKPOINTS_KEPT = 2
 """One could be enough, since a checkpoint appears only when complete; two survive a disk that lies."""

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
-from mi_refgs.surfels.table import MAX_SH_DEGREE
+from mi_refgs.surfels.channels import MAX_SH_DEGREE
 
 
 def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.errors import InputError
-from mi_refgs.surfels.table import CHANNELS, GEOMETRY, MAX_SH_DEGREE, Surfels, sh_columns
+from mi_refgs.surfels.channels import CHANNELS, MAX_SH_DEGREE, channel
+from mi_refgs.surfels.table import Surfels
 
 # Y_0 = 1 / (2 √π): a DC coefficient c shows as the colour 0.5 + Y_0 c. [3DGS]
 SH_DC = 0.28209479177387814
@@ -18,10 +19,6 @@ SH_DC = 0.28209479177387814
 DISTANCE_FLOOR = 1e-4
 # Neighbours whose mean squared distance gives the scale. [3DGS]
 NEIGHBOURS = 3
-# Uniform jitter of the initial albedo around its mean: breaks ties between surfels. [Ref-Gaussian]
-ALBEDO_JITTER = 0.025
-# Distance that initial values keep from 0 and 1, where the logit ends and the sigmoid has no slope left.
-PROBABILITY_MARGIN = 1e-6
 
 
 def from_points(
@@ -30,53 +27,42 @@ def from_points(
     colours: np.ndarray | None = None,  # (N, 3) linear radiance
     *,
     rng: np.random.Generator,
-    channels: Sequence[str] = tuple(CHANNELS),
-    sh_degree: int = 0,
-    indirect_degree: int | None = None,
-    opacity: float = 0.1,
-    metallic: float = 0.01,
-    roughness: float = 0.1,
-    albedo: float = 0.5,
+    channels: Sequence[str] | None = None,
+    degree: Mapping[str, int] | None = None,
     scale_factor: float = 1.0,
+    **initial: float,
 ) -> Surfels:
     """One surfel per point: scale from its 3 nearest neighbours, normal as given or uniform at random.
 
-    The tangents are turned at random about the normal. `colours` fill the DC of radiance_sh (grey 0.5 by
-    default); the indirect coefficients start at exactly 0. Initial values as in the released Ref-Gaussian,
-    but rotations are uniform over SO(3), not over positive components. Raises InputError for wrong shapes,
-    NaN or unknown channels.
+    The tangents are turned at random about the normal. `channels` beside the geometry (default: all that are
+    declared); `degree` of spherical harmonics by channel, 0 by default; `initial` activated values by
+    channel, such as `roughness=0.3`, by default those of `surfels.channels`. `colours` fill the DC of
+    radiance_sh (grey 0.5 by default). Rotations are uniform over SO(3), not over positive components as in
+    the released Ref-Gaussian. Raises InputError for wrong shapes, NaN, unknown channels or values out of
+    range.
     """
     points = _check("points", points, np.shape(points)[:1])
-    unknown = [name for name in channels if name not in CHANNELS]
-    if unknown or not 0 <= sh_degree <= MAX_SH_DEGREE:
-        wrong = (
-            f"channels: {unknown[0]}: unknown"
-            if unknown
-            else f"sh_degree: {sh_degree}: not in 0..{MAX_SH_DEGREE}"
-        )
-        raise InputError(
-            f"surfels: {wrong}; use channels of {', '.join(CHANNELS)} and a degree of 0..{MAX_SH_DEGREE}"
-        )
     count = len(points)
+    for name in (*(channels or ()), *(degree or ()), *initial):
+        channel(name)
+    for name, wanted in (degree or {}).items():
+        if not 0 <= wanted <= MAX_SH_DEGREE:
+            raise InputError(f"surfels: degree of {name}: {wanted} is not in 0 … {MAX_SH_DEGREE}; choose one")
+    if normals is not None:
+        normals = _check("normals", normals, (count,))
     log_scale = np.log(neighbour_scale(points) * scale_factor)
     raw: dict[str, np.ndarray] = {
         "position": points,
-        "rotation": quaternions(
-            None if normals is None else _check("normals", normals, (count,)), count, rng
-        ),
+        "rotation": quaternions(normals, count, rng),
         "scale": np.repeat(log_scale[:, None], 2, axis=1),
-        "opacity": np.full((count, 1), logit(opacity)),
-        "radiance_sh": np.zeros((count, sh_columns(sh_degree))),
-        "albedo": jittered_albedo(count, rng, albedo),
-        "metallic": np.full((count, 1), logit(metallic)),
-        "roughness": np.full((count, 1), logit(roughness)),
-        "indirect_sh": np.zeros(
-            (count, sh_columns(sh_degree if indirect_degree is None else indirect_degree))
-        ),
     }
-    if colours is not None:
+    for name, declared in CHANNELS.items():
+        if name not in raw and (declared.geometry or channels is None or name in channels):
+            width = declared.width((degree or {}).get(name, 0))
+            raw[name] = declared.start(count, width, rng, initial.get(name))
+    if colours is not None and "radiance_sh" in raw:
         raw["radiance_sh"][:, :3] = (_check("colours", colours, (count,)) - 0.5) / SH_DC
-    return Surfels.from_numpy({name: raw[name] for name in CHANNELS if name in GEOMETRY or name in channels})
+    return Surfels.from_numpy({name: raw[name] for name in CHANNELS if name in raw})
 
 
 def neighbour_scale(points: np.ndarray) -> np.ndarray:
@@ -114,18 +100,6 @@ def quaternions(normals: np.ndarray | None, count: int, rng: np.random.Generator
     tangent[short] = np.cross(n[short], np.eye(3)[np.argmin(np.abs(n[short]), axis=1)])
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     return Rotation.from_matrix(np.stack([tangent, np.cross(n, tangent), n], axis=-1)).as_quat()
-
-
-def jittered_albedo(count: int, rng: np.random.Generator, albedo: float = 0.5) -> np.ndarray:
-    """Raw albedo (count, 3): uniform noise around `albedo`, kept within 0.001 and 0.999."""
-    noise = rng.uniform(-ALBEDO_JITTER, ALBEDO_JITTER, (count, 3))
-    return logit(np.clip(albedo + noise, 0.001, 0.999))
-
-
-def logit(value: float | np.ndarray) -> np.ndarray:
-    """Inverse of the logistic sigmoid, float64, of values clipped to [1e-6, 1 - 1e-6]."""
-    value = np.clip(np.asarray(value, dtype=np.float64), PROBABILITY_MARGIN, 1 - PROBABILITY_MARGIN)
-    return np.log(value) - np.log1p(-value)
 
 
 def _check(name: str, values: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:

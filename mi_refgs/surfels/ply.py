@@ -20,22 +20,8 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
 from mi_refgs.ply import read_header
-from mi_refgs.surfels.table import MAX_SH_DEGREE, Surfels, sh_columns
-
-# Property groups of the channels that are not spherical harmonics. Quaternion x, y, z, w: rot_1, 2, 3, 0.
-PROPERTIES: dict[str, tuple[str, ...]] = {
-    "position": ("x", "y", "z"),
-    "rotation": ("rot_1", "rot_2", "rot_3", "rot_0"),
-    "scale": ("scale_0", "scale_1"),
-    "opacity": ("opacity",),
-    "albedo": ("albedo_0", "albedo_1", "albedo_2"),
-    "metallic": ("metallic",),
-    "roughness": ("roughness",),
-}
-REQUIRED = ("position", "rotation", "scale", "opacity")
-# Prefix of the properties of a spherical-harmonic channel.
-SH_PREFIX = {"radiance_sh": "f", "indirect_sh": "ind"}
-
+from mi_refgs.surfels.channels import CHANNELS, MAX_SH_DEGREE, sh_columns
+from mi_refgs.surfels.table import Surfels
 
 # ---------------- reading ----------------
 
@@ -60,13 +46,14 @@ def read_ply(path: str | Path) -> Surfels:
             f"{path}: scale_2: the file holds 3D Gaussians; export surfels (2DGS) with two scales instead"
         )
     arrays = {}
-    for channel, properties in PROPERTIES.items():
-        if channel in REQUIRED or any(name in names for name in properties):
-            arrays[channel] = _columns(path, vertices, properties)
-    for channel in SH_PREFIX:
-        if any(name.startswith(f"{SH_PREFIX[channel]}_") for name in names):
-            degree = _sh_degree(path, names, SH_PREFIX[channel])
-            arrays[channel] = _columns(path, vertices, _sh_properties(channel, degree))
+    for name, channel in CHANNELS.items():
+        if channel.harmonics:
+            prefix = channel.properties[0]
+            if any(found.startswith(f"{prefix}_") for found in names):
+                degree = _sh_degree(path, names, prefix)
+                arrays[name] = _columns(path, vertices, _sh_properties(prefix, degree))
+        elif channel.geometry or any(found in names for found in channel.properties):
+            arrays[name] = _columns(path, vertices, channel.properties)
     return Surfels.from_numpy(arrays)
 
 
@@ -129,9 +116,9 @@ def _sh_degree(path: Path, names: tuple[str, ...], prefix: str) -> int:
     )
 
 
-def _sh_properties(channel: str, degree: int) -> tuple[str, ...]:
+def _sh_properties(prefix: str, degree: int) -> tuple[str, ...]:
     """Property names in the table's column order (3 coefficient + rgb)."""
-    prefix, others = SH_PREFIX[channel], (degree + 1) ** 2 - 1
+    others = (degree + 1) ** 2 - 1
     rest = tuple(f"{prefix}_rest_{rgb * others + k}" for k in range(others) for rgb in range(3))
     return (*(f"{prefix}_dc_{rgb}" for rgb in range(3)), *rest)
 
@@ -148,8 +135,9 @@ def write_ply(path: str | Path, surfels: Surfels) -> None:
     surfels.validate()
     values: dict[str, np.ndarray] = {}
     for channel, table in surfels.to_numpy().items():
-        sh = channel in SH_PREFIX
-        properties = _sh_properties(channel, surfels.sh_degree(channel)) if sh else PROPERTIES[channel]
+        properties = CHANNELS[channel].properties
+        if CHANNELS[channel].harmonics:
+            properties = _sh_properties(properties[0], surfels.sh_degree(channel))
         values |= {name: table[:, column] for column, name in enumerate(properties)}
     names = _file_order(values)
     rows = np.zeros(surfels.count, dtype=[(name, "<f4") for name in names])
@@ -171,6 +159,12 @@ def _file_order(values: dict[str, np.ndarray]) -> list[str]:
         )
 
     order = ["x", "y", "z", "nx", "ny", "nz", *numbered("f_dc_"), *numbered("f_rest_"), "opacity"]
-    order += [*numbered("scale_"), *numbered("rot_"), *numbered("albedo_")]
-    order += [name for name in ("metallic", "roughness") if name in values]
-    return order + numbered("ind_dc_") + numbered("ind_rest_")
+    order += [*numbered("scale_"), *numbered("rot_")]
+    others = [channel for channel in CHANNELS.values() if channel.properties[0] not in (*order, "f")]
+    for channel in sorted(others, key=lambda channel: channel.harmonics):
+        prefix = channel.properties[0]
+        if channel.harmonics:
+            order += [*numbered(f"{prefix}_dc_"), *numbered(f"{prefix}_rest_")]
+        else:
+            order += [name for name in channel.properties if name in values]
+    return order

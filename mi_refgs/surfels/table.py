@@ -23,25 +23,8 @@ from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.rows import columns_of
+from mi_refgs.surfels.channels import CHANNELS, channel, geometry
 
-# Raw columns per channel, in table order; 0 stands for 3 (degree + 1)² harmonics, column = 3 coef + rgb.
-CHANNELS: dict[str, int] = {
-    "position": 3,
-    "rotation": 4,
-    "scale": 2,
-    "opacity": 1,
-    "radiance_sh": 0,
-    "albedo": 3,
-    "metallic": 1,
-    "roughness": 1,
-    "indirect_sh": 0,
-}
-# The channels without which nothing can be splatted.
-GEOMETRY = ("position", "rotation", "scale", "opacity")
-# The channels whose activation has no bound of its own: their values are limited to RAW_LIMIT.
-UNBOUNDED = ("position", "radiance_sh", "indirect_sh")
-# Highest spherical-harmonic degree that the 3DGS family stores; shade.sh evaluates no more.
-MAX_SH_DEGREE = 3
 # Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is worthless.
 QUATERNION_FLOOR = 1e-12
 # e^±40 = 4e-18 … 2e17 scene units: float32 holds them and their squares. `primitives` bound the size of
@@ -49,11 +32,6 @@ QUATERNION_FLOOR = 1e-12
 LOG_SCALE_LIMIT = 40.0
 # 1 / (1 + e^-40) is 1 in float32, and e^40 squared still fits float32 (the derivative needs it).
 LOGIT_LIMIT = 40.0
-
-
-def sh_columns(degree: int) -> int:
-    """Number of raw columns of a spherical-harmonic channel of this degree."""
-    return 3 * (degree + 1) ** 2
 
 
 def sigmoid(x: Any) -> Any:
@@ -80,9 +58,8 @@ class Surfels:
         channel takes 3 % of a training step, whose optimiser keeps values finite; values that come from
         elsewhere need it.
         """
-        unknown = [name for name in raw if name not in CHANNELS]
-        if unknown:
-            raise InputError(f"surfels: {unknown[0]}: unknown channel; use one of {', '.join(CHANNELS)}")
+        for name in raw:
+            channel(name)
         self.raw = {name: raw[name] for name in CHANNELS if name in raw}
         self.screened = screened
         self._check_shapes()
@@ -122,17 +99,15 @@ class Surfels:
             shape = tuple(tensor.shape)
             if len(shape) != 2 or shape[0] != rows:
                 raise InputError(f"surfels: {name}: shape {shape}, expected ({rows}, D); one row per surfel")
-            width = CHANNELS[name]
-            allowed = (width,) if width else tuple(sh_columns(degree) for degree in range(MAX_SH_DEGREE + 1))
-            if shape[1] not in allowed:
-                choices = " or ".join(str(columns) for columns in allowed)
+            if shape[1] not in channel(name).widths:
+                choices = " or ".join(str(columns) for columns in channel(name).widths)
                 raise InputError(
                     f"surfels: {name}: {shape[1]} columns, expected {choices}; fix the array's shape"
                 )
 
     def validate(self) -> None:
         """Raise InputError if a geometry channel is missing, a shape is wrong, or a value is not finite."""
-        for name in GEOMETRY:
+        for name in geometry():
             if name not in self.raw:
                 raise InputError(
                     f"surfels: {name}: the channel is missing; add it, nothing can be splatted without it"
@@ -144,7 +119,7 @@ class Surfels:
                 raise InputError(f"surfels: {name}: {bad} values are NaN or infinite; remove those surfels")
 
     def usable(self) -> Any:
-        """Which surfels (mi.Bool, width N) have finite raw values, below RAW_LIMIT where UNBOUNDED.
+        """Which surfels (mi.Bool, width N) have finite raw values, below RAW_LIMIT where unbounded.
 
         In a `screened` table the others cover no pixel and get zero gradient. Detached.
         """
@@ -192,6 +167,21 @@ class Surfels:
 
     # ---------------- activated values ----------------
 
+    def value(self, name: str) -> Any:
+        """Activated values of a channel by its declaration.
+
+        `mi.Float` for one column, `mi.Color3f` for three, a list of either for harmonics (mi.Color3f a
+        coefficient) and other widths. Geometry has accessors of its own types.
+        """
+        columns = self.columns(name)
+        if channel(name).activation == "sigmoid":
+            columns = [sigmoid(column) for column in columns]
+        if channel(name).harmonics:
+            return [mi.Color3f(*columns[start : start + 3]) for start in range(0, len(columns), 3)]
+        if len(columns) == 3:
+            return mi.Color3f(*columns)
+        return columns[0] if len(columns) == 1 else columns
+
     def position(self) -> Any:
         """World positions (mi.Point3f), scene units."""
         return mi.Point3f(*self.columns("position"))
@@ -230,27 +220,23 @@ class Surfels:
 
     def albedo(self) -> Any:
         """Albedo in [0, 1] (mi.Color3f), linear."""
-        return mi.Color3f(*(sigmoid(column) for column in self.columns("albedo")))
+        return self.value("albedo")
 
     def metallic(self) -> Any:
         """Metallic weight in [0, 1] (mi.Float)."""
-        return sigmoid(self.columns("metallic")[0])
+        return self.value("metallic")
 
     def roughness(self) -> Any:
         """Perceptual roughness r in [0, 1] (mi.Float); GGX α = r²."""
-        return sigmoid(self.columns("roughness")[0])
+        return self.value("roughness")
 
     def radiance_sh(self) -> list[Any]:
         """Coefficients (mi.Color3f) of the radiance channel; the colour is max(0, 0.5 + Σ c_k Y_k)."""
-        return self._coefficients("radiance_sh")
+        return self.value("radiance_sh")
 
     def indirect_sh(self) -> list[Any]:
         """Coefficients (mi.Color3f) of the indirect channel; the colour is max(0, Σ c_k Y_k), no offset."""
-        return self._coefficients("indirect_sh")
-
-    def _coefficients(self, name: str) -> list[Any]:
-        columns = self.columns(name)
-        return [mi.Color3f(*columns[start : start + 3]) for start in range(0, len(columns), 3)]
+        return self.value("indirect_sh")
 
     def frame(self) -> tuple[Any, Any, Any]:
         """World tangents and normal (t_u, t_v, n), the columns of the rotation matrix (three mi.Vector3f).
@@ -292,7 +278,7 @@ class Surfels:
 
 
 def _limit(name: str) -> float:
-    return RAW_LIMIT if name in UNBOUNDED else math.inf
+    return math.inf if channel(name).bounded else RAW_LIMIT
 
 
 def gather_rows(tensor: Any, parent: Any) -> Any:

@@ -13,11 +13,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refgs import methods
 from mi_refgs.errors import InputError, shown
 from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.files import read_json
 from mi_refgs.images import image_size, read_exr, read_png, write_exr
-from mi_refgs.methods import config
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.plugins.properties import read_background, read_light, read_shading, read_surfels
 from mi_refgs.render.pipeline import Shading
@@ -144,7 +144,7 @@ def test_json_that_is_no_object(text: str, tmp_path: Path) -> None:
     ],
 )
 def test_methods_that_make_no_sense(text: str, tmp_path: Path) -> None:
-    refused(lambda path: config.load(str(path)), tmp_path / "a.toml", text.encode())
+    refused(lambda path: methods.load(str(path)), tmp_path / "a.toml", text.encode())
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_models_that_make_no_sense(content: dict[str, Any], tmp_path: Path) -> N
 @pytest.mark.parametrize("place", [3, None, "a" * 5000, "a\0b", "\ud800", ["a"]])
 def test_runs_whose_data_is_nowhere(place: Any, tmp_path: Path) -> None:
     def read(path: Path) -> None:
-        load_split(Run(path.parent), config.load("ref_gaussian"), "train")
+        load_split(Run(path.parent), methods.load("ref_gaussian"), "train")
 
     refused(read, tmp_path / "dataset.json", json.dumps({"path": place}).encode(), "path")
 

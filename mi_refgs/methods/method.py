@@ -1,0 +1,194 @@
+"""A method as data: what a file of `variants/` says, in frozen dataclasses.
+
+Iteration numbers in a file are written for the file's own `iterations`; a preset gives the number to run, and
+every window, stage and interval is scaled with it (`methods.read`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from mi_refgs.methods.window import Window
+from mi_refgs.surfels.channels import MAX_SH_DEGREE, channel
+
+AT_ONCE = Window(0, 3, 1)
+"""One degree of spherical harmonics more in each of the first three iterations."""
+MESH_WINDOW = Window(20_000, 50_000, 2_000)
+"""When the released Ref-Gaussian code extracts its mesh on synthetic scenes."""
+
+
+@dataclass(frozen=True)
+class About:
+    """What the file stands for."""
+
+    name: str = ""
+    paper: str = ""
+    deviations: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class SurfelOptions:
+    """The table of surfels at the start, and its limits."""
+
+    channels: tuple[str, ...] = ("radiance_sh", "albedo", "metallic", "roughness", "indirect_sh")
+    count: int = 20_000  # initial surfels
+    max_count: int = 40_000  # densification stops here
+    inside: float = 0.0  # share of the initial surfels in the visual hull's volume; the others on its surface
+    degree: dict[str, int] = field(default_factory=dict)  # of spherical harmonics by channel; else 3
+    sh_raise: Window = AT_ONCE  # one more degree of radiance_sh each time it is due
+    initial: dict[str, float] = field(default_factory=dict)  # activated, by channel; else the channel's own
+
+    def degree_of(self, name: str) -> int:
+        """Degree of the spherical harmonics of a channel."""
+        return self.degree.get(name, MAX_SH_DEGREE)
+
+    def columns(self, name: str) -> int:
+        """Raw columns of a channel."""
+        return channel(name).width(self.degree_of(name))
+
+    def start(self, name: str) -> float:
+        """Initial value of a channel, activated."""
+        return self.initial.get(name, channel(name).initial)
+
+
+@dataclass(frozen=True)
+class LightOptions:
+    """The learnable lat-long environment; absent channels and light cost nothing."""
+
+    height: int = 64  # texels; width is twice that
+    radiance: float = 0.5  # initial, everywhere
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stretch of the schedule with its own way to shade, up to and including iteration `until`."""
+
+    until: int
+    at: Literal["surfel", "pixel"] = "pixel"
+    reflectance: Literal["radiance", "split_sum"] = "split_sum"
+    diffuse: Literal["sh", "irradiance"] = "sh"
+    reset_materials: bool = False  # albedo, metallic and roughness start anew when the stage begins
+
+
+@dataclass(frozen=True)
+class Refine:
+    """Adaptive control of the table [3DGS §5.2, 2DGS; Ref-Gaussian §3.4]."""
+
+    densify: Window | None = None
+    gradient: float = 2e-4  # NDC units; a mean over views, which no number of iterations changes
+    dense_extent: float = 0.01  # clone below, split above, in scene extents
+    prune_opacity: float = 0.05
+    prune_extent: float = 0.1  # scene extents; larger surfels go
+    reset: Window | None = None  # opacity to at most reset_opacity
+    reset_opacity: float = 0.01
+    reset_raise: tuple[str, ...] = ()  # channels that it lifts to at least their initial value
+    propagate: Window | None = None  # material-aware normal propagation
+    propagate_opacity: float = 0.9
+    propagate_scale: float = 1.5
+    propagate_metallic: float = 0.02  # surfels at least this metallic …
+    propagate_roughness: float = 0.1  # … and at most this rough are enlarged
+    propagate_hold: int = 200  # iterations without opacity learning afterwards
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """Extraction of the occluding mesh, when due."""
+
+    extract: Window = MESH_WINDOW
+    resolution: int = 128  # voxels along the longest side
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """L = (1 - ssim) L1 + ssim (1 - SSIM) + normal L_n + smooth L_s + alpha L_α."""
+
+    ssim: float = 0.2
+    normal: float = 0.05
+    normal_rise: int = 0  # iterations in which the weight of L_n rises linearly from 0
+    smooth: float = 0.0
+    smooth_until: int = 18_000
+    alpha: float = 0.0
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam learning rates, raw units a step; of positions in scene extents."""
+
+    channel: dict[str, float] = field(default_factory=dict)  # by channel; else the channel's own
+    rest: dict[str, float] = field(default_factory=dict)  # factor of the higher degrees; likewise
+    light: float = 0.01  # texels of the environment
+    position_final: float = 1.6e-6  # of positions, at 0.6 of the iterations
+    decay: float = 1.0  # factor that all but the position's rate reach, log-linearly, at the last iteration
+
+    def of(self, name: str) -> float:
+        """Rate of a channel."""
+        return self.channel.get(name, channel(name).rate)
+
+    def rest_of(self, name: str) -> float:
+        """Factor of that for harmonics of degree 1 and above."""
+        return self.rest.get(name, channel(name).rest_rate)
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """How pictures are read."""
+
+    images: Literal["png", "exr"] = "png"
+    background: Literal["white", "black"] = "white"
+    downscale: int | None = None  # pixels of a file along a pixel's side; absent: what the preset can afford
+
+
+@dataclass(frozen=True)
+class Method:
+    """Everything that describes a fit; the resolved copy is saved with the run."""
+
+    iterations: int
+    stage: dict[str, Stage]
+    about: About = About()
+    surfels: SurfelOptions = SurfelOptions()
+    light: LightOptions | None = None
+    refine: Refine = Refine()
+    mesh: MeshOptions | None = None
+    loss: LossWeights = LossWeights()
+    rates: Rates = Rates()
+    data: DataOptions = DataOptions()
+    seed: int = 0
+    checkpoint_every: int = 1_000  # iterations; a kill loses at most so many
+    preview_every: int = 1_000
+    log_every: int = 50
+    variant: str = ""  # filled in by `load`: the file's stem
+    preset: str = ""
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError("iterations: less than 1; give how many to run")
+        if not self.stage:
+            raise ValueError("stage: expected at least one named table; add one")
+
+    def stages(self) -> list[tuple[str, Stage]]:
+        """Stages in the order of their `until`."""
+        return sorted(self.stage.items(), key=lambda item: item[1].until)
+
+    def stage_at(self, iteration: int) -> tuple[str, Stage]:
+        """The stage a (1-based) iteration belongs to."""
+        return next((item for item in self.stages() if iteration <= item[1].until), self.stages()[-1])
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How long to run, and how large to grow."""
+
+    iterations: int
+    surfels: int
+    max_surfels: int
+    pixels: int  # of a picture; larger ones are read smaller, so that the preset takes its time
+
+
+# About 4 and 11 minutes for 200² pictures on one AVX-512 core; the last follows from these. A step of 256²
+# pixels takes 1.14 times as long as one of 200², one of 400² 1.9 times; the paper's pictures have 800².
+PRESETS = {
+    "quick": Preset(2_000, 15_000, 20_000, 256 * 256),
+    "standard": Preset(4_000, 25_000, 40_000, 256 * 256),
+    "paper": Preset(50_000, 30_000, 100_000, 800 * 800),
+}

@@ -1,0 +1,180 @@
+"""Reads methods strictly from TOML: a file, those that it extends, `key=value` assignments, a preset.
+
+No other module opens a TOML or knows a method's name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from mi_refgs.errors import InputError, shown
+from mi_refgs.files import is_file
+from mi_refgs.methods.build import build, plain
+from mi_refgs.methods.method import PRESETS, Method
+from mi_refgs.methods.window import Window
+from mi_refgs.render.pipeline import Shading
+from mi_refgs.resources import resource_dir
+from mi_refgs.surfels.channels import CHANNELS, geometry
+
+MAX_TEXT, MAX_LINE = 2**16, 2000
+"""Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
+
+# Fields that count iterations, and so scale with the preset, as windows do.
+_SCALED = {"iterations", "until", "normal_rise", "smooth_until", "propagate_hold"}
+
+
+def load(variant: str, preset: str = "standard", assignments: list[str] | None = None) -> Method:
+    """Read a method by name or TOML path, apply `key=value` assignments, and scale it to a preset.
+
+    Raises InputError naming the file and the key for anything unknown or of the wrong type.
+    """
+    if preset not in PRESETS:
+        raise InputError(f"--preset: {preset}: unknown; use one of {', '.join(PRESETS)}")
+    path = _find(variant, "--variant", Path())
+    table = _extended(path, [])
+    chosen = PRESETS[preset]
+    method = build(Method, table, str(path))
+    method = _scale(method, chosen.iterations / method.iterations)
+    table = plain(method)
+    table["surfels"] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
+    for assignment in assignments or []:
+        _assign(table, assignment)
+    where = "--set" if assignments else str(path)
+    return _checked(build(Method, table | {"variant": path.stem, "preset": preset}, where), str(path))
+
+
+def _checked(method: Method, where: str) -> Method:
+    """The method; raises InputError for unknown channels and a stage that channels and light cannot serve."""
+    surfels, rates = method.surfels, method.rates
+    channels = {*geometry(), *surfels.channels}
+    for key, named, known in (
+        ("surfels.channels", surfels.channels, set(CHANNELS)),
+        ("surfels.initial", surfels.initial, channels),
+        ("surfels.degree", surfels.degree, {name for name in CHANNELS if CHANNELS[name].harmonics}),
+        ("rates.channel", rates.channel, set(CHANNELS)),
+        ("rates.rest", rates.rest, {name for name in CHANNELS if CHANNELS[name].harmonics}),
+    ):
+        if unknown := [name for name in named if name not in known]:
+            allowed = ", ".join(name for name in CHANNELS if name in known)
+            raise InputError(f"{where}: {key}: '{unknown[0]}' is unknown; use some of {allowed}")
+    for name, stage in method.stages():
+        try:
+            Shading.of(stage, method.mesh is not None).check(channels, method.light is not None)
+        except InputError as error:
+            raise InputError(f"{where}: stage.{name}: {error}") from error
+        if stage.reset_materials and not any(CHANNELS[name].material for name in channels):
+            raise InputError(f"{where}: stage.{name}: reset_materials: there are no materials; remove it")
+    return method
+
+
+def load_resolved(path: Path) -> Method:
+    """Read the resolved `config.toml` of a run, unscaled."""
+    return build(Method, _read(path), str(path))
+
+
+def dump(method: Method) -> str:
+    """The method as TOML text that `load_resolved` reads back."""
+    return tomli_w.dumps(plain(method))
+
+
+def names() -> list[str]:
+    """The methods that ship with the package."""
+    return sorted(path.stem for path in resource_dir("variants").glob("*.toml"))
+
+
+def _find(variant: str, where: str, folder: Path) -> Path:
+    """A shipped method by its name, or a path to a .toml from `folder`; `where` names what asks for it."""
+    path = folder / variant if variant.endswith(".toml") else resource_dir("variants") / f"{variant}.toml"
+    if not is_file(path):
+        known = ", ".join(names())
+        raise InputError(f"{where}: {variant}: no such method; use one of {known}, or a path to a .toml")
+    return path
+
+
+def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
+    """The table of a file, with those that it `extends`; paths are relative to the file that names them.
+
+    `above` are the files that extend this one, resolved.
+    """
+    if path.resolve() in above:
+        raise InputError(f"{path}: extends: the file extends itself, through others or not; break the circle")
+    table = _read(path)
+    base, dropped = table.pop("extends", None), table.pop("drop", [])
+    if base is None and not dropped:
+        return table
+    if not isinstance(base, str):
+        raise InputError(
+            f"{path}: extends: expected a name or a path in quotes, found {shown(base)}; correct it"
+        )
+    if not isinstance(dropped, list) or not all(isinstance(name, str) for name in dropped):
+        raise InputError(f"{path}: drop: expected a list of keys, such as ['mesh', 'loss.alpha']; correct it")
+    parent = _extended(_find(base, f"{path}: extends", path.parent), [*above, path.resolve()])
+    for name in dropped:
+        _drop(parent, name, path)
+    return _merge(parent, table)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        if len(text) > MAX_TEXT or max(map(len, text.splitlines()), default=0) > MAX_LINE:
+            raise ValueError("too long")
+        return tomllib.loads(text)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except (ValueError, RecursionError) as error:  # of TOML, UTF-8, long numbers; deep nesting
+        raise InputError(f"{path}: not valid TOML ({error}); correct that line") from error
+
+
+def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in changes.items():
+        both = isinstance(value, dict) and isinstance(base.get(key), dict)
+        merged[key] = _merge(base[key], value) if both else value
+    return merged
+
+
+def _drop(table: dict[str, Any], name: str, path: Path) -> None:
+    *parents, last = name.split(".")
+    for parent in parents:
+        inner = table.get(parent)
+        table = inner if isinstance(inner, dict) else {}
+    if last not in table:
+        raise InputError(f"{path}: drop: no key '{name}' in the extended file; remove it from `drop`")
+    del table[last]
+
+
+def _assign(table: dict[str, Any], assignment: str) -> None:
+    key, separator, text = assignment.partition("=")
+    if not separator:
+        raise InputError(f"--set: {assignment}: expected key=value, such as loss.ssim=0.1")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        value = text
+    *parents, last = key.strip().split(".")
+    for parent in parents:
+        inner = table.setdefault(parent, {})
+        if not isinstance(inner, dict):
+            raise InputError(f"--set: {key}: '{parent}' is not a table; check the key")
+        table = inner
+    table[last] = value
+
+
+def _scale(value: Any, factor: float, key: str = "") -> Any:
+    """Scale every field that counts iterations: windows exactly, others to a whole number of at least 1."""
+    if isinstance(value, dict):
+        return {name: _scale(inner, factor) for name, inner in value.items()}
+    if isinstance(value, Window):
+        return Window(factor * value.start, factor * value.until, factor * value.every)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: _scale(getattr(value, f.name), factor, f.name) for f in dataclasses.fields(value)}
+        return dataclasses.replace(value, **fields)
+    if key in _SCALED:
+        return max(round(value * factor), 1) if value > 0 else value
+    return value

@@ -1,0 +1,45 @@
+"""Events on a schedule, at the multiples of an interval."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+TIE = 1e-6
+"""Intervals by which a scaled window may miss a multiple of its interval for the rounding of floats."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """Events at the multiples of `every` with start < multiple ≤ until, each at the nearest iteration.
+
+    In iterations, but not whole ones: a preset scales them, and rounded they would hold another number of
+    events. Events that fall on one iteration (`every` below 1) happen once.
+    """
+
+    start: float
+    until: float
+    every: float
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for an interval that is not positive, and for infinities and NaN."""
+        if not self.every > 0 or not math.isfinite(self.start + self.until + self.every):
+            raise ValueError("expected finite numbers and an 'every' above 0; correct the window")
+
+    def due(self, iteration: int) -> bool:
+        """Whether an event falls on this (1-based) iteration."""
+        return self.count(iteration) > self.count(iteration - 1)
+
+    def count(self, iteration: int) -> int:
+        """Events up to and including this iteration."""
+        return max(self._newest(iteration) - math.floor(self.start / self.every + TIE), 0)
+
+    def since(self, iteration: int) -> int | None:
+        """Iterations since the last event before this one; None if there was none yet."""
+        if not self.count(iteration - 1):
+            return None
+        return iteration - math.floor(self._newest(iteration - 1) * self.every + 0.5)
+
+    def _newest(self, iteration: int) -> int:
+        """The largest k ≤ until / every for which k · every rounds to this iteration or one before."""
+        return min(math.ceil((iteration + 0.5) / self.every) - 1, math.floor(self.until / self.every + TIE))
