@@ -2,31 +2,41 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from mi_refgs.data import hull
+from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.reference.camera import look_at
-from mi_refgs.surfels import hull
+
+BLACK = np.zeros(3)
 
 
 def sphere_views(
     count: int, size: int, centre: np.ndarray, radius: float, rng: np.random.Generator
-) -> list[hull.View]:
+) -> list[View]:
     """Exact masks of a sphere from cameras at distance 4 around it; the picture shows the view's number."""
     views = []
-    focal = -1.6 * size
+    focal = 1.6 * size
     for number in range(count):
         forward = rng.normal(size=3)
         forward /= np.linalg.norm(forward)
         to_world = look_at(centre - 4 * forward, centre, (0.3, 0.5, 0.8))
         column, row = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
-        rays = np.stack([(column - size / 2) / focal, (row - size / 2) / focal, np.ones_like(row)], axis=-1)
-        cosine = rays[..., 2] / np.linalg.norm(rays, axis=-1)
+        rays = np.stack([(column - size / 2) / focal, (row - size / 2) / focal, -np.ones_like(row)], axis=-1)
+        cosine = -rays[..., 2] / np.linalg.norm(rays, axis=-1)
         alpha = (4 * np.sqrt(1 - cosine**2) < radius).astype(np.float32)
-        colour = np.full((size, size, 3), number / count, dtype=np.float32)
-        views.append(hull.View(focal, focal, size / 2, size / 2, to_world, alpha, colour))
+        image = np.float32(number / count) * np.repeat(alpha[..., None], 3, axis=2)
+        middle = size / 2
+        views.append(
+            View(
+                "", size, size, focal, focal, middle, middle, to_world, image, alpha, None, None, linear=True
+            )
+        )
     return views
 
 
@@ -49,9 +59,9 @@ def test_visual_hull_of_a_sphere(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
     cosine = np.sum(normals * outward, axis=1) / distance
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean() < 12
-    colours = hull.median_colours(points, views)
+    colours = hull.median_colours(points, views, BLACK)
     assert np.all((colours > 0.3) & (colours < 0.7))
-    facing = hull.median_colours(points, views[:1], normals)
+    facing = hull.median_colours(points, views[:1], BLACK, normals)
     seen = np.sum(normals * (views[0].to_world[:3, 3] - points), axis=1) > 0
     # At the silhouette a mask of whole pixels may miss the point, which then stays grey.
     assert np.all(facing[~seen] == 0.5) and np.mean(facing[seen] == 0) > 0.8
@@ -72,7 +82,7 @@ def test_points_inside_the_hull_of_a_sphere(rng: np.random.Generator) -> None:
         tiny.inner_points(4000, np.random.default_rng(1)) * 1e6, points, rtol=0, atol=1e-12
     )
     # Every view sees every point, whatever its side: colours are the median of all views.
-    assert np.all(np.abs(hull.median_colours(points[distance < 0.7], views) - 0.5) < 0.06)
+    assert np.all(np.abs(hull.median_colours(points[distance < 0.7], views, BLACK) - 0.5) < 0.06)
 
 
 def test_points_inside_a_hull_are_uniform_across_voxels(rng: np.random.Generator) -> None:
@@ -100,7 +110,7 @@ def test_a_hull_of_hardly_any_volume_ends_the_search(rng: np.random.Generator) -
 
 def test_empty_hull_and_parallel_cameras_are_refused(rng: np.random.Generator) -> None:
     views = sphere_views(4, 16, np.zeros(3), 0.8, rng)
-    nothing = [hull.View(v.fx, v.fy, v.cx, v.cy, v.to_world, v.alpha * 0) for v in views]
+    nothing = [replace(view, alpha=np.zeros((16, 16), np.float32)) for view in views]
     with pytest.raises(InputError, match="inside every mask"):
         hull.visual_hull(nothing, hull.camera_bounds(views), resolution=8)
     for few in ([], views[:1]):
@@ -108,4 +118,4 @@ def test_empty_hull_and_parallel_cameras_are_refused(rng: np.random.Generator) -
             hull.camera_bounds(few)
     points = hull.random_points(100, np.array([[-1, 0, 2], [1, 1, 2.5]]), rng)
     assert points.shape == (100, 3) and np.all((points >= [-1, 0, 2]) & (points <= [1, 1, 2.5]))
-    assert np.all(hull.median_colours(points, nothing) == 0.5)
+    assert np.all(hull.median_colours(points, nothing, BLACK) == 0.5)

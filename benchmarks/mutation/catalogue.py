@@ -753,7 +753,7 @@ _FILES = [
         "surfels/init.py",
     ),
     *_in(
-        "data/transforms.py",
+        "data/frames.py",
         (
             "data: axes of OpenCV's camera",
             "np.diag([-1.0, 1.0, -1.0, 1.0])",
@@ -768,7 +768,7 @@ _FILES = [
         ),
         (
             "data: intrinsics are not scaled down",
-            "(x / self.downscale for x in self._intrinsics",
+            "(x / self.options.downscale for x in self._intrinsics",
             "(x for x in self._intrinsics",
             "test_data.py::test_downscale_averages_composited_pixels",
         ),

@@ -1,289 +1,70 @@
-"""One frame of a transforms file: its picture, its camera, its ground-truth maps."""
+"""The Blender / NeRF layout: `transforms_{split}.json` beside pictures, and its relatives.
+
+Keys: `camera_angle_x` (radians) or `fl_x`, and `camera_angle_y`, `fl_y`, `cx`, `cy`, `w`, `h` (pixels), each
+in a frame or for the whole file; `k1` … `k4`, `p1`, `p2`, `is_fisheye`, `camera_model` (`data.lens` undoes the
+distortion); `frames` with `file_path` (with or without extension) and `transform_matrix`
+(camera to world, OpenGL axes); optional `exr_path`, `normal_path` (X, Y, Z, world) and `depth_path` (along
+the viewing axis) as `data.make_dataset` writes them.
+"""
 
 from __future__ import annotations
 
-import math
-import os
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-
-from mi_refgs.constants import MAX_NUMBER, RIGID_TOLERANCE
-from mi_refgs.errors import InputError, shown
-from mi_refgs.files import is_file
-from mi_refgs.data.lens import Lens, Undistortion, undistortion
-from mi_refgs.images import box_downscale, image_size, read_exr_image, read_png
-
-if TYPE_CHECKING:
-    from mi_refgs.splat.camera import Camera
-
-SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
-"""File name endings that `file_path` may carry or leave out, in the order in which they are tried."""
-LENS_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
-CAMERA_MODELS = {
-    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), False),
-    **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), True),
-}
-"""Values of `camera_model`, as COLMAP and nerfstudio name them, and whether each is a fisheye."""
-OTHER_LENSES = ("k5", "k6", "ftheta_p0", "latlong", "equirectangular", "orthographic")
-"""Keys of lenses that are refused, unless they are 0 or false."""
-MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
-"""OpenGL's camera looks along −z with +x right, Mitsuba's along +z with +x left; its own inverse."""
+from mi_refgs.data.frames import FrameReader
+from mi_refgs.data.readers import ReadOptions, Recording, held_out
+from mi_refgs.errors import InputError
+from mi_refgs.files import read_json
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """One picture and its camera."""
+class TransformsReader:
+    """Reads folders with `transforms_train.json` or `transforms.json`."""
 
-    name: str
-    width: int  # pixels
-    height: int  # pixels
-    fx: float  # focal length, pixels, positive
-    fy: float
-    cx: float  # principal point, pixels from the left edge; the centre is width / 2
-    cy: float
-    to_world: np.ndarray  # (4, 4) float64, rigid, from Mitsuba's camera frame: +z forward, +x left, +y up
-    image: np.ndarray  # (H, W, 3) float32 target, composited onto the background
-    alpha: np.ndarray | None  # (H, W) float32
-    normal: np.ndarray | None  # (H, W, 3) float32, world space, 0 off the object
-    depth: np.ndarray | None  # (H, W) float32 along the viewing axis, 0 off the object
-    linear: bool  # whether `image` is linear radiance (EXR) or sRGB-encoded (PNG)
-    near: float = 0.0  # depth of the near plane, scene units; `load` derives it from all cameras
+    name = "Blender / NeRF"
+    looks_for = "transforms_train.json or transforms.json"
 
-    def camera(self) -> Camera:
-        """The splatter's camera; in Mitsuba's frame both of its focal lengths are negative."""
-        from mi_refgs.splat.camera import Camera
+    def recognises(self, folder: Path) -> bool:
+        """Whether the folder holds a transforms file."""
+        return any(folder.glob("transforms*.json"))
 
-        focal = (-self.fx, -self.fy)
-        return Camera.from_pose(self.width, self.height, *focal, self.cx, self.cy, self.to_world, self.near)
+    def size(self, folder: Path, images: str) -> tuple[int, int]:
+        """Width and height of the first training picture as it lies in its file."""
+        transforms, content, frames = _frames(folder, "train")
+        return FrameReader(transforms, content, ReadOptions(images=images)).size(*frames[0])
+
+    def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
+        """The views of one split; the light is `environment.exr`."""
+        transforms, content, frames = _frames(folder, split)
+        reader = FrameReader(transforms, content, options)
+        light = folder / "environment.exr"
+        views = tuple(reader.read(i, frame) for i, frame in frames)
+        return Recording(views, environment=light if light.is_file() else None, source=transforms)
 
 
-@dataclass(frozen=True)
-class FrameReader:
-    """Turns the frames of one transforms file into views."""
-
-    transforms: Path
-    content: dict[str, Any]
-    downscale: int
-    background: float
-    images: str
-    truth: bool
-
-    def read(self, index: int, frame: Any) -> View:
-        file = self._file(index, frame)
-        to_world = self._to_world(index, frame)
-        premultiplied, alpha, source = self._picture(file)
-        height, width = premultiplied.shape[:2]
-        fx, fy, cx, cy = (x / self.downscale for x in self._intrinsics(frame, file, *source))
-        straight = self._undistortion(index, frame, (width, height, fx, fy, cx, cy))
-        if straight is not None:
-            fx, fy = fx * straight.zoom, fy * straight.zoom
-            premultiplied = straight.resample(premultiplied)
-            alpha = None if alpha is None else straight.resample(alpha[..., None])[..., 0]
-        normal = self._map(index, frame, "normal_path", (*source, 3), straight)
-        depth = self._map(index, frame, "depth_path", (*source, 1), straight)
-        if normal is not None:
-            length = np.linalg.norm(normal, axis=-1, keepdims=True)
-            normal = np.where(length > 0, normal / np.maximum(length, 1e-12), 0).astype(np.float32)
-        if alpha is not None:
-            premultiplied += (1 - alpha[..., None]) * np.float32(self.background)
-        return View(
-            name=_stem(str(Path(frame["file_path"]))),
-            width=width,
-            height=height,
-            fx=fx,
-            fy=fy,
-            cx=cx,
-            cy=cy,
-            to_world=to_world,
-            image=premultiplied,
-            alpha=alpha,
-            normal=normal,
-            depth=None if depth is None else depth[..., 0],
-            linear=self.images == "exr",
+def _frames(path: Path, split: str) -> tuple[Path, dict[str, Any], list[tuple[int, Any]]]:
+    """The file that holds a split, its content, and the split's frames with their index in it."""
+    own = path / f"transforms_{split}.json"
+    shared = [p for p in (path / "transforms_train.json", path / "transforms.json") if p.is_file()]
+    # A training file beside a test file is used whole; alone, it is shared by both splits.
+    whole = own.is_file() and (split != "train" or (path / "transforms_test.json").is_file())
+    if not whole and (split not in ("train", "test") or not shared):
+        raise InputError(
+            f"{path}: transforms_{split}.json: missing; give a complete data set in the Blender convention"
         )
-
-    def size(self, index: int, frame: Any) -> tuple[int, int]:
-        """Width and height of a frame's picture as it lies in the file."""
-        return image_size(self._file(index, frame))
-
-    def _file(self, index: int, frame: Any) -> Path:
-        """The picture of a frame."""
-        if not isinstance(frame, dict):
-            raise InputError(f"{self.transforms}: frames[{index}]: not an object; give it a file_path")
-        named = self._path(index, frame, "file_path")
-        if named is None:
-            raise InputError(f"{self.transforms}: frames[{index}].file_path: missing; name the picture")
-        if self.images == "exr":
-            return self._path(index, frame, "exr_path") or named.with_name(f"{_stem(named.name)}.exr")
-        candidates = [named.with_name(_stem(named.name) + suffix) for suffix in SUFFIXES[:-1]]
-        file = next((c for c in (named, *candidates) if is_file(c)), candidates[0])
-        if file.suffix.lower() == ".exr":
-            raise InputError(f"{file}: images: the picture is an EXR file; read this data set as 'exr'")
-        return file
-
-    def _path(self, index: int, frame: dict[str, Any], key: str) -> Path | None:
-        """The file that a key names; None where the frame has no such key, or an empty name.
-
-        Names are relative to the transforms file and stay in its folder. Symbolic links are followed: they
-        belong to whoever made the folder, not to the file.
-        """
-        name = frame.get(key)
-        if name is None or name == "":
-            return None
-        inside = os.path.normpath(name) if isinstance(name, str) else os.pardir
-        if os.path.isabs(inside) or inside.split(os.sep)[0] in (os.pardir, os.curdir):
-            raise InputError(
-                f"{self.transforms}: frames[{index}].{key}: {shown(name)} names no file in the "
-                "data set's folder; move the file there and give its relative path"
-            )
-        return self.transforms.parent / inside
-
-    def _picture(self, file: Path) -> tuple[np.ndarray, np.ndarray | None, tuple[int, int]]:
-        """Premultiplied colour and alpha at the wanted size, and the rows and columns of the file."""
-        if self.images == "exr":
-            pixels = read_exr_image(file)
-            if pixels.shape[-1] < 3:
-                raise InputError(f"{file}: channels: no R, G, B; export a colour picture")
-        else:
-            pixels = read_png(file)
-            if pixels.shape[-1] == 4:
-                pixels[..., :3] *= pixels[..., 3:]
-        height, width = pixels.shape[:2]
-        if min(width, height) < self.downscale:
-            raise InputError(
-                f"{file}: downscale: {width} × {height} pixels are less than a block of {self.downscale}²; "
-                "give a smaller number"
-            )
-        small = box_downscale(pixels, self.downscale)
-        alpha = np.ascontiguousarray(small[..., 3]) if small.shape[-1] == 4 else None
-        return np.ascontiguousarray(small[..., :3]), alpha, (height, width)
-
-    def _map(
-        self,
-        index: int,
-        frame: dict[str, Any],
-        key: str,
-        expected: tuple[int, int, int],
-        straight: Undistortion | None,
-    ) -> np.ndarray | None:
-        """A ground-truth map at the wanted size, each pixel a mean over the surface in its block.
-
-        `expected` is the shape that the file must have: the picture's.
-        """
-        file = self._path(index, frame, key) if self.truth else None
-        if file is None:
-            return None
-        pixels = read_exr_image(file)
-        if pixels.shape != expected:
-            raise InputError(
-                f"{file}: frames[{index}].{key}: has shape {pixels.shape} but the picture needs {expected}; "
-                "export both at one size or remove the key"
-            )
-        covered = np.any(pixels != 0, axis=-1, keepdims=True).astype(np.float32)
-        share, total = box_downscale(covered, self.downscale), box_downscale(pixels, self.downscale)
-        if straight is not None:  # linear, so that no weight is negative
-            share, total = straight.resample(share, order=1), straight.resample(total, order=1)
-        return (total / np.maximum(share, 1e-12)).astype(np.float32)
-
-    def _to_world(self, index: int, frame: dict[str, Any]) -> np.ndarray:
-        field = f"{self.transforms}: frames[{index}].transform_matrix"
-        try:
-            matrix = np.array(frame["transform_matrix"], dtype=np.float64)
-        except (KeyError, TypeError, ValueError, OverflowError):
-            matrix = np.empty(0)
-        if matrix.shape != (4, 4):
-            raise InputError(f"{field}: missing or not 4 × 4 numbers; give the camera-to-world matrix")
-        rotation = matrix[:3, :3]
-        rigid = (
-            np.all(np.isfinite(matrix))
-            and np.abs(rotation.T @ rotation - np.eye(3)).max() < RIGID_TOLERANCE
-            and np.linalg.det(rotation) > 0
-            and np.abs(matrix[3] - [0, 0, 0, 1]).max() < RIGID_TOLERANCE
-        )
-        if not rigid:
-            raise InputError(f"{field}: not a rotation and a translation; remove scale, shear and mirroring")
-        return matrix @ MITSUBA_FROM_OPENGL
-
-    def _given(self, frame: dict[str, Any], key: str) -> Any:
-        """The value of a key in the frame, or for the whole file; None where there is neither."""
-        return frame.get(key, self.content.get(key))
-
-    def _number(self, frame: dict[str, Any], key: str) -> float | None:
-        value = self._given(frame, key)
-        if value is None:
-            return None
-        if type(value) not in (int, float) or not abs(value) <= MAX_NUMBER:
-            raise InputError(f"{self.transforms}: {key}: {shown(value)} is not a number; correct it")
-        return float(value)
-
-    def _undistortion(
-        self, index: int, frame: dict[str, Any], view: tuple[int, int, float, float, float, float]
-    ) -> Undistortion | None:
-        """How to undo the lens of a frame, whose size and intrinsics are given; None for a pinhole."""
-        model = self._given(frame, "camera_model") or "OPENCV"
-        fisheye = self._given(frame, "is_fisheye") or False
-        odd = [key for key in OTHER_LENSES if self._given(frame, key)]
-        if not isinstance(model, str) or model not in CAMERA_MODELS or not isinstance(fisheye, bool) or odd:
-            raise InputError(
-                f"{self.transforms}: {odd[0] if odd else 'camera_model'}: this lens is unknown here; "
-                "undistort the pictures, or give OpenCV's perspective or fisheye coefficients"
-            )
-        fisheye = fisheye or CAMERA_MODELS[model]
-        k1, k2, k3, k4, p1, p2 = (self._number(frame, key) or 0.0 for key in LENS_KEYS)
-        if (p1 or p2) if fisheye else k4:
-            field, kind = ("p1, p2", "fisheye") if fisheye else ("k4", "perspective")
-            raise InputError(
-                f"{self.transforms}: {field}: a {kind} lens has none here; undistort the pictures, "
-                "or set it to 0"
-            )
-        if not (fisheye or any((k1, k2, k3, p1, p2))):
-            return None
-        lens = Lens(fisheye, (k1, k2, k3, k4) if fisheye else (k1, k2, k3), (p1, p2))
-        try:
-            return undistortion(lens, *view)
-        except InputError as error:
-            raise InputError(f"{self.transforms}: frames[{index}]: k1 … p2: {error}") from None
-
-    def _intrinsics(
-        self, frame: dict[str, Any], file: Path, height: int, width: int
-    ) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy in pixels of the picture file."""
-
-        def number(key: str) -> float | None:
-            value = self._number(frame, key)
-            if value is not None and value <= 0:
-                raise InputError(
-                    f"{self.transforms}: {key}: {shown(value)} is not a positive number; correct it"
-                )
-            return value
-
-        for key, size in (("w", width), ("h", height)):
-            wanted = number(key)
-            if wanted is not None and wanted != size:
-                raise InputError(
-                    f"{file}: {key}: the picture is {width} × {height} pixels, but {self.transforms.name} "
-                    f"says {key} = {wanted:g}; restore the picture, or give only camera_angle_x"
-                )
-        focal: list[float | None] = []
-        for length, angle, size in (("fl_x", "camera_angle_x", width), ("fl_y", "camera_angle_y", height)):
-            pixels, radians = number(length), number(angle)
-            if pixels is None and radians is not None:
-                if not 1 / MAX_NUMBER < radians < math.pi:
-                    raise InputError(
-                        f"{self.transforms}: {angle}: {radians:g} is not between 0 and π; give radians"
-                    )
-                pixels = 0.5 * size / math.tan(radians / 2)
-            focal.append(pixels)
-        fx = focal[0]
-        if fx is None:
-            raise InputError(f"{self.transforms}: camera_angle_x: missing; give radians, or fl_x in pixels")
-        return fx, focal[1] or fx, number("cx") or width / 2, number("cy") or height / 2
+    transforms = own if whole else shared[0]
+    content = read_json(transforms)
+    frames = content.get("frames")
+    if not isinstance(frames, list):
+        raise InputError(f"{transforms}: frames: missing or not a list; add one entry for each picture")
+    selected = list(enumerate(frames))
+    if not whole:
+        selected = held_out(sorted(selected, key=lambda item: _file_path(item[1])), split)
+    if not selected:
+        kind = {"train": "training", "test": "test"}.get(split, split)
+        raise InputError(f"{transforms}: frames: zero {kind} views; add pictures")
+    return transforms, content, selected
 
 
-def _stem(name: str) -> str:
-    """A file's name without an ending of SUFFIXES; any other dot is part of the name."""
-    path = Path(name)
-    return str(path.with_suffix("")) if path.suffix.lower() in SUFFIXES else name
+def _file_path(frame: Any) -> str:
+    return str(frame.get("file_path", "")) if isinstance(frame, dict) else ""

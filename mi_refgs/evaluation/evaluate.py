@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.transforms import View
+from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics, pictures
 from mi_refgs.files import read_json

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.transforms import View
+from mi_refgs.data.view import View
 from mi_refgs.evaluation.metrics import environment
 from mi_refgs.images import srgb_from_linear
 from mi_refgs.render.display import displayed

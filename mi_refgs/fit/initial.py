@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from mi_refgs.data.dataset import Dataset, View
+from mi_refgs.data import hull
+from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.images import linear_from_srgb
 from mi_refgs.methods.method import Method
-from mi_refgs.surfels import hull, init
+from mi_refgs.surfels import init
 from mi_refgs.surfels.order import morton_order
 from mi_refgs.surfels.table import Surfels
 
@@ -25,22 +25,26 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
     options = method.surfels
     if not 0 <= options.inside <= 1:
         raise InputError(f"method: surfels.inside: {options.inside} is no share; give a number from 0 to 1")
-    views = [_view(view, data) for view in data.views]
-    bounds = hull.camera_bounds(views)
-    if all(view.alpha is not None for view in data.views):
-        shape = hull.visual_hull(views, bounds)
+    views, behind = data.views, data.background
+    if all(view.alpha is not None for view in views):
+        shape = hull.visual_hull(views, hull.camera_bounds(views))
         inner = shape.inner_points(round(options.inside * options.count), rng)
         outer, facing = shape.surface_points(options.count - len(inner), rng)
         points = np.concatenate([outer, inner])
         normals = np.concatenate([facing, init.random_normals(len(inner), rng)])
         # What lies inside has no side to be seen from: every view of it votes.
         colours = np.concatenate(
-            [hull.median_colours(outer, views, facing), hull.median_colours(inner, views)]
+            [hull.median_colours(outer, views, behind, facing), hull.median_colours(inner, views, behind)]
         )
+    elif data.points is not None and len(data.points.position):
+        row = rng.choice(len(data.points.position), options.count, len(data.points.position) < options.count)
+        points, normals = data.points.position[row], init.random_normals(options.count, rng)
+        known = data.points.colour
+        colours = hull.median_colours(points, views, behind) if known is None else known[row]
     else:
-        points = hull.random_points(options.count, bounds, rng)
+        points = hull.random_points(options.count, hull.camera_bounds(views), rng)
         normals = init.random_normals(options.count, rng)
-        colours = hull.median_colours(points, views)
+        colours = hull.median_colours(points, views, behind)
     order = morton_order(points)
     return init.from_points(
         points[order],
@@ -51,11 +55,3 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
         degree={name: options.degree_of(name) for name in options.channels},
         **options.initial,
     )
-
-
-def _view(view: View, data: Dataset) -> hull.View:
-    alpha = np.ones(view.image.shape[:2], np.float32) if view.alpha is None else view.alpha
-    covered = np.maximum(alpha, 1e-3)[..., None]
-    colour = np.clip((view.image - (1 - alpha[..., None]) * data.background) / covered, 0, None)
-    colour = colour if data.linear else linear_from_srgb(np.clip(colour, 0, 1))
-    return hull.View(-view.fx, -view.fy, view.cx, view.cy, view.to_world, alpha, colour.astype(np.float32))

@@ -1,7 +1,6 @@
 """Points to start from: on and in the visual hull of alpha masks, or in a box, and the colours there.
 
-World positions in scene units; cameras in Mitsuba's frame (+z forward, +x left, +y up), hence signed focal
-lengths. `bounds` is a (2, 3) array: the lowest and highest corner of a box.
+World positions in scene units. `bounds` is a (2, 3) array: the lowest and highest corner of a box.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
 # Voxels per edge of the visual hull's grid: at 200² a voxel of the cube the views span is two pixels wide.
@@ -27,34 +27,6 @@ HULL_DRAWS = 64
 COLOUR_VIEWS = 32
 # Singular value of the mean of (I - d dᵀ), 0 for parallel view axes, below which they do not meet.
 FOCUS_CONDITION = 1e-3
-
-
-@dataclass(frozen=True)
-class View:
-    """One training view, in NumPy."""
-
-    fx: float  # pixels, signed
-    fy: float  # pixels, signed
-    cx: float  # pixels
-    cy: float  # pixels
-    to_world: np.ndarray  # (4, 4) world from camera, rigid
-    alpha: np.ndarray  # (H, W) in [0, 1]
-    colour: np.ndarray | None = None  # (H, W, 3) linear, not premultiplied
-
-    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Array indices (row, column), integer at pixel centres, of world points (N, 3); and if seen."""
-        to_world = np.asarray(self.to_world, dtype=np.float64)
-        local = (points - to_world[:3, 3]) @ to_world[:3, :3]
-        depth = np.where(local[:, 2] > 0, local[:, 2], np.inf)
-        column = self.fx * local[:, 0] / depth + self.cx - 0.5
-        row = self.fy * local[:, 1] / depth + self.cy - 0.5
-        height, width = self.alpha.shape
-        seen = (
-            (local[:, 2] > 0)
-            & (abs(column - (width - 1) / 2) <= width / 2)
-            & (abs(row - (height - 1) / 2) <= height / 2)
-        )
-        return row, column, seen
 
 
 def camera_bounds(views: Sequence[View]) -> np.ndarray:
@@ -73,7 +45,7 @@ def camera_bounds(views: Sequence[View]) -> np.ndarray:
         )
     focus = np.linalg.solve(system, np.einsum("nij,nj->i", projectors, origins) / len(views))
     distance = np.linalg.norm(origins - focus, axis=1)
-    reach = [max(v.alpha.shape[1] / abs(v.fx), v.alpha.shape[0] / abs(v.fy)) / 2 for v in views]
+    reach = [max(v.width / v.fx, v.height / v.fy) / 2 for v in views]
     half = min(float(np.max(distance * reach)), float(distance.max()))
     return np.stack([focus - half, focus + half])
 
@@ -153,7 +125,7 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int = HUL
         row, column, seen = view.project(points)
         # No view is blurred as if it were nearer to the middle than a voxel.
         distance = max(float(np.linalg.norm(middle - view.to_world[:3, 3])), float(voxel.max()))
-        blur = 0.5 * float(voxel.max()) * abs(view.fx) / distance
+        blur = 0.5 * float(voxel.max()) * view.fx / distance
         mask = gaussian_filter(np.asarray(view.alpha, dtype=np.float32), blur, mode="nearest")
         value = map_coordinates(mask, np.stack([row[seen], column[seen]]), order=1, mode="nearest")
         inside[alive[seen]] = np.minimum(inside[alive[seen]], value)
@@ -173,30 +145,25 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int = HUL
 
 
 def median_colours(
-    points: np.ndarray, views: Sequence[View], normals: np.ndarray | None = None
+    points: np.ndarray, views: Sequence[View], background: np.ndarray, normals: np.ndarray | None = None
 ) -> np.ndarray:
     """Median linear colour (N, 3) of the points over the views that show them with alpha > 0.5.
 
-    Points that no view shows are 0.5 grey. With `normals`, only views in front of a point vote. There is no
+    `background` (3,) is that of the views. Points that no view shows are 0.5 grey. With `normals`, only views in front of a point vote. There is no
     occlusion test: the median of many views forgives it. At most 32 views, evenly chosen, are read.
     """
-    chosen = [view for view in views if view.colour is not None]
-    chosen = (
-        [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, COLOUR_VIEWS).astype(int))]
-        if chosen
-        else []
-    )
-    if not chosen or not len(points):
+    if not views or not len(points):
         return np.full((len(points), 3), 0.5)
+    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, COLOUR_VIEWS).astype(int))]
     samples = np.full((len(chosen), len(points), 3), np.nan, dtype=np.float32)
     for sample, view in zip(samples, chosen, strict=True):
         row, column, seen = view.project(points)
         if normals is not None:
             seen = seen & (np.sum(normals * (view.to_world[:3, 3] - points), axis=1) > 0)
         at = np.rint([row[seen], column[seen]]).astype(int)
-        row_index, column_index = np.clip(at, 0, np.array(view.alpha.shape)[:, None] - 1)
-        colour = np.asarray(view.colour)[row_index, column_index]
-        opaque = view.alpha[row_index, column_index] > 0.5
+        row_index, column_index = np.clip(at, 0, np.array([[view.height], [view.width]]) - 1)
+        colour = view.colour(background)[row_index, column_index]
+        opaque = np.full(len(colour), True) if view.alpha is None else view.alpha[row_index, column_index] > 0.5
         sample[np.flatnonzero(seen)[opaque]] = colour[opaque]
     ordered = np.sort(samples, axis=0)  # NaN last
     number = np.count_nonzero(~np.isnan(ordered[..., 0]), axis=0)

@@ -1,0 +1,62 @@
+"""One picture of a data set with its camera, in NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mi_refgs.images import linear_from_srgb
+
+if TYPE_CHECKING:
+    from mi_refgs.splat.camera import Camera
+
+ALPHA_FLOOR = 1e-3
+"""Alpha by which colour is divided at least: fainter pixels have no colour of their own in 8 bits."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One picture and its camera."""
+
+    name: str
+    width: int  # pixels
+    height: int  # pixels
+    fx: float  # focal length, pixels, positive
+    fy: float
+    cx: float  # principal point, pixels from the left edge; the centre is width / 2
+    cy: float
+    to_world: np.ndarray  # (4, 4) float64, rigid, from Mitsuba's camera frame: +z forward, +x left, +y up
+    image: np.ndarray  # (H, W, 3) float32 target, composited onto the background
+    alpha: np.ndarray | None  # (H, W) float32
+    normal: np.ndarray | None  # (H, W, 3) float32, world space, 0 off the object
+    depth: np.ndarray | None  # (H, W) float32 along the viewing axis, 0 off the object
+    linear: bool  # whether `image` is linear radiance (EXR) or sRGB-encoded (PNG)
+    near: float = 0.0  # depth of the near plane, scene units; `read_dataset` derives it from all cameras
+
+    def camera(self) -> Camera:
+        """The splatter's camera; in Mitsuba's frame both of its focal lengths are negative."""
+        from mi_refgs.splat.camera import Camera
+
+        focal = (-self.fx, -self.fy)
+        return Camera.from_pose(self.width, self.height, *focal, self.cx, self.cy, self.to_world, self.near)
+
+    def colour(self, background: np.ndarray) -> np.ndarray:
+        """Linear colour (H, W, 3) of the object alone, not premultiplied; `background` (3,) as in `image`."""
+        alpha = np.float32(1) if self.alpha is None else self.alpha[..., None]
+        colour = np.clip((self.image - (1 - alpha) * background) / np.maximum(alpha, ALPHA_FLOOR), 0, None)
+        return colour if self.linear else linear_from_srgb(np.clip(colour, 0, 1))
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Array indices (row, column), integer at pixel centres, of world points (N, 3); and if seen."""
+        local = (points - self.to_world[:3, 3]) @ self.to_world[:3, :3]
+        depth = np.where(local[:, 2] > 0, local[:, 2], np.inf)
+        column = -self.fx * local[:, 0] / depth + self.cx - 0.5
+        row = -self.fy * local[:, 1] / depth + self.cy - 0.5
+        seen = (
+            (local[:, 2] > 0)
+            & (abs(column - (self.width - 1) / 2) <= self.width / 2)
+            & (abs(row - (self.height - 1) / 2) <= self.height / 2)
+        )
+        return row, column, seen
