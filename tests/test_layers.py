@@ -12,7 +12,7 @@ from helpers import ROOT, imported_packages
 
 PACKAGE = "mi_refgs"
 
-BOTTOM = {"constants", "device", "errors", "files", "images", "ply"}
+BOTTOM = {"constants", "device", "errors", "files", "images", "ply", "timing"}
 """What everything may stand on."""
 
 RENDERER = {"render", "shade", "occlusion", "splat", "surfels", "primitives"} | BOTTOM
@@ -28,6 +28,7 @@ LAYERS: dict[str, set[str]] = {
     "ply": {"errors"},
     "rows": set(),
     "device": set(),
+    "timing": set(),
     "primitives": BOTTOM,
     "surfels": {"rows", "primitives"} | BOTTOM,
     "splat": {"surfels", "primitives", "rows"} | BOTTOM,

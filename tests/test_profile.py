@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,16 +15,17 @@ import numpy as np
 import pytest
 from tiny_scene import SETTINGS, SIZE
 
-from mi_refgs import methods, splat
+from mi_refgs import methods, timing
 from mi_refgs.cli import main
 from mi_refgs.data import dataset as data_module
-from mi_refgs.fit import optim, train
 from mi_refgs.fit.train import Trainer
 from mi_refgs.methods.method import LightOptions, Method
 from mi_refgs.profiling import phases
 from mi_refgs.profiling.advice import advice
 from mi_refgs.profiling.profile import Profile, StageProfile, Work, count_work, profile_stage
-from mi_refgs.shade import prefilter
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.shade.envmap import PrefilteredLight
+from mi_refgs.splat import Blended, Footprints
 
 PAUSE = 0.25
 """Seconds that a planted sleep takes: far more than any stage of the tiny scene, on a busy machine too."""
@@ -38,7 +39,7 @@ def trainer(data: Path, method: Path) -> Trainer:
     return Trainer(resolved, data_module.read_dataset(data, "train"))
 
 
-# ---------- Stages ----------
+# ---------- Phases ----------
 
 
 class Sleepy(dr.CustomOp):
@@ -55,73 +56,112 @@ class Sleepy(dr.CustomOp):
         return "sleepy"
 
 
-def sleepy_blend(footprints: Any, features: Any, *rest: Any) -> Any:
-    return _blend(footprints, [dr.custom(Sleepy, features[0]), *features[1:]], *rest)
+class SleepyClock(phases.PhaseClock):
+    """Sleeps in one phase: forward in its function, backward on either side of a boundary."""
 
+    def __init__(self, place: str, side: str) -> None:
+        super().__init__()
+        self.place, self.side = place, side
 
-def sleepy_prefilter(self: Any) -> None:
-    time.sleep(PAUSE)
-    _prefilter_backward(self)
+    def call(self, phase: str, function: Callable[[], Any], arguments: Any = ()) -> Any:
+        def slow() -> Any:
+            time.sleep(PAUSE)
+            return function()
 
+        return super().call(phase, slow if (phase, self.side) == (self.place, "in") else function, arguments)
 
-def sleepy_render(surfels: Any, *rest: Any, **options: Any) -> Any:
-    frame = _render(surfels, *rest, **options)
-    return replace(frame, alpha=dr.custom(Sleepy, frame.alpha))
+    def boundary(self, value: Any, phase: str) -> Any:
+        def slow(side: str, value: Any) -> Any:
+            if (phase, side) != (self.place, self.side):
+                return value
+            chosen = [True]  # one array only: the pause is taken once
+            return phases._map(
+                value, lambda x: dr.custom(Sleepy, x) if dr.grad_enabled(x) and chosen and chosen.pop() else x
+            )
 
-
-def sleepy_objective(frame: Any, *rest: Any) -> Any:
-    return _objective(replace(frame, alpha=dr.custom(Sleepy, frame.alpha)), *rest)
-
-
-def sleepy_project(surfels: Any, *rest: Any) -> Any:
-    found = _project(surfels, *rest)
-    return replace(found, columns=[dr.custom(Sleepy, found.columns[0]), *found.columns[1:]])
-
-
-def sleepy_step(self: Any, iteration: int, loss: Any) -> None:
-    time.sleep(PAUSE)
-    _step(self, iteration, loss)
-
-
-_blend, _project, _render, _objective = splat.blend, splat.project, train.render, train.objective
-_prefilter_backward, _step = prefilter._Prefilter.backward, optim.Adam.step
+        return slow("after", super().boundary(slow("before", value), phase))
 
 
 @pytest.mark.parametrize(
-    ("owner", "name", "planted", "stage", "at"),
+    ("place", "side", "phase", "at"),
     [
-        (splat, "blend", sleepy_blend, "splat backward", "initial"),
-        (splat, "blend", sleepy_blend, "splat backward", "deferred"),
-        (splat, "project", sleepy_project, "surfels backward", "deferred"),
-        (prefilter._Prefilter, "backward", sleepy_prefilter, "prefilter backward", "initial"),
-        (prefilter._Prefilter, "backward", sleepy_prefilter, "prefilter backward", "deferred"),
-        (train, "render", sleepy_render, "shade backward", "deferred"),
-        (train, "objective", sleepy_objective, "loss backward", "deferred"),
-        (optim.Adam, "step", sleepy_step, "optimiser", "deferred"),
+        ("surfels backward", "after", "splat backward", "initial"),
+        ("surfels backward", "after", "splat backward", "deferred"),
+        ("splat backward", "before", "splat backward", "deferred"),
+        ("surfels backward", "before", "surfels backward", "deferred"),
+        ("prefilter backward", "before", "prefilter backward", "initial"),
+        ("prefilter backward", "before", "prefilter backward", "deferred"),
+        ("shade backward", "before", "shade backward", "deferred"),
+        ("shade backward", "after", "loss backward", "deferred"),
+        *[
+            (name, "in", name, "deferred")
+            for name in ("prefilter forward", "shade forward", "project", "tile lists", "sort")
+        ],
+        *[(name, "in", name, "deferred") for name in ("splat forward", "ssim forward", "optimiser")],
     ],
 )
 def test_time_is_booked_where_it_is_spent(
-    owner: Any,
-    name: str,
-    planted: Any,
-    stage: str,
-    at: str,
-    trainer: Trainer,
-    monkeypatch: pytest.MonkeyPatch,
+    place: str, side: str, phase: str, at: str, trainer: Trainer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(owner, name, planted)
     monkeypatch.setattr(phases, "WARM_UP", 1)
+    monkeypatch.setattr(phases, "PhaseClock", lambda: SleepyClock(place, side))
     trainer.iteration = {"initial": 5, "deferred": 35}[at]
-    found = phases.phase_times(trainer, 3)
-    assert found[stage] > 1e3 * PAUSE
-    assert max(ms for other, ms in found.items() if other != stage) < 1e3 * PAUSE
+    found = phases.phase_times(trainer.step, 3)
+    assert found[phase] > 1e3 * PAUSE
+    assert max(ms for other, ms in found.items() if other != phase) < 1e3 * PAUSE
 
 
-def test_the_clock_leaves_nothing_behind(trainer: Trainer) -> None:
-    before = splat.blend, splat.project, train.render, dr.backward, optim.Adam.step
+class Notes:
+    """A listener that writes down what it hears, in order, and changes nothing."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.boundaries: dict[str, Any] = {}
+
+    def call(self, phase: str, function: Callable[[], Any], arguments: Any) -> Any:
+        self.calls.append(phase)
+        return function()
+
+    def boundary(self, value: Any, phase: str) -> Any:
+        self.boundaries[phase] = value
+        return value
+
+
+def test_hooks_stand_where_their_names_say(trainer: Trainer) -> None:
+    notes = Notes()
+    trainer.iteration = 35
+    with timing.listening(notes):
+        trainer.step()
+    expected = [name for name in phases.PHASES if name.endswith("forward")] + [
+        "project",
+        "tile lists",
+        "sort",
+    ]
+    assert sorted(notes.calls) == sorted([*expected, "loss backward", "optimiser"])
+    assert notes.calls[-3:] == ["ssim forward", "loss backward", "optimiser"]
+    assert notes.calls.index("splat forward") < notes.calls.index("shade forward")  # at pixels
+    footprints, features = notes.boundaries.pop("surfels backward")
+    assert isinstance(footprints, Footprints) and dr.width(features[0]) == trainer.surfels.count
+    kinds = {"splat backward": Blended, "shade backward": Frame, "prefilter backward": PrefilteredLight}
+    assert {name: type(value) for name, value in notes.boundaries.items()} == kinds
+
+
+def test_hooks_do_nothing_unless_somebody_listens() -> None:
+    value = [object()]
+    assert timing.boundary(value, "sort") is value
+    twice = timing.phase("sort")(lambda x: 2 * x)
+    assert twice(3) == 6
+    notes = Notes()
+    with timing.listening(notes):
+        assert twice(3) == 6 and timing.boundary(value, "project") is value
+    assert (notes.calls, notes.boundaries) == (["sort"], {"project": value})
+    assert twice(3) == 6 and notes.calls == ["sort"]
+
+
+def test_profiling_leaves_nothing_behind(trainer: Trainer) -> None:
     method = trainer.method
     profile_stage(trainer, "initial", 1)
-    assert (splat.blend, splat.project, train.render, dr.backward, optim.Adam.step) == before
+    assert timing._listener is None
     assert trainer.iteration == 0 and trainer.method is method
 
 
@@ -136,7 +176,7 @@ def test_a_step_with_a_clock_is_the_same_step(
         trainer = Trainer(resolved, data_module.read_dataset(data, "train"))
         trainer.iteration = 1
         if timed:
-            phases.phase_times(trainer, 1)
+            phases.phase_times(trainer.step, 1)
         else:
             trainer.step()
         tables.append(trainer.surfels.to_numpy())

@@ -31,6 +31,7 @@ from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.surfels.table import gather_rows
+from mi_refgs.timing import phase
 
 # Adam's decay rates and the ε that 3DGS uses: tiny, as per-surfel gradients of a pixel mean are about 1e-7.
 BETA_1 = 0.9
@@ -140,6 +141,7 @@ class Adam:
             self._marks.clear()
         return found
 
+    @phase("optimiser")
     def step(self, iteration: int, loss: Any = None) -> None:
         """Apply one update with the learning rates of this iteration (0-based), then clear the gradients.
 

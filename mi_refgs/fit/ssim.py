@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.device import replayed
+from mi_refgs.timing import phase
 
 # Half width of the 11-pixel window, in pixels. [Wang et al. 2004, §III.B]
 WINDOW_RADIUS = 5
@@ -40,6 +41,7 @@ def window() -> list[float]:
     return [weight / sum(weights) for weight in weights]
 
 
+@phase("ssim forward")
 def ssim(x: Sequence[Any], y: Sequence[Any], width: int, height: int) -> Any:
     """Mean SSIM (mi.Float, width 1) of two images given as planes (mi.Float, raster order) in [0, 1].
 

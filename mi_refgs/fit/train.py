@@ -35,6 +35,7 @@ from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.channels import channel, geometry
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.timing import phase
 
 
 def _shapes(method: Method) -> dict[str, tuple[int, ...]]:
@@ -228,7 +229,7 @@ class Trainer:
         )
         loss, self.error = objective(frame, target, self.data, self.method.loss, iteration)
         self.loss = dr.detach(loss)
-        dr.backward(loss)
+        phase("loss backward")(dr.backward)(loss)
 
         if self.method.refine.densify is not None and iteration <= self.method.refine.densify.until:
             length = dr.norm(dr.grad(shift) * mi.Vector2f(0.5 * camera.width, 0.5 * camera.height))

@@ -78,9 +78,10 @@ def _of_stage(stage: StageProfile, found: Profile, method: Method) -> Iterator[s
             f"Stage {stage.name}: filtering the light takes {light:.1f} ms, more than splatting "
             f"({splat:.1f} ms): halve its rows (--set light.height={method.light.height // 2})."
         )
-    if of("sort") > splat:
+    lists = of("tile lists", "sort")
+    if lists > splat:
         yield (
-            f"Stage {stage.name}: listing and sorting takes {of('sort'):.1f} ms, more than splatting "
+            f"Stage {stage.name}: listing and sorting takes {lists:.1f} ms, more than splatting "
             f"({splat:.1f} ms), for {found.work.pairs / max(found.work.surfels, 1):.0f} tiles a surfel: "
             "large, faint surfels do that (--set refine.prune_opacity, refine.prune_extent)."
         )

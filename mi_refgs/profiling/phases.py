@@ -1,13 +1,11 @@
-"""Where the time of a training step goes: wall time by stage, between barriers.
+"""Where the time of a training step goes: wall time by phase, between barriers.
 
-Forward stages are functions that a clock wraps. The backward pass is one call of Dr.Jit: invisible identities
-at the stages' boundaries are visited by it in turn, and tell the clock which stage it has come to. Only the
-names of the package's own functions are known here, nothing of the kernels behind them.
+The clock listens to the hooks of `mi_refgs.timing`. The backward pass is one call of Dr.Jit: identities at
+the boundaries between phases tell the clock which one the pass has come to.
 """
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -17,10 +15,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_refgs.timing import listening
+
 PHASES = (
     "prefilter forward",
     "shade forward",
     "project",
+    "tile lists",
     "sort",
     "splat forward",
     "ssim forward",
@@ -33,83 +34,33 @@ PHASES = (
     "rest",
 )
 """In the order of a step. `shade forward` and `shade backward` are those of shading at pixels; shading at
-surfels goes back in `surfels backward`, with the projection. `rest`: whatever no stage covers."""
-
+surfels goes back in `surfels backward`, with the projection. `rest`: whatever no other phase covers."""
 
 WARM_UP = 4
 """Steps with barriers before the first that counts: a kernel that ends at a barrier is compiled anew."""
 
 
 class PhaseClock:
-    """Wraps functions so that each call is evaluated, waited for and booked under a name."""
+    """Books wall time under the innermost phase; a `timing.Listener`."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
-        self._undo: list[tuple[Any, str, Any]] = []
-        self._stage: str | None = None  # of the backward pass
+        self._phase: str | None = None
         self._since = 0.0
 
-    def wrap(
-        self,
-        owner: Any,
-        attribute: str,
-        stage: str | None,
-        *,
-        entered: str | None = None,
-        left: str | None = None,
-    ) -> None:
-        """Replace owner.attribute by a version timed as `stage`, until `restore`.
-
-        The backward pass is in stage `entered` from where it reaches the function's result, and in `left`
-        once it has come to its arguments.
-        """
-        original = getattr(owner, attribute)
-
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            if left is not None:
-                args, kwargs = self._boundary((args, kwargs), left)
-            if stage is None:
-                result = original(*args, **kwargs)
-            else:
-                dr.eval(args, kwargs)  # what the stage is given is not its own time
-                result = self.measure(stage, lambda: original(*args, **kwargs))
-            return result if entered is None else self._boundary(result, entered)
-
-        self._replace(owner, attribute, timed)
-
-    def wrap_backward(self, stage: str) -> None:
-        """Time Dr.Jit's backward pass by boundaries; it begins in this stage."""
-        original = dr.backward
-
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            dr.eval(args)
-            self._barrier()
-            self._stage, self._since = stage, time.perf_counter()
-            original(*args, **kwargs)
-            self._reach(None)
-
-        self._replace(dr, "backward", timed)
-
-    def measure(self, stage: str, call: Callable[[], Any]) -> Any:
-        """Run, evaluate, wait, book."""
-        self._barrier()
-        begin = time.perf_counter()
-        result = call()
-        dr.eval(result)
-        self._barrier()
-        self.seconds[stage] += time.perf_counter() - begin
+    def call(self, phase: str, function: Callable[[], Any], arguments: Any = ()) -> Any:
+        """Evaluate the arguments, which are not the phase's own time; run, evaluate, wait, book."""
+        dr.eval(arguments)
+        outer = self._phase
+        self._enter(phase)
+        try:
+            result = function()
+            dr.eval(result)
+        finally:
+            self._enter(outer)
         return result
 
-    def restore(self) -> None:
-        """Put the originals back."""
-        while self._undo:
-            setattr(*self._undo.pop())
-
-    def _replace(self, owner: Any, attribute: str, function: Any) -> None:
-        self._undo.append((owner, attribute, getattr(owner, attribute)))
-        setattr(owner, attribute, function)
-
-    def _boundary(self, value: Any, stage: str) -> Any:
+    def boundary(self, value: Any, phase: str) -> Any:
         """The value, with identities on all that carries derivatives."""
         leaves: list[Any] = []
 
@@ -121,21 +72,16 @@ class PhaseClock:
         _map(value, collect)
         if not leaves:
             return value
-        passed = iter(dr.custom(_Boundary, leaves, lambda: self._reach(stage)))
+        passed = iter(dr.custom(_Boundary, leaves, lambda: self._enter(phase)))
         return _map(value, lambda leaf: next(passed) if dr.grad_enabled(leaf) else leaf)
 
-    def _reach(self, stage: str | None) -> None:
-        if self._stage is None:  # another backward pass than the timed one
-            return
-        self._barrier()
-        now = time.perf_counter()
-        self.seconds[self._stage] += now - self._since
-        self._stage, self._since = stage, now
-
-    @staticmethod
-    def _barrier() -> None:
+    def _enter(self, phase: str | None) -> None:
         dr.eval()
         dr.sync_thread()
+        now = time.perf_counter()
+        if self._phase is not None:
+            self.seconds[self._phase] += now - self._since
+        self._phase, self._since = phase, now
 
 
 class _Boundary(dr.CustomOp):
@@ -169,42 +115,20 @@ def _map(value: Any, change: Callable[[Any], Any]) -> Any:
     return value
 
 
-def phase_times(trainer: Any, steps: int, before: Callable[[], None] = lambda: None) -> dict[str, float]:
-    """Median milliseconds a step by stage, in the order of PHASES; `before` is called ahead of every step.
+def phase_times(
+    step: Callable[[], Any], steps: int, before: Callable[[], None] = lambda: None
+) -> dict[str, float]:
+    """Median milliseconds of a step by phase, in the order of PHASES; `before` is called ahead of every one.
 
-    With barriers between them: their sum is more than a step takes, as kernels otherwise fuse across stages.
+    With barriers between phases: their sum is more than a step takes, as kernels otherwise fuse across them.
     """
-
-    def module(name: str) -> Any:
-        return importlib.import_module(f"mi_refgs.{name}")
-
-    clock = PhaseClock()
-    splat, optim = module("splat"), module("fit.optim")
-    clock.wrap(splat, "project", "project")
-    clock.wrap(splat, "list_by_tile", "sort")
-    clock.wrap(splat, "blend", "splat forward", entered="splat backward", left="surfels backward")
-    clock.wrap(module("render.pipeline"), "shade", "shade forward")
-    clock.wrap(module("fit.train"), "render", None, entered="shade backward")
-    clock.wrap(
-        module("shade.envmap").EnvironmentLight,
-        "prefilter",
-        "prefilter forward",
-        entered="prefilter backward",
-    )
-    clock.wrap(module("fit.losses"), "ssim", "ssim forward")
-    clock.wrap(optim.Adam, "step", "optimiser")
-    clock.wrap_backward("loss backward")
     rows = []
-    try:
-        for _ in range(WARM_UP + steps):
-            before()
-            clock.seconds.clear()
-            clock.measure("all", trainer.step)
-            row = dict(clock.seconds)
-            whole = row.pop("all")
-            rows.append(row | {"rest": whole - sum(row.values())})
-    finally:
-        clock.restore()
+    for _ in range(WARM_UP + steps):
+        before()
+        clock = PhaseClock()
+        with listening(clock):
+            clock.call("rest", step)
+        rows.append(clock.seconds)
     rows = rows[WARM_UP:]
-    named = [stage for stage in PHASES if any(stage in row for row in rows)]
-    return {stage: 1e3 * float(np.median([row.get(stage, 0.0) for row in rows])) for stage in named}
+    named = [phase for phase in PHASES if any(phase in row for row in rows)]
+    return {phase: 1e3 * float(np.median([row.get(phase, 0.0) for row in rows])) for phase in named}

@@ -112,7 +112,7 @@ def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
         misses = dr.detail.launch_stats()[2] - misses
         prepare()
         launches = _launches(trainer.step)
-        stages = phase_times(trainer, max(steps // 3, 5), prepare)
+        stages = phase_times(trainer.step, max(steps // 3, 5), prepare)
     return StageProfile(
         name=name,
         step_ms=1e3 * float(np.median(times)),

@@ -27,9 +27,13 @@ from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.splat import Blended, Camera, splat
 from mi_refgs.surfels.channels import geometry
 from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
+from mi_refgs.timing import boundary, phase
 
 MATERIALS = ("albedo", "metallic", "roughness")
 """Channels of what is shaded by a light."""
+
+
+_shade = phase("shade forward")(shade)
 
 
 @dataclass(frozen=True)
@@ -132,8 +136,10 @@ def render(
     if surfels.count == 0:
         surfels, shift = _nothing(surfels), None
     if shading.at == "surfel":
-        return _shade_at_surfels(surfels, camera, shading, light, sh_degree, shift, aovs)
-    return _shade_at_pixels(surfels, camera, shading, light, occluder, sh_degree, shift)
+        frame = _shade_at_surfels(surfels, camera, shading, light, sh_degree, shift, aovs)
+    else:
+        frame = _shade_at_pixels(surfels, camera, shading, light, occluder, sh_degree, shift)
+    return boundary(frame, "shade backward")
 
 
 def render_depth(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
@@ -202,7 +208,7 @@ def _shade_at_surfels(
             roughness=surfels.roughness(),
             radiance=_radiance(surfels, direction, sh_degree) if shading.diffuse == "sh" else None,
         )
-        terms = shade(points, light, shading.diffuse, shading.accuracy)
+        terms = _shade(points, light, shading.diffuse, shading.accuracy)
     # A feature costs time in every pair, so what is not asked for is not blended.
     features = [*terms.total(), *normal]
     if aovs:
@@ -271,7 +277,7 @@ def _shade_at_pixels(
             occluder, surfels, light, shading.accuracy, shading.diffuse, camera.origin, ray, points, covered
         )
         maps["visibility"] = points.visibility
-    shaded = shade(points, light, shading.diffuse, shading.accuracy)
+    shaded = _shade(points, light, shading.diffuse, shading.accuracy)
     terms = Terms(*(term * blended.alpha for term in (shaded.diffuse, shaded.specular, shaded.indirect)))
     return Frame(
         alpha=blended.alpha,

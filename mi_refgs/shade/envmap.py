@@ -26,6 +26,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.images import EXR_MAGIC, linear_from_srgb, read_exr_image, read_hdr, read_png, write_exr
 from mi_refgs.shade import lobe_matrices
 from mi_refgs.shade.prefilter import Operator, prefilter
+from mi_refgs.timing import boundary, phase
 
 DEFAULT_HEIGHT = 64
 """Rows of a light that is fitted: 2.8° a texel, about what an image of a few hundred pixels resolves in a
@@ -210,6 +211,10 @@ class EnvironmentLight:
 
     def prefilter(self) -> PrefilteredLight:
         """The levels of this light, under AD; a fixed linear operator on the radiance (`prefilter`)."""
+        return boundary(self._prefilter(), "prefilter backward")
+
+    @phase("prefilter forward")
+    def _prefilter(self) -> PrefilteredLight:
         return PrefilteredLight(*prefilter(self.radiance()))
 
     def write(self, path: str | os.PathLike[str]) -> None:

@@ -12,10 +12,12 @@ from mi_refgs.splat.blend import Blended, blend
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.tiles import TileLists, list_by_tile
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.timing import boundary, phase
 
 __all__ = ["Blended", "Camera", "Footprints", "TileLists", "blend", "list_by_tile", "project", "splat"]
 
 
+@phase("project")
 def project(surfels: Surfels, camera: Camera, shift: Any = None) -> Footprints:
     """Footprints of a table's own primitive in a camera; `shift` as `Primitive.project` has it."""
     return primitive_of(widths_of(surfels.raw)).project(surfels, camera, shift)
@@ -30,4 +32,6 @@ def splat(surfels: Surfels, features: list[Any], camera: Camera, shift: Any = No
         blank = [dr.zeros(mi.Float, camera.width * camera.height) for _ in range(len(features) + 2)]
         return Blended(blank[2:], *blank[:2])
     footprints = project(surfels, camera, shift)
-    return blend(footprints, features, list_by_tile(footprints, camera), camera)
+    lists = list_by_tile(footprints, camera)
+    footprints, features = boundary((footprints, features), "surfels backward")
+    return boundary(blend(footprints, features, lists, camera), "splat backward")

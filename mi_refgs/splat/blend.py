@@ -39,6 +39,7 @@ from mi_refgs.primitives import Footprints, Primitive
 from mi_refgs.rows import PackedRows
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.tiles import TileLists
+from mi_refgs.timing import phase
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class Blended:
     alpha: Any  # Σ w
 
 
+@phase("splat forward")
 def blend(footprints: Footprints, features: list[Any], lists: TileLists, camera: Camera) -> Blended:
     """Composite per-surfel features (K × mi.Float (N,)); differentiable in features and footprint columns."""
     out = dr.custom(_Blend, footprints.columns + features, footprints.primitive, lists, camera)

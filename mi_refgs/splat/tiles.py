@@ -15,6 +15,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.primitives import Footprints
 from mi_refgs.rows import PackedRows
 from mi_refgs.splat.camera import Camera
+from mi_refgs.timing import phase
 
 MAX_PAIR_BITS = 27
 """Log₂ of the most pairs that are sorted: they take 40 bytes each, 5 GB in all."""
@@ -40,6 +41,7 @@ class TileLists:
         return dr.width(self.surfel_from_pair)
 
 
+@phase("tile lists")
 def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     """List every surfel in each tile that its footprint may touch.
 
@@ -77,11 +79,18 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     if not found:
         return _empty(tiles_x, tiles_y)
     pairs, depth = found[0] if len(found) == 1 else (dr.concat(list(x)) for x in zip(*found, strict=True))
+    tile, surfel = _sorted(pairs, depth, tiles)
+    return TileLists(surfel, *_runs(tile, tiles), tiles_x, tiles_y)
+
+
+@phase("sort")
+def _sorted(pairs: Any, depth: Any, tiles: int) -> tuple[Any, Any]:
+    """Tile and surfel of the pairs (tile, surfel), by tile, then by depth."""
     nearest_first = _nearest_first(depth)
     pairs = _sorted_by(dr.gather(mi.UInt64, pairs, nearest_first), 0, (tiles - 1).bit_length())
     tile, surfel = _upper(pairs), _lower(pairs)
     dr.eval(tile, surfel)
-    return TileLists(surfel, *_runs(tile, tiles), tiles_x, tiles_y)
+    return tile, surfel
 
 
 def _nearest_first(depth: Any) -> Any:
