@@ -20,8 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
 
-from benchmarks.mutation.catalogue import MISTAKES, Mistake
-from benchmarks.mutation.planting import copy_repository, planted
+from benchmarks.mutation.planting import Mistake, catalogue, copy_repository, planted
 
 WORKERS = 2
 TIME_LIMIT = 300
@@ -40,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--list", action="store_true", help="print the catalogue and stop")
     parser.add_argument("--workers", type=int, default=WORKERS, metavar="N", help="copies tested at once")
     options = parser.parse_args(arguments)
-    chosen = [mistake for mistake in MISTAKES if options.only in mistake.name]
+    chosen = [mistake for mistake in catalogue() if options.only in mistake.name]
     if options.list or not chosen:
         for mistake in chosen:
             print(f"{mistake.name:52} {mistake.file:36} {mistake.test}")

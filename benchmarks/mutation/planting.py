@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +23,16 @@ class Mistake:
     before: str
     after: str
     test: str
+
+
+def catalogue() -> list[Mistake]:
+    """The mistakes of catalogue.toml."""
+    files = tomllib.loads(Path(__file__).with_name("catalogue.toml").read_text(encoding="utf-8"))
+    return [
+        Mistake(name, f"mi_refgs/{file}", before, after, f"tests/{test}")
+        for file, mistakes in files.items()
+        for name, (before, after, test) in mistakes.items()
+    ]
 
 
 def copy_repository(folder: Path) -> Path:
