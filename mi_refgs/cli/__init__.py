@@ -1,6 +1,7 @@
 """`refgs …`: one module a command; here the parser, and what turns errors into sentences and exit codes.
 
-Exit codes: 0 done, 1 the installation is unusable, 2 bad input, 130 interrupted, 143 terminated (SIGTERM).
+Exit codes: 0 done, 1 the installation is unusable, 2 bad input, 3 jobs of a comparison failed, 130
+interrupted, 143 terminated (SIGTERM).
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import sys
 from collections.abc import Iterator, Sequence
 
 from mi_refgs import __version__
-from mi_refgs.cli import dataset, demo, doctor, evaluate, export, profile, render, train
+from mi_refgs.cli import compare, dataset, demo, doctor, evaluate, export, profile, render, train
 from mi_refgs.cli.command import Parser, Result, UnusableError, finite, prepare
 from mi_refgs.errors import InputError
 from mi_refgs.runs.interrupt import TerminatedError
@@ -28,7 +29,7 @@ def build_parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"mi_refgs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=Parser)
-    for module in (doctor, demo, dataset, train, evaluate, render, export, profile):
+    for module in (doctor, demo, dataset, train, evaluate, compare, render, export, profile):
         module.add(commands)
     return parser
 

@@ -25,6 +25,7 @@ class About:
     name: str = ""
     paper: str = ""
     deviations: tuple[str, ...] = ()
+    paper_row: str = ""  # what the paper's tables call it, as in compare/paper.json
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ from mi_refgs.runs import checkpoint
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
 
+LOG = "metrics.jsonl"
+"""The log of training; another log of a run is another .jsonl."""
 CHECKPOINTS_KEPT = 2
 """One could be enough, since a checkpoint appears only when complete; two survive a disk that lies."""
 
@@ -97,7 +99,7 @@ class Run:
 
     def rewind(self, iteration: int) -> None:
         """Make the folder ready to go on after `iteration`: drops later checkpoints (`load_checkpoint` found
-        them damaged), later lines of the log, which a resumed run writes again, and what killed processes
+        them damaged), later lines of the logs (*.jsonl), which a resumed run writes again, and what killed processes
         left behind.
 
         Raises InputError if the folder cannot be written.
@@ -108,19 +110,19 @@ class Run:
         for path in self.checkpoints():
             if int(path.stem) > iteration:
                 path.unlink()
-        log = self.path / "metrics.jsonl"
-        text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
-        kept = [line for line in text.splitlines() if _logged(line) <= iteration]
-        write_bytes(log, "".join(f"{line}\n" for line in kept).encode())
+        for log in {self.path / LOG, *self.path.glob("*.jsonl")}:
+            text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+            kept = [line for line in text.splitlines() if _logged(line) <= iteration]
+            write_bytes(log, "".join(f"{line}\n" for line in kept).encode())
 
     # ---------------- logs ----------------
 
-    def log(self, line: dict[str, Any]) -> None:
-        """Append one JSON line to metrics.jsonl, with null for a number that is not finite.
+    def log(self, line: dict[str, Any], name: str = LOG) -> None:
+        """Append one JSON line with an `iteration` to a log, with null for a number that is not finite.
 
         Raises InputError if it cannot be written.
         """
-        path = self.path / "metrics.jsonl"
+        path = self.path / name
         line = {
             name: None if isinstance(value, float) and not math.isfinite(value) else value
             for name, value in line.items()

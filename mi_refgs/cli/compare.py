@@ -1,0 +1,100 @@
+"""`refgs compare`: methods side by side on the same data sets, with tables, plots and a page."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mi_refgs.cli.command import Result, add_command, add_output, add_settings, say
+from mi_refgs.cli.train import DEFAULT_PRESET
+from mi_refgs.errors import InputError
+
+if TYPE_CHECKING:
+    from mi_refgs.compare.jobs import Job
+
+EXIT_INCOMPLETE = 3
+"""Exit code of a comparison in which a job failed: its row says why, the others are there."""
+EXAMPLE = "refgs compare data/glossy --variants ref_gaussian,base_2dgs --seeds 0,1 -o runs/compare"
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    summary = "fit data sets with several methods, and set the results side by side"
+    parser = add_command(commands, "compare", summary, EXAMPLE, run)
+    parser.add_argument(
+        "data",
+        type=Path,
+        nargs="*",
+        metavar="DATA",
+        help="data sets; without any, the table of what the folder holds is made again",
+    )
+    add_output(parser, "folder of the comparison; the same command goes on where it stopped", "FOLDER")
+    parser.add_argument(
+        "--variants", nargs="+", metavar="V", help="methods: names or .toml files, by spaces or commas"
+    )
+    parser.add_argument("--seeds", nargs="+", default=["0"], metavar="K", help="as in 0,1 (default 0)")
+    parser.add_argument(
+        "--preset", metavar="P", help=f"quick, standard or paper: how long (default {DEFAULT_PRESET})"
+    )
+    add_settings(parser)
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="jobs at once, which share the cores (default 1)"
+    )
+
+
+def run(args: argparse.Namespace) -> Result:
+    """Do what is left to do, then make the table of all runs in the folder."""
+    from mi_refgs.compare import execute, jobs, results
+
+    if args.data:
+        todo = _plan(args)
+        threads = execute.threads_each(args.workers, args.threads)
+        wanted = [dataclasses.replace(job, threads=threads) for job in todo if not jobs.finished(job)]
+        say(f"{args.output}: {len(wanted)} of {len(todo)} jobs to do, {args.workers} at once")
+        try:
+            execute.execute_all(wanted, args.workers, Report(len(wanted)))
+        except KeyboardInterrupt as error:
+            raise type(error)(f"interrupted; the same command goes on, from {args.output}") from None
+    elif args.variants or args.set or args.preset:
+        raise InputError("DATA: none given; name the data sets that the methods are to be fitted to")
+    table = results.write(args.output)
+    text = results.text(args.output, table)
+    return Result(dataclasses.asdict(table), text, 0 if table.complete else EXIT_INCOMPLETE)
+
+
+def _plan(args: argparse.Namespace) -> list[Job]:
+    from mi_refgs.compare import jobs, results
+    from mi_refgs.methods import names
+
+    variants = _separated(args.variants or [])
+    if not variants:
+        raise InputError(f"--variants: none given; name some of {', '.join(names())}")
+    try:
+        seeds = [int(seed) for seed in _separated(args.seeds)]
+    except ValueError as error:
+        raise InputError(f"--seeds: {' '.join(args.seeds)}: not whole numbers; write them as 0,1") from error
+    preset = args.preset or DEFAULT_PRESET
+    planned = jobs.plan(
+        args.output, args.data, variants, seeds, preset, args.set, args.mitsuba_variant, args.threads
+    )
+    results.begin(args.output, planned, sys.argv[1:])
+    return planned
+
+
+def _separated(values: list[str]) -> list[str]:
+    return [part for value in values for part in value.split(",") if part]
+
+
+class Report:
+    """A line on standard error for each job that ended."""
+
+    def __init__(self, count: int) -> None:
+        self.count, self.done = count, 0
+
+    def __call__(self, job: Job, seconds: float, reason: str | None) -> None:
+        self.done += 1
+        outcome = f"done in {seconds:.0f} s" if reason is None else f"failed: {reason}"
+        say(f"[{self.done}/{self.count}] {job.title}: {outcome}")

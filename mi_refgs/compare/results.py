@@ -1,0 +1,64 @@
+"""The files of a comparison: compare.json, and, made of the runs, table.json and table.md."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from mi_refgs import __version__
+from mi_refgs.compare import jobs
+from mi_refgs.compare.jobs import SETTINGS, Job
+from mi_refgs.compare.table import Table, rows_or_error, table_of
+from mi_refgs.compare.text import markdown
+from mi_refgs.files import cannot_write, read_json, write_bytes
+
+TABLE, TABLE_TEXT = "table.json", "table.md"
+
+
+def begin(folder: Path, planned: Sequence[Job], arguments: Sequence[str]) -> None:
+    """Write what the jobs share, and each job into its run folder; raises InputError if that is impossible.
+
+    The table has a row for each of them from now on.
+    """
+    for job in planned:
+        job.write()
+    before = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
+    data, variants = [job.data for job in planned], [Path(job.variant).stem for job in planned]
+    about = {
+        "data": list(dict.fromkeys([*before.get("data", []), *data])),
+        "variants": list(dict.fromkeys([*before.get("variants", []), *variants])),
+        "preset": planned[0].preset,
+        "set": list(planned[0].settings),
+        "command": shlex.join(["refgs", *arguments]),
+        "version": __version__,
+    }
+    write_bytes(folder / SETTINGS, (json.dumps(about, indent=2) + "\n").encode())
+
+
+def write(folder: Path) -> Table:
+    """Make the table of all jobs in the folder, as table.json and table.md.
+
+    Raises InputError if there are none, and if a file cannot be written.
+    """
+    about = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
+    data, variants = about.get("data", []), about.get("variants", [])
+
+    def order(job: Job) -> tuple[int, int, int]:
+        return data.index(job.data), variants.index(Path(job.variant).stem), job.seed
+
+    table = rows_or_error(table_of(folder, sorted(jobs.jobs_in(folder), key=order), about))
+    try:
+        content = json.dumps(dataclasses.asdict(table), indent=1, ensure_ascii=False)
+        write_bytes(folder / TABLE, f"{content}\n".encode())
+        write_bytes(folder / TABLE_TEXT, markdown(table).encode())
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    return table
+
+
+def text(folder: Path, table: Table) -> str:
+    """The table for the terminal, and where its files are."""
+    return f"{markdown(table)}\n{folder / TABLE_TEXT}, {folder / TABLE}"

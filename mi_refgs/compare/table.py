@@ -1,0 +1,205 @@
+"""The table of a comparison, from its run folders: mean ± s.d. over seeds for each scene and method."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mi_refgs.compare.jobs import FAILED, Job, finished
+from mi_refgs.compare.paper import Figures, Place, place_of
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation.evaluate import read_metrics
+from mi_refgs.files import read_json
+
+
+@dataclass(frozen=True)
+class Column:
+    """A number of metrics.json as the table shows it."""
+
+    key: str
+    title: str
+    unit: str
+    form: str  # of the mean; the s.d. is written likewise
+    reason: str = ""  # key of metrics.json that says why the number is missing
+
+    def text(self, value: float) -> str:
+        """A value for people."""
+        return format(value, self.form)
+
+
+COLUMNS = (
+    Column("psnr", "PSNR", "dB", ".2f"),
+    Column("ssim", "SSIM", "", ".4f"),
+    Column("flip", "FLIP", "", ".4f", "flip_reason"),
+    Column("lpips", "LPIPS", "", ".4f", "lpips_reason"),
+    Column("normal_mae_deg", "normal error", "°", ".2f", "normal_reason"),
+    Column("env_correlation", "light correlation", "", ".3f", "env_reason"),
+    Column("train_seconds", "training", "s", ".0f"),
+    Column("surfels", "surfels", "", ".0f"),
+    Column("ms_per_frame", "frame", "ms", ".1f"),
+)
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """A number over seeds; `sd` is the sample's standard deviation, None for a single seed."""
+
+    mean: float
+    sd: float | None
+    values: tuple[float, ...]
+
+    @staticmethod
+    def of(values: Sequence[float]) -> Statistic:
+        """Of at least one value."""
+        sd = statistics.stdev(values) if len(values) > 1 else None
+        return Statistic(statistics.fmean(values), sd, tuple(values))
+
+
+@dataclass(frozen=True)
+class Published:
+    """The paper's figure for a row's system, and ours minus it."""
+
+    value: float
+    difference: float | None
+
+
+@dataclass
+class Row:
+    """A method on a scene."""
+
+    variant: str
+    name: str  # what the method calls itself
+    seeds: list[int] = field(default_factory=list)  # of finished runs
+    runs: list[str] = field(default_factory=list)  # their folders, below the comparison's
+    numbers: dict[str, Statistic | None] = field(default_factory=dict)  # by a column's key
+    missing: dict[str, str] = field(default_factory=dict)  # why a number is None
+    failed: dict[int, str] = field(default_factory=dict)  # seed → why
+    unfinished: list[int] = field(default_factory=list)
+    footnotes: list[int] = field(default_factory=list)  # deviations from the original, numbered from 1
+    paper_row: str = ""  # the paper's name for the method
+    paper: dict[str, Published] = field(default_factory=dict)  # by a column's key
+
+
+@dataclass
+class Scene:
+    """A data set with its rows."""
+
+    name: str
+    path: str
+    rows: list[Row] = field(default_factory=list)
+    image_size: list[int] = field(default_factory=list)
+    test_views: int = 0
+    place: Place | None = None  # in the paper
+    note: str = ""  # what to keep in mind when comparing with the paper
+    published: dict[str, dict[str, float]] = field(default_factory=dict)  # other systems → key → figure
+
+
+@dataclass
+class Table:
+    """All scenes of a comparison, and what their numbers rely on."""
+
+    scenes: list[Scene] = field(default_factory=list)
+    footnotes: list[str] = field(default_factory=list)
+    machines: list[dict[str, Any]] = field(default_factory=list)
+    about: dict[str, Any] = field(default_factory=dict)  # preset, settings, command line, versions
+
+    @property
+    def complete(self) -> bool:
+        """Whether every job of the table is done."""
+        rows = [row for scene in self.scenes for row in scene.rows]
+        return not any(row.failed or row.unfinished for row in rows)
+
+
+def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
+    """The table of the jobs of a comparison in `folder`; raises InputError for a run that cannot be read."""
+    figures = Figures.read()
+    table = Table(about=about)
+    scenes: dict[str, Scene] = {}
+    rows: dict[tuple[str, str], Row] = {}
+    metrics: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for job in jobs:
+        key = job.data, Path(job.variant).stem
+        scene = scenes.setdefault(job.data, Scene(Path(job.data).name, job.data))
+        if key not in rows:
+            rows[key], metrics[key] = Row(key[1], key[1]), []
+            scene.rows.append(rows[key])
+        row = rows[key]
+        if job.run.exists():
+            _describe(row, job, table)
+        if finished(job):
+            found = read_metrics(job.run)
+            assert found is not None
+            metrics[key].append(found)
+            row.seeds.append(job.seed)
+            row.runs.append(str(Path(job.folder).relative_to(folder.resolve())))
+            scene.image_size, scene.test_views = found["image_size"], found["test_views"]
+            if found["machine"] not in table.machines:
+                table.machines.append(found["machine"])
+        elif (failure := Path(job.folder) / FAILED).is_file():
+            row.failed[job.seed] = str(read_json(failure).get("reason"))
+        else:
+            row.unfinished.append(job.seed)
+    for (path, _), row in rows.items():
+        _fill(row, metrics[path, row.variant])
+        _compare_with_paper(row, scenes[path], figures)
+    for scene in scenes.values():
+        _add_published(scene, figures)
+    table.scenes = list(scenes.values())
+    return table
+
+
+def _describe(row: Row, job: Job, table: Table) -> None:
+    """What the method says of itself, its deviations as footnotes that rows share."""
+    about = job.run.method().about
+    row.name, row.paper_row = about.name or row.variant, about.paper_row
+    for text in about.deviations:
+        if text not in table.footnotes:
+            table.footnotes.append(text)
+    row.footnotes = [table.footnotes.index(text) + 1 for text in about.deviations]
+
+
+def _fill(row: Row, found: list[dict[str, Any]]) -> None:
+    for column in COLUMNS:
+        values = [m[column.key] for m in found]
+        if values and all(value is not None for value in values):
+            row.numbers[column.key] = Statistic.of([float(value) for value in values])
+            continue
+        row.numbers[column.key] = None
+        reasons = [m.get(column.reason) for m in found if m[column.key] is None]
+        if reasons and reasons[0]:
+            row.missing[column.key] = str(reasons[0])
+
+
+def _compare_with_paper(row: Row, scene: Scene, figures: Figures) -> None:
+    scene.place = place_of(Path(scene.path))
+    if scene.place is None:
+        return
+    for key, value in figures.of(scene.place, row.paper_row).items():
+        ours = row.numbers.get(key)
+        row.paper[key] = Published(value, None if ours is None else ours.mean - value)
+
+
+def _add_published(scene: Scene, figures: Figures) -> None:
+    """The paper's figures for systems that no row stands for, and a note where pictures differ in size."""
+    if scene.place is None:
+        return
+    rows = {row.paper_row for row in scene.rows}
+    for system in figures.systems(scene.place):
+        if system not in rows:
+            scene.published[system] = figures.of(scene.place, system)
+    size, published = scene.image_size, scene.place.size
+    if size and published and size != list(published):
+        scene.note = (
+            f"the paper's pictures have {published[0]} × {published[1]} pixels, these {size[0]} × {size[1]}: "
+            "the differences are no reproduction"
+        )
+
+
+def rows_or_error(table: Table) -> Table:
+    """The table; raises InputError if it has no row."""
+    if not table.scenes:
+        raise InputError("DATA: none given, and the folder holds no comparison; name data sets to fit")
+    return table

@@ -1,0 +1,145 @@
+"""One job in a process of its own: `python -m mi_refgs.compare.worker RUN_FOLDER`.
+
+A crash of the process is no crash of the comparison. The process ends, its state saved, when its standard
+input closes: whoever started it is gone.
+
+Exit codes: 0 done, 2 failed (failed.json says why), 143 told to stop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mi_refgs.compare.jobs import FAILED, Job
+from mi_refgs.errors import InputError
+from mi_refgs.runs.interrupt import TerminatedError
+
+DONE, FAILURE, STOPPED = 0, 2, 143
+"""Exit codes."""
+CURVE = "curve.jsonl"
+CURVE_POINTS, CURVE_VIEWS = 10, 4
+"""Measurements during a fit, evenly spread over it, and the test views of each, spread over the split."""
+PATIENCE = 60.0
+"""Seconds to wait for the process that worked in the folder before to save its state."""
+GRACE = 30.0
+"""Seconds between asking this process to end and ending it."""
+
+
+def main(folder: Path) -> int:
+    """Do the job of a run folder and return the exit code."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        with _alone_in(folder):
+            (folder / FAILED).unlink(missing_ok=True)
+            fit_and_measure(Job.read(folder))
+    except KeyboardInterrupt:
+        return STOPPED
+    except InputError as error:
+        return _failed(folder, str(error))
+    except Exception as error:
+        traceback.print_exc()
+        return _failed(folder, f"{type(error).__name__}: {error} (job.log has the details)")
+    return DONE
+
+
+def fit_and_measure(job: Job) -> None:
+    """Train from the newest checkpoint, if there is one, to the end; then write artefacts and metrics.
+
+    Raises InputError as training and evaluation do, and KeyboardInterrupt for Ctrl-C and SIGTERM.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if job.threads is not None:
+        dr.set_thread_count(job.threads)
+    mi.set_variant(job.mitsuba_variant)
+    mi.set_log_level(mi.LogLevel.Warn)
+
+    from mi_refgs.evaluation.evaluate import evaluate
+    from mi_refgs.fit.whole import begin, finish, read_views
+
+    run, data = job.run, Path(job.data)
+    method = run.method() if run.exists() else job.method()
+    trainer = begin(method, read_views(method, data, "train", truth=False), run)
+    trainer.train(Curve(job))
+    finish(trainer, run)
+    evaluate(run, data)
+
+
+class Curve:
+    """PSNR on a few test views in the course of a fit, measured between its steps, off its clock."""
+
+    def __init__(self, job: Job) -> None:
+        from mi_refgs.fit.whole import read_views
+
+        self.run, method = job.run, job.method()
+        self.data = read_views(method, Path(job.data), "test", truth=False)
+        last = len(self.data.views) - 1
+        count = min(CURVE_VIEWS, last + 1)
+        self.views = [self.data.views[i * last // max(count - 1, 1)] for i in range(count)]
+        self.due = {round(method.iterations * (k + 1) / CURVE_POINTS) for k in range(CURVE_POINTS)}
+
+    def __call__(self, trainer: Any) -> None:
+        from mi_refgs.evaluation.metrics import psnr
+        from mi_refgs.evaluation.pictures import RenderedView, target
+
+        while trainer.notices:
+            print(f"refgs: warning: {trainer.notices.pop(0)}", file=sys.stderr)
+        if trainer.iteration not in self.due:
+            return
+        values = [
+            psnr(RenderedView.of(trainer.view(view.camera()), self.data).image, target(view))
+            for view in self.views
+        ]
+        line = {"iteration": trainer.iteration, "seconds": round(trainer.seconds, 3)}
+        self.run.log(line | {"psnr": round(sum(values) / len(values), 4)}, CURVE)
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock; raises InputError if another process keeps it."""
+    with (folder / ".lock").open("w") as file:
+        until = time.monotonic() + PATIENCE
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except OSError:
+                if time.monotonic() > until:
+                    raise InputError(f"{folder}: another process works in it; wait until it ends") from None
+                time.sleep(0.2)
+        yield
+
+
+def _end_with_parent() -> None:
+    """End this process when its standard input closes: between two steps, the state saved, if it trains."""
+    while os.read(0, 1):  # not sys.stdin: its lock would be held when the interpreter ends
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE)
+    os._exit(STOPPED)
+
+
+def _failed(folder: Path, reason: str) -> int:
+    print(f"refgs: {reason}", file=sys.stderr)
+    Job.read(folder).run.write_json(FAILED, {"reason": reason})
+    return FAILURE
+
+
+if __name__ == "__main__":
+
+    def _terminated(*_: object) -> None:
+        raise TerminatedError
+
+    signal.signal(signal.SIGTERM, _terminated)
+    sys.exit(main(Path(sys.argv[1])))
