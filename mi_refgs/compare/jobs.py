@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.data.dataset import count_views
+from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.files import read_json
@@ -89,8 +89,7 @@ def plan(
     data set or a method that cannot be used, two of one name, and runs that were made with other settings.
     """
     for path in data:
-        count_views(path, "train")
-        count_views(path, "test")
+        read_dataset(path, "test", truth=False)
     _unique((path.resolve().name for path in data), "DATA", "give the folders different names")
     _unique((Path(variant).stem for variant in variants), "--variants", "name each once")
     _unique((str(seed) for seed in seeds), "--seeds", "give each once")

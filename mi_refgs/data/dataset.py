@@ -89,11 +89,6 @@ def read_dataset(
     return Dataset(path, split, views, colour, images == "exr", found.environment, found.points)
 
 
-def count_views(path: str | Path, split: str) -> int:
-    """Views of a split; no picture is read. Raises InputError as `read_dataset` does if there are none."""
-    return len(_frames(Path(path), split)[2])
-
-
 def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, int, int]:
     """The smallest `downscale` with which the first training picture has at most so many pixels.
 
