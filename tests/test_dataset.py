@@ -267,7 +267,7 @@ def test_unwritable_output(made: Path, tmp_path: Path) -> None:
         make_dataset(made.parent / "ball.xml", tmp_path / "file" / "out", **OPTIONS)
 
 
-@pytest.mark.parametrize("name", ["mirror_ring", "mixed", "diffuse", "glossy_demo"])
+@pytest.mark.parametrize("name", ["mirror_ring", "patched_ball", "mixed", "diffuse", "glossy_demo"])
 def test_example_scenes(name: str) -> None:
     """Loads in plain Mitsuba; about one unit large, around the origin; nothing from outside the folder."""
     scene = mi.load_file(str(SCENES / f"{name}.xml"), resx=8, resy=8, spp=4)

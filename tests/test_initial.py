@@ -88,6 +88,6 @@ def test_a_share_out_of_range_is_refused(ball: dataset.Dataset, share: float) ->
 
 @pytest.mark.parametrize("variant", methods.names())
 def test_methods_start_alike(variant: str) -> None:
-    """A method is compared with another one from the same surfels."""
+    """A method is compared with another one from the same points."""
     full, other = (methods.load(name, "quick").surfels for name in ("ref_gaussian", variant))
-    assert (full.inside, full.start("opacity")) == (other.inside, other.start("opacity"))
+    assert (full.inside, full.count, full.max_count) == (other.inside, other.count, other.max_count)

@@ -39,8 +39,8 @@ IMPOSSIBLE = {
     ),
     "a channel misspelt": (f"[surfels]\nchannels = ['albdeo']\n{STAGE}", ["'albdeo' is unknown", "albedo"]),
     "materials reset that are none": (
-        f"[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nreset_materials = true",
-        ["stage.only", "reset_materials"],
+        f"[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nrestart = ['metallic']",
+        ["stage.only", "restart", "metallic"],
     ),
 }
 

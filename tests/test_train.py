@@ -45,7 +45,7 @@ at = "surfel"
 diffuse = "irradiance"
 [stage.deferred]
 until = 30
-reset_materials = true
+restart = ["albedo", "metallic", "roughness", "light"]
 [mesh]
 extract = { start = 9, until = 30, every = 10 }
 resolution = 24
@@ -54,8 +54,7 @@ densify = { start = 3, until = 24, every = 6 }
 gradient = 1e-6
 reset = { start = 0, until = 24, every = 14 }
 reset_raise = ["metallic"]
-propagate = { start = 0, until = 24, every = 5 }
-propagate_hold = 4
+propagate = { when = { start = 0, until = 24, every = 5 }, hold = 4, noise = 0.1 }
 [loss]
 smooth = 0.1
 alpha = 0.1

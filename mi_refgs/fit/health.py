@@ -11,7 +11,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.fit.optim import Skipped
-from mi_refgs.runs.checkpoint import LIGHT
+from mi_refgs.methods.method import LIGHT
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 

@@ -54,8 +54,9 @@ def objective(
     loss = (1 - weights.ssim) * losses.l1(image, target.image)
     if weights.ssim:
         loss += weights.ssim * losses.d_ssim(image, target.image, width, height)
-    if weights.normal:
-        risen = min(iteration / weights.normal_rise, 1) if weights.normal_rise else 1
+    if weights.normal and iteration > weights.normal_start:
+        since = iteration - weights.normal_start
+        risen = min(since / weights.normal_rise, 1) if weights.normal_rise else 1
         # Opaque: it changes from step to step, and a literal would be compiled into each one's kernels.
         weight = dr.opaque(mi.Float, weights.normal * risen)
         depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, target.camera)

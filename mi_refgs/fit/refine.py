@@ -15,7 +15,7 @@ import numpy as np
 
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
-from mi_refgs.methods.method import Refine
+from mi_refgs.methods.method import Propagation, Refine
 from mi_refgs.primitives import Primitive, primitive_of, widths_of
 from mi_refgs.surfels.channels import channel, logit
 from mi_refgs.surfels.order import morton_order
@@ -129,17 +129,25 @@ def reset_opacity(surfels: Surfels, options: Refine, floors: Mapping[str, float]
     return Surfels.from_numpy(raw)
 
 
-def propagate_normals(surfels: Surfels, options: Refine) -> Surfels:
-    """Material-aware normal propagation: make all surfels opaque, enlarge the reflective. [Ref-Gaussian §3.4]
+def propagate_normals(surfels: Surfels, options: Propagation, rng: np.random.Generator) -> Surfels:
+    """Make all surfels opaque, and enlarge the reflective. [3DGS-DR §3.3; Ref-Gaussian §3.4]
 
     Enlarged opaque surfels cover their neighbours, whose reflections then follow the normals that already
-    explain them. Reflective means metallic and smooth; a rough metal has no sharp reflection to propagate.
+    explain them. Reflective means metallic, and smooth where there is a roughness and a limit of it: a rough
+    metal has no sharp reflection to propagate. Noise on the colour of what reflects nothing keeps it from
+    explaining reflections.
     """
     raw = surfels.to_numpy()
-    raw["opacity"] = np.maximum(raw["opacity"], np.float32(logit(options.propagate_opacity)))
-    metallic, roughness = sigmoid(raw["metallic"][:, 0]), sigmoid(raw["roughness"][:, 0])
-    reflective = (metallic >= options.propagate_metallic) & (roughness <= options.propagate_roughness)
-    primitive_of(widths_of(raw)).resize(raw, reflective, options.propagate_scale)
+    raw["opacity"] = np.maximum(raw["opacity"], np.float32(logit(options.opacity)))
+    metallic = sigmoid(raw["metallic"][:, 0])
+    reflective = metallic >= options.metallic
+    if options.roughness is not None and "roughness" in raw:
+        reflective &= sigmoid(raw["roughness"][:, 0]) <= options.roughness
+    primitive_of(widths_of(raw)).resize(raw, reflective, options.scale)
+    if options.noise and "radiance_sh" in raw:
+        dull = np.flatnonzero(metallic <= options.noise_metallic)
+        noise = rng.uniform(-options.noise, options.noise, (len(dull), 3))
+        raw["radiance_sh"][dull, :3] += noise.astype(np.float32)
     return Surfels.from_numpy(raw)
 
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refgs.fit.optim import Group
-from mi_refgs.methods.method import Method
-from mi_refgs.runs.checkpoint import LIGHT
+from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.surfels.channels import channel, geometry
 
 POSITION_STEPS = 0.6

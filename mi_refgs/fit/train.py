@@ -23,7 +23,7 @@ from mi_refgs.fit.initial import initial_surfels
 from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.optim import Adam, Group
 from mi_refgs.fit.schedule import Schedule
-from mi_refgs.methods.method import Method, Stage
+from mi_refgs.methods.method import LightOptions, Method, Stage
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
 from mi_refgs.occlusion.visibility import Occluder
@@ -33,7 +33,7 @@ from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.channels import channel, geometry
+from mi_refgs.surfels.channels import geometry
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.timing import phase
 
@@ -68,8 +68,7 @@ class Trainer:
         if state is None:
             self.params |= initial_surfels(method, data, self.schedule.rng(0)).raw
             if method.light is not None:
-                start = EnvironmentLight.constant(method.light.radiance, method.light.height)
-                self.params[LIGHT] = start.raw
+                self.params[LIGHT] = self._first_light(method.light).raw
             self.optimiser = Adam(self.params, self._groups())
             self._clear_statistics()
         else:
@@ -170,8 +169,8 @@ class Trainer:
         """One iteration: enter a stage if it begins, one gradient step, then what falls due."""
         iteration = self.iteration + 1
         name, stage = self.method.stage_at(iteration)
-        if iteration > 1 and stage.reset_materials and self.method.stage_at(iteration - 1)[0] != name:
-            self._reset_materials(iteration)
+        if iteration > 1 and stage.restart and self.method.stage_at(iteration - 1)[0] != name:
+            self._restart(stage.restart, iteration)
         self._gradient_step(iteration, stage)
         self.iteration = iteration
         self._refine(iteration)
@@ -266,10 +265,15 @@ class Trainer:
         if options.reset is not None and options.reset.due(iteration):
             floors = {name: surfels.start(name) for name in options.reset_raise}
             self._replace(refine.reset_opacity(self.surfels, options, floors), cleared=("opacity", *floors))
-        elif options.propagate is not None and options.propagate.due(iteration) and "metallic" in self.params:
-            self._replace(refine.propagate_normals(self.surfels, options), cleared=("opacity", "scale"))
+        elif options.propagate is not None and options.propagate.when.due(iteration):
+            rng = self.schedule.rng(iteration)
+            colour = ("radiance_sh",) if options.propagate.noise else ()
+            self._replace(
+                refine.propagate_normals(self.surfels, options.propagate, rng),
+                cleared=("opacity", "scale", *colour),
+            )
             self.optimiser.set_factor("opacity", 0.0)
-            self.held_until = iteration + options.propagate_hold
+            self.held_until = iteration + options.propagate.hold
         if iteration >= self.held_until:
             self.optimiser.set_factor("opacity", 1.0)
 
@@ -284,10 +288,15 @@ class Trainer:
         self.gradient_sum = dr.gather(mi.Float, self.gradient_sum, index)
         self.gradient_count = dr.gather(mi.Float, self.gradient_count, index)
 
-    def _reset_materials(self, iteration: int) -> None:
-        rng, options = self.schedule.rng(iteration), self.method.surfels
-        starts = {name: options.start(name) for name in options.channels if channel(name).material}
-        self._replace(refine.restart(self.surfels, starts, rng), cleared=tuple(starts))
+    def _restart(self, names: tuple[str, ...], iteration: int) -> None:
+        """Channels and the light back to their initial values, without history."""
+        options = self.method.surfels
+        starts = {name: options.start(name) for name in names if name != LIGHT}
+        edited = refine.restart(self.surfels, starts, self.schedule.rng(iteration))
+        self._replace(edited, cleared=tuple(starts))
+        if LIGHT in names and self.method.light is not None:
+            self.params[LIGHT] = self._first_light(self.method.light).raw
+            self.optimiser.reset(LIGHT)
 
     def _replace(self, surfels: Surfels, cleared: tuple[str, ...] = ()) -> None:
         self.params.update(surfels.raw)
@@ -302,6 +311,10 @@ class Trainer:
 
     def _groups(self) -> dict[str, Group]:
         return self.schedule.groups(self.extent)
+
+    @staticmethod
+    def _first_light(options: LightOptions) -> EnvironmentLight:
+        return EnvironmentLight.constant(options.radiance, options.height)
 
     # ---------------- state ----------------
 

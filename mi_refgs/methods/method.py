@@ -12,6 +12,8 @@ from typing import Literal
 from mi_refgs.methods.window import Window
 from mi_refgs.surfels.channels import MAX_SH_DEGREE, channel
 
+LIGHT = "light"
+"""Name of the environment among the parameters of a fit; the others are channels of the surfels."""
 AT_ONCE = Window(0, 3, 1)
 """One degree of spherical harmonics more in each of the first three iterations."""
 MESH_WINDOW = Window(20_000, 50_000, 2_000)
@@ -69,7 +71,24 @@ class Stage:
     at: Literal["surfel", "pixel"] = "pixel"
     reflectance: Literal["radiance", "split_sum"] = "split_sum"
     diffuse: Literal["sh", "irradiance"] = "sh"
-    reset_materials: bool = False  # albedo, metallic and roughness start anew when the stage begins
+    restart: tuple[str, ...] = ()  # channels, and `light`, that start anew when the stage begins
+
+
+@dataclass(frozen=True)
+class Propagation:
+    """Normal propagation: opaque surfels, of which the reflective grow over their neighbours.
+
+    [3DGS-DR, Ye et al. 2024, §3.3; aware of the material: Ref-Gaussian §3.4]
+    """
+
+    when: Window
+    opacity: float = 0.9  # all surfels are made at least this opaque
+    scale: float = 1.5  # factor of the sizes of the reflective
+    metallic: float = 0.02  # reflective is what is at least this metallic …
+    roughness: float | None = 0.1  # … and at most this rough; absent: however rough
+    noise: float = 0.0  # half the width of the noise on the constant colour of the others, in coefficients
+    noise_metallic: float = 0.05  # which are at most this metallic
+    hold: int = 200  # iterations without opacity learning afterwards
 
 
 @dataclass(frozen=True)
@@ -84,12 +103,7 @@ class Refine:
     reset: Window | None = None  # opacity to at most reset_opacity
     reset_opacity: float = 0.01
     reset_raise: tuple[str, ...] = ()  # channels that it lifts to at least their initial value
-    propagate: Window | None = None  # material-aware normal propagation
-    propagate_opacity: float = 0.9
-    propagate_scale: float = 1.5
-    propagate_metallic: float = 0.02  # surfels at least this metallic …
-    propagate_roughness: float = 0.1  # … and at most this rough are enlarged
-    propagate_hold: int = 200  # iterations without opacity learning afterwards
+    propagate: Propagation | None = None
 
 
 @dataclass(frozen=True)
@@ -106,7 +120,8 @@ class LossWeights:
 
     ssim: float = 0.2
     normal: float = 0.05
-    normal_rise: int = 0  # iterations in which the weight of L_n rises linearly from 0
+    normal_start: int = 0  # iterations before L_n counts
+    normal_rise: int = 0  # iterations in which its weight then rises linearly from 0
     smooth: float = 0.0
     smooth_until: int = 18_000
     alpha: float = 0.0

@@ -15,7 +15,7 @@ import tomli_w
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import is_file
 from mi_refgs.methods.build import build, plain
-from mi_refgs.methods.method import PRESETS, Method
+from mi_refgs.methods.method import LIGHT, PRESETS, Method
 from mi_refgs.methods.window import Window
 from mi_refgs.render.pipeline import Shading
 from mi_refgs.resources import resource_dir
@@ -25,7 +25,7 @@ MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
 
 # Fields that count iterations, and so scale with the preset, as windows do.
-_SCALED = {"iterations", "until", "normal_rise", "smooth_until", "propagate_hold"}
+_SCALED = {"iterations", "until", "normal_start", "normal_rise", "smooth_until", "hold"}
 
 
 def load(variant: str, preset: str = "standard", assignments: list[str] | None = None) -> Method:
@@ -67,8 +67,11 @@ def _checked(method: Method, where: str) -> Method:
             Shading.of(stage, method.mesh is not None).check(channels, method.light is not None)
         except InputError as error:
             raise InputError(f"{where}: stage.{name}: {error}") from error
-        if stage.reset_materials and not any(CHANNELS[name].material for name in channels):
-            raise InputError(f"{where}: stage.{name}: reset_materials: there are no materials; remove it")
+        there = {*surfels.channels} | ({LIGHT} if method.light is not None else set())
+        if absent := [restarted for restarted in stage.restart if restarted not in there]:
+            raise InputError(f"{where}: stage.{name}: restart: there is no '{absent[0]}'; remove it")
+    if method.refine.propagate is not None and "metallic" not in surfels.channels:
+        raise InputError(f"{where}: refine.propagate: there is no channel 'metallic'; add it, or drop this")
     return method
 
 

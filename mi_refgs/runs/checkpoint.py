@@ -17,14 +17,13 @@ import numpy as np
 
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
+from mi_refgs.methods.method import LIGHT
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.surfels.channels import geometry
 from mi_refgs.surfels.table import Surfels
 
 PARAMS, OPTIMISER, MESH = "params/", "optimiser/", "mesh/"
 """What the names of parameters, of Adam's moments and of the occluder begin with."""
-LIGHT = "light"
-"""Name of the environment among the parameters; the others are channels of the surfels."""
 _MARK = b"sha256 "
 _DIGITS = 64
 

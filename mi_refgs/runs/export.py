@@ -27,7 +27,7 @@ from mi_refgs.files import read_json
 from mi_refgs.runs.checkpoint import PARAMS, tensors
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.run import Run
-from mi_refgs.runs.checkpoint import LIGHT
+from mi_refgs.methods.method import LIGHT
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, Shading, render
