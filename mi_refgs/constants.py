@@ -58,6 +58,15 @@ SORT_DEPTH_RANGE = 5.0
 """Factor by which a surfel's depth in a tile may exceed that of its centre in the sort: a plane that turns
 away from the camera within its reach has no depth of its own there."""
 
+GAUSSIAN_LOW_PASS = 0.3
+"""pixel²: the screen-space filter adds it to the covariance of a 3D Gaussian. Files that others fitted were
+fitted with it. [3DGS, released code]"""
+
+GAUSSIAN_SLOPE_MARGIN = 0.15
+"""Share of the picture's width and height beyond its border from which on the projection of a 3D Gaussian is
+linearised there, and not at its centre: the affine approximation of what lies far beside the view would cover
+all of it. [3DGS, released code: 1.3 tan(fov/2)]"""
+
 TILE_SIZES = ((512.0, (4, 4)), (1024.0, (8, 4)), (math.inf, (8, 8)))
 """Focal lengths in pixels, and width and height in pixels of the tiles of cameras below them. The pixels of a
 tile share a list of surfels and its order: large tiles give one order to more of the picture, and evaluate

@@ -18,6 +18,7 @@ from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.primitives.surfel import FootprintAdjoint
 from mi_refgs.reference import splat as oracle
+from mi_refgs.reference import surfel as oracle_surfel
 from mi_refgs.reference.camera import look_at
 from mi_refgs.splat import Blended, Camera, list_by_tile, project, splat, tiles
 from mi_refgs.surfels.table import Surfels
@@ -368,12 +369,6 @@ def test_second_view_compiles_nothing() -> None:
     assert dr.detail.launch_stats()[2] == misses
 
 
-def oracle_surfels(scene: Scene) -> dict[str, np.ndarray]:
-    """The surfels in the camera frame, in float64; opacity 0 where culled."""
-    to_camera, origin = scene.camera.to_world[:3, :3].T, scene.camera.to_world[:3, 3]
-    return oracle._surfels(scene.raw, (scene.raw["position"] - origin) @ to_camera.T, to_camera, scene.camera)
-
-
 @pytest.mark.parametrize("thinness", [1.0, 1e-5])
 @pytest.mark.parametrize("seed", range(0, 20, 3))
 def test_tile_lists_hold_what_contributes_and_little_else(seed: int, thinness: float) -> None:
@@ -395,7 +390,7 @@ def test_tile_lists_hold_what_contributes_and_little_else(seed: int, thinness: f
     y, x = (v.ravel() for v in np.mgrid[0 : camera.height, 0 : camera.width])
     tile = y // camera.tile[1] * lists.tiles_x + x // camera.tile[0]
     alpha, _ = footprint(scene.raw, scene.camera, x + 0.5, y + 0.5)
-    alpha[oracle_surfels(scene)["opacity"] == 0] = 0
+    alpha[oracle_surfel.camera_surfels(scene.raw, scene.camera)["opacity"] == 0] = 0
     # Float32 may lose what is at the threshold itself.
     strong = alpha >= ALPHA_MIN * (1 + 1e-3)
     needed = {(int(i), int(tile[pixel])) for i, pixel in zip(*np.nonzero(strong), strict=True)}
@@ -411,7 +406,7 @@ def test_tile_lists_are_in_the_oracles_order(seed: int, tile: tuple[int, int]) -
     scene = make_scene(seed)
     camera = scene.fast_camera()
     lists = list_by_tile(project(scene.surfels(), camera), camera)
-    order = oracle._order(oracle_surfels(scene), scene.camera)
+    order = oracle_surfel.order(oracle_surfel.camera_surfels(scene.raw, scene.camera), scene.camera)
     surfel, compared = lists.surfel_from_pair.numpy(), 0
     for i, (begin, end) in enumerate(zip(lists.pair_begin.numpy(), lists.pair_end.numpy(), strict=True)):
         y, x = (k * size for k, size in zip(divmod(i, lists.tiles_x), camera.tile[::-1], strict=True))

@@ -12,6 +12,7 @@ import numpy as np
 
 from mi_refgs import constants as c
 from mi_refgs.reference import splat as oracle
+from mi_refgs.reference import surfel
 
 Array = np.ndarray
 STEP = 1e-40
@@ -38,11 +39,9 @@ def differentiate(
     `order` (N, H·W) replaces the oracle's: surfels from front to back.
     """
     x, y = (v.ravel() for v in np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5))
-    to_camera = camera.to_world[:3, :3].T
-    centres = (raw["position"] - camera.to_world[:3, 3]) @ to_camera.T
-    surfels = oracle._surfels(raw, centres, to_camera, camera)
+    surfels = surfel.camera_surfels(raw, camera)
     if order is None:
-        order = oracle._order(surfels, camera).reshape(len(features), -1)
+        order = surfel.order(surfels, camera).reshape(len(features), -1)
     culled = surfels["opacity"] == 0
 
     alpha, z = (values.real for values in footprint(raw, camera, x, y))

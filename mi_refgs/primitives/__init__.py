@@ -1,5 +1,6 @@
 """What is splatted: surfels and 3D Gaussians. A new primitive is one more file, registered here."""
 
+from mi_refgs.primitives.gaussian import Gaussian
 from mi_refgs.primitives.primitive import (
     PRIMITIVES,
     Adjoint,
@@ -26,3 +27,4 @@ __all__ = [
 ]
 
 register(Surfel())
+register(Gaussian())

@@ -16,44 +16,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.splat import PinholeCamera
+from mi_refgs.reference.footprint import GEOMETRY, Rules
+from mi_refgs.reference.lookup import Light, harmonics, positive, shade, unit
+from mi_refgs.reference.pinhole import QUATERNION_FLOOR, PinholeCamera, rotation_axes, sigmoid
+from mi_refgs.reference.primitives import primitive_of
 
 Array = np.ndarray
 STEP = 1e-40
-GEOMETRY = ("position", "rotation", "scale", "opacity")
 MAPS = ("radiance", "alpha", "depth", "normal", "albedo", "metallic", "roughness")
-DIELECTRIC_F0 = 0.04
-QUATERNION_FLOOR = 1e-12
-"""Largest |component| below which a quaternion is the identity, with gradient 0: a rule of the table."""
-
-
-@dataclass(frozen=True)
-class Light:
-    """Prefiltered levels, the map itself first, and the roughness of the others; the split-sum table."""
-
-    levels: list[Array]  # (h, 2h, 3) each
-    roughness: tuple[float, ...]
-    table: Array  # (n, n, 2): [roughness, n·v]
-
-    def flat(self) -> Array:
-        """All texels (T, 3), level after level."""
-        return np.concatenate([level.reshape(-1, 3) for level in self.levels])
-
-    def split(self, flat: Array) -> list[Array]:
-        """Inverse of `flat`."""
-        ends = np.cumsum([level.size // 3 for level in self.levels])[:-1]
-        return [x.reshape(y.shape) for x, y in zip(np.split(flat, ends), self.levels, strict=True)]
-
-
-@dataclass(frozen=True)
-class Rules:
-    """The named constants of footprints and compositing; others than the product's measure their bias."""
-
-    alpha_min: float = c.ALPHA_MIN
-    alpha_max: float = c.ALPHA_MAX
-    transmittance_min: float = c.TRANSMITTANCE_MIN
-    low_pass: float | None = c.LOW_PASS_INV_VARIANCE  # None: no screen-space filter
-    edge_on: float = c.EDGE_ON_COSINE
 
 
 @dataclass(frozen=True)
@@ -69,7 +39,7 @@ class Scene:
     diffuse: str = "sh"
     light: Light | None = None
     visibility: Callable[[Array, Array], Array] | None = None  # unit normals, unit rays (P, 3) → 0 … 1 (P,)
-    rules: Rules = Rules()
+    rules: Rules = field(default_factory=Rules)
 
 
 @dataclass
@@ -91,9 +61,9 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     raw = {name: np.asarray(x, np.float64) for name, x in scene.raw.items()}
     camera, rules = scene.camera, scene.rules
     x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
-    columns = np.concatenate([raw[name] for name in GEOMETRY], axis=1)
-    culled = _culled(raw, camera, rules)
-    sample = _footprint(columns, camera, rules, x, y)
+    primitive = primitive_of(raw)
+    culled = primitive.culled(raw, camera, rules)
+    sample = primitive.footprint(raw, camera, rules, x, y)
     alpha, z = sample.alpha.real, sample.z.real
     hit = (alpha >= rules.alpha_min) & (z > camera.near) & ~culled[:, None]
     alpha = np.where(hit, alpha, 0)
@@ -123,7 +93,7 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
         (after, rules.transmittance_min, hit),
     ):
         in_band |= np.any(where & (np.abs(values - limit) < band * limit), 0)
-    in_band |= np.any(shown & (np.abs(sample.screen - sample.plane) < band * sample.screen), 0)
+    in_band |= np.any(shown & (sample.jump < band), 0)
     in_band |= np.any(near_band & (np.abs(z - camera.near) < band * camera.near), 0)
     picture = Picture(maps, in_band, shown, taps + pixel_taps)
     if weights is None:
@@ -138,15 +108,14 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     behind = _unsort(np.cumsum(part[::-1], axis=0)[::-1] - part, order)
     δalpha = np.where(shown, before * value - behind / (1 - alpha), 0)
     δz = np.where(shown, weight * δsums[:, -2], 0)
-    δcolumns = np.zeros_like(columns)
-    for d in range(columns.shape[1]):
-        moved = columns.astype(complex)
-        moved[:, d] += 1j * STEP
-        there = _footprint(moved, camera, rules, x, y)
-        slope_alpha, slope_z = there.alpha.imag / STEP, there.z.imag / STEP
-        δcolumns[:, d] = np.sum(np.where(shown, δalpha * slope_alpha + δz * slope_z, 0), 1)
-    widths = np.cumsum([raw[name].shape[1] for name in GEOMETRY])[:-1]
-    gradients = dict(zip(GEOMETRY, np.split(δcolumns, widths, axis=1), strict=True))
+    gradients = {name: np.zeros_like(raw[name]) for name in GEOMETRY}
+    for name in GEOMETRY:
+        for d in range(raw[name].shape[1]):
+            moved = raw | {name: raw[name].astype(complex)}
+            moved[name][:, d] += 1j * STEP
+            there = primitive.footprint(moved, camera, rules, x, y)
+            slope_alpha, slope_z = there.alpha.imag / STEP, there.z.imag / STEP
+            gradients[name][:, d] = np.sum(np.where(shown, δalpha * slope_alpha + δz * slope_z, 0), 1)
     δfeatures = weight @ δsums[:, :-2]
     δraw = itemwise_adjoint(lambda v: features_of(v, []), features_of.columns, δfeatures)
     for name, values in features_of.split(δraw).items():
@@ -181,105 +150,11 @@ def _unsort(values: Array, order: Array) -> Array:
     return out
 
 
-# ---------------- footprints ----------------
-
-
-@dataclass(frozen=True)
-class _Sample:
-    """A footprint at pixels, (N, P) each."""
-
-    alpha: Array
-    z: Array
-    unclamped: Array
-    screen: Array
-    plane: Array
-
-
-def camera_frame(raw: dict[str, Array], camera: PinholeCamera) -> tuple[Array, Array]:
-    """Centres (N, 3) and axes (N, 3, 3) — t_u, t_v, n — in the camera's frame."""
-    to_camera, origin = camera.to_world[:3, :3].T, camera.to_world[:3, 3]
-    centre = (raw["position"] - origin) @ to_camera.T
-    return centre, np.stack([axis @ to_camera.T for axis in rotation_axes(raw["rotation"])], axis=1)
-
-
-def rotation_axes(rotation: Array) -> tuple[Array, Array, Array]:
-    """Images (N, 3) of the three axes under quaternions (x, y, z, w) of any norm."""
-    largest = np.abs(rotation.real).max(axis=1, keepdims=True, initial=0)
-    valid = largest >= QUATERNION_FLOOR
-    q = np.where(valid, rotation / np.where(valid, largest, 1), np.array([0, 0, 0, 1.0]))
-    x, y, z, w = (q / np.sqrt(np.sum(q**2, axis=1, keepdims=True))).T
-    return (
-        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], axis=1),
-        np.stack([2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)], axis=1),
-        np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=1),
-    )
-
-
-def _culled(raw: dict[str, Array], camera: PinholeCamera, rules: Rules) -> Array:
-    centre, axes = camera_frame(raw, camera)
-    facing = np.abs(np.sum(centre * axes[:, 2], axis=1))
-    culled = ~(centre[:, 2] > camera.near) | ~(facing > rules.edge_on * np.linalg.norm(centre, axis=1))
-    return culled | (_sigmoid(raw["opacity"][:, 0]) < rules.alpha_min)
-
-
-def _footprint(columns: Array, camera: PinholeCamera, rules: Rules, x: Array, y: Array) -> _Sample:
-    raw = dict(zip(GEOMETRY, np.split(columns, [3, 7, 9], axis=1), strict=True))
-    p, axes = camera_frame(raw, camera)
-    σ = np.exp(raw["scale"])
-    ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)])
-    with np.errstate(all="ignore"):
-        t = np.sum(p * axes[:, 2], axis=1)[:, None] / (axes[:, 2] @ ray)
-        # Only the difference to the ray through the surfel's own centre meets the axes: nothing cancels.
-        beside = ray[None] - (p / p[:, 2:])[:, :, None]
-        plane = np.zeros_like(t)
-        lift = np.einsum("nk,nkp->np", axes[:, 2], beside) / np.sum(p * axes[:, 2], 1)[:, None]
-        for i in range(2):
-            along = np.einsum("nk,nkp->np", axes[:, i], beside)
-            pa = np.sum(p * axes[:, i], 1)[:, None]
-            plane = plane + (t * (along - lift * pa) / σ[:, i : i + 1]) ** 2
-        middle = [f * p[:, i : i + 1] / p[:, 2:] + m for i, (f, m) in enumerate(_intrinsics(camera))]
-        screen = (x - middle[0]) ** 2 + (y - middle[1]) ** 2
-        screen = screen * rules.low_pass if rules.low_pass else np.full_like(screen, np.inf)
-        low_pass = ~(t.real > 0) | ~(screen.real >= plane.real)
-        opacity = _sigmoid(raw["opacity"])
-        unclamped = opacity * np.exp(-0.5 * np.where(low_pass, screen, plane))
-    alpha = np.where(unclamped.real > rules.alpha_max, rules.alpha_max, unclamped)
-    z = np.where(low_pass, p[:, 2:], t)
-    return _Sample(alpha, z, unclamped.real, screen.real, plane.real)
-
-
-def _intrinsics(camera: PinholeCamera) -> tuple[tuple[float, float], tuple[float, float]]:
-    return (camera.fx, camera.cx), (camera.fy, camera.cy)
-
-
 def sample_depth(scene: Scene) -> Array:
-    """Depth (N, P) of the sample of each surfel at each pixel: by it, every pixel sorts for itself."""
+    """Depth (N, P) of the sample of each primitive at each pixel: by it, every pixel sorts for itself."""
     x, y = scene.pixels % scene.camera.width + 0.5, scene.pixels // scene.camera.width + 0.5
-    columns = np.concatenate([np.asarray(scene.raw[name], np.float64) for name in GEOMETRY], axis=1)
-    return _footprint(columns, scene.camera, scene.rules, x, y).z
-
-
-def sort_key(raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner: tuple[int, int]) -> Array:
-    """Depth (N, P) by which surfels are ordered in the tiles of pixels; `corner`: the first pixel's place in
-    its tile. As `reference.splat` has it: the plane's depth, SORT_REACH σ from the centre at most."""
-    p, axes = camera_frame(raw, camera)
-    σ = np.exp(raw["scale"])
-    width, height = c.tile_size(abs(camera.fx))
-    x = (pixels % camera.width + corner[0]) // width * width + width / 2 - corner[0]
-    y = (pixels // camera.width + corner[1]) // height * height + height / 2 - corner[1]
-    ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)])
-    with np.errstate(all="ignore"):
-        k = 1 / p[:, 2:]
-        beside = ray[None] - (p * k)[:, :, None]
-        pn = np.sum(p * axes[:, 2], 1)[:, None]
-        lift = np.einsum("nk,nkp->np", axes[:, 2], beside) / pn
-        across = [
-            (np.einsum("nk,nkp->np", axes[:, i], beside) - lift * np.sum(p * axes[:, i], 1)[:, None])
-            / σ[:, i : i + 1]
-            for i in range(2)
-        ]
-        share = np.minimum(1, c.SORT_REACH * k / np.hypot(*across))
-        return 1 / np.maximum(k + share * lift, k / c.SORT_DEPTH_RANGE)
+    raw = {name: np.asarray(values, np.float64) for name, values in scene.raw.items()}
+    return primitive_of(raw).footprint(raw, scene.camera, scene.rules, x, y).z
 
 
 # ---------------- attributes of surfels ----------------
@@ -289,7 +164,7 @@ class _Features:
     """Features (N, K) of raw columns (N, D): normal, materials, SH colours; or normal and radiance."""
 
     def __init__(self, scene: Scene, raw: dict[str, Array]) -> None:
-        self.scene = scene
+        self.scene, self.normal = scene, primitive_of(raw).normal(raw)
         self.names = [name for name in raw if name not in ("scale", "opacity")]
         self.columns = np.concatenate([raw[name] for name in self.names], axis=1)
         self.widths = [raw[name].shape[1] for name in self.names]
@@ -302,12 +177,12 @@ class _Features:
 
     def __call__(self, columns: Array, taps: list[tuple[Array, Array, Array]]) -> Array:
         raw, scene = self.split(columns), self.scene
-        direction = _unit(raw["position"] - scene.camera.to_world[:3, 3])
-        normal = rotation_axes(raw["rotation"])[2]
+        direction = unit(raw["position"] - scene.camera.to_world[:3, 3])
+        normal = np.choose(self.normal[:, None], rotation_axes(raw["rotation"]))
         away = np.sum(normal * direction, 1, keepdims=True).real > c.FACING_TOLERANCE
         normal = np.where(away, -normal, normal)
-        materials = [_sigmoid(raw[n]) for n in ("albedo", "metallic", "roughness") if n in raw]
-        colour = _positive(_harmonics(raw["radiance_sh"], direction) + 0.5)
+        materials = [sigmoid(raw[n]) for n in ("albedo", "metallic", "roughness") if n in raw]
+        colour = positive(harmonics(raw["radiance_sh"], direction) + 0.5)
         if scene.at == "surfel":
             if scene.reflectance == "split_sum":
                 assert scene.light is not None
@@ -320,7 +195,7 @@ class _Features:
             parts.append(colour)
         if self.has_indirect:
             n_v = -np.sum(normal * direction, 1, keepdims=True)
-            parts.append(_positive(_harmonics(raw["indirect_sh"], 2 * n_v * normal + direction)))
+            parts.append(positive(harmonics(raw["indirect_sh"], 2 * n_v * normal + direction)))
         return np.concatenate(parts, axis=1)
 
 
@@ -331,10 +206,10 @@ class _Resolve:
         self.scene, self.features = scene, features
         camera = scene.camera
         ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
-        self.ray = _unit(ray @ camera.to_world[:3, :3].T)
+        self.ray = unit(ray @ camera.to_world[:3, :3].T)
         self.visibility = None
         if scene.visibility is not None:
-            self.visibility = scene.visibility(_unit(sums[:, :3]), self.ray)
+            self.visibility = scene.visibility(unit(sums[:, :3]), self.ray)
 
     def __call__(self, sums: Array, taps: list[tuple[Array, Array, Array]]) -> Array:
         alpha = sums[:, -1:]
@@ -359,145 +234,3 @@ class _Resolve:
         """Columns by map."""
         parts = np.split(values, [3, 4, 5, 8, 11, 12], axis=1)
         return {n: p for n, p in zip(MAPS, parts, strict=True) if p.shape[1]}
-
-
-# ---------------- shading ----------------
-
-
-def shade(
-    light: Light,
-    normal: Array,
-    view: Array,
-    materials: Array,
-    own: Array | None,
-    visibility: Array | None,
-    indirect: Array | None,
-    diffuse: str,
-    taps: list[tuple[Array, Array, Array]],
-) -> Array:
-    """Radiance (n, 3) of points; `materials` (n, 5) are albedo, metallic, roughness. As `shade.models`."""
-    n, v = _unit(normal), _unit(view)
-    albedo, metallic, roughness = materials[:, :3], materials[:, 3:4], materials[:, 4]
-    n_v = np.sum(n * v, 1)
-    f0 = DIELECTRIC_F0 * (1 - metallic) + albedo * metallic
-    a, b = _table(light.table, n_v, roughness)
-    reflectance = f0 * a[:, None] + b[:, None]
-    free = np.ones(len(n)) if visibility is None else visibility
-    factor = reflectance * free[:, None]
-    texel, share = _specular(light, 2 * n_v[:, None] * n - v, roughness)
-    flat = light.flat()
-    taps.append((texel, share, factor))
-    out = factor * np.einsum("nk,nkc->nc", share, flat[texel])
-    if diffuse == "sh":
-        assert own is not None
-        out = out + (1 - metallic) * own
-    else:
-        texel, share = _bilinear(light, n, np.full(len(n), len(light.levels) - 1))
-        factor = _positive(1 - reflectance) * (1 - metallic) * albedo
-        taps.append((texel, share, factor))
-        out = out + factor * np.einsum("nk,nkc->nc", share, flat[texel])
-    if visibility is not None and indirect is not None:
-        out = out + (1 - free)[:, None] * indirect * reflectance
-    return out
-
-
-def _table(table: Array, n_v: Array, roughness: Array) -> tuple[Array, Array]:
-    n = len(table)
-    x, y = _clip(n_v, 0, 1) * n - 0.5, _clip(roughness, 0, 1) * n - 0.5
-    j, i = (np.clip(np.floor(q.real), 0, n - 2).astype(int) for q in (x, y))
-    s, t = (x - j)[:, None], (y - i)[:, None]
-    upper = (1 - s) * table[i, j] + s * table[i, j + 1]
-    lower = (1 - s) * table[i + 1, j] + s * table[i + 1, j + 1]
-    pair = (1 - t) * upper + t * lower
-    return pair[:, 0], pair[:, 1]
-
-
-def _specular(light: Light, direction: Array, roughness: Array) -> tuple[Array, Array]:
-    first, r = light.roughness[0], roughness
-    sharp = r.real <= first
-    level = np.where(sharp, (np.where(sharp, r, first) / first) ** 4, 1.0)
-    inverse = 1 / np.where(sharp, first, r)
-    for a, b in zip(light.roughness, light.roughness[1:], strict=False):
-        level = level + _clip((inverse - 1 / a) / (1 / b - 1 / a), 0, 1)
-    lower = np.clip(level.real.astype(int), 0, len(light.levels) - 2)
-    t = (level - lower)[:, None]
-    one, two = (_bilinear(light, direction, lower + k) for k in range(2))
-    return np.concatenate([one[0], two[0]], 1), np.concatenate([(1 - t) * one[1], t * two[1]], 1)
-
-
-def _bilinear(light: Light, direction: Array, level: Array) -> tuple[Array, Array]:
-    """Texels (n, 4) of the flat levels and their weights."""
-    heights = np.array([len(x) for x in light.levels])
-    firsts = np.concatenate([[0], np.cumsum(2 * heights**2)[:-1]])
-    h = heights[level]
-    w, first = 2 * h, firsts[level]
-    x, y, z = direction.T
-    pole = (x.real == 0) & (z.real == 0)
-    sin = np.where(pole, 0, np.sqrt(np.where(pole, 1, x * x + z * z)))
-    turn = _atan2(np.where(pole, 0, x), np.where(pole, -1, -z)) / (2 * math.pi)
-    u = np.where(turn.real < 0, turn + 1, turn) * w - 0.5
-    v = _atan2(sin, y) / math.pi * (h - 1)
-    j = np.floor(u.real).astype(int)
-    i = np.clip(np.floor(v.real).astype(int), 0, h - 2)
-    s, t = u - j, v - i
-    texel = [first + (i + a) * w + (j + b) % w for a in (0, 1) for b in (0, 1)]
-    share = [(t if a else 1 - t) * (s if b else 1 - s) for a in (0, 1) for b in (0, 1)]
-    return np.stack(texel, 1), np.stack(share, 1)
-
-
-def _harmonics(coefficients: Array, direction: Array) -> Array:
-    """Σ c_k Y_k (n, 3) of coefficients (n, 3 (degree + 1)²); Legendre functions by recursion over z."""
-    degree = math.isqrt(coefficients.shape[1] // 3) - 1
-    x, y, z = direction.T
-    cos, sin = [np.ones_like(x)], [np.zeros_like(x)]  # r^m cos mφ, r^m sin mφ
-    for _ in range(degree):
-        cos, sin = [*cos, x * cos[-1] - y * sin[-1]], [*sin, x * sin[-1] + y * cos[-1]]
-    p = {(0, 0): np.ones_like(z)}  # over r^m
-    for m in range(1, degree + 1):
-        p[m, m] = -(2 * m - 1) * p[m - 1, m - 1]
-    for m in range(degree):
-        p[m + 1, m] = (2 * m + 1) * z * p[m, m]
-        for n in range(m + 2, degree + 1):
-            p[n, m] = ((2 * n - 1) * z * p[n - 1, m] - (n + m - 1) * p[n - 2, m]) / (n - m)
-    out = np.zeros((len(x), 3), coefficients.dtype)
-    for n in range(degree + 1):
-        for m in range(-n, n + 1):
-            k = abs(m)
-            norm = math.sqrt((2 * n + 1) / (4 * math.pi) * math.factorial(n - k) / math.factorial(n + k))
-            turn = 1 if m == 0 else math.sqrt(2) * (cos[k] if m > 0 else sin[k])
-            i = 3 * (n * (n + 1) + m)
-            out = out + (norm * p[n, k] * turn)[:, None] * coefficients[:, i : i + 3]
-    return out
-
-
-# ---------------- functions of complex steps ----------------
-
-
-def _sigmoid(x: Array) -> Array:
-    return 1 / (1 + np.exp(-x))
-
-
-def _positive(x: Array) -> Array:
-    """max(0, x) with slope 1 at 0."""
-    return np.where(x.real < 0, 0, x)
-
-
-def _clip(x: Array, low: float, high: float) -> Array:
-    return np.where(x.real < low, low, np.where(x.real > high, high, x))
-
-
-def _atan2(y: Array, x: Array) -> Array:
-    value = np.arctan2(y.real, x.real)
-    if not (np.iscomplexobj(y) or np.iscomplexobj(x)):
-        return value
-    squared = x.real**2 + y.real**2
-    slope = (x.real * np.imag(y) - y.real * np.imag(x)) / np.where(squared > 0, squared, 1)
-    return value + 1j * slope
-
-
-def _unit(v: Array) -> Array:
-    """v / |v| by rows; (0, 0, 1) where |v|² is below NORM_FLOOR."""
-    largest = np.abs(v.real).max(axis=1, keepdims=True)
-    valid = largest > math.sqrt(c.NORM_FLOOR)
-    v = np.where(valid, v / np.where(valid, largest, 1), np.array([0, 0, 1.0]))
-    return v / np.sqrt(np.sum(v * v, axis=1, keepdims=True))

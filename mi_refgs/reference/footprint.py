@@ -1,0 +1,78 @@
+"""What a footprint is to an oracle, for every primitive: a module with these functions.
+
+Letters: N primitives, P pixels. Raw channels are real or, for derivatives by a complex step, complex. The
+columns of its `scale` say which primitive a table is of.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from mi_refgs import constants as c
+from mi_refgs.reference.pinhole import PinholeCamera
+
+Array = np.ndarray
+GEOMETRY = ("position", "rotation", "scale", "opacity")
+
+
+@dataclass(frozen=True)
+class Rules:
+    """The named constants of footprints and compositing; others than the product's measure their bias."""
+
+    alpha_min: float = c.ALPHA_MIN
+    alpha_max: float = c.ALPHA_MAX
+    transmittance_min: float = c.TRANSMITTANCE_MIN
+    low_pass: float | None = c.LOW_PASS_INV_VARIANCE  # None: no screen-space filter
+    edge_on: float = c.EDGE_ON_COSINE
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Footprints at pixels, (N, P) each."""
+
+    alpha: Array  # after the clamp
+    z: Array  # depth of the sample
+    unclamped: Array  # real part of α before the clamp
+    jump: Array  # relative distance of ρ to where depth jumps; infinite where it does not
+
+
+def tile_centres(camera: PinholeCamera, pixels: Array, corner: tuple[int, int]) -> tuple[Array, Array]:
+    """Centres x, y (P,) of the tiles of pixels; `corner` is the first pixel's place in its tile."""
+    width, height = c.tile_size(abs(camera.fx))
+    x = (pixels % camera.width + corner[0]) // width * width + width / 2 - corner[0]
+    y = (pixels // camera.width + corner[1]) // height * height + height / 2 - corner[1]
+    return x, y
+
+
+class Footprints(Protocol):
+    """The functions of `reference.surfel` and `reference.gaussian`."""
+
+    def culled(self, raw: dict[str, Array], camera: PinholeCamera, rules: Rules) -> Array:
+        """Which rows (N,) cover no pixel."""
+
+    def footprint(
+        self, raw: dict[str, Array], camera: PinholeCamera, rules: Rules, x: Array, y: Array
+    ) -> Sample:
+        """Footprints at pixel centres x, y (P,)."""
+
+    def sort_key(
+        self, raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner: tuple[int, int]
+    ) -> Array:
+        """Depth (N, P) by which rows are ordered in the tiles of pixels (raster indices).
+
+        `corner` is the first pixel's place in its tile.
+        """
+
+    def normal(self, raw: dict[str, Array]) -> Array:
+        """Which of the three axes (N,) is the normal."""
+
+    def images(
+        self, raw: dict[str, Array], camera: PinholeCamera, band: float
+    ) -> tuple[list[tuple[Array, Array, Array]], Array]:
+        """α, depth and whether it jumps within the `band` (H, W) of each row; and the order (N, H, W).
+
+        α is clamped, and 0 where culled. By loops, for `reference.splat`.
+        """
