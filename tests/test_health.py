@@ -18,7 +18,7 @@ from mi_refgs.fit import health
 from mi_refgs.fit.optim import Adam, Skipped
 from mi_refgs.fit.train import Trainer
 from mi_refgs.methods.method import Method
-from mi_refgs.surfels.channels import geometry
+from mi_refgs.primitives.surfel import Surfel
 from mi_refgs.surfels.table import Surfels
 
 
@@ -116,7 +116,7 @@ def test_a_fit_in_which_every_step_fails_ends_with_one_sentence(
         trainer.train()
     assert trainer.iteration == 3 * method.log_every
     after = trainer.surfels.to_numpy()
-    for name in geometry():  # materials begin anew in iteration 9, with the deferred stage
+    for name in Surfel.widths:  # materials begin anew in iteration 9, with the deferred stage
         np.testing.assert_array_equal(after[name], before[name])
 
 

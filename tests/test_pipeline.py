@@ -15,6 +15,7 @@ from integrator_scenes import HEIGHT, WIDTH, raw_channels, sky
 from mi_refgs.reference import shade as reference
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
+from mi_refgs.reference.pinhole import rotation_matrix
 from mi_refgs.render.pipeline import Frame, Shading, render
 from mi_refgs.shade import brdf, lobe_matrices
 from mi_refgs.shade.envmap import EnvironmentLight
@@ -58,7 +59,7 @@ def attributes(raw: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.n
     """What is blended or shaded, surfel by surfel."""
     direction = raw["position"] - origin
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    normal = np.array([oracle.rotation_matrix(q)[:, 2] for q in raw["rotation"]])
+    normal = np.array([rotation_matrix(q)[:, 2] for q in raw["rotation"]])
     away = np.sum(normal * direction, axis=1) > 0.25
     coefficients = raw["radiance_sh"].reshape(len(normal), -1, 3)
     basis = np.array([reference.sh_basis(d, 1) for d in direction])

@@ -18,7 +18,6 @@ from mi_refgs.fit.train import Trainer
 from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.render import pipeline
 from mi_refgs.splat import Blended, Camera, blend, list_by_tile, project, splat
-from mi_refgs.surfels.channels import geometry
 from mi_refgs.surfels.table import Surfels
 
 
@@ -51,7 +50,7 @@ class Ours:
         finally:
             pipeline.splat = splat
         surfels, columns, camera = calls[0]
-        bare = Surfels({name: surfels.raw[name] for name in geometry()})
+        bare = Surfels({name: surfels.raw[name] for name in surfels.primitive.widths})
         shape = (len(columns) + 2, camera.width * camera.height)
         return Ours(bare, columns, camera, np.random.default_rng(0).normal(size=shape))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.splatting.workload import Workload
 from mi_refgs import constants as c
-from mi_refgs.reference.splat import PinholeCamera, rotation_matrix
+from mi_refgs.reference.pinhole import PinholeCamera, rotation_matrix
 
 Array = np.ndarray
 

@@ -10,10 +10,11 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.primitives.surfel import Surfel
 from mi_refgs.reference.camera import look_at
 from mi_refgs.reference.splat import PinholeCamera
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.channels import geometry, logit
+from mi_refgs.surfels.channels import logit
 from mi_refgs.surfels.init import quaternions
 from mi_refgs.surfels.table import Surfels
 
@@ -111,7 +112,7 @@ def fitted(folder: str) -> Workload:
     view = load_split(run, run.method(), "test").views[0]
     if state is None:
         raise InputError(f"{folder}: checkpoints: none; train it first")
-    raw = {name: np.asarray(state[f"params/{name}"], np.float32) for name in geometry()}
+    raw = {name: np.asarray(state[f"params/{name}"], np.float32) for name in Surfel.widths}
     count = len(raw["position"])
     features = np.random.default_rng(7).uniform(size=(count, FEATURES)).astype(np.float32)
     pinhole = PinholeCamera(view.width, view.height, -view.fx, -view.fy, view.cx, view.cy, view.to_world)

@@ -14,6 +14,8 @@ import numpy as np
 from benchmarks.stability.case import Array, Case, Raw, camera, facing, plain, sky, sphere
 from benchmarks.stability.measure import light_of
 from mi_refgs.reference import picture as oracle
+from mi_refgs.reference import surfel
+from mi_refgs.reference.pinhole import camera_frame
 
 WIDTH, HEIGHT = 48, 40
 SAMPLES = 4
@@ -77,7 +79,7 @@ def _rules(case: Case) -> Iterator[dict[str, Any]]:
     light = light_of(case.light) if case.reflectance == "split_sum" else None
     base = _scene(case, light)
     pixel_sorted = replace(base, order=_by_pixel(base))
-    depth = oracle.camera_frame(base.raw, base.camera)[0][:, 2]
+    depth = camera_frame(base.raw, base.camera)[0][:, 2]
     by_centre = np.broadcast_to(np.argsort(depth, kind="stable")[:, None], base.order.shape)
     exact = oracle.render(pixel_sorted)
     pairs: list[tuple[str, Callable[[], oracle.Picture], Callable[[], oracle.Picture]]] = [
@@ -115,7 +117,7 @@ def _scene(case: Case, light: oracle.Light | None) -> oracle.Scene:
     c = case.camera
     pixels = np.arange(c.width * c.height)
     raw = {n: np.asarray(x, np.float64) for n, x in case.raw.items()}
-    key = oracle.sort_key(raw, c, pixels, (0, 0))
+    key = surfel.sort_key(raw, c, pixels, (0, 0))
     order = np.argsort(key, axis=0, kind="stable")
     return oracle.Scene(raw, c, pixels, order, case.at, case.reflectance, case.diffuse, light)
 

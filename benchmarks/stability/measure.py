@@ -16,6 +16,7 @@ from mi_refgs.device import upload, upload_tensor
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import occlusion as trace
 from mi_refgs.reference import picture as oracle
+from mi_refgs.reference import surfel
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.pipeline import Shading, render
 from mi_refgs.shade import brdf, lobe_matrices
@@ -412,7 +413,7 @@ def condition(
 def inversion(case: Case, scene: oracle.Scene, truth: oracle.Picture) -> float:
     """Largest relative difference of depths in the wrong order, among the surfels that a pixel shows."""
     phase = fast_camera(case).tile_offset
-    key = oracle.sort_key(scene.raw, scene.camera, scene.pixels, phase)
+    key = surfel.sort_key(scene.raw, scene.camera, scene.pixels, phase)
     key, shown = (np.take_along_axis(x, scene.order, 0) for x in (key, truth.shown))
     key = np.where(shown, key, 0)
     late = np.where(shown, (np.maximum.accumulate(key) - key) / np.where(shown, key, 1), 0)

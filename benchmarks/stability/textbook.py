@@ -15,6 +15,7 @@ from benchmarks.stability.case import Array, Case
 from mi_refgs import constants as c
 from mi_refgs.reference import lookup
 from mi_refgs.reference import picture as oracle
+from mi_refgs.reference.pinhole import rotation_axes
 
 NEAR = 0.2
 """Scene units; what lies nearer is dropped."""
@@ -56,7 +57,7 @@ def _render(case: Case, scene: oracle.Scene, order: Array) -> dict[str, Array]:
     x = (scene.pixels % p.width).astype(f) + f(0.5)
     y = (scene.pixels // p.width).astype(f) + f(0.5)
     q = raw["rotation"] / np.maximum(np.linalg.norm(raw["rotation"], axis=1, keepdims=True), FLOOR)
-    axes = [a.astype(f) for a in oracle.rotation_axes(q)]
+    axes = [a.astype(f) for a in rotation_axes(q)]
     σ = np.exp(raw["scale"])
     opacity = 1 / (1 + np.exp(-raw["opacity"][:, 0]))
     features = _features(case, axes[2])

@@ -51,6 +51,7 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
         normals[order],
         colours[order],
         rng=rng,
+        primitive=options.primitive,
         channels=options.channels,
         degree={name: options.degree_of(name) for name in options.channels},
         **options.initial,

@@ -8,7 +8,7 @@ import numpy as np
 
 from mi_refgs.fit.optim import Group
 from mi_refgs.methods.method import LIGHT, Method
-from mi_refgs.surfels.channels import channel, geometry
+from mi_refgs.surfels.channels import channel
 
 POSITION_STEPS = 0.6
 """Share of the iterations after which positions learn at their final rate: 30,000 of 50,000 in the released
@@ -41,7 +41,7 @@ class Schedule:
         """Learning rates of every parameter of the method; `extent` in scene units."""
         rates, iterations = self.method.rates, self.method.iterations
         groups = {}
-        for name in (*geometry(), *self.method.surfels.channels):
+        for name in self.method.surfels.names:
             rate = rates.of(name)
             head = 3 if channel(name).harmonics else 0
             groups[name] = Group(rate, rate * rates.decay, iterations, head, rates.rest_of(name))

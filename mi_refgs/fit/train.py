@@ -33,7 +33,6 @@ from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.channels import geometry
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.timing import phase
 
@@ -41,7 +40,7 @@ from mi_refgs.timing import phase
 def _shapes(method: Method) -> dict[str, tuple[int, ...]]:
     """The shape of every parameter of a method, without the first axis."""
     shapes: dict[str, tuple[int, ...]] = {
-        name: (method.surfels.columns(name),) for name in (*geometry(), *method.surfels.channels)
+        name: (method.surfels.columns(name),) for name in method.surfels.names
     }
     return shapes if method.light is None else shapes | {LIGHT: (2 * method.light.height, 3)}
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from mi_refgs.methods.window import Window
+from mi_refgs.primitives import primitive_named
 from mi_refgs.surfels.channels import MAX_SH_DEGREE, channel
 
 LIGHT = "light"
@@ -34,6 +35,7 @@ class About:
 class SurfelOptions:
     """The table of surfels at the start, and its limits."""
 
+    primitive: str = "surfel"  # what is splatted
     channels: tuple[str, ...] = ("radiance_sh", "albedo", "metallic", "roughness", "indirect_sh")
     count: int = 20_000  # initial surfels
     max_count: int = 40_000  # densification stops here
@@ -46,9 +48,15 @@ class SurfelOptions:
         """Degree of the spherical harmonics of a channel."""
         return self.degree.get(name, MAX_SH_DEGREE)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All channels, those of the primitive first; raises InputError for an unknown primitive."""
+        return (*primitive_named(self.primitive).widths, *self.channels)
+
     def columns(self, name: str) -> int:
         """Raw columns of a channel."""
-        return channel(name).width(self.degree_of(name))
+        widths = primitive_named(self.primitive).widths
+        return widths[name] if name in widths else channel(name).width(self.degree_of(name))
 
     def start(self, name: str) -> float:
         """Initial value of a channel, activated."""

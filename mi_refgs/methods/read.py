@@ -17,9 +17,10 @@ from mi_refgs.files import is_file
 from mi_refgs.methods.build import build, plain
 from mi_refgs.methods.method import LIGHT, PRESETS, Method
 from mi_refgs.methods.window import Window
+from mi_refgs.primitives import PRIMITIVES
 from mi_refgs.render.pipeline import Shading
 from mi_refgs.resources import resource_dir
-from mi_refgs.surfels.channels import CHANNELS, geometry
+from mi_refgs.surfels.channels import CHANNELS
 
 MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
@@ -51,7 +52,10 @@ def load(variant: str, preset: str = "standard", assignments: list[str] | None =
 def _checked(method: Method, where: str) -> Method:
     """The method; raises InputError for unknown channels and a stage that channels and light cannot serve."""
     surfels, rates = method.surfels, method.rates
-    channels = {*geometry(), *surfels.channels}
+    if surfels.primitive not in PRIMITIVES:
+        known = ", ".join(PRIMITIVES)
+        raise InputError(f"{where}: surfels.primitive: '{surfels.primitive}' is unknown; use one of {known}")
+    channels = {*surfels.names}
     for key, named, known in (
         ("surfels.channels", surfels.channels, set(CHANNELS)),
         ("surfels.initial", surfels.initial, channels),

@@ -58,7 +58,7 @@ class VertexSurfels:
     def of(mesh: Mesh, surfels: Surfels) -> VertexSurfels:
         """The NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint.
 
-        The footprint is the surfel's Gaussian in its plane, and one of a voxel across it. Detached. Raises
+        The footprint is the surfel's own Gaussian, wider by a voxel along its normal. Detached. Raises
         InputError if there are no surfels, or a channel of their materials is missing.
         """
         for name in CHANNELS:
@@ -70,8 +70,10 @@ class VertexSurfels:
             raise InputError("occluder: surfels: there are none to take materials from")
         surfels = surfels.detach().cleaned()
         position, opacity = surfels.position().numpy().T, surfels.opacity().numpy()
-        scale = surfels.scale().numpy().T
-        axes = [axis.numpy().T for axis in surfels.frame()]
+        axes, spread = surfels.primitive.extent(surfels.to_numpy())
+        normal = surfels.primitive.normal(surfels).numpy().T
+        across = np.abs(np.sum(axes * normal[:, None], axis=2)) > 0.5
+        spread = np.where(across, np.hypot(spread, mesh.voxel), spread)
         usable = np.flatnonzero(surfels.usable().numpy())
         if not len(usable):
             raise InputError("occluder: surfels: none has finite values; mend them, or trace nothing")
@@ -79,14 +81,14 @@ class VertexSurfels:
         _, found = cKDTree(position[usable]).query(mesh.vertices, k=np.arange(1, count + 1))
         found = usable[found]
         offset = mesh.vertices[:, None] - position[found]
-        u, v, w = ((offset * axis[found]).sum(-1) for axis in axes)
-        across = scale[found]
-        reach = np.square(u / across[..., 0]) + np.square(v / across[..., 1]) + np.square(w / mesh.voxel)
+        along = np.einsum("vkc,vkac->vka", offset, axes[found])
+        beside = offset - np.einsum("vka,vkac->vkc", along, axes[found])
+        reach = np.square(along / spread[found]).sum(-1) + np.square(beside / mesh.voxel).sum(-1)
         weight = opacity[found] * np.exp(-0.5 * reach)
         total = weight.sum(1, keepdims=True)
         alone = np.arange(count) == 0
         weight = np.where(total > WEIGHT_FLOOR, weight / np.maximum(total, WEIGHT_FLOOR), alone)
-        normal = _normals(mesh, axes[2][found], weight)
+        normal = _normals(mesh, normal[found], weight)
         return VertexSurfels(
             surfels.count,
             mi.UInt32(mesh.faces.ravel()),

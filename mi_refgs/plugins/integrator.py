@@ -27,9 +27,9 @@ from mi_refgs.plugins.properties import (
     read_surfels,
     read_terms,
 )
+from mi_refgs.primitives import primitive_of, widths_of
 from mi_refgs.render.pipeline import MATERIALS, Frame, render
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.channels import geometry
 from mi_refgs.surfels.table import Surfels
 
 CHECK_SECONDS = 1.0
@@ -170,6 +170,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def check(self) -> None:
         """Raise InputError for shapes that do not fit and for channels that are needed but absent."""
         Surfels(self.surfels.raw)  # checks shapes; values are checked where a file is read
+        primitive_of(widths_of(self.surfels.raw))
         self.shading.check(self.surfels.raw)
         for name in (aov.type for aov in self.aovs if aov.type in MATERIALS):
             if not self.surfels.has(name):
@@ -190,7 +191,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def parameters_changed(self, keys: list[str]) -> None:
         self.check()
         self.changed = True
-        moved = not keys or not {*keys}.isdisjoint(geometry())
+        moved = not keys or not {*keys}.isdisjoint(self.surfels.primitive.widths)
         if moved and self.occluder is not None and self.shading.accuracy.traced_bounces:
             self.occluder.set_materials(self.surfels)
 

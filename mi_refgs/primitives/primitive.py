@@ -117,9 +117,9 @@ class Primitive(ABC):
 
     @abstractmethod
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """World axes (N, A, 3) along which its Gaussian extends, and standard deviations (N, A) along them.
+        """Orthonormal world axes (N, A, 3) along which its Gaussian extends, and standard deviations (N, A).
 
-        Those of what is split lie at normal deviates of these.
+        The children of what is split lie at normal deviates of these.
         """
 
     @abstractmethod
@@ -148,17 +148,29 @@ def unregister(name: str) -> None:
     del PRIMITIVES[name]
 
 
+def primitive_named(name: str) -> Primitive:
+    """The primitive of this name; raises InputError if there is none."""
+    if name not in PRIMITIVES:
+        raise InputError(f"primitive: '{name}' is unknown; use one of {', '.join(PRIMITIVES)}")
+    return PRIMITIVES[name]
+
+
+def nearest_primitive(widths: Mapping[str, int]) -> tuple[Primitive, list[str]]:
+    """The primitive that lacks the fewest of its channels, and which; `widths` are numbers of raw columns."""
+
+    def lacking(primitive: Primitive) -> list[str]:
+        return [name for name, width in primitive.widths.items() if widths.get(name) != width]
+
+    found = min(PRIMITIVES.values(), key=lambda primitive: len(lacking(primitive)))
+    return found, lacking(found)
+
+
 def primitive_of(widths: Mapping[str, int]) -> Primitive:
     """The primitive whose channels are there, with their numbers of raw columns.
 
     Raises InputError naming what is missing for the primitive that comes nearest.
     """
-
-    def lacking(primitive: Primitive) -> list[str]:
-        return [name for name, width in primitive.widths.items() if widths.get(name) != width]
-
-    nearest = min(PRIMITIVES.values(), key=lambda primitive: len(lacking(primitive)))
-    missing = lacking(nearest)
+    nearest, missing = nearest_primitive(widths)
     if not missing:
         return nearest
     name = missing[0]

@@ -25,7 +25,6 @@ from mi_refgs.render.reflection import reflection
 from mi_refgs.shade.models import Accuracy, ShadingPoints, Terms, reflect, safe_normalize, shade
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.splat import Blended, Camera, splat
-from mi_refgs.surfels.channels import geometry
 from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
 from mi_refgs.timing import boundary, phase
 
@@ -79,7 +78,7 @@ class Shading:
 
     def check(self, channels: Collection[str], light: bool = True, mesh: bool = True) -> None:
         """Raise InputError if surfels with these channels, and what is there beside them, lack something."""
-        needed = [*geometry()]
+        needed: list[str] = []
         if self.reflectance == "split_sum":
             needed += MATERIALS
         if self.reflectance == "radiance" or self.diffuse == "sh":
@@ -132,6 +131,7 @@ def render(
     `shading.accuracy.traced_bounces` needs an occluder whose `set_materials` has seen these surfels.
     Raises InputError for what `shading.check` refuses.
     """
+    primitive_of(widths_of(surfels.raw))
     shading.check(surfels.raw, light is not None, occluder is not None)
     if surfels.count == 0:
         surfels, shift = _nothing(surfels), None
@@ -168,7 +168,7 @@ def _facing(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
     """
     # A surfel at the camera's own position has no direction; it is culled, so any will do.
     direction = safe_normalize(camera.towards(surfels.position()))
-    normal = primitive_of(widths_of(surfels.raw)).normal(surfels)
+    normal = surfels.primitive.normal(surfels)
     return direction, dr.select(dr.detach(dr.dot(normal, direction)) > FACING_TOLERANCE, -normal, normal)
 
 

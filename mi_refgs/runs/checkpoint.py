@@ -19,7 +19,6 @@ from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import LIGHT
 from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.surfels.channels import geometry
 from mi_refgs.surfels.table import Surfels
 
 PARAMS, OPTIMISER, MESH = "params/", "optimiser/", "mesh/"
@@ -80,13 +79,14 @@ def check(state: Mapping[str, np.ndarray]) -> None:
     params = part(state, PARAMS)
     try:
         table = Surfels({name: value for name, value in params.items() if name != LIGHT})
+        geometry = table.primitive.widths
         if LIGHT in params:
             EnvironmentLight(params[LIGHT])
     except InputError as error:
         raise DamagedError(str(error)) from error
     scalars = ["iteration", "seconds", "held_until"]
     rows = ["gradient_sum", "gradient_count"]
-    signed = [f"{PARAMS}{name}" for name in {*geometry(), *params}]
+    signed = [f"{PARAMS}{name}" for name in {*geometry, *params}]
     for tensor, values in params.items():
         _check(state, [f"{OPTIMISER}{tensor}/first"], (values.size,), signed=True)
         _check(state, [f"{OPTIMISER}{tensor}/second"], (values.size,))

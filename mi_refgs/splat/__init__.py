@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.primitives import Footprints, primitive_of, widths_of
+from mi_refgs.primitives import Footprints
 from mi_refgs.splat.blend import Blended, blend
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.tiles import TileLists, list_by_tile
@@ -20,7 +20,7 @@ __all__ = ["Blended", "Camera", "Footprints", "TileLists", "blend", "list_by_til
 @phase("project")
 def project(surfels: Surfels, camera: Camera, shift: Any = None) -> Footprints:
     """Footprints of a table's own primitive in a camera; `shift` as `Primitive.project` has it."""
-    return primitive_of(widths_of(surfels.raw)).project(surfels, camera, shift)
+    return surfels.primitive.project(surfels, camera, shift)
 
 
 def splat(surfels: Surfels, features: list[Any], camera: Camera, shift: Any = None) -> Blended:

@@ -50,7 +50,7 @@ class Channel:
     initial: float = 0.0  # activated; the points decide for geometry and the first colour
     jitter: float = 0.0  # half the width of the uniform noise on it, activated
     rest_rate: float = 1.0  # factor of the rate for harmonics of degree 1 and above
-    geometry: bool = False  # says where a surfel is, and is never shaded or blended
+    geometry: bool = False  # says where and how large a primitive is; there if its primitive has it
     material: bool = False  # describes a surface under any light
     aov: str = ""  # suffixes of its AOV, Mitsuba's: "RGB", "Y"; none without
 
@@ -114,11 +114,6 @@ def channel(name: str) -> Channel:
     return CHANNELS[name]
 
 
-def geometry() -> tuple[str, ...]:
-    """The channels without which nothing can be splatted."""
-    return tuple(name for name, x in CHANNELS.items() if x.geometry)
-
-
 def logit(value: float | np.ndarray) -> np.ndarray:
     """Inverse of the logistic sigmoid, float64, of values clipped to [1e-6, 1 - 1e-6]."""
     value = np.clip(np.asarray(value, dtype=np.float64), PROBABILITY_MARGIN, 1 - PROBABILITY_MARGIN)
@@ -128,7 +123,7 @@ def logit(value: float | np.ndarray) -> np.ndarray:
 # Rates as in 2DGS, those of materials and light as in Ref-Gaussian (appendix, implementation details).
 register(Channel("position", (3,), "identity", 1.6e-4, ("x", "y", "z"), geometry=True))
 register(Channel("rotation", (4,), "quaternion", 1e-3, ("rot_1", "rot_2", "rot_3", "rot_0"), geometry=True))
-register(Channel("scale", (2,), "exp", 5e-3, ("scale_0", "scale_1"), geometry=True))
+register(Channel("scale", (2, 3), "exp", 5e-3, ("scale_0", "scale_1", "scale_2"), geometry=True))
 register(Channel("opacity", (1,), "sigmoid", 0.05, ("opacity",), initial=0.1, geometry=True))
 register(Channel("radiance_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("f",), rest_rate=0.05))
 register(

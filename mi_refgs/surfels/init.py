@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.errors import InputError
+from mi_refgs.primitives import primitive_named
 from mi_refgs.surfels.channels import CHANNELS, MAX_SH_DEGREE, channel
 from mi_refgs.surfels.table import Surfels
 
@@ -27,12 +28,13 @@ def from_points(
     colours: np.ndarray | None = None,  # (N, 3) linear radiance
     *,
     rng: np.random.Generator,
+    primitive: str = "surfel",
     channels: Sequence[str] | None = None,
     degree: Mapping[str, int] | None = None,
     scale_factor: float = 1.0,
     **initial: float,
 ) -> Surfels:
-    """One surfel per point: scale from its 3 nearest neighbours, normal as given or uniform at random.
+    """One `primitive` per point: size from its 3 nearest neighbours, normal as given or uniform at random.
 
     The tangents are turned at random about the normal. `channels` beside the geometry (default: all that are
     declared); `degree` of spherical harmonics by channel, 0 by default; `initial` activated values by
@@ -50,14 +52,12 @@ def from_points(
             raise InputError(f"surfels: degree of {name}: {wanted} is not in 0 … {MAX_SH_DEGREE}; choose one")
     if normals is not None:
         normals = _check("normals", normals, (count,))
-    log_scale = np.log(neighbour_scale(points) * scale_factor)
-    raw: dict[str, np.ndarray] = {
-        "position": points,
-        "rotation": quaternions(normals, count, rng),
-        "scale": np.repeat(log_scale[:, None], 2, axis=1),
-    }
+    kind = primitive_named(primitive)
+    raw = {"position": points}
+    raw |= kind.start(neighbour_scale(points) * scale_factor, quaternions(normals, count, rng))
     for name, declared in CHANNELS.items():
-        if name not in raw and (declared.geometry or channels is None or name in channels):
+        chosen = not declared.geometry if channels is None else name in channels
+        if name not in raw and (name in kind.widths or chosen):
             width = declared.width((degree or {}).get(name, 0))
             raw[name] = declared.start(count, width, rng, initial.get(name))
     if colours is not None and "radiance_sh" in raw:

@@ -1,8 +1,8 @@
-"""Surfels in PLY files, with the property names and raw encodings of 2DGS, which other viewers know.
+"""Surfels and 3D Gaussians in PLY files, with the names and raw encodings of 2DGS and 3DGS.
 
-    x y z, nx ny nz       position; zeros, as 2DGS writes them, ignored when read
+    x y z, nx ny nz       position; zeros, as both write them, ignored when read
     f_dc_*, f_rest_*      radiance_sh            opacity                 logit
-    scale_0 scale_1       log scale              rot_0..3                quaternion, w first
+    scale_0..1 (..2)      log scale (3DGS)       rot_0..3                quaternion, w first
     albedo_0..2           logit                  metallic, roughness     logit
     ind_dc_*, ind_rest_*  indirect_sh
 
@@ -20,6 +20,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
 from mi_refgs.ply import read_header
+from mi_refgs.primitives import nearest_primitive, widths_of
 from mi_refgs.surfels.channels import CHANNELS, MAX_SH_DEGREE, sh_columns
 from mi_refgs.surfels.table import Surfels
 
@@ -30,8 +31,8 @@ def read_ply(path: str | Path) -> Surfels:
     """Read surfels from a binary or ASCII PLY file; unknown properties are ignored.
 
     Absent groups give absent channels. Raises InputError, naming file, property and remedy, if the file is
-    missing, truncated or no PLY, if it holds 3D Gaussians, if x y z, opacity, scale_0/1 or rot_0..3 or part
-    of another group is missing, or if a value is not finite.
+    missing, truncated or no PLY, if part of a group or, as x y z, opacity, scale_0..2 or rot_0..3, a channel
+    of its primitive is missing, or if a value is not finite.
     """
     path = Path(path)
     try:
@@ -41,10 +42,6 @@ def read_ply(path: str | Path) -> Surfels:
         raise InputError(f"{path}: file: cannot be read ({error.strerror}); check the path") from error
 
     names = vertices.dtype.names or ()
-    if "scale_2" in names:
-        raise InputError(
-            f"{path}: scale_2: the file holds 3D Gaussians; export surfels (2DGS) with two scales instead"
-        )
     arrays = {}
     for name, channel in CHANNELS.items():
         if channel.harmonics:
@@ -52,8 +49,12 @@ def read_ply(path: str | Path) -> Surfels:
             if any(found.startswith(f"{prefix}_") for found in names):
                 degree = _sh_degree(path, names, prefix)
                 arrays[name] = _columns(path, vertices, _sh_properties(prefix, degree))
-        elif channel.geometry or any(found in names for found in channel.properties):
-            arrays[name] = _columns(path, vertices, channel.properties)
+        elif there := [i for i, found in enumerate(channel.properties) if found in names]:
+            width = min(width for width in channel.widths if width > max(there))
+            arrays[name] = _columns(path, vertices, channel.properties[:width])
+    primitive, missing = nearest_primitive(widths_of(arrays))
+    for name in missing:
+        _columns(path, vertices, CHANNELS[name].properties[: primitive.widths[name]])  # says what is missing
     return Surfels.from_numpy(arrays)
 
 
@@ -135,7 +136,7 @@ def write_ply(path: str | Path, surfels: Surfels) -> None:
     surfels.validate()
     values: dict[str, np.ndarray] = {}
     for channel, table in surfels.to_numpy().items():
-        properties = CHANNELS[channel].properties
+        properties = CHANNELS[channel].properties[: table.shape[1]]
         if CHANNELS[channel].harmonics:
             properties = _sh_properties(properties[0], surfels.sh_degree(channel))
         values |= {name: table[:, column] for column, name in enumerate(properties)}

@@ -22,8 +22,9 @@ import numpy as np
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
+from mi_refgs.primitives import Primitive, primitive_of, widths_of
 from mi_refgs.rows import columns_of
-from mi_refgs.surfels.channels import CHANNELS, channel, geometry
+from mi_refgs.surfels.channels import CHANNELS, channel
 
 # Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is worthless.
 QUATERNION_FLOOR = 1e-12
@@ -41,12 +42,17 @@ def sigmoid(x: Any) -> Any:
     return dr.rcp(1.0 + dr.exp(-dr.clip(x, -LOGIT_LIMIT, LOGIT_LIMIT)))
 
 
+def _exp(x: Any) -> Any:
+    return dr.exp(dr.clip(x, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)) if dr.width(x) else x
+
+
 class Surfels:
     """N surfels as named raw channels, each an `mi.TensorXf` of shape (N, D), often a leaf of the AD graph.
 
-    `raw` maps channel names to tensors in the order of CHANNELS; a channel that a scene does not use is
-    absent and costs nothing. Accessors return activated values as Dr.Jit arrays of width N; gradients flow to
-    the raw tensors in both modes.
+    Its channels say whether the rows are surfels, 3D Gaussians or another `primitive`. `raw` maps channel
+    names to tensors in the order of CHANNELS; a channel that a scene does not use is absent and costs
+    nothing. Accessors return activated values as Dr.Jit arrays of width N; gradients flow to the raw tensors
+    in both modes.
     """
 
     raw: dict[str, Any]
@@ -105,14 +111,15 @@ class Surfels:
                     f"surfels: {name}: {shape[1]} columns, expected {choices}; fix the array's shape"
                 )
 
+    @property
+    def primitive(self) -> Primitive:
+        """What its rows are; raises InputError if channels are missing for that."""
+        return primitive_of(widths_of(self.raw))
+
     def validate(self) -> None:
-        """Raise InputError if a geometry channel is missing, a shape is wrong, or a value is not finite."""
-        for name in geometry():
-            if name not in self.raw:
-                raise InputError(
-                    f"surfels: {name}: the channel is missing; add it, nothing can be splatted without it"
-                )
+        """Raise InputError if a channel of its primitive is missing, a shape is wrong, a value not finite."""
         self._check_shapes()
+        primitive_of(widths_of(self.raw))
         for name, tensor in self.raw.items():
             bad = int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0
             if bad:
@@ -174,8 +181,8 @@ class Surfels:
         coefficient) and other widths. Geometry has accessors of its own types.
         """
         columns = self.columns(name)
-        if channel(name).activation == "sigmoid":
-            columns = [sigmoid(column) for column in columns]
+        activate = {"sigmoid": sigmoid, "exp": _exp}.get(channel(name).activation)
+        columns = columns if activate is None else [activate(column) for column in columns]
         if channel(name).harmonics:
             return [mi.Color3f(*columns[start : start + 3]) for start in range(0, len(columns), 3)]
         if len(columns) == 3:
@@ -201,13 +208,10 @@ class Surfels:
         return mi.Quaternion4f(x * inverse_norm, y * inverse_norm, z * inverse_norm, w * inverse_norm)
 
     def scale(self) -> Any:
-        """Standard deviations (s_u, s_v) along t_u and t_v (mi.Vector2f), scene units."""
-        if self.count == 0:
-            return dr.zeros(mi.Vector2f, 0)
-        u, v = (
-            dr.exp(dr.clip(column, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)) for column in self.columns("scale")
-        )
-        return mi.Vector2f(u, v)
+        """Standard deviations along the first two axes of `frame` (mi.Vector2f), or all (mi.Vector3f)."""
+        columns = self.columns("scale")
+        kind = mi.Vector2f if len(columns) == 2 else mi.Vector3f
+        return kind(*(_exp(column) for column in columns)) if self.count else dr.zeros(kind, 0)
 
     def opacity(self) -> Any:
         """Opacities in [0, 1] (mi.Float); `screened`: 0 with gradient 0 where the surfel is not `usable`."""
