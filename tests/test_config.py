@@ -255,3 +255,12 @@ def test_wrong_extends_are_named(text: str, words: list[str], tmp_path: Path) ->
     with pytest.raises(InputError) as error:
         methods.load(str(tmp_path / "own.toml"))
     assert all(word in str(error.value) for word in words), error.value
+
+
+def test_an_unknown_primitive_is_refused() -> None:
+    chosen = methods.load("ref_gaussian", "quick", ["surfels.primitive='gaussian'"])
+    assert chosen.surfels.columns("scale") == 3
+    with pytest.raises(
+        InputError, match=r"surfels\.primitive: 'ball' is unknown; use one of surfel, gaussian"
+    ):
+        methods.load("ref_gaussian", "quick", ["surfels.primitive='ball'"])

@@ -17,7 +17,6 @@ from mi_refgs.files import is_file
 from mi_refgs.methods.build import build, plain
 from mi_refgs.methods.method import LIGHT, PRESETS, Method
 from mi_refgs.methods.window import Window
-from mi_refgs.primitives import PRIMITIVES
 from mi_refgs.render.pipeline import Shading
 from mi_refgs.resources import resource_dir
 from mi_refgs.surfels.channels import CHANNELS
@@ -52,10 +51,10 @@ def load(variant: str, preset: str = "standard", assignments: list[str] | None =
 def _checked(method: Method, where: str) -> Method:
     """The method; raises InputError for unknown channels and a stage that channels and light cannot serve."""
     surfels, rates = method.surfels, method.rates
-    if surfels.primitive not in PRIMITIVES:
-        named, shipped = surfels.primitive, ", ".join(PRIMITIVES)
-        raise InputError(f"{where}: surfels.primitive: '{named}' is unknown; use one of {shipped}")
-    channels = {*surfels.names}
+    try:
+        channels = {*surfels.names}
+    except InputError as error:
+        raise InputError(f"{where}: surfels.{error}") from error
     for key, named, known in (
         ("surfels.channels", surfels.channels, set(CHANNELS)),
         ("surfels.initial", surfels.initial, channels),
