@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mi_refgs.cli.command import Result, add_command, add_output, add_settings, say
+from mi_refgs.cli.command import Result, add_command, add_settings, say
 from mi_refgs.cli.train import DEFAULT_PRESET
 from mi_refgs.errors import InputError
 
@@ -31,7 +31,19 @@ def add(commands: Any) -> None:
         metavar="DATA",
         help="data sets; without any, the table of what the folder holds is made again",
     )
-    add_output(parser, "folder of the comparison; the same command goes on where it stopped", "FOLDER")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FOLDER",
+        help="folder of the comparison; the same command goes on where it stopped",
+    )
+    parser.add_argument(
+        "--paper-table",
+        type=int,
+        metavar="N",
+        help="print the paper's table N with those of the folder's runs, and name the data that is missing",
+    )
     parser.add_argument(
         "--variants", nargs="+", metavar="V", help="methods: names or .toml files, by spaces or commas"
     )
@@ -49,10 +61,13 @@ def run(args: argparse.Namespace) -> Result:
     """Do what is left to do, then make the table of all runs in the folder."""
     from mi_refgs.compare import execute, jobs, results
 
+    if args.paper_table is not None:
+        return _paper_table(args)
+    if args.output is None:
+        raise InputError("-o: none given; name the folder of the comparison")
     if args.data:
-        todo = _plan(args)
-        threads = execute.threads_each(args.workers, args.threads)
-        wanted = [dataclasses.replace(job, threads=threads) for job in todo if not jobs.finished(job)]
+        todo = _plan(args, execute.threads_each(args.workers, args.threads))
+        wanted = [job for job in todo if not jobs.finished(job)]
         say(f"{args.output}: {len(wanted)} of {len(todo)} jobs to do, {args.workers} at once")
         try:
             execute.execute_all(wanted, args.workers, Report(len(wanted)))
@@ -65,7 +80,7 @@ def run(args: argparse.Namespace) -> Result:
     return Result(dataclasses.asdict(table), text, 0 if table.complete else EXIT_INCOMPLETE)
 
 
-def _plan(args: argparse.Namespace) -> list[Job]:
+def _plan(args: argparse.Namespace, threads: int | None) -> list[Job]:
     from mi_refgs.compare import jobs, results
     from mi_refgs.methods import names
 
@@ -78,10 +93,22 @@ def _plan(args: argparse.Namespace) -> list[Job]:
         raise InputError(f"--seeds: {' '.join(args.seeds)}: not whole numbers; write them as 0,1") from error
     preset = args.preset or DEFAULT_PRESET
     planned = jobs.plan(
-        args.output, args.data, variants, seeds, preset, args.set, args.mitsuba_variant, args.threads
+        args.output, args.data, variants, seeds, preset, args.set, args.mitsuba_variant, threads
     )
-    results.begin(args.output, planned, sys.argv[1:])
+    results.begin(args.output, planned, args.workers, sys.argv[1:])
     return planned
+
+
+def _paper_table(args: argparse.Namespace) -> Result:
+    from mi_refgs.compare import paper_table, results
+    from mi_refgs.compare.paper import Figures
+
+    figures = Figures.read()
+    if args.data or args.variants:
+        raise InputError("--paper-table: prints what -o holds and fits nothing; drop DATA and --variants")
+    ours = None if args.output is None else results.table(args.output)
+    found = paper_table.compared(args.paper_table, ours, figures)
+    return Result(dataclasses.asdict(found), paper_table.text(found, figures))
 
 
 def _separated(values: list[str]) -> list[str]:

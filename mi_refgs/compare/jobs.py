@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,7 +91,7 @@ def plan(
     """
     for path in data:
         read_dataset(path, "test", truth=False)
-    _unique((path.resolve().name for path in data), "DATA", "give the folders different names")
+    _unique((absolute(path).name for path in data), "DATA", "give the folders different names")
     _unique((Path(variant).stem for variant in variants), "--variants", "name each once")
     _unique((str(seed) for seed in seeds), "--seeds", "give each once")
     for seed in seeds:
@@ -100,8 +101,8 @@ def plan(
         raise InputError("--set: seed: a comparison takes its seeds from --seeds; drop it here")
     jobs = [
         Job(
-            folder=str(folder.resolve() / RUNS / path.resolve().name / Path(variant).stem / f"seed{seed}"),
-            data=str(path.resolve()),
+            folder=str(folder.resolve() / RUNS / absolute(path).name / Path(variant).stem / f"seed{seed}"),
+            data=str(absolute(path)),
             variant=str(Path(variant).resolve()) if variant.endswith(".toml") else variant,
             seed=seed,
             preset=preset,
@@ -151,7 +152,7 @@ def require_same(job: Job) -> None:
         raise InputError(
             f"{job.folder}/dataset.json: cannot be read ({error}); remove that run, or choose another -o"
         ) from error
-    if data.resolve() != Path(job.data):
+    if data.resolve() != Path(job.data).resolve():
         raise InputError(
             f"{job.folder}/dataset.json: path: the run was fitted to {data}, not to {job.data}; choose "
             "another -o, or remove that run"
@@ -175,6 +176,11 @@ def finished(job: Job) -> bool:
 def jobs_in(folder: Path) -> list[Job]:
     """The jobs of all runs in a comparison's folder."""
     return [Job.read(path.parent) for path in (folder / RUNS).glob(f"*/*/*/{JOB}")]
+
+
+def absolute(path: Path) -> Path:
+    """The path from the root, without dots; a link keeps its own name, which is the scene's."""
+    return Path(os.path.abspath(path))
 
 
 def _unique(names: Iterable[str], option: str, remedy: str) -> None:

@@ -45,7 +45,7 @@ class Figures:
     """All tables, and the data sets that they are about."""
 
     source: str
-    data_sets: dict[str, dict[str, Any]]  # name → of, words, size, scenes → folder names
+    data_sets: dict[str, dict[str, Any]]  # name → of, folder, words, size, scenes → folder names
     tables: dict[int, PaperTable]
 
     @staticmethod

@@ -11,6 +11,7 @@ from pathlib import Path
 from mi_refgs import __version__
 from mi_refgs.compare import jobs
 from mi_refgs.compare.jobs import SETTINGS, Job
+from mi_refgs.compare.page import PAGE, write_page
 from mi_refgs.compare.table import Table, rows_or_error, table_of
 from mi_refgs.compare.text import markdown
 from mi_refgs.files import cannot_write, read_json, write_bytes
@@ -18,7 +19,7 @@ from mi_refgs.files import cannot_write, read_json, write_bytes
 TABLE, TABLE_TEXT = "table.json", "table.md"
 
 
-def begin(folder: Path, planned: Sequence[Job], arguments: Sequence[str]) -> None:
+def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequence[str]) -> None:
     """Write what the jobs share, and each job into its run folder; raises InputError if that is impossible.
 
     The table has a row for each of them from now on.
@@ -32,10 +33,24 @@ def begin(folder: Path, planned: Sequence[Job], arguments: Sequence[str]) -> Non
         "variants": list(dict.fromkeys([*before.get("variants", []), *variants])),
         "preset": planned[0].preset,
         "set": list(planned[0].settings),
+        "workers": workers,
         "command": shlex.join(["refgs", *arguments]),
         "version": __version__,
     }
     write_bytes(folder / SETTINGS, (json.dumps(about, indent=2) + "\n").encode())
+
+
+def table(folder: Path) -> Table:
+    """The table of all jobs in the folder."""
+    about = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
+    data, variants = about.get("data", []), about.get("variants", [])
+
+    def order(job: Job) -> tuple[int, int, int]:
+        variant = Path(job.variant).stem
+        place = data.index(job.data) if job.data in data else len(data)
+        return place, variants.index(variant) if variant in variants else len(variants), job.seed
+
+    return table_of(folder, sorted(jobs.jobs_in(folder), key=order), about)
 
 
 def write(folder: Path) -> Table:
@@ -43,22 +58,17 @@ def write(folder: Path) -> Table:
 
     Raises InputError if there are none, and if a file cannot be written.
     """
-    about = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
-    data, variants = about.get("data", []), about.get("variants", [])
-
-    def order(job: Job) -> tuple[int, int, int]:
-        return data.index(job.data), variants.index(Path(job.variant).stem), job.seed
-
-    table = rows_or_error(table_of(folder, sorted(jobs.jobs_in(folder), key=order), about))
+    found = rows_or_error(table(folder))
     try:
-        content = json.dumps(dataclasses.asdict(table), indent=1, ensure_ascii=False)
+        content = json.dumps(dataclasses.asdict(found), indent=1, ensure_ascii=False)
         write_bytes(folder / TABLE, f"{content}\n".encode())
-        write_bytes(folder / TABLE_TEXT, markdown(table).encode())
+        write_bytes(folder / TABLE_TEXT, markdown(found).encode())
     except OSError as error:
         raise cannot_write(folder, error) from error
-    return table
+    write_page(folder, found)
+    return found
 
 
-def text(folder: Path, table: Table) -> str:
+def text(folder: Path, found: Table) -> str:
     """The table for the terminal, and where its files are."""
-    return f"{markdown(table)}\n{folder / TABLE_TEXT}, {folder / TABLE}"
+    return f"{markdown(found)}\n{folder / PAGE}, {folder / TABLE_TEXT}, {folder / TABLE}"

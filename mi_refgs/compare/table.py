@@ -23,6 +23,7 @@ class Column:
     title: str
     unit: str
     form: str  # of the mean; the s.d. is written likewise
+    higher: bool | None  # whether more is better; None: neither
     reason: str = ""  # key of metrics.json that says why the number is missing
 
     def text(self, value: float) -> str:
@@ -31,15 +32,16 @@ class Column:
 
 
 COLUMNS = (
-    Column("psnr", "PSNR", "dB", ".2f"),
-    Column("ssim", "SSIM", "", ".4f"),
-    Column("flip", "FLIP", "", ".4f", "flip_reason"),
-    Column("lpips", "LPIPS", "", ".4f", "lpips_reason"),
-    Column("normal_mae_deg", "normal error", "°", ".2f", "normal_reason"),
-    Column("env_correlation", "light correlation", "", ".3f", "env_reason"),
-    Column("train_seconds", "training", "s", ".0f"),
-    Column("surfels", "surfels", "", ".0f"),
-    Column("ms_per_frame", "frame", "ms", ".1f"),
+    Column("psnr", "PSNR", "dB", ".2f", True),
+    Column("ssim", "SSIM", "", ".4f", True),
+    Column("flip", "FLIP", "", ".4f", False, "flip_reason"),
+    Column("lpips", "LPIPS", "", ".4f", False, "lpips_reason"),
+    Column("normal_mae_deg", "normal error", "°", ".2f", False, "normal_reason"),
+    Column("normal_mae_deg_full", "normal error, whole image", "°", ".2f", False, "normal_reason"),
+    Column("env_correlation", "light correlation", "", ".3f", True, "env_reason"),
+    Column("train_seconds", "training", "s", ".0f", False),
+    Column("surfels", "surfels", "", ".0f", None),
+    Column("ms_per_frame", "frame", "ms", ".1f", False),
 )
 
 
@@ -114,7 +116,7 @@ class Table:
 
 
 def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
-    """The table of the jobs of a comparison in `folder`; raises InputError for a run that cannot be read."""
+    """The table of the jobs of a comparison in `folder`; a run that cannot be read is a failed one."""
     figures = Figures.read()
     table = Table(about=about)
     scenes: dict[str, Scene] = {}
@@ -127,9 +129,14 @@ def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
             rows[key], metrics[key] = Row(key[1], key[1]), []
             scene.rows.append(rows[key])
         row = rows[key]
-        if job.run.exists():
-            _describe(row, job, table)
-        if finished(job):
+        try:
+            if job.run.exists():
+                _describe(row, job, table)
+            done = finished(job)
+        except InputError as error:  # a config.toml of another version
+            row.failed[job.seed] = str(error)
+            continue
+        if done:
             found = read_metrics(job.run)
             assert found is not None
             metrics[key].append(found)
