@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
+import threading
+import time
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -184,6 +187,44 @@ def test_a_worker_ends_with_the_process_that_started_it(ball: Path, variants: tu
     assert process.stdin is not None
     process.stdin.close()
     assert process.wait(30) == -15
+
+
+def test_a_worker_of_the_cluster_is_killed_midway(
+    ball: Path, variants: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Another worker goes on from the checkpoint; the log has each iteration once."""
+    distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
+    from mi_refgs.compare.cluster import run_on_cluster
+
+    settings = ("iterations=150", "checkpoint_every=10", "log_every=10", *SIX[1:3])
+    [job] = jobs.plan(tmp_path, [ball], [str(variants[1])], [0], "quick", settings, "llvm_ad_rgb", 1)
+    reports: list[tuple[Job, str | None]] = []
+    killed: list[int] = []
+
+    def kill(address: str) -> None:
+        until = time.monotonic() + 60
+        while not job.run.checkpoints() and time.monotonic() < until:
+            time.sleep(0.05)
+        with distributed.Client(address) as client:
+            [(worker, tasks)] = [item for item in client.processing().items() if item[1]]
+            assert tasks
+            killed.append(client.run(os.getpid, workers=[worker])[worker])
+        assert not job.run.checkpoints()[-1].stem.endswith("150")
+        os.kill(killed[0], signal.SIGKILL)
+
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        killer = threading.Thread(target=kill, args=[cluster.scheduler_address])
+        killer.start()
+        run_on_cluster([job], cluster.scheduler_address, 1, lambda *said: reports.append(said))
+        killer.join()
+    assert killed and reports == [(job, None)] and jobs.finished(job)
+    logged = [
+        json.loads(line)["iteration"] for line in (job.run.path / "metrics.jsonl").read_text().splitlines()
+    ]
+    assert logged == list(range(10, 151, 10))
+    assert (job.run.path / "job.log").read_text().count("resumed at iteration") == 1
 
 
 # ---------- Refusals ----------
@@ -404,6 +445,8 @@ def test_variants_name_rows_of_the_paper() -> None:
     known = {s for t in figures.tables.values() for systems in t.metrics.values() for s in systems}
     rows = {name: load(name).about.paper_row for name in names()}
     assert rows["ref_gaussian"] == "Ref-Gaussian" and set(rows.values()) <= known | {""}
+    for name, row in rows.items():  # a row that a file inherits is another method's
+        assert load(name).about.name.startswith("w/o") == row.startswith("w/o"), name
 
 
 def scene_of(name: str, data_set: str, psnr: float, seconds: float) -> Scene:

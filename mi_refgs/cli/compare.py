@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,11 +56,19 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--workers", type=int, default=1, metavar="N", help="jobs at once, which share the cores (default 1)"
     )
+    parser.add_argument(
+        "--cluster",
+        nargs="?",
+        const="",
+        metavar="ADDRESS",
+        help="run the jobs on dask.distributed: on the scheduler at ADDRESS, whose workers must see the same "
+        "folders, or on N workers of this machine",
+    )
 
 
 def run(args: argparse.Namespace) -> Result:
     """Do what is left to do, then make the table of all runs in the folder."""
-    from mi_refgs.compare import execute, jobs, results
+    from mi_refgs.compare import cluster, execute, jobs, results
 
     if args.paper_table is not None:
         return _paper_table(args)
@@ -70,7 +79,10 @@ def run(args: argparse.Namespace) -> Result:
         wanted = [job for job in todo if not jobs.finished(job)]
         say(f"{args.output}: {len(wanted)} of {len(todo)} jobs to do, {args.workers} at once")
         try:
-            execute.execute_all(wanted, args.workers, Report(len(wanted)))
+            if args.cluster is None:
+                execute.execute_all(wanted, args.workers, Report(len(wanted)))
+            else:
+                cluster.run_on_cluster(wanted, args.cluster or None, args.workers, Report(len(wanted)))
         except KeyboardInterrupt as error:
             raise type(error)(f"interrupted; the same command goes on, from {args.output}") from None
     elif args.variants or args.set or args.preset:
@@ -119,9 +131,10 @@ class Report:
     """A line on standard error for each job that ended."""
 
     def __init__(self, count: int) -> None:
-        self.count, self.done = count, 0
+        self.count, self.done, self.begin = count, 0, time.perf_counter()
 
-    def __call__(self, job: Job, seconds: float, reason: str | None) -> None:
+    def __call__(self, job: Job, reason: str | None) -> None:
         self.done += 1
-        outcome = f"done in {seconds:.0f} s" if reason is None else f"failed: {reason}"
-        say(f"[{self.done}/{self.count}] {job.title}: {outcome}")
+        minutes = (time.perf_counter() - self.begin) / 60
+        outcome = "done" if reason is None else f"failed: {reason}"
+        say(f"[{self.done}/{self.count}] after {minutes:.1f} min: {job.title}: {outcome}")

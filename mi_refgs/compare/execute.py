@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
@@ -34,6 +33,8 @@ def execute(job: Job, stop: threading.Event | None = None) -> str | None:
 
     Raises InputError if the run folder cannot be written.
     """
+    if stop is not None and stop.is_set():
+        return None
     job.write()
     code = DONE
     for _ in range(1 + RETRIES):
@@ -52,25 +53,19 @@ def execute(job: Job, stop: threading.Event | None = None) -> str | None:
     return reason
 
 
-def execute_all(jobs: Sequence[Job], workers: int, report: Callable[[Job, float, str | None], None]) -> None:
-    """Do jobs, `workers` at once; `report(job, seconds, reason)` hears of each that ended.
+def execute_all(jobs: Sequence[Job], workers: int, report: Callable[[Job, str | None], None]) -> None:
+    """Do jobs, `workers` at once; `report(job, reason)` hears of each that ended.
 
     Raises KeyboardInterrupt or TerminatedError after a signal, when all processes have saved their state.
     """
     stop = threading.Event()
-
-    def timed(job: Job) -> tuple[float, str | None]:
-        begin = time.perf_counter()
-        reason = None if stop.is_set() else execute(job, stop)
-        return time.perf_counter() - begin, reason
-
     with held_interrupts() as release, ThreadPoolExecutor(workers) as pool:
-        pending = {pool.submit(timed, job): job for job in jobs}
+        pending = {pool.submit(execute, job, stop): job for job in jobs}
         try:
             while pending:
                 done, _ = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
                 for future in done:
-                    report(pending.pop(future), *future.result())
+                    report(pending.pop(future), future.result())
                 release()
         except BaseException:
             stop.set()

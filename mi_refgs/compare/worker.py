@@ -71,6 +71,8 @@ def fit_and_measure(job: Job) -> None:
     run, data = job.run, Path(job.data)
     method = run.method() if run.exists() else job.method()
     trainer = begin(method, read_views(method, data, "train", truth=False), run)
+    if trainer.iteration:
+        print(f"refgs: resumed at iteration {trainer.iteration} of {method.iterations}", file=sys.stderr)
     trainer.train(Curve(job))
     finish(trainer, run)
     evaluate(run, data)
