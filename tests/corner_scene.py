@@ -11,9 +11,11 @@ from helpers import unit, vector
 
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.reflection import reflection
+from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.envmap import PrefilteredLight
-from mi_refgs.shade.models import Accuracy, ShadingPoints
+from mi_refgs.shade.points import ShadingPoints
+from mi_refgs.shade.reflectance import Surroundings
+from mi_refgs.shade.reflection import reflection
 from mi_refgs.surfels.table import Surfels
 
 VOXEL = 1e-4
@@ -113,7 +115,8 @@ def seen(
     if occluder is None:
         occluder = Occluder(corner()) if surfels is None else with_materials(corner(), surfels)
     table: Any = surfels
-    return reflection(occluder, table, light, accuracy, diffuse, mi.Point3f(eye), vector(place - eye), points)
+    around = Surroundings(occluder, table, light, mi.Point3f(eye), vector(place - eye))
+    return reflection(points, around, diffuse, accuracy)
 
 
 def wall_blocks(place: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

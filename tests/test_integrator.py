@@ -26,9 +26,10 @@ from scipy.spatial.transform import Rotation
 
 from mi_refgs.constants import TILE_SIZES, tile_size
 from mi_refgs.reference.camera import look_at
-from mi_refgs.render.pipeline import Shading, render
+from mi_refgs.render.pipeline import render
 from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import CHANNELS, Surfels

@@ -11,7 +11,7 @@ import pytest
 from integrator_scenes import image, integrator, plane_mesh, raw_channels, scene
 from test_integrator_derivatives import check_derivatives
 
-from mi_refgs.shade.models import Accuracy
+from mi_refgs.shade.accuracy import Accuracy
 
 
 def test_properties_of_the_plugin(tmp_path: Path) -> None:

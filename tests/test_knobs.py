@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import drjit as dr
@@ -16,10 +16,12 @@ from test_models import N, points_of, scene
 from mi_refgs.errors import InputError
 from mi_refgs.reference import lobe as exact
 from mi_refgs.reference import shade as reference
-from mi_refgs.render.pipeline import Shading
 from mi_refgs.shade import brdf, lobe_matrices
+from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.models import Accuracy, multiple_scattering, reflect, shade
+from mi_refgs.shade.points import reflect
+from mi_refgs.shade.shading import Shading
+from mi_refgs.shade.split_sum import multiple_scattering, shade
 
 KNOBS = (Accuracy(dominant=True), Accuracy(multiscatter=True), Accuracy(dominant=True, multiscatter=True))
 CASES = [(knobs, "irradiance", "open") for knobs in KNOBS] + [(KNOBS[2], "sh", "indirect")]
@@ -94,7 +96,7 @@ def test_terms_against_the_oracle(
     levels, values = level_maps(light), scene(rng, occlusion)
     terms = shade(points_of(values), light, diffuse, knobs)
     expected = np.array([oracle(values, levels, diffuse, knobs, k) for k in range(N)])
-    for n, term in enumerate((terms.diffuse, terms.specular, terms.indirect)):
+    for n, term in enumerate(vars(terms.filled()).values()):
         got = np.broadcast_to(term.numpy().T, (N, 3))
         np.testing.assert_allclose(got, expected[:, n], rtol=2e-4, atol=5e-5)
 
@@ -113,7 +115,7 @@ def test_derivatives_of_the_points(
     terms = shade(points, light, diffuse, knobs)
     loss = sum(
         dr.dot(mi.Vector3f(term), vector(weight[:, n]))
-        for n, term in enumerate((terms.diffuse, terms.specular, terms.indirect))
+        for n, term in enumerate(vars(terms.filled()).values())
     )
     dr.backward(loss)
 
@@ -184,7 +186,7 @@ def test_degenerate_points_stay_finite(knobs: Accuracy, radiance: np.ndarray) ->
     dr.enable_grad(leaf)
     dr.set_grad(leaf, 1)
     total = shade(
-        replace(points, roughness=leaf), EnvironmentLight(raw).prefilter(), "irradiance", knobs
+        points.replaced(roughness=leaf), EnvironmentLight(raw).prefilter(), "irradiance", knobs
     ).total()
     assert dr.all(dr.isfinite(dr.forward_to(total)), axis=None)
 
@@ -286,7 +288,7 @@ def test_a_point_seen_from_behind_keeps_its_mirror_direction(radiance: np.ndarra
     values["normal"] = unit(rng.normal(size=(N, 3)))
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     points = points_of(values)
-    mirrored = shade(replace(points), light).specular.numpy()
+    mirrored = shade(points.replaced(), light).specular.numpy()
     np.testing.assert_allclose(
         shade(points, light, "sh", KNOBS[0]).specular.numpy(), mirrored, rtol=2e-4, atol=2e-4
     )

@@ -15,10 +15,12 @@ from helpers import unit, vector
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import lobe as exact
-from mi_refgs.render.reflection import reflection
 from mi_refgs.shade import brdf
+from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ggx_sampling import Lobe, lobe_point, lobe_turn
-from mi_refgs.shade.models import Accuracy, ShadingPoints
+from mi_refgs.shade.points import ShadingPoints
+from mi_refgs.shade.reflectance import Surroundings
+from mi_refgs.shade.reflection import reflection
 
 # ---------------- the points ----------------
 
@@ -141,11 +143,16 @@ def test_convex_shapes_are_free_and_one_ray_is_the_mirror_ray() -> None:
     eye = vector(normal + 2 * view)
     n = len(normal)
     points = ShadingPoints(
-        vector(normal), vector(view), mi.Color3f(0.5), mi.Float(1), dr.full(mi.Float, 0.4, n)
+        vector(normal),
+        vector(view),
+        albedo=mi.Color3f(0.5),
+        metallic=mi.Float(1),
+        roughness=dr.full(mi.Float, 0.4, n),
     )
     for rays in (1, 2, 8):
         accuracy = Accuracy(visibility_rays=rays)
-        free = reflection(occluder, None, None, accuracy, "irradiance", eye, vector(-2 * view), points)  # type: ignore[arg-type]
+        around = Surroundings(occluder, None, None, eye, vector(-2 * view))  # type: ignore[arg-type]
+        free = reflection(points, around, "irradiance", accuracy)
         assert dr.width(free.visibility) == n
         assert float(dr.mean(free.visibility)[0]) > 0.999 and float(dr.min(free.visibility)[0]) > 0.8
     place, points = floor_points(0.5)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -15,7 +14,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.reference import shade as reference
 from mi_refgs.shade import brdf, lobe_matrices
 from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.models import ShadingPoints, reflect, safe_normalize, shade
+from mi_refgs.shade.points import ShadingPoints, reflect, safe_normalize
+from mi_refgs.shade.split_sum import shade
 
 N = 50
 CASES = [(d, o) for d in ("sh", "irradiance") for o in ("open", "visibility", "indirect")]
@@ -70,7 +70,7 @@ def test_terms_against_the_oracle(
     levels, values = level_maps(light), scene(rng, occlusion)
     terms = shade(points_of(values), light, diffuse)
     expected = np.array([oracle(values, levels, diffuse, k) for k in range(N)])
-    for n, term in enumerate((terms.diffuse, terms.specular, terms.indirect)):
+    for n, term in enumerate(vars(terms.filled()).values()):
         np.testing.assert_allclose(np.broadcast_to(term.numpy(), (3, N)).T, expected[:, n], atol=2e-4)
     np.testing.assert_allclose(terms.total().numpy().T, expected.sum(1), atol=4e-4)
 
@@ -91,7 +91,7 @@ def test_derivatives_of_each_parameter(
     terms = shade(points, light, diffuse)
     loss = sum(
         dr.dot(mi.Vector3f(term), mi.Vector3f(weight[:, n].T.astype(np.float32)))
-        for n, term in enumerate((terms.diffuse, terms.specular, terms.indirect))
+        for n, term in enumerate(vars(terms.filled()).values())
     )
     dr.backward(loss)
 
@@ -161,7 +161,7 @@ def test_the_diffuse_base_gets_what_the_specular_layer_leaves(rng: np.random.Gen
     values = scene(rng, "visibility")
     values["albedo"], values["metallic"] = np.ones((N, 3)), np.zeros(N)
     points = points_of(values)
-    free = shade(replace(points, visibility=None), light, "irradiance")
+    free = shade(points.replaced(visibility=None), light, "irradiance")
     np.testing.assert_allclose(free.total().numpy(), 1, atol=1e-3)
     assert free.diffuse.numpy().min() < 0.955 < free.diffuse.numpy().max()
     np.testing.assert_array_equal(shade(points, light, "irradiance").diffuse.numpy(), free.diffuse.numpy())
@@ -172,11 +172,11 @@ def test_visibility_selects_between_light_and_indirect(
 ) -> None:
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     points = points_of(scene(rng, "indirect"))
-    free = shade(replace(points, visibility=None, indirect=None), light).specular.numpy()
-    visible = shade(replace(points, visibility=mi.Float(np.ones(N, np.float32))), light)
+    free = shade(points.replaced(visibility=None, indirect=None), light).specular.numpy()
+    visible = shade(points.replaced(visibility=mi.Float(np.ones(N, np.float32))), light)
     np.testing.assert_allclose(visible.specular.numpy(), free, rtol=1e-6)
     assert dr.all(visible.indirect == 0, axis=None)
-    hidden = shade(replace(points, visibility=mi.Float(np.zeros(N, np.float32))), light)
+    hidden = shade(points.replaced(visibility=mi.Float(np.zeros(N, np.float32))), light)
     assert dr.all(hidden.specular == 0, axis=None) and dr.all(hidden.indirect > 0, axis=None)
 
 
@@ -243,4 +243,4 @@ def test_bad_arguments(radiance: np.ndarray, rng: np.random.Generator) -> None:
     with pytest.raises(InputError, match="unknown"):
         shade(points, light, "lambert")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="missing"):
-        shade(replace(points, radiance=None), light)
+        shade(points.replaced(radiance=None), light)

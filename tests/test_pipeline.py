@@ -16,9 +16,10 @@ from mi_refgs.reference import shade as reference
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.reference.pinhole import rotation_matrix
-from mi_refgs.render.pipeline import Frame, Shading, render
+from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.shade import brdf, lobe_matrices
 from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 

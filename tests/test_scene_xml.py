@@ -15,12 +15,12 @@ from integrator_scenes import HEIGHT, WIDTH, image, plane_mesh, raw_channels, se
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.pipeline import Shading
-from mi_refgs.render.reflection import mirror_visibility
 from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.models import Accuracy
+from mi_refgs.shade.shading import Shading
+from mi_refgs.shade.visibility import mirror_visibility
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 

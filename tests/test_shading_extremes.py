@@ -10,8 +10,9 @@ import pytest
 from helpers import level_maps, unit
 from test_models import oracle, points_of
 
+from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.envmap import MIN_HEIGHT, EnvironmentLight
-from mi_refgs.shade.models import Accuracy, shade
+from mi_refgs.shade.split_sum import shade
 
 N = 24
 AXES = np.concatenate([np.eye(3), -np.eye(3)])

@@ -11,8 +11,9 @@ from integrator_scenes import image, raw_channels, scene
 
 from mi_refgs.errors import InputError
 from mi_refgs.methods.read import load
-from mi_refgs.render.pipeline import Shading, render
-from mi_refgs.shade.models import Accuracy
+from mi_refgs.render.pipeline import render
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import CHANNELS, Surfels
 
@@ -71,7 +72,10 @@ def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
     [
         ({"at": "surfel", "occlusion": True}, "occlusion: needs shade_at = pixel"),
         ({"reflectance": "radiance", "occlusion": True}, "occlusion: needs shade_at = pixel"),
-        ({"reflectance": "radiance", "accuracy": Accuracy(dominant=True)}, "dominant, multiscatter: need"),
+        (
+            {"reflectance": "radiance", "accuracy": Accuracy(dominant=True)},
+            "dominant: needs reflectance",
+        ),
         ({"accuracy": Accuracy(visibility_rays=4)}, "visibility_rays, traced_bounces: need occlusion"),
         ({"accuracy": {"traced_bounces": 1}}, "visibility_rays, traced_bounces: need occlusion"),
     ],

@@ -350,24 +350,18 @@ def test_equal_error_is_interpolated() -> None:
     assert speedup.error_times_samples(noisy) == pytest.approx(0.8)
 
 
-def test_other_levels_leave_nothing_behind() -> None:
-    """The product's levels are restored, even after an error, and no operator of the others stays cached."""
+def test_other_levels_are_filtered_beside_the_shipped_ones() -> None:
+    """A light with other levels has their texels and mixes by their roughness."""
     light = lights.make_light("gradient", 16).environment(16)
-    before = np.array(light.prefilter().levels)
-
-    def use(fail: bool) -> None:
-        with methods.level_set("few") as count:
-            assert count == 4
-            assert len(np.array(light.prefilter().levels)) < len(before)
-            if fail:
-                raise KeyError
-
-    shipped = lobe_matrices.LEVEL_ROUGHNESS
-    use(False)
-    with pytest.raises(KeyError):
-        use(True)
-    assert lobe_matrices.LEVEL_ROUGHNESS == shipped
-    np.testing.assert_array_equal(np.array(light.prefilter().levels), before)
+    shipped, few = light.prefilter(), light.prefilter(methods.LEVEL_SETS["few"])
+    assert len(few.operator.shapes) == 4
+    assert len(np.array(few.levels)) < len(np.array(shipped.levels))
+    direction = mi.Vector3f(0.6, 0.0, 0.8)
+    for roughness in (0.1, 0.32, 1.0):
+        a, b = (x.specular(direction, mi.Float(roughness)).numpy() for x in (few, shipped))
+        np.testing.assert_allclose(a, b, rtol=1e-5)
+    a, b = (x.specular(direction, mi.Float(0.6)).numpy() for x in (few, shipped))
+    assert not np.allclose(a, b, rtol=1e-4)
 
 
 def test_a_missing_light_is_one_sentence(tmp_path: Path) -> None:

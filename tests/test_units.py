@@ -25,8 +25,9 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.depth_normals import normals_from_depth
-from mi_refgs.render.pipeline import Frame, Shading, render
+from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import splat
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.init import neighbour_scale

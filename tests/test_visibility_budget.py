@@ -20,7 +20,7 @@ from benchmarks.visibility.rules import PAPER, Rule
 from benchmarks.visibility.scenes import Concave, make_scene
 from benchmarks.visibility.settings import SMALL
 from benchmarks.visibility.stage import Stage
-from mi_refgs.shade.models import reflect
+from mi_refgs.shade.points import reflect
 from mi_refgs.shade.sh import sh_basis
 
 TINY = replace(SMALL, size=16, lattice=233, limit=128)

@@ -12,7 +12,7 @@ from benchmarks.common.budget import Step, noise_floor, take_apart
 from benchmarks.splitsum import methods
 from benchmarks.splitsum.exact import Stage, diffuse, reflectance
 from benchmarks.splitsum.settings import CONVEX
-from mi_refgs.shade.models import reflect
+from mi_refgs.shade.points import reflect
 
 TABLE = "table lookup"
 IRRADIANCE = "irradiance lookup"

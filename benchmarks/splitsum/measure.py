@@ -20,6 +20,7 @@ from benchmarks.splitsum import decompose, methods, surfels
 from benchmarks.splitsum.exact import Stage
 from benchmarks.splitsum.settings import Settings
 from benchmarks.splitsum.speedup import line, speed_ups
+from mi_refgs.shade.lobe_matrices import Levels
 
 ALL = "all"
 LEVELS_HEIGHT = 128
@@ -92,13 +93,12 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
             _sampled(run, stage, roughness, metallic)
     for levels in (methods.SHIPPED, *settings.level_sets):
         variants = [variant for variant in _variants(settings) if variant.levels == levels]
-        with methods.level_set(levels):
-            filtered = _prefilter(run, lights, variants)
-            for stage in tqdm(stages, desc=f"split sum, times ({levels})", disable=quiet):
-                calls = _split_sums(run, stage, variants, filtered, materials)
-                if levels == methods.SHIPPED:
-                    calls |= _sampled_calls(run, stage)
-                run.time(stage, calls)
+        filtered = _prefilter(run, lights, variants)
+        for stage in tqdm(stages, desc=f"split sum, times ({levels})", disable=quiet):
+            calls = _split_sums(run, stage, variants, filtered, materials)
+            if levels == methods.SHIPPED:
+                calls |= _sampled_calls(run, stage)
+            run.time(stage, calls)
     shared = {(stage.name, stage.light.name): stage for stage in stages}
     for name in tqdm(settings.budget_shapes, desc="error budget", disable=quiet):
         for light in lights:
@@ -198,12 +198,13 @@ def _prefilter(run: Run, lights: list[Light], variants: list[Variant]) -> dict[t
     """Every light at every height, by (light, height), with one set of levels; books the time it takes."""
     filtered, calls = {}, {}
     for variant in (variant for variant in variants if not variant.knob):
+        levels = methods.LEVEL_SETS[variant.levels]
         environments = {light.name: light.environment(variant.height) for light in lights}
         for name, environment in environments.items():
-            filtered[name, variant.height] = environment.prefilter()
+            filtered[name, variant.height] = environment.prefilter(levels)
 
-        def again(environment: Any = environments[lights[0].name]) -> Any:
-            return environment.prefilter().levels
+        def again(environment: Any = environments[lights[0].name], levels: Levels = levels) -> Any:
+            return environment.prefilter(levels).levels
 
         calls[variant.method, variant.height] = again
     dr.eval([light.levels for light in filtered.values()])

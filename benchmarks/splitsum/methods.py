@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -14,42 +13,26 @@ from benchmarks.common import montecarlo as mc
 from benchmarks.common.view import Points, first_hits
 from benchmarks.splitsum.exact import Stage
 from benchmarks.splitsum.settings import ALBEDO
-from mi_refgs.shade import lobe_matrices, prefilter
-from mi_refgs.shade.models import Accuracy, ShadingPoints, shade
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.lobe_matrices import LEVELS, Levels
+from mi_refgs.shade.points import ShadingPoints
+from mi_refgs.shade.split_sum import shade
 
 SHIPPED = "shipped"
-LEVEL_SETS: dict[str, tuple[float, ...]] = {
-    "few": (0.1, 0.32, 1.0),
-    SHIPPED: lobe_matrices.LEVEL_ROUGHNESS,
-    "many": (0.07, 0.1, 0.12, 0.15, 0.18, 0.22, 0.265, 0.32, 0.38, 0.45, 0.54, 0.65, 0.8, 1.0),
+
+
+def _levels(*roughness: float) -> Levels:
+    """Levels of these, each as fine as the shipped one of the next larger roughness."""
+    finer = (int(np.searchsorted(LEVELS.roughness, r - 1e-6)) for r in roughness)
+    return Levels(roughness, tuple(LEVELS.max_height[i] for i in finer))
+
+
+LEVEL_SETS = {
+    "few": _levels(0.1, 0.32, 1.0),
+    SHIPPED: LEVELS,
+    "many": _levels(0.07, 0.1, 0.12, 0.15, 0.18, 0.22, 0.265, 0.32, 0.38, 0.45, 0.54, 0.65, 0.8, 1.0),
 }
-"""Roughness of the filtered levels; the map itself is one more."""
-
-
-@contextmanager
-def level_set(name: str) -> Iterator[int]:
-    """Prefilter with other levels inside this context, which yields how many there are.
-
-    A light must be looked up in the context that it was filtered in.
-    """
-    shipped = lobe_matrices.LEVEL_ROUGHNESS, lobe_matrices.LEVEL_MAX_HEIGHT
-    caches = (prefilter._host_levels, prefilter._prepare)
-    if name == SHIPPED:
-        yield len(shipped[0]) + 1
-        return
-    roughness = LEVEL_SETS[name]
-    heights = tuple(shipped[1][int(np.searchsorted(shipped[0], r - 1e-6))] for r in roughness)
-    try:
-        for cache in caches:
-            cache.cache_clear()
-        # The levels are constants of the product; only this experiment replaces them.
-        vars(lobe_matrices).update(LEVEL_ROUGHNESS=roughness, LEVEL_MAX_HEIGHT=heights)
-        yield len(roughness) + 1
-    finally:
-        vars(lobe_matrices).update(LEVEL_ROUGHNESS=shipped[0], LEVEL_MAX_HEIGHT=shipped[1])
-        for cache in caches:
-            cache.cache_clear()
-
+"""Filtered levels; the map itself is one more."""
 
 KNOBS = {"": Accuracy(), "dominant": Accuracy(dominant=True), "multiscatter": Accuracy(multiscatter=True)}
 """Settings of `shade` that concern a surface that nothing shadows."""
@@ -58,7 +41,11 @@ KNOBS = {"": Accuracy(), "dominant": Accuracy(dominant=True), "multiscatter": Ac
 def split_sum(points: Any, material: mc.Material, light: Any, knob: str = "") -> Any:
     """Outgoing radiance as the product shades it."""
     surface = ShadingPoints(
-        points.normal, points.view, material.albedo, material.metallic, material.roughness
+        points.normal,
+        points.view,
+        albedo=material.albedo,
+        metallic=material.metallic,
+        roughness=material.roughness,
     )
     return shade(surface, light, "irradiance", KNOBS[knob]).total()
 

@@ -19,7 +19,8 @@ from benchmarks.splitsum import methods
 from benchmarks.splitsum.exact import Stage
 from benchmarks.splitsum.settings import ALBEDO
 from mi_refgs.constants import COVERAGE_FLOOR
-from mi_refgs.render.pipeline import Shading, render
+from mi_refgs.render.pipeline import render
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels.channels import logit
 from mi_refgs.surfels.init import from_points

@@ -18,9 +18,10 @@ from mi_refgs.reference import occlusion as trace
 from mi_refgs.reference import picture as oracle
 from mi_refgs.reference import surfel
 from mi_refgs.render.depth_normals import normals_from_depth
-from mi_refgs.render.pipeline import Shading, render
+from mi_refgs.render.pipeline import render
 from mi_refgs.shade import brdf, lobe_matrices
 from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera, list_by_tile, project
 from mi_refgs.surfels.table import Surfels
 

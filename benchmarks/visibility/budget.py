@@ -30,7 +30,7 @@ from benchmarks.visibility.rules import PAPER, Rule
 from benchmarks.visibility.settings import Settings
 from benchmarks.visibility.stage import Stage
 from mi_refgs.shade.brdf import split_sum
-from mi_refgs.shade.models import reflect
+from mi_refgs.shade.points import reflect
 
 MIRROR = "mirror-ray visibility"
 DIRECTION = "one direction of indirect light"

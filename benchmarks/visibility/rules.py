@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from benchmarks.visibility.settings import Settings
-from mi_refgs.shade.models import Accuracy
+from mi_refgs.shade.accuracy import Accuracy
 
 
 @dataclass(frozen=True)

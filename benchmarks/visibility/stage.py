@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -18,9 +17,12 @@ from benchmarks.visibility.scenes import Concave
 from benchmarks.visibility.settings import ALBEDO, METALLIC, VOXEL, Settings
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.pipeline import Shading, render
-from mi_refgs.render.reflection import reflection
-from mi_refgs.shade.models import ShadingPoints, shade
+from mi_refgs.render.pipeline import render
+from mi_refgs.shade.points import ShadingPoints
+from mi_refgs.shade.reflectance import Surroundings
+from mi_refgs.shade.reflection import reflection
+from mi_refgs.shade.shading import Shading
+from mi_refgs.shade.split_sum import shade
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.channels import logit
 from mi_refgs.surfels.init import from_points
@@ -78,19 +80,13 @@ class Stage:
         """The points with what the rule finds."""
         albedo = mi.Color3f(*(dr.opaque(mi.Float, float(x)) for x in self.albedo))
         metallic = dr.opaque(mi.Float, METALLIC)
-        at = ShadingPoints(points.normal, points.view, albedo, metallic, self.roughness)
+        at = ShadingPoints(
+            points.normal, points.view, albedo=albedo, metallic=metallic, roughness=self.roughness
+        )
         if not rule.rays:
             return at
-        return reflection(
-            self.occluder,
-            self.surfels,
-            self.light,
-            rule.accuracy(),
-            "irradiance",
-            self.origin,
-            -points.view,
-            at,
-        )
+        around = Surroundings(self.occluder, self.surfels, self.light, self.origin, -points.view)
+        return reflection(at, around, "irradiance", rule.accuracy())
 
     def shaded(self, points: Points, rule: Rule) -> Any:
         """Outgoing radiance (mi.Color3f)."""
@@ -100,7 +96,7 @@ class Stage:
         """(P, 3); with indirect light (P, 3) of blocked rays in place of the rule's own."""
         at = self.seen(self.points, rule)
         if indirect is not None:
-            at = replace(at, indirect=mi.Color3f(np.ascontiguousarray(indirect.T, np.float32)))
+            at = at.replaced(indirect=mi.Color3f(np.ascontiguousarray(indirect.T, np.float32)))
         shaded = shade(at, self.light, "irradiance", rule.accuracy())
         return np.array(shaded.total(), np.float64).T
 

@@ -27,11 +27,12 @@ from mi_refgs.methods.method import LightOptions, Method, Stage
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.pipeline import Frame, Shading, render, render_depth
+from mi_refgs.render.pipeline import Frame, render, render_depth
 from mi_refgs.runs.checkpoint import LIGHT, OPTIMISER, PARAMS, part, tensors
 from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.timing import phase
@@ -95,12 +96,12 @@ class Trainer:
     def view(self, camera: Camera, aovs: bool = True) -> Frame:
         """Render a view of the present state, without derivatives."""
         with dr.suspend_grad():
-            light = self.light.prefilter() if self.light is not None else None
+            shading = self.shading()
             return render(
                 self.surfels,
                 camera,
-                self.shading(),
-                light,
+                shading,
+                shading.light_of(self.light),
                 self.occluder,
                 sh_degree=self.schedule.sh_degree(self.iteration),
                 aovs=aovs,
@@ -215,12 +216,11 @@ class Trainer:
         shift = mi.Point2f(dr.opaque(mi.Float, 0, surfels.count), dr.opaque(mi.Float, 0, surfels.count))
         dr.enable_grad(shift)
         shading = self._shading(stage)
-        uses_light = shading.reflectance == "split_sum" and self.light is not None
         frame = render(
             surfels,
             camera,
             shading,
-            self.light.prefilter() if uses_light and self.light is not None else None,
+            shading.light_of(self.light),
             self.occluder,
             sh_degree=self.schedule.sh_degree(iteration),
             shift=shift,

@@ -77,7 +77,7 @@ class Stage:
 
     until: int
     at: Literal["surfel", "pixel"] = "pixel"
-    reflectance: Literal["radiance", "split_sum"] = "split_sum"
+    reflectance: str = "split_sum"  # a model of `shade.reflectance`
     diffuse: Literal["sh", "irradiance"] = "sh"
     restart: tuple[str, ...] = ()  # channels, and `light`, that start anew when the stage begins
 

@@ -17,8 +17,8 @@ from mi_refgs.files import is_file
 from mi_refgs.methods.build import build, plain
 from mi_refgs.methods.method import LIGHT, PRESETS, Method
 from mi_refgs.methods.window import Window
-from mi_refgs.render.pipeline import Shading
 from mi_refgs.resources import resource_dir
+from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.channels import CHANNELS
 
 MAX_TEXT, MAX_LINE = 2**16, 2000

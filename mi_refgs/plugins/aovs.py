@@ -13,34 +13,36 @@ import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR, NORM_FLOOR
 from mi_refgs.errors import InputError
-from mi_refgs.render.pipeline import MATERIALS, Frame
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.channels import CHANNELS
 
 # Suffixes as Mitsuba's own `aov` integrator gives them; `Bitmap.split` makes a greyscale layer of a lone Y.
-SUFFIXES = {
-    "albedo": "RGB",
-    "metallic": "Y",
-    "roughness": "Y",
+_SUFFIXES = {
     "normal": "XYZ",
     "depth": "T",
     "alpha": "Y",
     "visibility": "Y",
-    "diffuse": "RGB",
-    "specular": "RGB",
-    "indirect": "RGB",
+    **dict.fromkeys(TERMS, "RGB"),
 }
+
+
+def suffixes() -> dict[str, str]:
+    """Suffixes of the channels of every type: of what surfels may have, of geometry, and of terms."""
+    return {name: channel.aov for name, channel in CHANNELS.items() if channel.aov} | _SUFFIXES
 
 
 @dataclass(frozen=True)
 class AOV:
-    """One requested variable: its layer name in the image, and one of SUFFIXES."""
+    """One requested variable: its layer name in the image, and one of `suffixes`."""
 
     name: str
     type: str
 
     def channels(self) -> list[str]:
         """Channel names, such as `n.X`, `n.Y`, `n.Z`."""
-        return [f"{self.name}.{suffix}" for suffix in SUFFIXES[self.type]]
+        return [f"{self.name}.{suffix}" for suffix in suffixes()[self.type]]
 
 
 def parse_aovs(text: str) -> list[AOV]:
@@ -55,8 +57,8 @@ def parse_aovs(text: str) -> list[AOV]:
             raise InputError(
                 f"refgs: aovs: '{pair}' is not a <name>:<type> pair; write for example 'nn:normal'"
             )
-        if kind not in SUFFIXES:
-            raise InputError(f"refgs: aovs: unknown type '{kind}'; use one of {', '.join(SUFFIXES)}")
+        if kind not in suffixes():
+            raise InputError(f"refgs: aovs: unknown type '{kind}'; use one of {', '.join(suffixes())}")
         if any(name == other.name for other in aovs):
             raise InputError(f"refgs: aovs: the name '{name}' occurs twice; rename one of them")
         aovs.append(AOV(name, kind))
@@ -71,9 +73,9 @@ def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Any]:
     to the image over black.
     """
     seen = frame.alpha > COVERAGE_FLOOR
-    if kind in MATERIALS:
+    if kind in CHANNELS:
         value = frame.maps[kind]
-        return [*value] if kind == "albedo" else [value]
+        return [*value] if len(CHANNELS[kind].aov) > 1 else [value]
     if kind == "normal":
         length2 = dr.squared_norm(frame.normal)
         valid = seen & (length2 > NORM_FLOOR)

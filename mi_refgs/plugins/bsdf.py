@@ -16,7 +16,7 @@ import mitsuba as mi
 from mi_refgs.errors import InputError
 from mi_refgs.plugins import require_supported_variant
 from mi_refgs.shade.brdf import device_table, split_sum
-from mi_refgs.shade.models import DIELECTRIC_F0
+from mi_refgs.shade.split_sum import DIELECTRIC_F0
 
 ROUGHNESS_FLOOR = 0.01
 """Smaller roughness counts as this one: α = 1e-4 is the smallest that Mitsuba's microfacet distribution

@@ -17,9 +17,8 @@ from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.plugins import require_supported_variant
 from mi_refgs.plugins.aovs import aov_values
-from mi_refgs.plugins.light import RotatedLight, emitter_light
+from mi_refgs.plugins.light import emitter_light, rotated
 from mi_refgs.plugins.properties import (
-    TERMS,
     read_aovs,
     read_background,
     read_light,
@@ -28,8 +27,10 @@ from mi_refgs.plugins.properties import (
     read_terms,
 )
 from mi_refgs.primitives import primitive_of, widths_of
-from mi_refgs.render.pipeline import MATERIALS, Frame, render
+from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.channels import CHANNELS
 from mi_refgs.surfels.table import Surfels
 
 CHECK_SECONDS = 1.0
@@ -172,7 +173,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         Surfels(self.surfels.raw)  # checks shapes; values are checked where a file is read
         primitive_of(widths_of(self.surfels.raw))
         self.shading.check(self.surfels.raw)
-        for name in (aov.type for aov in self.aovs if aov.type in MATERIALS):
+        for name in (aov.type for aov in self.aovs if aov.type in CHANNELS):
             if not self.surfels.has(name):
                 raise InputError(f"refgs: {name}: the surfels have no such channel; add it, or do without it")
         if self.light is not None:
@@ -291,24 +292,30 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         return channels
 
     def _frame(self, scene: Any, camera: Camera) -> Frame:
-        light = None
-        if self.shading.reflectance == "split_sum":
-            light = self._prefiltered(scene)
-        aovs = len(self.terms) < len(TERMS) or any(aov.type in (*MATERIALS, *TERMS) for aov in self.aovs)
+        aovs = len(self.terms) < len(TERMS) or any(aov.type in (*CHANNELS, *TERMS) for aov in self.aovs)
         return render(
-            Surfels(self.surfels.raw, screened=True), camera, self.shading, light, self.occluder, aovs=aovs
+            Surfels(self.surfels.raw, screened=True),
+            camera,
+            self.shading,
+            self._light(scene),
+            self.occluder,
+            aovs=aovs,
         )
 
-    def _prefiltered(self, scene: Any) -> Any:
-        if self.light is None:
-            emitter = scene.environment()
-            if emitter is None:
-                raise InputError(
-                    "refgs: light: there is none; nest an `envmap` in the integrator, or in the scene"
-                )
-            return emitter_light(emitter)
-        light = self.light.prefilter()
-        return light if self.light_rotation is None else RotatedLight(light, self.light_rotation)
+    def _light(self, scene: Any) -> Any:
+        """The integrator's own light, else the scene's, as the model looks it up."""
+        wanted = self.shading.model.light
+        if wanted == "none":
+            return None
+        own = self.shading.light_of(self.light)
+        if own is not None:
+            return rotated(own, self.light_rotation)
+        emitter = scene.environment()
+        if emitter is None:
+            raise InputError(
+                "refgs: light: there is none; nest an `envmap` in the integrator, or in the scene"
+            )
+        return emitter_light(emitter, wanted == "filtered")
 
     def to_string(self) -> str:
         size = "x".join(str(x) for x in self.light.raw.shape[:2]) if self.light is not None else "the scene's"

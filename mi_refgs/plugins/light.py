@@ -5,7 +5,6 @@ No Mitsuba class is defined here, so that this module need not be reloaded when 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -13,30 +12,21 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.shade.envmap import DEFAULT_HEIGHT, MIN_HEIGHT, EnvironmentLight, PrefilteredLight, bounded
+from mi_refgs.shade.envmap import (
+    DEFAULT_HEIGHT,
+    MIN_HEIGHT,
+    EnvironmentLight,
+    PrefilteredLight,
+    UnfilteredLight,
+    bounded,
+)
+from mi_refgs.shade.light import ConstantLight, Light, RotatedLight
 from mi_refgs.shade.lobe_matrices import resample
 from mi_refgs.shade.prefilter import prefilter
 
 MAX_HEIGHT = 512
 """Rows above which an emitter's map is averaged down: at 512 filtering costs 45 ms a render on two cores,
 and it grows with the square of the rows. [measured]"""
-
-
-@dataclass(frozen=True)
-class RotatedLight:
-    """A prefiltered light seen through a rotation or in a mirror; the same lookups as `PrefilteredLight`."""
-
-    light: Any
-    light_from_world: Any  # mi.Matrix3f, detached
-
-    def specular(self, direction: Any, roughness: Any) -> Any:
-        return self.light.specular(self.light_from_world @ mi.Vector3f(direction), roughness)
-
-    def irradiance(self, normal: Any) -> Any:
-        return self.light.irradiance(self.light_from_world @ mi.Vector3f(normal))
-
-    def mirror(self, direction: Any) -> Any:
-        return self.light.mirror(self.light_from_world @ mi.Vector3f(direction))
 
 
 def own_light(emitter: Any) -> tuple[Any, Any]:
@@ -52,8 +42,8 @@ def own_light(emitter: Any) -> tuple[Any, Any]:
     return EnvironmentLight.from_radiance(np.tile(colour, (DEFAULT_HEIGHT, 2 * DEFAULT_HEIGHT, 1))), None
 
 
-def emitter_light(emitter: Any) -> Any:
-    """The prefiltered light of an emitter of the scene, under AD.
+def emitter_light(emitter: Any, filtered: bool = True) -> Light:
+    """The light of an emitter of the scene, under AD; not `filtered`, it has the lookup `radiance` alone.
 
     Gradients flow to its `data` and `scale`, or `radiance.value`. A map that must be resampled (see
     `_map_radiance`) can receive none: asking for it raises InputError, as does any emitter but `envmap` and
@@ -61,17 +51,22 @@ def emitter_light(emitter: Any) -> Any:
     """
     params = mi.traverse(emitter)
     if "data" not in params:
-        shape = (MIN_HEIGHT, 2 * MIN_HEIGHT, 3)
-        colour = _constant_radiance(params, emitter) + dr.zeros(mi.Float, shape[0] * shape[1])
-        return PrefilteredLight(*prefilter(mi.TensorXf(dr.ravel(colour), shape)))
+        return ConstantLight(_constant_radiance(params, emitter))
     radiance, resampled = _map_radiance(params, emitter)
     if resampled and dr.grad_enabled(params["data"]):
         raise InputError(
             f"emitter '{emitter.id()}': data: a map of {resampled} cannot be differentiated; "
             f"use one of h x 2h, h a multiple of 4 from {MIN_HEIGHT} to {MAX_HEIGHT}"
         )
-    light, matrix = PrefilteredLight(*prefilter(radiance)), _light_from_world(params)
-    return light if matrix is None else RotatedLight(light, matrix)
+    light: Light = UnfilteredLight(radiance.shape[0], radiance.array)
+    if filtered:
+        light = PrefilteredLight(*prefilter(radiance))
+    return rotated(light, _light_from_world(params))
+
+
+def rotated(light: Light, light_from_world: Any) -> Light:
+    """The light through a rotation, as `own_light` gives it; None turns nothing."""
+    return light if light_from_world is None else RotatedLight(light, light_from_world)
 
 
 def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:

@@ -5,7 +5,7 @@ No Mitsuba class is defined here, so that this module need not be reloaded when 
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import mitsuba as mi
@@ -15,14 +15,14 @@ from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.plugins.aovs import AOV, parse_aovs
 from mi_refgs.plugins.light import own_light
-from mi_refgs.render.pipeline import MATERIALS, Shading
+from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.models import Accuracy
+from mi_refgs.shade.points import TERMS
+from mi_refgs.shade.reflectance import MODELS
+from mi_refgs.shade.shading import DIFFUSE, Shading
 from mi_refgs.surfels.channels import CHANNELS
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
-
-TERMS = ("diffuse", "specular", "indirect")
 
 
 def _get(props: Any, name: str, default: Any) -> Any:
@@ -113,16 +113,14 @@ def read_light(props: Any) -> tuple[Any, Any]:
 
 def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None]:
     """How to shade, by defaults that fit the channels; and the occluder if that traces visibility."""
-    materials = all(surfels.has(name) for name in MATERIALS)
-    default = "split_sum" if materials else "radiance"
-    reflectance = _choice(props, "reflectance", default, ("split_sum", "radiance"))
-    default = "sh" if surfels.has("radiance_sh") or reflectance == "radiance" else "irradiance"
-    diffuse = _choice(props, "diffuse", default, ("sh", "irradiance"))
-    at: Any = _choice(props, "shade_at", "pixel", ("pixel", "surfel"))
+    default = Shading.default_reflectance(surfels.raw)
+    reflectance = _choice(props, "reflectance", default, tuple(MODELS))
+    diffuse = _choice(props, "diffuse", Shading.default_diffuse(reflectance, surfels.raw), DIFFUSE)
+    at: Any = _choice(props, "shade_at", MODELS[reflectance].orders[0], ("pixel", "surfel"))
     mesh = _path(props, "mesh")
-    deferred = at == "pixel" and reflectance == "split_sum"
-    occlusion = _flag(props, "occlusion", mesh is not None and deferred)
-    shading = Shading(at, reflectance, diffuse, occlusion, _accuracy(props))
+    shading = Shading(at, reflectance, diffuse)
+    occlusion = _flag(props, "occlusion", mesh is not None and shading.traceable)
+    shading = replace(shading, occlusion=occlusion, accuracy=_accuracy(props))
     shading.check(surfels.raw, mesh=mesh is not None)
     if not (occlusion and mesh):
         return shading, None
@@ -133,12 +131,12 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
 
 
 def _accuracy(props: Any) -> Accuracy:
-    """The knobs that buy accuracy, of which `Accuracy` refuses what is no bool or no number."""
-    return Accuracy(**{knob.name: _get(props, knob.name, knob.default) for knob in fields(Accuracy)})
+    """The options that buy accuracy; `Accuracy` refuses what is no bool or no number."""
+    return Accuracy(**{option.name: _get(props, option.name, option.default) for option in fields(Accuracy)})
 
 
 def read_terms(props: Any) -> list[str]:
-    """The terms that the image sums, by their names in `shade.models.Terms`."""
+    """The terms that the image sums, by name."""
     text = str(_get(props, "terms", ",".join(TERMS)))
     names = [name.strip() for name in text.split(",") if name.strip()]
     for name in names:

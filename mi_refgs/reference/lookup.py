@@ -42,7 +42,7 @@ def shade(
     diffuse: str,
     taps: list[tuple[Array, Array, Array]],
 ) -> Array:
-    """Radiance (n, 3) of points; `materials` (n, 5) are albedo, metallic, roughness. As `shade.models`."""
+    """Radiance (n, 3) of points; `materials` (n, 5) are albedo, metallic, roughness. As `shade.split_sum`."""
     n, v = unit(normal), unit(view)
     albedo, metallic, roughness = materials[:, :3], materials[:, 3:4], materials[:, 4]
     n_v = np.sum(n * v, 1)

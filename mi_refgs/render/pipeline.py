@@ -10,90 +10,24 @@ camera.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args, get_type_hints
+from dataclasses import dataclass, field
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR, FACING_TOLERANCE
-from mi_refgs.errors import InputError, shown
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.primitives import primitive_of, widths_of
-from mi_refgs.render.reflection import reflection
-from mi_refgs.shade.models import Accuracy, ShadingPoints, Terms, reflect, safe_normalize, shade
-from mi_refgs.shade.sh import clamp_positive, eval_sh
-from mi_refgs.splat import Blended, Camera, splat
+from mi_refgs.render.gbuffer import GBuffer, inverse_alpha
+from mi_refgs.shade.light import Light
+from mi_refgs.shade.points import ShadingPoints, Terms, safe_normalize
+from mi_refgs.shade.reflectance import SurfelView, Surroundings
+from mi_refgs.shade.shading import Shading, shade
+from mi_refgs.splat import Camera, splat
+from mi_refgs.surfels.channels import channel
 from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
-from mi_refgs.timing import boundary, phase
-
-MATERIALS = ("albedo", "metallic", "roughness")
-"""Channels of what is shaded by a light."""
-
-
-_shade = phase("shade forward")(shade)
-
-
-@dataclass(frozen=True)
-class Shading:
-    """How a method turns surfels into radiance: data, chosen per stage. The one place of its rules.
-
-    Radiance is blended linearly, so that the two orders are one for reflectance "radiance"; `at` is then
-    "surfel", which blends less. Raises InputError for what is not allowed together.
-    """
-
-    at: Literal["surfel", "pixel"] = "pixel"  # shade before or after blending
-    reflectance: Literal["radiance", "split_sum"] = "split_sum"  # SH colour alone, or diffuse + GGX specular
-    diffuse: Literal["sh", "irradiance"] = "sh"  # view-dependent SH colour, or of albedo and light
-    occlusion: bool = False  # trace visibility along the mirror direction, and fill with the indirect channel
-    accuracy: Accuracy = field(default_factory=Accuracy)  # what to pay for less error; rays need occlusion
-
-    def __post_init__(self) -> None:
-        """Raise InputError, or TypeError for an unknown key of `accuracy`, for what JSON may hold."""
-        if isinstance(self.accuracy, Mapping):  # as JSON keeps it
-            object.__setattr__(self, "accuracy", Accuracy(**self.accuracy))
-        for name, kind in get_type_hints(Shading).items():
-            value, allowed = getattr(self, name), get_args(kind)
-            if not (value in allowed if allowed else isinstance(value, kind)):
-                raise InputError(f"shading: {name}: {shown(value)} is not allowed; correct it")
-        if self.reflectance == "radiance":
-            object.__setattr__(self, "at", "surfel")
-        accuracy = self.accuracy
-        if self.occlusion and self.at != "pixel":
-            raise InputError(
-                "shading: occlusion: needs shade_at = pixel and reflectance = split_sum; set these"
-            )
-        if (accuracy.dominant or accuracy.multiscatter) and self.reflectance != "split_sum":
-            raise InputError("shading: dominant, multiscatter: need reflectance = split_sum; set it")
-        if (accuracy.visibility_rays > 1 or accuracy.traced_bounces) and not self.occlusion:
-            raise InputError("shading: visibility_rays, traced_bounces: need occlusion; trace a `mesh`")
-
-    @staticmethod
-    def of(stage: Any, mesh: bool) -> Shading:
-        """The shading of a stage (`at`, `reflectance`, `diffuse`); occluded if pixels are shaded and a `mesh`
-        is there."""
-        shading = Shading(stage.at, stage.reflectance, stage.diffuse)
-        return replace(shading, occlusion=mesh and shading.at == "pixel")
-
-    def check(self, channels: Collection[str], light: bool = True, mesh: bool = True) -> None:
-        """Raise InputError if surfels with these channels, and what is there beside them, lack something."""
-        needed: list[str] = []
-        if self.reflectance == "split_sum":
-            needed += MATERIALS
-        if self.reflectance == "radiance" or self.diffuse == "sh":
-            needed += ["radiance_sh"]
-        for name in needed:
-            if name not in channels:
-                raise InputError(
-                    f"shading: {name}: the surfels have no such channel; add it, or do without it"
-                )
-        if self.reflectance == "split_sum" and not light:
-            raise InputError(
-                "shading: light: reflectance = split_sum needs one; add it, or set reflectance = radiance"
-            )
-        if self.occlusion and not mesh:
-            raise InputError("shading: occlusion: there is no mesh to trace; give one, or trace nothing")
+from mi_refgs.timing import boundary
 
 
 @dataclass(frozen=True)
@@ -109,14 +43,14 @@ class Frame:
     normal: Any  # mi.Vector3f: blended world normal towards the camera, not normalised
     radiance: Any  # mi.Color3f, over black
     terms: Terms | None = None  # diffuse, specular, indirect, whose sum it is, where known apart
-    maps: dict[str, Any] = field(default_factory=dict)  # albedo, metallic, roughness, visibility where known
+    maps: dict[str, Any] = field(default_factory=dict)  # by channel (such as albedo), visibility, where known
 
 
 def render(
     surfels: Surfels,
     camera: Camera,
     shading: Shading,
-    light: Any = None,
+    light: Light | None = None,
     occluder: Occluder | None = None,
     sh_degree: int | None = None,
     shift: Any = None,
@@ -124,10 +58,9 @@ def render(
 ) -> Frame:
     """Render a view.
 
-    `light` is a `shade.PrefilteredLight`, needed unless `shading.reflectance` is "radiance". `sh_degree`
-    limits the degree of the radiance channel, for coarse-to-fine schedules. `aovs` asks for albedo, metallic,
-    roughness and the terms of the radiance even where the picture does not need them per pixel.
-    `shift`: see `splat.project`.
+    `light` is what `Shading.light_of` gives, needed unless the model asks for none. `sh_degree` limits the
+    degree of the radiance channel, for coarse-to-fine schedules. `aovs` asks for the materials and the terms
+    of the radiance even where the picture does not need them per pixel. `shift`: see `splat.project`.
     `shading.accuracy.traced_bounces` needs an occluder whose `set_materials` has seen these surfels.
     Raises InputError for what `shading.check` refuses.
     """
@@ -135,17 +68,17 @@ def render(
     shading.check(surfels.raw, light is not None, occluder is not None)
     if surfels.count == 0:
         surfels, shift = _nothing(surfels), None
-    if shading.at == "surfel":
-        frame = _shade_at_surfels(surfels, camera, shading, light, sh_degree, shift, aovs)
-    else:
-        frame = _shade_at_pixels(surfels, camera, shading, light, occluder, sh_degree, shift)
+    seen = _seen(surfels, camera, sh_degree)
+    attributes = shading.model.attributes(surfels, seen, shading)
+    scene = _Scene(surfels, camera, shading, light, occluder, seen, attributes, shift)
+    frame = _shade_at_surfels(scene, aovs) if shading.at == "surfel" else _shade_at_pixels(scene, aovs)
     return boundary(frame, "shade backward")
 
 
 def render_depth(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
     """Expected camera-z depth (0 where nothing is seen) and alpha of a view, and nothing else."""
     blended = splat(surfels, [], camera)
-    return blended.depth * _inverse_alpha(blended), blended.alpha
+    return blended.depth * inverse_alpha(blended), blended.alpha
 
 
 def _nothing(surfels: Surfels) -> Surfels:
@@ -156,10 +89,38 @@ def _nothing(surfels: Surfels) -> Surfels:
     )
 
 
-# ---------------- attributes of surfels ----------------
+# ---------------- the two orders ----------------
 
 
-def _facing(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
+@dataclass(frozen=True)
+class _Scene:
+    """What both orders start from."""
+
+    surfels: Surfels
+    camera: Camera
+    shading: Shading
+    light: Any
+    occluder: Any
+    seen: SurfelView
+    attributes: dict[str, Any]  # of the model, by name
+    shift: Any
+
+    @property
+    def normal(self) -> Any:
+        """The model's own normals (mi.Vector3f), or the surfels'."""
+        return self.attributes.get("normal", self.seen.normal)
+
+    @property
+    def named(self) -> dict[str, Any]:
+        """The attributes but the normal."""
+        return {name: value for name, value in self.attributes.items() if name != "normal"}
+
+    def materials(self) -> dict[str, Any]:
+        """Activated channels that have an AOV, by name."""
+        return {name: self.surfels.value(name) for name in self.surfels.raw if channel(name).aov}
+
+
+def _seen(surfels: Surfels, camera: Camera, sh_degree: int | None) -> SurfelView:
     """Unit direction from the camera to each surfel, and its normal turned towards the camera.
 
     A normal that points away by less than FACING_TOLERANCE stays: such a surfel lies just behind a
@@ -169,132 +130,60 @@ def _facing(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
     # A surfel at the camera's own position has no direction; it is culled, so any will do.
     direction = safe_normalize(camera.towards(surfels.position()))
     normal = surfels.primitive.normal(surfels)
-    return direction, dr.select(dr.detach(dr.dot(normal, direction)) > FACING_TOLERANCE, -normal, normal)
+    facing = dr.select(dr.detach(dr.dot(normal, direction)) > FACING_TOLERANCE, -normal, normal)
+    return SurfelView(direction, facing, sh_degree)
 
 
-def _radiance(surfels: Surfels, direction: Any, sh_degree: int | None) -> Any:
-    """SH colour max(0, ½ + Σ c Y(direction)) [3DGS, §4]."""
-    coefficients = surfels.radiance_sh()
-    if sh_degree is not None:
-        coefficients = coefficients[: (sh_degree + 1) ** 2]
-    return clamp_positive(eval_sh(coefficients, direction) + 0.5)
-
-
-def _materials(surfels: Surfels) -> list[Any]:
-    return [*surfels.albedo(), surfels.metallic(), surfels.roughness()]
-
-
-# ---------------- the two orders ----------------
-
-
-def _shade_at_surfels(
-    surfels: Surfels,
-    camera: Camera,
-    shading: Shading,
-    light: Any,
-    sh_degree: int | None,
-    shift: Any,
-    aovs: bool,
-) -> Frame:
-    direction, normal = _facing(surfels, camera)
-    if shading.reflectance == "radiance":
-        terms = Terms(_radiance(surfels, direction, sh_degree), *[dr.zeros(mi.Color3f, 1)] * 2)
-    else:
-        points = ShadingPoints(
-            normal=normal,
-            view=-direction,
-            albedo=surfels.albedo(),
-            metallic=surfels.metallic(),
-            roughness=surfels.roughness(),
-            radiance=_radiance(surfels, direction, sh_degree) if shading.diffuse == "sh" else None,
-        )
-        terms = _shade(points, light, shading.diffuse, shading.accuracy)
-    # A feature costs time in every pair, so what is not asked for is not blended.
-    features = [*terms.total(), *normal]
-    if aovs:
-        features += [*terms.diffuse, *terms.specular]
-    show_materials = aovs and surfels.has("albedo")
-    if show_materials:
-        features += _materials(surfels)
-    blended = splat(surfels, features, camera, shift)
-
-    inverse = _inverse_alpha(blended)
-    maps = blended.features
-    apart = Terms(mi.Color3f(*maps[6:9]), mi.Color3f(*maps[9:12]), dr.zeros(mi.Color3f, 1)) if aovs else None
-    return Frame(
-        alpha=blended.alpha,
-        depth=blended.depth * inverse,
-        normal=mi.Vector3f(*maps[3:6]),
-        radiance=mi.Color3f(*maps[0:3]),
-        terms=apart,
-        maps=_material_maps(maps[12:17], inverse) if show_materials else {},
-    )
-
-
-def _shade_at_pixels(
-    surfels: Surfels,
-    camera: Camera,
-    shading: Shading,
-    light: Any,
-    occluder: Occluder | None,
-    sh_degree: int | None,
-    shift: Any,
-) -> Frame:
-    direction, normal = _facing(surfels, camera)
-    features = [*normal, *_materials(surfels)]
-    if shading.diffuse == "sh":
-        features += [*_radiance(surfels, direction, sh_degree)]
-    if shading.occlusion and surfels.has("indirect_sh") and not shading.accuracy.traced_bounces:
-        # The mirror direction of the surfel's centre [Ref-Gaussian, §3.3]; starts at exactly 0 and must train
-        # from there.
-        mirrored = reflect(view=-direction, normal=normal)
-        features += [*clamp_positive(eval_sh(surfels.indirect_sh(), mirrored))]
-    blended = splat(surfels, features, camera, shift)
-
-    inverse = _inverse_alpha(blended)
-    normal = mi.Vector3f(*blended.features[0:3])
-    maps = _material_maps(blended.features[3:8], inverse)
-    rest = [x * inverse for x in blended.features[8:]]
-    radiance = None
-    if shading.diffuse == "sh":
-        radiance, rest = mi.Color3f(*rest[:3]), rest[3:]
-    depth = blended.depth * inverse
-    ray = camera.rays()
-    view = -dr.normalize(ray)
-    points = ShadingPoints(
-        normal=normal,
-        view=view,
-        albedo=maps["albedo"],
-        metallic=maps["metallic"],
-        roughness=maps["roughness"],
-        radiance=radiance,
-        indirect=mi.Color3f(*rest) if rest else None,
-    )
+def _shade_at_surfels(scene: _Scene, aovs: bool) -> Frame:
+    shading, direction = scene.shading, scene.seen.direction
+    points = ShadingPoints(scene.normal, -direction, scene.named)
     if shading.occlusion:
-        assert occluder is not None  # see `Shading.check`
-        covered = dr.detach(blended.alpha) > COVERAGE_FLOOR
-        points = reflection(
-            occluder, surfels, light, shading.accuracy, shading.diffuse, camera.origin, ray, points, covered
-        )
-        maps["visibility"] = points.visibility
-    shaded = _shade(points, light, shading.diffuse, shading.accuracy)
-    terms = Terms(*(term * blended.alpha for term in (shaded.diffuse, shaded.specular, shaded.indirect)))
+        centre = scene.surfels.position()
+        around = Surroundings(scene.occluder, scene.surfels, scene.light, centre, direction)
+        points = shading.model.trace(points, around, shading)
+    terms = shade(points, scene.light, shading)
+    # A feature costs time in every pair, so what is not asked for is not blended.
+    slots = {"radiance": terms.total(), "normal": scene.normal}
+    materials = scene.materials() if aovs else {}
+    if aovs:
+        slots |= terms.known() | materials
+    buffer = GBuffer.blend(scene.surfels, slots, scene.camera, scene.shift)
+    blended = buffer.slots
+    apart = Terms(**{name: blended[name] for name in terms.known()}).filled() if aovs else None
     return Frame(
-        alpha=blended.alpha,
-        depth=depth,
+        alpha=buffer.alpha,
+        depth=buffer.depth,
+        normal=blended["normal"],
+        radiance=blended["radiance"],
+        terms=apart,
+        maps={name: buffer.divided(name) for name in materials},
+    )
+
+
+def _shade_at_pixels(scene: _Scene, aovs: bool) -> Frame:
+    shading, camera = scene.shading, scene.camera
+    slots = {"normal": scene.normal} | scene.named
+    if aovs:
+        slots |= {name: value for name, value in scene.materials().items() if name not in slots}
+    buffer = GBuffer.blend(scene.surfels, slots, camera, scene.shift)
+
+    values = {name: buffer.divided(name) for name in slots if name != "normal"}
+    normal, ray = buffer.slots["normal"], camera.rays()
+    attributes = {name: values[name] for name in scene.named}
+    points = ShadingPoints(normal, -dr.normalize(ray), attributes)
+    maps = {name: values[name] for name in scene.surfels.raw if name in values}
+    if shading.occlusion:
+        covered = dr.detach(buffer.alpha) > COVERAGE_FLOOR
+        around = Surroundings(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered)
+        points = shading.model.trace(points, around, shading)
+        maps["visibility"] = points.visibility
+    shaded = shade(points, scene.light, shading)
+    terms = Terms(**{name: term * buffer.alpha for name, term in shaded.known().items()}).filled()
+    return Frame(
+        alpha=buffer.alpha,
+        depth=buffer.depth,
         normal=normal,
         radiance=terms.total(),
         terms=terms,
         maps=maps,
     )
-
-
-def _inverse_alpha(blended: Blended) -> Any:
-    """1/A where anything is seen, else 0, with a finite gradient everywhere."""
-    seen = blended.alpha > COVERAGE_FLOOR
-    return dr.select(seen, dr.rcp(dr.select(seen, blended.alpha, 1)), 0)
-
-
-def _material_maps(features: list[Any], inverse: Any) -> dict[str, Any]:
-    albedo = mi.Color3f(*(x * inverse for x in features[0:3]))
-    return {"albedo": albedo, "metallic": features[3] * inverse, "roughness": features[4] * inverse}

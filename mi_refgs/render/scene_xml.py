@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,8 +12,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
-from mi_refgs.render.pipeline import Shading
-from mi_refgs.shade.models import Accuracy
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 
 # Mitsuba wants a near plane, and a far plane, which the splatter has no use for, behind it: in near planes.
@@ -55,11 +53,9 @@ def write_scene_xml(
     _put(integrator, "string", "reflectance", shading.reflectance)
     _put(integrator, "string", "diffuse", shading.diffuse)
     _put(integrator, "boolean", "occlusion", str(shading.occlusion).lower())
-    for option in fields(Accuracy):
-        value = getattr(shading.accuracy, option.name)
-        if value != option.default:
-            kind = "boolean" if isinstance(value, bool) else "integer"
-            _put(integrator, kind, option.name, str(value).lower())
+    for name in shading.accuracy.chosen():
+        value = getattr(shading.accuracy, name)
+        _put(integrator, "boolean" if isinstance(value, bool) else "integer", name, str(value).lower())
     if mesh is not None:
         _put(integrator, "string", "mesh", mesh)
     if background is not None:

@@ -30,9 +30,10 @@ from mi_refgs.runs.run import Run
 from mi_refgs.methods.method import LIGHT
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.pipeline import Frame, Shading, render
+from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
@@ -106,7 +107,7 @@ class TrainedScene:
         Light and mesh are prepared once.
         """
         with dr.suspend_grad():
-            light = None if self.light is None else self.light.prefilter()
+            light = self.shading.light_of(self.light)
         occluder = Occluder(self.mesh)
         if self.shading.accuracy.traced_bounces:
             occluder.set_materials(self.surfels)

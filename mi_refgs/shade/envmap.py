@@ -11,8 +11,10 @@ an optimiser's step bounds the change of radiance; an exponential would let one 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.images import EXR_MAGIC, linear_from_srgb, read_exr_image, read_hdr, read_png, write_exr
 from mi_refgs.shade import lobe_matrices
+from mi_refgs.shade.lobe_matrices import LEVELS, Levels
 from mi_refgs.shade.prefilter import Operator, prefilter
 from mi_refgs.timing import boundary, phase
 
@@ -69,12 +72,12 @@ def inverse_softplus(radiance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PrefilteredLight:
-    """Levels of an environment (`EnvironmentLight.prefilter`); lookups are traced and differentiable."""
+    """Levels of an environment (`EnvironmentLight.prefilter`): a `light.Light`, traced and differentiable."""
 
     operator: Operator
     levels: Any  # flat RGBA texels, level after level
 
-    def mirror(self, direction: mi.Vector3f) -> mi.Color3f:
+    def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
         """Radiance (bilinear) that arrives from unit world directions; derivative in light and direction."""
         return self._bilinear(*_azimuth_polar(direction), mi.UInt32(0))
 
@@ -83,7 +86,7 @@ class PrefilteredLight:
 
         At roughness 1 the lobe D is constant and only the cosine is left, so this is the last level.
         """
-        return self._bilinear(*_azimuth_polar(normal), mi.UInt32(len(lobe_matrices.LEVEL_ROUGHNESS)))
+        return self._bilinear(*_azimuth_polar(normal), mi.UInt32(len(self.operator.roughness)))
 
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
         """Radiance averaged over the GGX lobe around unit world directions.
@@ -92,8 +95,8 @@ class PrefilteredLight:
         peak, and in roughness⁴ below the first level, where a lobe narrower than a texel only begins to
         spread. Derivative in light, direction and roughness. [split sum, Karis 2013]
         """
-        place = _level(roughness)
-        lower = dr.minimum(mi.UInt32(dr.detach(place)), len(lobe_matrices.LEVEL_ROUGHNESS) - 1)
+        place = _level(roughness, self.operator.roughness)
+        lower = dr.minimum(mi.UInt32(dr.detach(place)), len(self.operator.roughness) - 1)
         at = _azimuth_polar(direction)
         return dr.lerp(self._bilinear(*at, lower), self._bilinear(*at, lower + 1), place - mi.Float(lower))
 
@@ -101,22 +104,52 @@ class PrefilteredLight:
         """Colour at the fractions u of a turn and v of a meridian."""
         info = self.operator.info
         first, h, w = (dr.gather(mi.UInt32, info, 4 * level + k) for k in range(3))
-        x, y = dr.fma(u, mi.Float(w), -0.5), v * mi.Float(h - 1)
-        left = mi.Int32(dr.floor(dr.detach(x)))
-        # Bounded as integers: a NaN becomes some integer, and a bound in floats lets it pass.
-        row = dr.minimum(mi.UInt32(dr.detach(y)), h - 2)
-        s, t = x - mi.Float(left), y - mi.Float(row)
-        column = mi.UInt32(dr.select(left < 0, mi.Int32(w) - 1, dr.minimum(left, mi.Int32(w) - 1)))
-        right = dr.select(column + 1 < w, column + 1, 0)
-        above = first + row * w
 
         def texel(index: Any) -> Any:
-            return dr.gather(mi.Vector4f, self.levels, index)
+            return dr.gather(mi.Vector4f, self.levels, first + index)
 
-        upper = dr.lerp(texel(above + column), texel(above + right), s)
-        below = dr.lerp(texel(above + w + column), texel(above + w + right), s)
-        colour = dr.lerp(upper, below, t)
+        colour = _interpolated(texel, u, v, h, w)
         return mi.Color3f(colour.x, colour.y, colour.z)
+
+
+@dataclass(frozen=True)
+class UnfilteredLight:
+    """The map alone (`EnvironmentLight.unfiltered`), for models that look up nothing but radiance."""
+
+    height: int
+    texels: Any  # flat RGB texels, under AD
+
+    def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
+        """As of the `PrefilteredLight`."""
+        h = dr.opaque(mi.UInt32, self.height)
+
+        def texel(index: Any) -> Any:
+            return dr.gather(mi.Color3f, self.texels, index)
+
+        return _interpolated(texel, *_azimuth_polar(direction), h, 2 * h)
+
+    def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
+        """Raises InputError: that needs a filter."""
+        raise InputError("light: irradiance: the light is not filtered; use EnvironmentLight.prefilter()")
+
+    def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
+        """Raises InputError: that needs a filter."""
+        raise InputError("light: specular: the light is not filtered; use EnvironmentLight.prefilter()")
+
+
+def _interpolated(texel: Callable[[Any], Any], u: Any, v: Any, h: Any, w: Any) -> Any:
+    """Bilinear value of a map of h rows and w columns at the fractions u of a turn and v of a meridian."""
+    x, y = dr.fma(u, mi.Float(w), -0.5), v * mi.Float(h - 1)
+    left = mi.Int32(dr.floor(dr.detach(x)))
+    # Bounded as integers: a NaN becomes some integer, and a bound in floats lets it pass.
+    row = dr.minimum(mi.UInt32(dr.detach(y)), h - 2)
+    s, t = x - mi.Float(left), y - mi.Float(row)
+    column = mi.UInt32(dr.select(left < 0, mi.Int32(w) - 1, dr.minimum(left, mi.Int32(w) - 1)))
+    right = dr.select(column + 1 < w, column + 1, 0)
+    above = row * w
+    upper = dr.lerp(texel(above + column), texel(above + right), s)
+    below = dr.lerp(texel(above + w + column), texel(above + w + right), s)
+    return dr.lerp(upper, below, t)
 
 
 def _azimuth_polar(direction: Any) -> tuple[Any, Any]:
@@ -133,14 +166,14 @@ def _azimuth_polar(direction: Any) -> tuple[Any, Any]:
     return u, dr.atan2(sin, dr.select(off_pole, y, dr.select(y < 0, -1, 1))) * (1 / dr.pi)
 
 
-def _level(roughness: Any) -> Any:
-    """Fractional level 0 … L of a roughness, clamped to [0, 1]."""
-    first = lobe_matrices.LEVEL_ROUGHNESS[0]
+def _level(roughness: Any, levels: tuple[float, ...]) -> Any:
+    """Fractional level 0 … L of a roughness, clamped to [0, 1], for the roughness of the L levels."""
+    first = levels[0]
     r = dr.clip(roughness, 0, 1)
     sharp = dr.minimum(r, first) * (1 / first)
     level = dr.square(dr.square(sharp))
     inverse = dr.rcp(dr.maximum(r, first))
-    for a, b in zip(lobe_matrices.LEVEL_ROUGHNESS, lobe_matrices.LEVEL_ROUGHNESS[1:], strict=False):
+    for a, b in pairwise(levels):
         level += dr.clip((inverse - 1 / a) * (1 / (1 / b - 1 / a)), 0, 1)
     return level
 
@@ -209,13 +242,17 @@ class EnvironmentLight:
         """How many raw values are not < RAW_LIMIT, and black; waits for the device."""
         return int(dr.count(~(dr.abs(dr.detach(self.raw.array)) < RAW_LIMIT))[0])
 
-    def prefilter(self) -> PrefilteredLight:
+    def prefilter(self, levels: Levels = LEVELS) -> PrefilteredLight:
         """The levels of this light, under AD; a fixed linear operator on the radiance (`prefilter`)."""
-        return boundary(self._prefilter(), "prefilter backward")
+        return boundary(self._prefilter(levels), "prefilter backward")
 
     @phase("prefilter forward")
-    def _prefilter(self) -> PrefilteredLight:
-        return PrefilteredLight(*prefilter(self.radiance()))
+    def _prefilter(self, levels: Levels) -> PrefilteredLight:
+        return PrefilteredLight(*prefilter(self.radiance(), levels))
+
+    def unfiltered(self) -> UnfilteredLight:
+        """The map of this light, under AD, for models that look up nothing but radiance."""
+        return UnfilteredLight(self.height, self.radiance().array)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the radiance as a float32 EXR that Mitsuba's `envmap` shows in the same directions; atomic.

@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.shade.models import safe_normalize
+from mi_refgs.shade.points import safe_normalize
 
 GOLDEN = 2654435769
 """2³² / golden ratio: multiples of it, modulo 2³², are the most even sequence on a circle."""

@@ -20,6 +20,7 @@ import numpy as np
 
 from mi_refgs.device import replayed
 from mi_refgs.shade import fourier, lobe_matrices, mixing
+from mi_refgs.shade.lobe_matrices import LEVELS, Levels
 
 
 @dataclass(frozen=True)
@@ -33,15 +34,16 @@ class Operator:
     adjoint: mixing.Mixing
     info: Any  # 4 UInt32 a level: first texel, h, w, 0; level 0 is the map itself
     shapes: tuple[tuple[int, int], ...]  # (first texel, h) of each level, the same on the host
+    roughness: tuple[float, ...]  # of each level but the map itself
 
 
 @functools.lru_cache(maxsize=4)
-def _host_levels(height: int) -> list[lobe_matrices.Level]:
-    return lobe_matrices.build_levels(height)
+def _host_levels(height: int, levels: Levels) -> list[lobe_matrices.Level]:
+    return lobe_matrices.build_levels(height, levels)
 
 
-def _build(height: int) -> Operator:
-    matrices = [level.weights for level in _host_levels(height)]
+def _build(height: int, wanted: Levels) -> Operator:
+    matrices = [level.weights for level in _host_levels(height, wanted)]
     transposed = [np.ascontiguousarray(matrix.swapaxes(0, 1)) for matrix in matrices]
     heights = [height] + [len(matrix) for matrix in matrices]
     firsts = [int(n) for n in np.cumsum([0] + [2 * h * h for h in heights])]
@@ -72,6 +74,7 @@ def _build(height: int) -> Operator:
             np.array([(f, h, 2 * h, 0) for f, h in zip(firsts, heights, strict=False)], np.uint32).ravel()
         ),
         shapes=tuple(zip(firsts, heights, strict=False)),
+        roughness=wanted.roughness,
     )
 
 
@@ -109,8 +112,8 @@ class _Prepared:
 
 
 @functools.lru_cache(maxsize=4)
-def _prepare(variant: str, height: int) -> _Prepared:
-    op = _build(height)
+def _prepare(variant: str, height: int, levels: Levels) -> _Prepared:
+    op = _build(height, levels)
 
     return _Prepared(
         op,
@@ -119,9 +122,9 @@ def _prepare(variant: str, height: int) -> _Prepared:
     )
 
 
-def operator(height: int) -> Operator:
-    """The prefilter for maps (height, 2·height), built once per height and variant (1 s at 64 rows)."""
-    return _prepare(mi.variant(), height).operator
+def operator(height: int, levels: Levels = LEVELS) -> Operator:
+    """The prefilter for maps (height, 2·height), built once a height, levels and variant (64 rows: 1 s)."""
+    return _prepare(mi.variant(), height, levels).operator
 
 
 class _Prefilter(dr.CustomOp):
@@ -147,7 +150,7 @@ def _opaque(values: Any) -> Any:
     return values
 
 
-def prefilter(radiance: Any) -> tuple[Operator, Any]:
+def prefilter(radiance: Any, levels: Levels = LEVELS) -> tuple[Operator, Any]:
     """Operator and levels (flat RGBA, under AD) of a radiance tensor (h, 2h, 3), h a multiple of 4."""
-    prepared = _prepare(mi.variant(), radiance.shape[0])
+    prepared = _prepare(mi.variant(), radiance.shape[0], levels)
     return prepared.operator, dr.custom(_Prefilter, prepared, radiance.array)

@@ -20,10 +20,10 @@ from mi_refgs.files import read_json
 from mi_refgs.images import image_size, read_exr, read_png, write_exr
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.plugins.properties import read_background, read_light, read_shading, read_surfels
-from mi_refgs.render.pipeline import Shading
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.ply import read_ply
 
 XYZ = "property float x\nproperty float y\nproperty float z\n"

@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from mi_refgs.device import upload
 from mi_refgs.reference.camera import look_at
-from mi_refgs.render.pipeline import Frame, Shading, render
+from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 

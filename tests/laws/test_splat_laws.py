@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from mi_refgs import constants
 from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.device import upload
-from mi_refgs.render.pipeline import Shading
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import splat
 from mi_refgs.surfels.table import Surfels
 

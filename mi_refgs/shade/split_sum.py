@@ -1,21 +1,29 @@
-"""Shading: from points with materials, under a prefiltered light, to named terms of outgoing radiance.
+"""The split sum's equations: an SH colour or a diffuse base, under a GGX layer that a filtered light lights.
 
-One function for every order of work: at pixels (deferred) and at surfels (forward) the same points come in
-and the same terms go out. [Reflective Gaussian Splatting, §3.2-3.3; split sum: Karis 2013]
+Points have albedo (mi.Color3f, 0 … 1: diffuse reflectance, or F0 of a metal), metallic (mi.Float, 0 … 1) and
+roughness (mi.Float, 0 … 1, α = roughness²); for diffuse="sh" also radiance (mi.Color3f), as fitted.
+
+[Reflective Gaussian Splatting, §3.2-3.3; split sum: Karis 2013]
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import NORM_FLOOR
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError
+from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.brdf import split_sum
-from mi_refgs.shade.envmap import PrefilteredLight
+from mi_refgs.shade.light import Light
+from mi_refgs.shade.points import ShadingPoints, Terms, reflect, safe_normalize
+
+Diffuse = Literal["sh", "irradiance"]
+"""Diffuse radiance as fitted (spherical harmonics), or of the albedo and the light."""
+
+PLAIN = Accuracy()
+"""Nothing paid for a smaller error."""
 
 DIELECTRIC_F0 = 0.04
 """Reflectance at normal incidence of a surface that is not metal (index of refraction 1.5)."""
@@ -26,77 +34,6 @@ SMOOTHNESS_FLOOR = 1e-12
 MEAN_FRESNEL_MAX = 1.25
 """The mean of Schlick's term is at most 1 for a colour in 0 … 1; this cap, out of its reach, keeps the series
 of bounces finite for any other colour: A + B ≥ 0.31 everywhere."""
-
-MAX_RAYS = 4096
-"""Rays of the lobe, or bounces, beyond which nothing changes but the time: the length of a kernel follows."""
-
-Diffuse = Literal["sh", "irradiance"]
-
-
-@dataclass(frozen=True)
-class Accuracy:
-    """What to pay for a smaller error; everything is off by default, and costs nothing then.
-
-    `shade` knows the first two, `render.pipeline` the others. Raises InputError for a value out of range.
-    """
-
-    dominant: bool = False  # look light up along the lobe's dominant direction, not the mirror direction
-    multiscatter: bool = False  # add the light that leaves after several bounces between facets
-    visibility_rays: int = 1  # rays of the GGX lobe that the visibility is averaged over; 1: the mirror ray
-    traced_bounces: int = 0  # times that what a blocked ray hits is shaded, in place of the indirect channel
-
-    def __post_init__(self) -> None:
-        for name in ("dominant", "multiscatter"):
-            if not isinstance(getattr(self, name), bool):
-                raise InputError(f"accuracy: {name}: {shown(getattr(self, name))} is neither True nor False")
-        for name, what, least in (("visibility_rays", "rays", 1), ("traced_bounces", "bounces", 0)):
-            number: Any = getattr(self, name)
-            if type(number) is not int or not least <= number <= MAX_RAYS:
-                some = ", ".join(str(least + i) for i in range(3))
-                raise InputError(
-                    f"accuracy: {name}: {shown(number)} is no number of {what}; use {some}, … {MAX_RAYS}"
-                )
-
-
-@dataclass(frozen=True)
-class ShadingPoints:
-    """N points to shade, all arrays of width N; what a scene does not use is None and costs nothing."""
-
-    normal: mi.Vector3f  # world frame, any length
-    view: mi.Vector3f  # world frame, any length, towards the camera
-    albedo: mi.Color3f  # 0 … 1: diffuse reflectance, or F0 of a metal
-    metallic: mi.Float  # 0 … 1
-    roughness: mi.Float  # 0 … 1, α = roughness²
-    radiance: mi.Color3f | None = None  # diffuse radiance as fitted (spherical harmonics), for diffuse="sh"
-    visibility: mi.Float | None = None  # 0 … 1: does light arrive along the reflected direction?
-    indirect: mi.Color3f | None = None  # radiance from there when it does not
-
-
-@dataclass(frozen=True)
-class Terms:
-    """Outgoing radiance by cause; the picture is their sum."""
-
-    diffuse: mi.Color3f
-    specular: mi.Color3f
-    indirect: mi.Color3f
-
-    def total(self) -> mi.Color3f:
-        """Sum of the terms."""
-        return self.diffuse + self.specular + self.indirect
-
-
-def safe_normalize(v: mi.Vector3f) -> mi.Vector3f:
-    """v / |v|, and (0, 0, 1) with zero gradient where |v|² < NORM_FLOOR."""
-    # Scaling by the largest component first keeps the square of a huge or tiny vector inside float32.
-    largest = dr.detach(dr.maximum(dr.maximum(dr.abs(v.x), dr.abs(v.y)), dr.abs(v.z)))
-    valid = largest > NORM_FLOOR**0.5
-    scaled = dr.select(valid, v * dr.rcp(dr.select(valid, largest, 1)), mi.Vector3f(0, 0, 1))
-    return scaled * dr.rsqrt(dr.squared_norm(scaled))
-
-
-def reflect(view: mi.Vector3f, normal: mi.Vector3f) -> mi.Vector3f:
-    """Mirror direction 2 (n·v) n - v of unit vectors that both point away from the surface."""
-    return dr.fma(2 * dr.dot(normal, view), normal, -view)
 
 
 def base_reflectance(points: ShadingPoints) -> mi.Color3f:
@@ -140,9 +77,9 @@ def multiple_scattering(f0: mi.Color3f, single: mi.Color3f, energy: mi.Float) ->
 
 def shade(
     points: ShadingPoints,
-    light: PrefilteredLight,
+    light: Light,
     diffuse: Diffuse = "sh",
-    accuracy: Accuracy = Accuracy(),
+    accuracy: Accuracy = PLAIN,
 ) -> Terms:
     """Outgoing radiance towards the camera, by cause.
 
@@ -172,23 +109,22 @@ def shade(
         further = multiple_scattering(f0, reflectance, scale + bias)
         specular += light.irradiance(normal) * further
         reflectance += further
-    indirect: Any = mi.Color3f(0)
-    if points.visibility is not None:
-        specular *= points.visibility
-        if points.indirect is not None:
-            indirect = (1 - points.visibility) * points.indirect * reflectance
+    indirect = None
+    visibility, blocking = points.get("visibility"), points.get("indirect")
+    if visibility is not None:
+        specular *= visibility
+        if blocking is not None:
+            indirect = (1 - visibility) * blocking * reflectance
     return Terms(_diffuse(points, normal, light, diffuse, reflectance), specular, indirect)
 
 
-def _diffuse(
-    points: ShadingPoints, normal: Any, light: PrefilteredLight, diffuse: Diffuse, reflectance: Any
-) -> Any:
+def _diffuse(points: ShadingPoints, normal: Any, light: Light, diffuse: Diffuse, reflectance: Any) -> Any:
     if diffuse == "irradiance":
         # The table, extrapolated, exceeds 1 by up to 1e-4: no negative light from that.
         left = dr.maximum(1 - reflectance, 0)
         return left * (1 - points.metallic) * points.albedo * light.irradiance(normal)
     if diffuse != "sh":
         raise InputError(f'shade: diffuse: "{diffuse}" is unknown; choose "sh" or "irradiance"')
-    if points.radiance is None:
+    if points.get("radiance") is None:
         raise InputError('shade: radiance: missing; diffuse="sh" needs it, diffuse="irradiance" does not')
     return (1 - points.metallic) * points.radiance

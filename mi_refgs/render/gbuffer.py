@@ -1,0 +1,59 @@
+"""The G-buffer: named values of the surfels, blended together and divided by alpha once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from mi_refgs.constants import COVERAGE_FLOOR
+from mi_refgs.splat import Blended, Camera, splat
+from mi_refgs.surfels.table import Surfels
+
+
+@dataclass(frozen=True)
+class GBuffer:
+    """Blended slots of a view: arrays of H·W values in raster order. A slot that nobody needs is absent."""
+
+    alpha: Any  # accumulated opacity
+    depth: Any  # expected camera-z depth, 0 where nothing is seen
+    slots: dict[str, Any]  # premultiplied by alpha, each of the type that was blended
+    inverse: Any  # 1/alpha where anything is seen, else 0
+
+    @staticmethod
+    def blend(surfels: Surfels, slots: Mapping[str, Any], camera: Camera, shift: Any = None) -> GBuffer:
+        """Blend values of width N by name: mi.Float, or an array of several such as mi.Color3f.
+
+        Every component is a feature, which costs time in every surfel-tile pair. `shift`: see
+        `splat.project`.
+        """
+        features = [part for value in slots.values() for part in _parts(value)]
+        blended = splat(surfels, features, camera, shift)
+        rest, maps = list(blended.features), {}
+        for name, value in slots.items():
+            width = len(_parts(value))
+            maps[name], rest = _joined(value, rest[:width]), rest[width:]
+        inverse = inverse_alpha(blended)
+        return GBuffer(blended.alpha, blended.depth * inverse, maps, inverse)
+
+    def divided(self, name: str) -> Any:
+        """A slot divided by alpha: the mean over what is seen, 0 where nothing is."""
+        value = self.slots[name]
+        return _joined(value, [part * self.inverse for part in _parts(value)])
+
+
+def inverse_alpha(blended: Blended) -> Any:
+    """1/A where anything is seen (COVERAGE_FLOOR), else 0, with a finite gradient everywhere."""
+    seen = blended.alpha > COVERAGE_FLOOR
+    return dr.select(seen, dr.rcp(dr.select(seen, blended.alpha, 1)), 0)
+
+
+def _parts(value: Any) -> list[Any]:
+    return [*value] if dr.depth_v(value) > 1 else [value]
+
+
+def _joined(like: Any, parts: list[Any]) -> Any:
+    """The parts as an array of the type of `like`."""
+    return type(like)(*parts)

@@ -1,0 +1,43 @@
+"""What a reflectance model may pay for a smaller error, as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from mi_refgs.errors import InputError, shown
+
+MAX_RAYS = 4096
+"""Rays of the lobe, or bounces, beyond which nothing changes but the time: the length of a kernel follows."""
+
+NEED_OCCLUSION = ("visibility_rays", "traced_bounces")
+"""Options that do nothing where no ray is traced."""
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """What to pay for a smaller error; everything is off by default, and costs nothing then.
+
+    A model says which of them it honours. Raises InputError for a value out of range.
+    """
+
+    dominant: bool = False  # look light up along the lobe's dominant direction, not the mirror direction
+    multiscatter: bool = False  # add the light that leaves after several bounces between facets
+    visibility_rays: int = 1  # rays of the GGX lobe that the visibility is averaged over; 1: the mirror ray
+    traced_bounces: int = 0  # times that what a blocked ray hits is shaded, in place of the indirect channel
+
+    def __post_init__(self) -> None:
+        for name in ("dominant", "multiscatter"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError(f"accuracy: {name}: {shown(getattr(self, name))} is neither True nor False")
+        for name, what, least in (("visibility_rays", "rays", 1), ("traced_bounces", "bounces", 0)):
+            number: Any = getattr(self, name)
+            if type(number) is not int or not least <= number <= MAX_RAYS:
+                some = ", ".join(str(least + i) for i in range(3))
+                raise InputError(
+                    f"accuracy: {name}: {shown(number)} is no number of {what}; use {some}, … {MAX_RAYS}"
+                )
+
+    def chosen(self) -> list[str]:
+        """Names of the options that differ from their defaults."""
+        return [option.name for option in fields(self) if getattr(self, option.name) != option.default]

@@ -1,0 +1,92 @@
+"""What reflectance models take and give: points to shade, and named terms of outgoing radiance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.constants import NORM_FLOOR
+from mi_refgs.errors import InputError
+
+
+@dataclass(init=False, eq=False)
+class ShadingPoints:
+    """N points to shade: normal and view, and whatever else a model names, all arrays of width N.
+
+    `normal` and `view` (mi.Vector3f) are in the world frame and of any length; `view` leads towards the
+    camera. Further attributes are read as `points.roughness`, or by `get` where they may be absent. An
+    attribute that a scene does not use is absent and costs nothing. Two names have one meaning for every
+    model: `visibility` (mi.Float, 0 … 1: does light arrive along the reflected direction?) and `indirect`
+    (mi.Color3f: radiance from there when it does not).
+    """
+
+    normal: Any
+    view: Any
+    attributes: dict[str, Any]  # by name
+
+    def __init__(
+        self, normal: Any, view: Any, attributes: Mapping[str, Any] | None = None, **named: Any
+    ) -> None:
+        """Points with `attributes` and those that are `named`; None says that there is none."""
+        self.normal, self.view = normal, view
+        given = {**(attributes or {}), **named}
+        self.attributes = {name: value for name, value in given.items() if value is not None}
+
+    def __getattr__(self, name: str) -> Any:
+        """An attribute; raises InputError if the points do not have it."""
+        if name.startswith("_") or name == "attributes":
+            raise AttributeError(name)
+        if name not in self.attributes:
+            raise InputError(f"shade: {name}: missing; the reflectance model needs it, so add it")
+        return self.attributes[name]
+
+    def get(self, name: str) -> Any:
+        """An attribute, or None if the points do not have it."""
+        return self.attributes.get(name)
+
+    def replaced(self, **attributes: Any) -> ShadingPoints:
+        """The same points with these attributes; None removes one."""
+        return ShadingPoints(self.normal, self.view, self.attributes, **attributes)
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Outgoing radiance (mi.Color3f) by cause, None where there is no such term; the picture is their sum."""
+
+    diffuse: Any
+    specular: Any = None
+    indirect: Any = None
+
+    def known(self) -> dict[str, Any]:
+        """The terms that there are, by name."""
+        return {name: getattr(self, name) for name in TERMS if getattr(self, name) is not None}
+
+    def total(self) -> Any:
+        """Sum of the terms."""
+        return sum(self.known().values(), mi.Color3f(0))
+
+    def filled(self) -> Terms:
+        """The same, with zeros for the terms that there are not."""
+        return Terms(**{name: dr.zeros(mi.Color3f, 1) for name in TERMS} | self.known())
+
+
+TERMS = ("diffuse", "specular", "indirect")
+"""Names of the terms."""
+
+
+def safe_normalize(v: mi.Vector3f) -> mi.Vector3f:
+    """v / |v|, and (0, 0, 1) with zero gradient where |v|² < NORM_FLOOR."""
+    # Scaling by the largest component first keeps the square of a huge or tiny vector inside float32.
+    largest = dr.detach(dr.maximum(dr.maximum(dr.abs(v.x), dr.abs(v.y)), dr.abs(v.z)))
+    valid = largest > NORM_FLOOR**0.5
+    scaled = dr.select(valid, v * dr.rcp(dr.select(valid, largest, 1)), mi.Vector3f(0, 0, 1))
+    return scaled * dr.rsqrt(dr.squared_norm(scaled))
+
+
+def reflect(view: mi.Vector3f, normal: mi.Vector3f) -> mi.Vector3f:
+    """Mirror direction 2 (n·v) n - v of unit vectors that both point away from the surface."""
+    return dr.fma(2 * dr.dot(normal, view), normal, -view)
