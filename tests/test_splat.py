@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from benchmarks.splatting.exact import differentiate, footprint
 from mi_refgs import constants
 from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.device import upload
@@ -19,7 +18,9 @@ from mi_refgs.errors import InputError
 from mi_refgs.primitives.surfel import FootprintAdjoint
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference import surfel as oracle_surfel
+from mi_refgs.reference.blend import differentiate
 from mi_refgs.reference.camera import look_at
+from mi_refgs.reference.footprint import Rules
 from mi_refgs.splat import Blended, Camera, list_by_tile, project, splat, tiles
 from mi_refgs.surfels.table import Surfels
 
@@ -389,7 +390,7 @@ def test_tile_lists_hold_what_contributes_and_little_else(seed: int, thinness: f
 
     y, x = (v.ravel() for v in np.mgrid[0 : camera.height, 0 : camera.width])
     tile = y // camera.tile[1] * lists.tiles_x + x // camera.tile[0]
-    alpha, _ = footprint(scene.raw, scene.camera, x + 0.5, y + 0.5)
+    alpha = oracle_surfel.footprint(scene.raw, scene.camera, Rules(), x + 0.5, y + 0.5).alpha
     alpha[oracle_surfel.camera_surfels(scene.raw, scene.camera)["opacity"] == 0] = 0
     # Float32 may lose what is at the threshold itself.
     strong = alpha >= ALPHA_MIN * (1 + 1e-3)

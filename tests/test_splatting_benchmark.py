@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from benchmark_runs import read_result, small_instance  # first: it lets `benchmarks` be found
 
-from benchmarks.splatting import errors, exact, fits, limits, raster, targets
+from benchmarks.splatting import errors, fits, limits, raster, targets
 from benchmarks.splatting.__main__ import main
 from benchmarks.splatting.baseline import baseline
 from benchmarks.splatting.ours import Ours
@@ -22,6 +22,7 @@ from benchmarks.splatting.workload import FEATURES, Workload, sphere
 from mi_refgs.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from mi_refgs.profiling.counts import Counts
 from mi_refgs.reference import splat as oracle
+from mi_refgs.reference.blend import differentiate
 from mi_refgs.reference.pinhole import rotation_matrix
 from mi_refgs.splat import list_by_tile, project
 from mi_refgs.surfels.table import Surfels
@@ -155,7 +156,7 @@ def test_contributing_pairs_are_the_oracle_s() -> None:
     workload = opaque(300, 28)
     raw = {name: values.astype(float) for name, values in workload.raw.items()}
     weights = np.zeros((FEATURES + 2, workload.pixels))
-    truth = exact.differentiate(raw, workload.features.astype(float), workload.pinhole, weights)
+    truth = differentiate(raw, workload.features.astype(float), workload.pinhole, weights)
     counts = Ours.of(workload, 0).counts()
     assert counts.contributing == pytest.approx(truth.shown.sum(), rel=2e-3)
     assert counts.covered == pytest.approx(truth.shown.any(axis=0).sum(), abs=2)
@@ -218,7 +219,7 @@ def test_exact_form_is_the_oracle() -> None:
 
     expected, band = maps(raw)
     weights[:, band] = 0
-    truth = exact.differentiate(raw, features, workload.pinhole, weights)
+    truth = differentiate(raw, features, workload.pinhole, weights)
     assert np.abs(truth.maps - expected).max() < 1e-12
     surfel = int(np.argmax(np.abs(truth.gradients["opacity"])))
     for name, gradient in truth.gradients.items():

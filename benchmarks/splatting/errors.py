@@ -7,11 +7,12 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 
-from benchmarks.splatting import exact, raster
+from benchmarks.splatting import raster
 from benchmarks.splatting.ours import Ours
 from benchmarks.splatting.workload import FEATURES, Workload
 from mi_refgs.constants import tile_size
 from mi_refgs.reference import splat as oracle
+from mi_refgs.reference.blend import differentiate
 from mi_refgs.splat import list_by_tile, project
 from mi_refgs.surfels.table import Surfels
 
@@ -45,7 +46,7 @@ def compare(workload: Workload, size: int) -> dict[str, float]:
     order = _order(ours, near, p)
     keep = np.logical_not(oracle.splat(raw, features[:, :1], p).band.ravel())
     weights = np.where(keep, part.weights(FEATURES + 2), 0).astype(np.float32)
-    truth = exact.differentiate(raw, features, p, weights.astype(np.float64), order)
+    truth = differentiate(raw, features, p, weights.astype(np.float64), order)
 
     ours.set_weights(weights)
     out = ours.both()

@@ -9,20 +9,19 @@ Letters: N surfels, P pixels, K features, D raw columns. Maps are (P, …).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.footprint import GEOMETRY, Rules
+from mi_refgs.reference.blend import STEP, Blend
+from mi_refgs.reference.footprint import Rules
 from mi_refgs.reference.lookup import Light, harmonics, positive, shade, unit
 from mi_refgs.reference.pinhole import QUATERNION_FLOOR, PinholeCamera, rotation_axes, sigmoid
 from mi_refgs.reference.primitives import primitive_of
 
 Array = np.ndarray
-STEP = 1e-40
 MAPS = ("radiance", "alpha", "depth", "normal", "albedo", "metallic", "roughness")
 
 
@@ -59,43 +58,18 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     `band` is the relative width of the declared discontinuities.
     """
     raw = {name: np.asarray(x, np.float64) for name, x in scene.raw.items()}
-    camera, rules = scene.camera, scene.rules
+    camera = scene.camera
     x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
-    primitive = primitive_of(raw)
-    culled = primitive.culled(raw, camera, rules)
-    sample = primitive.footprint(raw, camera, rules, x, y)
-    alpha, z = sample.alpha.real, sample.z.real
-    hit = (alpha >= rules.alpha_min) & (z > camera.near) & ~culled[:, None]
-    alpha = np.where(hit, alpha, 0)
-    order = scene.order
-    after = np.take_along_axis(np.log1p(-alpha), order, 0).cumsum(0)
-    before = np.exp(np.concatenate([np.zeros((1, len(x))), after[:-1]]))
-    ends = math.log(rules.transmittance_min) if rules.transmittance_min else -math.inf
-    alive = np.logical_and.accumulate(after >= ends, axis=0)
-    before, alive, after = (_unsort(v, order) for v in (before, alive, np.exp(after)))
-    shown = hit & alive
-    weight = np.where(shown, before * alpha, 0)
-
+    blend = Blend.of(raw, camera, scene.order, x, y, scene.rules)
     features_of = _Features(scene, raw)
     taps: list[tuple[Array, Array, Array]] = []
     features = features_of(features_of.columns, taps).real
-    sums = np.concatenate([weight.T @ features, np.sum(weight * np.where(hit, z, 0), 0)[:, None]], axis=1)
-    sums = np.concatenate([sums, weight.sum(0)[:, None]], axis=1)
+    sums = blend.sums(features)
     resolve = _Resolve(scene, features_of, x, y, sums)
     pixel_taps: list[tuple[Array, Array, Array]] = []
     maps = resolve.named(resolve(sums, pixel_taps).real)
 
-    near_band = alive & ~culled[:, None] & np.isfinite(z)
-    unclamped, in_band = sample.unclamped, np.zeros(len(x), bool)
-    for values, limit, where in (
-        (unclamped, rules.alpha_min, near_band),
-        (unclamped, rules.alpha_max, shown),
-        (after, rules.transmittance_min, hit),
-    ):
-        in_band |= np.any(where & (np.abs(values - limit) < band * limit), 0)
-    in_band |= np.any(shown & (sample.jump < band), 0)
-    in_band |= np.any(near_band & (np.abs(z - camera.near) < band * camera.near), 0)
-    picture = Picture(maps, in_band, shown, taps + pixel_taps)
+    picture = Picture(maps, blend.band(band), blend.shown, taps + pixel_taps)
     if weights is None:
         return picture
 
@@ -103,20 +77,7 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
         [np.asarray(weights.get(n, np.zeros_like(maps[n])), np.float64).reshape(len(x), -1) for n in maps], 1
     )
     δsums = itemwise_adjoint(lambda v: resolve(v, []), sums, δout)
-    value = features @ δsums[:, :-2].T + np.where(hit, z, 0) * δsums[:, -2] + δsums[:, -1]
-    part = np.take_along_axis(weight * value, order, 0)
-    behind = _unsort(np.cumsum(part[::-1], axis=0)[::-1] - part, order)
-    δalpha = np.where(shown, before * value - behind / (1 - alpha), 0)
-    δz = np.where(shown, weight * δsums[:, -2], 0)
-    gradients = {name: np.zeros_like(raw[name]) for name in GEOMETRY}
-    for name in GEOMETRY:
-        for d in range(raw[name].shape[1]):
-            moved = raw | {name: raw[name].astype(complex)}
-            moved[name][:, d] += 1j * STEP
-            there = primitive.footprint(moved, camera, rules, x, y)
-            slope_alpha, slope_z = there.alpha.imag / STEP, there.z.imag / STEP
-            gradients[name][:, d] = np.sum(np.where(shown, δalpha * slope_alpha + δz * slope_z, 0), 1)
-    δfeatures = weight @ δsums[:, :-2]
+    gradients, δfeatures = blend.adjoint(features, δsums)
     δraw = itemwise_adjoint(lambda v: features_of(v, []), features_of.columns, δfeatures)
     for name, values in features_of.split(δraw).items():
         gradients[name] = gradients.get(name, np.zeros_like(raw[name])) + values
@@ -141,12 +102,6 @@ def itemwise_adjoint(function: Callable[[Array], Array], inputs: Array, δ: Arra
         moved = inputs.astype(complex)
         moved[:, d] += 1j * STEP
         out[:, d] = np.sum(function(moved).imag / STEP * δ, axis=1)
-    return out
-
-
-def _unsort(values: Array, order: Array) -> Array:
-    out = np.empty_like(values)
-    np.put_along_axis(out, order, values, axis=0)
     return out
 
 
