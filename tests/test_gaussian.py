@@ -12,8 +12,8 @@ from test_splat import (
     PARAMETERS,
     Mutation,
     Scene,
+    check_transpose,
     fast_gradients,
-    fast_loss,
     fast_maps,
     gradient_errors,
     loss_weights,
@@ -136,21 +136,7 @@ def test_pictures_and_gradients_with_tiles_of_every_size(
 
 @pytest.mark.parametrize("seed", [3, 9, 14])
 def test_forward_mode_is_the_transpose_of_reverse(seed: int) -> None:
-    scene = gaussians(seed)
-    weights, rng = loss_weights(scene, seed), np.random.default_rng(seed)
-    direction = {name: rng.normal(size=values.shape) for name, values in scene.raw.items()}
-    direction["features"] = rng.normal(size=scene.features.shape)
-    reverse = fast_gradients(scene, weights)
-    surfels, features = scene.surfels(), scene.columns()
-    dr.enable_grad(surfels.raw, features)
-    for name in scene.raw:
-        dr.set_grad(surfels.raw[name], mi.TensorXf(direction[name].astype(np.float32)))
-    for column, values in zip(features, direction["features"].T, strict=True):
-        dr.set_grad(column, upload(values))
-    forward = dr.forward_to(fast_loss(scene, surfels, features, weights), flags=dr.ADFlag.Default)[0]
-    expected = sum(np.sum(reverse[name] * direction[name]) for name in PARAMETERS)
-    size = np.sqrt(sum(np.sum((reverse[name] * direction[name]) ** 2) for name in PARAMETERS))
-    assert abs(forward - expected) <= 1e-3 * size
+    check_transpose(gaussians(seed), seed)
 
 
 def _scale_column(index: int) -> Mutation:

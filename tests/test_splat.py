@@ -204,7 +204,10 @@ def test_gradients_match_the_oracle(seed: int) -> None:
 @pytest.mark.parametrize("seed", [3, 9, 14])
 def test_forward_mode_is_the_transpose_of_reverse(seed: int) -> None:
     """⟨∇loss, v⟩ from reverse mode equals the directional derivative from forward mode, for random v."""
-    scene = make_scene(seed)
+    check_transpose(make_scene(seed), seed)
+
+
+def check_transpose(scene: Scene, seed: int) -> None:
     weights = loss_weights(scene, seed)
     rng = np.random.default_rng(seed)
     direction = {name: rng.normal(size=values.shape) for name, values in scene.raw.items()}

@@ -49,7 +49,7 @@ class View:
 
 @dataclass(frozen=True)
 class Scene:
-    """Raw channels of COUNT surfels in a cloud of radius about 1 around the origin, and a view of it."""
+    """COUNT surfels or 3D Gaussians in a cloud of radius about 1 around the origin, and a view of it."""
 
     raw: Raw
     view: View
@@ -67,10 +67,15 @@ class Scene:
         return replace(self, raw=self.raw | {k: np.asarray(v, np.float32) for k, v in channels.items()})
 
 
-def random_scene(seed: int, size: float = 0.25, flatness: float = 0.0, opacity: float = 0.0) -> Scene:
-    """`size`: of the discs; `flatness`: log₁₀ of the ratio of their axes; `opacity`: the mean logit."""
+def random_scene(
+    seed: int, size: float = 0.25, flatness: float = 0.0, opacity: float = 0.0, axes: int = 2
+) -> Scene:
+    """`size`: of the discs; `flatness`: log₁₀ of the ratio of their axes; `opacity`: the mean logit.
+
+    `axes`: 3 for 3D Gaussians.
+    """
     rng = np.random.default_rng(seed)
-    scale = np.log(size * rng.uniform(0.3, 1.5, (COUNT, 2)))
+    scale = np.log(size * rng.uniform(0.3, 1.5, (COUNT, axes)))
     scale[:, 1] -= flatness * np.log(10) * rng.uniform(size=COUNT)
     raw = {
         "position": 0.5 * rng.normal(size=(COUNT, 3)),
@@ -96,7 +101,10 @@ SCENES = st.builds(
     size=st.floats(0.02, 0.6),
     flatness=st.floats(0, 2),
     opacity=st.floats(-3, 5),
+    axes=st.sampled_from([2, 3]),
 )
+"""Surfels, and 3D Gaussians."""
+DISCS = SCENES.filter(lambda scene: scene.raw["scale"].shape[1] == 2)
 
 
 @cache
