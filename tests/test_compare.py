@@ -152,6 +152,10 @@ def test_metrics_of_an_older_checkpoint_do_not_finish_a_run(
         assert not jobs.finished(job)
     (folder / "metrics.json").write_text("{")
     assert not jobs.finished(job)
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    assert jobs.finished(job)
+    (folder / "checkpoints" / "0000006.npz").unlink()
+    assert not jobs.finished(job)
 
 
 # ---------- Crashes ----------

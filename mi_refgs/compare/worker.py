@@ -22,6 +22,7 @@ from typing import Any
 
 from mi_refgs.compare.jobs import FAILED, Job
 from mi_refgs.errors import InputError
+from mi_refgs.methods.method import Method
 from mi_refgs.runs.interrupt import TerminatedError
 
 DONE, FAILURE, STOPPED = 0, 2, 143
@@ -73,7 +74,7 @@ def fit_and_measure(job: Job) -> None:
     trainer = begin(method, read_views(method, data, "train", truth=False), run)
     if trainer.iteration:
         print(f"refgs: resumed at iteration {trainer.iteration} of {method.iterations}", file=sys.stderr)
-    trainer.train(Curve(job))
+    trainer.train(Curve(job, method))
     finish(trainer, run)
     evaluate(run, data)
 
@@ -81,10 +82,10 @@ def fit_and_measure(job: Job) -> None:
 class Curve:
     """PSNR on a few test views in the course of a fit, measured between its steps, off its clock."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, method: Method) -> None:
         from mi_refgs.fit.whole import read_views
 
-        self.run, method = job.run, job.method()
+        self.run = job.run
         self.data = read_views(method, Path(job.data), "test", truth=False)
         last = len(self.data.views) - 1
         count = min(CURVE_VIEWS, last + 1)
