@@ -66,6 +66,7 @@ class Ball(Primitive):
     name = "ball"
     widths = {"position": 3, "radius": 1, "opacity": 1}  # noqa: RUF012
     columns = 5  # 1/σ², p.z, centre.x, centre.y, opacity
+    sizes = ("radius",)
 
     def project(self, surfels: Any, camera: Any, shift: Any = None) -> Footprints:
         p, opacity = camera.to_camera(surfels.position()), surfels.opacity()
@@ -112,9 +113,6 @@ class Ball(Primitive):
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         count = len(raw["radius"])
         return np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)), np.exp(raw["radius"].repeat(3, 1))
-
-    def resize(self, raw: dict[str, np.ndarray], rows: Any, factor: float) -> None:
-        raw["radius"][rows] += np.float32(np.log(factor))
 
 
 @pytest.fixture(autouse=True)

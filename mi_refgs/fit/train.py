@@ -269,7 +269,7 @@ class Trainer:
             colour = ("radiance_sh",) if options.propagate.noise else ()
             self._replace(
                 refine.propagate_normals(self.surfels, options.propagate, rng),
-                cleared=("opacity", "scale", *colour),
+                cleared=("opacity", *self.surfels.primitive.sizes, *colour),
             )
             self.optimiser.set_factor("opacity", 0.0)
             self.held_until = iteration + options.propagate.hold

@@ -52,6 +52,7 @@ class Gaussian(Primitive):
     name = "gaussian"
     widths = {"position": 3, "rotation": 4, "scale": 3, "opacity": 1}  # noqa: RUF012
     columns = 7  # a.x a.y b p.z centre.x centre.y opacity
+    sizes = ("scale",)
 
     def project(self, surfels: Any, camera: Any, shift: Any = None) -> Footprints:
         """Rows, and rectangles that hold every pixel with α ≥ ALPHA_MIN.
@@ -159,10 +160,6 @@ class Gaussian(Primitive):
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The three axes, and the standard deviations along them."""
         return rotation_axes(raw["rotation"]), np.exp(raw["scale"])
-
-    def resize(self, raw: dict[str, np.ndarray], rows: Any, factor: float) -> None:
-        """All three standard deviations."""
-        raw["scale"][rows] += np.float32(np.log(factor))
 
 
 def _near_picture(slope: Any, camera: Any) -> Any:

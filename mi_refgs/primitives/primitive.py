@@ -67,6 +67,8 @@ class Primitive(ABC):
     are among them."""
     columns: int
     """Columns of a row."""
+    sizes: tuple[str, ...]
+    """Its channels that are logarithms of standard deviations."""
 
     # ---------------- footprints, under AD ----------------
 
@@ -122,9 +124,10 @@ class Primitive(ABC):
         The children of what is split lie at normal deviates of these.
         """
 
-    @abstractmethod
     def resize(self, raw: dict[str, np.ndarray], rows: Any, factor: float) -> None:
         """Multiply the standard deviations of some rows by a factor, in place."""
+        for name in self.sizes:
+            raw[name][rows] += np.float32(np.log(factor))
 
 
 PRIMITIVES: dict[str, Primitive] = {}

@@ -65,6 +65,7 @@ class Surfel(Primitive):
     name = "surfel"
     widths = {"position": 3, "rotation": 4, "scale": 2, "opacity": 1}  # noqa: RUF012
     columns = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
+    sizes = ("scale",)
 
     def project(self, surfels: Any, camera: Any, shift: Any = None) -> Footprints:
         """Rows, and rectangles that hold every pixel with α ≥ ALPHA_MIN.
@@ -211,10 +212,6 @@ class Surfel(Primitive):
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The two tangents, and the standard deviations along them."""
         return rotation_axes(raw["rotation"])[:, :2], np.exp(raw["scale"])
-
-    def resize(self, raw: dict[str, np.ndarray], rows: Any, factor: float) -> None:
-        """Both standard deviations."""
-        raw["scale"][rows] += np.float32(np.log(factor))
 
 
 class FootprintAdjoint:

@@ -168,7 +168,9 @@ def count_work(trainer: Trainer) -> Work:
         pixels.append(counts[-1].pixels_of_surfel.numpy())
     largest = np.max(pixels, axis=0)
     seen = largest > 0
-    scale, opacity = (surfels.to_numpy()[name].astype(np.float64) for name in ("scale", "opacity"))
+    raw = {name: values.astype(np.float64) for name, values in surfels.to_numpy().items()}
+    sizes = np.sort(np.maximum(surfels.primitive.extent(raw)[1], np.finfo(np.float32).tiny), axis=1)
+    opacity = raw["opacity"]
 
     def mean(name: str) -> float:
         return float(np.mean([getattr(found, name) for found in counts]))
@@ -188,6 +190,6 @@ def count_work(trainer: Trainer) -> Work:
         unseen_share=float(1 - seen.mean()),
         single_share=of_seen(largest == 1),
         faint_share=of_seen(1 / (1 + np.exp(-opacity[:, 0])) < FAINT),
-        aspect=of_seen(np.exp(np.abs(scale[:, 0] - scale[:, 1])), np.median),
+        aspect=of_seen(sizes[:, -1] / sizes[:, -2], np.median),
         footprint=float(np.sum(pixels) / max(np.count_nonzero(pixels), 1)),
     )
