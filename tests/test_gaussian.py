@@ -20,8 +20,10 @@ from test_splat import (
     make_scene,
     outside_band,
 )
+from tiny_scene import train_command, write_data, write_method
 
 from mi_refgs import constants
+from mi_refgs.cli import main
 from mi_refgs.constants import ALPHA_MIN, GAUSSIAN_LOW_PASS
 from mi_refgs.device import upload
 from mi_refgs.fit import refine
@@ -316,3 +318,13 @@ def test_children_are_samples_of_their_parent() -> None:
     tiny = Surfels.from_numpy(raw | {"scale": raw["scale"] - 5})
     cloned = refine.densify_and_prune(tiny, hot, 1.0, options, 4 * count, rng).surfels.to_numpy()
     assert len(cloned["scale"]) == 2 * count and not cloned["position"].any()
+
+
+def test_the_whole_method_runs_on_them(tmp_path: Path) -> None:
+    """Both stages, the mesh, the run's files and its scene; the method only names another primitive."""
+    data, run = write_data(tmp_path / "data"), tmp_path / "run"
+    command = train_command(data, run, write_method(tmp_path))
+    assert main([*command, "surfels.primitive='gaussian'"]) == 0
+    assert read_ply(run / "surfels.ply").primitive.name == "gaussian"
+    assert main(["eval", str(run)]) == 0
+    assert np.isfinite(np.array(mi.render(mi.load_file(str(run / "scene.xml"))))).all()

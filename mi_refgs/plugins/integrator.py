@@ -108,7 +108,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
      * - position, rotation, scale, opacity, radiance_sh, albedo, metallic, roughness, indirect_sh
        - |tensor|
-       - Raw channels of shape (N, D). They may be replaced by ones with another N, all in one update.
+       - Raw channels of shape (N, D). They may be replaced by ones with another N, all in one update. A
+         ``scale`` of three columns makes the rows 3D Gaussians.
        - |exposed|, |differentiable|
 
      * - light
