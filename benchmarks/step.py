@@ -1,10 +1,10 @@
-"""Where the time of a training step goes: milliseconds by stage, kernel launches, cache misses once warm.
+"""Where the time of a training step goes: milliseconds by phase, kernel launches, cache misses once warm.
 
     python benchmarks/step.py [--surfels 20000] [--size 200] [--steps 30] [--json]
 
-Surfels cover a unit sphere, so every one of them is on the surface, about half of them seen. Each stage is
+Surfels cover a unit sphere, so every one of them is on the surface, about half of them seen. Each phase is
 timed between barriers, in steps of their own; `step` is the wall time of undisturbed steps, which is less
-than the sum because kernels fuse across stages; `splat` is that of the step's own splat and its gradients by
+than the sum because kernels fuse across phases; `splat` is that of the step's own splat and its gradients by
 themselves, called as a user would. `refgs profile` does the same for a scene of yours, and
 `python -m benchmarks.splatting` measures the splatter alone, its errors included.
 """
@@ -81,7 +81,7 @@ def step_times(surfels: int, size: int, steps: int, variant: str = METHOD) -> di
             "splat_ms": round(splat_ms, 2),
             "launches": found.launches,
             "cache_misses": found.misses,
-            "stages_ms": {key: round(value, 2) for key, value in found.stages_ms.items()},
+            "phases_ms": {key: round(value, 2) for key, value in found.phases_ms.items()},
         }
     return result
 

@@ -199,8 +199,8 @@ def test_of_a_run(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert files(finished) == before  # nothing is written
     (stage,) = found["stages"]
     assert stage["name"] == "deferred" and stage["misses"] >= 0 and stage["launches"] > 10
-    assert list(stage["stages_ms"]) == list(phases.PHASES)
-    assert 0 < stage["step_ms"] and all(ms >= 0 for ms in stage["stages_ms"].values())
+    assert list(stage["phases_ms"]) == list(phases.PHASES)
+    assert 0 < stage["step_ms"] and all(ms >= 0 for ms in stage["phases_ms"].values())
     work = found["work"]
     assert work["views"] == 3 and work["pixels"] == SIZE**2 and 0 < work["covered"] <= SIZE**2
     assert 0 < work["contributing"] < work["evaluated"] and 0 < work["share"] < 1
@@ -298,7 +298,7 @@ def cases() -> Iterator[tuple[dict[str, Any], dict[str, Any], str]]:
 @pytest.mark.parametrize(("work", "ms", "part"), list(cases()))
 def test_each_rule_follows_from_its_number(work: dict[str, Any], ms: dict[str, float], part: str) -> None:
     base = quiet_profile()
-    stage = replace(base.stages[0], stages_ms=base.stages[0].stages_ms | ms)
+    stage = replace(base.stages[0], phases_ms=base.stages[0].phases_ms | ms)
     found = replace(base, stages=(stage,), work=replace(base.work, **work))
     said = advice(found, a_method())
     assert len(said) == 1 and part in said[0]

@@ -174,6 +174,30 @@ def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
     return differentiate(scene.raw, scene.features, scene.camera, adjoints).gradients
 
 
+def test_exact_gradients_are_slopes_of_the_oracle() -> None:
+    """Of the surfel whose opacity matters most; and the maps are the oracle's."""
+    scene = make_scene(1)
+    weights = np.moveaxis(loss_weights(scene, 1), 2, 0).reshape(6, -1)
+
+    def maps(channels: dict[str, np.ndarray]) -> np.ndarray:
+        found = oracle.splat(channels, scene.features, scene.camera)
+        images = [found.features, found.depth[..., None], found.alpha[..., None]]
+        return np.concatenate(images, axis=-1).reshape(-1, 6)
+
+    truth = differentiate(scene.raw, scene.features, scene.camera, weights)
+    assert np.abs(truth.maps - maps(scene.raw)).max() < 1e-12
+    row = int(np.argmax(np.abs(truth.gradients["opacity"])))
+    for name, values in scene.raw.items():
+        for column in range(values.shape[1]):
+            sides = []
+            for step in (1e-6, -1e-6):
+                moved = scene.raw | {name: values.copy()}
+                moved[name][row, column] += step
+                sides.append(np.sum(weights.T * maps(moved)))
+            slope, scale = (sides[0] - sides[1]) / 2e-6, np.abs(truth.gradients[name]).max()
+            assert truth.gradients[name][row, column] == pytest.approx(slope, abs=1e-5 * scale), name
+
+
 def gradient_errors(got: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> dict[str, float]:
     """Relative L2 error per parameter class."""
     errors = {}

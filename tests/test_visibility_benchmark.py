@@ -18,11 +18,11 @@ from scipy.spatial import cKDTree
 from benchmarks.common.errors import compare
 from benchmarks.common.montecarlo import estimate
 from benchmarks.common.select import where
-from benchmarks.visibility import payoff, scenes
+from benchmarks.visibility import scenes, tradeoff
 from benchmarks.visibility.__main__ import main
 from benchmarks.visibility.rules import Rule
 from benchmarks.visibility.settings import SMALL
-from benchmarks.visibility.stage import Stage
+from benchmarks.visibility.setup import Setup
 
 Row = dict[str, Any]
 
@@ -54,7 +54,7 @@ def test_reports_are_written(folder: Path, result: dict[str, Any]) -> None:
     assert (folder / link).stat().st_size > 10_000
     with (folder / "visibility.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(result["rows"])
-    for row in result["payoffs"]:
+    for row in result["tradeoffs"]:
         assert f"{row['scene']}, roughness {row['roughness']:g}" in page
 
 
@@ -129,10 +129,10 @@ def test_the_budget_takes_the_error_of_the_rule_apart(result: dict[str, Any], sc
 def test_bounces_approach_the_path_tracer_at_full_depth() -> None:
     """In a bowl, most of whose light comes by several reflections: the bias falls to less than 4 %."""
     settings = replace(SMALL, spp=64)
-    stage = Stage(scenes.make_scene("bowl", settings.detail), settings)
-    stage.material(0.3)
-    reference = estimate(stage.reference(12))
-    found = [compare(stage.picture(Rule(64, bounces)), reference) for bounces in (0, 1, 2, 4, 8)]
+    setup = Setup(scenes.make_scene("bowl", settings.detail), settings)
+    setup.material(0.3)
+    reference = estimate(setup.reference(12))
+    found = [compare(setup.picture(Rule(64, bounces)), reference) for bounces in (0, 1, 2, 4, 8)]
     bias, relmse = [x.bias for x in found], [x.relmse for x in found]
     print(f"bias {np.round(bias, 3)}, relMSE {np.round(relmse, 3)}")
     assert bias == sorted(bias) and bias[0] < -0.3 and abs(bias[-1]) < 0.04
@@ -158,7 +158,7 @@ def test_payoff_is_chosen_elsewhere_within_the_budget() -> None:
         {"scene": name, "roughness": 0.3, "indirect": "harmonics", "total": 0.4} for name in ("here", "there")
     ]
     budgets += [row | {"indirect": "1 bounce", "total": 9.0} for row in budgets]
-    shading = payoff.payoffs(rows, budgets)[0]
+    shading = tradeoff.tradeoffs(rows, budgets)[0]
     assert (shading["scene"], shading["time"], shading["method"]) == ("here", "ms", "steady")
     assert shading["gain"] == pytest.approx(2) and shading["price"] == pytest.approx(2)
     assert shading["best_gain"] == pytest.approx(4) and shading["mirror_relmse"] == 1

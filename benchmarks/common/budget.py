@@ -8,17 +8,18 @@ sign and all; their squares do not, and the rest is their interaction: twice the
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from benchmarks.common.errors import CLEAR, weight
-from benchmarks.common.view import view_bins
+from benchmarks.common.report import number, table
 
 TOLERANCE = 0.2
 """Share of the total by which a sum of squares may miss it and still add up."""
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -43,15 +44,6 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Place:
-    """A range of n·v: its share of the points, and of the covariance of the two parts that interact most."""
-
-    name: str
-    points: float
-    share: float
-
-
-@dataclass(frozen=True)
 class Budget:
     """Parts in the order of the chain; `interaction` = total - sum of the parts' relMSE."""
 
@@ -60,42 +52,25 @@ class Budget:
     interaction: float
     pair: tuple[str, str]  # the two parts that interact most
     correlation: float  # of these two
-    covariance: float  # twice theirs: what of the interaction they explain
-    where: tuple[Place, ...]  # it comes from
-    joined: tuple[float, ...]  # sum of squares with the first groups of parts, 1, 2, …, as one part each
 
     @property
     def sum(self) -> float:
         """Sum of the parts' relMSE."""
         return self.total - self.interaction
 
-    def adds_up(self, squares: float) -> bool:
-        """Whether a sum of squares alone explains the total."""
-        return abs(self.total - squares) <= TOLERANCE * self.total
+    @property
+    def adds_up(self) -> bool:
+        """Whether the sum of squares alone explains the total."""
+        return abs(self.interaction) <= TOLERANCE * self.total
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> Row:
         """For JSON."""
-        return {
-            "parts": [vars(part) for part in self.parts],
-            "total": self.total,
-            "sum": self.sum,
-            "interaction": self.interaction,
-            "adds_up": self.adds_up(self.sum),
-            "pair": list(self.pair),
-            "correlation": self.correlation,
-            "pair_explains": self.adds_up(self.sum + self.covariance),
-            "where": [vars(place) for place in self.where],
-            "joined_add_up": [self.adds_up(squares) for squares in self.joined],
-        }
+        parts = {"parts": [vars(part) for part in self.parts], "sum": self.sum, "adds_up": self.adds_up}
+        return vars(self) | parts | {"pair": list(self.pair)}
 
 
-def take_apart(steps: Sequence[Step], n_dot_v: np.ndarray, groups: Sequence[tuple[str, str]] = ()) -> Budget:
-    """Budget of a chain of at least two steps, the last of which is the reference.
-
-    Args:
-        n_dot_v: cosine of the view angle (P,), to tell where parts interact.
-        groups: pairs of parts that may be looked at as one; those without such parts change nothing.
-    """
+def decompose(steps: Sequence[Step]) -> Budget:
+    """Budget of a chain of at least two steps, the last of which is the reference."""
     reference = steps[-1].values
     root = np.sqrt(weight(reference))
     differences = [before.values - after.values for before, after in itertools.pairwise(steps)]
@@ -115,26 +90,49 @@ def take_apart(steps: Sequence[Step], n_dot_v: np.ndarray, groups: Sequence[tupl
     cross = np.triu(products, 1)
     j, k = (int(x) for x in np.unravel_index(int(np.abs(cross).argmax()), cross.shape))
     size = float(np.sqrt(products[j, j] * products[k, k]))
-    both = (scaled[j] * scaled[k]).reshape(reference.shape).sum(-1)
-    bins = view_bins(n_dot_v).items() if both.sum() != 0 else ()
-    squares, joined = float(np.trace(products)), []
-    for group in groups:
-        if set(group) <= set(names):
-            first, second = (names.index(name) for name in group)
-            squares += 2 * float(products[first, second])
-        joined.append(squares)
-    return Budget(
-        parts,
-        total,
-        total - float(np.trace(products)),
-        (names[j], names[k]),
-        float(cross[j, k]) / size if size > 0 else 0.0,
-        2 * float(cross[j, k]),
-        tuple(Place(name, float(mask.mean()), float(both[mask].sum() / both.sum())) for name, mask in bins),
-        tuple(joined),
-    )
+    correlation = float(cross[j, k]) / size if size > 0 else 0.0
+    return Budget(parts, total, total - float(np.trace(products)), (names[j], names[k]), correlation)
 
 
 def noise_floor(error: np.ndarray, reference: np.ndarray) -> float:
     """relMSE below which a part or a whole cannot be told from standard errors (P, 3)."""
     return CLEAR * float((error**2 * weight(reference)).mean())
+
+
+# ---------------- as Markdown ----------------
+
+
+def budget_table(head: str, cases: Iterable[tuple[str, Row]]) -> str:
+    """A line for each labelled budget: parts, total, sum of squares and interaction."""
+    found = list(cases)
+    names = [part["name"] for part in found[0][1]["parts"]] if found else []
+    rows = [[label, *_cells(case)] for label, case in found]
+    return table([head, *names, "total", "sum", "interaction"], rows)
+
+
+def _cells(case: Row) -> list[str]:
+    if case["total"] < case["floor"]:
+        return [*["–"] * len(case["parts"]), f"< {number(case['floor'], 2)}", "–", "noise"]
+    parts = [f"{100 * part['share']:.0f} % ({number(part['relmse'], 2)})" for part in case["parts"]]
+    left = f"{100 * case['interaction'] / case['total']:+.0f} %"
+    if not case["adds_up"]:
+        left += f": {case['pair'][0]} and {case['pair'][1]}, ρ = {case['correlation']:+.2f}"
+    return [*parts, number(case["total"], 2), number(case["sum"], 2), left]
+
+
+def interactions(budgets: Sequence[Row]) -> str:
+    """The budgets above the noise whose squares do not add up, by the two parts that interact most."""
+    pairs: dict[str, list[float]] = {}
+    for row in above_noise(budgets):
+        if not row["adds_up"]:
+            pairs.setdefault(f"{row['pair'][0]} and {row['pair'][1]}", []).append(row["correlation"])
+    rows = [
+        [name, len(ρ), sum(x < 0 for x in ρ), f"{np.median(ρ):+.2f}"]
+        for name, ρ in sorted(pairs.items(), key=lambda item: -len(item[1]))
+    ]
+    return table(["parts", "budgets", "cancel in", "median ρ"], rows)
+
+
+def above_noise(budgets: Sequence[Row]) -> list[Row]:
+    """The budgets whose total is no noise."""
+    return [row for row in budgets if row["total"] >= row["floor"]]

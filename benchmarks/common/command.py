@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.lights import ROOT
-from benchmarks.common.report import write_csv, write_json, write_text
+from benchmarks.common.report import fill, write_csv, write_json, write_text
 from mi_refgs.errors import InputError
 
 
@@ -34,19 +34,22 @@ def write_reports(
     options: argparse.Namespace,
     measure: Callable[[], dict[str, Any]],
     plot: Callable[[dict[str, Any], Path], Any],
-    page: Callable[[dict[str, Any], Any, Path], str],
+    page: Callable[[dict[str, Any]], dict[str, Any]],
 ) -> int:
     """Measure, or read `options.json`; write JSON, CSV (of "rows") and page. The exit code: 2 for bad input.
 
-    `plot` writes its pictures of the result to a folder; `page` gets the result, what `plot` returned and the
-    page's folder, and returns Markdown.
+    `plot` writes its pictures of the result to a folder; `page` returns what the template page.md of the
+    benchmark leaves open: tables and numbers by name. The machine and the run's minutes are added.
     """
     folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", ROOT / "runs")
     try:
         result = json.loads(options.json.read_text(encoding="utf-8")) if options.json else measure()
         write_json(data / f"{name}.json", result)
         write_csv(data / f"{name}.csv", result["rows"])
-        write_text(folder / f"{name}.md", page(result, plot(result, folder / "images"), folder))
+        plot(result, folder / "images")
+        values = result["machine"] | {"minutes": f"{result['seconds'] / 60:.1f}"} | page(result)
+        template = (ROOT / "benchmarks" / name / "page.md").read_text(encoding="utf-8")
+        write_text(folder / f"{name}.md", fill(template, values))
     except InputError as error:
         print(error, file=sys.stderr)
         return 2

@@ -7,6 +7,7 @@ import io
 import json
 import math
 import platform
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -59,19 +60,23 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Markdown table; numbers to the right."""
-    body = [[str(cell) for cell in row] for row in rows]
+    """Markdown table; numbers to the right; None and no rows at all are empty."""
+    body = [["" if cell is None else str(cell) for cell in row] for row in rows]
+    if not body:
+        return "*Not measured in this run.*"
     rule = ["---"] + ["---:"] * (len(head) - 1)
     return "\n".join("| " + " | ".join(line) + " |" for line in [list(head), rule, *body])
 
 
-def prose(text: str) -> str:
-    """One paragraph on one line."""
-    return " ".join(text.split())
+def fill(template: str, values: Mapping[str, Any]) -> str:
+    """The text with every {{name}} replaced; raises KeyError for a name that has no value."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: str(values[found[1]]), template)
 
 
-def number(value: float, digits: int = 3) -> str:
-    """A few significant figures, without exponents from 0.001 to a million."""
+def number(value: float | None, digits: int = 3) -> str:
+    """A few significant figures, without exponents from 0.001 to a million; None is empty."""
+    if value is None:
+        return ""
     if value == 0:
         return "0"
     if not 1e-3 <= abs(value) < 1e6:

@@ -14,19 +14,30 @@ Key = TypeVar("Key", bound=Hashable)
 MIN_ROUNDS = 5
 
 
-def milliseconds(calls: Mapping[Key, Callable[[], Any]], seconds: float, most: int = 25) -> dict[Key, float]:
+def milliseconds(
+    calls: Mapping[Key, Callable[[], Any]],
+    seconds: float,
+    most: int = 25,
+    slow: Mapping[Key, tuple[Callable[[], Any], int]] | None = None,
+) -> dict[Key, float]:
     """Median wall time of each call, its result evaluated and waited for; first calls are not counted.
 
     All calls run once in each round, so that a machine that slows down slows all of them: ratios of these
     times stay true. Rounds go on until `seconds` have passed for each call, at least five and at most `most`.
+    `slow` calls run in the first rounds only, each as often as it says, and their time does not count.
     """
-    for call in calls.values():
+    slow = slow or {}
+    for call in [*calls.values(), *(call for call, _ in slow.values())]:
         once(call)
-    times: dict[Key, list[float]] = {key: [] for key in calls}
-    begin, rounds = time.perf_counter(), 0
-    while rounds < MIN_ROUNDS or (rounds < most and time.perf_counter() - begin < seconds * len(calls)):
+    times: dict[Key, list[float]] = {key: [] for key in (*calls, *slow)}
+    rounds, spent = 0, 0.0
+    while rounds < min(MIN_ROUNDS, most) or (rounds < most and spent < seconds * len(calls)):
         for key, call in calls.items():
             times[key].append(once(call))
+            spent += times[key][-1]
+        for key, (call, number) in slow.items():
+            if rounds < number:
+                times[key].append(once(call))
         rounds += 1
     return {key: 1e3 * float(np.median(found)) for key, found in times.items()}
 

@@ -1,4 +1,4 @@
-"""Straight lines through times and memory."""
+"""Time and memory as sums of what they grow with."""
 
 from __future__ import annotations
 
@@ -9,22 +9,6 @@ import numpy as np
 from scipy.optimize import nnls
 
 Row = dict[str, Any]
-
-
-def line(x: Sequence[float], y: Sequence[float]) -> dict[str, float]:
-    """Least squares y = a + b x, with R² = 1 - Σ residual² / Σ (y - mean)², and the decades that x spans."""
-    design = np.stack([np.ones(len(x)), np.asarray(x, float)], axis=1)
-    values = np.asarray(y, float)
-    solution, *_ = np.linalg.lstsq(design, values, rcond=None)
-    residual = values - design @ solution
-    spread = float(np.sum((values - values.mean()) ** 2))
-    return {
-        "a": float(solution[0]),
-        "b": float(solution[1]),
-        "r2": 1 - float(np.sum(residual**2)) / spread if spread else 1.0,
-        "decades": float(np.log10(max(x) / min(x))),
-        "points": len(x),
-    }
 
 
 def plane(rows: Sequence[Row], target: str, names: Sequence[str]) -> dict[str, float]:

@@ -28,9 +28,9 @@ TINY = (64, 16)
 """Surfels and pixels that compile a view's kernels, so that the compiler's own memory is not counted."""
 
 
-def measure_memory(grid: tuple[tuple[int, int], ...]) -> list[dict[str, Any]]:
-    """Peak memory of forward and backward for each number of surfels and size."""
-    return [_run("memory", case) for case in grid]
+def measure_memory(case: tuple[int, int]) -> dict[str, Any]:
+    """Peak memory of forward and backward for a number of surfels and a size."""
+    return _run("memory", case)
 
 
 def measure_step(case: tuple[int, int]) -> dict[str, Any]:
@@ -42,7 +42,13 @@ def measure_compile(case: tuple[int, int]) -> dict[str, Any]:
     """Milliseconds of the first forward and the first forward + backward: kernel cache empty, full, warm."""
     with tempfile.TemporaryDirectory() as folder:
         cold, cached = (_run("compile", case, DRJIT_CACHE_DIR=folder) for _ in range(2))
-    return {"cold": cold["first"], "cached": cached["first"], "warm": cached["second"]}
+    return {
+        "surfels": case[0],
+        "size": case[1],
+        "cold": cold["first"],
+        "cached": cached["first"],
+        "warm": cached["second"],
+    }
 
 
 def _run(task: str, case: tuple[int, int], **environment: str) -> dict[str, Any]:

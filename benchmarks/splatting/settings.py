@@ -23,8 +23,6 @@ class Settings:
         (50_000, 512),
     )
     volprim_repeats: int = 2
-    raster: Grid = ((1_000, 128), (1_000, 256), (10_000, 128), (10_000, 256))
-    raster_repeats: int = 3
     errors: Grid = ((1_000, 256), (10_000, 256), (50_000, 256), (50_000, 512))
     crop: int = 32  # pixels, edge of the part whose error is measured
     memory: Grid = (
@@ -37,10 +35,10 @@ class Settings:
         (1_000_000, 512),
         (1_000_000, 1024),
     )
-    compiled: Grid = ((10_000, 256),)  # cold and warm compile times
+    compiled: tuple[int, int] = (10_000, 256)  # cold and warm compile times
     step: tuple[int, int] = (20_000, 200)  # of the training step
     steps: int = 30
-    large_step: tuple[int, int] | None = (1_000_000, 1024)  # memory of one training step
+    large_step: tuple[int, int] = (1_000_000, 1024)  # memory of one training step
     triad: int = 1 << 25  # floats of each array that measures the bandwidth
 
 
@@ -50,7 +48,6 @@ FULL = Settings(
     seconds=6.0,
     volprim=tuple((n, size) for n in PAGE.surfels for size in (128, 256, 512)),
     volprim_repeats=3,
-    raster=tuple((n, size) for n in (1_000, 10_000, 50_000) for size in (128, 256, 512)),
     errors=tuple((n, size) for n in PAGE.surfels for size in (128, 256, 512)),
 )
 SMALL = Settings(
@@ -61,14 +58,12 @@ SMALL = Settings(
     seconds=0.1,
     volprim=((200, 32),),
     volprim_repeats=1,
-    raster=((200, 32), (2_000, 64)),
-    raster_repeats=1,
     errors=((200, 32), (2_000, 64)),
     crop=16,
-    memory=(),
-    compiled=(),
+    memory=((200, 32),),
+    compiled=(200, 32),
     step=(500, 32),
     steps=3,
-    large_step=None,
+    large_step=(500, 32),
     triad=1 << 20,
 )

@@ -8,9 +8,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.common.budget import Step, noise_floor, take_apart
+from benchmarks.common.budget import Step, decompose, noise_floor
 from benchmarks.splitsum import methods
-from benchmarks.splitsum.exact import Stage, diffuse, reflectance
+from benchmarks.splitsum.exact import Setup, diffuse, reflectance
 from benchmarks.splitsum.settings import CONVEX
 from mi_refgs.shade.points import reflect
 
@@ -22,42 +22,40 @@ LOBE = "lobe with N = V = R"
 SCHLICK = "Schlick in the table"
 SHADOW = "no shadow"
 BOUNCES = "no inter-reflection"
-GROUPS = ((SHADOW, BOUNCES), (LOBE, SCHLICK))
-"""Pairs that may be looked at as one: what the shape itself does to the light, and the reflectance's lobe."""
 
 
-def budgets(stage: Stage) -> list[dict[str, Any]]:
+def budgets(setup: Setup) -> list[dict[str, Any]]:
     """Budgets of every roughness and metal of a shape under a light, at the default height and the finest."""
-    settings = stage.settings
+    settings = setup.settings
     heights = sorted({settings.height, settings.heights[-1]})
-    lights = {height: stage.light.prefiltered(height) for height in heights}
-    finest = stage.light.prefiltered(settings.truth_height)
+    lights = {height: setup.light.prefiltered(height) for height in heights}
+    finest = setup.light.prefiltered(settings.truth_height)
     found = []
     for roughness in settings.roughness:
-        around = stage.prefiltered(roughness).mean
+        around = setup.prefiltered(roughness).mean
         for height in heights:
-            lookups = _lookups(stage, roughness, lights[height], finest, around)
+            lookups = _lookups(setup, roughness, lights[height], finest, around)
             for metallic in settings.budget_metallic:
-                steps = _chain(stage, roughness, metallic, lights[height], lookups)
+                steps = _chain(setup, roughness, metallic, lights[height], lookups)
                 found.append(
                     {
-                        "shape": stage.name,
-                        "light": stage.light.name,
+                        "shape": setup.name,
+                        "light": setup.light.name,
                         "roughness": roughness,
                         "metallic": metallic,
                         "height": height,
-                        "floor": _noise(stage, roughness, metallic),
-                        **take_apart(steps, stage.points.n_dot_v(), GROUPS).record(),
+                        "floor": _noise(setup, roughness, metallic),
+                        **decompose(steps).record(),
                     }
                 )
     return found
 
 
 def _lookups(
-    stage: Stage, roughness: float, shipped: Any, finest: Any, around: np.ndarray
+    setup: Setup, roughness: float, shipped: Any, finest: Any, around: np.ndarray
 ) -> dict[str, np.ndarray]:
     """What the chains of all metals share: radiance around the mirror direction in three qualities."""
-    points = stage.points
+    points = setup.points
     mirror = reflect(points.view, points.normal)
     r = dr.opaque(mi.Float, roughness)
     return {
@@ -69,14 +67,14 @@ def _lookups(
 
 
 def _chain(
-    stage: Stage, roughness: float, metallic: float, shipped: Any, lookups: dict[str, np.ndarray]
+    setup: Setup, roughness: float, metallic: float, shipped: Any, lookups: dict[str, np.ndarray]
 ) -> list[Step]:
     """From the product's own picture to the exact one."""
     f0 = reflectance(metallic)
     values = methods.picture_values(
-        methods.split_sum(stage.points, methods.material(metallic, roughness), shipped)
+        methods.split_sum(setup.points, methods.material(metallic, roughness), shipped)
     )
-    integrals = stage.integrals(roughness)
+    integrals = setup.integrals(roughness)
     a, b = integrals.table
     base = diffuse(metallic, integrals.table)
     looked_up, exact = base * lookups["irradiance"], base * integrals.irradiance.mean
@@ -91,17 +89,17 @@ def _chain(
         Step(LOBE, around * table + exact),
         Step(SCHLICK, integrals.radiance(metallic).mean),
     ]
-    return steps if stage.name in CONVEX else steps + _concave(stage, roughness, metallic)
+    return steps if setup.name in CONVEX else steps + _concave(setup, roughness, metallic)
 
 
-def _concave(stage: Stage, roughness: float, metallic: float) -> list[Step]:
+def _concave(setup: Setup, roughness: float, metallic: float) -> list[Step]:
     """What the shape itself adds: its shadow, and light that it reflects onto itself."""
-    direct = stage.integrals(roughness, occluded=True).radiance(metallic).mean
-    further = stage.bounces(roughness, metallic)
+    direct = setup.integrals(roughness, occluded=True).radiance(metallic).mean
+    further = setup.bounces(roughness, metallic)
     return [Step(SHADOW, direct), Step(BOUNCES, direct + further)]
 
 
-def _noise(stage: Stage, roughness: float, metallic: float) -> float:
+def _noise(setup: Setup, roughness: float, metallic: float) -> float:
     """relMSE below which a part or a whole cannot be told from the references' noise."""
-    reference = stage.integrals(roughness).radiance(metallic)
+    reference = setup.integrals(roughness).radiance(metallic)
     return noise_floor(reference.error, reference.mean)

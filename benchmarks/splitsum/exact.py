@@ -1,4 +1,4 @@
-"""Stages: one shape under one light as Mitsuba's scene, with the exact integrals of every roughness."""
+"""Set-ups: one shape under one light as Mitsuba's scene, with the exact integrals of every roughness."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def diffuse(metallic: float, table: tuple[np.ndarray, np.ndarray]) -> np.ndarray
     return mc.left_by_specular(reflectance(metallic), *table) * (1 - metallic) * np.array(ALBEDO)
 
 
-class Stage:
+class Setup:
     """One shape under one light: scene, sensor, points, and references made when asked for and kept."""
 
     def __init__(self, name: str, light: Light, settings: Settings) -> None:

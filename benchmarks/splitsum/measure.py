@@ -17,7 +17,7 @@ from benchmarks.common import montecarlo as mc
 from benchmarks.common.lights import Light, make_light
 from benchmarks.common.view import Points, view_bins
 from benchmarks.splitsum import decompose, methods, surfels
-from benchmarks.splitsum.exact import Stage
+from benchmarks.splitsum.exact import Setup
 from benchmarks.splitsum.settings import Settings
 from benchmarks.splitsum.speedup import line, speed_ups
 from mi_refgs.shade.lobe_matrices import Levels
@@ -42,18 +42,18 @@ class Run:
     surfel_budgets: list[dict[str, Any]] = field(default_factory=list)
     flip_reason: str = ""
 
-    def time(self, stage: Stage, calls: dict[tuple[str, int], Callable[[], Any]]) -> None:
+    def time(self, setup: Setup, calls: dict[tuple[str, int], Callable[[], Any]]) -> None:
         """Book the times of calls by (method, setting) that make the timed picture."""
         megapixels = self.settings.timing_size**2 / 1e6
         for key, ms in timing.milliseconds(calls, self.settings.timing_seconds).items():
-            self.times[(stage.name, stage.light.name, *key)] = ms / megapixels
+            self.times[(setup.name, setup.light.name, *key)] = ms / megapixels
 
     def add(
-        self, stage: Stage, method: str, setting: int, roughness: float, metallic: float, values: np.ndarray
+        self, setup: Setup, method: str, setting: int, roughness: float, metallic: float, values: np.ndarray
     ) -> None:
         """Book the errors of a picture (P, 3), for the split sum also by view angle."""
-        reference = stage.integrals(roughness).radiance(metallic)
-        points = stage.points
+        reference = setup.integrals(roughness).radiance(metallic)
+        points = setup.points
         flip, self.flip_reason = errors.flip(points.image(values), points.image(reference.mean))
         masks: dict[str, Any] = {ALL: None}
         if method.startswith("split_sum"):
@@ -62,8 +62,8 @@ class Run:
             found = errors.compare(values, reference, mask)
             self.rows.append(
                 {
-                    "shape": stage.name,
-                    "light": stage.light.name,
+                    "shape": setup.name,
+                    "light": setup.light.name,
                     "roughness": roughness,
                     "metallic": metallic,
                     "method": method,
@@ -86,32 +86,32 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     lights = [make_light(name, settings.truth_height) for name in settings.lights]
     run = Run(settings)
     materials = [(r, m) for r in settings.roughness for m in settings.metallic]
-    stages = [Stage(name, light, settings) for name in settings.shapes for light in lights]
+    stages = [Setup(name, light, settings) for name in settings.shapes for light in lights]
 
-    for stage in tqdm(stages, desc="references, path tracer, Monte Carlo", disable=quiet):
+    for setup in tqdm(stages, desc="references, path tracer, Monte Carlo", disable=quiet):
         for roughness, metallic in materials:
-            _sampled(run, stage, roughness, metallic)
+            _sampled(run, setup, roughness, metallic)
     for levels in (methods.SHIPPED, *settings.level_sets):
         variants = [variant for variant in _variants(settings) if variant.levels == levels]
         filtered = _prefilter(run, lights, variants)
-        for stage in tqdm(stages, desc=f"split sum, times ({levels})", disable=quiet):
-            calls = _split_sums(run, stage, variants, filtered, materials)
+        for setup in tqdm(stages, desc=f"split sum, times ({levels})", disable=quiet):
+            calls = _split_sums(run, setup, variants, filtered, materials)
             if levels == methods.SHIPPED:
-                calls |= _sampled_calls(run, stage)
-            run.time(stage, calls)
-    shared = {(stage.name, stage.light.name): stage for stage in stages}
+                calls |= _sampled_calls(run, setup)
+            run.time(setup, calls)
+    shared = {(setup.name, setup.light.name): setup for setup in stages}
     for name in tqdm(settings.budget_shapes, desc="error budget", disable=quiet):
         for light in lights:
-            stage = shared.get((name, light.name)) or Stage(name, light, settings)
-            run.budgets += decompose.budgets(stage)
+            setup = shared.get((name, light.name)) or Setup(name, light, settings)
+            run.budgets += decompose.budgets(setup)
             if name == surfels.SHAPE:
-                run.surfel_budgets.append(surfels.budget(stage))
+                run.surfel_budgets.append(surfels.budget(setup))
     return {
         "machine": report.machine(),
         "settings": vars(settings),
         "seconds": time.perf_counter() - begin,
         "frequencies": {light.name: light.frequency() for light in lights},
-        "pixels": {stage.name: stage.points.count for stage in stages},
+        "pixels": {setup.name: setup.points.count for setup in stages},
         "rows": [_timed(run, row) for row in run.rows],
         "times": [
             {"shape": s, "light": n, "method": method, "setting": k, "ms_per_mpx": ms}
@@ -139,21 +139,21 @@ def _timed(run: Run, row: dict[str, Any]) -> dict[str, Any]:
 # ---------------- errors ----------------
 
 
-def _sampled(run: Run, stage: Stage, roughness: float, metallic: float) -> None:
+def _sampled(run: Run, setup: Setup, roughness: float, metallic: float) -> None:
     """Pictures of the path tracer and of plain Monte Carlo."""
     settings = run.settings
-    stage.set_material(metallic, roughness)
+    setup.set_material(metallic, roughness)
     material = methods.material(metallic, roughness)
     seed = 1 + len(run.rows)
     for spp in settings.spp:
-        image = mi.render(stage.scene, sensor=stage.sensor, integrator=stage.direct, spp=spp, seed=seed + spp)
-        values = stage.points.of_image(image)
-        run.add(stage, "path", spp, roughness, metallic, values)
-    reference = stage.integrals(roughness).radiance(metallic)
+        image = mi.render(setup.scene, sensor=setup.sensor, integrator=setup.direct, spp=spp, seed=seed + spp)
+        values = setup.points.of_image(image)
+        run.add(setup, "path", spp, roughness, metallic, values)
+    reference = setup.integrals(roughness).radiance(metallic)
     run.scores.append(
         {
-            "shape": stage.name,
-            "light": stage.light.name,
+            "shape": setup.name,
+            "light": setup.light.name,
             "roughness": roughness,
             "metallic": metallic,
             "score": errors.mean_score(values, reference),
@@ -163,8 +163,8 @@ def _sampled(run: Run, stage: Stage, roughness: float, metallic: float) -> None:
         return  # plain Monte Carlo only serves the plots of speed against error, which show one metal
     for samples in settings.samples:
         count, stream = (dr.opaque(mi.UInt32, n) for n in (samples, seed + samples))
-        found = mc.monte_carlo(stage.points, material, stage.emitter, count, stream)
-        run.add(stage, "monte_carlo", samples, roughness, metallic, methods.picture_values(found))
+        found = mc.monte_carlo(setup.points, material, setup.emitter, count, stream)
+        run.add(setup, "monte_carlo", samples, roughness, metallic, methods.picture_values(found))
 
 
 @dataclass(frozen=True)
@@ -216,41 +216,41 @@ def _prefilter(run: Run, lights: list[Light], variants: list[Variant]) -> dict[t
 
 
 def _split_sums(
-    run: Run, stage: Stage, variants: list[Variant], filtered: dict[tuple[str, int], Any], materials: Any
+    run: Run, setup: Setup, variants: list[Variant], filtered: dict[tuple[str, int], Any], materials: Any
 ) -> dict[tuple[str, int], Callable[[], Any]]:
-    """Book pictures of the split sums of a stage; calls that make the timed ones."""
+    """Book pictures of the split sums of a setup; calls that make the timed ones."""
     timed = methods.material(TIMED_METALLIC, TIMED_ROUGHNESS)
     calls = {}
     for variant in variants:
-        light = filtered[stage.light.name, variant.height]
+        light = filtered[setup.light.name, variant.height]
 
         def shader(points: Points, light: Any = light, knob: str = variant.knob) -> Any:
             return methods.split_sum(points, timed, light, knob)
 
         for roughness, metallic in materials:
             material = methods.material(metallic, roughness)
-            radiance = methods.split_sum(stage.points, material, light, variant.knob)
+            radiance = methods.split_sum(setup.points, material, light, variant.knob)
             values = methods.picture_values(radiance)
-            run.add(stage, variant.method, variant.height, roughness, metallic, values)
-        calls[variant.method, variant.height] = methods.with_primary_rays(stage, shader)
+            run.add(setup, variant.method, variant.height, roughness, metallic, values)
+        calls[variant.method, variant.height] = methods.with_primary_rays(setup, shader)
     return calls
 
 
-def _sampled_calls(run: Run, stage: Stage) -> dict[tuple[str, int], Callable[[], Any]]:
+def _sampled_calls(run: Run, setup: Setup) -> dict[tuple[str, int], Callable[[], Any]]:
     """Calls that make the timed pictures of the path tracer and of plain Monte Carlo."""
-    stage.set_material(TIMED_METALLIC, TIMED_ROUGHNESS)
+    setup.set_material(TIMED_METALLIC, TIMED_ROUGHNESS)
     material = methods.material(TIMED_METALLIC, TIMED_ROUGHNESS)
     calls: dict[tuple[str, int], Callable[[], Any]] = {}
     for count in run.settings.timed_spp:
 
         def path(spp: int = count) -> Any:
-            return mi.render(stage.scene, sensor=stage.timing_sensor, integrator=stage.direct, spp=spp)
+            return mi.render(setup.scene, sensor=setup.timing_sensor, integrator=setup.direct, spp=spp)
 
         samples, seed = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, 1)
 
         def plain(points: Points, samples: Any = samples, seed: Any = seed) -> Any:
-            return mc.monte_carlo(points, material, stage.emitter, samples, seed)
+            return mc.monte_carlo(points, material, setup.emitter, samples, seed)
 
         calls["path", count] = path
-        calls["monte_carlo", count] = methods.with_primary_rays(stage, plain)
+        calls["monte_carlo", count] = methods.with_primary_rays(setup, plain)
     return calls

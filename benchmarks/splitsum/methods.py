@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.view import Points, first_hits
-from benchmarks.splitsum.exact import Stage
+from benchmarks.splitsum.exact import Setup
 from benchmarks.splitsum.settings import ALBEDO
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.lobe_matrices import LEVELS, Levels
@@ -60,12 +60,12 @@ def material(metallic: float, roughness: float) -> mc.Material:
     return mc.device_material(ALBEDO, metallic, roughness)
 
 
-def with_primary_rays(stage: Stage, shader: Callable[[Points], Any]) -> Callable[[], Any]:
+def with_primary_rays(setup: Setup, shader: Callable[[Points], Any]) -> Callable[[], Any]:
     """A call that meets the surface at the centre of every pixel of the timed picture and shades it there."""
-    size, sensor = stage.settings.timing_size, stage.timing_sensor
+    size, sensor = setup.settings.timing_size, setup.timing_sensor
 
     def run() -> Any:
-        hit, ray = first_hits(stage.scene, sensor, size)
+        hit, ray = first_hits(setup.scene, sensor, size)
         pixel = dr.arange(mi.UInt32, size * size)
         colour = shader(Points(size, pixel, hit.p, hit.sh_frame.n, -ray.d, hit.n))
         return dr.select(hit.is_valid(), colour, 0)

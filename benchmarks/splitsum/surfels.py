@@ -13,10 +13,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.common.budget import Step, noise_floor, take_apart
+from benchmarks.common.budget import Step, decompose, noise_floor
 from benchmarks.common.view import Points
 from benchmarks.splitsum import methods
-from benchmarks.splitsum.exact import Stage
+from benchmarks.splitsum.exact import Setup
 from benchmarks.splitsum.settings import ALBEDO
 from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.render.pipeline import render
@@ -61,28 +61,28 @@ def sphere_surfels(count: int) -> Surfels:
     return Surfels.from_numpy(raw)
 
 
-def budget(stage: Stage) -> dict[str, Any]:
+def budget(setup: Setup) -> dict[str, Any]:
     """Budget of the surfels' picture of a sphere, where they cover its pixels."""
-    settings = stage.settings
+    settings = setup.settings
     height = settings.heights[-1]
-    light = stage.light.prefiltered(height)
+    light = setup.light.prefiltered(height)
     surfels = sphere_surfels(settings.surfels)
-    camera = Camera.from_sensor(stage.sensor.inner)
+    camera = Camera.from_sensor(setup.sensor.inner)
     shading = Shading(at="pixel", reflectance="split_sum", diffuse="irradiance")
-    shipped = stage.points.of_image(methods.picture_values(render(surfels, camera, shading, light).radiance))
+    shipped = setup.points.of_image(methods.picture_values(render(surfels, camera, shading, light).radiance))
 
     group = mi.Float(band(surfels.to_numpy()["position"][:, 1]).astype(np.float32))
     blended = splat(surfels, [*surfels.frame()[2], group], camera)
-    normal = _at(blended.features[:3], stage.points)
-    odd, alpha = (_at([x], stage.points)[:, 0] for x in (blended.features[3], blended.alpha))
+    normal = _at(blended.features[:3], setup.points)
+    odd, alpha = (_at([x], setup.points)[:, 0] for x in (blended.features[3], blended.alpha))
     covered = alpha > COVERAGE_FLOOR
     share = np.stack([alpha - odd, odd], axis=-1)
 
-    facing = np.where(np.sum(normal * _rows(stage.points.view), -1, keepdims=True) < 0, -normal, normal)
-    by_surfel = _shaded(stage, light, facing)
-    by_mesh = _shaded(stage, light, _rows(stage.points.normal))
-    here = band(_rows(stage.points.position)[:, 1])
-    exact = [stage.integrals(roughness).radiance(metallic) for metallic, roughness in MATERIALS]
+    facing = np.where(np.sum(normal * _rows(setup.points.view), -1, keepdims=True) < 0, -normal, normal)
+    by_surfel = _shaded(setup, light, facing)
+    by_mesh = _shaded(setup, light, _rows(setup.points.normal))
+    here = band(_rows(setup.points.position)[:, 1])
+    exact = [setup.integrals(roughness).radiance(metallic) for metallic, roughness in MATERIALS]
     steps = [
         Step("", shipped),
         Step(BLENDING, _mixed(by_surfel, share)),
@@ -91,11 +91,9 @@ def budget(stage: Stage) -> dict[str, Any]:
         Step(SPLIT_SUM, _chosen([estimate.mean for estimate in exact], here)),
     ]
     noise = _chosen([estimate.error for estimate in exact], here)[covered]
-    found = take_apart(
-        [Step(step.replaced, step.values[covered]) for step in steps], stage.points.n_dot_v()[covered]
-    )
+    found = decompose([Step(step.replaced, step.values[covered]) for step in steps])
     return {
-        "light": stage.light.name,
+        "light": setup.light.name,
         "height": height,
         "surfels": settings.surfels,
         "covered": float(covered.mean()),
@@ -113,9 +111,9 @@ def _at(maps: list[Any], points: Points) -> np.ndarray:
     return np.stack([np.array(x, np.float64) for x in maps], axis=-1)[points.pixel.numpy()]
 
 
-def _shaded(stage: Stage, light: Any, normal: np.ndarray) -> list[np.ndarray]:
+def _shaded(setup: Setup, light: Any, normal: np.ndarray) -> list[np.ndarray]:
     """The split sum of each material with these normals (P, 3)."""
-    points = stage.points
+    points = setup.points
     turned = Points(
         points.size,
         points.pixel,

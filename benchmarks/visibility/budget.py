@@ -24,11 +24,11 @@ import drjit as dr
 import numpy as np
 
 from benchmarks.common import montecarlo as mc
-from benchmarks.common.budget import Step, noise_floor, take_apart
+from benchmarks.common.budget import Step, decompose, noise_floor
 from benchmarks.visibility import harmonics
 from benchmarks.visibility.rules import PAPER, Rule
 from benchmarks.visibility.settings import Settings
-from benchmarks.visibility.stage import Stage
+from benchmarks.visibility.setup import Setup
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.points import reflect
 
@@ -124,31 +124,31 @@ def bounces_shown(settings: Settings) -> list[int]:
 
 
 def budgets(
-    stage: Stage, roughness: float, references: Mapping[str, np.ndarray], depth: int
+    setup: Setup, roughness: float, references: Mapping[str, np.ndarray], depth: int
 ) -> list[dict[str, Any]]:
     """The budgets of a scene, for JSON: by harmonics, and by few and many bounces of traced light.
 
     `references` are the path tracer's batches at depths 2 ("direct") and `depth` ("full"). `floor` is what
     their noise may be all of.
     """
-    fitted, exact = fit(stage, depth), exact_light(stage, references)
-    shipped = Shipped(stage.picture(Rule(0)), reflectance(stage), stage.picture(PAPER, fitted.mirror))
+    fitted, exact = fit(setup, depth), exact_light(setup, references)
+    shipped = Shipped(setup.picture(Rule(0)), reflectance(setup), setup.picture(PAPER, fitted.mirror))
     # Half the difference of two pictures of half the samples each is one standard error of that of all.
-    first, second = (stage.picture(PAPER, half) for half in fitted.halves)
+    first, second = (setup.picture(PAPER, half) for half in fitted.halves)
     chains = {"harmonics": (by_harmonics(shipped, exact, fitted), 0.5 * (first - second))}
-    for bounces in bounces_shown(stage.settings):
-        light = (stage.reference(2 + bounces) - references["direct"]).mean(0)
+    for bounces in bounces_shown(setup.settings):
+        light = (setup.reference(2 + bounces) - references["direct"]).mean(0)
         traced = Traced(
-            stage.picture(Rule(1, bounces)), stage.picture(Rule(stage.settings.counts[-1], bounces)), light
+            setup.picture(Rule(1, bounces)), setup.picture(Rule(setup.settings.counts[-1], bounces)), light
         )
         chains[bounces_name(bounces)] = by_tracing(shipped, exact, traced), np.zeros_like(light)
     return [
         {
-            "scene": stage.name,
+            "scene": setup.name,
             "roughness": roughness,
             "indirect": name,
             "floor": noise_floor(np.hypot(exact.indirect.error, noise), exact.whole),
-            **take_apart(steps, stage.points.n_dot_v()).record(),
+            **decompose(steps).record(),
         }
         for name, (steps, noise) in chains.items()
     ]
@@ -162,26 +162,26 @@ def bounces_name(bounces: int) -> str:
 # ---------------- what goes in ----------------
 
 
-def exact_light(stage: Stage, batches: Mapping[str, np.ndarray]) -> Exact:
+def exact_light(setup: Setup, batches: Mapping[str, np.ndarray]) -> Exact:
     """By quadrature, and by the path tracer's pictures: batches (B, P, 3) of each depth, of equal seeds.
 
     The random numbers of two depths are the same: their pictures differ by the added reflections alone.
     """
-    environment = stage.scene.environment()
-    blocked, open_ = (stage.reflected(stage.constant, scene).mean(0) for scene in (stage.scene, None))
+    environment = setup.scene.environment()
+    blocked, open_ = (setup.reflected(setup.constant, scene).mean(0) for scene in (setup.scene, None))
     return Exact(
         blocked / open_,
-        mc.estimate(stage.reflected(environment, None)),
-        mc.estimate(stage.reflected(environment, stage.scene)),
+        mc.estimate(setup.reflected(environment, None)),
+        mc.estimate(setup.reflected(environment, setup.scene)),
         mc.estimate(batches["full"] - batches["direct"]),
     )
 
 
-def fit(stage: Stage, depth: int) -> TrainedScene:
+def fit(setup: Setup, depth: int) -> TrainedScene:
     """The best harmonics for the light of the path tracer's `max_depth`, looked up."""
-    settings, points = stage.settings, stage.points
+    settings, points = setup.settings, setup.points
     parts = [
-        harmonics.traced(stage.scene, points, depth, settings.lattice, seed)
+        harmonics.traced(setup.scene, points, depth, settings.lattice, seed)
         for seed in range(1, settings.batches + 1)
     ]
     mirror = reflect(points.view, points.normal)
@@ -190,12 +190,12 @@ def fit(stage: Stage, depth: int) -> TrainedScene:
         np.array(harmonics.along(coefficients, mirror), np.float64).T for coefficients in (whole, even, odd)
     )
     light = harmonics.Surroundings(whole)
-    open_, free = (stage.reflected(light, scene).mean(0) for scene in (None, stage.scene))
+    open_, free = (setup.reflected(light, scene).mean(0) for scene in (None, setup.scene))
     return TrainedScene(looked_up, open_ - free, (first, second))
 
 
-def reflectance(stage: Stage) -> np.ndarray:
+def reflectance(setup: Setup) -> np.ndarray:
     """S of the product's table (P, 3)."""
-    points = stage.points
-    scale, bias = split_sum(dr.dot(points.normal, points.view), stage.roughness)
-    return stage.albedo * np.array(scale, np.float64)[:, None] + np.array(bias, np.float64)[:, None]
+    points = setup.points
+    scale, bias = split_sum(dr.dot(points.normal, points.view), setup.roughness)
+    return setup.albedo * np.array(scale, np.float64)[:, None] + np.array(bias, np.float64)[:, None]

@@ -11,11 +11,11 @@ from tqdm import tqdm
 from benchmarks.common import errors, report, timing
 from benchmarks.common import montecarlo as mc
 from benchmarks.visibility.budget import budgets
-from benchmarks.visibility.payoff import payoffs
 from benchmarks.visibility.rules import Rule, rules
 from benchmarks.visibility.scenes import make_scene
 from benchmarks.visibility.settings import Settings
-from benchmarks.visibility.stage import TIMED_ROUGHNESS, Stage
+from benchmarks.visibility.setup import TIMED_ROUGHNESS, Setup
+from benchmarks.visibility.tradeoff import tradeoffs
 
 DEPTHS = {"direct": 2, "bounce": 3, "full": 12}
 """Mitsuba's `max_depth`: light after one reflection, after up to two, and after up to eleven."""
@@ -27,23 +27,23 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     scenes = [make_scene(name, settings.detail) for name in (*settings.scenes, *settings.meshes)]
     rows: list[dict[str, Any]] = []
     curve: list[dict[str, Any]] = []
-    taken_apart: list[dict[str, Any]] = []
+    found_budgets: list[dict[str, Any]] = []
     facts: dict[str, Any] = {}
     for concave in tqdm(scenes, desc="scenes", disable=quiet):
-        stage = Stage(concave, settings)
+        setup = Setup(concave, settings)
         found: list[dict[str, Any]] = []
-        for roughness in tqdm(settings.roughness, desc=stage.name, disable=quiet):
-            stage.material(roughness)
-            references = {name: stage.reference(depth) for name, depth in DEPTHS.items()}
-            found += _errors(stage, roughness, references)
-            curve += _curve(stage, roughness)
-            taken_apart += budgets(stage, roughness, references, DEPTHS["full"])
-        times = _times(stage)
+        for roughness in tqdm(settings.roughness, desc=setup.name, disable=quiet):
+            setup.material(roughness)
+            references = {name: setup.reference(depth) for name, depth in DEPTHS.items()}
+            found += _errors(setup, roughness, references)
+            curve += _curve(setup, roughness)
+            found_budgets += budgets(setup, roughness, references, DEPTHS["full"])
+        times = _times(setup)
         rows += [row | times.get(row["method"], dict.fromkeys(("ms", "frame_ms"))) for row in found]
-        facts[stage.name] = {
-            "pixels": stage.points.count,
+        facts[setup.name] = {
+            "pixels": setup.points.count,
             "triangles": len(concave.mesh.faces),
-            "surfels": stage.surfels.count,
+            "surfels": setup.surfels.count,
         }
     return {
         "machine": report.machine(),
@@ -52,14 +52,14 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
         "scenes": facts,
         "rows": rows,
         "curve": curve,
-        "budgets": taken_apart,
-        "payoffs": payoffs(rows, taken_apart),
+        "budgets": found_budgets,
+        "tradeoffs": tradeoffs(rows, found_budgets),
     }
 
 
-def _errors(stage: Stage, roughness: float, references: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+def _errors(setup: Setup, roughness: float, references: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """A row for each rule and depth."""
-    pictures = {rule: stage.picture(rule) for rule in rules(stage.settings)}
+    pictures = {rule: setup.picture(rule) for rule in rules(setup.settings)}
     rows = []
     for name, batches in references.items():
         reference = mc.estimate(batches)
@@ -67,7 +67,7 @@ def _errors(stage: Stage, roughness: float, references: dict[str, np.ndarray]) -
             found = errors.compare(values, reference)
             rows.append(
                 {
-                    "scene": stage.name,
+                    "scene": setup.name,
                     "roughness": roughness,
                     "method": rule.name,
                     **vars(rule),
@@ -82,18 +82,18 @@ def _errors(stage: Stage, roughness: float, references: dict[str, np.ndarray]) -
     return rows
 
 
-def _curve(stage: Stage, roughness: float) -> list[dict[str, Any]]:
+def _curve(setup: Setup, roughness: float) -> list[dict[str, Any]]:
     """Over rays: distance of the visibility to the exact one, and of the picture to that of many rays."""
-    exact, noise = stage.visibility()
-    limit = stage.picture(Rule(stage.settings.limit, bounces=1))
+    exact, noise = setup.visibility()
+    limit = setup.picture(Rule(setup.settings.limit, bounces=1))
     weight = errors.weight(limit)
     found = []
-    for rays in (*stage.settings.counts, stage.settings.limit):
-        visibility = np.array(stage.seen(stage.points, Rule(rays)).visibility, np.float64)
-        picture = stage.picture(Rule(rays, bounces=1))
+    for rays in (*setup.settings.counts, setup.settings.limit):
+        visibility = np.array(setup.seen(setup.points, Rule(rays)).visibility, np.float64)
+        picture = setup.picture(Rule(rays, bounces=1))
         found.append(
             {
-                "scene": stage.name,
+                "scene": setup.name,
                 "roughness": roughness,
                 "rays": rays,
                 "visibility_rms": float(np.sqrt(np.mean((visibility - exact) ** 2))),
@@ -105,13 +105,13 @@ def _curve(stage: Stage, roughness: float) -> list[dict[str, Any]]:
     return found
 
 
-def _times(stage: Stage) -> dict[str, dict[str, float]]:
+def _times(setup: Setup) -> dict[str, dict[str, float]]:
     """Milliseconds of each rule that is timed, by name: shading alone, and the product's frame."""
-    stage.material(TIMED_ROUGHNESS)
-    timed = [rule for rule in rules(stage.settings) if rule.rays in (0, 1, *stage.settings.rays)]
-    seconds = stage.settings.timing_seconds
+    setup.material(TIMED_ROUGHNESS)
+    timed = [rule for rule in rules(setup.settings) if rule.rays in (0, 1, *setup.settings.rays)]
+    seconds = setup.settings.timing_seconds
     shading, frame = (
         timing.milliseconds({rule.name: make(rule) for rule in timed}, seconds)
-        for make in (stage.shading_call, stage.frame_call)
+        for make in (setup.shading_call, setup.frame_call)
     )
     return {rule.name: {"ms": shading[rule.name], "frame_ms": frame[rule.name]} for rule in timed}

@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.common import figures
 from benchmarks.common.select import where
-from benchmarks.visibility.payoff import MIRROR
+from benchmarks.visibility.tradeoff import MIRROR
 
 RAYS_ONLY = "#c77b30"
 BOUNCES = ("#9ecae1", "#4292c6", "#08306b", "#6a51a3")

@@ -92,11 +92,11 @@ def _threads() -> int:
 
 def text(found: Profile, said: list[str]) -> str:
     """For people."""
-    names = list(dict.fromkeys(name for stage in found.stages for name in stage.stages_ms))
+    names = list(dict.fromkeys(name for stage in found.stages for name in stage.phases_ms))
     lines = [_row("a training step, ms", [stage.name for stage in found.stages])]
     for name in names:
-        lines.append(_row(f"  {name}", [f"{stage.stages_ms.get(name, 0):.2f}" for stage in found.stages]))
-    sums = [sum(stage.stages_ms.values()) for stage in found.stages]
+        lines.append(_row(f"  {name}", [f"{stage.phases_ms.get(name, 0):.2f}" for stage in found.stages]))
+    sums = [sum(stage.phases_ms.values()) for stage in found.stages]
     lines.append(_row("  sum, between barriers", [f"{ms:.2f}" for ms in sums]))
     lines.append(_row("undisturbed step", [f"{stage.step_ms:.2f}" for stage in found.stages]))
     lines.append(_row("kernel launches", [f"{stage.launches:.0f}" for stage in found.stages]))

@@ -66,7 +66,7 @@ def _of_work(found: Profile) -> Iterator[str]:
 
 
 def _of_stage(stage: StageProfile, found: Profile, method: Method) -> Iterator[str]:
-    ms = stage.stages_ms
+    ms = stage.phases_ms
     whole = sum(ms.values())
 
     def of(*names: str) -> float:

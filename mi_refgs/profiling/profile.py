@@ -36,7 +36,7 @@ class StageProfile:
     step_ms: float  # median of undisturbed steps
     launches: int  # kernels a step
     misses: int  # kernels compiled in all warm steps together
-    stages_ms: dict[str, float]  # by `profiling.phases`, between barriers
+    phases_ms: dict[str, float]  # by `profiling.phases`, between barriers
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
         step_ms=1e3 * float(np.median(times)),
         launches=launches,
         misses=misses,
-        stages_ms=stages,
+        phases_ms=stages,
     )
 
 

@@ -16,7 +16,7 @@ TIMES = ("ms", "frame_ms")
 """Of visibility and shading on a mesh; of the product's frame of surfels."""
 
 
-def payoffs(rows: list[Row], budgets: list[Row]) -> list[Row]:
+def tradeoffs(rows: list[Row], budgets: list[Row]) -> list[Row]:
     """For each scene, roughness and kind of time: a setting within the budget, and what it gains.
 
     The setting is chosen on the other scenes: of those within the budget here, the one of the least mean

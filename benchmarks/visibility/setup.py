@@ -1,4 +1,4 @@
-"""Stages: one concave scene under the light, its pictures by each rule and by the path tracer."""
+"""Set-ups: one concave scene under the light, its pictures by each rule and by the path tracer."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OPACITY = 0.99
 TIMED_ROUGHNESS = 0.3
 
 
-class Stage:
+class Setup:
     """One concave scene under the light."""
 
     def __init__(
