@@ -37,7 +37,7 @@ def main(arguments: list[str] | None = None) -> int:
         result.update(measure(options.quick, options.only, options.quiet))
         return result
 
-    code = write_reports("stability", options, run, lambda *_: None, lambda r, *_: page(r))
+    code = write_reports("stability", options, run, lambda *_: None, page)
     failed = failures(result) if result else []
     for line in failed:
         print(line, file=sys.stderr)
