@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,25 @@ def new(rows: int, columns: int, width: float, height: float, **options: Any) ->
         ax.tick_params(labelsize=8)
         ax.spines[["top", "right"]].set_visible(False)
     return figure, axes
+
+
+def series(
+    ax: Any,
+    points: Sequence[tuple[float, float, Any]],
+    style: str,
+    colour: str,
+    label: str | None,
+    **look: Any,
+) -> None:
+    """Points (x, y, text) on two logarithmic axes, each with its text beside it unless that is None."""
+    if not points:
+        return
+    x, y, texts = zip(*points, strict=True)
+    ax.plot(x, y, style, color=colour, label=label, **{"markersize": 4, "linewidth": 1} | look)
+    ax.set(xscale="log", yscale="log")
+    for place, text in zip(zip(x, y, strict=True), texts, strict=True):
+        if text is not None:
+            ax.annotate(f"{text}", place, xytext=(3, 3), textcoords="offset points", fontsize=6)
 
 
 def save(figure: Any, path: Path) -> Path:

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+import os
 import platform
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,13 +20,14 @@ from mi_refgs.files import replace_file
 
 
 def machine() -> dict[str, Any]:
-    """What the times were taken on."""
+    """What the times were taken on, and how busy it is: the load average of the last minute."""
     return {
         "cpu": _cpu(),
         "threads": int(dr.thread_count()),
         "mitsuba": mi.__version__,
         "drjit": dr.__version__,
         "variant": mi.variant(),
+        "load": f"{os.getloadavg()[0]:.1f}",
     }
 
 

@@ -11,9 +11,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
+from PIL import Image
 
 import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
+
+import mitsuba as mi  # isort: skip
+import trimesh
+
+from mi_refgs import methods
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.data.make_dataset import Settings, _prepare_folder
 from mi_refgs.errors import InputError
+from mi_refgs.evaluation.evaluate import load_split
+from mi_refgs.images import read_exr_image, read_png, write_exr, write_png
+from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.resources import resource_dir
+from mi_refgs.runs import checkpoint
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.run import Run
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.ply import read_ply, write_ply
+from mi_refgs.surfels.table import Surfels
 
 SEED = 0
 """Seed of the numbers in the files to start from."""
@@ -54,16 +75,11 @@ def _finite(*arrays: Any) -> None:
 
 
 def _table(rows: int = 7) -> dict[str, np.ndarray]:
-    from mi_refgs.surfels.channels import CHANNELS
-
     rng = np.random.default_rng(SEED)
     return {name: rng.normal(size=(rows, channel.width(1))) for name, channel in CHANNELS.items()}
 
 
 def _surfel_files(folder: Path) -> list[bytes]:
-    from mi_refgs.surfels.ply import write_ply
-    from mi_refgs.surfels.table import Surfels
-
     write_ply(folder / "a.ply", Surfels.from_numpy(_table()))
     binary = (folder / "a.ply").read_bytes()
     names = ["x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3", "metallic"]
@@ -78,8 +94,6 @@ def _surfel_files(folder: Path) -> list[bytes]:
 
 
 def _read_surfels(path: Path) -> None:
-    from mi_refgs.surfels.ply import read_ply
-
     _finite(*read_ply(path).to_numpy().values())
 
 
@@ -89,10 +103,6 @@ TRIANGLES = np.array([quad[:3] for quad in QUADS], dtype=np.uint32)
 
 
 def _meshes(folder: Path) -> list[bytes]:
-    import trimesh
-
-    from mi_refgs.occlusion.mesh import Mesh, write_mesh
-
     solid = trimesh.creation.icosphere(1)
     vertices, faces = np.asarray(solid.vertices, np.float32), np.asarray(solid.faces, np.uint32)
     write_mesh(folder / "a.ply", Mesh(vertices, faces, 0.1))
@@ -109,8 +119,6 @@ def _meshes(folder: Path) -> list[bytes]:
 
 
 def _foreign_meshes(folder: Path) -> list[bytes]:
-    import trimesh
-
     solid = trimesh.Trimesh(CUBE, TRIANGLES, process=False)
     obj = "mtllib ../../etc/passwd\n" + str(solid.export(file_type="obj"))
     return [
@@ -127,11 +135,6 @@ def _binary(data: Any) -> bytes:
 
 def _read_mesh(path: Path) -> None:
     """Rays through the mesh as well: Embree reads what a wrong index names."""
-    import mitsuba as mi
-
-    from mi_refgs.occlusion.mesh import read_mesh
-    from mi_refgs.occlusion.visibility import Occluder
-
     mesh = read_mesh(path)
     _finite(mesh.vertices, mesh.voxel)
     points = np.random.default_rng(SEED).normal(size=(3, 64)).astype(np.float32)
@@ -151,10 +154,6 @@ def _read_foreign_mesh(folder: Path, data: bytes) -> None:
 
 
 def _exr_files(folder: Path) -> list[bytes]:
-    import OpenEXR
-
-    from mi_refgs.images import write_exr
-
     image = np.random.default_rng(SEED).random((5, 7, 4))
     files = []
     for kind in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "DWAA"):
@@ -170,14 +169,10 @@ def _exr_files(folder: Path) -> list[bytes]:
 
 
 def _read_exr(path: Path) -> None:
-    from mi_refgs.images import read_exr_image
-
     _finite(read_exr_image(path))
 
 
 def _picture_files(folder: Path) -> list[bytes]:
-    from PIL import Image
-
     rgba = np.random.default_rng(SEED).integers(0, 256, (9, 11, 4), dtype=np.uint8)
     picture, files = Image.fromarray(rgba), []
     for mode in ("RGBA", "RGB", "L", "LA", "P", "1", "I;16"):
@@ -196,16 +191,12 @@ def _saved(picture: Any, kind: str, **options: Any) -> bytes:
 
 
 def _read_picture(path: Path) -> None:
-    from mi_refgs.images import read_png
-
     pixels = read_png(path)
     _finite(pixels)
     assert pixels.min() >= 0 and pixels.max() <= 1
 
 
 def _light_files(folder: Path) -> list[bytes]:
-    import mitsuba as mi
-
     bitmap = mi.Bitmap(np.random.default_rng(SEED).random((8, 16, 3)).astype(np.float32))
     files = []
     for ending in ("hdr", "exr", "pfm"):
@@ -215,8 +206,6 @@ def _light_files(folder: Path) -> list[bytes]:
 
 
 def _read_light(path: Path) -> None:
-    from mi_refgs.shade.envmap import EnvironmentLight
-
     _finite(EnvironmentLight.from_file(path).radiance().numpy())
 
 
@@ -224,8 +213,6 @@ def _read_light(path: Path) -> None:
 
 
 def _transforms(folder: Path) -> list[bytes]:
-    from mi_refgs.images import write_exr, write_png
-
     rng, frames = np.random.default_rng(SEED), []
     for i in range(3):
         write_png(folder / f"r_{i}.png", rng.random((6, 8, 4)))
@@ -246,24 +233,17 @@ def _transforms(folder: Path) -> list[bytes]:
 
 
 def _read_transforms(path: Path) -> None:
-    from mi_refgs.data.dataset import read_dataset
-
     for view in read_dataset(path.parent, "train").views:
         _finite(view.image, view.alpha, view.depth, view.to_world, [view.fx, view.fy, view.cx, view.cy])
 
 
 def _methods(folder: Path) -> list[bytes]:
-    from mi_refgs import methods
-    from mi_refgs.resources import resource_dir
-
     shipped = [path.read_bytes() for path in sorted(resource_dir("variants").glob("*.toml"))]
     own = b'extends = "ref_gaussian"\ndrop = ["mesh"]\niterations = 100\n[loss]\nssim = 0.1\n'
     return [*shipped, methods.dump(methods.load("ref_gaussian")).encode(), own]
 
 
 def _read_method(path: Path) -> None:
-    from mi_refgs import methods
-
     method = methods.load(str(path), "quick", ["loss.ssim=0.3"])
     assert methods.dump(method)
     method.stage_at(1)
@@ -289,8 +269,6 @@ def _state() -> dict[str, np.ndarray]:
 
 
 def _checkpoints(folder: Path) -> list[bytes]:
-    from mi_refgs.runs import checkpoint
-
     class Code:
         def __reduce__(self) -> tuple[Any, ...]:
             return (exec, ("raise SystemExit('code was run')",))
@@ -306,10 +284,6 @@ def _sign(data: bytes) -> bytes:
 
 
 def _read_checkpoint(path: Path) -> None:
-    from mi_refgs import methods
-    from mi_refgs.runs.export import TrainedScene
-    from mi_refgs.runs.run import Run
-
     (path.parent / "checkpoints").mkdir(exist_ok=True)
     path.replace(path.parent / "checkpoints" / "0000003.npz")
     state = Run(path.parent).load_checkpoint()
@@ -318,8 +292,6 @@ def _read_checkpoint(path: Path) -> None:
 
 
 def _models(folder: Path) -> list[bytes]:
-    from mi_refgs.occlusion.mesh import Mesh, write_mesh
-
     (folder / "surfels.ply").write_bytes(_surfel_files(folder)[0])
     write_mesh(folder / "mesh.ply", Mesh(CUBE, TRIANGLES, 0.1))
     accuracy = {"dominant": False, "multiscatter": False, "visibility_rays": 1, "traced_bounces": 0}
@@ -334,18 +306,12 @@ def _models(folder: Path) -> list[bytes]:
 
 
 def _read_model(path: Path) -> None:
-    from mi_refgs.runs.export import TrainedScene
-
     fitted = TrainedScene.read(path.parent)
     assert isinstance(fitted.iteration, int) and np.isfinite(fitted.seconds)
 
 
 def _read_data_place(path: Path) -> None:
     """dataset.json of a run names a folder; only what lies there as a data set is read."""
-    from mi_refgs import methods
-    from mi_refgs.evaluation.evaluate import load_split
-    from mi_refgs.runs.run import Run
-
     load_split(Run(path.parent), methods.load("ref_gaussian"), "train")
 
 
@@ -361,8 +327,6 @@ def _settings(folder: Path) -> list[bytes]:
 
 def _read_settings(path: Path) -> None:
     """dataset.json of a data set, before it is written anew."""
-    from mi_refgs.data.make_dataset import Settings, _prepare_folder
-
     (path.parent / "transforms_train.json").write_text("{}")
     _prepare_folder(path.parent, Settings("a.xml", "0", 3, 1, 8, 1, 0, 3, (-30.0, 80.0), 40.0, 0.9, 0), False)
 
@@ -373,8 +337,6 @@ def _logs(folder: Path) -> list[bytes]:
 
 
 def _read_log(path: Path) -> None:
-    from mi_refgs.runs.run import Run
-
     Run(path.parent).rewind(5)
 
 
@@ -382,8 +344,6 @@ def _read_log(path: Path) -> None:
 
 
 def _scenes(folder: Path) -> list[bytes]:
-    from mi_refgs.occlusion.mesh import Mesh, write_mesh
-
     (folder / "s.ply").write_bytes(_surfel_files(folder)[0])
     write_mesh(folder / "m.ply", Mesh(CUBE, TRIANGLES, 0.1))
     strings = {"filename": "s.ply", "mesh": "m.ply", "shade_at": "pixel", "aovs": "n:normal,d:depth",
@@ -401,8 +361,6 @@ def _scenes(folder: Path) -> list[bytes]:
 
 def _read_scene(path: Path) -> None:
     """Mitsuba wraps what a plugin raises in a RuntimeError with the traceback's text."""
-    import mitsuba as mi
-
     try:
         mi.load_file(str(path))
     except RuntimeError as error:

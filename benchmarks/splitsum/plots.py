@@ -11,7 +11,6 @@ from benchmarks.common import figures, report
 from benchmarks.common.errors import CLEAR
 from benchmarks.common.select import Row, where
 from benchmarks.splitsum import select
-from benchmarks.splitsum.plot_budget import budget
 
 
 def plot(result: dict[str, Any], folder: Path) -> None:
@@ -27,9 +26,6 @@ def plot(result: dict[str, Any], folder: Path) -> None:
         figures.save(figure, folder / f"splitsum_{name}.png")
 
 
-# ---------------- speed against error ----------------
-
-
 def pareto_light(result: dict[str, Any]) -> str:
     """The light of the plot over roughness: the studio, or the run's last built-in one before the sun."""
     names = select.lights(result)
@@ -38,124 +34,107 @@ def pareto_light(result: dict[str, Any]) -> str:
 
 def pareto(result: dict[str, Any]) -> Any:
     """Error over time, one panel a roughness."""
-    roughness = list(result["settings"]["roughness"])
-    columns = min(4, len(roughness))
-    rows = -(-len(roughness) // columns)
-    figure, axes = figures.new(rows, columns, 3.0, 2.6, sharex=True, sharey=True)
     light, shape = pareto_light(result), select.convex(result)[0]
-    for ax, r in zip(axes.flat, roughness, strict=False):
-        _front(ax, _cases(result, shape, light, r))
-        ax.set_title(f"roughness {r:g}", fontsize=9)
-    for ax in axes.flat[len(roughness) :]:
-        ax.set_visible(False)
-    _finish(figure, axes, f"{shape}, light: {light}, metallic {select.picture_metallic(result):g}")
-    return figure
+    panels = {f"roughness {r:g}": (light, r) for r in result["settings"]["roughness"]}
+    return _fronts(
+        result, panels, 4, f"{shape}, light: {light}, metallic {select.picture_metallic(result):g}"
+    )
 
 
 def over_lights(result: dict[str, Any]) -> Any:
     """Error over time, one panel a light, at a middling roughness."""
-    names = select.lights(result)
     roughness = min(result["settings"]["roughness"], key=lambda r: abs(r - 0.3))
-    figure, axes = figures.new(1, len(names), 2.8, 2.7, sharex=True, sharey=True)
+    panels = {light: (light, roughness) for light in select.lights(result)}
     shape = select.convex(result)[0]
-    for ax, light in zip(axes.flat, names, strict=True):
-        _front(ax, _cases(result, shape, light, roughness))
-        ax.set_title(light, fontsize=9)
-    _finish(figure, axes, f"{shape}, roughness {roughness:g}, lights of rising frequency")
-    return figure
+    return _fronts(result, panels, 5, f"{shape}, roughness {roughness:g}, lights of rising frequency")
 
 
-def _cases(result: dict[str, Any], shape: str, light: str, roughness: float) -> list[Row]:
-    """All methods on one surface."""
-    metallic = select.picture_metallic(result)
-    return where(
-        result["rows"], shape=shape, light=light, roughness=roughness, metallic=metallic, n_dot_v="all"
-    )
-
-
-def _front(ax: Any, cases: list[Row]) -> None:
-    """All methods of one case on logarithmic axes."""
-    for method, marker, label in (
-        ("path", "o", "Mitsuba path, spp"),
-        ("monte_carlo", "s", "plain Monte Carlo"),
-    ):
-        known = [row for row in where(cases, method=method) if row["ms_per_mpx"]]
-        ax.plot(
-            [row["ms_per_mpx"] for row in known],
-            [row["relmse"] for row in known],
-            marker + "-",
-            color=figures.COLOURS[method],
-            markersize=3,
-            linewidth=1,
-            label=label,
-        )
-        if method == "path":
-            for row in known:
-                ax.annotate(
-                    f"{row['setting']}",
-                    (row["ms_per_mpx"], row["relmse"]),
-                    xytext=(3, 3),
-                    textcoords="offset points",
-                    fontsize=6,
-                )
-    split = [row for row in where(cases, method="split_sum") if row["ms_per_mpx"]]
-    ax.plot(
-        [row["ms_per_mpx"] for row in split],
-        [select.shown_relmse(row) for row in split],
-        "o",
-        color=figures.COLOURS["split_sum"],
-        markersize=4,
-        label="split sum, rows of light",
-    )
-    for row in (split[0], split[-1]) if split else ():
-        ax.annotate(
-            f"{row['setting']}",
-            (row["ms_per_mpx"], select.shown_relmse(row)),
-            xytext=(-4, -2),
-            textcoords="offset points",
-            ha="right",
-            fontsize=6,
-            color=figures.COLOURS["split_sum"],
-        )
-    finest = max((row["setting"] for row in split), default=0)
-    for row in cases:
-        knob = row["method"].removeprefix("split_sum_")
-        if knob in MARKS and (row["setting"] == finest or knob.endswith("levels")):
-            ax.plot(
-                [row["ms_per_mpx"]],
-                [select.shown_relmse(row)],
-                MARKS[knob],
-                color=figures.COLOURS["knob"],
-                markersize=6,
-                fillstyle="none",
-                label=knob.replace("_", " "),
-            )
-    floor = max((CLEAR * row["relmse_floor"] for row in cases), default=0)
-    if floor:
-        ax.axhspan(floor / 1e3, floor, color=figures.COLOURS["floor"], alpha=0.4, linewidth=0)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    ax.margins(x=0.12)
-
-
-MARKS = {"dominant": "D", "multiscatter": "x", "few_levels": "v", "many_levels": "^"}
-
-
-def _finish(figure: Any, axes: Any, title: str) -> None:
-    low, high = [], []
-    for ax in axes.flat:
-        values = np.concatenate([line.get_ydata() for line in ax.lines] or [np.ones(1)]).astype(float)
-        values = values[values > 0]
-        low.append(values.min())
-        high.append(values.max())
-    axes.flat[0].set_ylim(max(min(low) / 4, 1e-9), min(max(high) * 3, 1e3))
+def _fronts(result: dict[str, Any], panels: dict[str, tuple[str, float]], columns: int, title: str) -> Any:
+    """All methods on one convex surface, a panel for each light and roughness."""
+    rows = -(-len(panels) // columns)
+    figure, axes = figures.new(rows, min(columns, len(panels)), 2.9, 2.6, sharex=True, sharey=True)
+    fixed = {"shape": select.convex(result)[0], "metallic": select.picture_metallic(result), "n_dot_v": "all"}
+    for ax, (name, (light, roughness)) in zip(axes.flat, panels.items(), strict=False):
+        _front(ax, where(result["rows"], light=light, roughness=roughness, **fixed))
+        ax.set_title(name, fontsize=9)
+    for ax in axes.flat[len(panels) :]:
+        ax.set_visible(False)
     for ax in axes[:, 0]:
         ax.set_ylabel("relMSE", fontsize=8)
     for ax in axes[-1]:
         ax.set_xlabel("ms per megapixel", fontsize=8)
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    figure.suptitle(f"{title} (grey: below the reference's noise)", fontsize=10)
+    _legend(figure, axes, f"{title} (grey: below the reference's noise)", 4)
+    return figure
+
+
+SAMPLED = {"path": ("o-", "Mitsuba path, spp"), "monte_carlo": ("s-", "plain Monte Carlo")}
+MARKS = {"dominant": "D", "multiscatter": "x", "few_levels": "v", "many_levels": "^"}
+
+
+def _front(ax: Any, cases: list[Row]) -> None:
+    """All methods of one case."""
+    for method, (style, label) in SAMPLED.items():
+        known = [row for row in where(cases, method=method) if row["ms_per_mpx"]]
+        spp = [row["setting"] if method == "path" else None for row in known]
+        points = [(row["ms_per_mpx"], row["relmse"], n) for row, n in zip(known, spp, strict=True)]
+        figures.series(ax, points, style, figures.COLOURS[method], label, markersize=3)
+    split = [row for row in where(cases, method="split_sum") if row["ms_per_mpx"]]
+    ends = {row["setting"] for row in (split[0], split[-1])}
+    points = [_shown(row, row["setting"] if row["setting"] in ends else None) for row in split]
+    figures.series(ax, points, "o", figures.COLOURS["split_sum"], "split sum, rows of light")
+    for row in cases:
+        knob = row["method"].removeprefix("split_sum_")
+        if knob in MARKS and (row["setting"] == split[-1]["setting"] or knob.endswith("levels")):
+            look = {"markersize": 6, "fillstyle": "none"}
+            name = knob.replace("_", " ")
+            figures.series(ax, [_shown(row, None)], MARKS[knob], figures.COLOURS["knob"], name, **look)
+    floor = max((CLEAR * row["relmse_floor"] for row in cases), default=0)
+    if floor:
+        low = ax.get_ylim()[0]
+        ax.axhspan(floor / 1e3, floor, color=figures.COLOURS["floor"], alpha=0.4, linewidth=0)
+        ax.set_ylim(bottom=max(low, 1e-9))
+    ax.margins(x=0.12)
+
+
+def _shown(row: Row, text: Any) -> tuple[float, float, Any]:
+    return row["ms_per_mpx"], select.shown_relmse(row), text
+
+
+def _legend(figure: Any, axes: Any, title: str, columns: int) -> None:
+    """One legend for all panels, and the title."""
+    named: dict[str, Any] = {}
+    for ax in axes.flat:
+        named |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    options = {"loc": "outside lower center", "ncols": columns, "fontsize": 8, "frameon": False}
+    figure.legend(named.values(), named.keys(), **options)
+    figure.suptitle(title, fontsize=10)
+
+
+def budget(result: dict[str, Any]) -> Any:
+    """relMSE of each approximation alone over roughness, one panel a shape and light."""
+    budgets, names = result["budgets"], select.lights(result)
+    shapes = list(dict.fromkeys(row["shape"] for row in budgets))
+    metallic, height = max(row["metallic"] for row in budgets), max(row["height"] for row in budgets)
+    figure, axes = figures.new(len(shapes), len(names), 2.7, 2.2, sharex=True, sharey=True)
+    parts = list(dict.fromkeys(part["name"] for row in budgets for part in row["parts"]))
+    for line, shape in zip(axes, shapes, strict=True):
+        for ax, light in zip(line, names, strict=True):
+            cases = where(budgets, shape=shape, light=light, metallic=metallic, height=height)
+            x = [row["roughness"] for row in cases]
+            ax.plot(x, [row["total"] for row in cases], "k", linewidth=2, label="whole error")
+            for k, name in enumerate(parts):
+                y = [part["relmse"] for row in cases for part in row["parts"] if part["name"] == name]
+                if y:
+                    ax.plot(x, y, "o-", markersize=2.5, linewidth=1, color=f"C{k}", label=name)
+            ax.plot(x, [row["floor"] for row in cases], ":", color="grey", linewidth=1, label="noise")
+            ax.set(yscale="log", ylim=(1e-8, 10))
+            ax.set_title(f"{shape}, {light}", fontsize=9)
+        line[0].set_ylabel("relMSE", fontsize=8)
+    for ax in axes[-1]:
+        ax.set_xlabel("roughness", fontsize=8)
+    title = f"Error of each approximation alone, {height} rows of light, metallic {metallic:g}"
+    _legend(figure, axes, title, 5)
+    return figure
 
 
 # ---------------- where ----------------

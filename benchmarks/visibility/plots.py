@@ -42,24 +42,15 @@ def _speed(ax: Any, result: dict[str, Any], scene: str, roughness: float) -> Non
     timed = [row for row in rows if row["ms"] is not None]
     for bounces, dominant in dict.fromkeys((row["bounces"], row["dominant"]) for row in timed):
         found = [row for row in where(timed, bounces=bounces, dominant=dominant) if row["rays"]]
-        x, y = [row["ms"] for row in found], [row["relmse"] for row in found]
+        points = [(row["ms"], row["relmse"], None if dominant else row["rays"]) for row in found]
         rank = list(result["settings"]["bounces"]).index(bounces) if bounces else 0
         colour = BOUNCES[rank % len(BOUNCES)] if bounces else RAYS_ONLY
         label = f"{bounces} bounce{'s' * (bounces > 1)}" if bounces else "rays only"
-        ax.plot(x, y, MARKERS[dominant], color=colour, label=label + ", dominant" * dominant, ms=5)
-        if not dominant:
-            for row in found:
-                ax.annotate(
-                    f"{row['rays']}",
-                    (row["ms"], row["relmse"]),
-                    fontsize=6,
-                    xytext=(3, 3),
-                    textcoords="offset points",
-                )
+        figures.series(ax, points, MARKERS[dominant], colour, label + ", dominant" * dominant)
     none, mirror = where(timed, rays=0)[0], where(timed, method=MIRROR)[0]
     ax.plot(none["ms"], none["relmse"], "x", color="#444444", label="no occlusion")
     ax.axhline(mirror["relmse"], color="#bbbbbb", lw=0.8, zorder=0)
-    ax.set(xscale="log", yscale="log", xlabel="ms per frame", title=f"{scene}, roughness {roughness:g}")
+    ax.set(xlabel="ms per frame", title=f"{scene}, roughness {roughness:g}")
     ax.set_ylabel("relMSE at full depth")
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_minor_formatter(ticker.LogFormatterSciNotation(minor_thresholds=(1.2, 0.3)))
@@ -71,24 +62,10 @@ def _convergence(ax: Any, result: dict[str, Any], scene: str) -> None:
     for k, roughness in enumerate(values):
         rows = where(result["curve"], scene=scene, roughness=roughness)
         colour = SHADES[k % len(SHADES)]
-        rays = [row["rays"] for row in rows]
-        ax.plot(
-            rays,
-            [row["visibility_rms"] for row in rows],
-            "o-",
-            color=colour,
-            ms=3,
-            label=f"visibility, r = {roughness:g}",
-        )
-        near = rows[:-1]
-        ax.plot(
-            rays[:-1],
-            [row["to_limit"] ** 0.5 for row in near],
-            "s--",
-            color=colour,
-            ms=3,
-            label=f"traced picture, r = {roughness:g}",
-        )
+        near = [(row["rays"], row["visibility_rms"], None) for row in rows]
+        picture = [(row["rays"], row["to_limit"] ** 0.5, None) for row in rows[:-1]]
+        figures.series(ax, near, "o-", colour, f"visibility, r = {roughness:g}", markersize=3)
+        figures.series(ax, picture, "s--", colour, f"traced picture, r = {roughness:g}", markersize=3)
         ax.axhline(rows[0]["visibility_floor"], color=colour, lw=0.8, ls=":", zorder=0)
-    ax.set(xscale="log", yscale="log", xlabel="rays of the lobe", ylabel="distance to the traced answer")
+    ax.set(xlabel="rays of the lobe", ylabel="distance to the traced answer")
     ax.set_title(scene)
