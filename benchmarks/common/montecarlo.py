@@ -161,10 +161,7 @@ def prefilter_lobe(points: Points, roughness: float, α: Any) -> Lobe:
 
     scale = dr.opaque(mi.Float, 1 / norm)
     return Lobe(
-        frame,
-        sample,
-        pdf,
-        lambda light: [dr.maximum(light.z, 0) * scale * ggx(dr.normalize(up + light), α2)],
+        frame, sample, pdf, lambda light: [dr.maximum(light.z, 0) * scale * ggx(dr.normalize(up + light), α2)]
     )
 
 
@@ -323,9 +320,7 @@ def monte_carlo(points: Points, material: Material, emitter: Any, samples: Any, 
         choice = rng.next_float32()
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         light = dr.select(
-            choice < share,
-            _reflect(view, sample_visible(view, α, u)),
-            mi.warp.square_to_cosine_hemisphere(u),
+            choice < share, _reflect(view, sample_visible(view, α, u)), mi.warp.square_to_cosine_hemisphere(u)
         )
         specular, density, schlick = specular_times_cosine(view, light, α2)
         cosine = dr.maximum(light.z, 0) * dr.inv_pi

@@ -54,12 +54,7 @@ def measure_compile(case: tuple[int, int]) -> dict[str, Any]:
 def _run(task: str, case: tuple[int, int], **environment: str) -> dict[str, Any]:
     command = [sys.executable, "-m", "benchmarks.splatting.process", task, *map(str, case)]
     done = subprocess.run(
-        command,
-        cwd=ROOT,
-        env=os.environ | environment,
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
+        command, cwd=ROOT, env=os.environ | environment, stdout=subprocess.PIPE, text=True, check=True
     )
     result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return result

@@ -52,10 +52,7 @@ def measure_peaks(triad: int) -> dict[str, float]:
         return dr.fma(b, factors[0], a)
 
     fma, moved = (min(once(call) for _ in range(TRIES)) for call in (multiply_add, add))
-    return {
-        "gflops": 2e-9 * lanes * STEPS * CHAINS / fma,
-        "gbytes": 1e-9 * 3 * FLOAT * triad / moved,
-    }
+    return {"gflops": 2e-9 * lanes * STEPS * CHAINS / fma, "gbytes": 1e-9 * 3 * FLOAT * triad / moved}
 
 
 def bytes_moved(counts: Counts, features: int) -> dict[str, int]:

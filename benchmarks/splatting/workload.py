@@ -23,14 +23,7 @@ DISTANCE = 4.0
 FIELD_OF_VIEW = 40.0  # degrees
 DIRECTION = (0.6, 0.8, 0.0)
 """From the sphere's centre to the camera."""
-CHANNELS = {
-    "normal": 3,
-    "albedo": 3,
-    "metallic": 1,
-    "roughness": 1,
-    "radiance": 3,
-    "indirect light": 3,
-}
+CHANNELS = {"normal": 3, "albedo": 3, "metallic": 1, "roughness": 1, "radiance": 3, "indirect light": 3}
 """Features of the full G-buffer; with depth and alpha they are its 16 channels."""
 FEATURES = sum(CHANNELS.values())
 COLOUR = 3

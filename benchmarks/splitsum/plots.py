@@ -195,13 +195,7 @@ def speedup(result: dict[str, Any]) -> Any:
         values = np.array([[cell["speed_up"] for cell in line] for line in cells])
         texts = [[speed_text(cell) for cell in line] for line in cells]
         figures.heat(
-            ax,
-            values,
-            texts,
-            names,
-            [f"{r:g}" for r in roughness],
-            norm=LogNorm(1, 1e4),
-            cmap="viridis",
+            ax, values, texts, names, [f"{r:g}" for r in roughness], norm=LogNorm(1, 1e4), cmap="viridis"
         )
         ax.set_title(shape, fontsize=9)
         ax.set_xlabel("roughness", fontsize=8)
@@ -215,11 +209,7 @@ def speedup(result: dict[str, Any]) -> Any:
 def least_speed_up(result: dict[str, Any], shape: str, light: str, roughness: float) -> Row:
     """Of the metals, for the finest light."""
     found = where(
-        result["speed_ups"],
-        shape=shape,
-        light=light,
-        roughness=roughness,
-        height=select.best_height(result),
+        result["speed_ups"], shape=shape, light=light, roughness=roughness, height=select.best_height(result)
     )
     return min(found, key=lambda row: float(row["speed_up"]))
 

@@ -112,10 +112,7 @@ def by_tracing(shipped: Shipped, exact: Exact, traced: Traced) -> list[Step]:
 
 def _split_sum(exact: Exact) -> list[Step]:
     """What both end with."""
-    return [
-        Step(SPLIT, exact.visibility * exact.free.mean + exact.indirect.mean),
-        Step(APART, exact.whole),
-    ]
+    return [Step(SPLIT, exact.visibility * exact.free.mean + exact.indirect.mean), Step(APART, exact.whole)]
 
 
 def bounces_shown(settings: Settings) -> list[int]:
