@@ -23,6 +23,10 @@ def label(row: Row) -> str:
     return name + f"{row['surfels']:,}, {row['size']}²" + spread
 
 
+def _sized(row: Row) -> str:
+    return f"{row['surfels']:,} surfels and {row['size']}²"
+
+
 def page(result: dict[str, Any]) -> dict[str, Any]:
     """By name in page.md."""
     rows, peaks = result["rows"], result["peaks"]
@@ -47,8 +51,8 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
         "gbytes": number(peaks["gbytes"]),
         "step_surfels": f"{result['settings']['step'][0]:,}",
         "step_size": result["settings"]["step"][1],
-        "compile_case": label(result["compile"]),
-        "large_case": label(result["large_step"]),
+        "compile_case": _sized(result["compile"]),
+        "large_case": _sized(result["large_step"]),
         "large_seconds": number(result["large_step"]["ms"] / 1e3),
         "large_gib": f"{result['large_step']['whole_process'] / 2**30:.2f}",
         "scenes": ", ".join(f"`{row['case']}`" for row in rows if row["spread"] is None) or "none",
