@@ -114,7 +114,8 @@ def test_a_planted_mistake_fails(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_page(tmp_path: Path) -> None:
     assert main(["--only", "one surfel", "-o", str(tmp_path), "--quiet"]) == 0
     page = (tmp_path / "stability.md").read_text()
-    assert "| one surfel |" in page and "1 hold, 0 are ill-conditioned, 0 fail. 0 values" in page
+    assert "| one surfel |" in page
+    assert "of 1 hard cases 1 hold, 0 are ill-conditioned, 0 fail; 0 values are not finite" in page
     assert not re.search(r"\bnan\b|\binf\b|\bNone\b", page)
 
 
