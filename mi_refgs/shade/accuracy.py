@@ -10,6 +10,9 @@ from mi_refgs.errors import InputError, shown
 MAX_RAYS = 4096
 """Rays of the lobe, or bounces, beyond which nothing changes but the time: the length of a kernel follows."""
 
+MAX_DIRECTIONS = 64
+"""Directions of the hemisphere at most: which of them are free is one bit each of a 64-bit word."""
+
 NEED_OCCLUSION = ("visibility_rays", "traced_bounces")
 """Options that do nothing where no ray is traced."""
 
@@ -25,17 +28,22 @@ class Accuracy:
     multiscatter: bool = False  # add the light that leaves after several bounces between facets
     visibility_rays: int = 1  # rays of the GGX lobe that the visibility is averaged over; 1: the mirror ray
     traced_bounces: int = 0  # times that what a blocked ray hits is shaded, in place of the indirect channel
+    directions: int = 24  # from which models that sum over the hemisphere take light
 
     def __post_init__(self) -> None:
         for name in ("dominant", "multiscatter"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"accuracy: {name}: {shown(getattr(self, name))} is neither True nor False")
-        for name, what, least in (("visibility_rays", "rays", 1), ("traced_bounces", "bounces", 0)):
+        for name, what, least, most in (
+            ("visibility_rays", "rays", 1, MAX_RAYS),
+            ("traced_bounces", "bounces", 0, MAX_RAYS),
+            ("directions", "directions", 1, MAX_DIRECTIONS),
+        ):
             number: Any = getattr(self, name)
-            if type(number) is not int or not least <= number <= MAX_RAYS:
+            if type(number) is not int or not least <= number <= most:
                 some = ", ".join(str(least + i) for i in range(3))
                 raise InputError(
-                    f"accuracy: {name}: {shown(number)} is no number of {what}; use {some}, … {MAX_RAYS}"
+                    f"accuracy: {name}: {shown(number)} is no number of {what}; use {some}, … {most}"
                 )
 
     def chosen(self) -> list[str]:

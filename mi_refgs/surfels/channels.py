@@ -146,3 +146,17 @@ register(
     Channel("roughness", (1,), "sigmoid", 5e-3, ("roughness",), initial=0.1, material=True, aov="Y"),
 )
 register(Channel("indirect_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("ind",), rest_rate=0.05))
+# Of the model "gaussian_shader"; its specular tint and normals. [GaussianShader, Jiang et al. 2024, §4]
+register(
+    Channel(
+        "tint",
+        (3,),
+        "sigmoid",
+        7.5e-3,
+        ("tint_0", "tint_1", "tint_2"),
+        initial=0.5,
+        material=True,
+        aov="RGB",
+    )
+)
+register(Channel("normal_offset", (3,), "identity", 1e-3, ("offset_0", "offset_1", "offset_2")))

@@ -1,6 +1,6 @@
 """Reflectance models, one file each; importing this package registers those that ship."""
 
-from mi_refgs.shade.reflectance import radiance, split_sum
+from mi_refgs.shade.reflectance import gaussian_shader, mirror, monte_carlo, radiance, split_sum
 from mi_refgs.shade.reflectance.model import (
     MODELS,
     Reflectance,
@@ -12,5 +12,8 @@ from mi_refgs.shade.reflectance.model import (
 
 register(split_sum.SplitSum())
 register(radiance.Radiance())
+register(mirror.Mirror())
+register(gaussian_shader.GaussianShader())
+register(monte_carlo.MonteCarlo())
 
 __all__ = ["MODELS", "Reflectance", "SurfelView", "Surroundings", "register", "unregister"]

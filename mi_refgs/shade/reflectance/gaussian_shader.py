@@ -1,0 +1,47 @@
+"""The model of GaussianShader: a colour, a diffuse and a tinted specular layer. [Jiang et al. 2024, §4]"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from mi_refgs.shade.brdf import split_sum
+from mi_refgs.shade.points import ShadingPoints, Terms, reflect, safe_normalize
+from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
+from mi_refgs.surfels.table import Surfels
+
+if TYPE_CHECKING:
+    from mi_refgs.shade.shading import Shading
+
+
+class GaussianShader(Reflectance):
+    """c = radiance + (1 - tint) E(n) + (tint A + B) L(r, roughness), with E the irradiance of the normal.
+
+    The normal is that of the surfel plus a fitted `normal_offset`, which turns round with it: the original
+    has one offset a side. The light is linear and without an upper bound; theirs is clamped to [0, 1].
+    """
+
+    name = "gaussian_shader"
+    orders = ("surfel",)
+
+    def channels(self, diffuse: str) -> tuple[str, ...]:
+        return ("radiance_sh", "roughness", "tint", "normal_offset")
+
+    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+        turned = dr.detach(dr.dot(surfels.primitive.normal(surfels), seen.normal)) < 0
+        x, y, z = surfels.value("normal_offset")
+        offset = type(seen.normal)(x, y, z)
+        return {
+            "normal": safe_normalize(seen.normal + dr.select(turned, -offset, offset)),
+            "radiance": seen.harmonic_colour(surfels.value("radiance_sh")),
+            "roughness": surfels.value("roughness"),
+            "tint": surfels.value("tint"),
+        }
+
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+        normal, view = safe_normalize(points.normal), safe_normalize(points.view)
+        scale, bias = split_sum(dr.dot(normal, view), points.roughness)
+        diffuse = points.radiance + (1 - points.tint) * light.irradiance(normal)
+        reflected = light.specular(reflect(view, normal), points.roughness)
+        return Terms(diffuse, dr.fma(points.tint, scale, bias) * reflected)

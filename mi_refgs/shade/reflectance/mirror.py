@@ -1,0 +1,31 @@
+"""The model of 3DGS-DR: a fitted radiance mixed with a perfect mirror. [Ye et al. 2024, §3.2]"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from mi_refgs.shade.points import ShadingPoints, Terms, reflect, safe_normalize
+from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
+from mi_refgs.surfels.table import Surfels
+
+if TYPE_CHECKING:
+    from mi_refgs.shade.shading import Shading
+
+
+class Mirror(Reflectance):
+    """c = (1 - m) radiance + m L(r), of the unfiltered light in the mirror direction r; m is `metallic`."""
+
+    name = "mirror"
+    light = "radiance"
+
+    def channels(self, diffuse: str) -> tuple[str, ...]:
+        return ("radiance_sh", "metallic")
+
+    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+        radiance = seen.harmonic_colour(surfels.value("radiance_sh"))
+        return {"radiance": radiance, "metallic": surfels.value("metallic")}
+
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+        mirror = reflect(safe_normalize(points.view), safe_normalize(points.normal))
+        share = points.metallic
+        return Terms((1 - share) * points.radiance, share * light.radiance(mirror))
