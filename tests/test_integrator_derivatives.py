@@ -20,7 +20,6 @@ from integrator_scenes import (
 )
 
 from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.surfels.table import CHANNELS
 
 STEPS = (2e-3, 2e-4)
 """Widths of differences; the better one counts: rounding spoils the small one, curvature the large one."""
@@ -73,7 +72,7 @@ def check_derivatives(of: mi.Scene, key: str, spp: int = 1) -> None:
     assert abs(reverse - forward) < 1e-5 * np.linalg.norm(weight) * np.linalg.norm(tangent)
 
 
-@pytest.mark.parametrize("key", [*(name for name in CHANNELS if name != "indirect_sh"), "light"])
+@pytest.mark.parametrize("key", [*(name for name in raw_channels() if name != "indirect_sh"), "light"])
 def test_derivatives_of_every_channel(key: str) -> None:
     check_derivatives(scene(), f"integrator.{key}")
 

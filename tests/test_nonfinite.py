@@ -82,7 +82,7 @@ def test_a_surfel_with_such_a_value_is_as_good_as_absent(kind: str, tmp_path: Pa
         made, {name: value[others] for name, value in raw.items()} | {"light": light}
     )
     assert wanted.max() > 0.1
-    for channel in CHANNELS:
+    for channel in raw:
         values = {name: value.copy() for name, value in raw.items()}
         # A large number saturates where the activation has a bound, and does so without a NaN.
         values[channel][CULPRITS, -1] = (*BAD[:3], np.nan, np.inf) if CHANNELS[channel].bounded else BAD

@@ -84,6 +84,7 @@ def everything(surfels: Surfels) -> object:
     """Every accessor of every channel, with a weight of its own per entry."""
     arrays = [*surfels.position(), *surfels.scale(), surfels.opacity(), *surfels.albedo(), surfels.metallic()]
     arrays += [surfels.roughness(), *(entry for axis in surfels.frame() for entry in axis)]
+    arrays += [*surfels.value("tint"), *surfels.value("normal_offset")]
     arrays += [
         part
         for name in ("radiance_sh", "indirect_sh")
