@@ -105,4 +105,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script it does not find its neighbours
     main()

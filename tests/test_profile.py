@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -13,6 +15,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+from helpers import ROOT
 from tiny_scene import SETTINGS, SIZE
 
 from mi_refgs import methods, timing
@@ -251,6 +254,16 @@ def test_what_is_neither_run_nor_data(
     shutil.rmtree(run / "checkpoints")
     assert main(["profile", str(run)]) == 2
     assert "checkpoints: none yet" in capsys.readouterr().err
+
+
+def test_the_benchmark_of_a_step_runs_as_a_script(tmp_path: Path) -> None:
+    options = ["--surfels", "300", "--size", "32", "--steps", "1", "--json"]
+    script = [sys.executable, str(ROOT / "benchmarks" / "step.py"), *options]
+    done = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = json.loads(done.stdout)
+    for stage in ("initial", "deferred"):
+        assert found[stage]["splat_ms"] > 0 and list(found[stage]["phases_ms"]) == list(phases.PHASES)
 
 
 # ---------- Counts and advice ----------
