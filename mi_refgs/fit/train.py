@@ -46,11 +46,22 @@ def _shapes(method: Method) -> dict[str, tuple[int, ...]]:
     return shapes if method.light is None else shapes | {LIGHT: (2 * method.light.height, 3)}
 
 
+def first_light(options: LightOptions) -> EnvironmentLight:
+    """The environment that a fit starts with: one radiance everywhere."""
+    return EnvironmentLight.constant(options.radiance, options.height)
+
+
 class Trainer:
     """The state of a fit and the step that advances it."""
 
-    def __init__(self, method: Method, data: Dataset, run: Run | None = None) -> None:
-        """Set up a fit of `data`, from the newest checkpoint of `run` if it has one."""
+    def __init__(
+        self,
+        method: Method,
+        data: Dataset,
+        run: Run | None = None,
+        state: dict[str, np.ndarray] | None = None,
+    ) -> None:
+        """Set up a fit of `data`, from a `state`, or the newest checkpoint of `run` if it has one."""
         self.method, self.data, self.run = method, data, run
         self.extent = data.scene_extent
         self.schedule = Schedule(method, len(data.views))
@@ -64,11 +75,12 @@ class Trainer:
         self.params: dict[str, Any] = {}
         self.gradient_sum: Any = None  # of each surfel since it was densified last, and of how many views
         self.gradient_count: Any = None
-        state = run.load_checkpoint() if run is not None else None
+        if state is None and run is not None:
+            state = run.load_checkpoint()
         if state is None:
             self.params |= initial_surfels(method, data, self.schedule.rng(0)).raw
             if method.light is not None:
-                self.params[LIGHT] = self._first_light(method.light).raw
+                self.params[LIGHT] = first_light(method.light).raw
             self.optimiser = Adam(self.params, self._groups())
             self._clear_statistics()
         else:
@@ -294,7 +306,7 @@ class Trainer:
         edited = refine.restart(self.surfels, starts, self.schedule.rng(iteration))
         self._replace(edited, cleared=tuple(starts))
         if LIGHT in names and self.method.light is not None:
-            self.params[LIGHT] = self._first_light(self.method.light).raw
+            self.params[LIGHT] = first_light(self.method.light).raw
             self.optimiser.reset(LIGHT)
 
     def _replace(self, surfels: Surfels, cleared: tuple[str, ...] = ()) -> None:
@@ -310,10 +322,6 @@ class Trainer:
 
     def _groups(self) -> dict[str, Group]:
         return self.schedule.groups(self.extent)
-
-    @staticmethod
-    def _first_light(options: LightOptions) -> EnvironmentLight:
-        return EnvironmentLight.constant(options.radiance, options.height)
 
     # ---------------- state ----------------
 

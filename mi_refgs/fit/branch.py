@@ -1,0 +1,71 @@
+"""A fit that goes on with another method: what both have is kept, what is new starts as the method says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mi_refgs.fit.train import Trainer, first_light
+from mi_refgs.methods.method import LIGHT, Method
+from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, part
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.lobe_matrices import resample
+from mi_refgs.surfels.channels import channel, geometry
+
+
+def branch(trainer: Trainer, method: Method) -> Trainer:
+    """A trainer of `method`, at the same iteration of the same data; `trainer` stays as it is.
+
+    Harmonics of another degree are cut or filled with zeros, a light of another size is resampled, and both
+    keep their history as far as they keep their entries. It has no run folder.
+    """
+    state = trainer.state()
+    old, count = part(state, PARAMS), trainer.surfels.count
+    rng = trainer.schedule.rng(trainer.iteration)
+    wanted: dict[str, np.ndarray] = {}
+    for name in (*geometry(), *method.surfels.channels):
+        width = method.surfels.columns(name)
+        if name not in old:
+            wanted[name] = channel(name).start(count, width, rng, method.surfels.start(name))
+        else:
+            wanted[name] = _columns(old[name], width)
+    if method.light is not None:
+        height = method.light.height
+        if LIGHT not in old:
+            wanted[LIGHT] = first_light(method.light).raw.numpy()
+        elif len(old[LIGHT]) == height:
+            wanted[LIGHT] = old[LIGHT]
+        else:
+            radiance = EnvironmentLight(trainer.params[LIGHT]).radiance().numpy()
+            wanted[LIGHT] = EnvironmentLight.from_radiance(resample(radiance, height)).raw.numpy()
+    new = {name: value for name, value in state.items() if not name.startswith((PARAMS, OPTIMISER))}
+    for name, values in wanted.items():
+        new[f"{PARAMS}{name}"] = np.asarray(values, np.float32)
+        new |= {f"{OPTIMISER}{key}": value for key, value in _history(state, old, name, values).items()}
+    return Trainer(method, trainer.data, state=new)
+
+
+def _columns(table: np.ndarray, width: int) -> np.ndarray:
+    """The first `width` columns, zeros beyond those that are there."""
+    kept = table[:, :width]
+    return np.pad(kept, ((0, 0), (0, width - kept.shape[1])))
+
+
+def _history(
+    state: dict[str, np.ndarray], old: dict[str, np.ndarray], name: str, values: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Adam's moments of one tensor, by the names of `Adam.state_dict`."""
+    known = {
+        key: state.get(f"{OPTIMISER}{name}/{key}") for key in ("first", "second", "steps", "factor", "usual")
+    }
+    if any(value is None for value in known.values()):
+        known = {"steps": np.array(0), "factor": np.array(1.0), "usual": np.array(0.0)}
+    else:
+        shape = old[name].shape
+        for key in ("first", "second"):
+            moments = np.reshape(known[key], shape)
+            same_rows = values.ndim == 2 and values.shape[0] == shape[0]
+            known[key] = _columns(moments, values.shape[1]).ravel() if same_rows else None
+    for key in ("first", "second"):
+        if known.get(key) is None or np.size(known[key]) != values.size:
+            known[key] = np.zeros(values.size, np.float32)
+    return {f"{name}/{key}": np.asarray(value) for key, value in known.items()}
