@@ -9,7 +9,7 @@ from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, part
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.lobe_matrices import resample
-from mi_refgs.surfels.channels import channel, geometry
+from mi_refgs.surfels.channels import channel
 
 
 def branch(trainer: Trainer, method: Method) -> Trainer:
@@ -22,7 +22,7 @@ def branch(trainer: Trainer, method: Method) -> Trainer:
     old, count = part(state, PARAMS), trainer.surfels.count
     rng = trainer.schedule.rng(trainer.iteration)
     wanted: dict[str, np.ndarray] = {}
-    for name in (*geometry(), *method.surfels.channels):
+    for name in method.surfels.names:
         width = method.surfels.columns(name)
         if name not in old:
             wanted[name] = channel(name).start(count, width, rng, method.surfels.start(name))
@@ -54,18 +54,15 @@ def _history(
     state: dict[str, np.ndarray], old: dict[str, np.ndarray], name: str, values: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Adam's moments of one tensor, by the names of `Adam.state_dict`."""
-    known = {
-        key: state.get(f"{OPTIMISER}{name}/{key}") for key in ("first", "second", "steps", "factor", "usual")
-    }
-    if any(value is None for value in known.values()):
-        known = {"steps": np.array(0), "factor": np.array(1.0), "usual": np.array(0.0)}
-    else:
-        shape = old[name].shape
-        for key in ("first", "second"):
-            moments = np.reshape(known[key], shape)
-            same_rows = values.ndim == 2 and values.shape[0] == shape[0]
-            known[key] = _columns(moments, values.shape[1]).ravel() if same_rows else None
+    found: dict[str, np.ndarray] = {}
     for key in ("first", "second"):
-        if known.get(key) is None or np.size(known[key]) != values.size:
-            known[key] = np.zeros(values.size, np.float32)
-    return {f"{name}/{key}": np.asarray(value) for key, value in known.items()}
+        moments = state.get(f"{OPTIMISER}{name}/{key}")
+        kept = np.zeros(values.shape, np.float32)
+        if moments is not None and values.ndim == 2:
+            kept = _columns(moments.reshape(old[name].shape), values.shape[1])
+        elif moments is not None and moments.size == values.size:
+            kept = moments
+        found[f"{name}/{key}"] = kept.ravel()
+    for key, fresh in (("steps", 0), ("factor", 1.0), ("usual", 0.0)):
+        found[f"{name}/{key}"] = state.get(f"{OPTIMISER}{name}/{key}", np.array(fresh))
+    return found
