@@ -140,7 +140,7 @@ def test_an_edit_clears_the_moments_of_what_it_changed(method: Method) -> None:
         return {name for name, value in trainer.state().items() if name.endswith("first") and np.any(value)}
 
     before = moving()
-    trainer._refine(5)
+    trainer.control.refine(5)
     assert before - moving() == {"optimiser/opacity/first", "optimiser/scale/first"}
 
 
@@ -157,7 +157,7 @@ def test_the_screen_gradient_is_in_half_pictures(method: Method, monkeypatch: py
     trainer.step()
     expected = 0.5 * SIZE * np.linalg.norm(np.array(dr.grad(shifts[0])), axis=0)
     assert expected.max() > 0
-    np.testing.assert_allclose(trainer.gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(trainer.control.gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
 
 
 def test_a_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: Path) -> None:
@@ -190,14 +190,14 @@ def test_a_signal_waits_for_the_step_in_hand(
     """A signal inside iteration 7, before its refinement: the checkpoint holds the whole iteration."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
-    refine = trainer._refine
+    refine = trainer.control.refine
 
     def interrupted_refine(iteration: int) -> None:
         if iteration == 7:
             os.kill(os.getpid(), signal.Signals[number])
         refine(iteration)
 
-    monkeypatch.setattr(trainer, "_refine", interrupted_refine)
+    monkeypatch.setattr(trainer.control, "refine", interrupted_refine)
     before = signal.getsignal(signal.Signals[number])
     with pytest.raises(KeyboardInterrupt) as caught:
         trainer.train()
@@ -214,7 +214,7 @@ def test_a_second_signal_is_not_held(
     """Twice within iteration 7, which ends it there; what was saved before is whole."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
-    refine, after = trainer._refine, []
+    refine, after = trainer.control.refine, []
 
     def interrupted_refine(iteration: int) -> None:
         if iteration == 7:
@@ -223,7 +223,7 @@ def test_a_second_signal_is_not_held(
             after.append(iteration)
         refine(iteration)
 
-    monkeypatch.setattr(trainer, "_refine", interrupted_refine)
+    monkeypatch.setattr(trainer.control, "refine", interrupted_refine)
     with pytest.raises(TerminatedError):
         trainer.train()
     state = run.load_checkpoint()

@@ -103,7 +103,7 @@ def fit(
         method = sized(load_method(variant, preset, assignments), data_path, say)
     views = read_views(method, data_path, "train", truth=False)
     warn_of_data(method, views)
-    trainer = begin(method, views, folder)
+    trainer = begin(method, views, folder, say)
     if resumed:
         say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mi_refgs.fit.train import Trainer, first_light
+from mi_refgs.fit.control import first_light
+from mi_refgs.fit.train import Trainer
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, part
 from mi_refgs.shade.envmap import EnvironmentLight
@@ -12,7 +13,7 @@ from mi_refgs.shade.lobe_matrices import resample
 from mi_refgs.surfels.channels import channel
 
 
-def branch(trainer: Trainer, method: Method) -> Trainer:
+def branched(trainer: Trainer, method: Method) -> Trainer:
     """A trainer of `method`, at the same iteration of the same data; `trainer` stays as it is.
 
     Harmonics of another degree are cut or filled with zeros, a light of another size is resampled, and both
@@ -41,7 +42,10 @@ def branch(trainer: Trainer, method: Method) -> Trainer:
     for name, values in wanted.items():
         new[f"{PARAMS}{name}"] = np.asarray(values, np.float32)
         new |= {f"{OPTIMISER}{key}": value for key, value in _history(state, old, name, values).items()}
-    return Trainer(method, trainer.data, state=new)
+    made = Trainer(method, trainer.data, state=new)
+    if method.mesh is not None and made.occluder.empty and made.shading().traceable:
+        made.extract_mesh()
+    return made
 
 
 def _columns(table: np.ndarray, width: int) -> np.ndarray:

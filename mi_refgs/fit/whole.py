@@ -8,6 +8,8 @@ from pathlib import Path
 
 from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
 from mi_refgs.errors import InputError
+from mi_refgs.fit.select import DECISIONS, select_terms, with_terms
+from mi_refgs.fit.state import decisions_of
 from mi_refgs.fit.train import Trainer
 from mi_refgs.methods.method import PRESETS, Method
 from mi_refgs.runs.export import up_to_date
@@ -48,27 +50,36 @@ def read_views(method: Method, path: Path, split: str, truth: bool = True) -> Da
     )
 
 
-def begin(method: Method, views: Dataset, run: Run) -> Trainer:
+def begin(method: Method, views: Dataset, run: Run, tell: Callable[[str], None] = lambda _: None) -> Trainer:
     """A trainer that writes into `run`: from its newest checkpoint if the folder holds a run, else anew.
 
-    Raises InputError for checkpoints that are all damaged and a folder that cannot be written.
+    `tell` hears what is decided about the terms of a method that selects them. Raises InputError for
+    checkpoints that are all damaged and a folder that cannot be written.
     """
     resumed = run.exists()
-    trainer = Trainer(method, views, run)
+    state = run.load_checkpoint() if resumed else None
+    if state is not None:
+        method = with_terms(method, decisions_of(state))
+    trainer = Trainer(method, views, run, state)
     if resumed:
         run.rewind(trainer.iteration)
     else:
         run.create(method, str(views.path.resolve()))
+    select_terms(trainer, tell)
     return trainer
 
 
 def finish(trainer: Trainer, run: Run) -> str | None:
     """Save the state if no checkpoint holds it, and write the artefacts; returns a warning if there is one.
 
-    The first test view becomes the camera of scene.xml, and a training view where there are no test views.
+    Afterwards config.toml has the terms that were chosen. The first test view becomes the camera of
+    scene.xml, and a training view where there are no test views.
     """
     if not any(int(path.stem) == trainer.iteration for path in run.checkpoints()):
         run.save_checkpoint(trainer.iteration, trainer.state())
+    if trainer.decisions:
+        run.write_method(trainer.method)
+        run.write_json(DECISIONS, trainer.decisions)
     warning = None
     try:
         first = read_views(trainer.method, trainer.data.path, "test").views[0]

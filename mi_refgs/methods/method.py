@@ -7,10 +7,11 @@ every window, stage and interval is scaled with it (`methods.read`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from mi_refgs.methods.window import Window
 from mi_refgs.primitives import primitive_named
+from mi_refgs.shade.accuracy import MAX_LEVELS
 from mi_refgs.surfels.channels import MAX_SH_DEGREE, channel
 
 LIGHT = "light"
@@ -79,6 +80,8 @@ class Stage:
     at: Literal["surfel", "pixel"] = "pixel"
     reflectance: str = "split_sum"  # a model of `shade.reflectance`
     diffuse: Literal["sh", "irradiance"] = "sh"
+    visibility_rays: int = 1  # of the lobe, where there is a mesh; 1: the mirror ray
+    light_levels: int = MAX_LEVELS  # of roughness, that the light is filtered to
     restart: tuple[str, ...] = ()  # channels, and `light`, that start anew when the stage begins
 
 
@@ -164,6 +167,32 @@ class DataOptions:
 
 
 @dataclass(frozen=True)
+class Term:
+    """Something that a method can do without, as changes of its file, and when a fit tries it."""
+
+    after: int  # iterations before it is tried
+    trial: int  # iterations with it, and without it, that are compared
+    change: dict[str, Any] = field(default_factory=dict)  # tables merged over the method's
+    drop: tuple[str, ...] = ()  # keys that it removes before
+    needs: tuple[str, ...] = ()  # terms that must be in use
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Terms that a fit tries on training views held out for it, and what each must bring to stay.
+
+    A term stays if the PSNR of these views rises by `gain`, and by the price of the time of a step and of the
+    memory of parameters that it costs.
+    """
+
+    term: dict[str, Term]
+    holdout: int = 8  # every so many training views judge
+    gain: float = 0.05  # dB
+    gain_per_ms: float = 0.01  # dB for each millisecond of a step
+    gain_per_mb: float = 0.01  # dB for each MB of parameters and their moments
+
+
+@dataclass(frozen=True)
 class Method:
     """Everything that describes a fit; the resolved copy is saved with the run."""
 
@@ -181,8 +210,12 @@ class Method:
     checkpoint_every: int = 1_000  # iterations; a kill loses at most so many
     preview_every: int = 1_000
     log_every: int = 50
-    variant: str = ""  # filled in by `load`: the file's stem
+    select: Selection | None = None
+    terms: tuple[str, ...] = ()  # of `select`, in use
+    variant: str = ""  # filled in by `load`, as the others below: the file's stem
+    file: str = ""
     preset: str = ""
+    assignments: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.iterations < 1:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import tomli_w
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import is_file
 from mi_refgs.methods.build import build, plain
-from mi_refgs.methods.method import LIGHT, PRESETS, Method
+from mi_refgs.methods.method import LIGHT, PRESETS, Method, Term
 from mi_refgs.methods.window import Window
 from mi_refgs.resources import resource_dir
 from mi_refgs.shade.shading import Shading
@@ -25,11 +26,16 @@ MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
 
 # Fields that count iterations, and so scale with the preset, as windows do.
-_SCALED = {"iterations", "until", "normal_start", "normal_rise", "smooth_until", "hold"}
+_SCALED = {"iterations", "until", "normal_start", "normal_rise", "smooth_until", "hold", "after", "trial"}
 
 
-def load(variant: str, preset: str = "standard", assignments: list[str] | None = None) -> Method:
-    """Read a method by name or TOML path, apply `key=value` assignments, and scale it to a preset.
+def load(
+    variant: str,
+    preset: str = "standard",
+    assignments: Sequence[str] | None = None,
+    terms: Sequence[str] = (),
+) -> Method:
+    """Read a method by name or TOML path, with some of its terms; scale it to a preset, apply `key=value`.
 
     Raises InputError naming the file and the key for anything unknown or of the wrong type.
     """
@@ -37,6 +43,8 @@ def load(variant: str, preset: str = "standard", assignments: list[str] | None =
         raise InputError(f"--preset: {preset}: unknown; use one of {', '.join(PRESETS)}")
     path = _find(variant, "--variant", Path())
     table = _extended(path, [])
+    for name in terms:
+        table = _with_term(table, name, path)
     chosen = PRESETS[preset]
     method = build(Method, table, str(path))
     method = _scale(method, chosen.iterations / method.iterations)
@@ -45,7 +53,20 @@ def load(variant: str, preset: str = "standard", assignments: list[str] | None =
     for assignment in assignments or []:
         _assign(table, assignment)
     where = "--set" if assignments else str(path)
-    return _checked(build(Method, table | {"variant": path.stem, "preset": preset}, where), str(path))
+    made = {"variant": path.stem, "file": variant, "preset": preset, "terms": [*terms]}
+    made["assignments"] = [*(assignments or [])]
+    return _checked(build(Method, table | made, where), str(path))
+
+
+def _with_term(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
+    """The table of a file with the changes of one of its terms."""
+    try:
+        term = build(Term, table["select"]["term"][name], f"{path}: select.term.{name}")
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: select.term: there is no '{name}'; use one of its terms") from error
+    for key in term.drop:
+        _drop(table, key, path)
+    return _merge(table, term.change)
 
 
 def _checked(method: Method, where: str) -> Method:

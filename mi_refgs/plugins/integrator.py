@@ -92,6 +92,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - Rays of the lobe that visibility is averaged over, 1 is the mirror ray; and how often what blocks
          rays is shaded, in place of the surfels' indirect light. (Default: 1, 0)
 
+     * - light_levels
+       - |int|
+       - Levels of roughness that the light is filtered to; fewer cost less. (Default: 7)
+
      * - terms
        - |string|
        - Terms in the image, out of ``diffuse,specular,indirect``. (Default: all)
@@ -316,7 +320,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             raise InputError(
                 "refgs: light: there is none; nest an `envmap` in the integrator, or in the scene"
             )
-        return emitter_light(emitter, wanted == "filtered")
+        return emitter_light(emitter, wanted == "filtered", self.shading.levels)
 
     def to_string(self) -> str:
         size = "x".join(str(x) for x in self.light.raw.shape[:2]) if self.light is not None else "the scene's"

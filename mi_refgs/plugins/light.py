@@ -21,7 +21,7 @@ from mi_refgs.shade.envmap import (
     bounded,
 )
 from mi_refgs.shade.light import ConstantLight, Light, RotatedLight
-from mi_refgs.shade.lobe_matrices import resample
+from mi_refgs.shade.lobe_matrices import LEVELS, Levels, resample
 from mi_refgs.shade.prefilter import prefilter
 
 MAX_HEIGHT = 512
@@ -42,8 +42,8 @@ def own_light(emitter: Any) -> tuple[Any, Any]:
     return EnvironmentLight.from_radiance(np.tile(colour, (DEFAULT_HEIGHT, 2 * DEFAULT_HEIGHT, 1))), None
 
 
-def emitter_light(emitter: Any, filtered: bool = True) -> Light:
-    """The light of an emitter of the scene, under AD; not `filtered`, it has the lookup `radiance` alone.
+def emitter_light(emitter: Any, filtered: bool = True, levels: Levels = LEVELS) -> Light:
+    """The light of an emitter of the scene, under AD; not `filtered` to `levels`, it has `radiance` alone.
 
     Gradients flow to its `data` and `scale`, or `radiance.value`. A map that must be resampled (see
     `_map_radiance`) can receive none: asking for it raises InputError, as does any emitter but `envmap` and
@@ -60,7 +60,7 @@ def emitter_light(emitter: Any, filtered: bool = True) -> Light:
         )
     light: Light = UnfilteredLight(radiance.shape[0], radiance.array)
     if filtered:
-        light = PrefilteredLight(*prefilter(radiance))
+        light = PrefilteredLight(*prefilter(radiance, levels))
     return rotated(light, _light_from_world(params))
 
 

@@ -50,6 +50,10 @@ class Run:
         self.require_none()
         self._make_folders()
         write_bytes(self.path / "dataset.json", json.dumps({"path": dataset}).encode())
+        self.write_method(method)
+
+    def write_method(self, method: Method) -> None:
+        """Write the resolved method."""
         write_bytes(self.path / "config.toml", dump(method).encode())
 
     def method(self) -> Method:
@@ -133,7 +137,7 @@ class Run:
         except OSError as error:
             raise cannot_write(path, error) from error
 
-    def write_json(self, name: str, content: dict[str, Any]) -> None:
+    def write_json(self, name: str, content: Any) -> None:
         """Write a JSON file of the run."""
         write_bytes(self.path / name, (json.dumps(content, indent=2) + "\n").encode())
 

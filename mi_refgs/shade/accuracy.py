@@ -6,12 +6,16 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from mi_refgs.errors import InputError, shown
+from mi_refgs.shade.lobe_matrices import LEVEL_ROUGHNESS
 
 MAX_RAYS = 4096
 """Rays of the lobe, or bounces, beyond which nothing changes but the time: the length of a kernel follows."""
 
 MAX_DIRECTIONS = 64
 """Directions of the hemisphere at most: which of them are free is one bit each of a 64-bit word."""
+
+MAX_LEVELS = len(LEVEL_ROUGHNESS)
+"""Filtered levels of a light, at most: as many as there are matrices for."""
 
 NEED_OCCLUSION = ("visibility_rays", "traced_bounces")
 """Options that do nothing where no ray is traced."""
@@ -29,6 +33,7 @@ class Accuracy:
     visibility_rays: int = 1  # rays of the GGX lobe that the visibility is averaged over; 1: the mirror ray
     traced_bounces: int = 0  # times that what a blocked ray hits is shaded, in place of the indirect channel
     directions: int = 24  # from which models that sum over the hemisphere take light
+    light_levels: int = MAX_LEVELS  # levels of roughness that the light is filtered to; fewer cost less
 
     def __post_init__(self) -> None:
         for name in ("dominant", "multiscatter"):
@@ -38,6 +43,7 @@ class Accuracy:
             ("visibility_rays", "rays", 1, MAX_RAYS),
             ("traced_bounces", "bounces", 0, MAX_RAYS),
             ("directions", "directions", 1, MAX_DIRECTIONS),
+            ("light_levels", "levels", 2, MAX_LEVELS),
         ):
             number: Any = getattr(self, name)
             if type(number) is not int or not least <= number <= most:

@@ -10,6 +10,7 @@ from mi_refgs.errors import InputError, shown
 from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.light import Light
+from mi_refgs.shade.lobe_matrices import Levels
 from mi_refgs.shade.points import ShadingPoints, Terms
 from mi_refgs.shade.reflectance import MODELS, Reflectance
 from mi_refgs.shade.split_sum import Diffuse
@@ -62,10 +63,17 @@ class Shading:
 
     @staticmethod
     def of(stage: Any, mesh: bool) -> Shading:
-        """The shading of a stage (`at`, `reflectance`, `diffuse`); occluded if there is a `mesh` and the
-        model can trace it in this order."""
-        shading = Shading(stage.at, stage.reflectance, stage.diffuse)
-        return replace(shading, occlusion=mesh and shading.traceable)
+        """The shading of a stage by its fields of the same names, with `visibility_rays` and `light_levels`.
+
+        It is occluded if there is a `mesh` and the model can trace it in this order.
+        """
+        shading = Shading(
+            stage.at, stage.reflectance, stage.diffuse, accuracy=Accuracy(light_levels=stage.light_levels)
+        )
+        if not (mesh and shading.traceable):
+            return shading
+        accuracy = replace(shading.accuracy, visibility_rays=stage.visibility_rays)
+        return replace(shading, occlusion=True, accuracy=accuracy)
 
     @staticmethod
     def default_reflectance(channels: Collection[str]) -> str:
@@ -95,7 +103,14 @@ class Shading:
         """The light as the model looks it up, under AD; None if there is none, or it asks for none."""
         if environment is None or self.model.light == "none":
             return None
-        return environment.prefilter() if self.model.light == "filtered" else environment.unfiltered()
+        return (
+            environment.prefilter(self.levels) if self.model.light == "filtered" else environment.unfiltered()
+        )
+
+    @property
+    def levels(self) -> Levels:
+        """The levels of roughness that a light is filtered to."""
+        return Levels.some(self.accuracy.light_levels)
 
     def check(self, channels: Collection[str], light: bool = True, mesh: bool = True) -> None:
         """Raise InputError if surfels with these channels, and what is there beside them, lack something."""

@@ -1,0 +1,182 @@
+"""Model only what a scene needs: terms of a method are tried while it is fitted, and stay if they earn it.
+
+A term is tried where the fit has come to: both go on from there for a while, with it and without it, and the
+views held out for the purpose judge. The one that wins is the fit that goes on, so a trial costs what its
+loser took. A term that is not in use is absent from the table, the G-buffer, the kernels and the optimiser.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refgs import methods
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.fit.branch import branched
+from mi_refgs.fit.train import Trainer
+from mi_refgs.methods.method import Method, Selection
+from mi_refgs.render.display import displayed
+
+MOMENTS = 3
+"""Arrays of float32 that a parameter needs: itself, and Adam's first and second moment."""
+
+DECISIONS = "decisions.json"
+"""File of a run with the decisions."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """How a method did in a trial."""
+
+    psnr: float  # dB, mean over the views held out
+    ms: float  # median of a step
+    mb: float  # parameters and their moments
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One term, tried or not."""
+
+    term: str
+    iteration: int
+    stays: bool
+    reason: str
+    without: Trial | None = None
+    with_it: Trial | None = None
+
+    @property
+    def gain(self) -> float | None:
+        """dB that the term brings."""
+        return None if self.without is None or self.with_it is None else self.with_it.psnr - self.without.psnr
+
+
+def select_terms(trainer: Trainer, tell: Callable[[str], None] = lambda _: None) -> None:
+    """Let a trainer try the terms of its method as they fall due; none if its method selects nothing.
+
+    Until the last decision it fits the views that are not held out. `tell` hears every decision.
+    """
+    select = trainer.method.select
+    if select is None:
+        return
+    whole = trainer.data
+    kept = tuple(view for i, view in enumerate(whole.views) if i % select.holdout)
+    judges = replace(whole, views=whole.views[:: select.holdout])
+    if _open(trainer, select):
+        trainer.adopt(trainer.method, replace(whole, views=kept), trainer.state())
+
+    def between(trainer: Trainer) -> None:
+        while (name := _due(trainer, select)) is not None:
+            decision = _try(trainer, name, select, judges)
+            trainer.decisions.append(asdict(decision))
+            tell(sentence(decision))
+            if not _open(trainer, select):
+                trainer.adopt(trainer.method, whole, trainer.state())
+            trainer.save()
+
+    trainer.between = between
+
+
+def _open(trainer: Trainer, select: Selection) -> list[str]:
+    """Terms that are not decided yet, in the order in which they are tried."""
+    decided = {row["term"] for row in trainer.decisions}
+    return sorted((name for name in select.term if name not in decided), key=lambda n: select.term[n].after)
+
+
+def _due(trainer: Trainer, select: Selection) -> str | None:
+    names = _open(trainer, select)
+    return names[0] if names and trainer.iteration >= select.term[names[0]].after else None
+
+
+def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Decision:
+    term, method, iteration = select.term[name], trainer.method, trainer.iteration
+    if missing := [needed for needed in term.needs if needed not in method.terms]:
+        return Decision(name, iteration, False, f"needs {missing[0]}")
+    made = methods.load(method.file, method.preset, method.assignments, (*method.terms, name))
+    candidate = replace(made, data=method.data)
+    rival = branched(trainer, candidate)
+    with_it = _run(rival, term.trial, judges)
+    without = _run(trainer, term.trial, judges)
+    gain, wanted = with_it.psnr - without.psnr, asked(without, with_it, select)
+    stays = gain >= wanted
+    if stays:
+        trainer.adopt(candidate, trainer.data, rival.state())
+    return Decision(name, iteration, stays, f"{gain:+.2f} dB of {wanted:.2f} asked", without, with_it)
+
+
+def asked(without: Trial, with_it: Trial, select: Selection) -> float:
+    """PSNR (dB) that a term has to bring for what it costs."""
+    time_price = select.gain_per_ms * max(with_it.ms - without.ms, 0)
+    return select.gain + time_price + select.gain_per_mb * max(with_it.mb - without.mb, 0)
+
+
+def _run(trainer: Trainer, steps: int, judges: Dataset) -> Trial:
+    """Go on for some steps, and what came of it."""
+    seconds = []
+    for _ in range(steps):
+        begin = time.perf_counter()
+        trainer.step()
+        dr.sync_thread()
+        seconds.append(time.perf_counter() - begin)
+    trainer.seconds += sum(seconds)
+    entries = sum(int(np.prod(tensor.shape)) for tensor in trainer.params.values())
+    # The first half may compile kernels.
+    return Trial(
+        held_out_psnr(trainer, judges),
+        1e3 * float(np.median(seconds[steps // 2 :])),
+        MOMENTS * 4 * entries / 1e6,
+    )
+
+
+def held_out_psnr(trainer: Trainer, judges: Dataset) -> float:
+    """Mean PSNR (dB) of the present state on views that it was not fitted to; waits for the device."""
+    found = []
+    for view in judges.views:
+        frame = trainer.view(view.camera(), aovs=False)
+        planes = [np.array(plane) for plane in displayed(frame, judges.background, judges.linear)]
+        image = np.stack(planes, axis=-1).reshape(view.image.shape)
+        square = np.square(np.clip(image, 0, 1) - np.clip(view.image, 0, 1))
+        found.append(-10 * np.log10(max(float(square.mean()), 1e-10)))
+    return float(np.mean(found))
+
+
+def sentence(decision: Decision) -> str:
+    """A decision for people."""
+    verdict = "stays" if decision.stays else "is left out"
+    if decision.without is None or decision.with_it is None:
+        return f"{decision.term} {verdict}: {decision.reason}"
+    ms, mb = (getattr(decision.with_it, unit) - getattr(decision.without, unit) for unit in ("ms", "mb"))
+    return f"{decision.term} {verdict}: {decision.reason}, {ms:+.1f} ms a step, {mb:+.1f} MB"
+
+
+def table(decisions: list[dict[str, Any]]) -> str:
+    """The decisions of a fit as lines of text."""
+    rows = [("term", "iteration", "gain", "time", "memory", "verdict")]
+    for row in decisions:
+        cells = ["", "", ""]
+        if row["with_it"] is not None:
+            of, to = row["without"], row["with_it"]
+            cells = [
+                f"{to['psnr'] - of['psnr']:+.2f} dB",
+                f"{to['ms'] - of['ms']:+.1f} ms",
+                f"{to['mb'] - of['mb']:+.1f} MB",
+            ]
+        verdict = "stays" if row["stays"] else f"left out ({row['reason']})"
+        rows.append((row["term"], str(row["iteration"]), *cells, verdict))
+    widths = [max(len(row[i]) for row in rows) for i in range(5)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=True)).rstrip()
+        for row in rows
+    )
+
+
+def with_terms(method: Method, decisions: list[dict[str, Any]]) -> Method:
+    """The method with the terms that decisions have left in it."""
+    names = tuple(row["term"] for row in decisions if row["stays"])
+    if method.select is None or names == method.terms:
+        return method
+    return replace(methods.load(method.file, method.preset, method.assignments, names), data=method.data)

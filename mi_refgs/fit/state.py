@@ -1,0 +1,73 @@
+"""What a checkpoint holds of a fit, as named arrays; `runs.checkpoint` reads and checks the files."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.methods.method import LIGHT, Method
+from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, part
+
+if TYPE_CHECKING:
+    from mi_refgs.fit.train import Trainer
+
+
+def shapes(method: Method) -> dict[str, tuple[int, ...]]:
+    """The shape of every parameter of a method, without the first axis."""
+    found: dict[str, tuple[int, ...]] = {
+        name: (method.surfels.columns(name),) for name in method.surfels.names
+    }
+    return found if method.light is None else found | {LIGHT: (2 * method.light.height, 3)}
+
+
+def packed(trainer: Trainer) -> dict[str, np.ndarray]:
+    """Everything that a checkpoint holds."""
+    mesh = trainer.occluder.mesh()
+    state = {f"{PARAMS}{name}": tensor.numpy() for name, tensor in trainer.params.items()}
+    state |= {f"{OPTIMISER}{name}": value for name, value in trainer.optimiser.state_dict().items()}
+    state |= {
+        "gradient_sum": trainer.control.gradient_sum.numpy(),
+        "gradient_count": trainer.control.gradient_count.numpy(),
+    }
+    state |= {"iteration": np.array(trainer.iteration), "seconds": np.array(trainer.seconds)}
+    state["held_until"] = np.array(trainer.control.held_until)
+    if trainer.decisions:
+        state["decisions"] = np.frombuffer(json.dumps(trainer.decisions).encode(), np.uint8)
+    if mesh is not None:
+        state |= {
+            "mesh/vertices": mesh.vertices,
+            "mesh/faces": mesh.faces,
+            "mesh/voxel": np.array(mesh.voxel),
+        }
+    return state
+
+
+def decisions_of(state: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """What was decided about the terms of the method so far."""
+    if "decisions" not in state:
+        return []
+    found: list[dict[str, Any]] = json.loads(state["decisions"].tobytes().decode())
+    return found
+
+
+def mesh_of(state: dict[str, np.ndarray]) -> Mesh | None:
+    """The occluder, if there is one."""
+    if "mesh/faces" not in state:
+        return None
+    return Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
+
+
+def require_fit(method: Method, state: dict[str, np.ndarray]) -> None:
+    """Raise InputError if the method has changed since the state was written."""
+    expected = shapes(method)
+    found = {name: value.shape[1:] for name, value in part(state, PARAMS).items()}
+    for name in expected.keys() | found.keys():
+        if found.get(name) != expected.get(name):
+            raise InputError(
+                f"config.toml: {name}: the checkpoint has {found.get(name, 'none')}, the method "
+                f"{expected.get(name, 'none')}; undo the change, or start another run"
+            )
