@@ -216,7 +216,7 @@ def test_extends_changes_only_what_it_says(tmp_path: Path) -> None:
     child.write_text('extends = "ref_gaussian"\n[loss]\nssim = 0.5\n')
     base, changed = methods.load("ref_gaussian"), methods.load(str(child))
     assert changed.loss == dataclasses.replace(base.loss, ssim=0.5)
-    assert dataclasses.replace(changed, loss=base.loss, variant=base.variant) == base
+    assert dataclasses.replace(changed, loss=base.loss, variant=base.variant, file=base.file) == base
     assert Path(child).stem == changed.variant
 
 
@@ -230,7 +230,7 @@ def test_extends_takes_every_shipped_method_and_own_files(base: str, tmp_path: P
     shipped, changed = methods.load(base), methods.load(str(grandchild))
     assert changed.loss == dataclasses.replace(shipped.loss, ssim=0.5, normal=0.3)
     assert changed.refine.densify is None and changed.refine.reset is None
-    same = dataclasses.replace(changed, loss=shipped.loss, refine=shipped.refine, variant=base)
+    same = dataclasses.replace(changed, loss=shipped.loss, refine=shipped.refine, variant=base, file=base)
     assert same == shipped
 
 

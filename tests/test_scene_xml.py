@@ -24,7 +24,13 @@ from mi_refgs.shade.visibility import mirror_visibility
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 
-OTHER: dict[str, Any] = {"dominant": True, "multiscatter": True, "visibility_rays": 3, "traced_bounces": 1}
+OTHER: dict[str, Any] = {
+    "dominant": True,
+    "multiscatter": True,
+    "visibility_rays": 3,
+    "traced_bounces": 1,
+    "light_levels": 2,
+}
 """A value for each option that is not its default."""
 
 
