@@ -19,6 +19,7 @@ from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.runs.export import TrainedScene, export
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.visibility import mirror_visibility
 from mi_refgs.splat.camera import Camera
@@ -30,8 +31,16 @@ OTHER: dict[str, Any] = {
     "visibility_rays": 3,
     "traced_bounces": 1,
     "light_levels": 2,
+    "directions": 5,
 }
 """A value for each option that is not its default."""
+
+
+def shading_with(option: str) -> Shading:
+    """A shading whose model honours the option, with OTHER's value."""
+    name = next(name for name, model in MODELS.items() if option in model.accuracy)
+    accuracy = Accuracy(**{option: OTHER[option]})
+    return Shading(MODELS[name].orders[0], name, diffuse="irradiance", occlusion=True, accuracy=accuracy)
 
 
 def fitted(folder: Path, shading: Shading) -> TrainedScene:
@@ -58,7 +67,7 @@ def shown(folder: Path, made: TrainedScene, camera: Camera) -> tuple[mi.Scene, n
 @pytest.mark.parametrize("option", [field.name for field in fields(Accuracy)])
 def test_every_option_of_accuracy_goes_round(option: str, tmp_path: Path) -> None:
     """Through scene.xml and through model.json; and the pictures are the same."""
-    shading = Shading(diffuse="irradiance", occlusion=True, accuracy=Accuracy(**{option: OTHER[option]}))
+    shading = shading_with(option)
     made = fitted(tmp_path, shading)
     scene, seen, expected = shown(tmp_path, made, view())
     assert scene.integrator().shading == shading and TrainedScene.read(tmp_path).shading == shading
