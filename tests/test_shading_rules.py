@@ -123,3 +123,15 @@ def needless(shading: Shading) -> set[str]:
         except InputError:
             pass
     return found
+
+
+def test_a_stage_says_how_many_directions(tmp_path: Path) -> None:
+    """A model that sums over the hemisphere is occluded at surfels; others have no directions."""
+    path = tmp_path / "own.toml"
+    text = "iterations = 100\n[surfels]\nchannels = ['albedo', 'roughness']\n" + LIGHT + STAGE
+    path.write_text(f"{text}at = 'surfel'\nreflectance = 'monte_carlo'\ndirections = 8")
+    shading = Shading.of(load(str(path)).stage["only"], mesh=True)
+    assert shading.occlusion and shading.accuracy == Accuracy(directions=8)
+    path.write_text(f"{text}at = 'surfel'\ndiffuse = 'irradiance'\ndirections = 8")
+    with pytest.raises(InputError, match="directions: needs reflectance = monte_carlo"):
+        load(str(path))

@@ -192,7 +192,7 @@ class Trainer:
         self.iteration = iteration
         self.control.refine(iteration)
         mesh = self.method.mesh
-        if mesh is not None and self._shading(stage).at == "pixel" and mesh.extract.due(iteration):
+        if mesh is not None and self._shading(stage).traceable and mesh.extract.due(iteration):
             self.extract_mesh()
 
     def statistics(self) -> dict[str, Any]:

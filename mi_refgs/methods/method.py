@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from mi_refgs.methods.window import Window
 from mi_refgs.primitives import primitive_named
-from mi_refgs.shade.accuracy import MAX_LEVELS
+from mi_refgs.shade.accuracy import DIRECTIONS, MAX_LEVELS
 from mi_refgs.surfels.channels import MAX_SH_DEGREE, channel
 
 LIGHT = "light"
@@ -82,6 +82,7 @@ class Stage:
     diffuse: Literal["sh", "irradiance"] = "sh"
     visibility_rays: int = 1  # of the lobe, where there is a mesh; 1: the mirror ray
     light_levels: int = MAX_LEVELS  # of roughness, that the light is filtered to
+    directions: int = DIRECTIONS  # of the hemisphere, for models that sum light over it
     restart: tuple[str, ...] = ()  # channels, and `light`, that start anew when the stage begins
 
 

@@ -18,6 +18,7 @@ from mi_refgs.fit.train import Trainer
 from mi_refgs.methods.method import Refine
 from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.profiling.phases import phase_times
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import list_by_tile, project
 
 WARM_UP = 4
@@ -86,7 +87,8 @@ def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
     found = []
     for name in names:
         mesh = trainer.method.mesh
-        if trainer.method.stage[name].at == "pixel" and mesh is not None and trainer.occluder.mesh() is None:
+        traced = Shading.of(trainer.method.stage[name], mesh=True).occlusion
+        if traced and mesh is not None and trainer.occluder.mesh() is None:
             trainer.extract_mesh()
         found.append(profile_stage(trainer, name, steps))
     allocated = int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))

@@ -11,6 +11,9 @@ from mi_refgs.shade.lobe_matrices import LEVEL_ROUGHNESS
 MAX_RAYS = 4096
 """Rays of the lobe, or bounces, beyond which nothing changes but the time: the length of a kernel follows."""
 
+DIRECTIONS = 24
+"""Directions of the hemisphere unless somebody asks for others; R3DG has 64, which takes twice as long."""
+
 MAX_DIRECTIONS = 64
 """Directions of the hemisphere at most: which of them are free is one bit each of a 64-bit word."""
 
@@ -32,7 +35,7 @@ class Accuracy:
     multiscatter: bool = False  # add the light that leaves after several bounces between facets
     visibility_rays: int = 1  # rays of the GGX lobe that the visibility is averaged over; 1: the mirror ray
     traced_bounces: int = 0  # times that what a blocked ray hits is shaded, in place of the indirect channel
-    directions: int = 24  # from which models that sum over the hemisphere take light
+    directions: int = DIRECTIONS  # from which models that sum over the hemisphere take light
     light_levels: int = MAX_LEVELS  # levels of roughness that the light is filtered to; fewer cost less
 
     def __post_init__(self) -> None:
@@ -55,3 +58,7 @@ class Accuracy:
     def chosen(self) -> list[str]:
         """Names of the options that differ from their defaults."""
         return [option.name for option in fields(self) if getattr(self, option.name) != option.default]
+
+
+PLAIN = Accuracy()
+"""Nothing paid for a smaller error."""

@@ -63,16 +63,15 @@ class Shading:
 
     @staticmethod
     def of(stage: Any, mesh: bool) -> Shading:
-        """The shading of a stage by its fields of the same names, with `visibility_rays` and `light_levels`.
+        """The shading of a stage by its fields of the same names, those of `Accuracy` among them.
 
         It is occluded if there is a `mesh` and the model can trace it in this order.
         """
-        shading = Shading(
-            stage.at, stage.reflectance, stage.diffuse, accuracy=Accuracy(light_levels=stage.light_levels)
-        )
+        accuracy = Accuracy(light_levels=stage.light_levels, directions=stage.directions)
+        shading = Shading(stage.at, stage.reflectance, stage.diffuse, accuracy=accuracy)
         if not (mesh and shading.traceable):
             return shading
-        accuracy = replace(shading.accuracy, visibility_rays=stage.visibility_rays)
+        accuracy = replace(accuracy, visibility_rays=stage.visibility_rays)
         return replace(shading, occlusion=True, accuracy=accuracy)
 
     @staticmethod

@@ -14,16 +14,13 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
-from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.accuracy import PLAIN, Accuracy
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light import Light
 from mi_refgs.shade.points import ShadingPoints, Terms, reflect, safe_normalize
 
 Diffuse = Literal["sh", "irradiance"]
 """Diffuse radiance as fitted (spherical harmonics), or of the albedo and the light."""
-
-PLAIN = Accuracy()
-"""Nothing paid for a smaller error."""
 
 DIELECTRIC_F0 = 0.04
 """Reflectance at normal incidence of a surface that is not metal (index of refraction 1.5)."""
