@@ -73,7 +73,7 @@ def test_terms_are_weighed_as_the_method_says(
         for x, a in ((radiance, alpha), picture)
     )
     expected = 0.7 * reference.l1(shown, goal) + 0.3 * (1 - reference.ssim(shown, goal))
-    expected += 0.4 * reference.alpha_loss(alpha, picture[1], "l1")
+    expected += 0.4 * reference.alpha_loss(alpha, picture[1])
     assert float(loss[0]) == pytest.approx(expected, abs=2e-5)
     assert float(error[0]) == pytest.approx(np.mean((shown - goal) ** 2), rel=1e-4)
 

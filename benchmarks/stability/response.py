@@ -112,7 +112,7 @@ def _loss(name: str, radiance: Array, alpha: Array, target: Array, target_alpha:
         image = oracle.display_image(radiance, alpha, (0.5, 0.5, 0.5))
         image = np.where((target >= losses.SATURATED) & (image > target), target, image)
         value = 0.8 * oracle.l1(image, target) + 0.2 * (1 - oracle.ssim(image, target))
-        return value + 0.2 * oracle.alpha_loss(alpha, target_alpha, "l1")
+        return value + 0.2 * oracle.alpha_loss(alpha, target_alpha)
 
     places = [(r, c) for r in (0, 4, 7) for c in (1, 5)]
     slopes = np.array([_slopes(exact, radiance, alpha, place) for place in places])

@@ -18,8 +18,6 @@ from mi_refgs.render.stencil import neighbours
 
 # An 8-bit target value of 255 stands for everything from here up: the sensor clipped.
 SATURATED = 254.5 / 255.0
-# Alpha is kept this far from 0 and 1 in the cross-entropy, whose slope is then at most 10⁴ per pixel.
-ENTROPY_MARGIN = 1e-4
 
 
 def saturated(
@@ -65,16 +63,9 @@ def d_ssim(render: Iterable[Any], target: Iterable[Any], width: int, height: int
     return 1 - ssim(list(render), list(target), width, height)
 
 
-def alpha_loss(alpha: Any, target: Any, kind: str = "l1") -> Any:
-    """Accumulated alpha against a mask in [0, 1]: kind "l1" or "bce" (cross-entropy), mean."""
-    target = dr.detach(target)
-    if kind == "l1":
-        return _mean(_abs(alpha - target))
-    if kind != "bce":
-        raise ValueError(f"losses.alpha_loss: kind {kind!r}; use 'l1' or 'bce'")
-    # An affine squeeze, not a clamp: a pixel at exactly 0 that should be 1 keeps its gradient.
-    a = ENTROPY_MARGIN + (1 - 2 * ENTROPY_MARGIN) * alpha
-    return _mean(-target * dr.log(a) - (1 - target) * dr.log(1 - a))
+def alpha_loss(alpha: Any, target: Any) -> Any:
+    """Mean absolute difference of accumulated alpha and a mask in [0, 1]."""
+    return _mean(_abs(alpha - dr.detach(target)))
 
 
 # ---------------- geometry losses ----------------
@@ -91,13 +82,11 @@ def normal_consistency(normal: Any, depth_normal: Any, valid: Any, alpha: Any) -
     return _mean(weight * (weight - dr.dot(mi.Vector3f(normal), mi.Vector3f(depth_normal))))
 
 
-def normal_smoothness(
-    normal: Iterable[Any], image: Iterable[Any], width: int, height: int, weight: Any = None
-) -> Any:
+def normal_smoothness(normal: Iterable[Any], image: Iterable[Any], width: int, height: int) -> Any:
     """Edge-aware normal smoothness ‖∇N‖ exp(-‖∇I‖) (Ref-Gaussian §3.3): pixel mean, sum over axes.
 
-    ∇ is Sobel / 8 with the border repeated; ‖·‖ is the mean absolute value over the three planes. `weight`
-    (H·W) masks pixels. Gradients flow to N only.
+    ∇ is Sobel / 8 with the border repeated; ‖·‖ is the mean absolute value over the three planes. Gradients
+    flow to N only.
     """
     total = mi.Float(0)
     normal_slopes = [sobel(plane, width, height) for plane in normal]
@@ -106,7 +95,7 @@ def normal_smoothness(
         bend = sum((_abs(slopes[axis]) for slopes in normal_slopes), mi.Float(0)) / len(normal_slopes)
         edge = sum((dr.abs(slopes[axis]) for slopes in image_slopes), mi.Float(0)) / len(image_slopes)
         total += bend * dr.exp(-edge)
-    return _mean(total if weight is None else total * dr.detach(weight))
+    return _mean(total)
 
 
 def sobel(plane: Any, width: int, height: int) -> tuple[Any, Any]:

@@ -53,14 +53,11 @@ def ssim(image: np.ndarray, target: np.ndarray) -> float:
     return float(total / image.size)
 
 
-def alpha_loss(alpha: np.ndarray, target: np.ndarray, kind: str) -> float:
-    """Mean absolute difference ("l1") or cross-entropy of 1e-4 + (1 - 2e-4) A ("bce")."""
+def alpha_loss(alpha: np.ndarray, target: np.ndarray) -> float:
+    """Mean absolute difference."""
     total = 0.0
     for index in np.ndindex(alpha.shape):
-        a, t = float(alpha[index]), float(target[index])
-        squeezed = 1e-4 + (1 - 2e-4) * a
-        entropy = -t * math.log(squeezed) - (1 - t) * math.log(1 - squeezed)
-        total += abs(a - t) if kind == "l1" else entropy
+        total += abs(float(alpha[index]) - float(target[index]))
     return total / alpha.size
 
 
