@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
@@ -53,7 +54,7 @@ class RenderedView:
 
         normal = planes(frame.normal)
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
-        maps = {name: planes(m) if name == "albedo" else plane(m) for name, m in frame.maps.items()}
+        maps = {name: planes(m) if dr.depth_v(m) > 1 else plane(m) for name, m in frame.maps.items()}
         return RenderedView(
             planes(displayed(frame, data.background, data.linear)),
             plane(frame.alpha),

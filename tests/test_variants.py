@@ -1,0 +1,159 @@
+"""The shipped methods: exactly what each changes of the full one, and that each fits, evaluates, renders."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers import ROOT
+from tiny_scene import SETTINGS, write_data
+
+from mi_refgs import methods
+from mi_refgs.cli import main
+from mi_refgs.methods.build import plain
+
+FULL = "ref_gaussian"
+GEOMETRY_LOSS = {"loss.normal", "loss.normal_rise"}
+COLOUR_ONLY = {
+    "light",
+    "mesh",
+    "rates.channel",
+    "rates.rest",
+    "refine.reset_raise",
+    "stage.deferred",
+    "stage.initial",
+    "stage.radiance",
+    "surfels.channels",
+    "surfels.degree",
+    "surfels.initial",
+}
+NO_MESH = {"mesh", "rates.channel", "rates.rest", "surfels.channels", "surfels.degree"}
+
+DIFFERENCES: dict[str, set[str]] = {
+    "ref_gaussian": set(),
+    "ref_gaussian_paper": {
+        "iterations",
+        "loss.normal",
+        "loss.normal_rise",
+        "loss.smooth",
+        "loss.smooth_until",
+        "mesh.extract",
+        "rates.channel",
+        "rates.decay",
+        "rates.light",
+        "rates.rest",
+        "refine.densify",
+        "refine.propagate",
+        "refine.reset",
+        "stage.deferred",
+        "stage.initial",
+        "surfels.degree",
+        "surfels.initial",
+        "surfels.sh_raise",
+    },
+    "no_pbr": NO_MESH | {"stage.deferred", "stage.initial", "surfels.initial"},
+    "no_interreflection": NO_MESH,
+    "no_deferred": NO_MESH | {"stage.deferred"},
+    "no_initial_stage": {"stage.initial"},
+    "no_material_aware": {"refine.propagate"},
+    "gaussians_3d": {"surfels.primitive"},
+    "base_2dgs": COLOUR_ONLY,
+    "base_3dgs": COLOUR_ONLY | GEOMETRY_LOSS | {"surfels.primitive"},
+    "base_3dgs_dr": NO_MESH
+    | GEOMETRY_LOSS
+    | {
+        "refine.propagate",
+        "stage.deferred",
+        "stage.initial",
+        "surfels.initial",
+        "surfels.primitive",
+        "surfels.sh_raise",
+    },
+    "base_gaussian_shader": NO_MESH
+    | {
+        "light.radiance",
+        "loss.normal_rise",
+        "refine.reset_raise",
+        "stage.deferred",
+        "stage.initial",
+        "stage.only",
+        "surfels.initial",
+        "surfels.primitive",
+    },
+    "base_r3dg": {
+        "light.height",
+        "light.radiance",
+        "mesh.extract",
+        "rates.channel",
+        "rates.rest",
+        "refine.reset_raise",
+        "stage.deferred",
+        "stage.initial",
+        "stage.radiance",
+        "stage.relightable",
+        "surfels.channels",
+        "surfels.degree",
+        "surfels.initial",
+        "surfels.primitive",
+    },
+    "auto": COLOUR_ONLY | {"select"},
+}
+"""Keys, to the second level, by which a method differs from the full one; `about` aside."""
+
+
+def entries(variant: str) -> dict[str, Any]:
+    """The resolved, unscaled keys of a method to the second level."""
+    method = plain(methods.load(variant, "standard"))
+    for name in ("about", "variant", "file", "preset", "assignments", "terms"):
+        method.pop(name)
+    found = {}
+    for key, value in method.items():
+        inner = value if isinstance(value, dict) and key != "select" else {"": value}
+        found |= {f"{key}.{name}".rstrip("."): entry for name, entry in inner.items()}
+    return found
+
+
+@pytest.mark.parametrize("variant", methods.names())
+def test_a_method_changes_exactly_what_is_listed(variant: str) -> None:
+    full, other = entries(FULL), entries(variant)
+    changed = {key for key in full.keys() | other.keys() if full.get(key) != other.get(key)}
+    whole = {"light", "mesh"}  # where a method has none of it
+    absent = {name for name in whole if not any(key.startswith(f"{name}.") for key in other)}
+    changed = {key for key in changed if key.partition(".")[0] not in absent} | absent
+    # The preset decides how many iterations run, and everything is scaled to them.
+    assert changed == DIFFERENCES[variant] - {"iterations"}
+
+
+@pytest.mark.parametrize("variant", methods.names())
+def test_a_method_says_what_it_is(variant: str) -> None:
+    """One level of `extends`; a name of its own; a baseline cites its paper and lists its deviations."""
+    content = tomllib.loads((ROOT / "variants" / f"{variant}.toml").read_text())
+    about = content["about"]
+    assert content.get("extends", FULL) == FULL and ("extends" in content) == (variant != FULL)
+    assert about["name"] and "paper_row" in about
+    if variant.startswith("base_"):
+        assert about["paper"] and about["deviations"]
+    names = [methods.load(name).about.name for name in methods.names()]
+    assert len({*names}) == len(names)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("variants") / "ball", views=6)
+
+
+@pytest.mark.parametrize("variant", methods.names())
+def test_every_method_fits_and_evaluates(variant: str, data: Path, tmp_path: Path) -> None:
+    """A few steps in every stage, with a mesh where the method has one."""
+    run = tmp_path / "run"
+    method = methods.load(variant, "quick")
+    stages = [f"stage.{name}.until={2 * i + 2}" for i, (name, _) in enumerate(method.stages())]
+    small = ["light.height=8"] if method.light is not None else []
+    if method.mesh is not None:
+        small += ["mesh.resolution=12", "mesh.extract={start = 0, until = 6, every = 1}"]
+    settings = [*SETTINGS, *stages, *small]
+    assert main(["train", str(data), "-o", str(run), "--variant", variant, "--set", *settings]) == 0
+    assert main(["eval", str(run)]) == 0
+    assert main(["render", str(run), "-o", str(tmp_path / "view.exr")]) == 0
