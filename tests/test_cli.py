@@ -373,6 +373,7 @@ def test_unwritable_output(
         (["dataset", "no.xml", "-o", "there"], ["no.xml", "missing"]),
         (["render", "no.xml", "-o", "x.bmp"], ["x.bmp", ".exr or .png"]),
         (["render", "no.xml", "-o", "x.png", "--spp", "-1"], ["--spp"]),
+        (["export", "run", "--limit", "40"], ["--limit", "--prune"]),
     ],
 )
 def test_bad_arguments(

@@ -18,6 +18,7 @@ ROWS = (
     ("env_psnr", "light, PSNR after scale", "{:.2f} dB"),
     ("env_correlation", "light, correlation", "{:.3f}"),
     ("surfels", "surfels", "{}"),
+    ("pruned", "pruned", "from {0[surfels]} surfels, training views within {0[psnr]:.1f} dB"),
     ("iterations", "iterations", "{}"),
     ("train_seconds", "training", "{:.0f} s"),
     ("ms_per_frame", "frame", "{:.1f} ms"),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import platform
 import re
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict
     Evaluates the artefacts as they lie in the folder, after writing what a newer checkpoint makes stale.
     Every key is always there: null, with a `…_reason`, where it does not apply. Normals count where the true
     alpha is above ½ and there is a true normal. `ms_per_frame` is the median over single synchronised frames
-    of the displayed picture alone, light filtered beforehand.
+    of the displayed picture alone, light filtered beforehand. `pruned` is null for a
+    whole scene.
 
     Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, and for data
     that is gone.
@@ -128,7 +130,10 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict
         "train_seconds": fitted.seconds,
         "iterations": fitted.iteration,
         "surfels": fitted.surfels.count,
-        "ms_per_frame": _milliseconds(fitted.renderer(aovs=False), [v.camera() for v in views.views], views),
+        "pruned": None if fitted.pruned is None else dataclasses.asdict(fitted.pruned),
+        "ms_per_frame": milliseconds([fitted.renderer(aovs=False)], [v.camera() for v in views.views], views)[
+            0
+        ],
         "variant": method.variant,
         "preset": method.preset,
         "dataset": str(views.path),
@@ -182,16 +187,19 @@ def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[st
     return metrics.environment(light, truth) | {"env_reason": None}, pictures.lights(light, truth)
 
 
-def _milliseconds(view: Callable[[Camera], Frame], cameras: list[Camera], data: Dataset) -> float:
-    """Median time of a frame up to the displayed image, each waited for."""
-    seconds = []
+def milliseconds(
+    scenes: Sequence[Callable[[Camera], Frame]], cameras: list[Camera], data: Dataset
+) -> list[float]:
+    """Median time of a frame up to the displayed image, each waited for; of several scenes in turn."""
+    seconds: list[list[float]] = [[] for _ in scenes]
     for i in range(WARM_UP_FRAMES + TIMED_FRAMES):
-        dr.sync_thread()
-        begin = time.perf_counter()
-        dr.eval(displayed(view(cameras[i % len(cameras)]), data.background, data.linear))
-        dr.sync_thread()
-        seconds.append(time.perf_counter() - begin)
-    return 1000 * float(np.median(seconds[WARM_UP_FRAMES:]))
+        for view, times in zip(scenes, seconds, strict=True):
+            dr.sync_thread()
+            begin = time.perf_counter()
+            dr.eval(displayed(view(cameras[i % len(cameras)]), data.background, data.linear))
+            dr.sync_thread()
+            times.append(time.perf_counter() - begin)
+    return [1000 * float(np.median(times[WARM_UP_FRAMES:])) for times in seconds]
 
 
 def _mean(per_view: list[dict[str, Any]], name: str) -> float | None:

@@ -29,12 +29,14 @@ def write_scene_xml(
     shading: Shading,
     camera: Camera,
     background: Sequence[float] | None = None,
+    remark: str = "",
 ) -> None:
     """Write a Mitsuba scene with one `refgs` integrator and one perspective sensor, atomically.
 
     ply, envmap, mesh: file names relative to the folder of the XML, so that the folder can be moved.
     background: linear radiance (r, g, b) composited under alpha, or None for a transparent image. The scene
     has a parameter `spp`, as in `mi.load_file(path, spp=4)`, 1 by default: pixel centres, as in training.
+    remark: a comment in the file, if not empty.
 
     Mitsuba's `perspective` sensor has square pixels. Where those of the camera are not (fx ≠ fy), the film
     has more of them along one axis, and a comment says so: the same view, to half a pixel at that border.
@@ -46,6 +48,8 @@ def write_scene_xml(
         raise InputError(f"{path}: mesh: there is none to trace; give one, or shade without occlusion")
     scene = ElementTree.Element("scene", version="3.0.0")
     scene.append(ElementTree.Comment(" needs `import mi_refgs` before mi.load_file "))
+    if remark:
+        scene.append(ElementTree.Comment(f" {remark} "))
     _put(scene, "default", "spp", "1")
     integrator = ElementTree.SubElement(scene, "integrator", type="refgs", id="refgs")
     _put(integrator, "string", "filename", ply)

@@ -42,6 +42,15 @@ SURFELS, LIGHT_MAP, MESH, SCENE, MODEL = "surfels.ply", "envmap.exr", "mesh.ply"
 """Prefix of the surfels' channels and of the light in a checkpoint."""
 
 
+@dataclass(frozen=True)
+class Pruned:
+    """That a scene is not the whole fit, and how near its pictures are to the whole one's."""
+
+    surfels: int  # of the whole
+    limit: float  # dB that the pictures of all training views had to keep
+    psnr: float  # dB, of the worst of them
+
+
 @dataclass(frozen=True, eq=False)
 class TrainedScene:
     """What a fit has found: enough to render, and nothing that only training needs."""
@@ -52,6 +61,7 @@ class TrainedScene:
     shading: Shading
     iteration: int
     seconds: float  # spent training
+    pruned: Pruned | None = None  # absent: all that the fit has found
 
     @staticmethod
     def from_state(method: Method, state: Mapping[str, np.ndarray]) -> TrainedScene:
@@ -80,6 +90,9 @@ class TrainedScene:
             content = read_json(note)
             shading = Shading(**content["shading"])
             iteration, seconds = int(content["iteration"]), float(content["seconds"])
+            pruned = content.get("pruned")
+            if pruned is not None:
+                pruned = Pruned(int(pruned["surfels"]), float(pruned["limit"]), float(pruned["psnr"]))
             if iteration < 0 or not 0 <= seconds < math.inf:
                 raise ValueError("iteration or seconds out of range")
         except (ValueError, KeyError, TypeError, OverflowError) as error:
@@ -94,6 +107,7 @@ class TrainedScene:
             shading,
             iteration,
             seconds,
+            pruned,
         )
         try:
             shading.check(fitted.surfels.raw, fitted.light is not None)
@@ -143,6 +157,7 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera) -> list[Path]:
         shading=fitted.shading,
         camera=camera,
         background=None,
+        remark="" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels",
     )
     # Last, since it vouches for the others.
     note: dict[str, Any] = {
@@ -150,6 +165,8 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera) -> list[Path]:
         "seconds": fitted.seconds,
         "surfels": fitted.surfels.count,
     }
+    if fitted.pruned is not None:
+        note["pruned"] = dataclasses.asdict(fitted.pruned)
     Run(folder).write_json(MODEL, note | {"shading": dataclasses.asdict(fitted.shading)})
     return [folder / name for name in (SURFELS, light, mesh, SCENE, MODEL) if name is not None]
 

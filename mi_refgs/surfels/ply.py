@@ -133,6 +133,11 @@ def write_ply(path: str | Path, surfels: Surfels) -> None:
     Reading it back gives the same bits. Raises InputError if a value is not finite or the path cannot be
     written.
     """
+    write_bytes(path, encode_ply(surfels))
+
+
+def encode_ply(surfels: Surfels) -> bytes:
+    """The bytes of the PLY file; raises InputError if a value is not finite."""
     surfels.validate()
     values: dict[str, np.ndarray] = {}
     for channel, table in surfels.to_numpy().items():
@@ -148,7 +153,7 @@ def write_ply(path: str | Path, surfels: Surfels) -> None:
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {surfels.count}\n{properties_text}end_header\n"
     )
-    write_bytes(path, header.encode("ascii") + rows.tobytes())
+    return header.encode("ascii") + rows.tobytes()
 
 
 def _file_order(values: dict[str, np.ndarray]) -> list[str]:
