@@ -108,7 +108,7 @@ def entries(variant: str) -> dict[str, Any]:
     method = plain(methods.load(variant, "standard"))
     for name in ("about", "variant", "file", "preset", "assignments", "terms"):
         method.pop(name)
-    found = {}
+    found: dict[str, Any] = {}
     for key, value in method.items():
         inner = value if isinstance(value, dict) and key != "select" else {"": value}
         found |= {f"{key}.{name}".rstrip("."): entry for name, entry in inner.items()}
