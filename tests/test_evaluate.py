@@ -121,9 +121,9 @@ def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: 
     """Test views are rendered with materials and normals, the timed frames without."""
     asked: list[bool] = []
 
-    def rendered(*arguments: Any, aovs: bool) -> Frame:
-        asked.append(aovs)
-        return render(*arguments, aovs=aovs)  # type: ignore[misc]
+    def rendered(*arguments: Any, aovs: bool, normals: bool) -> Frame:
+        asked.append(aovs or normals)
+        return render(*arguments, aovs=aovs, normals=normals)  # type: ignore[misc]
 
     monkeypatch.setattr("mi_refgs.runs.export.render", rendered)
     evaluate(run)

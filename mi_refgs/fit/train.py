@@ -119,6 +119,7 @@ class Trainer:
                 self.occluder,
                 sh_degree=self.schedule.sh_degree(self.iteration),
                 aovs=aovs,
+                normals=aovs,
             )
 
     # ---------------- the loop ----------------
@@ -241,6 +242,7 @@ class Trainer:
             self.occluder,
             sh_degree=self.schedule.sh_degree(iteration),
             shift=shift,
+            normals=self.method.loss.uses_normals,
         )
         loss, self.error = objective(frame, target, self.data, self.method.loss, iteration)
         self.loss = dr.detach(loss)

@@ -138,6 +138,11 @@ class LossWeights:
     smooth_until: int = 18_000
     alpha: float = 0.0
 
+    @property
+    def uses_normals(self) -> bool:
+        """Whether a loss looks at the blended normals."""
+        return self.normal > 0 or self.smooth > 0
+
 
 @dataclass(frozen=True)
 class Rates:

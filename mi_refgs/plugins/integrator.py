@@ -305,6 +305,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             self._light(scene),
             self.occluder,
             aovs=aovs,
+            normals=any(aov.type == "normal" for aov in self.aovs),
         )
 
     def _light(self, scene: Any) -> Any:

@@ -40,7 +40,7 @@ class Frame:
 
     alpha: Any  # accumulated opacity
     depth: Any  # expected camera-z depth, 0 where nothing is seen
-    normal: Any  # mi.Vector3f: blended world normal towards the camera, not normalised
+    normal: Any  # mi.Vector3f: blended world normal towards the camera, not normalised; None if not asked for
     radiance: Any  # mi.Color3f, over black
     terms: Terms | None = None  # diffuse, specular, indirect, whose sum it is, where known apart
     maps: dict[str, Any] = field(default_factory=dict)  # by channel (such as albedo), visibility, where known
@@ -55,12 +55,14 @@ def render(
     sh_degree: int | None = None,
     shift: Any = None,
     aovs: bool = False,
+    normals: bool = True,
 ) -> Frame:
     """Render a view.
 
     `light` is what `Shading.light_of` gives, needed unless the model asks for none. `sh_degree` limits the
     degree of the radiance channel, for coarse-to-fine schedules. `aovs` asks for the materials and the terms
-    of the radiance even where the picture does not need them per pixel. `shift`: see `splat.project`.
+    of the radiance even where the picture does not need them per pixel; without `normals`, they are absent
+    where it does not. `shift`: see `splat.project`.
     `shading.accuracy.traced_bounces` needs an occluder whose `set_materials` has seen these surfels.
     Raises InputError for what `shading.check` refuses.
     """
@@ -71,7 +73,9 @@ def render(
     seen = _seen(surfels, camera, sh_degree)
     attributes = shading.model.attributes(surfels, seen, shading)
     scene = _Scene(surfels, camera, shading, light, occluder, seen, attributes, shift)
-    frame = _shade_at_surfels(scene, aovs) if shading.at == "surfel" else _shade_at_pixels(scene, aovs)
+    frame = (
+        _shade_at_surfels(scene, aovs, normals) if shading.at == "surfel" else _shade_at_pixels(scene, aovs)
+    )
     return boundary(frame, "shade backward")
 
 
@@ -134,7 +138,7 @@ def _seen(surfels: Surfels, camera: Camera, sh_degree: int | None) -> SurfelView
     return SurfelView(direction, facing, sh_degree)
 
 
-def _shade_at_surfels(scene: _Scene, aovs: bool) -> Frame:
+def _shade_at_surfels(scene: _Scene, aovs: bool, normals: bool) -> Frame:
     shading, direction = scene.shading, scene.seen.direction
     points = ShadingPoints(scene.normal, -direction, scene.named)
     if shading.occlusion:
@@ -143,7 +147,7 @@ def _shade_at_surfels(scene: _Scene, aovs: bool) -> Frame:
         points = shading.model.trace(points, around, shading)
     terms = shade(points, scene.light, shading)
     # A feature costs time in every pair, so what is not asked for is not blended.
-    slots = {"radiance": terms.total(), "normal": scene.normal}
+    slots = {"radiance": terms.total()} | ({"normal": scene.normal} if normals else {})
     materials = scene.materials() if aovs else {}
     if aovs:
         slots |= terms.known() | materials
@@ -153,7 +157,7 @@ def _shade_at_surfels(scene: _Scene, aovs: bool) -> Frame:
     return Frame(
         alpha=buffer.alpha,
         depth=buffer.depth,
-        normal=blended["normal"],
+        normal=blended.get("normal"),
         radiance=blended["radiance"],
         terms=apart,
         maps={name: buffer.divided(name) for name in materials},

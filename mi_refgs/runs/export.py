@@ -128,7 +128,7 @@ class TrainedScene:
 
         def view(camera: Camera) -> Frame:
             with dr.suspend_grad():
-                return render(self.surfels, camera, self.shading, light, occluder, aovs=aovs)
+                return render(self.surfels, camera, self.shading, light, occluder, aovs=aovs, normals=aovs)
 
         return view
 
