@@ -109,9 +109,10 @@ def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Dec
 
 
 def asked(without: Trial, with_it: Trial, select: Selection) -> float:
-    """PSNR (dB) that a term has to bring for what it costs."""
-    time_price = select.gain_per_ms * max(with_it.ms - without.ms, 0)
-    return select.gain + time_price + select.gain_per_mb * max(with_it.mb - without.mb, 0)
+    """PSNR (dB) that a term has to bring for what it costs; what it may lose, where it saves."""
+    time_price = select.gain_per_ms * (with_it.ms - without.ms)
+    price = time_price + select.gain_per_mb * (with_it.mb - without.mb)
+    return price + (select.gain if with_it.mb > without.mb or price > 0 else 0)
 
 
 def _run(trainer: Trainer, steps: int, judges: Dataset) -> Trial:

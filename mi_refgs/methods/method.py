@@ -187,8 +187,8 @@ class Term:
 class Selection:
     """Terms that a fit tries on training views held out for it, and what each must bring to stay.
 
-    A term stays if the PSNR of these views rises by `gain`, and by the price of the time of a step and of the
-    memory of parameters that it costs.
+    A term stays if the PSNR of these views rises by the price of the time of a step and of the memory that it
+    costs, and by `gain` if it costs anything; one that saves time and memory may lose as much.
     """
 
     term: dict[str, Term]
