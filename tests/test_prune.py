@@ -228,6 +228,17 @@ def test_a_pruned_run_shows_what_is_left_and_can_be_brought_back(
     assert TrainedScene.read(run).pruned is None
 
 
+@pytest.mark.parametrize("note", [7, {}, {"surfels": 5, "limit": 50, "psnr": float("nan")}])
+def test_a_note_that_cannot_be_read(note: object, finished: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    content = json.loads((run / "model.json").read_text())
+    (run / "model.json").write_text(json.dumps(content | {"pruned": note}))
+    with pytest.raises(
+        InputError, match=r"model\.json: cannot be read .*; write it again with `refgs export"
+    ):
+        TrainedScene.read(run)
+
+
 def test_nothing_is_pruned_for_good(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -50,6 +50,10 @@ class Pruned:
     limit: float  # dB that the pictures of all training views had to keep
     psnr: float  # dB, of the worst of them
 
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.limit) and math.isfinite(self.psnr)):
+            raise ValueError("pruned: a number is not finite")
+
 
 @dataclass(frozen=True, eq=False)
 class TrainedScene:
