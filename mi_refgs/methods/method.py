@@ -195,7 +195,7 @@ class Selection:
     holdout: int = 8  # every so many training views judge
     gain: float = 0.05  # dB
     gain_per_ms: float = 0.01  # dB for each millisecond of a step
-    gain_per_mb: float = 0.01  # dB for each MB of parameters and their moments
+    gain_per_mb: float = 0.002  # dB for each MB of parameters and their moments
 
 
 @dataclass(frozen=True)
