@@ -120,43 +120,28 @@ def logit(value: float | np.ndarray) -> np.ndarray:
     return np.log(value) - np.log1p(-value)
 
 
-# Rates as in 2DGS, those of materials and light as in Ref-Gaussian (appendix, implementation details).
-register(Channel("position", (3,), "identity", 1.6e-4, ("x", "y", "z"), geometry=True))
-register(Channel("rotation", (4,), "quaternion", 1e-3, ("rot_1", "rot_2", "rot_3", "rot_0"), geometry=True))
-register(Channel("scale", (2, 3), "exp", 5e-3, ("scale_0", "scale_1", "scale_2"), geometry=True))
-register(Channel("opacity", (1,), "sigmoid", 0.05, ("opacity",), initial=0.1, geometry=True))
-register(Channel("radiance_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("f",), rest_rate=0.05))
-register(
+def _numbered(prefix: str, count: int = 3) -> tuple[str, ...]:
+    return tuple(f"{prefix}_{i}" for i in range(count))
+
+
+QUATERNION = ("rot_1", "rot_2", "rot_3", "rot_0")
+"""PLY files have w first."""
+
+# Rates as in 2DGS, those of materials and light as in Ref-Gaussian (appendix, implementation details); tint
+# and offset of the normal belong to GaussianShader (Jiang et al. 2024, §4).
+for _declared in (
+    Channel("position", (3,), "identity", 1.6e-4, ("x", "y", "z"), geometry=True),
+    Channel("rotation", (4,), "quaternion", 1e-3, QUATERNION, geometry=True),
+    Channel("scale", (2, 3), "exp", 5e-3, _numbered("scale"), geometry=True),
+    Channel("opacity", (1,), "sigmoid", 0.05, ("opacity",), 0.1, geometry=True),
+    Channel("radiance_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("f",), rest_rate=0.05),
     Channel(
-        "albedo",
-        (3,),
-        "sigmoid",
-        7.5e-3,
-        ("albedo_0", "albedo_1", "albedo_2"),
-        initial=0.5,
-        jitter=ALBEDO_JITTER,
-        material=True,
-        aov="RGB",
-    )
-)
-register(
-    Channel("metallic", (1,), "sigmoid", 5e-3, ("metallic",), initial=0.01, material=True, aov="Y"),
-)
-register(
-    Channel("roughness", (1,), "sigmoid", 5e-3, ("roughness",), initial=0.1, material=True, aov="Y"),
-)
-register(Channel("indirect_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("ind",), rest_rate=0.05))
-# Of the model "gaussian_shader"; its specular tint and normals. [GaussianShader, Jiang et al. 2024, §4]
-register(
-    Channel(
-        "tint",
-        (3,),
-        "sigmoid",
-        7.5e-3,
-        ("tint_0", "tint_1", "tint_2"),
-        initial=0.5,
-        material=True,
-        aov="RGB",
-    )
-)
-register(Channel("normal_offset", (3,), "identity", 1e-3, ("offset_0", "offset_1", "offset_2")))
+        "albedo", (3,), "sigmoid", 7.5e-3, _numbered("albedo"), 0.5, ALBEDO_JITTER, material=True, aov="RGB"
+    ),
+    Channel("metallic", (1,), "sigmoid", 5e-3, ("metallic",), 0.01, material=True, aov="Y"),
+    Channel("roughness", (1,), "sigmoid", 5e-3, ("roughness",), 0.1, material=True, aov="Y"),
+    Channel("indirect_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("ind",), rest_rate=0.05),
+    Channel("tint", (3,), "sigmoid", 7.5e-3, _numbered("tint"), 0.5, material=True, aov="RGB"),
+    Channel("normal_offset", (3,), "identity", 1e-3, _numbered("offset")),
+):
+    register(_declared)
