@@ -48,9 +48,9 @@ class Job:
         """Data set, variant and seed, for people."""
         return f"{Path(self.data).name} × {Path(self.variant).stem} × seed {self.seed}"
 
-    def method(self) -> Method:
-        """The method to run; raises InputError as `load` and `sized` do."""
-        method = load(self.variant, self.preset, [*self.settings, f"seed={self.seed}"])
+    def method(self, terms: Sequence[str] = ()) -> Method:
+        """The method to run, with these of its terms; raises InputError as `load` and `sized` do."""
+        method = load(self.variant, self.preset, [*self.settings, f"seed={self.seed}"], terms)
         return sized(method, Path(self.data))
 
     def write(self) -> None:
@@ -135,10 +135,15 @@ def require_settings(folder: Path, preset: str, settings: Sequence[str]) -> None
 
 def require_same(job: Job) -> None:
     """Raise InputError if the job's folder holds a run of another method or other data."""
-    method = job.method()
     if not job.run.exists():
+        job.method()
         return
-    before, now = (_flat(dataclasses.replace(m, about=About())) for m in (job.run.method(), method))
+    made = job.run.method()
+    # Neither what it is called nor where its file lies changes a run; the terms are what the run has chosen.
+    before, now = (
+        _flat(dataclasses.replace(method, about=About(), file=""))
+        for method in (made, job.method(made.terms))
+    )
     differing = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     if differing:
         key = differing[0]
