@@ -16,6 +16,10 @@ from mi_refgs.errors import InputError
 
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp(\.[^.]*)?")
 """Names that `replace_file` gives to files that are not whole yet."""
+ANY_FILE = 2**24
+"""Bytes of pixels that any file may promise."""
+MAX_EXPANSION = 1100
+"""Bytes of pixels that a byte of a larger file may promise: DEFLATE cannot expand by more than 1,032."""
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
@@ -81,3 +85,18 @@ def read_json(path: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError(f"{path}: JSON: the outermost value is not an object; export the file again")
     return content
+
+
+def require_file(path: Path) -> None:
+    """Raise InputError unless this is a file."""
+    if not is_file(path):
+        raise InputError(f"{path}: file: missing; restore it, or remove what refers to it")
+
+
+def check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:
+    """Raise InputError for a size that no file of this length can hold, before memory is asked for."""
+    promised = width * height * bytes_per_pixel
+    if promised > max(ANY_FILE, MAX_EXPANSION * path.stat().st_size):
+        raise InputError(
+            f"{path}: size: {width} × {height} pixels are more than the file can hold; export it again"
+        )

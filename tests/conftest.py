@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, Phase, settings
 from tiny_scene import train_command, write_data, write_method
 
 from mi_refgs.cli import main
-from mi_refgs.images import MITSUBA_EXR_THREADS
+from mi_refgs.exr import MITSUBA_EXR_THREADS
 
 # The same examples in every run. Kernels are compiled in the first, so there is no deadline; failures are not
 # simplified, since examples are mostly seeds.

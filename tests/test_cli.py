@@ -17,9 +17,10 @@ from tiny_scene import SIZE, train_command
 
 from mi_refgs.cli import demo, main
 from mi_refgs.cli.train import load_method
+from mi_refgs.exr import read_exr
 from mi_refgs.fit.train import Trainer
 from mi_refgs.fit.whole import sized
-from mi_refgs.images import read_exr, read_png, srgb_from_linear, write_png
+from mi_refgs.images import read_png, srgb_from_linear, write_png
 from mi_refgs.methods.method import PRESETS
 from mi_refgs.methods.read import load_resolved
 

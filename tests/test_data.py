@@ -14,7 +14,8 @@ from PIL import Image
 
 from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
 from mi_refgs.errors import InputError
-from mi_refgs.images import box_downscale, read_exr_image, read_png, write_exr, write_png
+from mi_refgs.exr import read_exr_image, write_exr
+from mi_refgs.images import box_downscale, read_png, write_png
 
 ANGLE = 0.7  # camera_angle_x, radians
 WIDTH, HEIGHT = 6, 4

@@ -19,7 +19,8 @@ from mi_refgs.data import pathtrace
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.make_dataset import make_dataset
 from mi_refgs.errors import InputError
-from mi_refgs.images import read_exr_image, srgb_from_linear
+from mi_refgs.exr import read_exr_image
+from mi_refgs.images import srgb_from_linear
 from mi_refgs.shade import lobe_matrices
 
 SCENES = Path(__file__).parent.parent / "scenes"

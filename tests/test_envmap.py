@@ -12,7 +12,7 @@ import pytest
 from helpers import level_maps, unit, vector
 
 from mi_refgs.errors import InputError
-from mi_refgs.images import write_exr
+from mi_refgs.exr import write_exr
 from mi_refgs.reference import shade as reference
 from mi_refgs.shade import envmap, lobe_matrices, prefilter
 from mi_refgs.shade.envmap import EnvironmentLight

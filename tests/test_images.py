@@ -11,15 +11,9 @@ import pytest
 from helpers import run_python
 
 from mi_refgs.errors import InputError
+from mi_refgs.exr import read_exr, read_exr_image, write_exr
 from mi_refgs.files import replace_file, write_bytes
-from mi_refgs.images import (
-    linear_from_srgb,
-    read_exr,
-    read_exr_image,
-    srgb_from_linear,
-    write_exr,
-    write_png,
-)
+from mi_refgs.images import linear_from_srgb, srgb_from_linear, write_png
 
 
 def test_srgb_curve() -> None:
@@ -92,7 +86,7 @@ import mi_refgs, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 dr.set_thread_count(1)
 from mi_refgs.data.make_dataset import _load_scene
-from mi_refgs.images import mitsuba_exr
+from mi_refgs.exr import mitsuba_exr
 from mi_refgs.shade.envmap import EnvironmentLight
 folder = Path(sys.argv[1])
 EnvironmentLight.constant(0.5, 8).write(folder / "light.exr")

@@ -12,7 +12,8 @@ import pytest
 
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
-from mi_refgs.images import write_exr, write_png
+from mi_refgs.exr import write_exr
+from mi_refgs.images import write_png
 
 WIDTH, HEIGHT = 96, 120
 PINHOLE = {"fl_x": 80.0, "fl_y": 84.0, "cx": 50.0, "cy": 57.0}

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.data.frames import MITSUBA_FROM_OPENGL
-from mi_refgs.images import write_exr, write_png
+from mi_refgs.exr import write_exr
+from mi_refgs.images import write_png
 from mi_refgs.methods.method import PRESETS
 from mi_refgs.reference.camera import look_at
 

@@ -24,7 +24,8 @@ from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.make_dataset import Settings, _prepare_folder
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
-from mi_refgs.images import read_exr_image, read_png, write_exr, write_png
+from mi_refgs.exr import read_exr_image, write_exr
+from mi_refgs.images import read_png, write_png
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.resources import resource_dir

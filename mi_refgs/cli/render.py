@@ -80,7 +80,7 @@ def load_scene(path: Path, aovs: list[str]) -> Any:
     """
     import mitsuba as mi
 
-    from mi_refgs.images import mitsuba_exr
+    from mi_refgs.exr import mitsuba_exr
 
     before = mi.file_resolver()
     beside = mi.FileResolver(before)
@@ -109,8 +109,9 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
     import mitsuba as mi
     import numpy as np
 
+    from mi_refgs.exr import mitsuba_exr
     from mi_refgs.files import replace_file
-    from mi_refgs.images import mitsuba_exr, srgb_from_linear, write_png
+    from mi_refgs.images import srgb_from_linear, write_png
 
     try:
         image = mi.render(scene, sensor=sensor, spp=spp)

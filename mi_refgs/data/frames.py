@@ -16,7 +16,8 @@ from mi_refgs.files import is_file
 from mi_refgs.data.lens import Lens, Undistortion, undistortion
 from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.view import View
-from mi_refgs.images import box_downscale, image_size, read_exr_image, read_png
+from mi_refgs.exr import read_exr_image
+from mi_refgs.images import box_downscale, image_size, read_png
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 """File name endings that `file_path` may carry or leave out, in the order in which they are tried."""

@@ -31,7 +31,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.files import read_json, write_bytes
 from mi_refgs.data.frames import MITSUBA_FROM_OPENGL
 from mi_refgs.data.pathtrace import Tracer, bounding_sphere, camera_poses, environment_image
-from mi_refgs.images import mitsuba_exr, read_exr, read_png, srgb_from_linear, write_exr, write_png
+from mi_refgs.exr import mitsuba_exr, read_exr, write_exr
+from mi_refgs.images import read_png, srgb_from_linear, write_png
 
 VIEW_FILES = (
     "transforms_*.json",

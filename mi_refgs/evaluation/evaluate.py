@@ -20,9 +20,10 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics, pictures
+from mi_refgs.exr import read_exr_image
 from mi_refgs.files import read_json
 from mi_refgs.fit.whole import read_views
-from mi_refgs.images import read_exr_image, write_png
+from mi_refgs.images import write_png
 from mi_refgs.methods.method import Method
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit.optim import Skipped
+from mi_refgs.fit.skips import Skipped
 from mi_refgs.methods.method import LIGHT
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels

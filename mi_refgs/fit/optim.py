@@ -4,9 +4,8 @@ Letters: θ parameter, g gradient, m v first and second moment, t step count of 
     m ← β₁ m + (1 - β₁) g,   v ← β₂ v + (1 - β₂) g²,   θ ← θ - η √(1 - β₂ᵗ) / (1 - β₁ᵗ) · m / (√v + ε)
 [Kingman and Ba 2015, §2, the efficient order].
 
-Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing: the device decides, the
-host does not wait for it, and `report` says later how many there were and which rows had such gradients. And
-|g| is cut to OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor,
+Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing (`fit.skips`). And |g| is
+cut to OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor,
 whichever is more, and to RAW_LIMIT, whose square float32 holds. A step is at most (1 - β₁) / √(1 - β₂) = 3.2
 η long however large g is, so the cut shortens the one in hand by less than 5 %. What it bounds is the memory
 of v: after one gradient of 10¹⁰, an entry of usual gradients 10⁻⁷ would not move for 2 ln(10¹⁷ √(1 - β₂)) /
@@ -17,10 +16,7 @@ steps.
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Mapping, MutableMapping
-from dataclasses import dataclass
-from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -30,6 +26,8 @@ import numpy as np
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
+from mi_refgs.fit.rates import Group
+from mi_refgs.fit.skips import Skipped, Skips
 from mi_refgs.surfels.table import gather_rows
 from mi_refgs.timing import phase
 
@@ -40,46 +38,8 @@ EPSILON = 1e-15
 OUTLIER = 100.0
 """Gradients beyond this many times the usual are cut; see above."""
 
-WIDE_ROW = 64
-"""Columns beyond which rows are not told apart: harmonics have 48, a row of the light hundreds."""
-
-MEMORY = 4096
-"""Steps that `report` may come late."""
-
 SAMPLES = 10_000
 """Entries that a median is taken of."""
-
-
-@dataclass(frozen=True)
-class Skipped:
-    """Steps that changed nothing since the last report."""
-
-    count: int
-    iteration: int  # 0-based, of the last one
-    rows: dict[str, np.ndarray]  # rows whose gradient was not finite, by tensor; absent where there was none
-
-
-@dataclass(frozen=True)
-class Group:
-    """Learning rate of one tensor: from `rate` log-linearly to `final` in `steps` iterations, then constant.
-
-    The first `head` columns learn at the rate, the others at rate · tail (spherical harmonics: head 3, tail
-    1/20).
-    """
-
-    rate: float  # per step, units of the raw tensor
-    final: float | None = None  # None: constant
-    steps: int = 1  # iterations
-    head: int = 0  # columns; 0: every column
-    tail: float = 1.0  # factor
-    unit: float = 1.0  # of the raw tensor, to which the moments refer: ε, and what float32 squares, have none
-
-    def at(self, iteration: int) -> float:
-        """Learning rate at this iteration (0-based)."""
-        if self.final is None or self.rate <= 0 or self.final <= 0:
-            return self.rate
-        progress = min(max(iteration / max(self.steps, 1), 0.0), 1.0)
-        return math.exp((1 - progress) * math.log(self.rate) + progress * math.log(self.final))
 
 
 class Adam:
@@ -106,12 +66,7 @@ class Adam:
         self._steps: dict[str, int] = {}
         self._usual: dict[str, float] = {}  # median √(v / (1 - β₂ᵗ)); 0: not known yet
         self._least: dict[str, Any] = {}  # the same on the device; infinity: not known yet
-        # By number of rows, (rows,): bit i where a gradient of the i-th group was not finite.
-        self._marks: dict[int, Any] = {}
-        self._calls, self._iteration = 0, 0  # number and iteration of the last step
-        self._reported = 0  # number of the last step that was reported
-        # At the number of a step modulo MEMORY: that number, if the step was skipped.
-        self._skipped = dr.opaque(mi.UInt32, 0, MEMORY)
+        self._skips = Skips(params, self.groups)
         for name in groups:
             self._clear(name)
             self._steps[name] = 0
@@ -128,18 +83,7 @@ class Adam:
 
     def report(self) -> Skipped:
         """The steps that were skipped since the last call; waits for the device, so not for every step."""
-        skipped = self._skipped.numpy()
-        skipped = skipped[skipped > self._reported]
-        rows = {}
-        for i, name in enumerate(self.groups if len(skipped) else ()):
-            marks = self._marks.get(self._marked(name))
-            rows[name] = np.flatnonzero(marks.numpy() >> i & 1) if marks is not None else np.zeros(0, int)
-        last = self._iteration - (self._calls - int(skipped.max(initial=0)))
-        found = Skipped(len(skipped), last, {name: at for name, at in rows.items() if len(at)})
-        self._reported = self._calls
-        if len(skipped):
-            self._marks.clear()
-        return found
+        return self._skips.report()
 
     @phase("optimiser")
     def step(self, iteration: int, loss: Any = None) -> None:
@@ -153,15 +97,7 @@ class Adam:
             g = dr.grad(self.params[name]).array
             if dr.width(g) and not (g.state == dr.VarState.Literal and float(g[0]) == 0):
                 gradients[name] = g
-        self._calls, self._iteration = self._calls + 1, iteration
-        number, place = dr.opaque(mi.UInt32, self._calls), dr.opaque(mi.UInt32, self._calls % MEMORY)
-        for skip in self._not_finite(gradients):
-            if loss is not None:
-                skip |= ~dr.isfinite(loss)
-            # Almost never active, so it costs nothing.
-            dr.scatter(self._skipped, number, place, skip)
-        dr.eval(self._skipped, self._marks)
-        good = dr.gather(mi.UInt32, self._skipped, place) != number
+        good = self._skips.good(gradients, iteration, loss)
 
         updated: dict[str, tuple[Any, Any]] = {}
         inverse: dict[int, Any] = {}  # by step count, which tensors share: each number costs time to send
@@ -206,38 +142,6 @@ class Adam:
         self._usual[name] = usual
         self._least[name] = dr.opaque(mi.Float, usual or math.inf)
 
-    def _marked(self, name: str) -> int:
-        """Rows of the marks that a tensor shares with others; 1 for one of wide rows, not told apart."""
-        rows, width = int(self.params[name].shape[0]), math.prod(self.params[name].shape[1:])
-        return rows if width <= WIDE_ROW else 1
-
-    def _not_finite(self, gradients: Mapping[str, Any]) -> list[Any]:
-        """Where something is not finite (mi.Bool), by rows or by entries; rows get bit i for the i-th group.
-
-        One look at a row serves all of its tensors. Only head columns are looked at: the others are of
-        spherical harmonics, whose gradient is that of a head column times a bounded function.
-        """
-        by_entry: list[Any] = []
-        by_row: dict[int, Any] = {}
-        for i, name in enumerate(self.groups):
-            if name not in gradients:
-                continue
-            g, rows, bit = gradients[name], self._marked(name), mi.UInt32(1 << i)
-            self._marks.setdefault(rows, dr.opaque(mi.UInt32, 0, rows))
-            if rows == 1:
-                bad = ~dr.isfinite(g)
-                dr.scatter_reduce(dr.ReduceOp.Or, self._marks[1], bit, 0, bad, dr.ReduceMode.Direct)
-                by_entry.append(bad)
-                continue
-            width = dr.width(g) // rows
-            first = dr.arange(mi.UInt32, rows) * width
-            columns = [dr.gather(mi.Float, g, first + c) for c in range(self.groups[name].head or width)]
-            found = dr.select(reduce(operator.and_, map(dr.isfinite, columns)), mi.UInt32(0), bit)
-            by_row[rows] = by_row.get(rows, mi.UInt32(0)) | found
-        for rows, found in by_row.items():
-            self._marks[rows] |= found
-        return by_entry + [found != 0 for found in by_row.values()]
-
     def gather(self, parent: Any, names: list[str], fresh: Any | None = None) -> None:
         """Let the moments of (N, D) tensors follow their rows: row i takes those of row parent[i].
 
@@ -259,23 +163,15 @@ class Adam:
                 moments[name] = rows
             dr.eval(self._first[name], self._second[name])
             self._make_leaf(name)
-        self._marks.clear()
+        self._skips.forget_rows()
 
-    def reset(self, name: str, rows: Any | None = None) -> None:
-        """Zero the moments of one tensor, or of the rows where `rows` (mi.Bool) holds; its step count stays.
+    def reset(self, name: str) -> None:
+        """Zero the moments of one tensor; its step count stays.
 
         Keeping the count is what 3DGS does: the next update is up to about 3 η long, not η. Call it after
         replacing params[name].
         """
-        if rows is None:
-            self._clear(name)
-        else:
-            width = int(self.params[name].shape[-1])
-            row = dr.arange(mi.UInt32, dr.width(self._first[name])) // width
-            cleared = dr.gather(mi.Bool, mi.Bool(rows), row)
-            for moments in (self._first, self._second):
-                moments[name] = dr.select(cleared, 0.0, moments[name])
-            dr.eval(self._first[name], self._second[name])
+        self._clear(name)
         self._make_leaf(name)
 
     def state_dict(self) -> dict[str, np.ndarray]:

@@ -21,7 +21,8 @@ from mi_refgs.fit import health
 from mi_refgs.fit.control import AdaptiveControl, first_light
 from mi_refgs.fit.initial import initial_surfels
 from mi_refgs.fit.objective import Target, objective
-from mi_refgs.fit.optim import Adam, Group
+from mi_refgs.fit.optim import Adam
+from mi_refgs.fit.rates import Group
 from mi_refgs.fit.schedule import Schedule
 from mi_refgs.fit.state import decisions_of, mesh_of, packed, require_fit
 from mi_refgs.methods.method import Method, Stage

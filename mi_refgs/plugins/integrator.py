@@ -5,19 +5,17 @@ Imported or reloaded for each variant: see `mi_refgs.plugins`.
 
 from __future__ import annotations
 
-import math
-import time
-import warnings
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.plugins import require_supported_variant
 from mi_refgs.plugins.aovs import aov_values
-from mi_refgs.plugins.light import emitter_light, rotated
+from mi_refgs.plugins.film import through_film
+from mi_refgs.plugins.light import light_of
 from mi_refgs.plugins.properties import (
     read_aovs,
     read_background,
@@ -26,6 +24,7 @@ from mi_refgs.plugins.properties import (
     read_surfels,
     read_terms,
 )
+from mi_refgs.plugins.unusable import UnusableValues
 from mi_refgs.primitives import primitive_of, widths_of
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.shade.points import TERMS
@@ -33,24 +32,21 @@ from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.channels import CHANNELS
 from mi_refgs.surfels.table import Surfels
 
-CHECK_SECONDS = 1.0
-"""Least time between two looks for values that cannot be used: each waits for the device."""
-
 
 class RefGSIntegrator(mi.SamplingIntegrator):
     r"""
     .. _integrator-refgs:
 
-    Reflective Gaussian surfels (:monosp:`refgs`)
-    ---------------------------------------------
+    Reflective Gaussians (:monosp:`refgs`)
+    --------------------------------------
 
     .. pluginparameters::
 
      * - filename
        - |string|
-       - PLY file with the surfels: 2DGS's properties, and albedo, metallic, roughness and indirect SH, all
-         raw (before the activation). In Python, channels may be given instead, or replaced, by tensors
-         under their names.
+       - PLY file with the surfels, or with 3D Gaussians: the properties of 2DGS or 3DGS, and those of the
+         other channels below, all raw (before the activation). In Python, channels may be given instead, or
+         replaced, by tensors under their names.
 
      * - light *or any name*
        - |emitter|
@@ -65,17 +61,20 @@ class RefGSIntegrator(mi.SamplingIntegrator):
      * - occlusion
        - |bool|
        - Trace visibility along the mirror direction, and show the surfels' indirect light where it is
-         blocked. (Default: whether there is a ``mesh``)
+         blocked; ``monte_carlo`` traces each of its directions. (Default: whether there is a ``mesh``)
 
      * - shade_at
        - |string|
        - ``pixel`` (blend attributes, then shade) or ``surfel`` (shade, then blend radiance). (Default:
-         ``pixel``)
+         ``pixel``; ``surfel`` with ``gaussian_shader`` and ``monte_carlo``, which have no other)
 
      * - reflectance
        - |string|
-       - ``split_sum`` (diffuse and GGX specular) or ``radiance`` (the SH colour alone, needs no light; the
-         two orders of shading are then the same). (Default: ``split_sum`` if the surfels have materials)
+       - ``split_sum`` (diffuse and GGX specular), ``radiance`` (the SH colour alone, needs no light; the two
+         orders of shading are then the same), ``mirror`` (the SH colour mixed with a perfect mirror by
+         ``metallic``, 3DGS-DR), ``gaussian_shader`` (SH colour, diffuse and tinted specular layer) or
+         ``monte_carlo`` (light summed over the hemisphere, R3DG). (Default: the first of these whose channels
+         the surfels have)
 
      * - diffuse
        - |string|
@@ -92,9 +91,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - Rays of the lobe that visibility is averaged over, 1 is the mirror ray; and how often what blocks
          rays is shaded, in place of the surfels' indirect light. (Default: 1, 0)
 
-     * - light_levels
+     * - directions, light_levels
        - |int|
-       - Levels of roughness that the light is filtered to; fewer cost less. (Default: 7)
+       - Directions that ``monte_carlo`` takes light from; levels of roughness that ``split_sum`` filters the
+         light to. Fewer cost less. (Default: 24, 7)
 
      * - terms
        - |string|
@@ -107,10 +107,11 @@ class RefGSIntegrator(mi.SamplingIntegrator):
      * - aovs
        - |string|
        - Comma-separated ``<name>:<type>`` pairs as in the ``aov`` integrator, appended to RGB(A). Types:
-         ``albedo``, ``metallic``, ``roughness``, ``normal`` (world, towards the camera), ``depth``,
+         ``albedo``, ``metallic``, ``roughness``, ``tint``, ``normal`` (world, towards the camera), ``depth``,
          ``alpha``, ``visibility``, ``diffuse``, ``specular``, ``indirect``. (Default: none)
 
-     * - position, rotation, scale, opacity, radiance_sh, albedo, metallic, roughness, indirect_sh
+     * - position, rotation, scale, opacity, radiance_sh, albedo, metallic, roughness, indirect_sh, tint,
+         normal_offset *or any registered channel*
        - |tensor|
        - Raw channels of shape (N, D). They may be replaced by ones with another N, all in one update. A
          ``scale`` of three columns makes the rows 3D Gaussians.
@@ -169,9 +170,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.background = read_background(props)
         self.aovs = read_aovs(props)
         self.check()
-        self.changed = False  # since the last look for unusable values
-        self.next_look = -math.inf  # seconds of the monotonic clock
-        self._warn_of_unusable()
+        self.unusable = UnusableValues(self.surfels, self.light)
 
     def check(self) -> None:
         """Raise InputError for shapes that do not fit and for channels that are needed but absent."""
@@ -196,25 +195,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     def parameters_changed(self, keys: list[str]) -> None:
         self.check()
-        self.changed = True
+        self.unusable.changed = True
         moved = not keys or not {*keys}.isdisjoint(self.surfels.primitive.widths)
         if moved and self.occluder is not None and self.shading.accuracy.traced_bounces:
             self.occluder.set_materials(self.surfels)
-
-    def _warn_of_unusable(self) -> None:
-        """Warn, once, of surfels that are left out and of texels that are black."""
-        unusable = self.surfels.unusable()
-        found = [f"{len(rows)} surfels in {name} (first: {rows[0]})" for name, rows in unusable.items()]
-        black = self.light.unusable() if self.light is not None else 0
-        found += [f"{black} values of light"] if black else []
-        if found:
-            self.next_look = math.inf
-            warnings.warn(
-                f"refgs: values are NaN, infinite or beyond {RAW_LIMIT:g}: {', '.join(found)}; these surfels "
-                "are left out, and such light is black",
-                RuntimeWarning,
-                stacklevel=2,
-            )
 
     def aov_names(self) -> list[str]:
         return [channel for aov in self.aovs for channel in aov.channels()]
@@ -231,10 +215,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         evaluate: bool = True,
     ) -> Any:
         """The image (h, w, c) of a sensor; see the class for its channels."""
-        now = time.monotonic()
-        if self.changed and now >= self.next_look:
-            self.changed, self.next_look = False, now + CHECK_SECONDS
-            self._warn_of_unusable()
+        self.unusable.look(self.surfels, self.light)
         image = self._image(scene, sensor, spp)
         if evaluate:
             dr.eval(image)
@@ -268,18 +249,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             )
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        film = sensor.film()
-        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-            raise InputError("refgs: film: refgs renders RGB radiance only; use an `hdrfilm`")
-        camera = Camera.from_sensor(sensor)
-        factor = math.ceil(math.sqrt(max(1, int(spp) or int(sensor.sampler().sample_count()))))
-        alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        channels = self._channels(scene, camera.supersampled(factor), alpha)
-        values = dr.ravel(mi.ArrayXf([_box(channel, camera, factor) for channel in channels]))
-        tensor = mi.TensorXf(values, (camera.height, camera.width, len(channels)))
-        film.prepare(self.aov_names())
-        film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
-        return film.develop()
+        return through_film(sensor, spp, partial(self._channels, scene), self.aov_names())
 
     def _channels(self, scene: Any, camera: Camera, alpha: bool) -> list[Any]:
         """R, G, B, (A), W and the AOVs, as the film's blocks have them."""
@@ -302,26 +272,11 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             Surfels(self.surfels.raw, screened=True),
             camera,
             self.shading,
-            self._light(scene),
+            light_of(self.shading, self.light, self.light_rotation, scene),
             self.occluder,
             aovs=aovs,
             normals=any(aov.type == "normal" for aov in self.aovs),
         )
-
-    def _light(self, scene: Any) -> Any:
-        """The integrator's own light, else the scene's, as the model looks it up."""
-        wanted = self.shading.model.light
-        if wanted == "none":
-            return None
-        own = self.shading.light_of(self.light)
-        if own is not None:
-            return rotated(own, self.light_rotation)
-        emitter = scene.environment()
-        if emitter is None:
-            raise InputError(
-                "refgs: light: there is none; nest an `envmap` in the integrator, or in the scene"
-            )
-        return emitter_light(emitter, wanted == "filtered", self.shading.levels)
 
     def to_string(self) -> str:
         size = "x".join(str(x) for x in self.light.raw.shape[:2]) if self.light is not None else "the scene's"
@@ -332,21 +287,6 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             f"shading = {self.shading}",
         ]
         return "RefGSIntegrator[\n  " + ",\n  ".join(lines) + "\n]"
-
-
-def _box(channel: Any, camera: Camera, factor: int) -> Any:
-    """Mean of each factor × factor block of a (supersampled) raster; a channel of width 1 is constant."""
-    pixels = camera.width * camera.height
-    if dr.width(channel) == 1:
-        return channel + dr.zeros(mi.Float, pixels)
-    if factor == 1:
-        return channel
-    sample = dr.arange(mi.UInt32, pixels * factor * factor)
-    pixel, part = sample // (factor * factor), sample % (factor * factor)
-    x = (pixel % camera.width) * factor + part % factor
-    y = (pixel // camera.width) * factor + part // factor
-    ordered = dr.gather(mi.Float, channel, y * (camera.width * factor) + x, mode=dr.ReduceMode.Permute)
-    return dr.block_sum(ordered, factor * factor) / (factor * factor)
 
 
 mi.register_integrator("refgs", RefGSIntegrator)

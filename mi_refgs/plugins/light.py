@@ -23,6 +23,7 @@ from mi_refgs.shade.envmap import (
 from mi_refgs.shade.light import ConstantLight, Light, RotatedLight
 from mi_refgs.shade.lobe_matrices import LEVELS, Levels, resample
 from mi_refgs.shade.prefilter import prefilter
+from mi_refgs.shade.shading import Shading
 
 MAX_HEIGHT = 512
 """Rows above which an emitter's map is averaged down: at 512 filtering costs 45 ms a render on two cores,
@@ -62,6 +63,23 @@ def emitter_light(emitter: Any, filtered: bool = True, levels: Levels = LEVELS) 
     if filtered:
         light = PrefilteredLight(*prefilter(radiance, levels))
     return rotated(light, _light_from_world(params))
+
+
+def light_of(shading: Shading, own: EnvironmentLight | None, rotation: Any, scene: Any) -> Light | None:
+    """The integrator's own light and rotation, else the scene's emitter, as the shading's model looks it up.
+
+    None if the model asks for no light. Raises InputError if there is none.
+    """
+    wanted = shading.model.light
+    if wanted == "none":
+        return None
+    light = shading.light_of(own)
+    if light is not None:
+        return rotated(light, rotation)
+    emitter = scene.environment()
+    if emitter is None:
+        raise InputError("refgs: light: there is none; nest an `envmap` in the integrator, or in the scene")
+    return emitter_light(emitter, wanted == "filtered", shading.levels)
 
 
 def rotated(light: Light, light_from_world: Any) -> Light:

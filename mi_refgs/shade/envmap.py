@@ -25,7 +25,9 @@ import numpy as np
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
-from mi_refgs.images import EXR_MAGIC, linear_from_srgb, read_exr_image, read_hdr, read_png, write_exr
+from mi_refgs.exr import EXR_MAGIC, read_exr_image, write_exr
+from mi_refgs.hdr import read_hdr
+from mi_refgs.images import linear_from_srgb, read_png
 from mi_refgs.shade import lobe_matrices
 from mi_refgs.shade.lobe_matrices import LEVELS, Levels
 from mi_refgs.shade.prefilter import Operator, prefilter

@@ -16,8 +16,9 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.errors import InputError, shown
 from mi_refgs.evaluation.evaluate import load_split
+from mi_refgs.exr import read_exr, write_exr
 from mi_refgs.files import read_json
-from mi_refgs.images import image_size, read_exr, read_png, write_exr
+from mi_refgs.images import image_size, read_png
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.plugins.properties import read_background, read_light, read_shading, read_surfels
 from mi_refgs.runs.export import TrainedScene

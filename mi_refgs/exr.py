@@ -1,0 +1,154 @@
+"""EXR files as NumPy arrays, written whole or not.
+
+Mitsuba's own EXR files are left to it only where it loads or saves a scene (`mitsuba_exr` says why).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.files import check_size, replace_file, require_file
+
+EXR_MAGIC = b"\x76\x2f\x31\x01"
+"""First bytes of every EXR file."""
+EXR_OTHER_FLAGS = 0x1800
+"""Bits of the version for deep data and for several parts."""
+EXR_BYTES = (4, 2, 4)
+"""Bytes of a sample by pixel type: UINT, HALF, FLOAT."""
+EXR_CHANNEL = 17
+"""Bytes of an entry of the list of channels after its name, the name's zero included."""
+MAX_EXR_HEADER = 2**20
+"""Bytes; headers with a preview picture have tens of kilobytes."""
+SRGB_CHROMATICITIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
+"""x, y of red, green, blue and white (ITU-R BT.709), which an EXR file without the attribute has."""
+CHROMATICITY_TOLERANCE = 1e-3
+"""Half the last digit that standards give, and far below the difference between any two of them."""
+MITSUBA_EXR_THREADS = 2
+"""Mitsuba 3.9 reads and writes EXR files on a worker thread; with one thread in all it waits for ever."""
+
+
+def read_exr(path: str | Path) -> dict[str, np.ndarray]:
+    """All channels of an EXR file's first part by name, float32 (H, W) each.
+
+    Raises InputError if the file is missing, unreadable or holds NaN or infinite values.
+    """
+    return _read_exr(Path(path))[0]
+
+
+def read_exr_image(path: str | Path) -> np.ndarray:
+    """EXR file as float32 (H, W, C): C = 4 for R, G, B, A, 3 for R, G, B, or X, Y, Z, 1 for a single channel.
+
+    Raises InputError as `read_exr` does, if the file has none of these sets of channels, and for colours in
+    other primaries than those of linear sRGB.
+    """
+    channels, header = _read_exr(Path(path))
+    primaries = header.get("chromaticities", SRGB_CHROMATICITIES)
+    if "R" in channels and not np.allclose(primaries, SRGB_CHROMATICITIES, atol=CHROMATICITY_TOLERANCE):
+        raise InputError(f"{path}: chromaticities: not those of sRGB; convert the image to linear sRGB")
+    for names in ("RGBA", "RGB", "XYZ"):
+        if set(names) <= channels.keys():
+            return np.stack([channels[name] for name in names], axis=-1)
+    if len(channels) == 1:
+        return next(iter(channels.values()))[..., None]
+    found = ", ".join(sorted(channels))
+    raise InputError(f"{path}: channels: found {found}; export R, G, B (and A), or X, Y, Z, or one channel")
+
+
+def exr_size(path: Path) -> tuple[int, int]:
+    """Width and height of an EXR file's data window; raises InputError for a header that makes no sense.
+
+    Only one part of flat pixels passes. Layout: OpenEXR's file format (magic, version, attributes of name,
+    type, length and value up to an empty name).
+    """
+    require_file(path)
+    try:
+        with path.open("rb") as file:
+            header = file.read(MAX_EXR_HEADER)
+        magic, version = struct.unpack_from("<4sI", header)
+        if magic != EXR_MAGIC or version & EXR_OTHER_FLAGS:
+            raise ValueError("no EXR file, or one of several parts or of deep pixels")
+        position, found = 8, {}
+        while header[position] != 0:
+            name, kind, rest = header[position:].split(b"\0", 2)
+            position += len(name) + len(kind) + 2
+            (length,) = struct.unpack_from("<I", rest)
+            found[name] = header[position + 4 : position + 4 + length]
+            position += 4 + length
+        left, top, right, bottom = struct.unpack("<4i", found[b"dataWindow"])
+        size, channels, pixel = (right - left + 1, bottom - top + 1), found[b"channels"], 0
+        while channels[0] != 0:
+            name, channels = channels.split(b"\0", 1)
+            pixel += EXR_BYTES[struct.unpack_from("<I", channels)[0]]
+            channels = channels[EXR_CHANNEL - 1 :]
+        if min(size) < 1:
+            raise ValueError("an empty data window")
+    except OSError as error:
+        raise InputError(f"{path}: file: cannot be read ({error.strerror}); check the path") from error
+    except (ValueError, KeyError, IndexError, struct.error) as error:
+        raise InputError(f"{path}: header: not a readable EXR file ({error}); export it again") from error
+    check_size(path, *size, pixel)
+    return size
+
+
+def _read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Channels and header of the first part."""
+    import OpenEXR
+
+    exr_size(path)
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(c.pixels, dtype=np.float32) for name, c in file.channels().items()}
+            header = dict(file.header())
+    except Exception as error:  # the binding raises RuntimeError, TypeError or its own types
+        raise InputError(f"{path}: pixels: not a readable EXR file ({error}); export it again") from error
+    for name, pixels in channels.items():
+        bad = np.argwhere(~np.isfinite(pixels))
+        if len(bad):
+            row, column = bad[0]
+            raise InputError(
+                f"{path}: channel {name}: {len(bad)} NaN or infinite values, the first at row {row}, "
+                f"column {column}; render the image again"
+            )
+    return channels, header
+
+
+def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, half: bool = False) -> None:
+    """Write an (H, W, C) or (H, W) array as ZIP-compressed float32 (or float16) EXR, atomically.
+
+    `names` holds one letter a channel; by default Y, RGB or RGBA by the number of channels. Raises InputError
+    if the path cannot be written.
+    """
+    import OpenEXR
+
+    image = np.asarray(image)
+    planes = image[..., None] if image.ndim == 2 else image
+    names = names or {1: "Y", 3: "RGB", 4: "RGBA"}[planes.shape[-1]]
+    dtype = np.float16 if half else np.float32
+    channels = {name: np.ascontiguousarray(planes[..., i], dtype=dtype) for i, name in enumerate(names)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    replace_file(path, lambda temporary: OpenEXR.File(header, channels).write(str(temporary)))
+
+
+@contextlib.contextmanager
+def mitsuba_exr() -> Iterator[None]:
+    """Give Dr.Jit a second thread, if it has but one, while Mitsuba itself may read or write EXR files."""
+    import drjit as dr
+
+    before = dr.thread_count()
+    if before >= MITSUBA_EXR_THREADS:
+        yield
+        return
+    dr.sync_thread()
+    dr.set_thread_count(MITSUBA_EXR_THREADS)
+    try:
+        yield
+    finally:
+        dr.sync_thread()
+        dr.set_thread_count(before)

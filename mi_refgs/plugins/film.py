@@ -1,0 +1,54 @@
+"""From the channels of a picture to the image of a sensor's film.
+
+No Mitsuba class is defined here, so that this module need not be reloaded when the variant changes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.errors import InputError
+from mi_refgs.splat.camera import Camera
+
+Channels = Callable[[Camera, bool], list[Any]]
+"""Channels of a picture, arrays of one value a pixel or one in all, for a camera and whether the film has
+alpha: R, G, B, (A), the weight and the AOVs, as the film's blocks have them."""
+
+
+def through_film(sensor: Any, spp: int, channels: Channels, aovs: list[str]) -> Any:
+    """The image (h, w, c) of `channels`, sampled, filtered and developed for a sensor; under AD.
+
+    A sample count n (`spp`, or 0 for that of the sampler) gives k × k regular samples a pixel, k = ⌈√n⌉, box
+    filtered. `aovs` names the channels beyond the weight. Raises InputError for a film of another kind.
+    """
+    film = sensor.film()
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        raise InputError("refgs: film: refgs renders RGB radiance only; use an `hdrfilm`")
+    camera = Camera.from_sensor(sensor)
+    factor = math.ceil(math.sqrt(max(1, int(spp) or int(sensor.sampler().sample_count()))))
+    made = channels(camera.supersampled(factor), mi.has_flag(film.flags(), mi.FilmFlags.Alpha))
+    values = dr.ravel(mi.ArrayXf([_box(channel, camera, factor) for channel in made]))
+    tensor = mi.TensorXf(values, (camera.height, camera.width, len(made)))
+    film.prepare(aovs)
+    film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
+    return film.develop()
+
+
+def _box(channel: Any, camera: Camera, factor: int) -> Any:
+    """Mean of each factor × factor block of a (supersampled) raster; a channel of width 1 is constant."""
+    pixels = camera.width * camera.height
+    if dr.width(channel) == 1:
+        return channel + dr.zeros(mi.Float, pixels)
+    if factor == 1:
+        return channel
+    sample = dr.arange(mi.UInt32, pixels * factor * factor)
+    pixel, part = sample // (factor * factor), sample % (factor * factor)
+    x = (pixel % camera.width) * factor + part % factor
+    y = (pixel // camera.width) * factor + part // factor
+    ordered = dr.gather(mi.Float, channel, y * (camera.width * factor) + x, mode=dr.ReduceMode.Permute)
+    return dr.block_sum(ordered, factor * factor) / (factor * factor)
