@@ -3,7 +3,8 @@
 `import mi_refgs` does two things: it makes sure that Dr.Jit runs on a usable LLVM (`mi_refgs.llvm`), and it
 registers the Mitsuba plugins (`mi_refgs.plugins`), now if a variant is set and again after every switch. It
 may stand before or after `mi.set_variant`; it should stand before `import mitsuba`, so that it can still
-choose the LLVM.
+choose the LLVM. The names of `__all__` are what a user of Python needs; each module of theirs is imported
+when its first name is asked for, so that `import mi_refgs` stays quick.
 
 Raises:
     ImportError: when neither a usable LLVM nor a CUDA device is there; the message says what to install.
@@ -11,12 +12,135 @@ Raises:
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from mi_refgs import llvm
 
+if TYPE_CHECKING:
+    from mi_refgs.data.dataset import Dataset as Dataset
+    from mi_refgs.data.dataset import read_dataset as read_dataset
+    from mi_refgs.data.make_dataset import make_dataset as make_dataset
+    from mi_refgs.data.readers import register as register_reader
+    from mi_refgs.data.view import View as View
+    from mi_refgs.errors import InputError as InputError
+    from mi_refgs.evaluation.evaluate import evaluate as evaluate
+    from mi_refgs.fit.train import Trainer as Trainer
+    from mi_refgs.methods.method import Method as Method
+    from mi_refgs.methods.read import load as load_method
+    from mi_refgs.occlusion.mesh import Mesh as Mesh
+    from mi_refgs.occlusion.mesh import read_mesh as read_mesh
+    from mi_refgs.occlusion.mesh import write_mesh as write_mesh
+    from mi_refgs.occlusion.visibility import Occluder as Occluder
+    from mi_refgs.primitives import Primitive as Primitive
+    from mi_refgs.primitives import register as register_primitive
+    from mi_refgs.render.pipeline import Frame as Frame
+    from mi_refgs.render.pipeline import render as render_frame
+    from mi_refgs.runs.export import TrainedScene as TrainedScene
+    from mi_refgs.runs.run import Run as Run
+    from mi_refgs.shade.accuracy import Accuracy as Accuracy
+    from mi_refgs.shade.envmap import EnvironmentLight as EnvironmentLight
+    from mi_refgs.shade.reflectance import Reflectance as Reflectance
+    from mi_refgs.shade.reflectance import register as register_reflectance
+    from mi_refgs.shade.shading import Shading as Shading
+    from mi_refgs.splat.camera import Camera as Camera
+    from mi_refgs.surfels.channels import Channel as Channel
+    from mi_refgs.surfels.channels import register as register_channel
+    from mi_refgs.surfels.init import from_points as from_points
+    from mi_refgs.surfels.ply import read_ply as read_ply
+    from mi_refgs.surfels.ply import write_ply as write_ply
+    from mi_refgs.surfels.table import Surfels as Surfels
+
 __version__ = "0.1.0"
+
+_PUBLIC = {
+    "Accuracy": ("shade.accuracy", "Accuracy"),
+    "Camera": ("splat.camera", "Camera"),
+    "Channel": ("surfels.channels", "Channel"),
+    "Dataset": ("data.dataset", "Dataset"),
+    "EnvironmentLight": ("shade.envmap", "EnvironmentLight"),
+    "Frame": ("render.pipeline", "Frame"),
+    "InputError": ("errors", "InputError"),
+    "Mesh": ("occlusion.mesh", "Mesh"),
+    "Method": ("methods.method", "Method"),
+    "Occluder": ("occlusion.visibility", "Occluder"),
+    "Primitive": ("primitives", "Primitive"),
+    "Reflectance": ("shade.reflectance", "Reflectance"),
+    "Run": ("runs.run", "Run"),
+    "Shading": ("shade.shading", "Shading"),
+    "Surfels": ("surfels.table", "Surfels"),
+    "TrainedScene": ("runs.export", "TrainedScene"),
+    "Trainer": ("fit.train", "Trainer"),
+    "View": ("data.view", "View"),
+    "evaluate": ("evaluation.evaluate", "evaluate"),
+    "from_points": ("surfels.init", "from_points"),
+    "load_method": ("methods.read", "load"),
+    "make_dataset": ("data.make_dataset", "make_dataset"),
+    "read_dataset": ("data.dataset", "read_dataset"),
+    "read_mesh": ("occlusion.mesh", "read_mesh"),
+    "read_ply": ("surfels.ply", "read_ply"),
+    "register_channel": ("surfels.channels", "register"),
+    "register_primitive": ("primitives", "register"),
+    "register_reader": ("data.readers", "register"),
+    "register_reflectance": ("shade.reflectance", "register"),
+    "render_frame": ("render.pipeline", "render"),
+    "write_mesh": ("occlusion.mesh", "write_mesh"),
+    "write_ply": ("surfels.ply", "write_ply"),
+}
+"""Public name → the module that defines it, and its name there."""
+
+__all__ = [
+    "Accuracy",
+    "Camera",
+    "Channel",
+    "Dataset",
+    "EnvironmentLight",
+    "Frame",
+    "InputError",
+    "Mesh",
+    "Method",
+    "Occluder",
+    "Primitive",
+    "Reflectance",
+    "Run",
+    "Shading",
+    "Surfels",
+    "TrainedScene",
+    "Trainer",
+    "View",
+    "evaluate",
+    "from_points",
+    "load_method",
+    "make_dataset",
+    "read_dataset",
+    "read_mesh",
+    "read_ply",
+    "register_channel",
+    "register_primitive",
+    "register_reader",
+    "register_reflectance",
+    "render_frame",
+    "write_mesh",
+    "write_ply",
+]
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]
+
+
+if not TYPE_CHECKING:  # a type checker reads the imports above
+
+    def __getattr__(name: str) -> Any:
+        """Import a public name when it is asked for first. [PEP 562]"""
+        if name not in _PUBLIC:
+            raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+        module, inner = _PUBLIC[name]
+        value = globals()[name] = getattr(importlib.import_module(f"{__name__}.{module}"), inner)
+        return value
+
 
 llvm.select()
 _llvm_problem = llvm.problem()

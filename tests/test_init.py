@@ -8,6 +8,7 @@ from scipy.stats import kstest
 
 from mi_refgs.errors import InputError
 from mi_refgs.surfels import init
+from mi_refgs.surfels.channels import Channel, sigmoid
 
 
 def test_from_points(rng: np.random.Generator) -> None:
@@ -69,3 +70,21 @@ def test_random_normals_are_uniform(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-12)
     np.testing.assert_allclose(normals.T @ normals / 20_000, np.eye(3) / 3, atol=0.02)
     assert all(kstest(axis, "uniform", (-1, 2)).pvalue > 1e-3 for axis in normals.T)  # Archimedes
+
+
+def test_a_channel_starts_at_its_activated_value(rng: np.random.Generator) -> None:
+    """Whatever the activation; a size that is none is refused."""
+    declared = {
+        "exp": Channel("width", (2,), "exp", 1e-3, ("w_0", "w_1"), initial=0.2),
+        "sigmoid": Channel("share", (2,), "sigmoid", 1e-3, ("s_0", "s_1"), initial=0.2),
+        "identity": Channel("offset", (2,), "identity", 1e-3, ("o_0", "o_1"), initial=0.2),
+    }
+    activate = {"exp": np.exp, "sigmoid": sigmoid, "identity": np.asarray}
+    for kind, channel in declared.items():
+        for value in (None, 0.7):
+            raw = channel.start(5, 2, rng, value)
+            assert raw.shape == (5, 2)
+            np.testing.assert_allclose(activate[kind](raw), 0.2 if value is None else value, rtol=1e-6)
+    for value in (0.0, -1.0, np.inf):
+        with pytest.raises(InputError, match=r"width: .* is no size; start it above 0"):
+            declared["exp"].start(1, 1, rng, value)

@@ -15,7 +15,7 @@ from mi_refgs.fit.optim import Adam
 from mi_refgs.fit.rates import Group
 from mi_refgs.methods.method import Propagation, Refine
 from mi_refgs.methods.window import Window
-from mi_refgs.surfels.channels import logit
+from mi_refgs.surfels.channels import logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 
 OPTIONS = Refine()
@@ -109,7 +109,7 @@ def test_the_wait_follows_the_rate_that_lifts_opacities() -> None:
     params = {"opacity": mi.TensorXf(np.full((1, 1), logit(options.reset_opacity), np.float32))}
     optimiser = Adam(params, {"opacity": Group(rate)})
     steps = 0
-    while refine.sigmoid(params["opacity"].numpy())[0, 0] < options.prune_opacity:
+    while sigmoid(params["opacity"].numpy())[0, 0] < options.prune_opacity:
         dr.set_grad(params["opacity"], -1e-6)
         optimiser.step(steps)
         steps += 1
@@ -130,8 +130,8 @@ def test_growth_stops_at_the_limit_and_takes_the_hottest(scale: float) -> None:
 def test_reset_lowers_opacity_and_lifts_metallic_only() -> None:
     surfels = table()
     edited = refine.reset_opacity(surfels, OPTIONS, {"metallic": 0.6}).to_numpy()
-    np.testing.assert_allclose(refine.sigmoid(edited["opacity"]), OPTIONS.reset_opacity, rtol=1e-5)
-    np.testing.assert_allclose(refine.sigmoid(edited["metallic"]), 0.6, rtol=1e-5)
+    np.testing.assert_allclose(sigmoid(edited["opacity"]), OPTIONS.reset_opacity, rtol=1e-5)
+    np.testing.assert_allclose(sigmoid(edited["metallic"]), 0.6, rtol=1e-5)
     assert np.array_equal(edited["scale"], surfels.to_numpy()["scale"])
 
 
@@ -147,9 +147,7 @@ def test_propagation_is_material_aware(rng: np.random.Generator) -> None:
     edited = refine.propagate_normals(Surfels.from_numpy(raw), PROPAGATION, rng).to_numpy()
     grown = np.exp(edited["scale"] - raw["scale"])[:, 0]
     np.testing.assert_allclose(grown, [1, 1, 1.5, 1.5, 1.5, 1.5], rtol=1e-5)
-    np.testing.assert_allclose(
-        refine.sigmoid(edited["opacity"])[:, 0], [0.9, 0.9, 0.95, 0.9, 0.9, 0.9], rtol=1e-5
-    )
+    np.testing.assert_allclose(sigmoid(edited["opacity"])[:, 0], [0.9, 0.9, 0.95, 0.9, 0.9, 0.9], rtol=1e-5)
 
 
 def test_propagation_without_a_limit_of_roughness_grows_every_metal(rng: np.random.Generator) -> None:
@@ -170,8 +168,8 @@ def test_a_restart_of_materials_leaves_geometry() -> None:
     surfels = table()
     starts = {"albedo": 0.5, "metallic": 0.01, "roughness": 0.1}
     edited = refine.restart(surfels, starts, np.random.default_rng(0)).to_numpy()
-    np.testing.assert_allclose(refine.sigmoid(edited["metallic"]), 0.01, rtol=1e-5)
-    np.testing.assert_allclose(refine.sigmoid(edited["roughness"]), 0.1, rtol=1e-5)
-    assert np.abs(refine.sigmoid(edited["albedo"]) - 0.5).max() <= 0.025 + 1e-6
+    np.testing.assert_allclose(sigmoid(edited["metallic"]), 0.01, rtol=1e-5)
+    np.testing.assert_allclose(sigmoid(edited["roughness"]), 0.1, rtol=1e-5)
+    assert np.abs(sigmoid(edited["albedo"]) - 0.5).max() <= 0.025 + 1e-6
     for name in ("position", "rotation", "scale", "opacity"):
         assert np.array_equal(edited[name], surfels.to_numpy()[name])

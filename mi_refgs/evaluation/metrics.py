@@ -135,14 +135,13 @@ def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> 
 # ---------------- light ----------------
 
 
-def environment(light: np.ndarray, truth: np.ndarray, peak: float | None = None) -> dict[str, Any]:
+def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     """Recovered against true environment after one least-squares scale per channel, weighted by solid angle.
 
     Photographs fix the light only up to such a scale, which the albedo takes up. The true map is resampled to
-    the recovered one's grid (`shade.lobe`: first and last row on the poles) by averaging; with `peak`, both
-    are first clipped there (what no clipped photograph could show). Keys: `env_scale` (three numbers),
-    `env_mae` (linear, after the scale), `env_psnr` (dB, after sRGB encoding and clamping to [0, 1]) and
-    `env_correlation` (Pearson, of the same encoded values).
+    the recovered one's grid (`shade.lobe_matrices`: first and last row on the poles) by averaging. Keys:
+    `env_scale` (three numbers), `env_mae` (linear, after the scale), `env_psnr` (dB, after sRGB encoding and
+    clamping to [0, 1]) and `env_correlation` (Pearson, of the same encoded values).
     """
     light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
     for name, array in (("light", light), ("truth", truth)):
@@ -150,8 +149,6 @@ def environment(light: np.ndarray, truth: np.ndarray, peak: float | None = None)
             raise InputError(
                 f"metrics: environment {name}: need finite (h, w, 3) values, h ≥ 2; write the map again"
             )
-    if peak is not None:
-        light, truth = np.minimum(light, peak), np.minimum(truth, peak)
     rows = lobe_matrices.row_resampling(len(truth), len(light))
     columns = lobe_matrices.column_resampling(truth.shape[1], light.shape[1])
     truth = np.einsum("ih,jw,hwc->ijc", rows, columns, truth, optimize=True)

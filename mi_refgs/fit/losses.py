@@ -47,14 +47,9 @@ def clip_highlights(render: Iterable[Any], target: Iterable[Any], clipped: Itera
 # ---------------- image losses ----------------
 
 
-def l1(render: Iterable[Any], target: Iterable[Any], clipped: Iterable[Any] | None = None) -> Any:
-    """Mean absolute difference over pixels and planes; the slope at equality is 0.
-
-    `clipped` (see `saturated`): where the target is clipped, a brighter render is no error.
-    """
+def l1(render: Iterable[Any], target: Iterable[Any]) -> Any:
+    """Mean absolute difference over pixels and planes; the slope at equality is 0."""
     render, target = list(render), [dr.detach(plane) for plane in target]
-    if clipped is not None:
-        render = clip_highlights(render, target, clipped)
     return _mean(sum((_abs(a - b) for a, b in zip(render, target, strict=True)), mi.Float(0))) / len(render)
 
 

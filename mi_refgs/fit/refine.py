@@ -17,7 +17,7 @@ from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import Propagation, Refine
 from mi_refgs.primitives import Primitive, primitive_of, widths_of
-from mi_refgs.surfels.channels import channel, logit
+from mi_refgs.surfels.channels import channel, logit, sigmoid
 from mi_refgs.surfels.order import morton_order
 from mi_refgs.surfels.table import Surfels
 
@@ -53,11 +53,6 @@ class TableEdit:
         """The same rows, those of neighbours next to each other; densifying leaves new ones at the end."""
         order = morton_order(self.surfels.raw["position"].numpy())
         return TableEdit(self.surfels.gather(upload(order, mi.UInt32)), self.parent[order], self.fresh[order])
-
-
-def sigmoid(x: np.ndarray) -> np.ndarray:
-    """Logistic sigmoid without overflow, float64."""
-    return 0.5 * (1 + np.tanh(0.5 * np.asarray(x, dtype=np.float64)))
 
 
 def densify_and_prune(

@@ -14,7 +14,7 @@ from skimage import measure
 from mi_refgs.errors import InputError
 from mi_refgs.files import is_file, write_bytes
 from mi_refgs.occlusion.tsdf import TSDF
-from mi_refgs.ply import read_header
+from mi_refgs.ply import Header, read_header
 
 COMPONENT_KEEP = 0.1
 """Area, relative to the largest connected component, from which a component is an object and not a floater.
@@ -30,11 +30,11 @@ FOREIGN_RESOLUTION = 256
 grid has 128 along the longest side. Its triangles say nothing: two of them make an exact wall. Rays then
 start 0.8 % of the diagonal off the surface, and walls closer to each other than that do not occlude."""
 
-HEADER_BYTES = 4096
-"""A PLY header of a mesh is a few hundred bytes."""
-
 FORMATS = ("ply", "obj", "stl", "off")
 """Endings of the files that `read_mesh` takes."""
+
+NO_HEADER = Header("", (), ())
+"""Of the formats that have none."""
 
 VOXEL_COMMENT = "voxel_size"
 """Key of the PLY comment that holds the voxel the mesh was extracted with."""
@@ -110,18 +110,18 @@ def read_mesh(path: Path | str) -> Mesh:
     path = Path(path)
     if not is_file(path):
         raise InputError(f"{path}: mesh: no such file; give the mesh.ply of a run")
-    with path.open("rb") as file:
-        header = file.read(HEADER_BYTES).split(b"end_header")[0].decode("ascii", "replace")
-    noted = [
-        line.split()[2:3] for line in header.splitlines() if line.startswith(f"comment {VOXEL_COMMENT} ")
-    ]
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        raise InputError(f"{path}: mesh: not one of {', '.join(FORMATS)}; write it again as PLY or OBJ")
     try:
-        voxel = float(noted[0][0]) if noted else None
-        if voxel is not None and not 0 < voxel < np.inf:
-            raise ValueError("a voxel without size")
-        if ["element", "face", "0"] in map(str.split, header.splitlines()):
+        with path.open("rb") as file:
+            header = read_header(path, file) if kind == "ply" else NO_HEADER
+            file.seek(0)
+            data = file.read()
+        voxel = _voxel(header)
+        if any(element.name == "face" and not element.count for element in header.elements):
             return Mesh.empty() if voxel is None else Mesh.empty(voxel)
-        mesh = _load(path)
+        mesh = _load(path, kind, data)
         if voxel is None:
             voxel = float(np.linalg.norm(mesh.extents)) / FOREIGN_RESOLUTION if len(mesh.faces) else 1.0
     except InputError:
@@ -139,19 +139,24 @@ def read_mesh(path: Path | str) -> Mesh:
     return Mesh(vertices, np.asarray(mesh.faces, np.uint32), voxel)
 
 
-def _load(path: Path) -> Any:
-    """What trimesh makes of a file, with the lengths and indices checked that it trusts."""
-    kind = path.suffix.lower().removeprefix(".")
-    with path.open("rb") as file:
-        if kind == "ply":
-            read_header(path, file)
-            file.seek(0)
-        elif kind not in FORMATS:
-            raise InputError(f"{path}: mesh: not one of {', '.join(FORMATS)}; write it again as PLY or OBJ")
-        # From memory, trimesh resolves no other names: textures, materials, archives.
-        data = io.BytesIO(file.read())
+def _voxel(header: Header) -> float | None:
+    """The voxel that a comment notes, None without one; raises ValueError for one without size."""
+    noted = [words[1:2] for words in map(str.split, header.comments) if words[:1] == [VOXEL_COMMENT]]
+    if not noted:
+        return None
+    voxel = float(noted[0][0]) if noted[0] else 0.0
+    if not 0 < voxel < np.inf:
+        raise ValueError("a voxel without size")
+    return voxel
+
+
+def _load(path: Path, kind: str, data: bytes) -> Any:
+    """What trimesh makes of a file's bytes, with the indices checked that it trusts.
+
+    From memory, trimesh resolves no other names: textures, materials, archives.
+    """
     options: Any = {"skip_materials": True} if kind in ("ply", "obj") else {}
-    mesh: Any = trimesh.load(data, file_type=kind, force="mesh", process=False, **options)
+    mesh: Any = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False, **options)
     faces = np.asarray(mesh.faces)
     if faces.size and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
         raise InputError(f"{path}: mesh: a face names a vertex that is not there; write the file again")

@@ -20,6 +20,7 @@ from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.profiling.phases import phase_times
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import list_by_tile, project
+from mi_refgs.surfels.channels import sigmoid
 
 WARM_UP = 4
 """Steps before the first that counts: they compile kernels."""
@@ -191,7 +192,7 @@ def count_work(trainer: Trainer) -> Work:
         contributing=mean("contributing"),
         unseen_share=float(1 - seen.mean()),
         single_share=of_seen(largest == 1),
-        faint_share=of_seen(1 / (1 + np.exp(-opacity[:, 0])) < FAINT),
+        faint_share=of_seen(sigmoid(opacity[:, 0]) < FAINT),
         aspect=of_seen(sizes[:, -1] / sizes[:, -2], np.median),
         footprint=float(np.sum(pixels) / max(np.count_nonzero(pixels), 1)),
     )

@@ -91,7 +91,7 @@ def images(
     ):
         p = world_to_camera @ (position - origin)
         depths.append(p[2])
-        opacity = 1 / (1 + np.exp(-logit[0]))
+        opacity = sigmoid(logit[0])
         if p[2] <= camera.near or opacity < c.ALPHA_MIN:
             found.append((np.zeros_like(x), np.ones_like(x), np.zeros(x.shape, bool)))
             continue

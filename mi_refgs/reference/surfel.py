@@ -114,7 +114,7 @@ def camera_surfels(raw: dict[str, Array], camera: PinholeCamera) -> dict[str, Ar
     centres = (raw["position"] - origin) @ to_camera.T
     axes = np.array([to_camera @ rotation_matrix(q) for q in raw["rotation"]]).reshape(-1, 3, 3)
     sigma = np.exp(raw["scale"])
-    opacity = 1 / (1 + np.exp(-raw["opacity"][:, 0]))
+    opacity = sigmoid(raw["opacity"][:, 0])
     facing = np.abs(np.sum(centres * axes[:, :, 2], axis=1))
     culled = centres[:, 2] <= camera.near
     culled |= facing <= c.EDGE_ON_COSINE * np.linalg.norm(centres, axis=1)

@@ -83,6 +83,10 @@ class Channel:
                 noise = rng.uniform(-self.jitter, self.jitter, (count, width))
                 return logit(np.clip(value + noise, *JITTER_RANGE))
             return np.full((count, width), logit(value))
+        if self.activation == "exp":
+            if not 0 < value < np.inf:
+                raise InputError(f"surfels: {self.name}: {value} is no size; start it above 0")
+            value = np.log(value)
         return np.full((count, width), float(value))
 
 
@@ -118,6 +122,11 @@ def logit(value: float | np.ndarray) -> np.ndarray:
     """Inverse of the logistic sigmoid, float64, of values clipped to [1e-6, 1 - 1e-6]."""
     value = np.clip(np.asarray(value, dtype=np.float64), PROBABILITY_MARGIN, 1 - PROBABILITY_MARGIN)
     return np.log(value) - np.log1p(-value)
+
+
+def sigmoid(raw: float | np.ndarray) -> np.ndarray:
+    """Logistic sigmoid without overflow, float64."""
+    return 0.5 * (1 + np.tanh(0.5 * np.asarray(raw, dtype=np.float64)))
 
 
 def _numbered(prefix: str, count: int = 3) -> tuple[str, ...]:
