@@ -57,7 +57,7 @@ class Report:
         return not self.problems
 
     def to_dict(self) -> dict[str, object]:
-        """The report as `refgs doctor --json` prints it: only what JSON knows."""
+        """The report as `refgs doctor --json` prints it, in types that JSON has."""
         return {"usable": self.usable, **asdict(self)}
 
     def to_text(self) -> str:

@@ -31,7 +31,7 @@ SRGB_CHROMATICITIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 CHROMATICITY_TOLERANCE = 1e-3
 """Half the last digit that standards give, and far below the difference between any two of them."""
 MITSUBA_EXR_THREADS = 2
-"""Mitsuba 3.9 reads and writes EXR files on a worker thread; with one thread in all it waits for ever."""
+"""Mitsuba 3.9 reads and writes EXR files on a worker thread; with one thread in all, it never returns."""
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:

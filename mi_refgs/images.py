@@ -82,7 +82,7 @@ def _open_picture(path: Path) -> Iterator[Any]:
     require_file(path)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `check_size` asks for more
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `check_size` is stricter
             picture = Image.open(path, formats=("PNG", "JPEG"))
         with picture:
             check_size(path, *picture.size, len(picture.getbands()))

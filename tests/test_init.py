@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.stats import kstest
@@ -79,7 +81,11 @@ def test_a_channel_starts_at_its_activated_value(rng: np.random.Generator) -> No
         "sigmoid": Channel("share", (2,), "sigmoid", 1e-3, ("s_0", "s_1"), initial=0.2),
         "identity": Channel("offset", (2,), "identity", 1e-3, ("o_0", "o_1"), initial=0.2),
     }
-    activate = {"exp": np.exp, "sigmoid": sigmoid, "identity": np.asarray}
+    activate: dict[str, Callable[..., np.ndarray]] = {
+        "exp": np.exp,
+        "sigmoid": sigmoid,
+        "identity": np.asarray,
+    }
     for kind, channel in declared.items():
         for value in (None, 0.7):
             raw = channel.start(5, 2, rng, value)

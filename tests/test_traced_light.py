@@ -179,7 +179,7 @@ def test_traced_light_comes_closer_to_the_integral(roughness: float) -> None:
         "8 rays": Accuracy(visibility_rays=8),
         "traced mirror ray": Accuracy(traced_bounces=1),
         "8 traced rays": Accuracy(visibility_rays=8, traced_bounces=1),
-        "all knobs": Accuracy(dominant=True, visibility_rays=64, traced_bounces=1),
+        "all options": Accuracy(dominant=True, visibility_rays=64, traced_bounces=1),
     }.items():
         terms = shade(seen(points, place, accuracy, surfels, light), light, "irradiance", accuracy)
         got = (terms.filled().specular + terms.filled().indirect).numpy().T
@@ -187,7 +187,7 @@ def test_traced_light_comes_closer_to_the_integral(roughness: float) -> None:
     print(f"relMSE at roughness {roughness}: " + ", ".join(f"{k}: {e:.4f}" for k, e in error.items()))
     assert error["8 rays"] < error["mirror ray"]
     assert error["8 traced rays"] < 0.25 * error["mirror ray"]
-    assert max(error["8 traced rays"], error["all knobs"]) < 0.5 * error["traced mirror ray"]
+    assert max(error["8 traced rays"], error["all options"]) < 0.5 * error["traced mirror ray"]
 
 
 @pytest.mark.parametrize("diffuse", ["irradiance", "sh"])

@@ -14,7 +14,7 @@ COLOURS = {
     "path": "#444444",
     "monte_carlo": "#c77b30",
     "split_sum": "#1f77b4",
-    "knob": "#2a9d5c",
+    "option": "#2a9d5c",
     "floor": "#bbbbbb",
 }
 DOTS_PER_INCH = 110

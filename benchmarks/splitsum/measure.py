@@ -169,35 +169,35 @@ def _sampled(run: Run, setup: Setup, roughness: float, metallic: float) -> None:
 
 @dataclass(frozen=True)
 class Variant:
-    """A split sum: levels, rows of the light, and a knob of `shade`."""
+    """A split sum: levels, rows of the light, and a option of `shade`."""
 
     levels: str
     height: int
-    knob: str = ""
+    option: str = ""
 
     @property
     def method(self) -> str:
         """Its name in the report."""
         levels = "" if self.levels == methods.SHIPPED else f"_{self.levels}_levels"
-        return f"split_sum{levels}" + (f"_{self.knob}" if self.knob else "")
+        return f"split_sum{levels}" + (f"_{self.option}" if self.option else "")
 
 
 def _variants(settings: Settings) -> list[Variant]:
     shipped = [Variant(methods.SHIPPED, height) for height in settings.heights]
-    knobs = [
-        Variant(methods.SHIPPED, height, knob)
+    options = [
+        Variant(methods.SHIPPED, height, option)
         for height in {settings.height, settings.heights[-1]}
-        for knob in methods.KNOBS
-        if knob
+        for option in methods.OPTIONS
+        if option
     ]
     levels = [Variant(name, min(LEVELS_HEIGHT, settings.heights[-1])) for name in settings.level_sets]
-    return sorted(shipped + knobs, key=lambda variant: variant.height) + levels
+    return sorted(shipped + options, key=lambda variant: variant.height) + levels
 
 
 def _prefilter(run: Run, lights: list[Light], variants: list[Variant]) -> dict[tuple[str, int], Any]:
     """Every light at every height, by (light, height), with one set of levels; books the time it takes."""
     filtered, calls = {}, {}
-    for variant in (variant for variant in variants if not variant.knob):
+    for variant in (variant for variant in variants if not variant.option):
         levels = methods.LEVEL_SETS[variant.levels]
         environments = {light.name: light.environment(variant.height) for light in lights}
         for name, environment in environments.items():
@@ -224,12 +224,12 @@ def _split_sums(
     for variant in variants:
         light = filtered[setup.light.name, variant.height]
 
-        def shader(points: Points, light: Any = light, knob: str = variant.knob) -> Any:
-            return methods.split_sum(points, timed, light, knob)
+        def shader(points: Points, light: Any = light, option: str = variant.option) -> Any:
+            return methods.split_sum(points, timed, light, option)
 
         for roughness, metallic in materials:
             material = methods.material(metallic, roughness)
-            radiance = methods.split_sum(setup.points, material, light, variant.knob)
+            radiance = methods.split_sum(setup.points, material, light, variant.option)
             values = methods.picture_values(radiance)
             run.add(setup, variant.method, variant.height, roughness, metallic, values)
         calls[variant.method, variant.height] = methods.with_primary_rays(setup, shader)

@@ -34,11 +34,11 @@ LEVEL_SETS = {
 }
 """Filtered levels; the map itself is one more."""
 
-KNOBS = {"": Accuracy(), "dominant": Accuracy(dominant=True), "multiscatter": Accuracy(multiscatter=True)}
+OPTIONS = {"": Accuracy(), "dominant": Accuracy(dominant=True), "multiscatter": Accuracy(multiscatter=True)}
 """Settings of `shade` that concern a surface that nothing shadows."""
 
 
-def split_sum(points: Any, material: mc.Material, light: Any, knob: str = "") -> Any:
+def split_sum(points: Any, material: mc.Material, light: Any, option: str = "") -> Any:
     """Outgoing radiance as the product shades it."""
     surface = ShadingPoints(
         points.normal,
@@ -47,7 +47,7 @@ def split_sum(points: Any, material: mc.Material, light: Any, knob: str = "") ->
         metallic=material.metallic,
         roughness=material.roughness,
     )
-    return shade(surface, light, "irradiance", KNOBS[knob]).total()
+    return shade(surface, light, "irradiance", OPTIONS[option]).total()
 
 
 def picture_values(radiance: Any) -> np.ndarray:

@@ -83,11 +83,11 @@ def _front(ax: Any, cases: list[Row]) -> None:
     points = [_shown(row, row["setting"] if row["setting"] in ends else None) for row in split]
     figures.series(ax, points, "o", figures.COLOURS["split_sum"], "split sum, rows of light")
     for row in cases:
-        knob = row["method"].removeprefix("split_sum_")
-        if knob in MARKS and (row["setting"] == split[-1]["setting"] or knob.endswith("levels")):
+        option = row["method"].removeprefix("split_sum_")
+        if option in MARKS and (row["setting"] == split[-1]["setting"] or option.endswith("levels")):
             look = {"markersize": 6, "fillstyle": "none"}
-            name = knob.replace("_", " ")
-            figures.series(ax, [_shown(row, None)], MARKS[knob], figures.COLOURS["knob"], name, **look)
+            name = option.replace("_", " ")
+            figures.series(ax, [_shown(row, None)], MARKS[option], figures.COLOURS["option"], name, **look)
     floor = max((CLEAR * row["relmse_floor"] for row in cases), default=0)
     if floor:
         low = ax.get_ylim()[0]

@@ -91,7 +91,7 @@ def _threads() -> int:
 
 
 def text(found: Profile, said: list[str]) -> str:
-    """For people."""
+    """The profile as lines of text: a table of milliseconds, counts, and what would help."""
     names = list(dict.fromkeys(name for stage in found.stages for name in stage.phases_ms))
     lines = [_row("a training step, ms", [stage.name for stage in found.stages])]
     for name in names:

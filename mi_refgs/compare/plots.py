@@ -24,7 +24,7 @@ from mi_refgs.runs.run import Run
 AXES = (("seconds", "training (s)"), ("iteration", "iterations"))
 """Key of a line of a curve, and the axis' title."""
 STYLES, DPI = ("-", "--", ":"), 140
-"""Of lines, the next for each ten methods; pixels per inch, for screens that show two for one."""
+"""Line styles, the next one for every ten methods; pixels per inch, twice those of a common screen."""
 CROP_VIEWS = 16
 """Test views that are searched for the crop, evenly spread."""
 CROP_SHARE, CROP_MIN = 3, 24

@@ -27,7 +27,7 @@ class Column:
     reason: str = ""  # key of metrics.json that says why the number is missing
 
     def text(self, value: float) -> str:
-        """A value for people."""
+        """A value as the table shows it."""
         return format(value, self.form)
 
 
@@ -55,7 +55,7 @@ class Statistic:
 
     @staticmethod
     def of(values: Sequence[float]) -> Statistic:
-        """Of at least one value."""
+        """The statistic of at least one value."""
         sd = statistics.stdev(values) if len(values) > 1 else None
         return Statistic(statistics.fmean(values), sd, tuple(values))
 

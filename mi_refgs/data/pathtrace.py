@@ -66,7 +66,7 @@ def environment_image(scene: Any, height: int) -> np.ndarray:
 
     Shown by an `envmap` with an identity `to_world` it is the same light: first row at +y, last at -y;
     column 0 beside −z, turning to +x. An `envmap` of this size that is not turned comes back unchanged; what
-    is finer is averaged (`shade.lobe.resample`).
+    is finer is averaged (`shade.lobe_matrices.resample`).
     """
     import drjit as dr
     import mitsuba as mi

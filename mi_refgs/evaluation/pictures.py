@@ -28,7 +28,7 @@ MARGIN = 4
 TITLE_HEIGHT = 16
 """Pixels above each picture, enough for Pillow's built-in font."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Of linear sRGB primaries (ITU-R BT.709)."""
+"""Luminance of the linear sRGB primaries (ITU-R BT.709)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -146,7 +146,7 @@ def held_out_psnr(trainer: Trainer, judges: Dataset) -> float:
 
 
 def sentence(decision: Decision) -> str:
-    """A decision for people."""
+    """A decision as one sentence."""
     verdict = "stays" if decision.stays else "is left out"
     if decision.without is None or decision.with_it is None:
         return f"{decision.term} {verdict}: {decision.reason}"

@@ -1,6 +1,6 @@
 """Reads methods strictly from TOML: a file, those that it extends, `key=value` assignments, a preset.
 
-No other module opens a TOML or knows a method's name.
+No other module opens a TOML file, and none contains a method's name.
 """
 
 from __future__ import annotations

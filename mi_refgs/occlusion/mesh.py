@@ -34,7 +34,7 @@ FORMATS = ("ply", "obj", "stl", "off")
 """Endings of the files that `read_mesh` takes."""
 
 NO_HEADER = Header("", (), ())
-"""Of the formats that have none."""
+"""What stands for the header of formats without one."""
 
 VOXEL_COMMENT = "voxel_size"
 """Key of the PLY comment that holds the voxel the mesh was extracted with."""

@@ -23,11 +23,11 @@ NEIGHBOURS = 4
 """Surfels that a vertex mixes: those that overlap at a point of a fitted surface with visible weight."""
 
 WEIGHT_FLOOR = 1e-6
-"""Sum of weights below which no surfel reaches a vertex: the nearest one then speaks alone."""
+"""Sum of weights below which no surfel reaches a vertex, which then takes the nearest one only."""
 
 NORMAL_AGREEMENT = 0.5
 """Cosine between the neighbours' mean normal and the mesh's from which the former, which a fit has smoothed,
-is believed: at a rim the neighbours are another face's."""
+is used: at a rim the neighbours belong to another face."""
 
 CHANNELS = ("albedo", "metallic", "roughness")
 """What a surface that is hit is shaded with."""
@@ -46,7 +46,7 @@ class SurfaceSample:
 
 @dataclass(frozen=True)
 class VertexSurfels:
-    """Of every vertex of a mesh, the surfels around it. V vertices, K neighbours, F faces."""
+    """The surfels around every vertex of a mesh. V vertices, K neighbours, F faces."""
 
     count: int  # surfels
     faces: Any  # mi.UInt32 (3 F)
@@ -104,7 +104,7 @@ class VertexSurfels:
         """
         if surfels.count != self.count:
             raise InputError(
-                f"occluder: surfels: there are {surfels.count}, and the mesh knows {self.count}; call "
+                f"occluder: surfels: there are {surfels.count}, but the mesh was given {self.count}; call "
                 "Occluder.set_materials whenever their number changes"
             )
         columns = [*surfels.albedo(), surfels.metallic(), surfels.roughness()]

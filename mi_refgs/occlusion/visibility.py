@@ -114,7 +114,7 @@ class Occluder:
             ray, valid = self._ray(origin, direction, normal)
             hit = self._scene.ray_intersect_preliminary(ray, coherent=False, active=valid & active)
             stopped = hit.is_valid()
-            # Of a miss Embree leaves what was in its registers, NaN among it.
+            # Embree leaves the fields of a miss undefined: they may be NaN.
             distance, triangle, barycentric = (
                 dr.select(stopped, x, 0) for x in (hit.t, hit.prim_index, hit.prim_uv)
             )

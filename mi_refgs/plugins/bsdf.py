@@ -188,7 +188,7 @@ class RefGSBSDF(mi.BSDF):
             return dr.select(active, _density(ctx, self._material(si, active), wi, wo), 0)
 
     def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-        """Both; see mi.BSDF."""
+        """`eval` and `pdf` at once; see mi.BSDF."""
         wi, active = _front(si.wi, active)
         wo, active = _front(wo, active)
         material = self._material(si, active)

@@ -1,4 +1,4 @@
-"""From the channels of a picture to the image of a sensor's film.
+"""Channels of a picture are sampled, filtered and developed by a sensor's film.
 
 No Mitsuba class is defined here, so that this module need not be reloaded when the variant changes.
 """

@@ -1,4 +1,4 @@
-"""Mitsuba's environment emitters as the lights that `mi_refgs.shade` knows.
+"""Mitsuba's environment emitters as the lights of `mi_refgs.shade`.
 
 No Mitsuba class is defined here, so that this module need not be reloaded when the variant changes.
 """

@@ -39,7 +39,7 @@ def read_aovs(props: Any) -> list[AOV]:
 
 
 def _path(props: Any, name: str) -> str | None:
-    """A file property, found beside the XML first; Mitsuba knows that folder only while it makes plugins."""
+    """A file property, searched beside the XML first; Mitsuba searches there only while it makes plugins."""
     value = _get(props, name, None)
     return None if value is None else str(mi.file_resolver().resolve(str(value)))
 

@@ -118,7 +118,7 @@ class Gaussian(Primitive):
         return GaussianAdjoint()
 
     def evaluate_forward(self, row: Any, sample: GaussianSample, drow: Any) -> tuple[Any, Any]:
-        """By the chain rule, column by column."""
+        """Apply the chain rule, column by column."""
         delta, ddelta = sample.delta, mi.Vector2f(-drow[4], -drow[5])
         du = linear(drow[0], drow[1], delta) + linear(row[0], row[1], ddelta)
         dv = drow[2] * delta.y + row[2] * ddelta.y

@@ -56,7 +56,7 @@ class Adjoint(Protocol):
 class Primitive(ABC):
     """One kind of thing to splat. Rows are its columns of one footprint, then features.
 
-    Of the arguments, `surfels` is a `surfels.table.Surfels`, `camera` a `splat.camera.Camera`, and `raw` maps
+    The argument `surfels` is a `surfels.table.Surfels`, `camera` a `splat.camera.Camera`, and `raw` maps
     channels to NumPy arrays (N, D) of raw values.
     """
 

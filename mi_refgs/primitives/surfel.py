@@ -137,7 +137,7 @@ class Surfel(Primitive):
         return FootprintAdjoint()
 
     def evaluate_forward(self, row: Any, sample: SurfelSample, drow: Any) -> tuple[Any, Any]:
-        """By the chain rule, column by column."""
+        """Apply the chain rule, column by column."""
         plane = ~sample.low_pass
         delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
         ddelta = mi.Vector2f(-drow[7], -drow[8])

@@ -14,7 +14,7 @@ from mi_refgs.splat.blend import advance
 
 @dataclass(frozen=True)
 class Counts:
-    """Of one view."""
+    """What the splatter has to do for one view, in numbers of things."""
 
     surfels: int
     pixels: int
@@ -32,7 +32,7 @@ class Counts:
 
     @property
     def share(self) -> float:
-        """Contributing of evaluated."""
+        """Share of the evaluated pairs that contribute."""
         return self.contributing / max(self.evaluated, 1)
 
 

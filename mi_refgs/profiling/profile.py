@@ -43,7 +43,7 @@ class StageProfile:
 
 @dataclass(frozen=True)
 class Work:
-    """Of a view, as the mean over training views; shares are between 0 and 1."""
+    """What a view costs, as the mean over training views; shares are between 0 and 1."""
 
     views: int
     surfels: int
@@ -61,7 +61,7 @@ class Work:
 
     @property
     def share(self) -> float:
-        """Contributing of evaluated."""
+        """Share of the evaluated pairs that contribute."""
         return self.contributing / max(self.evaluated, 1)
 
 

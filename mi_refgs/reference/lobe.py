@@ -1,4 +1,4 @@
-"""The GGX lobe by brute force in NumPy float64: the integrals that `shade`'s accuracy knobs approximate.
+"""The GGX lobe by brute force in NumPy float64: the integrals that `shade`'s options of accuracy approximate.
 
 GGX α = roughness², height-correlated Smith, Schlick. Directions are unit (3,) or (n, 3) arrays and point away
 from the surface; colours have three channels.

@@ -163,7 +163,7 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera) -> list[Path]:
         background=None,
         remark="" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels",
     )
-    # Last, since it vouches for the others.
+    # Written last: where it is, the other files are complete.
     note: dict[str, Any] = {
         "iteration": fitted.iteration,
         "seconds": fitted.seconds,

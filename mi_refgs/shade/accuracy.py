@@ -12,7 +12,7 @@ MAX_RAYS = 4096
 """Rays of the lobe, or bounces, beyond which nothing changes but the time: the length of a kernel follows."""
 
 DIRECTIONS = 24
-"""Directions of the hemisphere unless somebody asks for others; R3DG has 64, which takes twice as long."""
+"""Default number of directions of the hemisphere; R3DG has 64, which takes twice as long."""
 
 MAX_DIRECTIONS = 64
 """Directions of the hemisphere at most: which of them are free is one bit each of a 64-bit word."""

@@ -205,7 +205,7 @@ class EnvironmentLight:
 
     @classmethod
     def from_radiance(cls, radiance: np.ndarray) -> EnvironmentLight:
-        """From linear radiance (h, 2h, 3), in Mitsuba's orientation; values below 1e-4 become 1e-4.
+        """Take linear radiance (h, 2h, 3), in Mitsuba's orientation; values below 1e-4 become 1e-4.
 
         Raises InputError for NaN, infinity or another shape.
         """
@@ -216,7 +216,7 @@ class EnvironmentLight:
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:
-        """From a lat-long image (EXR, HDR), resampled to `height` rows, keeping its energy.
+        """Read a lat-long image (EXR, HDR) and resample it to `height` rows, keeping its energy.
 
         Without `height`: the image's own rows, to the next lower multiple of 4. Raises InputError when it is
         no such image.

@@ -25,7 +25,7 @@ HORIZON = 1e-6
 
 
 def lobe_turn(index: mi.UInt32) -> mi.UInt32:
-    """By how much pixels `index` turn their points, as a 32-bit fraction: a hash and nothing else."""
+    """The turn of the points of pixels `index`, as a 32-bit fraction: a hash of the index."""
     return mi.UInt32(mi.sample_tea_32(index, dr.zeros(mi.UInt32, dr.width(index)))[0])
 
 

@@ -43,7 +43,7 @@ class Levels:
 
 
 LEVELS = Levels()
-"""The levels that a light has unless somebody asks for others."""
+"""The levels of a light by default."""
 
 DROP_BELOW = 1e-5
 """Matrix entries below this fraction of their level's largest are dropped: 0.05 % of a lobe (L1), 1e-4 of its

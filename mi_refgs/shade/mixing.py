@@ -44,7 +44,7 @@ def make_mixing(blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarra
     slot, step, source, weight = slot[order], step[order], source[order], weight[order]
     begin = np.flatnonzero(np.diff(slot, prepend=-1))
     end = np.append(begin[1:], len(slot))
-    # Equally long lanes side by side: a packet waits for its longest.
+    # Equally long lanes side by side: a packet runs until its longest lane ends.
     lanes = np.argsort(begin - end, kind="stable")
     begin, end = begin[lanes], end[lanes]
     first, last, place, stride, origin = to_device(begin, end, slot[begin], step[begin], source)

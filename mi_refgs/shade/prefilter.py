@@ -145,7 +145,7 @@ class _Prefilter(dr.CustomOp):
 
 
 def _opaque(values: Any) -> Any:
-    """In memory: a literal would be another recording."""
+    """The values in memory: Dr.Jit would record another function for a literal."""
     dr.make_opaque(values)
     return values
 

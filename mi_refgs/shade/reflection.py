@@ -120,7 +120,7 @@ def _firefly_clamp(total: Any, largest: Any, free: Any, count: Any, α: Any) -> 
     """What share (0 … 1, detached) of the sum over blocked rays counts, in each colour.
 
     The `largest` of `count` rays counts for no more than all rays would at the mean of the others, `free`
-    ones included: of few rays of a narrow lobe, one that finds a lamp in a reflection speckles the picture.
+    ones included: one of a few rays of a narrow lobe that finds a lamp in a reflection speckles the picture.
     In a wide lobe rays differ anyway, so this fades out with its α (see CLAMP_MAX_ALPHA). The more rays, the
     less is clamped: the limit is the true mean.
     """

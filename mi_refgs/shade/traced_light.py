@@ -59,7 +59,7 @@ class MeshRadiance:
     def of(
         occluder: Occluder, surfels: Surfels, light: Light, accuracy: Accuracy, diffuse: Diffuse
     ) -> MeshRadiance:
-        """With the present values of everything, evaluated."""
+        """Take the present values of all arguments, and evaluate them."""
         surfels = surfels.cleaned()  # one that became unusable after `set_materials` may still be looked up
         surface = occluder.surface(surfels)
         coefficients = surfels.radiance_sh() if diffuse == "sh" else []

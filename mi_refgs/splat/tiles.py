@@ -123,7 +123,7 @@ def _lower(joined: Any) -> Any:
 
 
 def _sorted_by(joined: Any, shift: int, bits: int) -> Any:
-    """In the order of some bits of the upper half; stable. One pass of a counting sort."""
+    """Sort by some bits of the upper half, stably: one pass of a counting sort."""
     digit = (_upper(joined) >> shift) & ((1 << bits) - 1)
     dr.eval(joined, digit)
     return dr.gather(mi.UInt64, joined, dr.detail.block_mkperm(digit, dr.width(digit), 1 << bits))

@@ -156,8 +156,8 @@ def test_no_more_light_leaves_than_arrives(
         roughness=np.full((COUNT, 1), logit(roughness)),
     )
     light = EnvironmentLight.constant(1.0, LIGHT_ROWS).raw
-    knobs = {"dominant": dominant, "multiscatter": multiscatter}
-    rgba = picture(uniform, light, diffuse="irradiance", shade_at=shade_at, **knobs)
+    options = {"dominant": dominant, "multiscatter": multiscatter}
+    rgba = picture(uniform, light, diffuse="irradiance", shade_at=shade_at, **options)
     assert rgba.min() >= 0
     # Lookups are bilinear, a prefiltered 1 is 1 ± 1e-4.
     assert np.all(rgba[..., :3] <= rgba[..., 3:] * (1 + 1e-3) + 1e-5)

@@ -1,4 +1,4 @@
-"""The knobs that buy accuracy as properties of the `refgs` plugin."""
+"""The options of accuracy as properties of the `refgs` plugin."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from mi_refgs.shade.accuracy import Accuracy
 
 def test_properties_of_the_plugin(tmp_path: Path) -> None:
     mesh = plane_mesh(tmp_path)
-    knobs: dict[str, Any] = {
+    options: dict[str, Any] = {
         "dominant": True,
         "multiscatter": True,
         "visibility_rays": 4,
         "traced_bounces": 2,
     }
-    of = scene(mesh=mesh, **knobs)
+    of = scene(mesh=mesh, **options)
     assert of.integrator().shading.accuracy == Accuracy(True, True, 4, 2)
     assert scene(mesh=mesh).integrator().shading.accuracy == Accuracy()
     plain = image(scene(mesh=mesh, terms="specular,indirect"))
-    for name, value in knobs.items():
+    for name, value in options.items():
         assert (
             np.abs(image(scene(mesh=mesh, terms="specular,indirect", **{name: value})) - plain).max() > 0.01
         ), name
@@ -52,13 +52,13 @@ def test_bad_properties_are_refused(changes: dict[str, Any], words: str) -> None
 
 @pytest.mark.parametrize("rays", [1, 3])
 def test_derivatives_of_mi_render(rays: int, tmp_path: Path) -> None:
-    knobs: dict[str, Any] = {
+    options: dict[str, Any] = {
         "dominant": True,
         "multiscatter": True,
         "visibility_rays": rays,
         "traced_bounces": 2,
     }
-    check_derivatives(scene(mesh=plane_mesh(tmp_path), diffuse="irradiance", **knobs), "integrator.light")
+    check_derivatives(scene(mesh=plane_mesh(tmp_path), diffuse="irradiance", **options), "integrator.light")
 
 
 def test_new_surfels_give_new_materials(tmp_path: Path) -> None:

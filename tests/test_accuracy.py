@@ -1,4 +1,4 @@
-"""Knobs of `shade` that buy accuracy: the float64 oracle, derivatives, and the integrals they approach."""
+"""Options of accuracy: the float64 oracle, derivatives, and the integrals they approach."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from mi_refgs.shade.points import reflect
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.split_sum import multiple_scattering, shade
 
-KNOBS = (Accuracy(dominant=True), Accuracy(multiscatter=True), Accuracy(dominant=True, multiscatter=True))
-CASES = [(knobs, "irradiance", "open") for knobs in KNOBS] + [(KNOBS[2], "sh", "indirect")]
+OPTIONS = (Accuracy(dominant=True), Accuracy(multiscatter=True), Accuracy(dominant=True, multiscatter=True))
+CASES = [(options, "irradiance", "open") for options in OPTIONS] + [(OPTIONS[2], "sh", "indirect")]
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def radiance() -> np.ndarray:
 
 
 def oracle(
-    values: dict[str, Any], levels: list[np.ndarray], diffuse: str, knobs: Accuracy, k: int
+    values: dict[str, Any], levels: list[np.ndarray], diffuse: str, options: Accuracy, k: int
 ) -> np.ndarray:
     one: dict[str, Any] = {name: None if x is None else x[k] for name, x in values.items()}
     return reference.shade(
@@ -41,8 +41,8 @@ def oracle(
         levels,
         lobe_matrices.LEVEL_ROUGHNESS,
         diffuse=diffuse,
-        dominant=knobs.dominant,
-        multiscatter=knobs.multiscatter,
+        dominant=options.dominant,
+        multiscatter=options.multiscatter,
         **one,
     )
 
@@ -51,14 +51,14 @@ def oracle(
 
 
 def test_everything_is_off_by_default(radiance: np.ndarray, rng: np.random.Generator) -> None:
-    """Same bits as without the argument; each knob changes the picture."""
+    """Same bits as without the argument; each option changes the picture."""
     assert Shading().accuracy == Accuracy() == Accuracy(False, False, 1, 0)
     points = points_of(scene(rng, "open"))
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     plain, same = shade(points, light), shade(points, light, "sh", Accuracy())
     np.testing.assert_array_equal(plain.total().numpy(), same.total().numpy())
-    for knobs in KNOBS:
-        changed = shade(points, light, "sh", knobs).specular.numpy()
+    for options in OPTIONS:
+        changed = shade(points, light, "sh", options).specular.numpy()
         assert np.abs(changed - plain.specular.numpy()).max() > 0.01
 
 
@@ -88,22 +88,22 @@ def test_bad_settings_are_refused(bad: dict[str, Any]) -> None:
 # ---------------- terms and derivatives ----------------
 
 
-@pytest.mark.parametrize(("knobs", "diffuse", "occlusion"), CASES)
+@pytest.mark.parametrize(("options", "diffuse", "occlusion"), CASES)
 def test_terms_against_the_oracle(
-    knobs: Accuracy, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
+    options: Accuracy, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     levels, values = level_maps(light), scene(rng, occlusion)
-    terms = shade(points_of(values), light, diffuse, knobs)
-    expected = np.array([oracle(values, levels, diffuse, knobs, k) for k in range(N)])
+    terms = shade(points_of(values), light, diffuse, options)
+    expected = np.array([oracle(values, levels, diffuse, options, k) for k in range(N)])
     for n, term in enumerate(vars(terms.filled()).values()):
         got = np.broadcast_to(term.numpy().T, (N, 3))
         np.testing.assert_allclose(got, expected[:, n], rtol=2e-4, atol=5e-5)
 
 
-@pytest.mark.parametrize(("knobs", "diffuse", "occlusion"), CASES[2:])
+@pytest.mark.parametrize(("options", "diffuse", "occlusion"), CASES[2:])
 def test_derivatives_of_the_points(
-    knobs: Accuracy, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
+    options: Accuracy, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
     """Every input of every point against one-sided differences of the oracle, with random weights; where the
     two sides disagree, a kink of the lookup is near."""
@@ -112,7 +112,7 @@ def test_derivatives_of_the_points(
     points, weight = points_of(values), rng.normal(size=(N, 3, 3))
     used = {name: getattr(points, name) for name, x in values.items() if x is not None}
     dr.enable_grad(list(used.values()))
-    terms = shade(points, light, diffuse, knobs)
+    terms = shade(points, light, diffuse, options)
     loss = sum(
         dr.dot(mi.Vector3f(term), vector(weight[:, n]))
         for n, term in enumerate(vars(terms.filled()).values())
@@ -123,7 +123,7 @@ def test_derivatives_of_the_points(
         changed = dict(values)
         changed[name] = np.array(values[name], np.float64)
         changed[name][k] = x
-        return float((oracle(changed, levels, diffuse, knobs, k) * weight[k]).sum())
+        return float((oracle(changed, levels, diffuse, options, k) * weight[k]).sum())
 
     for name, array in used.items():
         gradient = np.array(dr.grad(array)).reshape(-1, N).T
@@ -131,20 +131,20 @@ def test_derivatives_of_the_points(
         assert name == "radiance" or np.abs(gradient).max() > 0, f"{name} receives no gradient"
 
 
-@pytest.mark.parametrize("knobs", KNOBS)
-def test_derivative_of_the_light(knobs: Accuracy, radiance: np.ndarray, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("options", OPTIONS)
+def test_derivative_of_the_light(options: Accuracy, radiance: np.ndarray, rng: np.random.Generator) -> None:
     """Outgoing radiance is linear in radiance: any step will do."""
     points = points_of(scene(rng, "visibility"))
     weight = vector(rng.normal(size=(N, 3)))
     raw = EnvironmentLight.from_radiance(radiance).raw
     dr.enable_grad(raw)
-    lit = shade(points, EnvironmentLight(raw).prefilter(), "irradiance", knobs)
+    lit = shade(points, EnvironmentLight(raw).prefilter(), "irradiance", options)
     dr.backward(dr.dot(mi.Vector3f(lit.total()), weight))
     gradient = dr.grad(raw).numpy() / -np.expm1(-radiance)
 
     def loss(map_: np.ndarray) -> float:
         light = EnvironmentLight.from_radiance(map_).prefilter()
-        total = shade(points, light, "irradiance", knobs).total()
+        total = shade(points, light, "irradiance", options).total()
         return float((total.numpy().astype(np.float64) * weight.numpy()).sum())
 
     for _ in range(3):
@@ -153,8 +153,8 @@ def test_derivative_of_the_light(knobs: Accuracy, radiance: np.ndarray, rng: np.
         assert abs((gradient * step).sum() - difference) < 2e-3 * np.linalg.norm(gradient)
 
 
-@pytest.mark.parametrize("knobs", KNOBS)
-def test_degenerate_points_stay_finite(knobs: Accuracy, radiance: np.ndarray) -> None:
+@pytest.mark.parametrize("options", OPTIONS)
+def test_degenerate_points_stay_finite(options: Accuracy, radiance: np.ndarray) -> None:
     """Zero normals and views, from behind, roughness 0 and 1 (and beyond), colours beyond 1: finite values
     and gradients."""
     normals = [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 0, -1], [0, 1, 0], [1e-25, 0, 0], [1e15, 0, 1e15]]
@@ -177,7 +177,7 @@ def test_degenerate_points_stay_finite(knobs: Accuracy, radiance: np.ndarray) ->
         getattr(points, name) for name in ("normal", "view", "albedo", "metallic", "roughness", "indirect")
     ]
     dr.enable_grad(raw, *inputs)
-    total = shade(points, EnvironmentLight(raw).prefilter(), "irradiance", knobs).total()
+    total = shade(points, EnvironmentLight(raw).prefilter(), "irradiance", options).total()
     dr.backward(total)
     for array in (total, dr.grad(raw).array, *map(dr.grad, inputs)):
         assert dr.all(dr.isfinite(array), axis=None)
@@ -186,7 +186,7 @@ def test_degenerate_points_stay_finite(knobs: Accuracy, radiance: np.ndarray) ->
     dr.enable_grad(leaf)
     dr.set_grad(leaf, 1)
     total = shade(
-        points.replaced(roughness=leaf), EnvironmentLight(raw).prefilter(), "irradiance", knobs
+        points.replaced(roughness=leaf), EnvironmentLight(raw).prefilter(), "irradiance", options
     ).total()
     assert dr.all(dr.isfinite(dr.forward_to(total)), axis=None)
 
@@ -195,7 +195,7 @@ def test_degenerate_points_stay_finite(knobs: Accuracy, radiance: np.ndarray) ->
 
 
 def lit_by(
-    map_: np.ndarray, cosines: list[float], roughness: float, knobs: Accuracy, f0: float
+    map_: np.ndarray, cosines: list[float], roughness: float, options: Accuracy, f0: float
 ) -> np.ndarray:
     """Specular radiance (C,) of a metal under a map, by `shade`; its normal is +x."""
     view = np.array([[c, np.sqrt(1 - c * c), 0] for c in cosines])
@@ -209,7 +209,7 @@ def lit_by(
         "indirect": None,
     }
     light = EnvironmentLight.from_radiance(map_).prefilter()
-    return shade(points_of(values), light, "irradiance", knobs).specular.numpy()[0].astype(np.float64)
+    return shade(points_of(values), light, "irradiance", options).specular.numpy()[0].astype(np.float64)
 
 
 @pytest.mark.parametrize("roughness", [0.3, 0.5, 0.7, 0.9])
@@ -231,8 +231,8 @@ def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -
         for c in cosines
     ]
     mirror, dominant = (
-        np.linalg.norm(lit_by(map_, cosines, roughness, knobs, 0.8) - truth)
-        for knobs in (Accuracy(), KNOBS[0])
+        np.linalg.norm(lit_by(map_, cosines, roughness, options, 0.8) - truth)
+        for options in (Accuracy(), OPTIONS[0])
     )
     print(f"roughness {roughness}: mirror {mirror:.4f}, dominant {dominant:.4f}")
     assert dominant < (0.8 if roughness < 0.6 else 0.5) * mirror
@@ -243,7 +243,7 @@ def test_a_white_metal_loses_nothing(rng: np.random.Generator) -> None:
     values = scene(rng, "open")
     values["albedo"], values["metallic"] = np.ones((N, 3)), np.ones(N)
     light = EnvironmentLight.constant(1.0, 16).prefilter()
-    total = shade(points_of(values), light, "irradiance", KNOBS[1]).total().numpy()
+    total = shade(points_of(values), light, "irradiance", OPTIONS[1]).total().numpy()
     assert shade(points_of(values), light, "irradiance").total().numpy().min() < 0.5
     np.testing.assert_allclose(total, 1, atol=2e-4)
 
@@ -290,6 +290,6 @@ def test_a_point_seen_from_behind_keeps_its_mirror_direction(radiance: np.ndarra
     points = points_of(values)
     mirrored = shade(points.replaced(), light).specular.numpy()
     np.testing.assert_allclose(
-        shade(points, light, "sh", KNOBS[0]).specular.numpy(), mirrored, rtol=2e-4, atol=2e-4
+        shade(points, light, "sh", OPTIONS[0]).specular.numpy(), mirrored, rtol=2e-4, atol=2e-4
     )
     assert dr.all(dr.isfinite(reflect(points.view, points.normal)), axis=None)
