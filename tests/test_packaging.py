@@ -106,7 +106,7 @@ def test_every_package_is_listed() -> None:
     )
 
 
-IMPORT_NAMES = {"scikit_image": "skimage", "pillow": "pil", "mitsuba": "drjit"}
+IMPORT_NAMES = {"scikit_image": "skimage", "pillow": "pil", "mitsuba": "drjit", "dask": "distributed"}
 """What a distribution brings under another name than its own, in lower case."""
 
 

@@ -50,7 +50,7 @@ class Figures:
 
     @staticmethod
     def read() -> Figures:
-        """From the file that comes with the package."""
+        """Read the file that comes with the package."""
         content = read_json(FILE)
         tables = {
             table["table"]: PaperTable(

@@ -68,7 +68,7 @@ class Reader(Protocol):
 
 
 READERS: list[Reader] = []
-"""In the order in which they are asked."""
+"""Every reader, in the order in which they are asked."""
 
 
 def register(reader: Reader) -> None:

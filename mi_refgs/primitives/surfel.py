@@ -166,7 +166,7 @@ class Surfel(Primitive):
         a_x, a_y, b_x, b_y, c_x, c_y, _, x, y, opacity = row[: self.columns]
         r2 = reach(opacity) * 1.0005 + 1e-4  # rounding of q
         low, high = mi.Vector2f(low.x - x, low.y - y), mi.Vector2f(high.x - x, high.y - y)
-        # Of thin ellipses the matrix of q keeps no digit of its determinant: that of a sum of squares of
+        # The matrix of q of a thin ellipse keeps no digit of its determinant. That of a sum of squares of
         # linear forms is the sum of squares of their cross products, and q itself is best left in squares.
         a_b, a_c, b_c = a_x * b_y - a_y * b_x, a_x * c_y - a_y * c_x, b_x * c_y - b_y * c_x
         determinant = dr.square(a_b) - r2 * dr.fma(a_c, a_c, b_c * b_c)
@@ -239,7 +239,7 @@ class FootprintAdjoint:
         δa, δb = u * by_plane, v * by_plane  # of a·δ and b·δ
         self.depth = dr.fma(ratio, δz, self.depth)  # z = p_z / w, or p_z under the low-pass
         δw = -ratio * dr.fma(sample.z, δz, dr.fma(u, u, v * v) * -minus_2δrho)
-        # By the low-pass, ρ is a multiple of δ·δ.
+        # In the low-pass, ρ is a multiple of δ·δ.
         by_screen = dr.select(plane, 0, minus_2δrho)
         self.screen = [dr.fma(by_screen, d, total) for d, total in zip(delta, self.screen, strict=True)]
         self.a = _moments(self.a, δa, delta)

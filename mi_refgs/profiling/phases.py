@@ -33,8 +33,8 @@ PHASES = (
     "optimiser",
     "rest",
 )
-"""In the order of a step. `shade forward` and `shade backward` are those of shading at pixels; shading at
-surfels goes back in `surfels backward`, with the projection. `rest`: whatever no other phase covers."""
+"""Every phase, in the order of a step. `shade forward` and `shade backward` are those of shading at pixels;
+shading at surfels goes back in `surfels backward`, with the projection. `rest`: whatever no other covers."""
 
 WARM_UP = 4
 """Steps with barriers before the first that counts: a kernel that ends at a barrier is compiled anew."""
@@ -120,7 +120,7 @@ def phase_times(
 ) -> dict[str, float]:
     """Median milliseconds of a step by phase, in the order of PHASES; `before` is called ahead of every one.
 
-    With barriers between phases: their sum is more than a step takes, as kernels otherwise fuse across them.
+    There are barriers between phases. The sum is more than a step takes, where kernels fuse across phases.
     """
     rows = []
     for _ in range(WARM_UP + steps):

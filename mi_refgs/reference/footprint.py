@@ -74,5 +74,5 @@ class Footprints(Protocol):
     ) -> tuple[list[tuple[Array, Array, Array]], Array]:
         """α, depth and whether it jumps within the `band` (H, W) of each row; and the order (N, H, W).
 
-        α is clamped, and 0 where culled. By loops, for `reference.splat`.
+        α is clamped, and 0 where culled. Written as loops, for `reference.splat`.
         """

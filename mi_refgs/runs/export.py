@@ -69,7 +69,7 @@ class TrainedScene:
 
     @staticmethod
     def from_state(method: Method, state: Mapping[str, np.ndarray]) -> TrainedScene:
-        """From the state of a `Trainer`, as a checkpoint holds it."""
+        """Take the state of a `Trainer`, as a checkpoint holds it."""
         params = tensors(state, PARAMS)
         light = params.pop(LIGHT, None)
         mesh = None
@@ -88,7 +88,7 @@ class TrainedScene:
 
     @staticmethod
     def read(folder: Path) -> TrainedScene:
-        """From the artefacts in a run folder; raises InputError for a file that cannot be used."""
+        """Read the artefacts in a run folder; raises InputError for a file that cannot be used."""
         note = folder / MODEL
         try:
             content = read_json(note)

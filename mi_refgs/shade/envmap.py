@@ -122,7 +122,7 @@ class UnfilteredLight:
     texels: Any  # flat RGB texels, under AD
 
     def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
-        """As of the `PrefilteredLight`."""
+        """Radiance in unit directions, as `PrefilteredLight.radiance` gives it."""
         h = dr.opaque(mi.UInt32, self.height)
 
         def texel(index: Any) -> Any:

@@ -26,7 +26,7 @@ DIELECTRIC_F0 = 0.04
 """Reflectance at normal incidence of a surface that is not metal (index of refraction 1.5)."""
 
 SMOOTHNESS_FLOOR = 1e-12
-"""Below it √(1 - α), whose slope is infinite at α = 1, is held: its factor is below 1e-12 there."""
+"""Least 1 - α in √(1 - α), whose slope is infinite at α = 1; its factor is below 1e-12 there."""
 
 MEAN_FRESNEL_MAX = 1.25
 """The mean of Schlick's term is at most 1 for a colour in 0 … 1; this cap, out of its reach, keeps the series

@@ -26,7 +26,7 @@ PROBABILITY_MARGIN = 1e-6
 """Distance that initial values keep from 0 and 1, where the logit ends."""
 
 Activation = Literal["identity", "quaternion", "exp", "sigmoid", "harmonics"]
-"""From raw to meaning: the number itself, a normalised quaternion (x, y, z, w), exp, the logistic sigmoid, or
+"""What a raw number means: itself, a normalised quaternion (x, y, z, w), exp, the logistic sigmoid, or
 spherical-harmonic coefficients of a colour, column = 3 coefficient + rgb."""
 
 
