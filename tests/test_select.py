@@ -217,11 +217,16 @@ def test_an_interrupted_selection_resumes_where_it_was(
         assert tensor.shape == resumed.params[name].shape
 
 
-def test_a_run_keeps_its_decisions(variant: str, folder: Path, tmp_path: Path) -> None:
+def test_a_run_keeps_its_decisions(
+    variant: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """On the command line, with real trials: config.toml, decisions.json and the PLY tell of one method."""
     run = tmp_path / "run"
     command = train_command(folder, run, Path(variant))
-    assert main([*command[: command.index("--set")], "--set", *SETTINGS]) == 0
+    assert main([*command[: command.index("--set")], "--json", "--set", *SETTINGS]) == 0
+    printed = capsys.readouterr()
+    assert "refgs: interreflection " in printed.err
+    assert json.loads(printed.out)["decisions"] == json.loads((run / "decisions.json").read_text())
     rows = json.loads((run / "decisions.json").read_text())
     method = Run(run).method()
     assert [row["term"] for row in rows] == ["degree", "specular", "interreflection"]

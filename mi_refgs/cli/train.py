@@ -66,6 +66,11 @@ def run(args: argparse.Namespace) -> Result:
         f"{args.output}: {trainer.iteration} iterations in {trainer.seconds:.0f} s, "
         f"{trainer.surfels.count} surfels; next: refgs eval {args.output}"
     )
+    if trainer.decisions:
+        from mi_refgs.fit.select import table
+
+        data |= {"terms": list(trainer.method.terms), "decisions": trainer.decisions}
+        text = f"{table(trainer.decisions)}\n{text}"
     return Result(data, text)
 
 
