@@ -11,7 +11,6 @@ by more than 1 MB in 10,000 steps or met a value that is not finite.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
@@ -29,6 +28,8 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
+
+from benchmarks.common.command import plain_parser
 
 ROOT = Path(__file__).parents[1]
 SIZE, VIEWS = 32, 5
@@ -265,11 +266,7 @@ def _resident() -> int:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one of the two and print its result as JSON."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.survival",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = plain_parser("survival", __doc__)
     parser.add_argument("what", choices=("kill", "soak"))
     parser.add_argument("--times", type=int, default=50, help="kills")
     parser.add_argument("--steps", type=int, default=100_000)

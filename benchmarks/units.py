@@ -10,7 +10,6 @@ differs from that of the first unit by more than 0.1 dB, or normals by more than
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 
 import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
+from benchmarks.common.command import plain_parser
 from benchmarks.common.report import write_json
 
 import drjit as dr  # isort: skip
@@ -93,11 +93,7 @@ def means(rows: list[dict[str, Any]], key: str) -> dict[str, float]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.units",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = plain_parser("units", __doc__)
     parser.add_argument("--size", type=int, default=64, help="pixels a side (default %(default)s)")
     parser.add_argument("--views", type=int, default=32, help="training views (default %(default)s)")
     parser.add_argument("--seeds", type=int, default=4, help="fits of each unit (default %(default)s)")

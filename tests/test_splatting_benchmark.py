@@ -14,7 +14,7 @@ from benchmark_runs import read_result, small_instance  # first: it lets `benchm
 
 from benchmarks.common.select import where
 from benchmarks.common.timing import milliseconds
-from benchmarks.splatting import errors, fits, page, roofline
+from benchmarks.splatting import errors, page, roofline
 from benchmarks.splatting import measure as measure_module
 from benchmarks.splatting.__main__ import main
 from benchmarks.splatting.ours import Ours
@@ -201,7 +201,7 @@ def test_fits_find_what_was_put_in() -> None:
     rows = [dict(zip("abc", rng.uniform(1, 1e6, size=3), strict=True)) for _ in range(12)]
     for row in rows:
         row["y"] = 5e6 + 3 * row["a"] + 40 * row["b"]
-    found = fits.plane(rows, "y", "abc")
+    found = measure_module.plane(rows, "y", "abc")
     expected = {"constant": 5e6, "a": 3, "b": 40}
     assert all(found[key] == pytest.approx(value, rel=1e-3) for key, value in expected.items())
     assert found["c"] < 1e-2 and found["r2"] > 0.9999

@@ -18,7 +18,7 @@ from benchmark_runs import read_result, run_benchmark, small_instance
 from benchmarks.common import budget, errors, lights, view
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.select import where
-from benchmarks.splitsum import decompose, methods, speedup, surfels
+from benchmarks.splitsum import decompose, exact, speedup, surfels
 from mi_refgs.errors import InputError
 from mi_refgs.reference.shade import lobe_average, split_sum
 from mi_refgs.shade import lobe_matrices
@@ -348,7 +348,7 @@ def test_equal_error_is_interpolated() -> None:
 def test_other_levels_are_filtered_beside_the_shipped_ones() -> None:
     """A light with other levels has their texels and mixes by their roughness."""
     light = lights.make_light("gradient", 16).environment(16)
-    shipped, few = light.prefilter(), light.prefilter(methods.LEVEL_SETS["few"])
+    shipped, few = light.prefilter(), light.prefilter(exact.LEVEL_SETS["few"])
     assert len(few.operator.shapes) == 4
     assert len(np.array(few.levels)) < len(np.array(shipped.levels))
     direction = mi.Vector3f(0.6, 0.0, 0.8)

@@ -20,8 +20,7 @@ from benchmarks.common.montecarlo import estimate
 from benchmarks.common.select import where
 from benchmarks.visibility import scenes, tradeoff
 from benchmarks.visibility.__main__ import main
-from benchmarks.visibility.rules import Rule
-from benchmarks.visibility.settings import SMALL
+from benchmarks.visibility.settings import SMALL, Rule
 from benchmarks.visibility.setup import Setup
 
 Row = dict[str, Any]

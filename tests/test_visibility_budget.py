@@ -16,9 +16,8 @@ from benchmarks.common.budget import Step, decompose
 from benchmarks.common.view import Look
 from benchmarks.visibility import budget, harmonics
 from benchmarks.visibility.measure import DEPTHS
-from benchmarks.visibility.rules import PAPER, Rule
 from benchmarks.visibility.scenes import Concave, make_scene
-from benchmarks.visibility.settings import SMALL
+from benchmarks.visibility.settings import PAPER, SMALL, Rule
 from benchmarks.visibility.setup import Setup
 from mi_refgs.shade.points import reflect
 from mi_refgs.shade.sh import sh_basis

@@ -9,23 +9,43 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
+
+import mitsuba as mi  # isort: skip
+
 from benchmarks.common.lights import ROOT
 from benchmarks.common.report import fill, write_csv, write_json, write_text
 from mi_refgs.errors import InputError
 
 
-def make_parser(name: str, description: str | None) -> argparse.ArgumentParser:
-    """Parser of `python -m benchmarks.NAME` with the options that all have, but for the sizes."""
-    parser = argparse.ArgumentParser(
+def plain_parser(name: str, description: str | None) -> argparse.ArgumentParser:
+    """Parser of `python -m benchmarks.NAME`."""
+    return argparse.ArgumentParser(
         prog=f"python -m benchmarks.{name}",
         description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def make_parser(
+    name: str, description: str | None, page: Any = None, **sizes: tuple[Any, str]
+) -> argparse.ArgumentParser:
+    """With the options that all pages have, and a flag for each other size than that of the page.
+
+    `sizes`: settings and help. `options.settings` are the chosen ones. Sets Mitsuba's variant.
+    """
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    parser = plain_parser(name, description)
+    parser.set_defaults(settings=page)
     parser.add_argument("-o", "--output", type=Path, help="folder; without it docs/ and runs/")
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="write page and pictures of this earlier run"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    group = parser.add_mutually_exclusive_group()
+    for flag, (settings, text) in sizes.items():
+        group.add_argument(f"--{flag}", action="store_const", dest="settings", const=settings, help=text)
     return parser
 
 

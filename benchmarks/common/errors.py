@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,10 @@ class Errors:
     def below_floor(self) -> bool:
         """Whether relMSE cannot be told from the reference's noise."""
         return self.relmse < CLEAR * self.relmse_floor
+
+    def record(self) -> dict[str, Any]:
+        """For CSV and JSON."""
+        return vars(self) | {"below_floor": self.below_floor}
 
 
 def weight(reference: np.ndarray, scale: float | None = None) -> np.ndarray:

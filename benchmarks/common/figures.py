@@ -41,6 +41,31 @@ def new(rows: int, columns: int, width: float, height: float, **options: Any) ->
     return figure, axes
 
 
+def grid(titles: Sequence[str], columns: int, width: float, height: float, x: str, y: str) -> tuple[Any, Any]:
+    """Figure and an axis for each title, in rows of so many; axes are shared, labels stand at the rim."""
+    columns = min(columns, len(titles))
+    figure, axes = new(-(-len(titles) // columns), columns, width, height, sharex=True, sharey=True)
+    for ax, title in zip(axes.flat, titles, strict=False):
+        ax.set_title(title, fontsize=9)
+    for ax in axes.flat[len(titles) :]:
+        ax.set_visible(False)
+    for ax in axes[-1]:
+        ax.set_xlabel(x, fontsize=8)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(y, fontsize=8)
+    return figure, axes.ravel()[: len(titles)]
+
+
+def legend(figure: Any, axes: Any, title: str, columns: int) -> None:
+    """One legend for all panels, and the title."""
+    named: dict[str, Any] = {}
+    for ax in axes:
+        named |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    options = {"loc": "outside lower center", "ncols": columns, "fontsize": 8, "frameon": False}
+    figure.legend(named.values(), named.keys(), **options)
+    figure.suptitle(title, fontsize=10)
+
+
 def series(
     ax: Any,
     points: Sequence[tuple[float, float, Any]],

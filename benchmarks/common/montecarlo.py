@@ -33,8 +33,6 @@ TABLE_NODES = 700
 """Midpoints of the float64 quadrature of (A, B): exact to 1e-6."""
 TABLE_COSINES = np.linspace(0.05, 1.0, 40) ** 2
 """n·v at which the quadrature is done; a cubic spline in √(n·v) lies between."""
-TABLE_TEXELS = 256
-"""Steps in √(n·v) of the reflectance that plain Monte Carlo looks up: linear between them within 1e-4."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +78,6 @@ def exact_table(n_dot_v: np.ndarray, roughness: float) -> tuple[np.ndarray, np.n
     """(A, B) (P, 1) each, by float64 quadrature of the reference implementation."""
     a, b = _table_spline(roughness)(np.sqrt(np.clip(n_dot_v, TABLE_COSINES[0], 1))).T
     return a[:, None], b[:, None]
-
-
-def left_by_specular(f0: Any, scale: Any, bias: Any) -> Any:
-    """Factor of the diffuse term: the part of a constant light that the specular one does not reflect."""
-    return 1 - f0 * scale - bias
 
 
 def smith_lambda(cosine: Any, α2: Any) -> Any:
@@ -260,75 +253,3 @@ def integrate(
 
 def _wrap(u: Any) -> Any:
     return u - dr.floor(u)
-
-
-@dataclass(frozen=True)
-class Material:
-    """One material for a whole object, on the device and opaque: another one compiles no new kernel."""
-
-    albedo: Any  # mi.Color3f
-    metallic: Any
-    roughness: Any
-    f0: Any
-    diffuse: Any  # mi.Float (3 (TABLE_TEXELS + 1)): diffuse reflectance over √(n·v), by rows
-
-    def diffuse_reflectance(self, cosine: Any) -> Any:
-        """What the diffuse term (mi.Color3f) reflects of a constant light, seen at this cosine."""
-        x = dr.sqrt(dr.clip(cosine, 0, 1)) * TABLE_TEXELS
-        first = dr.minimum(mi.UInt32(x), TABLE_TEXELS - 1)
-        low, high = (dr.gather(mi.Color3f, self.diffuse, first + k) for k in (0, 1))
-        return dr.lerp(low, high, x - mi.Float(first))
-
-
-def device_material(albedo: tuple[float, float, float], metallic: float, roughness: float) -> Material:
-    """Opaque values; F0 = 0.04 (1 - metallic) + albedo metallic."""
-    f0 = [0.04 * (1 - metallic) + a * metallic for a in albedo]
-    table = exact_table(np.linspace(0, 1, TABLE_TEXELS + 1) ** 2, roughness)
-    diffuse = left_by_specular(np.array(f0), *table) * (1 - metallic) * np.array(albedo)
-
-    def opaque(values: Any) -> Any:
-        return mi.Color3f(*(dr.opaque(mi.Float, float(x)) for x in values))
-
-    return Material(
-        opaque(albedo),
-        dr.opaque(mi.Float, metallic),
-        dr.opaque(mi.Float, roughness),
-        opaque(f0),
-        mi.Float(diffuse.ravel().astype(np.float32)),
-    )
-
-
-def monte_carlo(points: Points, material: Material, emitter: Any, samples: Any, seed: Any) -> Any:
-    """Outgoing radiance by plain importance sampling of the reflectance, `samples` (mi.UInt32) a point.
-
-    One of two lobes is drawn for each sample, visible normals or the cosine, and divided by their mixture's
-    density. The light is not sampled: this is what a renderer with a good BSDF and no emitter sampling pays.
-    """
-    frame = mi.Frame3f(points.normal)
-    view, α = frame.to_local(points.view), dr.square(material.roughness)
-    α2 = dr.square(α)
-    diffuse = material.diffuse_reflectance(view.z)
-    # Schlick at the view angle is close enough to choose a lobe by.
-    grazing = dr.clip(1 - view.z, 0, 1)
-    mirror = (
-        mi.luminance(material.f0) + (1 - mi.luminance(material.f0)) * dr.square(dr.square(grazing)) * grazing
-    )
-    share = mirror / (mirror + mi.luminance(diffuse))
-    rng = mi.PCG32(size=points.count, initstate=mi.UInt64(seed))
-
-    def body(i: Any, total: Any, rng: Any) -> tuple[Any, ...]:
-        choice = rng.next_float32()
-        u = mi.Point2f(rng.next_float32(), rng.next_float32())
-        light = dr.select(
-            choice < share, _reflect(view, sample_visible(view, α, u)), mi.warp.square_to_cosine_hemisphere(u)
-        )
-        specular, density, schlick = specular_times_cosine(view, light, α2)
-        cosine = dr.maximum(light.z, 0) * dr.inv_pi
-        value = diffuse * cosine + (material.f0 * (1 - schlick) + schlick) * specular
-        density = dr.lerp(cosine, density, share)
-        arriving = radiance(emitter, frame.to_world(light))
-        return i + 1, total + dr.select(light.z > 0, value * arriving / density, 0), rng
-
-    start = (mi.UInt32(0), dr.zeros(mi.Color3f, points.count), rng)
-    _, total, _ = dr.while_loop(start, lambda i, *_: i < samples, body)
-    return total / mi.Float(samples)

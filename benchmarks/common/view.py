@@ -58,13 +58,8 @@ class Look:
 def make_sensor(look: Look, size: int) -> Any:
     """Sensor of size × size pixels that samples pixel centres only."""
     _register(mi.variant())
-    film = {
-        "type": "hdrfilm",
-        "width": size,
-        "height": size,
-        "rfilter": {"type": "box"},
-        "component_format": "float32",
-    }
+    box = {"type": "box"}
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": box, "component_format": "float32"}
     to_world = mi.ScalarTransform4f().look_at(look.origin, look.target, [0, 1, 0])
     camera = {"type": "perspective", "fov": look.fov, "to_world": to_world, "film": film}
     return mi.load_dict({"type": SENSOR, "inner": camera, "film": film, "sampler": {"type": "independent"}})
@@ -126,6 +121,11 @@ def surface(scene: Any, sensor: Any, size: int) -> Points:
     found = every.gather(dr.compress(front))
     dr.eval(found.position, found.normal, found.view, found.offset)
     return found
+
+
+def rows(vectors: Any) -> np.ndarray:
+    """Dr.Jit's vectors or colours of P points as (P, 3) float64."""
+    return np.array(vectors, np.float64).T
 
 
 def view_bins(n_dot_v: np.ndarray) -> dict[str, np.ndarray]:

@@ -8,7 +8,6 @@ file to standard output. The exit code is 1 if there was one.
 
 from __future__ import annotations
 
-import argparse
 import collections
 import json
 import select
@@ -18,6 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common.command import plain_parser
 from benchmarks.fuzz import SECONDS
 from benchmarks.fuzz.readers import READERS
 from benchmarks.fuzz.worker import mutated
@@ -77,9 +77,7 @@ def row(name: str, found: list[dict[str, Any]]) -> str:
 
 def main() -> int:
     """Run, and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = plain_parser("fuzz", __doc__)
     parser.add_argument("--files", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--reader", nargs="+", choices=READERS, default=list(READERS), metavar="NAME")

@@ -49,27 +49,21 @@ class Reader:
 
     name: str
     kind: str  # how `mutate` may change the files: "json", "toml", "xml", or "" for bytes alone
-    samples: Callable[
-        [Path], list[bytes]
-    ]  # files to start from; may put others that these name in the folder
+    samples: Callable[[Path], list[bytes]]  # to start from; may put files that these name in the folder
     read: Callable[[Path, bytes], None]  # writes the file into the folder and reads it
     inside: bool = True  # whether it may open files in the folder only
     finish: Callable[[bytes], bytes] = lambda data: data  # after the mutation, every second time
 
 
 def _read_file(read: Callable[[Path], Any], name: str) -> Callable[[Path, bytes], None]:
+    """Fails for an answer that cannot be right: `read` gives the arrays that must be finite, or None."""
+
     def run(folder: Path, data: bytes) -> None:
         (folder / name).write_bytes(data)
-        read(folder / name)
+        found = [array for array in read(folder / name) or () if array is not None]
+        assert all(np.isfinite(array).all() for array in found), "a value that is not finite"
 
     return run
-
-
-def _finite(*arrays: Any) -> None:
-    """Fail for an answer that cannot be right."""
-    assert all(np.isfinite(array).all() for array in arrays if array is not None), (
-        "a value that is not finite"
-    )
 
 
 # ---------------- surfels and meshes ----------------
@@ -92,10 +86,6 @@ def _surfel_files(folder: Path) -> list[bytes]:
         f"ply\nformat ascii 1.0\ncomment c\n{header}{text}\n".encode(),
         f"ply\nformat binary_big_endian 1.0\n{header}".encode() + rows.astype(">f8").tobytes(),
     ]
-
-
-def _read_surfels(path: Path) -> None:
-    _finite(*read_ply(path).to_numpy().values())
 
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float32)
@@ -124,31 +114,25 @@ def _foreign_meshes(folder: Path) -> list[bytes]:
     obj = "mtllib ../../etc/passwd\n" + str(solid.export(file_type="obj"))
     return [
         b"obj" + obj.encode(),
-        b"stl" + _binary(solid.export(file_type="stl")),
+        b"stl" + bytes(solid.export(file_type="stl")),
         b"stl" + str(solid.export(file_type="stl_ascii")).encode(),
         b"off" + str(solid.export(file_type="off")).encode(),
     ]
 
 
-def _binary(data: Any) -> bytes:
-    return bytes(data)
-
-
-def _read_mesh(path: Path) -> None:
+def _read_mesh(path: Path) -> list[Any]:
     """Rays through the mesh as well: Embree reads what a wrong index names."""
     mesh = read_mesh(path)
-    _finite(mesh.vertices, mesh.voxel)
     points = np.random.default_rng(SEED).normal(size=(3, 64)).astype(np.float32)
     Occluder(mesh).visible(mi.Point3f(points), mi.Vector3f(-points)).numpy()
+    return [mesh.vertices, mesh.voxel]
 
 
 def _read_foreign_mesh(folder: Path, data: bytes) -> None:
     """The first three bytes of the sample say what it is, and stay as they are told."""
     ending = data[:3].decode("latin-1")
     ending = ending if ending in ("obj", "stl", "off") else "obj"
-    path = folder / f"a.{ending}"
-    path.write_bytes(data[3:])
-    _read_mesh(path)
+    _read_file(_read_mesh, f"a.{ending}")(folder, data[3:])
 
 
 # ---------------- pictures ----------------
@@ -169,10 +153,6 @@ def _exr_files(folder: Path) -> list[bytes]:
     return [*files, (folder / "a.exr").read_bytes(), (folder / "b.exr").read_bytes()]
 
 
-def _read_exr(path: Path) -> None:
-    _finite(read_exr_image(path))
-
-
 def _picture_files(folder: Path) -> list[bytes]:
     rgba = np.random.default_rng(SEED).integers(0, 256, (9, 11, 4), dtype=np.uint8)
     picture, files = Image.fromarray(rgba), []
@@ -191,10 +171,10 @@ def _saved(picture: Any, kind: str, **options: Any) -> bytes:
     return buffer.getvalue()
 
 
-def _read_picture(path: Path) -> None:
+def _read_picture(path: Path) -> list[Any]:
     pixels = read_png(path)
-    _finite(pixels)
-    assert pixels.min() >= 0 and pixels.max() <= 1
+    assert not (pixels < 0).any() and not (pixels > 1).any()
+    return [pixels]
 
 
 def _light_files(folder: Path) -> list[bytes]:
@@ -206,8 +186,8 @@ def _light_files(folder: Path) -> list[bytes]:
     return files + _picture_files(folder)[:2]
 
 
-def _read_light(path: Path) -> None:
-    _finite(EnvironmentLight.from_file(path).radiance().numpy())
+def _read_light(path: Path) -> list[Any]:
+    return [EnvironmentLight.from_file(path).radiance().numpy()]
 
 
 # ---------------- data sets and runs ----------------
@@ -233,9 +213,10 @@ def _transforms(folder: Path) -> list[bytes]:
     return [json.dumps(content).encode() for content in contents]
 
 
-def _read_transforms(path: Path) -> None:
-    for view in read_dataset(path.parent, "train").views:
-        _finite(view.image, view.alpha, view.depth, view.to_world, [view.fx, view.fy, view.cx, view.cy])
+def _read_transforms(path: Path) -> list[Any]:
+    views = read_dataset(path.parent, "train").views
+    cameras = [np.array([view.fx, view.fy, view.cx, view.cy]) for view in views]
+    return [*cameras, *(x for v in views for x in (v.image, v.alpha, v.depth, v.to_world))]
 
 
 def _methods(folder: Path) -> list[bytes]:
@@ -292,19 +273,15 @@ def _models(folder: Path) -> list[bytes]:
     (folder / "surfels.ply").write_bytes(_surfel_files(folder)[0])
     write_mesh(folder / "mesh.ply", Mesh(CUBE, TRIANGLES, 0.1))
     accuracy = {"dominant": False, "multiscatter": False, "visibility_rays": 1, "traced_bounces": 0}
-    shading = {
-        "at": "pixel",
-        "reflectance": "radiance",
-        "diffuse": "sh",
-        "occlusion": False,
-        "accuracy": accuracy,
-    }
+    shading = {"at": "pixel", "reflectance": "radiance", "diffuse": "sh", "occlusion": False}
+    shading["accuracy"] = accuracy
     return [json.dumps({"iteration": 3, "seconds": 1.5, "surfels": 7, "shading": shading}).encode()]
 
 
-def _read_model(path: Path) -> None:
+def _read_model(path: Path) -> list[Any]:
     fitted = TrainedScene.read(path.parent)
-    assert isinstance(fitted.iteration, int) and np.isfinite(fitted.seconds)
+    assert isinstance(fitted.iteration, int)
+    return [fitted.seconds]
 
 
 def _read_data_place(path: Path) -> None:
@@ -331,10 +308,6 @@ def _read_settings(path: Path) -> None:
 def _logs(folder: Path) -> list[bytes]:
     lines = [json.dumps({"iteration": i, "loss": 0.5 / i, "psnr": None}) for i in range(1, 9)]
     return ["\n".join(lines).encode(), lines[0].encode()]
-
-
-def _read_log(path: Path) -> None:
-    Run(path.parent).rewind(5)
 
 
 # ---------------- Mitsuba ----------------
@@ -376,20 +349,20 @@ def _file(name: str, kind: str, samples: Any, read: Callable[[Path], Any], file:
 READERS = {
     reader.name: reader
     for reader in (
-        _file("ply", "", _surfel_files, _read_surfels, "x.ply"),
+        _file("ply", "", _surfel_files, lambda path: read_ply(path).to_numpy().values(), "x.ply"),
         _file("mesh", "", _meshes, _read_mesh, "x.ply"),
         Reader("mesh-other", "", _foreign_meshes, _read_foreign_mesh),
         _file("transforms", "json", _transforms, _read_transforms, "transforms_train.json"),
         # A method may extend one elsewhere: it is the user's own file.
         _file("method", "toml", _methods, _read_method, "x.toml", inside=False),
-        _file("exr", "", _exr_files, _read_exr, "x.exr"),
+        _file("exr", "", _exr_files, lambda path: [read_exr_image(path)], "x.exr"),
         _file("picture", "", _picture_files, _read_picture, "x.png"),
         _file("light", "", _light_files, _read_light, "x.hdr"),
         _file("checkpoint", "", _checkpoints, _read_checkpoint, "x.npz", finish=_sign),
         _file("model", "json", _models, _read_model, "model.json"),
         _file("run-data", "json", _data_places, _read_data_place, "dataset.json", inside=False),
         _file("dataset", "json", _settings, _read_settings, "dataset.json"),
-        _file("log", "json", _logs, _read_log, "metrics.jsonl"),
+        _file("log", "json", _logs, lambda path: Run(path.parent).rewind(5), "metrics.jsonl"),
         # A scene may name files anywhere, as every scene of Mitsuba's.
         _file("scene", "xml", _scenes, _read_scene, "x.xml", inside=False),
     )

@@ -9,7 +9,6 @@ First all named tests run without a mistake: they must pass, or failing would pr
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
 
+from benchmarks.common.command import plain_parser
 from benchmarks.mutation.planting import Mistake, catalogue, copy_repository, planted
 
 WORKERS = 2
@@ -30,11 +30,7 @@ PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist")
 
 def main(arguments: list[str] | None = None) -> int:
     """Run, and print a line a mistake and the counts."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.mutation",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = plain_parser("mutation", __doc__)
     parser.add_argument("--only", default="", metavar="WORD", help="mistakes whose name holds the word")
     parser.add_argument("--list", action="store_true", help="print the catalogue and stop")
     parser.add_argument("--workers", type=int, default=WORKERS, metavar="N", help="copies tested at once")

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import drjit as dr
+import numpy as np
+from scipy.optimize import nnls
 from tqdm import tqdm
 
 from benchmarks.common import report, timing
-from benchmarks.splatting import errors, fits, process, roofline
+from benchmarks.splatting import errors, process, roofline
 from benchmarks.splatting.ours import Ours
 from benchmarks.splatting.settings import Settings
 from benchmarks.splatting.volprim import Volprim
@@ -56,10 +58,10 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
         "machine": report.machine(),
         "peaks": peaks,
         "rows": rows,
-        "cost": fits.plane(spheres, "both_ms", COST) if len(spheres) > len(COST) + 1 else None,
+        "cost": plane(spheres, "both_ms", COST) if len(spheres) > len(COST) + 1 else None,
         "errors": wrong,
         "memory": memory,
-        "memory_fit": fits.plane(memory, "peak", MEMORY) if len(memory) > len(MEMORY) + 1 else None,
+        "memory_fit": plane(memory, "peak", MEMORY) if len(memory) > len(MEMORY) + 1 else None,
         "large_step": process.measure_step(settings.large_step),
         "compile": process.measure_compile(settings.compiled),
         "step": step_times(*settings.step, settings.steps),
@@ -97,3 +99,22 @@ def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row
         row |= {f"bound_{kind}_ms": bound[kind], f"bytes_{kind}": moved[kind]}
         row |= {f"launches_{kind}": launches[kind][0], f"misses_{kind}": launches[kind][1]}
     return row
+
+
+def plane(rows: Sequence[Row], target: str, names: Sequence[str]) -> dict[str, float]:
+    """row[target] = constant + Σ c row[name], no coefficient negative; R², and the worst relative residual.
+
+    Squares of relative residuals are summed, so that small cases count as much as large ones.
+    """
+    values = np.array([float(row[target]) for row in rows])
+    design = np.array([[1.0, *(float(row[name]) for name in names)] for row in rows])
+    scale = design.max(axis=0)  # keeps the solver's columns of one size
+    solution, _ = nnls(design / scale / values[:, None], np.ones(len(rows)))
+    found = solution / scale
+    residual = design @ found - values
+    return {
+        "constant": float(found[0]),
+        **{name: float(value) for name, value in zip(names, found[1:], strict=True)},
+        "r2": 1 - float(np.sum(residual**2) / np.sum((values - values.mean()) ** 2)),
+        "worst": float(np.abs(residual / values).max()),
+    }

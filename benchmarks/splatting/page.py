@@ -138,7 +138,7 @@ WORDS = {"contributing": "contributing pair", "pairs": "listed pair", "surfels":
 def _sum(
     fit: Row | None, unit: str, scale: float, small: str, small_scale: float, names: Sequence[str]
 ) -> str:
-    """A fit of `fits.plane` as a formula."""
+    """A fit of `measure.plane` as a formula."""
     if fit is None:
         return "(not fitted)"
     terms = [f"{number(scale * fit['constant'])} {unit}"]

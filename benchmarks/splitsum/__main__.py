@@ -14,23 +14,19 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 
-import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
-
-import mitsuba as mi  # isort: skip
-
 from benchmarks.common.command import make_parser, write_reports
 from benchmarks.common.lights import BUILT_IN
+from benchmarks.splitsum.measure import measure
+from benchmarks.splitsum.page import page
+from benchmarks.splitsum.plots import plot
+from benchmarks.splitsum.settings import CONVEX, FULL, PAGE, SMALL
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure, and write the reports; exit code 2 for bad input."""
-    mi.set_variant("llvm_ad_rgb")
-    from benchmarks.splitsum.settings import CONVEX, FULL, PAGE, SMALL
-
-    parser = make_parser("splitsum", __doc__)
-    size = parser.add_mutually_exclusive_group()
-    size.add_argument("--small", action="store_true", help="a coarse instance, below a minute")
-    size.add_argument("--full", action="store_true", help="more pixels and samples, about an hour")
+    small = (SMALL, "a coarse instance, below a minute")
+    full = (FULL, "more pixels and samples, about an hour")
+    parser = make_parser("splitsum", __doc__, PAGE, small=small, full=full)
     parser.add_argument(
         "--envmap", metavar="FILE", action="append", default=[], help="another light; repeatable"
     )
@@ -40,18 +36,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--shape", action="append", choices=CONVEX, help="only these shapes; repeatable")
     parser.add_argument("--size", type=int, help="edge of the pictures whose error is measured, pixels")
     options = parser.parse_args(arguments)
-
-    from benchmarks.splitsum.measure import measure
-    from benchmarks.splitsum.page import page
-    from benchmarks.splitsum.plots import plot
-
-    settings = SMALL if options.small else FULL if options.full else PAGE
+    settings = options.settings
     settings = replace(settings, lights=(*(options.light or settings.lights), *options.envmap))
     if options.shape:
         settings = replace(settings, shapes=tuple(options.shape), budget_shapes=tuple(options.shape))
     if options.size:
         settings = replace(settings, size=options.size)
-
     return write_reports("splitsum", options, lambda: measure(settings, options.quiet), plot, page)
 
 

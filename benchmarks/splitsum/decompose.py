@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from benchmarks.common.budget import Step, decompose, noise_floor
-from benchmarks.splitsum import methods
-from benchmarks.splitsum.exact import Setup, diffuse, reflectance
+from benchmarks.common.budget import Row, Step, decompose, noise_floor
+from benchmarks.common.view import rows
+from benchmarks.splitsum.exact import Exact, diffuse, reflectance, split_sum
 from benchmarks.splitsum.settings import CONVEX
 from mi_refgs.shade.points import reflect
 
@@ -24,7 +23,7 @@ SHADOW = "no shadow"
 BOUNCES = "no inter-reflection"
 
 
-def budgets(setup: Setup) -> list[dict[str, Any]]:
+def budgets(setup: Exact) -> list[Row]:
     """Budgets of every roughness and metal of a shape under a light, at the default height and the finest."""
     settings = setup.settings
     heights = sorted({settings.height, settings.heights[-1]})
@@ -33,73 +32,42 @@ def budgets(setup: Setup) -> list[dict[str, Any]]:
     found = []
     for roughness in settings.roughness:
         around = setup.prefiltered(roughness).mean
-        for height in heights:
-            lookups = _lookups(setup, roughness, lights[height], finest, around)
-            for metallic in settings.budget_metallic:
-                steps = _chain(setup, roughness, metallic, lights[height], lookups)
-                found.append(
-                    {
-                        "shape": setup.name,
-                        "light": setup.light.name,
-                        "roughness": roughness,
-                        "metallic": metallic,
-                        "height": height,
-                        "floor": _noise(setup, roughness, metallic),
-                        **decompose(steps).record(),
-                    }
-                )
+        for height, metallic in itertools.product(heights, settings.budget_metallic):
+            steps = _chain(setup, roughness, metallic, lights[height], finest, around)
+            reference = setup.integrals(roughness).radiance(metallic)
+            row = setup.case(roughness, metallic) | {"height": height}
+            row["floor"] = noise_floor(reference.error, reference.mean)
+            found.append(row | decompose(steps).record())
     return found
 
 
-def _lookups(
-    setup: Setup, roughness: float, shipped: Any, finest: Any, around: np.ndarray
-) -> dict[str, np.ndarray]:
-    """What the chains of all metals share: radiance around the mirror direction in three qualities."""
-    points = setup.points
-    mirror = reflect(points.view, points.normal)
-    r = dr.opaque(mi.Float, roughness)
-    return {
-        "shipped": methods.picture_values(shipped.specular(mirror, r)),
-        "finest": methods.picture_values(finest.specular(mirror, r)),
-        "exact": around,
-        "irradiance": methods.picture_values(shipped.irradiance(points.normal)),
-    }
-
-
 def _chain(
-    setup: Setup, roughness: float, metallic: float, shipped: Any, lookups: dict[str, np.ndarray]
+    setup: Exact, roughness: float, metallic: float, light: Any, finest: Any, lobe: np.ndarray
 ) -> list[Step]:
-    """From the product's own picture to the exact one."""
-    f0 = reflectance(metallic)
-    values = methods.picture_values(
-        methods.split_sum(setup.points, methods.material(metallic, roughness), shipped)
-    )
+    """From the product's own picture to the exact one; `lobe`: the exact average around the mirror."""
+    points, f0 = setup.points, reflectance(metallic)
+    material = setup.set_material(metallic, roughness)
+    mirror = reflect(points.view, points.normal)
+    looked_up, resolved = (rows(x.specular(mirror, material["roughness"])) for x in (light, finest))
     integrals = setup.integrals(roughness)
     a, b = integrals.table
-    base = diffuse(metallic, integrals.table)
-    looked_up, exact = base * lookups["irradiance"], base * integrals.irradiance.mean
+    base, table = diffuse(metallic, integrals.table), f0 * a + b
+    exact = base * integrals.irradiance.mean
     around = (integrals.scale.mean + integrals.bias.mean) / (a + b)
-    table = f0 * a + b
     steps = [
-        Step("", values),
-        Step(TABLE, lookups["shipped"] * table + looked_up),
-        Step(IRRADIANCE, lookups["shipped"] * table + exact),
-        Step(RESOLUTION, lookups["finest"] * table + exact),
-        Step(LEVELS, lookups["exact"] * table + exact),
+        Step("", rows(split_sum(points, material, light))),
+        Step(TABLE, looked_up * table + base * rows(light.irradiance(points.normal))),
+        Step(IRRADIANCE, looked_up * table + exact),
+        Step(RESOLUTION, resolved * table + exact),
+        Step(LEVELS, lobe * table + exact),
         Step(LOBE, around * table + exact),
         Step(SCHLICK, integrals.radiance(metallic).mean),
     ]
     return steps if setup.name in CONVEX else steps + _concave(setup, roughness, metallic)
 
 
-def _concave(setup: Setup, roughness: float, metallic: float) -> list[Step]:
+def _concave(setup: Exact, roughness: float, metallic: float) -> list[Step]:
     """What the shape itself adds: its shadow, and light that it reflects onto itself."""
     direct = setup.integrals(roughness, occluded=True).radiance(metallic).mean
     further = setup.bounces(roughness, metallic)
     return [Step(SHADOW, direct), Step(BOUNCES, direct + further)]
-
-
-def _noise(setup: Setup, roughness: float, metallic: float) -> float:
-    """relMSE below which a part or a whole cannot be told from the references' noise."""
-    reference = setup.integrals(roughness).radiance(metallic)
-    return noise_floor(reference.error, reference.mean)

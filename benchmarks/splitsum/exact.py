@@ -1,7 +1,8 @@
-"""Set-ups: one shape under one light as Mitsuba's scene, with the exact integrals of every roughness."""
+"""Set-ups with the exact integrals of every roughness, and the split sum's own pictures of them."""
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +13,37 @@ import numpy as np
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.lights import Light
 from benchmarks.common.montecarlo import Estimate
-from benchmarks.common.view import Points, make_sensor, surface
-from benchmarks.splitsum.settings import ALBEDO, SHAPES, Settings, shape
+from benchmarks.common.setup import ALBEDO, Setup, path_tracer, shading_points
+from benchmarks.common.view import Points
+from benchmarks.splitsum.settings import SHAPES, Settings, shape
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.lobe_matrices import LEVELS, Levels
+from mi_refgs.shade.split_sum import shade
+
+SHIPPED = "shipped"
+FULL_DEPTH = 8
+
+
+def _levels(*roughness: float) -> Levels:
+    """Levels of these, each as fine as the shipped one of the next larger roughness."""
+    finer = (int(np.searchsorted(LEVELS.roughness, r - 1e-6)) for r in roughness)
+    return Levels(roughness, tuple(LEVELS.max_height[i] for i in finer))
+
+
+LEVEL_SETS = {
+    "few": _levels(0.1, 0.32, 1.0),
+    SHIPPED: LEVELS,
+    "many": _levels(0.07, 0.1, 0.12, 0.15, 0.18, 0.22, 0.265, 0.32, 0.38, 0.45, 0.54, 0.65, 0.8, 1.0),
+}
+"""Filtered levels; the map itself is one more."""
+
+OPTIONS = {"": Accuracy(), "dominant": Accuracy(dominant=True), "multiscatter": Accuracy(multiscatter=True)}
+"""Settings of `shade` that concern a surface that nothing shadows."""
+
+
+def split_sum(points: Points, material: dict[str, Any], light: Any, option: str = "") -> Any:
+    """Outgoing radiance (mi.Color3f) as the product shades it."""
+    return shade(shading_points(points, material), light, "irradiance", OPTIONS[option]).total()
 
 
 @dataclass(frozen=True)
@@ -26,14 +56,13 @@ class Integrals:
     table: tuple[np.ndarray, np.ndarray]  # (A, B), (P, 1) each: the first two under a constant light of 1
 
     def radiance(self, metallic: float) -> Estimate:
-        """Outgoing radiance: the integrals do not depend on F0 and albedo, so one set serves every metal."""
-        return self.specular(metallic) + self.irradiance.scaled(diffuse(metallic, self.table))
+        """Outgoing radiance: the integrals do not depend on F0 and albedo, so one set serves every metal.
 
-    def specular(self, metallic: float) -> Estimate:
-        """The specular part. Both integrals come from the same samples: their errors add, not the squares."""
-        f0 = reflectance(metallic)
-        error = f0 * self.scale.error + self.bias.error
-        return Estimate(f0 * self.scale.mean + self.bias.mean, error)
+        Both specular integrals come from the same samples: their errors add, not the squares.
+        """
+        f0, scale, bias = reflectance(metallic), self.scale, self.bias
+        specular = Estimate(f0 * scale.mean + bias.mean, f0 * scale.error + bias.error)
+        return specular + self.irradiance.scaled(diffuse(metallic, self.table))
 
 
 def reflectance(metallic: float) -> np.ndarray:
@@ -43,84 +72,48 @@ def reflectance(metallic: float) -> np.ndarray:
 
 def diffuse(metallic: float, table: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Diffuse reflectance (P, 3) of points with these (A, B): of what the specular term leaves."""
-    return mc.left_by_specular(reflectance(metallic), *table) * (1 - metallic) * np.array(ALBEDO)
+    scale, bias = table
+    return (1 - reflectance(metallic) * scale - bias) * (1 - metallic) * np.array(ALBEDO)
 
 
-class Setup:
-    """One shape under one light: scene, sensor, points, and references made when asked for and kept."""
+class Exact(Setup):
+    """One shape under one light, with references that are made when asked for and kept."""
 
     def __init__(self, name: str, light: Light, settings: Settings) -> None:
-        self.name, self.light, self.settings = name, light, settings
-        bsdf = {
-            "type": "refgs_bsdf",
-            "albedo": {"type": "rgb", "value": list(ALBEDO)},
-            "metallic": 0.5,
-            "roughness": 0.3,
-        }
-        self.scene = mi.load_dict(
-            {"type": "scene", "shape": {**shape(name), "bsdf": bsdf}, "light": light.emitter()}
-        )
-        self.emitter = self.scene.environment()
-        self.params = mi.traverse(self.scene)
-        self.sensor = make_sensor(SHAPES[name], settings.size)
-        self.timing_sensor = make_sensor(SHAPES[name], settings.timing_size)
-        self.points: Points = surface(self.scene, self.sensor, settings.size)
-        self.direct = mi.load_dict({"type": "path", "max_depth": 2})
-        self.full = mi.load_dict({"type": "path", "max_depth": 8, "rr_depth": 100})
-        self._bounces: dict[tuple[float, float], np.ndarray] = {}
-        self._irradiance: dict[bool, Estimate] = {}
-        self._integrals: dict[tuple[float, bool], Integrals] = {}
+        super().__init__(name, shape(name), light, SHAPES[name], settings)
+        self.light = light
+        self.bounces = functools.cache(self._bounces)
+        self.integrals = functools.cache(self._integrals)
+        self.irradiance = functools.cache(self._irradiance)
 
-    def set_material(self, metallic: float, roughness: float) -> None:
-        """Of the scene's surface."""
-        self.params["shape.bsdf.metallic.value"] = metallic
-        self.params["shape.bsdf.roughness.value"] = roughness
-        self.params.update()
+    def case(self, roughness: float, metallic: float) -> dict[str, Any]:
+        """What a row of a report says of its place."""
+        return {"shape": self.name, "light": self.light.name, "roughness": roughness, "metallic": metallic}
 
-    def integrals(self, roughness: float, occluded: bool = False) -> Integrals:
+    def _integrals(self, roughness: float, occluded: bool = False) -> Integrals:
         """The exact integrals, without or with the shape's own shadow."""
-        key = (roughness, occluded)
-        if key not in self._integrals:
-            occluder = self.scene if occluded else None
-            if occluded not in self._irradiance:
-                self._irradiance[occluded] = self._integrate(mc.cosine_lobe, 1, occluder)[0]
-            α = dr.opaque(mi.Float, roughness**2)
-            seed = 2 + round(1000 * roughness)
-            scale, bias = self._integrate(lambda points: mc.brdf_lobe(points, α), seed, occluder)
-            table = mc.exact_table(self.points.n_dot_v(), roughness)
-            self._integrals[key] = Integrals(scale, bias, self._irradiance[occluded], table)
-        return self._integrals[key]
+        α, seed = dr.opaque(mi.Float, roughness**2), 2 + round(1000 * roughness)
+        scale, bias = self._estimates(lambda points: mc.brdf_lobe(points, α), seed, occluded)
+        table = mc.exact_table(self.points.n_dot_v(), roughness)
+        return Integrals(scale, bias, self.irradiance(occluded), table)
+
+    def _irradiance(self, occluded: bool) -> Estimate:
+        return self._estimates(mc.cosine_lobe, 1, occluded)[0]
 
     def prefiltered(self, roughness: float) -> Estimate:
         """Radiance averaged over the lobe with N = V = R around the mirror direction, exactly."""
         α = dr.opaque(mi.Float, roughness**2)
-        return self._integrate(lambda points: mc.prefilter_lobe(points, roughness, α), 3, None)[0]
+        return self._estimates(lambda points: mc.prefilter_lobe(points, roughness, α), 3, False)[0]
 
-    def bounces(self, roughness: float, metallic: float) -> np.ndarray:
+    def _estimates(self, lobe: Any, seed: int, occluded: bool) -> list[Estimate]:
+        occluder = self.scene if occluded else None
+        return [mc.estimate(batches) for batches in self.integrate(lobe, self.emitter, occluder, seed)]
+
+    def _bounces(self, roughness: float, metallic: float) -> np.ndarray:
         """Radiance (P, 3) that the shape reflects onto itself, by the path tracer.
 
         The same random numbers with and without further bounces: the difference is those bounces alone.
         """
-        key = (roughness, metallic)
-        if key not in self._bounces:
-            self.set_material(metallic, roughness)
-            spp = self.settings.full_depth_spp
-            full, direct = (
-                mi.render(self.scene, sensor=self.sensor, integrator=path, spp=spp, seed=1)
-                for path in (self.full, self.direct)
-            )
-            self._bounces[key] = self.points.of_image(full) - self.points.of_image(direct)
-        return self._bounces[key]
-
-    def _integrate(self, lobe: Any, seed: int, occluder: Any) -> list[Estimate]:
-        settings = self.settings
-        found = mc.integrate(
-            lobe,
-            self.points,
-            self.emitter,
-            samples=settings.lattice,
-            batches=settings.batches,
-            seed=seed,
-            occluder=occluder,
-        )
-        return [mc.estimate(batches) for batches in found]
+        self.set_material(metallic, roughness)
+        full, direct = (self.render(path_tracer(n), self.settings.full_depth_spp, 1) for n in (FULL_DEPTH, 2))
+        return full - direct

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,163 +15,140 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.common import errors, report, timing
-from benchmarks.common import montecarlo as mc
 from benchmarks.common.lights import Light, make_light
-from benchmarks.common.view import Points, view_bins
-from benchmarks.splitsum import decompose, methods, surfels
-from benchmarks.splitsum.exact import Setup
+from benchmarks.common.setup import path_tracer
+from benchmarks.common.view import rows as picture_values
+from benchmarks.common.view import view_bins
+from benchmarks.splitsum import decompose, surfels
+from benchmarks.splitsum.exact import OPTIONS, LEVEL_SETS, SHIPPED, Exact, split_sum
 from benchmarks.splitsum.settings import Settings
-from benchmarks.splitsum.speedup import line, speed_ups
-from mi_refgs.shade.lobe_matrices import Levels
+from benchmarks.splitsum.speedup import Times, speed_ups, time_of
 
-ALL = "all"
 LEVELS_HEIGHT = 128
 """Rows of the light for other sets of levels: enough that its resolution does not hide them."""
-TIMED_METALLIC, TIMED_ROUGHNESS = 0.5, 0.3
-"""The material on which times are taken; a kernel is the same for every other."""
+TIMED = (0.5, 0.3)
+"""Metallic and roughness on which times are taken; a kernel is the same for every other."""
+Calls = dict[tuple[str, int], Callable[[], Any]]
+"""What makes the timed picture, by method and setting."""
 
 
 @dataclass
 class Run:
-    """What a run collects; `rows` and the rest go to JSON as they are."""
+    """What a run collects; all but `times` goes to JSON as it is."""
 
     settings: Settings
     rows: list[dict[str, Any]] = field(default_factory=list)
-    times: dict[tuple[str, str, str, int], float] = field(default_factory=dict)  # ms per megapixel
+    times: Times = field(default_factory=dict)
     prefilter_ms: list[dict[str, Any]] = field(default_factory=list)
     scores: list[dict[str, Any]] = field(default_factory=list)
-    budgets: list[dict[str, Any]] = field(default_factory=list)
-    surfel_budgets: list[dict[str, Any]] = field(default_factory=list)
     flip_reason: str = ""
 
-    def time(self, setup: Setup, calls: dict[tuple[str, int], Callable[[], Any]]) -> None:
-        """Book the times of calls by (method, setting) that make the timed picture."""
+    def time(self, setup: Exact, calls: Calls) -> None:
+        """Book the times of calls."""
         megapixels = self.settings.timing_size**2 / 1e6
-        for key, ms in timing.milliseconds(calls, self.settings.timing_seconds).items():
-            self.times[(setup.name, setup.light.name, *key)] = ms / megapixels
+        for (method, setting), ms in timing.milliseconds(calls, self.settings.timing_seconds).items():
+            found = self.times.setdefault((setup.name, setup.light.name, method), {})
+            found[setting] = ms / megapixels
 
     def add(
-        self, setup: Setup, method: str, setting: int, roughness: float, metallic: float, values: np.ndarray
+        self, setup: Exact, method: str, setting: int, roughness: float, metallic: float, values: np.ndarray
     ) -> None:
         """Book the errors of a picture (P, 3), for the split sum also by view angle."""
         reference = setup.integrals(roughness).radiance(metallic)
         points = setup.points
         flip, self.flip_reason = errors.flip(points.image(values), points.image(reference.mean))
-        masks: dict[str, Any] = {ALL: None}
+        case = setup.case(roughness, metallic) | {"method": method, "setting": setting}
+        masks: dict[str, Any] = {"all": None}
         if method.startswith("split_sum"):
             masks |= view_bins(points.n_dot_v())
         for name, mask in masks.items():
-            found = errors.compare(values, reference, mask)
-            self.rows.append(
-                {
-                    "shape": setup.name,
-                    "light": setup.light.name,
-                    "roughness": roughness,
-                    "metallic": metallic,
-                    "method": method,
-                    "setting": setting,
-                    "n_dot_v": name,
-                    "bias": found.bias,
-                    "bias_floor": found.bias_floor,
-                    "relmse": found.relmse,
-                    "relmse_floor": found.relmse_floor,
-                    "below_floor": found.below_floor,
-                    "mape": found.mape,
-                    "flip": flip if mask is None else None,
-                }
-            )
+            found = errors.compare(values, reference, mask).record()
+            self.rows.append(case | {"n_dot_v": name} | found | {"flip": flip if mask is None else None})
 
 
 def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     """Run it all; what comes back is the JSON report."""
     begin = time.perf_counter()
     lights = [make_light(name, settings.truth_height) for name in settings.lights]
-    run = Run(settings)
+    run, budgets, surfel_budgets = Run(settings), [], []
     materials = [(r, m) for r in settings.roughness for m in settings.metallic]
-    stages = [Setup(name, light, settings) for name in settings.shapes for light in lights]
+    stages = [Exact(name, light, settings) for name in settings.shapes for light in lights]
 
     for setup in tqdm(stages, desc="references, path tracer, Monte Carlo", disable=quiet):
         for roughness, metallic in materials:
             _sampled(run, setup, roughness, metallic)
-    for levels in (methods.SHIPPED, *settings.level_sets):
+    for levels in (SHIPPED, *settings.level_sets):
         variants = [variant for variant in _variants(settings) if variant.levels == levels]
         filtered = _prefilter(run, lights, variants)
         for setup in tqdm(stages, desc=f"split sum, times ({levels})", disable=quiet):
             calls = _split_sums(run, setup, variants, filtered, materials)
-            if levels == methods.SHIPPED:
-                calls |= _sampled_calls(run, setup)
-            run.time(setup, calls)
+            run.time(setup, calls | (_sampled_calls(setup) if levels == SHIPPED else {}))
     shared = {(setup.name, setup.light.name): setup for setup in stages}
     for name in tqdm(settings.budget_shapes, desc="error budget", disable=quiet):
         for light in lights:
-            setup = shared.get((name, light.name)) or Setup(name, light, settings)
-            run.budgets += decompose.budgets(setup)
+            setup = shared.get((name, light.name)) or Exact(name, light, settings)
+            budgets += decompose.budgets(setup)
             if name == surfels.SHAPE:
-                run.surfel_budgets.append(surfels.budget(setup))
+                surfel_budgets.append(surfels.budget(setup))
     return {
         "machine": report.machine(),
         "settings": vars(settings),
         "seconds": time.perf_counter() - begin,
         "frequencies": {light.name: light.frequency() for light in lights},
         "pixels": {setup.name: setup.points.count for setup in stages},
-        "rows": [_timed(run, row) for row in run.rows],
-        "times": [
-            {"shape": s, "light": n, "method": method, "setting": k, "ms_per_mpx": ms}
-            for (s, n, method, k), ms in run.times.items()
-        ],
+        "rows": [row | {"ms_per_mpx": time_of(run.times, row)} for row in run.rows],
         "prefilter_ms": run.prefilter_ms,
         "scores": run.scores,
-        "speed_ups": speed_ups(run.rows, run.times, settings),
-        "budgets": run.budgets,
-        "surfel_budgets": run.surfel_budgets,
+        "speed_ups": speed_ups(run.rows, run.times),
+        "budgets": budgets,
+        "surfel_budgets": surfel_budgets,
         "flip_reason": run.flip_reason,
     }
 
 
-def _timed(run: Run, row: dict[str, Any]) -> dict[str, Any]:
-    """A row with its time: measured, or on the straight line through the measured ones."""
-    key = (row["shape"], row["light"], row["method"])
-    exact = run.times.get((*key, row["setting"]))
-    if exact is None:
-        known = {k[3]: ms for k, ms in run.times.items() if k[:3] == key}
-        exact = line(known)(row["setting"]) if len(known) > 1 else None
-    return {**row, "ms_per_mpx": exact}
+# ---------------- Mitsuba's integrators ----------------
 
 
-# ---------------- errors ----------------
+def _samplers() -> dict[str, Any]:
+    """The path tracer stopped after direct light, and a renderer that samples the reflectance alone."""
+    plain = {"type": "direct", "bsdf_samples": 1, "emitter_samples": 0}
+    return {"path": path_tracer(2), "monte_carlo": mi.load_dict(plain)}
 
 
-def _sampled(run: Run, setup: Setup, roughness: float, metallic: float) -> None:
+def _sampled(run: Run, setup: Exact, roughness: float, metallic: float) -> None:
     """Pictures of the path tracer and of plain Monte Carlo."""
-    settings = run.settings
+    settings, seed = run.settings, 1 + len(run.rows)
     setup.set_material(metallic, roughness)
-    material = methods.material(metallic, roughness)
-    seed = 1 + len(run.rows)
-    for spp in settings.spp:
-        image = mi.render(setup.scene, sensor=setup.sensor, integrator=setup.direct, spp=spp, seed=seed + spp)
-        values = setup.points.of_image(image)
-        run.add(setup, "path", spp, roughness, metallic, values)
-    reference = setup.integrals(roughness).radiance(metallic)
-    run.scores.append(
-        {
-            "shape": setup.name,
-            "light": setup.light.name,
-            "roughness": roughness,
-            "metallic": metallic,
-            "score": errors.mean_score(values, reference),
-        }
-    )
+    counts = {"path": settings.spp, "monte_carlo": settings.samples}
     if metallic != settings.metallic[len(settings.metallic) // 2]:
-        return  # plain Monte Carlo only serves the plots of speed against error, which show one metal
-    for samples in settings.samples:
-        count, stream = (dr.opaque(mi.UInt32, n) for n in (samples, seed + samples))
-        found = mc.monte_carlo(setup.points, material, setup.emitter, count, stream)
-        run.add(setup, "monte_carlo", samples, roughness, metallic, methods.picture_values(found))
+        del counts["monte_carlo"]  # it only serves the plots of speed against error, which show one metal
+    for method, integrator in _samplers().items():
+        for spp in counts.get(method, ()):
+            values = setup.render(integrator, spp, seed + spp)
+            run.add(setup, method, spp, roughness, metallic, values)
+            if (method, spp) == ("path", settings.spp[-1]):
+                score = errors.mean_score(values, setup.integrals(roughness).radiance(metallic))
+                run.scores.append(setup.case(roughness, metallic) | {"score": score})
+
+
+def _sampled_calls(setup: Exact) -> Calls:
+    """Calls that make the timed pictures of both."""
+    setup.set_material(*TIMED)
+    return {
+        (method, spp): functools.partial(
+            mi.render, setup.scene, sensor=setup.timing_sensor, integrator=integrator, spp=spp
+        )
+        for method, integrator in _samplers().items()
+        for spp in setup.settings.timed_spp
+    }
+
+
+# ---------------- split sums ----------------
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A split sum: levels, rows of the light, and a option of `shade`."""
+    """A split sum: levels, rows of the light, and an option of `shade`."""
 
     levels: str
     height: int
@@ -178,79 +157,51 @@ class Variant:
     @property
     def method(self) -> str:
         """Its name in the report."""
-        levels = "" if self.levels == methods.SHIPPED else f"_{self.levels}_levels"
+        levels = "" if self.levels == SHIPPED else f"_{self.levels}_levels"
         return f"split_sum{levels}" + (f"_{self.option}" if self.option else "")
 
 
 def _variants(settings: Settings) -> list[Variant]:
-    shipped = [Variant(methods.SHIPPED, height) for height in settings.heights]
-    options = [
-        Variant(methods.SHIPPED, height, option)
-        for height in {settings.height, settings.heights[-1]}
-        for option in methods.OPTIONS
-        if option
-    ]
+    shipped = [Variant(SHIPPED, height) for height in settings.heights]
+    heights = {settings.height, settings.heights[-1]}
+    options = [Variant(SHIPPED, *pair) for pair in itertools.product(heights, filter(None, OPTIONS))]
     levels = [Variant(name, min(LEVELS_HEIGHT, settings.heights[-1])) for name in settings.level_sets]
     return sorted(shipped + options, key=lambda variant: variant.height) + levels
 
 
 def _prefilter(run: Run, lights: list[Light], variants: list[Variant]) -> dict[tuple[str, int], Any]:
     """Every light at every height, by (light, height), with one set of levels; books the time it takes."""
-    filtered, calls = {}, {}
+    filtered = {}
+    # One height after the other: only a few operators are kept at a time.
     for variant in (variant for variant in variants if not variant.option):
-        levels = methods.LEVEL_SETS[variant.levels]
-        environments = {light.name: light.environment(variant.height) for light in lights}
-        for name, environment in environments.items():
-            filtered[name, variant.height] = environment.prefilter(levels)
+        levels = LEVEL_SETS[variant.levels]
+        environments = [light.environment(variant.height) for light in lights]
+        for light, environment in zip(lights, environments, strict=True):
+            filtered[light.name, variant.height] = environment.prefilter(levels)
 
-        def again(environment: Any = environments[lights[0].name], levels: Levels = levels) -> Any:
+        def again(environment: Any = environments[0], levels: Any = levels) -> Any:
             return environment.prefilter(levels).levels
 
-        calls[variant.method, variant.height] = again
+        ms = timing.milliseconds({0: again}, run.settings.timing_seconds)[0]
+        run.prefilter_ms.append({"method": variant.method, "height": variant.height, "ms": ms})
     dr.eval([light.levels for light in filtered.values()])
-    # One height after the other: only a few operators are kept at a time.
-    for (method, height), call in calls.items():
-        ms = timing.milliseconds({0: call}, run.settings.timing_seconds)[0]
-        run.prefilter_ms.append({"method": method, "height": height, "ms": ms})
     return filtered
 
 
 def _split_sums(
-    run: Run, setup: Setup, variants: list[Variant], filtered: dict[tuple[str, int], Any], materials: Any
-) -> dict[tuple[str, int], Callable[[], Any]]:
+    run: Run,
+    setup: Exact,
+    variants: list[Variant],
+    filtered: dict[tuple[str, int], Any],
+    materials: list[tuple[float, float]],
+) -> Calls:
     """Book pictures of the split sums of a setup; calls that make the timed ones."""
-    timed = methods.material(TIMED_METALLIC, TIMED_ROUGHNESS)
-    calls = {}
+    calls: Calls = {}
     for variant in variants:
-        light = filtered[setup.light.name, variant.height]
-
-        def shader(points: Points, light: Any = light, option: str = variant.option) -> Any:
-            return methods.split_sum(points, timed, light, option)
-
+        light, option = filtered[setup.light.name, variant.height], variant.option
         for roughness, metallic in materials:
-            material = methods.material(metallic, roughness)
-            radiance = methods.split_sum(setup.points, material, light, variant.option)
-            values = methods.picture_values(radiance)
-            run.add(setup, variant.method, variant.height, roughness, metallic, values)
-        calls[variant.method, variant.height] = methods.with_primary_rays(setup, shader)
-    return calls
-
-
-def _sampled_calls(run: Run, setup: Setup) -> dict[tuple[str, int], Callable[[], Any]]:
-    """Calls that make the timed pictures of the path tracer and of plain Monte Carlo."""
-    setup.set_material(TIMED_METALLIC, TIMED_ROUGHNESS)
-    material = methods.material(TIMED_METALLIC, TIMED_ROUGHNESS)
-    calls: dict[tuple[str, int], Callable[[], Any]] = {}
-    for count in run.settings.timed_spp:
-
-        def path(spp: int = count) -> Any:
-            return mi.render(setup.scene, sensor=setup.timing_sensor, integrator=setup.direct, spp=spp)
-
-        samples, seed = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, 1)
-
-        def plain(points: Points, samples: Any = samples, seed: Any = seed) -> Any:
-            return mc.monte_carlo(points, material, setup.emitter, samples, seed)
-
-        calls["path", count] = path
-        calls["monte_carlo", count] = methods.with_primary_rays(setup, plain)
+            radiance = split_sum(setup.points, setup.set_material(metallic, roughness), light, option)
+            run.add(setup, variant.method, variant.height, roughness, metallic, picture_values(radiance))
+        shader = functools.partial(split_sum, material=setup.set_material(*TIMED), light=light, option=option)
+        calls[variant.method, variant.height] = setup.with_primary_rays(shader)
     return calls

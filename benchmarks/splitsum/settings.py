@@ -10,7 +10,6 @@ import mitsuba as mi
 from benchmarks.common.lights import BUILT_IN, ROOT
 from benchmarks.common.view import Look
 
-ALBEDO = (0.9, 0.6, 0.3)
 MESHES = ROOT / "scenes" / "meshes"
 
 SHAPES: dict[str, Look] = {

@@ -8,9 +8,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common.errors import CLEAR
-from benchmarks.splitsum.settings import CONVEX, Settings
+from benchmarks.common.select import Row, where
+from benchmarks.splitsum.settings import CONVEX
 
 METHOD = "split_sum"
+CASE = ("shape", "light", "roughness", "metallic")
+Times = dict[tuple[str, str, str], dict[int, float]]
+"""Milliseconds per megapixel by shape, light and method, then by setting."""
 
 
 def line(times: dict[int, float]) -> Callable[[float], float]:
@@ -21,6 +25,14 @@ def line(times: dict[int, float]) -> Callable[[float], float]:
     if offset < 0 or slope < 0:
         offset, slope = 0.0, float(np.median(t / n))
     return lambda samples: float(offset + slope * samples)
+
+
+def time_of(times: Times, row: Row) -> float | None:
+    """Of a row: measured, or on the straight line through the measured ones."""
+    known = times.get((row["shape"], row["light"], row["method"]), {})
+    if row["setting"] in known:
+        return known[row["setting"]]
+    return line(known)(row["setting"]) if len(known) > 1 else None
 
 
 def error_times_samples(points: list[tuple[int, float, float]]) -> float:
@@ -39,45 +51,30 @@ def exponent(points: list[tuple[int, float, float]]) -> float | None:
     return float(np.polyfit(x, y, 1)[0])
 
 
-def speed_ups(
-    rows: list[dict[str, Any]], times: dict[tuple[str, str, str, int], float], settings: Settings
-) -> list[dict[str, Any]]:
-    """One record for each convex shape, light, material and height: samples, times, their ratio.
+def speed_ups(rows: list[Row], times: Times) -> list[dict[str, Any]]:
+    """One record for each convex shape, light, material and height: samples, and the ratio of times.
 
     Where the split sum's error is below the noise floor the ratio is a lower bound, taken at the floor. The
     path tracer cannot take less than one sample.
     """
-    every = [row for row in rows if row["n_dot_v"] == "all" and row["shape"] in CONVEX]
-    paths: dict[tuple[Any, ...], list[tuple[int, float, float]]] = {}
-    for row in every:
-        if row["method"] == "path":
-            point = (row["setting"], row["relmse"], row["relmse_floor"])
-            paths.setdefault(_case(row), []).append(point)
     found = []
-    for row in every:
-        if row["method"] != METHOD:
-            continue
-        case, place = _case(row), (row["shape"], row["light"])
-        floor = CLEAR * row["relmse_floor"]
-        spp = error_times_samples(paths[case]) / max(row["relmse"], floor)
-        path_ms = line({key[3]: ms for key, ms in times.items() if key[:3] == (*place, "path")})(max(spp, 1))
-        split_ms = times[(*place, METHOD, row["setting"])]
+    for row in where(rows, method=METHOD, n_dot_v="all", shape=CONVEX):
+        case = {key: row[key] for key in CASE}
+        paths = [
+            (path["setting"], path["relmse"], path["relmse_floor"])
+            for path in where(rows, method="path", **case)
+        ]
+        spp = error_times_samples(paths) / max(row["relmse"], CLEAR * row["relmse_floor"])
+        path_ms = line(times[row["shape"], row["light"], "path"])(max(spp, 1))
+        split_ms = times[row["shape"], row["light"], METHOD][row["setting"]]
         found.append(
-            {
-                **dict(zip(("shape", "light", "roughness", "metallic"), case, strict=True)),
+            case
+            | {
                 "height": row["setting"],
-                "bias": row["bias"],
-                "relmse": row["relmse"],
                 "lower_bound": row["below_floor"],
                 "path_spp": spp,
-                "path_ms_per_mpx": path_ms,
-                "split_sum_ms_per_mpx": split_ms,
                 "speed_up": path_ms / split_ms,
-                "path_exponent": exponent(paths[case]),
+                "path_exponent": exponent(paths),
             }
         )
     return found
-
-
-def _case(row: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[key] for key in ("shape", "light", "roughness", "metallic"))

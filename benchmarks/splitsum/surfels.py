@@ -7,6 +7,7 @@ split sum itself comes last.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -14,16 +15,13 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.common.budget import Step, decompose, noise_floor
-from benchmarks.common.view import Points
-from benchmarks.splitsum import methods
-from benchmarks.splitsum.exact import Setup
-from benchmarks.splitsum.settings import ALBEDO
+from benchmarks.common.setup import ALBEDO, covering
+from benchmarks.common.view import Points, rows
+from benchmarks.splitsum.exact import Exact, split_sum
 from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.render.pipeline import render
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera, splat
-from mi_refgs.surfels.channels import logit
-from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
 
 SHAPE = "sphere"
@@ -36,9 +34,6 @@ MATERIALS = ((1.0, 0.2), (0.0, 0.6))
 """(metallic, roughness) of even and odd bands: polished metal and dull plastic."""
 BANDS = 6
 """Bands from pole to pole, of equal area."""
-OPACITY = 0.99
-EXTREME = 1e-6
-"""Distance of metallic from 0 and 1, which their activation cannot reach."""
 
 
 def band(y: np.ndarray) -> np.ndarray:
@@ -52,16 +47,11 @@ def sphere_surfels(count: int) -> Surfels:
     y, φ = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
     sine = np.sqrt(1 - y * y)
     points = np.stack([sine * np.cos(φ), y, sine * np.sin(φ)], axis=-1)
-    surfels = from_points(points, points, rng=np.random.default_rng(0), opacity=OPACITY)
-    raw = surfels.to_numpy()
-    metallic, roughness = np.array(MATERIALS)[band(y)].T
-    raw["metallic"] = logit(np.clip(metallic, EXTREME, 1 - EXTREME))[:, None].astype(np.float32)
-    raw["roughness"] = logit(roughness)[:, None].astype(np.float32)
-    raw["albedo"] = np.tile(logit(np.array(ALBEDO)), (count, 1)).astype(np.float32)
-    return Surfels.from_numpy(raw)
+    metallic, roughness = np.array(MATERIALS)[band(y)].T[..., None]
+    return covering(points, points, albedo=ALBEDO, metallic=metallic, roughness=roughness)
 
 
-def budget(setup: Setup) -> dict[str, Any]:
+def budget(setup: Exact) -> dict[str, Any]:
     """Budget of the surfels' picture of a sphere, where they cover its pixels."""
     settings = setup.settings
     height = settings.heights[-1]
@@ -69,7 +59,7 @@ def budget(setup: Setup) -> dict[str, Any]:
     surfels = sphere_surfels(settings.surfels)
     camera = Camera.from_sensor(setup.sensor.inner)
     shading = Shading(at="pixel", reflectance="split_sum", diffuse="irradiance")
-    shipped = setup.points.of_image(methods.picture_values(render(surfels, camera, shading, light).radiance))
+    shipped = setup.points.of_image(rows(render(surfels, camera, shading, light).radiance))
 
     group = mi.Float(band(surfels.to_numpy()["position"][:, 1]).astype(np.float32))
     blended = splat(surfels, [*surfels.frame()[2], group], camera)
@@ -78,10 +68,10 @@ def budget(setup: Setup) -> dict[str, Any]:
     covered = alpha > COVERAGE_FLOOR
     share = np.stack([alpha - odd, odd], axis=-1)
 
-    facing = np.where(np.sum(normal * _rows(setup.points.view), -1, keepdims=True) < 0, -normal, normal)
+    facing = np.where(np.sum(normal * rows(setup.points.view), -1, keepdims=True) < 0, -normal, normal)
     by_surfel = _shaded(setup, light, facing)
-    by_mesh = _shaded(setup, light, _rows(setup.points.normal))
-    here = band(_rows(setup.points.position)[:, 1])
+    by_mesh = _shaded(setup, light, rows(setup.points.normal))
+    here = band(rows(setup.points.position)[:, 1])
     exact = [setup.integrals(roughness).radiance(metallic) for metallic, roughness in MATERIALS]
     steps = [
         Step("", shipped),
@@ -102,28 +92,17 @@ def budget(setup: Setup) -> dict[str, Any]:
     }
 
 
-def _rows(vectors: Any) -> np.ndarray:
-    return np.array(vectors, np.float64).T
-
-
 def _at(maps: list[Any], points: Points) -> np.ndarray:
     """Values (P, K) of K full pictures at the points."""
     return np.stack([np.array(x, np.float64) for x in maps], axis=-1)[points.pixel.numpy()]
 
 
-def _shaded(setup: Setup, light: Any, normal: np.ndarray) -> list[np.ndarray]:
+def _shaded(setup: Exact, light: Any, normal: np.ndarray) -> list[np.ndarray]:
     """The split sum of each material with these normals (P, 3)."""
-    points = setup.points
-    turned = Points(
-        points.size,
-        points.pixel,
-        points.position,
-        mi.Vector3f(np.ascontiguousarray(normal.T, dtype=np.float32)),
-        points.view,
-        points.offset,
-    )
-    dr.eval(turned.normal)
-    return [methods.picture_values(methods.split_sum(turned, methods.material(*m), light)) for m in MATERIALS]
+    facing = mi.Vector3f(np.ascontiguousarray(normal.T, dtype=np.float32))
+    dr.eval(facing)
+    turned = replace(setup.points, normal=facing)
+    return [rows(split_sum(turned, setup.set_material(*m), light)) for m in MATERIALS]
 
 
 def _mixed(values: list[np.ndarray], share: np.ndarray) -> np.ndarray:

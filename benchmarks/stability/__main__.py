@@ -12,25 +12,17 @@ from __future__ import annotations
 
 import sys
 
-import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
-
-import mitsuba as mi  # isort: skip
-
 from benchmarks.common.command import make_parser, write_reports
+from benchmarks.stability.page import page
+from benchmarks.stability.run import failures, measure
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure, and write the reports; exit code 1 where a case fails, 2 for bad input."""
-    mi.set_variant("llvm_ad_rgb")
-    mi.set_log_level(mi.LogLevel.Error)
     parser = make_parser("stability", __doc__)
     parser.add_argument("--quick", action="store_true", help="what every test run can afford")
     parser.add_argument("--only", metavar="WORD", action="append", default=[], help="cases named so")
     options = parser.parse_args(arguments)
-
-    from benchmarks.stability.page import page
-    from benchmarks.stability.run import failures, measure
-
     result = {}
 
     def run() -> dict:

@@ -62,7 +62,26 @@ class Row:
     gradient_floor: dict[str, float]
     negligible: list[str]  # classes of less than NEGLIGIBLE
     textbook: float  # image error of the textbook formulas; inf where they are not finite
-    verdict: str
+
+    @property
+    def verdict(self) -> str:
+        """ "holds", "ill-conditioned", or what fails."""
+        failed: list[str] = []
+        ill: list[str] = []
+        if self.non_finite:
+            failed.append(f"{self.non_finite} values are not finite")
+        if self.kept < KEPT:
+            failed.append(f"only {self.kept:.0%} of the pixels are compared")
+        if self.order > ORDER_LIMIT:
+            failed.append(f"order wrong by {self.order:.1e}")
+        checks = [(n, getattr(self, n), IMAGE_LIMIT, self.image_floor) for n in ("image", "maps")]
+        checks += [(n, e, GRADIENT_LIMIT, self.gradient_floor[n]) for n, e in self.gradients.items()]
+        for name, error, limit, floor in checks:
+            if not error <= limit:
+                (ill if error <= ILL * floor else failed).append(f"{name} {error:.1e}")
+        if failed:
+            return "FAILS: " + ", ".join(failed)
+        return "ill-conditioned: " + ", ".join(ill) if ill else "holds"
 
 
 # ---------------- the product ----------------
@@ -253,40 +272,10 @@ def measure(case: Case, floors: bool = True, book: bool = True) -> Row:
     shown = truth.maps["alpha"][:, 0] > 0
     kept = float(np.mean(~band[shown])) if shown.any() else 1.0
     inverted = inversion(case, scene, truth) if len(order) else 0.0
-    verdict = judge(image, others, gradients, found.non_finite, kept, inverted, image_floor, gradient_floor)
     return Row(
         case.name, image, others, gradients, found.non_finite, kept, inverted, image_floor, gradient_floor,
-        negligible(exact, scene.raw), textbook.image_error(case, scene, band) if book else 0.0, verdict,
+        negligible(exact, scene.raw), textbook.image_error(case, scene, band) if book else 0.0,
     )  # fmt: skip
-
-
-def judge(
-    image: float,
-    maps: float,
-    gradients: dict[str, float],
-    non_finite: int,
-    kept: float,
-    order: float,
-    image_floor: float,
-    gradient_floor: dict[str, float],
-) -> str:
-    """ "holds", "ill-conditioned", or what fails."""
-    failed: list[str] = []
-    ill: list[str] = []
-    if non_finite:
-        failed.append(f"{non_finite} values are not finite")
-    if kept < KEPT:
-        failed.append(f"only {kept:.0%} of the pixels are compared")
-    if order > ORDER_LIMIT:
-        failed.append(f"order wrong by {order:.1e}")
-    checks = [("image", image, IMAGE_LIMIT, image_floor), ("maps", maps, IMAGE_LIMIT, image_floor)]
-    checks += [(n, e, GRADIENT_LIMIT, gradient_floor[n]) for n, e in gradients.items()]
-    for name, error, limit, floor in checks:
-        if not error <= limit:
-            (ill if error <= ILL * floor else failed).append(f"{name} {error:.1e}")
-    if failed:
-        return "FAILS: " + ", ".join(failed)
-    return "ill-conditioned: " + ", ".join(ill) if ill else "holds"
 
 
 def map_errors(found: dict[str, Array], exact: dict[str, Array], keep: Array) -> tuple[float, float]:

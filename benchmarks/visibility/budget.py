@@ -25,9 +25,9 @@ import numpy as np
 
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.budget import Step, decompose, noise_floor
+from benchmarks.common.view import rows
 from benchmarks.visibility import harmonics
-from benchmarks.visibility.rules import PAPER, Rule
-from benchmarks.visibility.settings import Settings
+from benchmarks.visibility.settings import PAPER, Rule, Settings
 from benchmarks.visibility.setup import Setup
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.points import reflect
@@ -184,7 +184,7 @@ def fit(setup: Setup, depth: int) -> TrainedScene:
     mirror = reflect(points.view, points.normal)
     whole, even, odd = (harmonics.mean(some).solve() for some in (parts, parts[::2], parts[1::2]))
     looked_up, first, second = (
-        np.array(harmonics.along(coefficients, mirror), np.float64).T for coefficients in (whole, even, odd)
+        rows(harmonics.along(coefficients, mirror)) for coefficients in (whole, even, odd)
     )
     light = harmonics.Surroundings(whole)
     open_, free = (setup.reflected(light, scene).mean(0) for scene in (None, setup.scene))

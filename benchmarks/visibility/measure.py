@@ -11,9 +11,8 @@ from tqdm import tqdm
 from benchmarks.common import errors, report, timing
 from benchmarks.common import montecarlo as mc
 from benchmarks.visibility.budget import budgets
-from benchmarks.visibility.rules import Rule, rules
 from benchmarks.visibility.scenes import make_scene
-from benchmarks.visibility.settings import Settings
+from benchmarks.visibility.settings import Rule, Settings, rules
 from benchmarks.visibility.setup import TIMED_ROUGHNESS, Setup
 from benchmarks.visibility.tradeoff import tradeoffs
 
@@ -64,21 +63,8 @@ def _errors(setup: Setup, roughness: float, references: dict[str, np.ndarray]) -
     for name, batches in references.items():
         reference = mc.estimate(batches)
         for rule, values in pictures.items():
-            found = errors.compare(values, reference)
-            rows.append(
-                {
-                    "scene": setup.name,
-                    "roughness": roughness,
-                    "method": rule.name,
-                    **vars(rule),
-                    "depth": name,
-                    "bias": found.bias,
-                    "bias_floor": found.bias_floor,
-                    "relmse": found.relmse,
-                    "relmse_floor": found.relmse_floor,
-                    "below_floor": found.below_floor,
-                }
-            )
+            case = {"scene": setup.name, "roughness": roughness, "method": rule.name, "depth": name}
+            rows.append(case | vars(rule) | errors.compare(values, reference).record())
     return rows
 
 

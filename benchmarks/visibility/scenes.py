@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import trimesh
 
 from benchmarks.common.view import Look
-from benchmarks.visibility.settings import METALLIC
 from mi_refgs.occlusion.mesh import read_mesh
 
 BOWLS = {"bowl": (60.0, -0.15), "deep_bowl": (90.0, -0.42)}
@@ -33,20 +30,6 @@ class Concave:
     name: str
     mesh: Any  # trimesh.Trimesh
     look: Look
-
-    def load(self, emitter: dict[str, Any], albedo: tuple[float, float, float]) -> Any:
-        """Mitsuba's scene under a light; a metal of that albedo."""
-        bsdf = {
-            "type": "refgs_bsdf",
-            "albedo": {"type": "rgb", "value": list(albedo)},
-            "metallic": METALLIC,
-            "roughness": 0.3,
-        }
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "mesh.ply"
-            path.write_bytes(self.mesh.export(file_type="ply", vertex_normal=True))
-            shape = {"type": "ply", "filename": str(path), "bsdf": bsdf}
-            return mi.load_dict({"type": "scene", "shape": shape, "light": emitter})
 
 
 def _bowl(name: str, detail: int) -> Concave:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -10,11 +12,11 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.common import montecarlo as mc
+from benchmarks.common import setup
 from benchmarks.common.lights import make_light
-from benchmarks.common.view import Points, first_hits, make_sensor, surface
-from benchmarks.visibility.rules import Rule
+from benchmarks.common.view import Points, rows
 from benchmarks.visibility.scenes import Concave
-from benchmarks.visibility.settings import ALBEDO, METALLIC, VOXEL, Settings
+from benchmarks.visibility.settings import METALLIC, VOXEL, Rule, Settings
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import render
@@ -24,17 +26,11 @@ from mi_refgs.shade.reflection import reflection
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.split_sum import shade
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.channels import logit
-from mi_refgs.surfels.init import from_points
-from mi_refgs.surfels.table import Surfels
 
-EXTREME = 1e-6
-"""Distance of albedo and metallic from 1, which their activation cannot reach."""
-OPACITY = 0.99
 TIMED_ROUGHNESS = 0.3
 
 
-class Setup:
+class Setup(setup.Setup):
     """One concave scene under the light."""
 
     def __init__(
@@ -42,47 +38,34 @@ class Setup:
         concave: Concave,
         settings: Settings,
         light_name: str = "studio",
-        albedo: tuple[float, float, float] = ALBEDO,
+        albedo: setup.Colour = setup.ALBEDO,
     ) -> None:
         light = make_light(light_name, settings.light_height)
-        self.name, self.settings, self.albedo = concave.name, settings, np.array(albedo)
-        self.scene = concave.load(light.emitter(), albedo)
-        self.params = mi.traverse(self.scene)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "mesh.ply"
+            path.write_bytes(concave.mesh.export(file_type="ply", vertex_normal=True))
+            shape = {"type": "ply", "filename": str(path)}
+            super().__init__(concave.name, shape, light, concave.look, settings, albedo)
         constant = mi.load_dict({"type": "scene", "light": {"type": "constant"}, "ball": {"type": "sphere"}})
         self.constant = constant.environment()
         self.light = light.prefiltered(settings.light_height)
-        self.sensor = make_sensor(concave.look, settings.size)
-        self.timing_sensor = make_sensor(concave.look, settings.timing_size)
-        self.points = surface(self.scene, self.sensor, settings.size)
         self.origin = mi.Point3f(concave.look.origin)
         mesh = concave.mesh
-        vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)
-        self.occluder = Occluder(Mesh(vertices, faces, VOXEL))
-        self.vertices, self.normals = vertices, np.array(mesh.vertex_normals, np.float32)
-        self.surfels = self.material(TIMED_ROUGHNESS)
+        self.vertices, self.normals = np.asarray(mesh.vertices, np.float32), np.array(mesh.vertex_normals)
+        self.occluder = Occluder(Mesh(self.vertices, np.asarray(mesh.faces, np.uint32), VOXEL))
+        self.material(TIMED_ROUGHNESS)
         self.occluder.set_materials(self.surfels)
 
-    def material(self, roughness: float) -> Surfels:
+    def material(self, roughness: float) -> None:
         """Give the scene this roughness; surfels at the mesh's vertices, of the same material."""
-        self.roughness = dr.opaque(mi.Float, roughness)
-        self.params["shape.bsdf.roughness.value"] = roughness
-        self.params.update()
-        rng = np.random.default_rng(0)
-        raw = from_points(self.vertices, self.normals, rng=rng, opacity=OPACITY).to_numpy()
-        count = len(self.vertices)
-        raw["albedo"] = np.tile(logit(np.minimum(self.albedo, 1 - EXTREME)), (count, 1)).astype(np.float32)
-        raw["metallic"] = np.full((count, 1), logit(np.array(1 - EXTREME)), np.float32)
-        raw["roughness"] = np.full((count, 1), logit(np.array(roughness)), np.float32)
-        self.surfels = Surfels.from_numpy(raw)
-        return self.surfels
+        self.surface = self.set_material(METALLIC, roughness)
+        self.roughness = self.surface["roughness"]
+        given = {"albedo": self.albedo, "metallic": METALLIC, "roughness": roughness}
+        self.surfels = setup.covering(self.vertices, self.normals.astype(np.float32), **given)
 
     def seen(self, points: Points, rule: Rule) -> ShadingPoints:
         """The points with what the rule finds."""
-        albedo = mi.Color3f(*(dr.opaque(mi.Float, float(x)) for x in self.albedo))
-        metallic = dr.opaque(mi.Float, METALLIC)
-        at = ShadingPoints(
-            points.normal, points.view, albedo=albedo, metallic=metallic, roughness=self.roughness
-        )
+        at = setup.shading_points(points, self.surface)
         if not rule.rays:
             return at
         around = Surroundings(self.occluder, self.surfels, self.light, self.origin, -points.view)
@@ -98,32 +81,17 @@ class Setup:
         if indirect is not None:
             at = at.replaced(indirect=mi.Color3f(np.ascontiguousarray(indirect.T, np.float32)))
         shaded = shade(at, self.light, "irradiance", rule.accuracy())
-        return np.array(shaded.total(), np.float64).T
+        return rows(shaded.total())
 
     def reference(self, depth: int) -> np.ndarray:
         """The path tracer's pictures: batches (B, P, 3), whose random numbers are those of other depths."""
-        integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
-        batches = [
-            self.points.of_image(
-                mi.render(
-                    self.scene, sensor=self.sensor, integrator=integrator, spp=self.settings.spp, seed=seed
-                )
-            )
-            for seed in range(1, self.settings.batches + 1)
-        ]
-        return np.stack(batches)
+        path, settings = setup.path_tracer(depth), self.settings
+        return np.stack([self.render(path, settings.spp, seed) for seed in range(1, settings.batches + 1)])
 
     def reflected(self, emitter: Any, occluder: Any) -> np.ndarray:
         """The integral of the reflectance and a light, past an occluder unless None: batches (B, P, 3)."""
         α = dr.square(self.roughness)
-        scale, bias = mc.integrate(
-            lambda points: mc.brdf_lobe(points, α),
-            self.points,
-            emitter,
-            samples=self.settings.lattice,
-            batches=self.settings.batches,
-            occluder=occluder,
-        )
+        scale, bias = self.integrate(lambda points: mc.brdf_lobe(points, α), emitter, occluder)
         return np.asarray(self.albedo * scale + bias)
 
     def visibility(self) -> tuple[np.ndarray, np.ndarray]:
@@ -134,15 +102,7 @@ class Setup:
 
     def shading_call(self, rule: Rule) -> Callable[[], Any]:
         """The timed picture of the mesh: a primary ray through every pixel, visibility, shading."""
-        size = self.settings.timing_size
-
-        def run() -> Any:
-            hit, ray = first_hits(self.scene, self.timing_sensor, size)
-            pixel = dr.arange(mi.UInt32, size * size)
-            points = Points(size, pixel, hit.p, hit.sh_frame.n, -ray.d, hit.n)
-            return dr.select(hit.is_valid(), self.shaded(points, rule), 0)
-
-        return run
+        return self.with_primary_rays(lambda points: self.shaded(points, rule))
 
     def frame_call(self, rule: Rule) -> Callable[[], Any]:
         """The product's own frame: the surfels splatted, visibility, shading."""

@@ -15,7 +15,7 @@ from benchmarks.stability import response
 from benchmarks.stability.__main__ import main
 from benchmarks.stability.case import Case, plain
 from benchmarks.stability.cases import catalogue
-from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, judge, measure
+from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, Row, measure
 from mi_refgs.primitives.surfel import FootprintAdjoint
 from mi_refgs.reference import picture as oracle
 
@@ -122,10 +122,11 @@ def test_page(tmp_path: Path) -> None:
 def test_verdicts() -> None:
     def verdict(**changes: Any) -> str:
         given: dict[str, Any] = {
-            "image": 1e-5, "maps": 1e-5, "gradients": {"scale": 1e-3}, "non_finite": 0, "kept": 1.0,
-            "order": 0.0, "image_floor": 0.0, "gradient_floor": {"scale": 0.0},
+            "name": "", "image": 1e-5, "maps": 1e-5, "gradients": {"scale": 1e-3}, "non_finite": 0,
+            "kept": 1.0, "order": 0.0, "image_floor": 0.0, "gradient_floor": {"scale": 0.0},
+            "negligible": [], "textbook": 0.0,
         }  # fmt: skip
-        return judge(**(given | changes))
+        return Row(**(given | changes)).verdict
 
     assert verdict() == "holds"
     assert verdict(image=2e-4).startswith("FAILS: image")
