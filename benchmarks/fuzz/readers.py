@@ -111,10 +111,11 @@ def _meshes(folder: Path) -> list[bytes]:
 
 def _foreign_meshes(folder: Path) -> list[bytes]:
     solid = trimesh.Trimesh(CUBE, TRIANGLES, process=False)
-    obj = "mtllib ../../etc/passwd\n" + str(solid.export(file_type="obj"))
+    obj, stl = "mtllib ../../etc/passwd\n" + str(solid.export(file_type="obj")), solid.export(file_type="stl")
+    assert isinstance(stl, bytes)
     return [
         b"obj" + obj.encode(),
-        b"stl" + bytes(solid.export(file_type="stl")),
+        b"stl" + stl,
         b"stl" + str(solid.export(file_type="stl_ascii")).encode(),
         b"off" + str(solid.export(file_type="off")).encode(),
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +152,7 @@ def speedup(result: Result) -> Any:
 def _heat(
     ax: Any,
     result: Result,
-    lines: dict[str, Callable[[float], Any]],
+    lines: Mapping[str, Callable[[float], Any]],
     value: Callable[[Any], float],
     text: Callable[[Any], str],
     ends: tuple[float, float],

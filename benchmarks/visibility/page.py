@@ -45,7 +45,7 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
         "spp": f"{s['spp'] * s['batches']:,}",
         "batches": s["batches"],
         "timing_size": s["timing_size"],
-        "rays": max(*s["rays"], *s["more_rays"]),
+        "rays": max([*s["rays"], *s["more_rays"]]),
         "bounces": max(s["bounces"]),
         "options": "".join(f" --mesh {Path(name).name}" for name in s["meshes"]),
     }
