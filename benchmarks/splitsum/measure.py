@@ -20,7 +20,7 @@ from benchmarks.common.setup import path_tracer
 from benchmarks.common.view import rows as picture_values
 from benchmarks.common.view import view_bins
 from benchmarks.splitsum import decompose, surfels
-from benchmarks.splitsum.exact import OPTIONS, LEVEL_SETS, SHIPPED, Exact, split_sum
+from benchmarks.splitsum.exact import LEVEL_SETS, OPTIONS, SHIPPED, Exact, split_sum
 from benchmarks.splitsum.settings import Settings
 from benchmarks.splitsum.speedup import Times, speed_ups, time_of
 
