@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.stability.case import Array, Case, Raw, camera, facing, plain, sky, sphere
+from benchmarks.stability.case import Array, Case, Raw, camera, facing, filled, plain, sky, sphere
 from benchmarks.stability.measure import light_of
 from mi_refgs.reference import picture as oracle
 from mi_refgs.reference import surfel
@@ -39,9 +39,8 @@ def scenes() -> Iterator[Case]:
         "rotation": facing(normal) + 0.02 * rng.normal(size=(600, 4)),
         "scale": np.log(rng.uniform(0.05, 0.12, (600, 2))),
         "opacity": rng.uniform(0, 7, (600, 1)),
-        "metallic": np.full((600, 1), 4.0),
-        "roughness": np.full((600, 1), -2.0),
     }
+    mirror |= filled(600, metallic=4, roughness=-2)
     yield plain("curved near-mirror", raw=mirror, camera=eye, light=sky(32))
     yield plain("planes through each other", raw=_planes(rng), **flat)
     mist = sphere(300)
@@ -61,12 +60,9 @@ def _planes(rng: np.random.Generator) -> Raw:
     flat = rng.uniform(-1, 1, (240, 3))
     raw["position"] = flat - np.sum(flat * normals, 1, keepdims=True) * normals
     raw["rotation"] = facing(normals)
-    raw["scale"] = np.full((240, 2), np.log(0.15))
-    raw["opacity"] = np.full((240, 1), 8.0)
-    raw["radiance_sh"] = (
-        np.where(np.arange(27) < 3, 1.0, 0) * np.where(np.arange(240) % 2, 1.2, -1.2)[:, None]
-    )
-    return raw
+    sides = np.where(np.arange(240) % 2, 1.2, -1.2)[:, None]
+    raw["radiance_sh"] = np.where(np.arange(27) < 3, 1.0, 0) * sides
+    return raw | filled(240, scale=np.log(0.15), opacity=8)
 
 
 def measure() -> dict[str, Any]:

@@ -49,8 +49,7 @@ class Case:
 def sphere(count: int = 40, seed: int = 1, degree: int = 2) -> Raw:
     """Overlapping discs on a unit sphere, normals outward with some noise, every channel."""
     rng = np.random.default_rng(seed)
-    normal = rng.normal(size=(count, 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = unit(rng.normal(size=(count, 3)))
     coefficients = 3 * (degree + 1) ** 2
     return {
         "position": normal,
@@ -63,6 +62,16 @@ def sphere(count: int = 40, seed: int = 1, degree: int = 2) -> Raw:
         "roughness": rng.normal(size=(count, 1)),
         "indirect_sh": 0.1 * rng.normal(size=(count, coefficients)) + 0.5 * (np.arange(coefficients) < 3),
     }
+
+
+def filled(count: int = 40, **values: float) -> Raw:
+    """Channels of the sphere with one raw value everywhere."""
+    return {name: np.full_like(sphere(count)[name], value) for name, value in values.items()}
+
+
+def unit(v: Array) -> Array:
+    """v / |v| by rows."""
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
 
 
 def facing(normal: Array) -> Array:

@@ -20,15 +20,19 @@ from benchmarks.stability.case import (
     Raw,
     camera,
     facing,
+    filled,
     plain,
     raw_light,
     sky,
     sphere,
+    unit,
 )  # fmt: skip
 from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.reference.splat import PinholeCamera
 
 LN = np.log
+EYE = np.array([3.0, 1.0, 2.0])
+"""Of the plain camera."""
 
 
 def catalogue() -> list[Case]:
@@ -55,45 +59,49 @@ def every(n: int = 2, k: int = 0, count: int = 40) -> Array:
 def _ends() -> Iterator[Case]:
     yield plain("plain scene")
     yield plain("plain scene, shaded at surfels", at="surfel", diffuse="irradiance")
-    for name, logit in (("0", -30.0), ("1", 30.0)):
-        yield plain(f"roughness {name}", raw={"roughness": np.full((40, 1), logit)})
-    mixed = where(every(), 30.0, "roughness", {"roughness": np.full((40, 1), -30.0)})
-    yield plain("roughness 0 beside 1", raw=mixed)
-    for name, logit in (("0", -30.0), ("1", 30.0)):
-        yield plain(f"metallic {name}", raw={"metallic": np.full((40, 1), logit)})
-    yield plain("albedo 0 and 1", raw=where(every(), 30.0, "albedo", {"albedo": np.full((40, 3), -30.0)}))
-    yield plain("opacity logit +30", raw={"opacity": np.full((40, 1), 30.0)})
-    yield plain("opacity logit -30: all transparent", raw={"opacity": np.full((40, 1), -30.0)})
-    mixed = where(every(), 30.0, "opacity", {"opacity": np.full((40, 1), -30.0)})
-    yield plain("opacity logits ±30", raw=mixed)
-    yield plain("opacity just above 1/255", raw={"opacity": np.full((40, 1), LN(0.0045))})
+    ends: dict[str, Raw] = {
+        "roughness 0": filled(roughness=-30),
+        "roughness 1": filled(roughness=30),
+        "roughness 0 beside 1": where(every(), 30, "roughness", filled(roughness=-30)),
+        "metallic 0": filled(metallic=-30),
+        "metallic 1": filled(metallic=30),
+        "albedo 0 and 1": where(every(), 30, "albedo", filled(albedo=-30)),
+        "opacity logit +30": filled(opacity=30),
+        "opacity logit -30: all transparent": filled(opacity=-30),
+        "opacity logits ±30": where(every(), 30, "opacity", filled(opacity=-30)),
+        "opacity just above 1/255": filled(opacity=LN(0.0045)),
+    }
+    for name, raw in ends.items():
+        yield plain(name, raw=raw)
+
+
+def _sideways(rng: np.random.Generator) -> tuple[Array, Array]:
+    """Unit vectors (40, 3) of the plain sphere's surfels to the eye, and random ones across them."""
+    view = unit(EYE - sphere()["position"])
+    return view, unit(np.cross(view, rng.normal(size=(40, 3))))
 
 
 def _normals() -> Iterator[Case]:
-    eye = np.array([3.0, 1.0, 2.0])
     rng = np.random.default_rng(2)
-    for name, slope in (("N·V → 0: 0.01", 0.01), ("N·V → 0: 0.001", 0.001), ("N·V negative: -0.1", -0.1)):
-        position = sphere()["position"]
-        view = eye - position
-        view /= np.linalg.norm(view, axis=1, keepdims=True)
-        side = np.cross(view, rng.normal(size=(40, 3)))
-        side /= np.linalg.norm(side, axis=1, keepdims=True)
+    for name, slope in {"→ 0: 0.01": 0.01, "→ 0: 0.001": 0.001, "negative: -0.1": -0.1}.items():
+        view, side = _sideways(rng)
         normal = np.sqrt(1 - slope**2) * side + slope * view
-        yield plain(name, raw={"rotation": facing(normal), "scale": np.full((40, 2), LN(0.4))})
+        yield plain(f"N·V {name}", raw={"rotation": facing(normal)} | filled(scale=LN(0.4)))
     # Two wide discs in one place, of the same weight everywhere: α₁ = α₂ (1 - α₁).
     pair = {n: x[:2] for n, x in sphere().items()}
-    view, side = eye / np.linalg.norm(eye), np.cross(eye, [0.3, 0.2, 1.0])
+    view, side = EYE / np.linalg.norm(EYE), np.cross(EYE, [0.3, 0.2, 1.0])
     side /= np.linalg.norm(side)
     tilt = 0.2  # below FACING_TOLERANCE: the second normal stays turned away
     first = np.sqrt(1 - tilt**2) * side + tilt * view
     for name, angle in (("normals that cancel but for 1e-3", 1e-3), ("normals that cancel", 0.0)):
         second = angle * np.cross(first, side) - first
         normals = np.stack([first, second / np.linalg.norm(second)])
-        both = {"position": np.zeros((2, 3)), "rotation": facing(normals), "scale": np.full((2, 2), LN(100))}
-        opacity = np.array([[LN(0.3 / 0.7)], [LN((3 / 7) / (4 / 7))]])
-        yield plain(name, raw=pair | both | {"opacity": opacity})
-    for name, size in (("quaternions of length 1e-10", 1e-10), ("quaternions of length 1e10", 1e10)):
-        yield plain(name, raw={"rotation": size * sphere()["rotation"]})
+        both = filled(2, position=0, scale=LN(100)) | {"rotation": facing(normals)}
+        both["opacity"] = np.array([[LN(0.3 / 0.7)], [LN((3 / 7) / (4 / 7))]])
+        yield plain(name, raw=pair | both)
+    for size in ("1e-10", "1e10"):
+        raw = {"rotation": float(size) * sphere()["rotation"]}
+        yield plain(f"quaternions of length {size}", raw=raw)
     yield plain("quaternions 0", raw=where(every(), 0.0, "rotation"))
 
 
@@ -101,16 +109,18 @@ def _normals() -> Iterator[Case]:
 
 
 def _scales() -> Iterator[Case]:
-    yield plain("scales 1e-8", raw={"scale": np.full((40, 2), LN(1e-8))})
-    yield plain("some scales 1e-8", raw=where(every(), LN(1e-8), "scale"))
-    yield plain("scales 0 (log scale -1000)", raw=where(every(), -1000.0, "scale"))
-    yield plain("scales 1e3", raw=where(every(4), LN(1e3), "scale"))
-    yield plain("scales 1e6", raw=where(every(4), LN(1e6), "scale"))
+    scales = {
+        "scales 1e-8": filled(scale=LN(1e-8)),
+        "some scales 1e-8": where(every(), LN(1e-8), "scale"),
+        "scales 0 (log scale -1000)": where(every(), -1000, "scale"),
+        "scales 1e3": where(every(4), LN(1e3), "scale"),
+        "scales 1e6": where(every(4), LN(1e6), "scale"),
+    }
+    for name, raw in scales.items():
+        yield plain(name, raw=raw)
     for ratio in (1e4, 1e6):
-        scale = np.tile([LN(0.5), LN(0.5 / ratio)], (40, 1))
-        yield plain(f"anisotropy {ratio:.0e}, length 0.5", raw={"scale": scale})
-        scale = np.tile([LN(0.05 * ratio), LN(0.05)], (40, 1))
-        yield plain(f"anisotropy {ratio:.0e}, width 0.05", raw={"scale": scale})
+        for name, axes in {"length 0.5": (0.5, 0.5 / ratio), "width 0.05": (0.05 * ratio, 0.05)}.items():
+            yield plain(f"anisotropy {ratio:.0e}, {name}", raw={"scale": np.tile(LN(axes), (40, 1))})
         raw, eye, corner = _part_of_film(1024, 1.5)
         raw["scale"] = raw["scale"] + [float(LN(ratio)), 0]
         name = f"anisotropy {ratio:.0e}, width of 1.5 pixels in a film of 1024²"
@@ -118,25 +128,18 @@ def _scales() -> Iterator[Case]:
 
 
 def _places() -> Iterator[Case]:
-    eye = np.array([3.0, 1.0, 2.0])
-    forward = -eye / np.linalg.norm(eye)
-    position = sphere()["position"]
-    view = eye - position
-    view /= np.linalg.norm(view, axis=1, keepdims=True)
-    rng = np.random.default_rng(4)
-    side = np.cross(view, rng.normal(size=(40, 3)))
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    eye, forward = EYE, -EYE / np.linalg.norm(EYE)
+    view, side = _sideways(np.random.default_rng(4))
     for slope in (1e-5, 2e-4, 1e-3):
-        normal = side + slope * view
-        yield plain(f"edge-on, cosine {slope:g}", raw={"rotation": facing(normal)})
-    behind = where(every(), position[every()] + 6 * eye / np.linalg.norm(eye), "position")
+        yield plain(f"edge-on, cosine {slope:g}", raw={"rotation": facing(side + slope * view)})
+    behind = where(every(), sphere()["position"][every()] + 6 * eye / np.linalg.norm(eye), "position")
     yield plain("half of the surfels behind the camera", raw=behind)
     for distance in (1e-1, 1e-3, 1e-6):
         near = where(every(8), (eye + distance * forward + 0.01 * distance * side)[every(8)], "position")
-        yield plain(f"surfels {distance:g} before the eye", raw=near | {"opacity": np.full((40, 1), -1.0)})
+        yield plain(f"surfels {distance:g} before the eye", raw=near | filled(opacity=-1))
     yield plain("surfels at the eye", raw=where(every(8), np.float32(eye), "position"))
     across = where(every(4), (eye + 0.5 * forward + 0.05 * side)[every(4)], "position")
-    raw = across | {"rotation": facing(side + 0.3 * view), "scale": np.full((40, 2), LN(0.6))}
+    raw = across | {"rotation": facing(side + 0.3 * view)} | filled(scale=LN(0.6))
     yield plain("across the eye's plane", raw=raw)
     yield plain("across the near plane", raw=raw, near=0.5)
 
@@ -202,7 +205,7 @@ def _worlds() -> Iterator[Case]:
 
 
 def _lights() -> Iterator[Case]:
-    shiny = {"roughness": sphere()["roughness"] - 2, "metallic": np.full((40, 1), 2.0)}
+    shiny = {"roughness": sphere()["roughness"] - 2} | filled(metallic=2)
     yield plain("a light with a peak of 1e6", raw=shiny, light=sky(peak=1e6))
     yield plain("a light of 1e6 everywhere", light=np.full((16, 32, 3), 1e6))
     yield plain("a black light (1e-4, the floor)", light=raw_light(np.full((16, 32, 3), 1e-4)))
@@ -210,25 +213,25 @@ def _lights() -> Iterator[Case]:
     yield plain("the smallest map", light=sky(8), raw=shiny)
     below = np.full((16, 32, 3), 1.0)
     below[13, 5] = 1e6
-    sheet = _level((0, 1, 0)) | {"roughness": np.full((40, 1), -1.0)}
-    above = camera((1.5, 4, 0.5))
+    sheet, above = _level((0, 1, 0)) | filled(roughness=-1), camera((1.5, 4, 0.5))
     yield plain("a sun of 1e6 below the horizon", raw=sheet, camera=above, light=raw_light(below))
-    poles = {"roughness": np.full((40, 1), -6.0), "metallic": np.full((40, 1), 3.0)}
     # Seen from above, mirrors around the top reflect the pole; from -z, those before the camera the seam.
-    yield plain("mirrors that reflect a pole", raw=poles | _level((0, 1, 0)), camera=camera((0.05, 4, 0.02)))
-    yield plain("mirrors that reflect the seam", raw=poles | _level((0, 0, -1)), camera=camera((0, 0.4, -4)))
-    yield plain(
-        "mirrors that reflect the other half", raw=poles | _level((0, 0, 1)), camera=camera((0, 0.4, 4))
-    )
+    mirrors = {
+        "a pole": ((0, 1, 0), (0.05, 4, 0.02)),
+        "the seam": ((0, 0, -1), (0, 0.4, -4)),
+        "the other half": ((0, 0, 1), (0, 0.4, 4)),
+    }
+    for name, (normal, eye) in mirrors.items():
+        raw = filled(roughness=-6, metallic=3) | _level(normal)
+        yield plain(f"mirrors that reflect {name}", raw=raw, camera=camera(eye))
 
 
-def _level(normal: tuple[float, float, float]) -> Raw:
+def _level(normal: tuple[float, ...]) -> Raw:
     """Discs in a plane, their normals within some degrees of its own."""
-    rng = np.random.default_rng(8)
-    n = np.array(normal) + 0.03 * rng.normal(size=(40, 3))
+    rng, axis = np.random.default_rng(8), np.array(normal)
+    n = axis + 0.03 * rng.normal(size=(40, 3))
     flat = rng.uniform(-1, 1, (40, 3))
-    flat -= np.sum(flat * np.array(normal), 1, keepdims=True) * np.array(normal)
-    return {"position": flat, "rotation": facing(n / np.linalg.norm(n, axis=1, keepdims=True))}
+    return {"position": flat - np.sum(flat * axis, 1, keepdims=True) * axis, "rotation": facing(unit(n))}
 
 
 # ---------------- pictures and cameras ----------------
@@ -266,9 +269,8 @@ def _part_of_film(size: int, pixels: float) -> tuple[Raw, PinholeCamera, tuple[i
 
 
 def _cameras() -> Iterator[Case]:
-    eye = np.array([3.0, 1.0, 2.0])
-    yield plain("a field of view of 1°", camera=camera(tuple(40 * eye), fov=1.0))
-    yield plain("a field of view of 150°", camera=camera(tuple(0.35 * eye), fov=150.0))
+    yield plain("a field of view of 1°", camera=camera(40 * EYE, fov=1.0))
+    yield plain("a field of view of 150°", camera=camera(0.35 * EYE, fov=150.0))
     yield plain("a camera at the object's centre", camera=camera((0, 0, 0), (1, 0.5, 0.2), 90))
     yield plain("a camera inside, near the wall", camera=camera((0.7, 0.5, 0.1), (-1, 0.5, 0.2), 90))
 
@@ -285,17 +287,12 @@ def _grid(n: int, size: float, y: float) -> tuple[Array, Array]:
     return np.stack([x, y + 0 * x, z], 1), np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
 
 
-def _discs_on_plate(y: float = 0.0, tilt: float = 0.05) -> Raw:
+def _discs_on_plate() -> Raw:
     rng = np.random.default_rng(9)
-    normal = np.array([0, 1.0, 0]) + tilt * rng.normal(size=(40, 3))
-    position = np.stack([rng.uniform(-1, 1, 40), np.full(40, y), rng.uniform(-1, 1, 40)], 1)
-    return {
-        "position": position,
-        "rotation": facing(normal / np.linalg.norm(normal, axis=1, keepdims=True)),
-        "opacity": np.full((40, 1), 2.0),
-        "roughness": np.full((40, 1), -2.0),
-        "metallic": np.full((40, 1), 1.0),
-    }
+    normal = np.array([0, 1.0, 0]) + 0.05 * rng.normal(size=(40, 3))
+    position = np.stack([rng.uniform(-1, 1, 40), np.zeros(40), rng.uniform(-1, 1, 40)], 1)
+    turned = {"position": position, "rotation": facing(unit(normal))}
+    return turned | filled(opacity=2, roughness=-2, metallic=1)
 
 
 def _with_mesh(name: str, parts: list[tuple[Array, Array]], voxel: float, **changes: Any) -> Case:
@@ -320,33 +317,25 @@ def _joined(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
 def _plates() -> Case:
     """A mirror below half a ceiling."""
     ceiling = _grid(3, 0.8, 0.5)
-    return _with_mesh(
-        "two plates",
-        [_grid(3, 1.5, 0.0), ceiling],
-        1e-3,
-        raw=_discs_on_plate(),
-        camera=camera((2.5, 1.6, 1.5)),
-    )
+    parts, eye = [_grid(3, 1.5, 0.0), ceiling], camera((2.5, 1.6, 1.5))
+    return _with_mesh("two plates", parts, 1e-3, raw=_discs_on_plate(), camera=eye)
 
 
 def _meshes() -> Iterator[Case]:
     yield _with_mesh("an empty mesh", [], 1.0)
-    sheet: Any = {"raw": _discs_on_plate(), "quick": True}
     wall = _grid(2, 1.5, 0.0)
     wall = (wall[0] @ np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, 1]]) - [1.3, 0, 0], wall[1])
     parts = [_grid(3, 1.5, 0.0), wall]
-    yield _with_mesh("an open sheet from above", parts, 1e-2, **sheet, camera=camera((2.5, 1.6, 1.5)))
-    yield _with_mesh("an open sheet from below", parts, 1e-2, **sheet, camera=camera((2.5, -1.6, 1.5)))
+    for name, height in (("above", 1.6), ("below", -1.6)):
+        eye = camera((2.5, height, 1.5))
+        yield _with_mesh(f"an open sheet from {name}", parts, 1e-2, raw=_discs_on_plate(), camera=eye)
     yield _plates()
     foreign = functools.partial(_foreign, _plates())
     yield replace(_plates(), name="the same mesh, made elsewhere", mesh=foreign, further=0.04)
     ball = trimesh.creation.icosphere(subdivisions=2)
-    grazing = _with_mesh(
-        "a grazing self-hit", [(np.asarray(ball.vertices), np.asarray(ball.faces))], 5e-3,
-        raw={"rotation": facing(sphere()["position"]), "opacity": np.full((40, 1), 2.0)},
-        camera=camera((3.0, 0.3, 2.0), (0.0, 1.0, 0.0), 20),
-    )  # fmt: skip
-    yield grazing
+    ball = [(np.asarray(ball.vertices), np.asarray(ball.faces))]
+    raw, eye = {"rotation": facing(sphere()["position"])}, camera((3.0, 0.3, 2.0), (0.0, 1.0, 0.0), 20)
+    yield _with_mesh("a grazing self-hit", ball, 5e-3, raw=raw | filled(opacity=2), camera=eye)
 
 
 def _foreign(case: Case) -> Mesh:

@@ -108,39 +108,35 @@ def _loss(name: str, radiance: Array, alpha: Array, target: Array, target_alpha:
     dr.backward(loss)
     found = np.stack([dr.grad(x).numpy() for x in (*planes, a)], 1).reshape(*SIZE, 4)
 
-    def exact(radiance: Array, alpha: Array) -> float:
-        image = oracle.display_image(radiance, alpha, (0.5, 0.5, 0.5))
+    def exact(values: Array) -> float:
+        image = oracle.display_image(values[..., :3], values[..., 3], (0.5, 0.5, 0.5))
         image = np.where((target >= losses.SATURATED) & (image > target), target, image)
         value = 0.8 * oracle.l1(image, target) + 0.2 * (1 - oracle.ssim(image, target))
-        return value + 0.2 * oracle.alpha_loss(alpha, target_alpha)
+        return value + 0.2 * oracle.alpha_loss(values[..., 3], target_alpha)
 
+    values = np.concatenate([radiance, alpha[..., None]], axis=-1)
     places = [(r, c) for r in (0, 4, 7) for c in (1, 5)]
-    slopes = np.array([_slopes(exact, radiance, alpha, place) for place in places])
+    slopes = np.array([_slopes(exact, values, place) for place in places])
     ours = np.array([found[place] for place in places])
     scale = float(np.linalg.norm(slopes))
     return {
         "name": name,
-        "value": _relative(float(loss[0]), exact(radiance, alpha)),
+        "value": _relative(float(loss[0]), exact(values)),
         "slope": float(np.linalg.norm(ours - slopes)) / max(scale, NOISE),
         "non_finite": int(np.sum(~np.isfinite(found))) + int(not np.isfinite(float(loss[0]))),
     }
 
 
-def _slopes(
-    exact: Callable[[Array, Array], float], radiance: Array, alpha: Array, place: tuple[int, int]
-) -> Array:
+def _slopes(exact: Callable[[Array], float], values: Array, place: tuple[int, int]) -> Array:
     """Derivatives (4,) by radiance and alpha of a pixel; at equality the slope of |x| is 0, as central
     differences have it."""
     out = np.zeros(4)
     for i in range(4):
-        step = 1e-6 * max(abs(radiance[place][i]), 1e-3) if i < 3 else 1e-7
+        step = 1e-6 * max(abs(values[place][i]), 1e-3) if i < 3 else 1e-7
         sides = []
         for sign in (1, -1):
-            r, a = radiance.copy(), alpha.copy()
-            if i < 3:
-                r[place][i] += sign * step
-            else:
-                a[place] += sign * step
-            sides.append(exact(r, a))
+            moved = values.copy()
+            moved[place][i] += sign * step
+            sides.append(exact(moved))
         out[i] = (sides[0] - sides[1]) / (2 * step)
     return out
