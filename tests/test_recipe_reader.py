@@ -6,6 +6,8 @@ it, and points to start from.
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -96,3 +98,14 @@ def test_a_fit_starts_from_its_points(folder: Path, tmp_path: Path, reader: None
 def test_a_folder_that_no_reader_knows_is_named(folder: Path) -> None:
     with pytest.raises(InputError, match=r"table: data set: no layout is recognised.*transforms_train\.json"):
         read_dataset(folder, "train")
+
+
+def test_a_reader_of_ones_own_is_asked_first() -> None:
+    """Also where it is registered before any data set was read."""
+    code = (
+        "import mi_refgs\nclass Own:\n    name = looks_for = 'own'\n"
+        "    def recognises(self, folder): return True\n"
+        "own = Own()\nmi_refgs.register_reader(own)\nfrom mi_refgs.data import dataset, readers\n"
+        "assert readers.READERS[0] is own and len(readers.READERS) == 2"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

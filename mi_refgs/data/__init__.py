@@ -1,1 +1,7 @@
 """Data sets: reading folders of pictures with cameras, and path-tracing new ones."""
+
+from mi_refgs.data.readers import register
+from mi_refgs.data.transforms import TransformsReader
+
+# Here, so that it is there before any other: the reader that was registered last is asked first.
+register(TransformsReader())

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.data.readers import PointCloud, ReadOptions, reader_of, register
-from mi_refgs.data.transforms import TransformsReader
+from mi_refgs.data.readers import PointCloud, ReadOptions, reader_of
 from mi_refgs.data.view import View
 
 EXTENT_MARGIN = 1.1
@@ -105,6 +104,3 @@ def _extent(views: tuple[View, ...]) -> float:
     origins = np.array([view.to_world[:3, 3] for view in views])
     middle = origins.mean(axis=0) if len(np.unique(origins, axis=0)) > 1 else 0
     return EXTENT_MARGIN * float(np.linalg.norm(origins - middle, axis=1).max()) or 1.0
-
-
-register(TransformsReader())
