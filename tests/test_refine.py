@@ -135,7 +135,7 @@ def test_reset_lowers_opacity_and_lifts_metallic_only() -> None:
     assert np.array_equal(edited["scale"], surfels.to_numpy()["scale"])
 
 
-PROPAGATION = Propagation(Window(0, 1, 1))
+PROPAGATION = Propagation(Window(0, 1, 1), roughness=0.1)
 
 
 def test_propagation_is_material_aware(rng: np.random.Generator) -> None:

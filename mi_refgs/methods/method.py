@@ -97,7 +97,7 @@ class Propagation:
     opacity: float = 0.9  # all surfels are made at least this opaque
     scale: float = 1.5  # factor of the sizes of the reflective
     metallic: float = 0.02  # reflective is what is at least this metallic …
-    roughness: float | None = 0.1  # … and at most this rough; absent: however rough
+    roughness: float | None = None  # … and at most this rough; absent: however rough
     noise: float = 0.0  # half the width of the noise on the constant colour of the others, in coefficients
     noise_metallic: float = 0.05  # which are at most this metallic
     hold: int = 200  # iterations without opacity learning afterwards
