@@ -26,7 +26,7 @@ from mi_refgs.surfels.channels import Channel
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
 
-SHININESS = Channel("shininess", (1,), "sigmoid", 0.02, ("shininess",), initial=0.5, material=True, aov="Y")
+SHININESS = Channel("shininess", (1,), "sigmoid", 0.02, ("shininess",), initial=0.5, aov="Y")
 SHARE = 0.3  # of the light that the lobe reflects
 
 

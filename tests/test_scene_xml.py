@@ -38,7 +38,7 @@ OTHER: dict[str, Any] = {
 
 def shading_with(option: str) -> Shading:
     """A shading whose model honours the option, with OTHER's value."""
-    name = next(name for name, model in MODELS.items() if option in model.accuracy)
+    name = next(name for name, model in MODELS.items() if option in model.honours)
     accuracy = Accuracy(**{option: OTHER[option]})
     return Shading(MODELS[name].orders[0], name, diffuse="irradiance", occlusion=True, accuracy=accuracy)
 

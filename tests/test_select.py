@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +18,12 @@ from tiny_scene import train_command, write_data
 from mi_refgs import methods, splat
 from mi_refgs.cli import main
 from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.errors import InputError
 from mi_refgs.fit import select
 from mi_refgs.fit.branch import branched
 from mi_refgs.fit.train import Trainer
 from mi_refgs.fit.whole import begin
+from mi_refgs.images import linear_from_srgb
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.runs.run import Run
@@ -274,3 +277,74 @@ def test_branching_resamples_the_light(variant: str, views: Dataset) -> None:
     assert finer.light is not None and trainer.light is not None
     mean = finer.light.radiance().numpy().mean((0, 1))
     np.testing.assert_allclose(mean, trainer.light.radiance().numpy().mean((0, 1)), rtol=0.02)
+
+
+# ---------------- what is refused, and what a trial must not spoil ----------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("holdout = 3", "holdout = 1", ["select.holdout", "1"]),
+        ('needs = ["specular"]', 'needs = ["speculr"]', ["interreflection", "speculr"]),
+        ("light = { height = 8 }", "light = { height = 10 }", ["light.height", "10"]),
+        ("degree = { radiance_sh = 1 } } }", "degrees = { radiance_sh = 1 } } }", ["degrees"]),
+        ("after = 5", "after = 9", ["interreflection", "tried later"]),
+    ],
+)
+def test_a_selection_that_cannot_be_made_is_refused_at_once(
+    old: str, new: str, words: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "own.toml"
+    assert old in METHOD
+    path.write_text(METHOD.replace(old, new))
+    with pytest.raises(InputError) as error:
+        methods.load(str(path), "quick")
+    assert all(word in str(error.value) for word in words), error.value
+
+
+def test_trials_end_with_the_fit(
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A term that has no room left is not tried, and no step is made beyond the last iteration."""
+    judged(monkeypatch, [21.0, 20.0, 19.0, 20.0])
+    settings = ["iterations=7", *SETTINGS[1:]]
+    trainer = begin(methods.load(variant, "quick", settings), views, Run(tmp_path / "run"))
+    trainer.train()
+    assert trainer.iteration == 7 and len(trainer.decisions) == 2
+    assert Run(tmp_path / "run").method().terms == ("degree",)
+
+
+def test_a_rival_that_fails_is_left_out(
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: Any) -> Trainer:
+        raise InputError("refine.prune_opacity: no surfel is left")
+
+    monkeypatch.setattr(select, "branched", failing)
+    trainer = fitted(variant, views, tmp_path / "run")
+    assert not any(row["stays"] for row in trainer.decisions) and trainer.iteration == 12
+    assert "no surfel is left" in trainer.decisions[0]["reason"]
+
+
+def test_the_time_of_trials_counts(
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The seconds of a fit hold the steps of both sides of a trial, and the judges' pictures."""
+    begin_ = time.perf_counter()
+    trainer = begin(methods.load(variant, "quick", SETTINGS), views, Run(tmp_path / "run"))
+    before = time.perf_counter()
+    trainer.train()
+    wall = time.perf_counter() - before
+    assert 0.7 * wall < trainer.seconds <= wall + 0.1 < time.perf_counter() - begin_ + 0.2
+
+
+def test_linear_pictures_are_judged_as_they_are_shown(
+    variant: str, views: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The score of a picture in linear radiance is that of the same picture as a PNG."""
+    trainer = Trainer(other(variant), views)
+    encoded = select.held_out_psnr(trainer, views)
+    linear = tuple(replace(v, image=linear_from_srgb(v.image), linear=True) for v in views.views)
+    judges = replace(views, views=linear, linear=False)
+    assert select.held_out_psnr(trainer, judges) == pytest.approx(encoded, abs=1e-4)

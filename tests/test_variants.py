@@ -126,6 +126,19 @@ def test_a_method_changes_exactly_what_is_listed(variant: str) -> None:
     assert changed == DIFFERENCES[variant] - {"iterations"}
 
 
+def test_what_defines_a_method() -> None:
+    """Values, not only keys."""
+    full = methods.load(FULL)
+    every_metal = methods.load("no_material_aware").refine.propagate
+    assert every_metal is not None and every_metal.roughness is None and full.refine.propagate is None
+    paper = methods.load("ref_gaussian_paper").refine.propagate
+    assert paper is not None and (paper.metallic, paper.roughness) == (0.02, 0.1)
+    assert [stage.at for _, stage in methods.load("no_deferred").stages()] == ["surfel"] * 2
+    assert [stage.at for _, stage in methods.load("no_initial_stage").stages()] == ["pixel"]
+    assert {stage.reflectance for _, stage in methods.load("no_pbr").stages()} == {"mirror"}
+    assert methods.load("no_interreflection").mesh is None and full.mesh is not None
+
+
 @pytest.mark.parametrize("variant", methods.names())
 def test_a_method_says_what_it_is(variant: str) -> None:
     """One level of `extends`; a name of its own; a baseline cites its paper and lists its deviations."""
@@ -133,8 +146,9 @@ def test_a_method_says_what_it_is(variant: str) -> None:
     about = content["about"]
     assert content.get("extends", FULL) == FULL and ("extends" in content) == (variant != FULL)
     assert about["name"] and "paper_row" in about
+    assert about["deviations"]
     if variant.startswith("base_"):
-        assert about["paper"] and about["deviations"]
+        assert about["paper"]
     names = [methods.load(name).about.name for name in methods.names()]
     assert len({*names}) == len(names)
 

@@ -171,7 +171,7 @@ class Progress:
             )
         if trainer.iteration % method.preview_every == 0:
             self._preview(trainer)
-        self.bar.update()
+        self.bar.update(trainer.iteration - self.bar.n)  # a trial is many iterations
 
     def _preview(self, trainer: Trainer) -> None:
         """The first training view and the light, as previews/<iteration>.png."""

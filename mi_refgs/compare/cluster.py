@@ -25,8 +25,8 @@ def run_on_cluster(
 ) -> None:
     """Do jobs on the workers of the scheduler at `address`, or on `workers` of this machine without one.
 
-    `report(job, reason)` hears of each that ended. A job whose worker died starts again from its checkpoint
-    on another, RETRIES times at most; then its row says why.
+    `report(job, reason)` is called for each that ended. A job whose worker died starts again from its
+    checkpoint on another, RETRIES times at most; then its row says why.
 
     Raises InputError without dask.distributed and for a scheduler that does not answer; KeyboardInterrupt or
     TerminatedError after a signal, when the jobs have been called off.

@@ -54,7 +54,7 @@ def execute(job: Job, stop: threading.Event | None = None) -> str | None:
 
 
 def execute_all(jobs: Sequence[Job], workers: int, report: Callable[[Job, str | None], None]) -> None:
-    """Do jobs, `workers` at once; `report(job, reason)` hears of each that ended.
+    """Do jobs, `workers` at once; `report(job, reason)` is called for each that ended.
 
     Raises KeyboardInterrupt or TerminatedError after a signal, when all processes have saved their state.
     """

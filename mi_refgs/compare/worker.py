@@ -74,7 +74,7 @@ def fit_and_measure(job: Job) -> None:
     trainer = begin(method, read_views(method, data, "train", truth=False), run)
     if trainer.iteration:
         print(f"refgs: resumed at iteration {trainer.iteration} of {method.iterations}", file=sys.stderr)
-    trainer.train(Curve(job, method))
+    trainer.train(Curve(job, method, trainer.iteration))
     finish(trainer, run)
     evaluate(run, data)
 
@@ -82,7 +82,7 @@ def fit_and_measure(job: Job) -> None:
 class Curve:
     """PSNR on a few test views in the course of a fit, measured between its steps, off its clock."""
 
-    def __init__(self, job: Job, method: Method) -> None:
+    def __init__(self, job: Job, method: Method, begin: int) -> None:
         from mi_refgs.fit.whole import read_views
 
         self.run = job.run
@@ -90,7 +90,8 @@ class Curve:
         last = len(self.data.views) - 1
         count = min(CURVE_VIEWS, last + 1)
         self.views = [self.data.views[i * last // max(count - 1, 1)] for i in range(count)]
-        self.due = {round(method.iterations * (k + 1) / CURVE_POINTS) for k in range(CURVE_POINTS)}
+        points = [round(method.iterations * (k + 1) / CURVE_POINTS) for k in range(CURVE_POINTS)]
+        self.due = [point for point in points if point > begin]
 
     def __call__(self, trainer: Any) -> None:
         from mi_refgs.evaluation.metrics import psnr
@@ -98,8 +99,10 @@ class Curve:
 
         while trainer.notices:
             print(f"refgs: warning: {trainer.notices.pop(0)}", file=sys.stderr)
-        if trainer.iteration not in self.due:
+        passed = [point for point in self.due if point <= trainer.iteration]
+        if not passed:
             return
+        self.due = self.due[len(passed) :]  # one point for all that a trial has passed
         values = [
             psnr(RenderedView.of(trainer.view(view.camera()), self.data).image, target(view))
             for view in self.views

@@ -72,7 +72,7 @@ def prune(
     the model can do without, degrees of harmonics, which every row pays for, and as many rows of the least
     blended weight as the training views allow.
     The worst training view stays at `limit` dB (above 0, at most 100: the same to rounding) or above, both
-    its displayed picture and its alpha. `tell` hears of every trial.
+    its displayed picture and its alpha. `tell` is called with every trial.
 
     The report has rows, channels and bytes of the PLY file `before` and `after`, the PSNR against the whole
     scene over the training and the test views, the median time of a frame, and the trials. Raises InputError

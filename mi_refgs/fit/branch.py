@@ -7,7 +7,7 @@ import numpy as np
 from mi_refgs.fit.control import first_light
 from mi_refgs.fit.train import Trainer
 from mi_refgs.methods.method import LIGHT, Method
-from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, part
+from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.lobe_matrices import resample
 from mi_refgs.surfels.channels import channel
@@ -38,7 +38,8 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
         else:
             radiance = EnvironmentLight(trainer.params[LIGHT]).radiance().numpy()
             wanted[LIGHT] = EnvironmentLight.from_radiance(resample(radiance, height)).raw.numpy()
-    new = {name: value for name, value in state.items() if not name.startswith((PARAMS, OPTIMISER))}
+    dropped = (PARAMS, OPTIMISER) if method.mesh is not None else (PARAMS, OPTIMISER, MESH)
+    new = {name: value for name, value in state.items() if not name.startswith(dropped)}
     for name, values in wanted.items():
         new[f"{PARAMS}{name}"] = np.asarray(values, np.float32)
         new |= {f"{OPTIMISER}{key}": value for key, value in _history(state, old, name, values).items()}

@@ -37,8 +37,12 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
             [hull.median_colours(outer, views, behind, facing), hull.median_colours(inner, views, behind)]
         )
     elif data.points is not None and len(data.points.position):
-        row = rng.choice(len(data.points.position), options.count, len(data.points.position) < options.count)
-        points, normals = data.points.position[row], init.random_normals(options.count, rng)
+        known_points = data.points.position
+        row = rng.permutation(np.arange(options.count) % len(known_points))
+        # Copies of a point lie around it, as far off as its neighbours do: their distance is a surfel's size.
+        spread = init.neighbour_scale(known_points)[row] * (len(known_points) < options.count)
+        points = known_points[row] + spread[:, None] * rng.normal(size=(options.count, 3))
+        normals = init.random_normals(options.count, rng)
         known = data.points.colour
         colours = hull.median_colours(points, views, behind) if known is None else known[row]
     else:

@@ -17,13 +17,18 @@ import numpy as np
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset
+from mi_refgs.errors import InputError
 from mi_refgs.fit.branch import branched
 from mi_refgs.fit.train import Trainer
+from mi_refgs.images import srgb_from_linear
 from mi_refgs.methods.method import Method, Selection
 from mi_refgs.render.display import displayed
 
 MOMENTS = 3
 """Arrays of float32 that a parameter needs: itself, and Adam's first and second moment."""
+
+TIME_NOISE = 0.05
+"""Part of a step by which its time may differ by chance."""
 
 DECISIONS = "decisions.json"
 """File of a run with the decisions."""
@@ -58,7 +63,8 @@ class Decision:
 def select_terms(trainer: Trainer, tell: Callable[[str], None] = lambda _: None) -> None:
     """Let a trainer try the terms of its method as they fall due; none if its method selects nothing.
 
-    Until the last decision it fits the views that are not held out. `tell` hears every decision.
+    Until the last decision it fits the views that are not held out. `tell` is called with a sentence for
+    every decision.
     """
     select = trainer.method.select
     if select is None:
@@ -71,12 +77,17 @@ def select_terms(trainer: Trainer, tell: Callable[[str], None] = lambda _: None)
 
     def between(trainer: Trainer) -> None:
         while (name := _due(trainer, select)) is not None:
+            seconds, begin = trainer.seconds, time.perf_counter()
             decision = _try(trainer, name, select, judges)
             trainer.decisions.append(asdict(decision))
             tell(sentence(decision))
             if not _open(trainer, select):
                 trainer.adopt(trainer.method, whole, trainer.state())
+            # All that a trial took counts: the loser's steps, the pictures of the judges.
+            trainer.seconds = seconds + time.perf_counter() - begin
             trainer.save()
+            if trainer.run is not None:
+                trainer.run.write_method(trainer.method)
 
     trainer.between = between
 
@@ -98,9 +109,14 @@ def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Dec
         return Decision(name, iteration, False, f"needs {missing[0]}")
     made = methods.load(method.file, method.preset, method.assignments, (*method.terms, name))
     candidate = replace(made, data=method.data)
-    rival = branched(trainer, candidate)
-    with_it = _run(rival, term.trial, judges)
-    without = _run(trainer, term.trial, judges)
+    if iteration + term.trial > method.iterations:
+        return Decision(name, iteration, False, "too late in the fit")
+    try:
+        rival = branched(trainer, candidate)
+        with_it = _run(rival, term.trial, judges, trainer.release)
+    except InputError as error:
+        return Decision(name, iteration, False, f"its fit failed: {error}")
+    without = _run(trainer, term.trial, judges, trainer.release)
     gain, wanted = with_it.psnr - without.psnr, asked(without, with_it, select)
     stays = gain >= wanted
     if stays:
@@ -112,18 +128,19 @@ def asked(without: Trial, with_it: Trial, select: Selection) -> float:
     """PSNR (dB) that a term has to bring for what it costs; what it may lose, where it saves."""
     time_price = select.gain_per_ms * (with_it.ms - without.ms)
     price = time_price + select.gain_per_mb * (with_it.mb - without.mb)
-    return price + (select.gain if with_it.mb > without.mb or price > 0 else 0)
+    costs = with_it.mb > without.mb or with_it.ms > (1 + TIME_NOISE) * without.ms
+    return price + (select.gain if costs else 0)
 
 
-def _run(trainer: Trainer, steps: int, judges: Dataset) -> Trial:
-    """Go on for some steps, and what came of it."""
-    seconds, start = [], time.perf_counter()
+def _run(trainer: Trainer, steps: int, judges: Dataset, release: Callable[[], None]) -> Trial:
+    """Go on for some steps, and what came of it; `release` lets an interrupt through between two of them."""
+    seconds = []
     for _ in range(steps):
         begin = time.process_time()
         trainer.step()
         dr.sync_thread()
         seconds.append(time.process_time() - begin)
-    trainer.seconds += time.perf_counter() - start
+        release()
     entries = sum(int(np.prod(tensor.shape)) for tensor in trainer.params.values())
     # The first half may compile kernels.
     return Trial(
@@ -140,7 +157,8 @@ def held_out_psnr(trainer: Trainer, judges: Dataset) -> float:
         frame = trainer.view(view.camera(), aovs=False)
         planes = [np.array(plane) for plane in displayed(frame, judges.background, judges.linear)]
         image = np.stack(planes, axis=-1).reshape(view.image.shape)
-        square = np.square(np.clip(image, 0, 1) - np.clip(view.image, 0, 1))
+        target = srgb_from_linear(view.image) if view.linear else view.image
+        square = np.square(np.clip(image, 0, 1) - np.clip(target, 0, 1))
         found.append(-10 * np.log10(max(float(square.mean()), 1e-10)))
     return float(np.mean(found))
 

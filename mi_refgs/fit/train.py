@@ -55,6 +55,7 @@ class Trainer:
         self.notices: list[str] = []  # messages for people; who shows one removes it
         self.decisions: list[dict[str, Any]] = []  # about terms of the method
         self.between: Callable[[Trainer], None] | None = None  # called ahead of each step of `train`
+        self.release: Callable[[], None] = lambda: None  # lets an interrupt through, while `train` runs
         self.occluder = Occluder()
         self.iteration, self.seconds = 0, 0.0
         self.skipped = 0  # steps that changed nothing, since their loss or gradient was not finite
@@ -131,9 +132,16 @@ class Trainer:
         Raises InputError when the run folder cannot be written: a checkpoint interval is lost at most.
         """
         with held_interrupts() as release:
+            self.release = release
             while self.iteration < self.method.iterations:
-                if self.between is not None:
-                    self.between(self)
+                try:
+                    if self.between is not None:
+                        self.between(self)
+                except KeyboardInterrupt:
+                    self.save()
+                    raise
+                if self.iteration == self.method.iterations:
+                    break
                 begin = time.perf_counter()
                 self.step()
                 if self.iteration % self.method.log_every == 0:

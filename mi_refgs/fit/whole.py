@@ -19,7 +19,7 @@ from mi_refgs.runs.run import Run
 def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> Method:
     """The method with the size of pictures decided: where it says none, what its preset can afford.
 
-    `tell` hears when pictures are read smaller than they are. Raises InputError as `read_dataset` does.
+    `tell` is called when pictures are read smaller than they are. Raises InputError as `read_dataset` does.
     """
     if method.data.downscale is not None:
         return method
@@ -53,7 +53,7 @@ def read_views(method: Method, path: Path, split: str, truth: bool = True) -> Da
 def begin(method: Method, views: Dataset, run: Run, tell: Callable[[str], None] = lambda _: None) -> Trainer:
     """A trainer that writes into `run`: from its newest checkpoint if the folder holds a run, else anew.
 
-    `tell` hears what is decided about the terms of a method that selects them. Raises InputError for
+    `tell` is called with what is decided about the terms of a method that selects them. Raises InputError for
     checkpoints that are all damaged and a folder that cannot be written.
     """
     resumed = run.exists()

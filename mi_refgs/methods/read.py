@@ -16,9 +16,10 @@ import tomli_w
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import is_file
 from mi_refgs.methods.build import build, plain
-from mi_refgs.methods.method import LIGHT, PRESETS, Method, Term
+from mi_refgs.methods.method import LIGHT, PRESETS, Method, Selection, Term
 from mi_refgs.methods.window import Window
 from mi_refgs.resources import resource_dir
+from mi_refgs.shade.envmap import MIN_HEIGHT
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.channels import CHANNELS
 
@@ -53,9 +54,35 @@ def load(
     for assignment in assignments or []:
         _assign(table, assignment)
     where = "--set" if assignments else str(path)
-    made = {"variant": path.stem, "file": variant, "preset": preset, "terms": [*terms]}
+    file = str(path.resolve()) if variant.endswith(".toml") else variant
+    made = {"variant": path.stem, "file": file, "preset": preset, "terms": [*terms]}
     made["assignments"] = [*(assignments or [])]
-    return _checked(build(Method, table | made, where), str(path))
+    method = _checked(build(Method, table | made, where), str(path))
+    if method.select is not None and not terms:
+        _check_terms(method, str(path))
+    return method
+
+
+def _check_terms(method: Method, where: str) -> None:
+    """Raise InputError for a selection that cannot be made; each term is loaded with those that it needs."""
+    select = method.select
+    assert select is not None
+    if select.holdout < 2:
+        raise InputError(f"{where}: select.holdout: {select.holdout} leaves no views to fit; give 2 or more")
+    for name, term in select.term.items():
+        if unknown := [needed for needed in term.needs if needed not in select.term]:
+            raise InputError(f"{where}: select.term.{name}: needs: there is no '{unknown[0]}'; name a term")
+        load(method.file, method.preset, method.assignments, [*_needed(select, name), name])
+
+
+def _needed(select: Selection, name: str) -> list[str]:
+    """The terms that one needs, and those that they need, in the order in which they are tried."""
+    found: list[str] = []
+    for needed in select.term[name].needs:
+        if select.term[needed].after > select.term[name].after or needed == name:
+            raise InputError(f"select.term.{name}: needs: '{needed}' is tried later; try it before")
+        found += [other for other in (*_needed(select, needed), needed) if other not in found]
+    return found
 
 
 def _with_term(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
@@ -76,16 +103,22 @@ def _checked(method: Method, where: str) -> Method:
         channels = {*surfels.names}
     except InputError as error:
         raise InputError(f"{where}: surfels.{error}") from error
+    bounded = {name for name in channels & CHANNELS.keys() if CHANNELS[name].activation == "sigmoid"}
     for key, named, known in (
-        ("surfels.channels", surfels.channels, set(CHANNELS)),
+        ("surfels.channels", surfels.channels, {name for name, x in CHANNELS.items() if not x.geometry}),
         ("surfels.initial", surfels.initial, channels),
         ("surfels.degree", surfels.degree, {name for name in CHANNELS if CHANNELS[name].harmonics}),
         ("rates.channel", rates.channel, set(CHANNELS)),
         ("rates.rest", rates.rest, {name for name in CHANNELS if CHANNELS[name].harmonics}),
+        ("refine.reset_raise", method.refine.reset_raise, bounded),
     ):
         if unknown := [name for name in named if name not in known]:
             allowed = ", ".join(name for name in CHANNELS if name in known)
             raise InputError(f"{where}: {key}: '{unknown[0]}' is unknown; use some of {allowed}")
+    if method.light is not None and (method.light.height % 4 or method.light.height < MIN_HEIGHT):
+        raise InputError(
+            f"{where}: light.height: {method.light.height} is no multiple of 4 from {MIN_HEIGHT}; give one"
+        )
     for name, stage in method.stages():
         try:
             Shading.of(stage, method.mesh is not None).check(channels, method.light is not None)
@@ -141,6 +174,8 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
     if not isinstance(dropped, list) or not all(isinstance(name, str) for name in dropped):
         raise InputError(f"{path}: drop: expected a list of keys, such as ['mesh', 'loss.alpha']; correct it")
     parent = _extended(_find(base, f"{path}: extends", path.parent), [*above, path.resolve()])
+    if "about" in table:  # what another file deviates from is not what this one does
+        parent.get("about", {}).pop("deviations", None)
     for name in dropped:
         _drop(parent, name, path)
     return _merge(parent, table)

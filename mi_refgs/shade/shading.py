@@ -57,8 +57,8 @@ class Shading:
         if not self.occlusion and {*chosen} & {*NEED_OCCLUSION}:
             raise InputError(f"shading: {', '.join(NEED_OCCLUSION)}: need occlusion; trace a `mesh`")
         for name in chosen:
-            if name not in self.model.accuracy:
-                able = " or ".join(other for other, model in MODELS.items() if name in model.accuracy)
+            if name not in self.model.honours:
+                able = " or ".join(other for other, model in MODELS.items() if name in model.honours)
                 raise InputError(f"shading: {name}: needs reflectance = {able}; set it")
 
     @staticmethod

@@ -51,7 +51,6 @@ class Channel:
     jitter: float = 0.0  # half the width of the uniform noise on it, activated
     rest_rate: float = 1.0  # factor of the rate for harmonics of degree 1 and above
     geometry: bool = False  # says where and how large a primitive is; there if its primitive has it
-    material: bool = False  # describes a surface under any light
     aov: str = ""  # suffixes of its AOV, Mitsuba's: "RGB", "Y"; none without
 
     @property
@@ -144,13 +143,11 @@ for _declared in (
     Channel("scale", (2, 3), "exp", 5e-3, _numbered("scale"), geometry=True),
     Channel("opacity", (1,), "sigmoid", 0.05, ("opacity",), 0.1, geometry=True),
     Channel("radiance_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("f",), rest_rate=0.05),
-    Channel(
-        "albedo", (3,), "sigmoid", 7.5e-3, _numbered("albedo"), 0.5, ALBEDO_JITTER, material=True, aov="RGB"
-    ),
-    Channel("metallic", (1,), "sigmoid", 5e-3, ("metallic",), 0.01, material=True, aov="Y"),
-    Channel("roughness", (1,), "sigmoid", 5e-3, ("roughness",), 0.1, material=True, aov="Y"),
+    Channel("albedo", (3,), "sigmoid", 7.5e-3, _numbered("albedo"), 0.5, ALBEDO_JITTER, aov="RGB"),
+    Channel("metallic", (1,), "sigmoid", 5e-3, ("metallic",), 0.01, aov="Y"),
+    Channel("roughness", (1,), "sigmoid", 5e-3, ("roughness",), 0.1, aov="Y"),
     Channel("indirect_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("ind",), rest_rate=0.05),
-    Channel("tint", (3,), "sigmoid", 7.5e-3, _numbered("tint"), 0.5, material=True, aov="RGB"),
+    Channel("tint", (3,), "sigmoid", 7.5e-3, _numbered("tint"), 0.5, aov="RGB"),
     Channel("normal_offset", (3,), "identity", 1e-3, _numbered("offset")),
 ):
     register(_declared)

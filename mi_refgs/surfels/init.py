@@ -1,4 +1,4 @@
-"""Initial surfels: one for each of the points that a scene starts from; `surfels.hull` finds such points."""
+"""Initial surfels: one for each of the points that a scene starts from; `data.hull` finds such points."""
 
 from __future__ import annotations
 

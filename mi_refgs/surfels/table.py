@@ -238,10 +238,6 @@ class Surfels:
         """Coefficients (mi.Color3f) of the radiance channel; the colour is max(0, 0.5 + Σ c_k Y_k)."""
         return self.value("radiance_sh")
 
-    def indirect_sh(self) -> list[Any]:
-        """Coefficients (mi.Color3f) of the indirect channel; the colour is max(0, Σ c_k Y_k), no offset."""
-        return self.value("indirect_sh")
-
     def frame(self) -> tuple[Any, Any, Any]:
         """World tangents and normal (t_u, t_v, n), the columns of the rotation matrix (three mi.Vector3f).
 

@@ -60,6 +60,11 @@ class Reflectance:
     visibility: Literal["none", "mirror", "own"] = "none"  # rays: none, of pixels in mirrors, by `trace`
     accuracy: tuple[str, ...] = ()  # options of `Accuracy` that it honours
 
+    @property
+    def honours(self) -> tuple[str, ...]:
+        """Options of `Accuracy` that change something: its own, and the levels of a light that it filters."""
+        return (*self.accuracy, "light_levels") if self.light == "filtered" else self.accuracy
+
     def channels(self, diffuse: str) -> tuple[str, ...]:
         """Channels beside the geometry that the surfels must have, for a choice of `Shading.diffuse`."""
         raise NotImplementedError

@@ -24,7 +24,7 @@ class SplitSum(Reflectance):
 
     name = "split_sum"
     visibility = "mirror"
-    accuracy = ("dominant", "multiscatter", "visibility_rays", "traced_bounces", "light_levels")
+    accuracy = ("dominant", "multiscatter", "visibility_rays", "traced_bounces")
 
     def channels(self, diffuse: str) -> tuple[str, ...]:
         return (*MATERIALS, "radiance_sh") if diffuse == "sh" else MATERIALS
