@@ -155,7 +155,7 @@ def test_panels_show_what_there_is(run: Run, folder: Path) -> None:
     shot = pictures.RenderedView.of(trainer.view(view.camera()), views)
     panels = pictures.panels(shot, view)
     assert list(panels) == [
-        "ground truth", "render", "true normals", "normals", "albedo", "roughness", "metallic", "visibility"
+        "ground truth", "render", "true normals", "normals", "albedo", "metallic", "roughness", "visibility"
     ]  # fmt: skip
     for title, picture in panels.items():
         assert picture.shape == (SIZE, SIZE, 3), title

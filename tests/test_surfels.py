@@ -36,7 +36,7 @@ def test_activations(count: int, rng: np.random.Generator) -> None:
     np.testing.assert_allclose(np.array(surfels.scale()).T, np.exp(raw["scale"]), rtol=1e-6)
     np.testing.assert_allclose(np.array(surfels.albedo()).T, sigmoid("albedo"), rtol=1e-6)
     for name in ("opacity", "metallic", "roughness"):
-        np.testing.assert_allclose(np.array(getattr(surfels, name)()), sigmoid(name)[:, 0], rtol=1e-6)
+        np.testing.assert_allclose(np.array(surfels.value(name)), sigmoid(name)[:, 0], rtol=1e-6)
     axes = Rotation.from_quat(raw["rotation"]).as_matrix()
     for column, axis in enumerate(surfels.frame()):
         np.testing.assert_allclose(np.array(axis).T, axes[:, :, column], atol=1e-6)
@@ -86,10 +86,7 @@ def everything(surfels: Surfels) -> object:
     arrays += [surfels.roughness(), *(entry for axis in surfels.frame() for entry in axis)]
     arrays += [*surfels.value("tint"), *surfels.value("normal_offset")]
     arrays += [
-        part
-        for name in ("radiance_sh", "indirect_sh")
-        for colour in getattr(surfels, name)()
-        for part in colour
+        part for name in ("radiance_sh", "indirect_sh") for colour in surfels.value(name) for part in colour
     ]
     generator = np.random.default_rng(9)
     total = mi.Float(0)
