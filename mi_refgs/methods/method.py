@@ -193,9 +193,9 @@ class Selection:
 
     term: dict[str, Term]
     holdout: int = 8  # every so many training views judge
-    gain: float = 0.05  # dB
-    gain_per_ms: float = 0.01  # dB for each millisecond of a step
-    gain_per_mb: float = 0.002  # dB for each MB of parameters and their moments
+    gain: float = 0.02  # dB
+    gain_per_ms: float = 0.003  # dB for each millisecond of a step
+    gain_per_mb: float = 0.001  # dB for each MB of parameters and their moments
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,9 @@ MAX_SH_DEGREE = 3
 ALBEDO_JITTER = 0.025
 """Uniform jitter of the initial albedo around its mean: breaks ties between surfels. [Ref-Gaussian]"""
 
+SH_DC = 0.28209479177387814
+"""Y_0 = 1 / (2 √π): a constant coefficient c adds the colour Y_0 c. [3DGS]"""
+
 JITTER_RANGE = (0.001, 0.999)
 """Where a jittered initial value in 0 … 1 is kept: away from the ends, where the sigmoid has no slope."""
 
@@ -72,7 +75,8 @@ class Channel:
     ) -> np.ndarray:
         """Initial raw values (count, width) float64 around `value` (activated; absent: `initial`).
 
-        Raises InputError for a value that the activation cannot give.
+        Of harmonics it is what the constant part adds to a colour. Raises InputError for a value that the
+        activation cannot give.
         """
         value = self.initial if value is None else value
         if self.activation == "sigmoid":
@@ -86,6 +90,9 @@ class Channel:
             if not 0 < value < np.inf:
                 raise InputError(f"surfels: {self.name}: {value} is no size; start it above 0")
             value = np.log(value)
+        if self.harmonics:  # the same from everywhere
+            constant = np.arange(width) < 3
+            return np.tile(np.where(constant, value / SH_DC, 0.0), (count, 1))
         return np.full((count, width), float(value))
 
 

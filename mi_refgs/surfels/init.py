@@ -10,11 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from mi_refgs.errors import InputError
 from mi_refgs.primitives import primitive_named
-from mi_refgs.surfels.channels import CHANNELS, MAX_SH_DEGREE, channel
+from mi_refgs.surfels.channels import CHANNELS, MAX_SH_DEGREE, SH_DC, channel
 from mi_refgs.surfels.table import Surfels
 
-# Y_0 = 1 / (2 √π): a DC coefficient c shows as the colour 0.5 + Y_0 c. [3DGS]
-SH_DC = 0.28209479177387814
 # Least distance to the neighbours, as part of the points' extent: keeps the log scale of doubled points
 # finite. 2DGS has 3e-4 scene units, whatever the unit.
 DISTANCE_FLOOR = 1e-4
