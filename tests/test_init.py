@@ -94,3 +94,11 @@ def test_a_channel_starts_at_its_activated_value(rng: np.random.Generator) -> No
     for value in (0.0, -1.0, np.inf):
         with pytest.raises(InputError, match=r"width: .* is no size; start it above 0"):
             declared["exp"].start(1, 1, rng, value)
+
+
+def test_harmonics_start_with_a_constant_part(rng: np.random.Generator) -> None:
+    """0.4 from everywhere: the constant coefficient times Y_0, and nothing beside it."""
+    surfels = init.from_points(rng.random((5, 3)), rng=rng, degree={"indirect_sh": 1}, indirect_sh=0.4)
+    raw = surfels.to_numpy()["indirect_sh"]
+    np.testing.assert_allclose(raw[:, :3] * 0.28209479, 0.4, rtol=1e-6)
+    assert np.all(raw[:, 3:] == 0)
