@@ -30,8 +30,8 @@ from mi_refgs.runs.run import Run
 from mi_refgs.surfels.ply import read_ply
 
 METHOD = """
-extends = "auto"
-drop = ["refine", "select.term"]
+extends = "base_2dgs"
+drop = ["refine"]
 iterations = 2_000
 checkpoint_every = 4
 log_every = 2

@@ -98,7 +98,7 @@ DIFFERENCES: dict[str, set[str]] = {
         "surfels.initial",
         "surfels.primitive",
     },
-    "auto": COLOUR_ONLY | {"select"},
+    "auto": {"select"},
 }
 """Keys, to the second level, by which a method differs from the full one; `about` aside."""
 

@@ -107,6 +107,8 @@ def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Dec
     term, method, iteration = select.term[name], trainer.method, trainer.iteration
     if missing := [needed for needed in term.needs if needed not in method.terms]:
         return Decision(name, iteration, False, f"needs {missing[0]}")
+    if present := [other for other in term.unless if other in method.terms]:
+        return Decision(name, iteration, False, f"nothing to do beside {present[0]}")
     made = methods.load(method.file, method.preset, method.assignments, (*method.terms, name))
     candidate = replace(made, data=method.data)
     if iteration + term.trial > method.iterations:

@@ -181,6 +181,7 @@ class Term:
     change: dict[str, Any] = field(default_factory=dict)  # tables merged over the method's
     drop: tuple[str, ...] = ()  # keys that it removes before
     needs: tuple[str, ...] = ()  # terms that must be in use
+    unless: tuple[str, ...] = ()  # terms that must not
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ def _check_terms(method: Method, where: str) -> None:
     if select.holdout < 2:
         raise InputError(f"{where}: select.holdout: {select.holdout} leaves no views to fit; give 2 or more")
     for name, term in select.term.items():
-        if unknown := [needed for needed in term.needs if needed not in select.term]:
+        if unknown := [other for other in (*term.needs, *term.unless) if other not in select.term]:
             raise InputError(f"{where}: select.term.{name}: needs: there is no '{unknown[0]}'; name a term")
         load(method.file, method.preset, method.assignments, [*_needed(select, name), name])
 
