@@ -179,7 +179,7 @@ class Term:
     after: int  # iterations before it is tried
     trial: int  # iterations with it, and without it, that are compared
     change: dict[str, Any] = field(default_factory=dict)  # tables merged over the method's
-    drop: tuple[str, ...] = ()  # keys that it removes before
+    drop: tuple[str, ...] = ()  # keys that it removes before, where they are there
     needs: tuple[str, ...] = ()  # terms that must be in use
     unless: tuple[str, ...] = ()  # terms that must not
 

@@ -5,6 +5,7 @@ No other module opens a TOML file, and none contains a method's name.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import tomllib
 from collections.abc import Sequence
@@ -92,7 +93,8 @@ def _with_term(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: select.term: there is no '{name}'; use one of its terms") from error
     for key in term.drop:
-        _drop(table, key, path)
+        with contextlib.suppress(InputError):  # another term, or a file below this one, may have dropped it
+            _drop(table, key, path)
     return _merge(table, term.change)
 
 
