@@ -75,9 +75,9 @@ def run(args: argparse.Namespace) -> Result:
     if args.output is None:
         raise InputError("-o: none given; name the folder of the comparison")
     if args.data:
-        todo = _plan(args, execute.threads_each(args.workers, args.threads))
-        wanted = [job for job in todo if not jobs.finished(job)]
-        say(f"{args.output}: {len(wanted)} of {len(todo)} jobs to do, {args.workers} at once")
+        planned = _plan(args, execute.threads_each(args.workers, args.threads))
+        wanted = [job for job in planned if not jobs.finished(job)]
+        say(f"{args.output}: {len(wanted)} of {len(planned)} jobs to do, {args.workers} at once")
         try:
             if args.cluster is None:
                 execute.execute_all(wanted, args.workers, Report(len(wanted)))
