@@ -1,8 +1,10 @@
-"""Makes scenes/lights/studio.exr, the environment of the example scenes: a photo studio, all of it analytic.
+"""Makes scenes/lights/*.exr, the environments of the example scenes: a photo studio, and an evening sky.
 
-Run from the repository root: python scenes/make_lights.py The map is lat-long in Mitsuba's `envmap`
-orientation (y up); the scenes turn it to z up. Edges are blurred over about two degrees, the width that a 64
-× 128 map can hold, so that a recovered light can be compared with it.
+Run from the repository root: python scenes/make_lights.py
+
+Every map is analytic, and lat-long in Mitsuba's `envmap` orientation (y up); the scenes turn it to z up. Edges
+are blurred over about two degrees, the width that a 64 × 128 map can hold, so that a recovered light can be
+compared with it.
 """
 
 from __future__ import annotations
@@ -105,6 +107,30 @@ def studio(d: np.ndarray) -> np.ndarray:
     return radiance
 
 
+def sky(d: np.ndarray) -> np.ndarray:
+    """Radiance (…, 3) of a clear evening from unit directions (…, 3), z up: low sun, clouds, hills, grass."""
+    z = d[..., 2]
+    azimuth = np.arctan2(d[..., 1], d[..., 0])
+    height = np.clip(z, 0, 1)[..., None]
+    horizon, zenith = np.array([0.95, 0.75, 0.55]), np.array([0.16, 0.30, 0.72])
+    radiance = horizon + (zenith - horizon) * height**0.45
+    cloud = np.sin(5 * azimuth + 4 * z) * np.sin(11 * z + 2 * np.cos(3 * azimuth))
+    cover = (np.clip(cloud - 0.25, 0, 1) * np.clip(4 * z, 0, 1))[..., None]
+    radiance = radiance + (np.array([1.3, 1.2, 1.15]) - radiance) * cover
+    angle = np.arccos(np.clip(d @ direction(-50, 24), -1, 1))
+    radiance = radiance + np.exp(-((angle / np.radians(14)) ** 2))[..., None] * np.array([1.6, 1.1, 0.6])
+    sun = step(np.radians(4) - angle)[..., None]
+    radiance = radiance + (np.array([60.0, 46.0, 30.0]) - radiance) * sun
+    ridge = 0.07 + 0.04 * np.sin(3 * azimuth) + 0.02 * np.sin(7 * azimuth + 1)
+    hills = step(ridge - np.arcsin(np.clip(z, -1, 1)))[..., None]
+    radiance = radiance + (np.array([0.10, 0.13, 0.11]) - radiance) * hills
+    grass = step(-np.arcsin(np.clip(z, -1, 1)))[..., None]
+    meadow = (
+        np.array([0.13, 0.19, 0.06]) * (1 + 0.35 * np.sin(9 * azimuth) * np.clip(-2 * z, 0, 1))[..., None]
+    )
+    return radiance + (meadow - radiance) * grass
+
+
 def lat_long_directions(height: int) -> np.ndarray:
     """World directions (height, 2·height, 3), z up, of a map that a scene turns by +90° about x."""
     rows, columns = np.arange(height) + 0.5, np.arange(2 * height) + 0.5
@@ -114,11 +140,12 @@ def lat_long_directions(height: int) -> np.ndarray:
 
 
 def main() -> None:
-    """Write the map beside this script."""
-    fine = studio(lat_long_directions(HEIGHT * OVERSAMPLING))
+    """Write the maps beside this script."""
+    directions = lat_long_directions(HEIGHT * OVERSAMPLING)
     target = Path(__file__).parent / "lights"
     target.mkdir(exist_ok=True)
-    write_exr(target / "studio.exr", box_downscale(fine, OVERSAMPLING), half=True)
+    for name, radiance in (("studio", studio), ("sky", sky)):
+        write_exr(target / f"{name}.exr", box_downscale(radiance(directions), OVERSAMPLING), half=True)
 
 
 if __name__ == "__main__":

@@ -5,10 +5,15 @@ Run from the repository root: python scenes/make_meshes.py
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import trimesh
+from skimage import measure
+
+Distance = Callable[[np.ndarray], np.ndarray]
+"""Signed distance (…,) of points (…, 3), about exact near the surface, negative inside."""
 
 
 def tube(centre_line: np.ndarray, radius: float, sides: int) -> trimesh.Trimesh:
@@ -59,13 +64,114 @@ def rounded_cube(power: float = 4.0) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, sphere.faces, vertex_normals=normals, process=False)
 
 
+def surface(distance: Distance, half: float, cells: int) -> trimesh.Trimesh:
+    """Zero level of a distance in the cube [-half, half]³ with the normals of its gradient."""
+    axis = np.linspace(-half, half, cells + 1)
+    step = axis[1] - axis[0]
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    vertices, faces, _, _ = measure.marching_cubes(distance(grid), 0.0, gradient_direction="descent")
+    vertices = vertices * step - half
+    offsets = 0.25 * step * np.eye(3)
+    normals = np.stack([distance(vertices + o) - distance(vertices - o) for o in offsets], axis=-1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
+    if mesh.volume < 0:
+        mesh.faces = mesh.faces[:, ::-1]
+    return trimesh.Trimesh(vertices, mesh.faces, vertex_normals=normals, process=False)
+
+
+def union(a: np.ndarray, b: np.ndarray, blend: float) -> np.ndarray:
+    """Distance of a union whose seam is rounded over about `blend`."""
+    share = np.clip(0.5 + 0.5 * (b - a) / blend, 0, 1)
+    return b + (a - b) * share - blend * share * (1 - share)
+
+
+def cut(a: np.ndarray, b: np.ndarray, blend: float) -> np.ndarray:
+    """Distance of a without b, the edge rounded over about `blend`."""
+    return -union(-a, b, blend)
+
+
+def hollow_block(p: np.ndarray) -> np.ndarray:
+    """A rounded block with a hole through it along x, bowls in the top and two sides, and a knob in one."""
+    q = np.abs(p) - np.array([0.52, 0.52, 0.42])
+    block = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0) - 0.16
+    hole = np.hypot(p[..., 1], p[..., 2] + 0.08) - 0.2
+    top = np.linalg.norm(p - [0, 0, 0.78], axis=-1) - 0.46
+    right = np.linalg.norm(p - [0, 0.86, -0.02], axis=-1) - 0.42
+    left = np.linalg.norm(p - [0, -0.86, -0.02], axis=-1) - 0.42
+    body = cut(cut(cut(cut(block, hole, 0.05), top, 0.05), right, 0.05), left, 0.05)
+    return union(body, np.linalg.norm(p - [0.1, 0.05, 0.42], axis=-1) - 0.13, 0.04)
+
+
+def shell(p: np.ndarray) -> np.ndarray:
+    """A hollow ball with six round windows and rounded rims."""
+    radius = np.linalg.norm(p, axis=-1)
+    wall = np.abs(radius - 0.84) - 0.07
+    windows = np.min(
+        [np.hypot(p[..., (i + 1) % 3], p[..., (i + 2) % 3]) - (0.5, 0.44, 0.38)[i] for i in range(3)], axis=0
+    )
+    return cut(wall, windows, 0.1)
+
+
+def cup(p: np.ndarray) -> np.ndarray:
+    """A cup with a thick round rim, a foot and a handle along +x."""
+    x, y, z = p[..., 0], p[..., 1], p[..., 2]
+    radius = np.hypot(x, y)
+    flare = 0.5 + 0.06 * (z + 0.55)  # outer radius grows upwards
+    outside = np.maximum(radius - flare, np.abs(z) - 0.55)
+    inside = np.maximum(radius - flare + 0.075, -(z + 0.46))
+    body = cut(outside, inside, 0.05) - 0.02
+    handle = np.hypot(np.hypot(x - 0.56, z) - 0.28, y) - 0.065
+    return union(body, np.maximum(handle, flare - 0.05 - radius), 0.06)
+
+
+def brick(columns: int, rows: int) -> trimesh.Trimesh:
+    """A building brick, open below: walls, a lid with studs, tubes between the studs. A stud a unit, z up."""
+    wall, height, stud = 0.16, 1.2, (0.3, 0.22)
+    w, d = columns / 2 - 0.01, rows / 2 - 0.01
+
+    def box(low: tuple[float, ...], high: tuple[float, ...]) -> trimesh.Trimesh:
+        return trimesh.creation.box(bounds=[low, high])
+
+    parts = [
+        box((-w, -d, height - wall), (w, d, height)),
+        box((-w, -d, 0), (-w + wall, d, height - wall)),
+        box((w - wall, -d, 0), (w, d, height - wall)),
+        box((-w + wall, -d, 0), (w - wall, -d + wall, height - wall)),
+        box((-w + wall, d - wall, 0), (w - wall, d, height - wall)),
+    ]
+    for i in range(columns):
+        for j in range(rows):
+            at = [i + 0.5 - columns / 2, j + 0.5 - rows / 2]
+            post = trimesh.creation.cylinder(stud[0], stud[1], sections=32)
+            parts.append(post.apply_translation([*at, height + stud[1] / 2]))
+            if i and j:
+                tube = trimesh.creation.cylinder(0.27, height - wall, sections=32)
+                parts.append(tube.apply_translation([at[0] - 0.5, at[1] - 0.5, (height - wall) / 2]))
+    return trimesh.util.concatenate(parts)
+
+
 def main() -> None:
     """Write the meshes beside this script."""
     target = Path(__file__).parent / "meshes"
     target.mkdir(exist_ok=True)
     meshes = {"torus": torus(0.82, 0.18), "trefoil": trefoil(0.27, 0.16), "rounded_cube": rounded_cube()}
+    meshes |= {"hollow_block": surface(hollow_block, 0.75, 30), "shell": surface(shell, 0.95, 38)}
+    whole = surface(cup, 0.9, 50)
+    centres = whole.triangles_center
+    inner = (np.hypot(*centres.T[:2]) < 0.47 + 0.06 * (centres[:, 2] + 0.55)) & (centres[:, 2] > -0.5)
+    for name, faces in (("cup_outside", ~inner), ("cup_inside", inner)):
+        used, index = np.unique(whole.faces[faces], return_inverse=True)
+        meshes[name] = trimesh.Trimesh(
+            whole.vertices[used],
+            index.reshape(-1, 3),
+            vertex_normals=whole.vertex_normals[used],
+            process=False,
+        )
     for name, mesh in meshes.items():
         mesh.export(target / f"{name}.ply", vertex_normal=True)
+    for columns, rows in ((4, 2), (2, 2), (3, 1)):
+        brick(columns, rows).export(target / f"brick_{columns}x{rows}.ply", vertex_normal=False)
 
 
 if __name__ == "__main__":
