@@ -3,8 +3,8 @@
 Run from the repository root: python scenes/make_lights.py
 
 Every map is analytic, and lat-long in Mitsuba's `envmap` orientation (y up); the scenes turn it to z up.
-Edges are blurred over about two degrees, the width that a 64 × 128 map can hold, so that a recovered light can be
-compared with it.
+Edges are blurred over about two degrees, the width that a 64 × 128 map can hold, so that a recovered light
+can be compared with it.
 """
 
 from __future__ import annotations
