@@ -148,7 +148,8 @@ def brick(columns: int, rows: int) -> trimesh.Trimesh:
             if i and j:
                 tube = trimesh.creation.cylinder(0.27, height - wall, sections=32)
                 parts.append(tube.apply_translation([at[0] - 0.5, at[1] - 0.5, (height - wall) / 2]))
-    return trimesh.util.concatenate(parts)
+    brick: trimesh.Trimesh = trimesh.util.concatenate(parts)  # type: ignore[assignment]
+    return brick
 
 
 def main() -> None:

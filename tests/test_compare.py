@@ -22,6 +22,8 @@ from mi_refgs.compare.jobs import Job
 from mi_refgs.compare.paper import Figures, Place, place_of
 from mi_refgs.compare.table import Row, Scene, Statistic, Table
 from mi_refgs.errors import InputError
+from mi_refgs.exr import write_exr
+from mi_refgs.images import read_png
 from mi_refgs.methods import load, names
 from mi_refgs.runs.run import Run
 
@@ -280,6 +282,23 @@ def test_no_test_views_are_refused(
     (data / "transforms_test.json").write_text(json.dumps(content))
     assert main(command(data, tmp_path / "out", variants[0])) == 2
     assert "zero test views" in capsys.readouterr().err
+
+
+def test_pictures_are_looked_for_as_the_methods_read_them(
+    ball: Path, variants: tuple[Path, Path], tmp_path: Path
+) -> None:
+    data = shutil.copytree(ball, tmp_path / "ball")
+    for picture in data.glob("*/r_*.png"):
+        write_exr(picture.with_suffix(".exr"), read_png(picture))
+        picture.unlink()
+
+    def plan(*settings: str) -> list[Job]:
+        folder, options = tmp_path / "out", [*SIX, *settings]
+        return jobs.plan(folder, [data], [str(variants[0])], [0], "quick", options, "llvm_ad_rgb", 1)
+
+    assert len(plan("data.images='exr'")) == 1
+    with pytest.raises(InputError, match="png"):
+        plan()
 
 
 def test_other_settings_are_refused(

@@ -34,13 +34,16 @@ def run_on_cluster(
     distributed = _distributed()
     with held_interrupts() as release, _client(distributed, address, workers) as client:
         pending = {client.submit(execute, job, key=job.folder, pure=False): job for job in jobs}
-        while pending:
-            with contextlib.suppress(TimeoutError):
-                distributed.wait(list(pending), timeout=POLL, return_when="FIRST_COMPLETED")
-            for future in [future for future in pending if future.done()]:
-                job = pending.pop(future)
-                report(job, _reason(job, future))
-            release()
+        try:
+            while pending:
+                with contextlib.suppress(TimeoutError):
+                    distributed.wait(list(pending), timeout=POLL, return_when="FIRST_COMPLETED")
+                for future in [future for future in pending if future.done()]:
+                    job = pending.pop(future)
+                    report(job, _reason(job, future))
+                release()
+        finally:
+            client.cancel(list(pending))  # what a scheduler of its own has not begun would outlive us
 
 
 @contextlib.contextmanager

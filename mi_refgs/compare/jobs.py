@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.files import read_json
-from mi_refgs.fit.whole import sized
-from mi_refgs.methods.method import About, Method
+from mi_refgs.fit.whole import read_views, sized
+from mi_refgs.methods.method import About, DataOptions, Method
 from mi_refgs.methods.read import load
 from mi_refgs.runs.run import Run
 
@@ -89,8 +88,6 @@ def plan(
     Seeds vary slowest, so that a comparison that is cut short has each method once. Raises InputError for a
     data set or a method that cannot be used, two of one name, and runs that were made with other settings.
     """
-    for path in data:
-        read_dataset(path, "test", truth=False)
     _unique((absolute(path).name for path in data), "DATA", "give the folders different names")
     _unique((Path(variant).stem for variant in variants), "--variants", "name each once")
     _unique((str(seed) for seed in seeds), "--seeds", "give each once")
@@ -115,9 +112,20 @@ def plan(
         for variant in variants
     ]
     require_settings(folder, preset, settings)
+    _require_test_views(jobs)
     for job in jobs:
         require_same(job)
     return jobs
+
+
+def _require_test_views(jobs: Iterable[Job]) -> None:
+    """Raise InputError for a data set whose test views cannot be read as its jobs will read them."""
+    read: set[tuple[str, DataOptions]] = set()
+    for job in jobs:
+        method = job.method()
+        if (job.data, method.data) not in read:
+            read_views(method, Path(job.data), "test", truth=False)
+            read.add((job.data, method.data))
 
 
 def require_settings(folder: Path, preset: str, settings: Sequence[str]) -> None:
