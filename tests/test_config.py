@@ -48,11 +48,13 @@ def test_a_preset_scales_every_number_of_iterations(tmp_path: Path) -> None:
         "iterations = 4000\n[light]\n[stage.first]\nuntil = 1000\n[stage.last]\nuntil = 4000\n"
         "[refine.propagate]\nwhen = {start = 0, until = 4000, every = 100}\nhold = 200\n"
         "[loss]\nsmooth_until = 3000\n"
+        "[data]\ncoarse = [{ until = 1000, block = 2 }, { until = 400, block = 4 }]\n"
     )
     method = methods.load(str(path), "quick")
     assert method.iterations == 2000 and [stage.until for _, stage in method.stages()] == [500, 2000]
     assert method.refine.propagate is not None
     assert (method.refine.propagate.hold, method.loss.smooth_until) == (100, 1500)
+    assert [method.data.block_at(i) for i in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]
 
 
 def test_stages_and_windows_meet_without_gap_or_overlap() -> None:
@@ -187,6 +189,14 @@ def test_assignments_are_applied_unscaled() -> None:
         (
             "iterations = 10\n[stage.a]\nuntil = 10\n[refine]\nreset = {start = 0, until = 9, every = 0}",
             ["own.toml", "refine: reset", "'every' above 0"],
+        ),
+        (
+            "iterations = 10\n[stage.a]\nuntil = 10\n[data]\ncoarse = [{ until = 5, block = 1 }]",
+            ["own.toml", "data.coarse", "block of 1", "2 or more"],
+        ),
+        (
+            "iterations = 10\n[stage.a]\nuntil = 10\n[light]\nevery = 0",
+            ["own.toml", "light.every: 0", "1 or more"],
         ),
     ],
 )

@@ -329,3 +329,21 @@ def test_lone_picture_leaves_zero_training_views(folder: Path) -> None:
     (folder / "transforms_test.json").unlink()
     with pytest.raises(InputError, match="zero training views"):
         read_dataset(folder, "train")
+
+
+def test_an_averaged_view_shows_the_same_points(folder: Path) -> None:
+    """Pixels are means of blocks, and a point lands in the block of its pixel."""
+    view = read_dataset(folder, "train").views[0]
+    small = view.averaged(2)
+    assert (small.width, small.height) == (WIDTH // 2, HEIGHT // 2)
+    np.testing.assert_allclose(small.image[1, 2], view.image[2:4, 4:6].mean(axis=(0, 1)), atol=1e-6)
+    assert small.alpha is not None and view.alpha is not None
+    np.testing.assert_allclose(small.alpha[0, 1], view.alpha[:2, 2:4].mean(), atol=1e-6)
+    points = np.array([[0.1, 0.2, 0.3], [0.3, 0.1, 0.2]])
+    row, column, _ = view.project(points)
+    less, lesser, _ = small.project(points)
+    # Indices are integers at pixel centres.
+    np.testing.assert_allclose([(row + 0.5) / 2 - 0.5, (column + 0.5) / 2 - 0.5], [less, lesser], atol=1e-9)
+    assert view.averaged(4).image.shape == (1, 1, 3)
+    with pytest.raises(InputError, match=r"data.coarse: 6 × 4 pixels are less than a block of 5²"):
+        view.averaged(5)

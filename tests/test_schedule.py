@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.fit.schedule import Schedule
-from mi_refgs.methods.method import Method, Stage, SurfelOptions
+from mi_refgs.methods.method import LightOptions, Method, Stage, SurfelOptions
 from mi_refgs.methods.window import Window
 
 
@@ -38,3 +38,10 @@ def test_the_degree_rises_with_its_window(iteration: int, degree: int) -> None:
     """One more at each multiple of 10 after the first, up to that of the table."""
     assert schedule().sh_degree(iteration) == degree
     assert np.isscalar(schedule().sh_degree(iteration))
+
+
+def test_the_light_learns_every_so_often_and_where_a_stage_ends() -> None:
+    stages = {"a": Stage(until=10), "b": Stage(until=20)}
+    method = Method(iterations=20, stage=stages, light=LightOptions(every=4))
+    assert [i for i in range(1, 21) if Schedule(method, 3).light_learns(i)] == [4, 8, 10, 12, 16, 20]
+    assert not any(schedule().light_learns(i) for i in range(20))

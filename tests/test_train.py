@@ -20,7 +20,7 @@ from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
 from mi_refgs.fit import train
 from mi_refgs.fit.train import Trainer
-from mi_refgs.methods.method import Method
+from mi_refgs.methods.method import DataOptions, Method, Rates
 from mi_refgs.reference.camera import look_at
 from mi_refgs.runs.interrupt import TerminatedError, held_interrupts
 from mi_refgs.runs.run import Run
@@ -39,6 +39,7 @@ sh_raise = { start = 2, until = 4, every = 2 }
 initial = { opacity = 0.6, metallic = 0.3, roughness = 0.3 }
 [light]
 height = 8
+every = 3
 [stage.initial]
 until = 8
 at = "surfel"
@@ -55,6 +56,8 @@ gradient = 1e-6
 reset = { start = 0, until = 24, every = 14 }
 reset_raise = ["metallic"]
 propagate = { when = { start = 0, until = 24, every = 5 }, hold = 4, noise = 0.1 }
+[data]
+coarse = [{ until = 6, block = 3 }, { until = 12, block = 2 }]
 [loss]
 smooth = 0.1
 alpha = 0.1
@@ -96,7 +99,8 @@ def run_folder(path: Path, method: Method) -> Run:
 
 def test_the_loss_falls_and_everything_trains(method: Method) -> None:
     data = ball()
-    trainer = Trainer(dataclasses.replace(method, refine=methods.Refine(), iterations=60), data)
+    method = dataclasses.replace(method, refine=methods.Refine(), data=DataOptions(), iterations=60)
+    trainer = Trainer(method, data)
     before = {name: tensor.numpy().copy() for name, tensor in trainer.params.items()}
     losses = []
     while trainer.iteration < 60:
@@ -155,7 +159,7 @@ def test_the_screen_gradient_is_in_half_pictures(method: Method, monkeypatch: py
     monkeypatch.setattr(train, "render", render)
     trainer = Trainer(method, ball())
     trainer.step()
-    expected = 0.5 * SIZE * np.linalg.norm(np.array(dr.grad(shifts[0])), axis=0)
+    expected = 0.5 * (SIZE // 3) * np.linalg.norm(np.array(dr.grad(shifts[0])), axis=0)  # coarse
     assert expected.max() > 0
     np.testing.assert_allclose(trainer.control.gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
 
@@ -313,3 +317,61 @@ def test_a_warm_step_compiles_nothing(method: Method) -> None:
     after, _, misses_after = dr.detail.launch_stats()
     assert misses_after == misses
     assert (after - launches) / 3 < 80
+
+
+def test_pictures_begin_coarse(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks of 3² pixels, then of 2², then whole pictures: each is rendered in its own size."""
+    trainer, widths, steps = Trainer(method, ball()), [], []
+    real = train.render
+
+    def rendered(surfels: Any, camera: Any, *args: Any, **kwargs: Any) -> Any:
+        widths.append(camera.width)
+        return real(surfels, camera, *args, **kwargs)
+
+    monkeypatch.setattr(train, "render", rendered)
+    for _ in range(13):
+        trainer.step()
+        steps.append(float(trainer.loss[0]))
+    assert widths == [SIZE // 3] * 6 + [SIZE // 2] * 6 + [SIZE]
+    assert np.all(np.isfinite(steps))
+
+
+def test_another_size_compiles_once(method: Method) -> None:
+    """Sizes in turn: the second step of each compiles nothing."""
+    method = dataclasses.replace(method, refine=methods.Refine(), mesh=None)
+    trainer, misses = Trainer(method, ball()), []
+    for iteration in (5, 5, 11, 11, 5, 5, 11, 11):
+        trainer.iteration = iteration
+        before = dr.detail.launch_stats()[2]
+        for _ in range(1 if iteration == 5 else 2):  # 6 ends a size, 12 and 13 lie in two
+            trainer.iteration = iteration
+            trainer.step()
+        dr.sync_thread()
+        misses.append(dr.detail.launch_stats()[2] - before)
+    assert misses[4:] == [0] * 4
+
+
+def test_a_light_that_is_shared_learns_the_sum(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gradient that three steps leave together is the sum of those that each leaves alone."""
+    assert method.light is not None
+    still = dataclasses.replace(method, rates=Rates(channel=dict.fromkeys(method.surfels.names, 0.0)))
+    sums = {}
+    for every in (1, 3):
+        light = dataclasses.replace(method.light, every=every)
+        rates = dataclasses.replace(still.rates, light=0.0)
+        trainer = Trainer(dataclasses.replace(still, light=light, rates=rates), ball())
+        seen: list[np.ndarray] = []
+        real = trainer.optimiser.step
+
+        def step(iteration: int, loss: Any, fit: Any = trainer, seen: Any = seen, real: Any = real) -> None:
+            seen.append(np.array(dr.grad(fit.params["light"]).array))
+            real(iteration, loss)
+
+        monkeypatch.setattr(trainer.optimiser, "step", step)
+        for _ in range(3):
+            trainer.step()
+        assert [bool(g.any()) for g in seen] == [every == 1, every == 1, True]
+        sums[every] = sum(g for g in seen if g.any())
+    scale = np.abs(sums[1]).max()
+    assert scale > 0
+    np.testing.assert_allclose(sums[3], sums[1], rtol=1e-4, atol=1e-5 * scale)

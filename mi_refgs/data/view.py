@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mi_refgs.images import linear_from_srgb
+from mi_refgs.errors import InputError
+from mi_refgs.images import box_downscale, linear_from_srgb
 
 if TYPE_CHECKING:
     from mi_refgs.splat.camera import Camera
@@ -41,6 +42,32 @@ class View:
 
         focal = (-self.fx, -self.fy)
         return Camera.from_pose(self.width, self.height, *focal, self.cx, self.cy, self.to_world, self.near)
+
+    def averaged(self, block: int) -> View:
+        """The same view with each square of `block` × `block` pixels as one, and without normals and depth.
+
+        Pixels at the right and the bottom that fill no square are left out. Raises InputError for a picture
+        of less than one square.
+        """
+        if min(self.width, self.height) < block:
+            raise InputError(
+                f"{self.name}: data.coarse: {self.width} × {self.height} pixels are less than a block of "
+                f"{block}²; give a smaller one"
+            )
+        alpha = None if self.alpha is None else box_downscale(self.alpha[..., None], block)[..., 0]
+        return replace(
+            self,
+            width=self.width // block,
+            height=self.height // block,
+            fx=self.fx / block,
+            fy=self.fy / block,
+            cx=self.cx / block,
+            cy=self.cy / block,
+            image=box_downscale(self.image, block),
+            alpha=alpha,
+            normal=None,
+            depth=None,
+        )
 
     def colour(self, background: np.ndarray) -> np.ndarray:
         """Linear colour (H, W, 3) of the object alone, not premultiplied; `background` (3,) as in `image`."""

@@ -37,6 +37,12 @@ class Schedule:
             self.method.surfels.sh_raise.count(iteration), self.method.surfels.degree_of("radiance_sh")
         )
 
+    def light_learns(self, iteration: int) -> bool:
+        """Whether the light learns from the iterations since it last did; always where a stage ends."""
+        light = self.method.light
+        ends = [stage.until for _, stage in self.method.stages()]
+        return light is not None and (iteration % light.every == 0 or iteration in ends)
+
     def groups(self, extent: float) -> dict[str, Group]:
         """Learning rates of every parameter of the method; `extent` in scene units."""
         rates, iterations = self.method.rates, self.method.iterations

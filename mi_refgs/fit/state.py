@@ -35,6 +35,7 @@ def packed(trainer: Trainer) -> dict[str, np.ndarray]:
     }
     state |= {"iteration": np.array(trainer.iteration), "seconds": np.array(trainer.seconds)}
     state["held_until"] = np.array(trainer.control.held_until)
+    state |= trainer.window.state()
     if trainer.decisions:
         state["decisions"] = np.frombuffer(json.dumps(trainer.decisions).encode(), np.uint8)
     if mesh is not None:

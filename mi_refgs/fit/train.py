@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from itertools import tee
 from typing import Any
 
 import drjit as dr
@@ -20,16 +19,17 @@ from mi_refgs.device import upload
 from mi_refgs.fit import health
 from mi_refgs.fit.control import AdaptiveControl, first_light
 from mi_refgs.fit.initial import initial_surfels
+from mi_refgs.fit.light_window import LightWindow
 from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.optim import Adam
 from mi_refgs.fit.rates import Group
 from mi_refgs.fit.schedule import Schedule
 from mi_refgs.fit.state import decisions_of, mesh_of, packed, require_fit
+from mi_refgs.fit.surface import surface_of
 from mi_refgs.methods.method import Method, Stage
-from mi_refgs.occlusion.mesh import Mesh, extract_mesh
-from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
+from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.pipeline import Frame, render, render_depth
+from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.runs.checkpoint import LIGHT, OPTIMISER, PARAMS, part, tensors
 from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
@@ -62,6 +62,7 @@ class Trainer:
         self._checked, self._failed = 0, 0  # iteration of the last check; failed steps in a row
         self.params: dict[str, Any] = {}
         self.control = AdaptiveControl(self)
+        self.window = LightWindow()
         self.loss: Any = None
         self.error: Any = None
         if state is None and run is not None:
@@ -91,6 +92,10 @@ class Trainer:
         self.extent = data.scene_extent
         self.schedule = Schedule(method, len(data.views))
         self.targets = [Target.of(view, data.background) for view in data.views]
+        self._coarse = {
+            block: [Target.of(view.averaged(block), data.background) for view in data.views]
+            for block in {pictures.block for pictures in method.data.coarse}
+        }
 
     # ---------------- what others look at ----------------
 
@@ -221,24 +226,16 @@ class Trainer:
     def extract_mesh(self) -> Mesh:
         """Fuse the rendered depth of all training views into a mesh and make it the occluder."""
         self.check()
-        surfels = self.surfels.detach()
-        views = tee(render_depth(surfels, target.camera) for target in self.targets)
         assert self.method.mesh is not None
-        volume = fuse(
-            (depth for depth, _ in views[0]),
-            (alpha for _, alpha in views[1]),
-            (target.camera for target in self.targets),
-            bounds_from_points(surfels.to_numpy()["position"]),
-            self.method.mesh.resolution,
-        )
-        mesh = extract_mesh(volume)
+        cameras = [target.camera for target in self.targets]
+        mesh = surface_of(self.surfels.detach(), cameras, self.method.mesh.resolution)
         self.occluder.update(mesh)
         return mesh
 
     # ---------------- one step ----------------
 
     def _gradient_step(self, iteration: int, stage: Stage) -> None:
-        target = self.targets[self.schedule.view(iteration)]
+        target = self._targets_at(iteration)[self.schedule.view(iteration)]
         camera, surfels = target.camera, self.surfels
         shift = mi.Point2f(dr.opaque(mi.Float, 0, surfels.count), dr.opaque(mi.Float, 0, surfels.count))
         dr.enable_grad(shift)
@@ -247,7 +244,7 @@ class Trainer:
             surfels,
             camera,
             shading,
-            shading.light_of(self.light),
+            self.window.light(self.light, shading),
             self.occluder,
             sh_degree=self.schedule.sh_degree(iteration),
             shift=shift,
@@ -256,11 +253,18 @@ class Trainer:
         loss, self.error = objective(frame, target, self.data, self.method.loss, iteration)
         self.loss = dr.detach(loss)
         phase("loss backward")(dr.backward)(loss)
+        if self.schedule.light_learns(iteration):
+            self.window.close()
 
         self.control.observe(dr.grad(shift), camera, iteration)
         if iteration % self.method.log_every == 0:
             dr.schedule(self.loss, self.error)
         self.optimiser.step(iteration - 1, self.loss)
+
+    def _targets_at(self, iteration: int) -> list[Target]:
+        """The pictures, all of one size, that an iteration is fitted to."""
+        block = self.method.data.block_at(iteration)
+        return self.targets if block == 1 else self._coarse[block]
 
     def _shading(self, stage: Stage) -> Shading:
         return Shading.of(stage, not self.occluder.empty)
@@ -286,3 +290,4 @@ class Trainer:
         self.control.held_until = int(state["held_until"])
         self.decisions = decisions_of(state)
         self.occluder = Occluder(mesh_of(state))
+        self.window.restore(self.light, self.shading(), state)

@@ -70,6 +70,7 @@ class LightOptions:
 
     height: int = 64  # texels; width is twice that
     radiance: float = 0.5  # initial, everywhere
+    every: int = 1  # iterations that share one filtered light; it learns from all of them at once
 
 
 @dataclass(frozen=True)
@@ -164,12 +165,27 @@ class Rates:
 
 
 @dataclass(frozen=True)
+class CoarsePictures:
+    """Pictures of fewer pixels for the iterations up to `until`, but for those of another table that ends
+    sooner."""
+
+    until: int  # iterations
+    block: int = 2  # pixels along a side of the squares that are averaged into one
+
+
+@dataclass(frozen=True)
 class DataOptions:
-    """How pictures are read."""
+    """How pictures are read, and how large they are in the course of a fit."""
 
     images: Literal["png", "exr"] = "png"
     background: Literal["white", "black"] = "white"
     downscale: int | None = None  # pixels of a file along a pixel's side; absent: what the preset can afford
+    coarse: tuple[CoarsePictures, ...] = ()
+
+    def block_at(self, iteration: int) -> int:
+        """Pixels along a side of what a (1-based) iteration takes for one pixel; 1 is a whole picture."""
+        due = [pictures for pictures in self.coarse if iteration <= pictures.until]
+        return min(due, key=lambda pictures: pictures.until).block if due else 1
 
 
 @dataclass(frozen=True)

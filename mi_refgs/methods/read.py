@@ -121,6 +121,10 @@ def _checked(method: Method, where: str) -> Method:
         raise InputError(
             f"{where}: light.height: {method.light.height} is no multiple of 4 from {MIN_HEIGHT}; give one"
         )
+    if method.light is not None and method.light.every < 1:
+        raise InputError(f"{where}: light.every: {method.light.every} is no number of steps; give 1 or more")
+    if too_small := [pictures.block for pictures in method.data.coarse if pictures.block < 2]:
+        raise InputError(f"{where}: data.coarse: a block of {too_small[0]} averages nothing; give 2 or more")
     for name, stage in method.stages():
         try:
             Shading.of(stage, method.mesh is not None).check(channels, method.light is not None)
@@ -234,6 +238,8 @@ def _scale(value: Any, factor: float, key: str = "") -> Any:
     """Scale every field that counts iterations: windows exactly, others to a whole number of at least 1."""
     if isinstance(value, dict):
         return {name: _scale(inner, factor) for name, inner in value.items()}
+    if isinstance(value, tuple):
+        return tuple(_scale(inner, factor) for inner in value)
     if isinstance(value, Window):
         return Window(factor * value.start, factor * value.until, factor * value.every)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
