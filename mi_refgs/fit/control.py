@@ -11,6 +11,8 @@ import numpy as np
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.fit import refine
+from mi_refgs.fit.refine import TableEdit
+from mi_refgs.fit.relocate import relocate, wander
 from mi_refgs.methods.method import LIGHT, LightOptions
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
@@ -57,6 +59,10 @@ class AdaptiveControl:
         options, surfels = fit.method.refine, fit.method.surfels
         if options.densify is not None and options.densify.due(iteration):
             self._densify(iteration)
+        if options.relocate is not None and options.relocate.when.due(iteration):
+            fit.check()
+            draws, limit = fit.schedule.rng(iteration), surfels.max_count
+            self._adopt(relocate(fit.surfels, options.relocate, limit, draws))
         if options.reset is not None and options.reset.due(iteration):
             floors = {name: surfels.start(name) for name in options.reset_raise}
             self.replace(refine.reset_opacity(fit.surfels, options, floors), cleared=("opacity", *floors))
@@ -85,11 +91,31 @@ class AdaptiveControl:
             fit.method.surfels.max_count,
             fit.schedule.rng(iteration),
             prune_transparent=since_reset is None or since_reset >= wait,
-        ).ordered()
-        self.replace(edited.surfels)
-        names = list(edited.surfels.raw)
-        fit.optimiser.gather(mi.UInt32(edited.parent), names, mi.Bool(edited.fresh))
+        )
+        self._adopt(edited)
         self.clear()
+
+    def _adopt(self, edit: TableEdit) -> None:
+        """Put an edited table in place of the present one; moments and statistics follow the rows."""
+        fit, edit = self.trainer, edit.ordered()
+        parent, fresh = upload(edit.parent, mi.UInt32), mi.Bool(edit.fresh)
+        self.replace(edit.surfels)
+        fit.optimiser.gather(parent, list(edit.surfels.raw), fresh)
+        self.gradient_sum = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_sum, parent))
+        self.gradient_count = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_count, parent))
+        dr.eval(self.gradient_sum, self.gradient_count)
+
+    def wander(self, iteration: int) -> None:
+        """The random step of positions that follows the optimiser's."""
+        fit = self.trainer
+        options = fit.method.refine.relocate
+        if options is None or not options.noise or not options.when.start < iteration <= options.when.until:
+            return
+        rate = fit.optimiser.rate("position", iteration - 1) / fit.extent
+        moved = wander(fit.surfels, rate, fit.extent, options, iteration, fit.method.seed)
+        dr.eval(moved)
+        dr.enable_grad(moved)
+        fit.params["position"] = moved
 
     def remove(self, rows: np.ndarray) -> None:
         """Take surfels out of the table; raises InputError if none would be left."""

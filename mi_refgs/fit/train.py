@@ -260,6 +260,7 @@ class Trainer:
         if iteration % self.method.log_every == 0:
             dr.schedule(self.loss, self.error)
         self.optimiser.step(iteration - 1, self.loss)
+        self.control.wander(iteration)
 
     def _targets_at(self, iteration: int) -> list[Target]:
         """The pictures, all of one size, that an iteration is fitted to."""

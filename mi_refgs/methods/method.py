@@ -105,6 +105,19 @@ class Propagation:
 
 
 @dataclass(frozen=True)
+class Relocation:
+    """Idle surfels move onto seen ones, and positions take random steps. [3DGS-MCMC, Kheradmand et al. 2024]
+
+    The steps end with the window.
+    """
+
+    when: Window
+    opacity: float = 0.005  # at most; what is as transparent is idle
+    grow: float = 0.0  # share of the table that is added each time, up to max_count
+    noise: float = 1e7  # of positions: 5e5 per squared unit where the extent is 4.5 units; 0: none
+
+
+@dataclass(frozen=True)
 class Refine:
     """Adaptive control of the table [3DGS §5.2, 2DGS; Ref-Gaussian §3.4]."""
 
@@ -117,6 +130,7 @@ class Refine:
     reset_opacity: float = 0.01
     reset_raise: tuple[str, ...] = ()  # channels that it lifts to at least their initial value
     propagate: Propagation | None = None
+    relocate: Relocation | None = None
 
 
 @dataclass(frozen=True)
