@@ -21,6 +21,7 @@ ROWS = (
     ("pruned", "pruned", "from {0[surfels]} surfels, training views within {0[psnr]:.1f} dB"),
     ("iterations", "iterations", "{}"),
     ("train_seconds", "training", "{:.0f} s"),
+    ("samples", "samples of a pixel", "{}"),
     ("ms_per_frame", "frame", "{:.1f} ms"),
 )
 """Key of metrics.json, name and format of what people read."""
@@ -36,6 +37,14 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--data", type=Path, metavar="DATA", help="another data set than the one it was fitted to"
     )
+    parser.add_argument(
+        "--samples",
+        type=int,
+        default=1,
+        metavar="N",
+        help="samples per pixel, box filtered: 4 are 2 × 2; 1 is the pixel's centre, as in training "
+        "(default %(default)s)",
+    )
 
 
 def run(args: argparse.Namespace) -> Result:
@@ -43,7 +52,7 @@ def run(args: argparse.Namespace) -> Result:
     from mi_refgs.evaluation.evaluate import SHEET, evaluate
     from mi_refgs.runs.run import Run
 
-    result = evaluate(Run(args.run_folder), args.data, progress=True)
+    result = evaluate(Run(args.run_folder), args.data, progress=True, samples=args.samples)
     return Result(result, f"{table(result)}\ncontact sheet: {args.run_folder / SHEET}")
 
 

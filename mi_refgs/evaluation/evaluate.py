@@ -64,14 +64,14 @@ def load_split(run: Run, method: Method, split: str, path: Path | None = None) -
     return read_views(method, path, split)
 
 
-def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict[str, Any]:
+def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples: int = 1) -> dict[str, Any]:
     """Render the test views, measure them, and write metrics.json, renders and a contact sheet into the run.
 
     Evaluates the artefacts as they lie in the folder, after writing what a newer checkpoint makes stale.
     Every key is always there: null, with a `…_reason`, where it does not apply. Normals count where the true
     alpha is above ½ and there is a true normal. `ms_per_frame` is the median over single synchronised frames
     of the displayed picture alone, light filtered beforehand. `pruned` is null for a
-    whole scene.
+    whole scene. All that is rendered has `samples` a pixel, box filtered (`render.samples`).
 
     Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, and for data
     that is gone.
@@ -81,7 +81,7 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict
     method = run.method()
     views = load_split(run, method, "test", data)
     fitted = up_to_date(run, method, views.views[0].camera())
-    view = fitted.renderer()
+    view = fitted.renderer(samples=samples)
     folder = run.path / FOLDER
     try:
         folder.mkdir(exist_ok=True)
@@ -132,9 +132,10 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False) -> dict
         "iterations": fitted.iteration,
         "surfels": fitted.surfels.count,
         "pruned": None if fitted.pruned is None else dataclasses.asdict(fitted.pruned),
-        "ms_per_frame": milliseconds([fitted.renderer(aovs=False)], [v.camera() for v in views.views], views)[
-            0
-        ],
+        "samples": samples,
+        "ms_per_frame": milliseconds(
+            [fitted.renderer(aovs=False, samples=samples)], [v.camera() for v in views.views], views
+        )[0],
         "variant": method.variant,
         "preset": method.preset,
         "dataset": str(views.path),

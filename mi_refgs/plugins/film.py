@@ -5,7 +5,6 @@ No Mitsuba class is defined here, so that this module need not be reloaded when 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
+from mi_refgs.render.samples import box_mean, samples_per_axis
 from mi_refgs.splat.camera import Camera
 
 Channels = Callable[[Camera, bool], list[Any]]
@@ -30,25 +30,11 @@ def through_film(sensor: Any, spp: int, channels: Channels, aovs: list[str]) -> 
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         raise InputError("refgs: film: refgs renders RGB radiance only; use an `hdrfilm`")
     camera = Camera.from_sensor(sensor)
-    factor = math.ceil(math.sqrt(max(1, int(spp) or int(sensor.sampler().sample_count()))))
+    factor = samples_per_axis(max(1, int(spp) or int(sensor.sampler().sample_count())))
     made = channels(camera.supersampled(factor), mi.has_flag(film.flags(), mi.FilmFlags.Alpha))
-    values = dr.ravel(mi.ArrayXf([_box(channel, camera, factor) for channel in made]))
+    pixels = dr.zeros(mi.Float, camera.width * camera.height)
+    values = dr.ravel(mi.ArrayXf([box_mean(channel, camera, factor) + pixels for channel in made]))
     tensor = mi.TensorXf(values, (camera.height, camera.width, len(made)))
     film.prepare(aovs)
     film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
     return film.develop()
-
-
-def _box(channel: Any, camera: Camera, factor: int) -> Any:
-    """Mean of each factor × factor block of a (supersampled) raster; a channel of width 1 is constant."""
-    pixels = camera.width * camera.height
-    if dr.width(channel) == 1:
-        return channel + dr.zeros(mi.Float, pixels)
-    if factor == 1:
-        return channel
-    sample = dr.arange(mi.UInt32, pixels * factor * factor)
-    pixel, part = sample // (factor * factor), sample % (factor * factor)
-    x = (pixel % camera.width) * factor + part % factor
-    y = (pixel // camera.width) * factor + part // factor
-    ordered = dr.gather(mi.Float, channel, y * (camera.width * factor) + x, mode=dr.ReduceMode.Permute)
-    return dr.block_sum(ordered, factor * factor) / (factor * factor)

@@ -31,6 +31,7 @@ from mi_refgs.methods.method import LIGHT
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.samples import supersampled
 from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
@@ -119,10 +120,10 @@ class TrainedScene:
             raise InputError(f"{folder}: {error}; or write it again with `refgs export {folder}`") from error
         return fitted
 
-    def renderer(self, aovs: bool = True) -> Callable[[Camera], Frame]:
+    def renderer(self, aovs: bool = True, samples: int = 1) -> Callable[[Camera], Frame]:
         """A function that renders views without derivatives, with materials and normals if `aovs`.
 
-        Light and mesh are prepared once.
+        `samples` a pixel as in `render.samples`. Light and mesh are prepared once.
         """
         with dr.suspend_grad():
             light = self.shading.light_of(self.light)
@@ -130,9 +131,12 @@ class TrainedScene:
         if self.shading.accuracy.traced_bounces:
             occluder.set_materials(self.surfels)
 
+        def once(camera: Camera) -> Frame:
+            return render(self.surfels, camera, self.shading, light, occluder, aovs=aovs, normals=aovs)
+
         def view(camera: Camera) -> Frame:
             with dr.suspend_grad():
-                return render(self.surfels, camera, self.shading, light, occluder, aovs=aovs, normals=aovs)
+                return supersampled(once, camera, samples)
 
         return view
 

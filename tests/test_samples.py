@@ -1,0 +1,114 @@
+"""Several samples a pixel: frames and metrics against means made by NumPy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from integrator_scenes import HEIGHT, WIDTH, raw_channels, sky
+from tiny_scene import SETTINGS, SIZE, write_data, write_method
+
+from mi_refgs import methods
+from mi_refgs.data import dataset
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation import metrics
+from mi_refgs.evaluation.evaluate import evaluate
+from mi_refgs.fit.train import Trainer
+from mi_refgs.images import srgb_from_linear
+from mi_refgs.reference.camera import look_at
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.render.samples import supersampled
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.run import Run
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.ply import write_ply
+from mi_refgs.surfels.table import Surfels
+
+POSE = look_at(np.array([0.5, 1.5, 3.0]), np.zeros(3), up=(0, 1, 0))
+
+
+def camera(factor: int = 1) -> Camera:
+    """A view of few pixels, each divided into factor² of its own."""
+    size, focal = (WIDTH * factor, HEIGHT * factor), 20.0 * factor
+    return Camera.from_pose(*size, -focal, -focal, size[0] / 2, 0.45 * size[1], POSE)
+
+
+def planes(value: object, factor: int = 1) -> np.ndarray:
+    """(H, W, C) in float64."""
+    flat = np.array(value, np.float64).reshape(-1, WIDTH * HEIGHT * factor**2)
+    return flat.T.reshape(HEIGHT * factor, WIDTH * factor, -1)
+
+
+def block_means(values: np.ndarray, factor: int) -> np.ndarray:
+    return values.reshape(HEIGHT, factor, WIDTH, factor, -1).mean((1, 3))
+
+
+@pytest.mark.parametrize("samples, factor", [(2, 2), (9, 3)])
+@pytest.mark.parametrize("at", ["surfel", "pixel"])
+def test_a_pixel_is_the_mean_of_its_samples(samples: int, factor: int, at: str) -> None:
+    """Radiance, terms, normals and alpha as they are; depth and maps by alpha."""
+    shading = Shading(at=at, diffuse="irradiance")  # type: ignore[arg-type]
+    light = EnvironmentLight.from_radiance(sky())
+    made = TrainedScene(Surfels.from_numpy(raw_channels()), light, None, shading, 1, 0.0)
+    frame, fine = made.renderer(samples=samples)(camera()), made.renderer()(camera(factor))
+
+    alpha = planes(fine.alpha, factor)
+    coverage = block_means(alpha, factor)
+    assert 0.2 < np.mean((coverage > 0.01) & (coverage < 0.99))  # borders, where the weights matter
+    np.testing.assert_allclose(planes(frame.alpha), coverage, atol=1e-6)
+    assert frame.terms is not None and fine.terms is not None
+    pairs = [(frame.radiance, fine.radiance), (frame.normal, fine.normal)]
+    pairs += [(getattr(frame.terms, n), getattr(fine.terms, n)) for n in ("diffuse", "specular")]
+    for mean, parts in pairs:
+        np.testing.assert_allclose(planes(mean), block_means(planes(parts, factor), factor), atol=2e-6)
+    for mean, parts in [(frame.depth, fine.depth), *((frame.maps[n], fine.maps[n]) for n in fine.maps)]:
+        weighted = block_means(planes(parts, factor) * alpha, factor)
+        expected = np.where(coverage > 1e-3, weighted / np.maximum(coverage, 1e-3), planes(mean))
+        np.testing.assert_allclose(planes(mean), expected, atol=1e-4)
+    assert {"albedo", "roughness", "metallic"} <= fine.maps.keys()
+
+
+def test_one_sample_is_the_pixel_centre_and_none_is_refused() -> None:
+    frame = Frame(mi.Float(1), mi.Float(1), None, mi.Color3f(1))
+    assert supersampled(lambda _: frame, camera(), 1) is frame
+    with pytest.raises(InputError, match="samples: 0"):
+        supersampled(lambda _: frame, camera(), 0)
+
+
+def test_eval_encodes_the_mean_of_linear_radiance(tmp_path: Path) -> None:
+    """PSNR with 2 × 2 samples is that of srgb(mean L / mean A), not of the mean of encoded samples."""
+    data = write_data(tmp_path / "ball")
+    method = methods.load(str(write_method(tmp_path)), "quick", SETTINGS)
+    run = Run(tmp_path / "run")
+    run.create(method, str(data))
+    Trainer(method, dataset.read_dataset(data, "train"), run).train()
+    evaluate(run)
+    raw = TrainedScene.read(run.path).surfels.to_numpy()
+    raw["radiance_sh"] = np.random.default_rng(1).normal(scale=10, size=raw["radiance_sh"].shape)
+    raw["scale"] -= 1.0
+    write_ply(run.path / "surfels.ply", Surfels.from_numpy(raw))  # neighbours that differ
+    once, result = evaluate(run), evaluate(run, samples=4)
+    assert once["samples"] == 1 and result["samples"] == 4
+    assert abs(once["psnr"] - result["psnr"]) > 1e-3
+    made, views = TrainedScene.read(run.path), dataset.read_dataset(data, "test")
+    scores, encoded_first = [], []
+    for view in views.views:
+        small = view.camera()
+        large = small.supersampled(2)
+        frame = made.renderer()(large)
+        parts = np.array([*frame.radiance, frame.alpha], np.float64).reshape(4, SIZE, 2, SIZE, 2)
+
+        def shown(radiance: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+            colour = srgb_from_linear(radiance / np.maximum(alpha, 1e-6))
+            return alpha * colour + (1 - alpha) * views.background[:, None, None]
+
+        mean = parts.mean((2, 4))
+        scores.append(metrics.psnr(shown(mean[:3], mean[3]).transpose(1, 2, 0), view.image))
+        each = [shown(parts[:3, :, i, :, j], parts[3, :, i, :, j]) for i in (0, 1) for j in (0, 1)]
+        encoded_first.append(metrics.psnr(np.mean(each, axis=0).transpose(1, 2, 0), view.image))
+    assert result["psnr"] == pytest.approx(np.mean(scores), abs=1e-4)
+    assert abs(np.mean(encoded_first) - np.mean(scores)) > 1e-3
