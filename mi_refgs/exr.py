@@ -43,7 +43,7 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def read_exr_image(path: str | Path) -> np.ndarray:
-    """EXR file as float32 (H, W, C): C = 4 for R, G, B, A, 3 for R, G, B, or X, Y, Z, 1 for a single channel.
+    """EXR file as float32 (H, W, C): R, G, B, A; R, G, B; X, Y, Z; Y, A; or a single channel.
 
     Raises InputError as `read_exr` does, if the file has none of these sets of channels, and for colours in
     other primaries than those of linear sRGB.
@@ -52,13 +52,15 @@ def read_exr_image(path: str | Path) -> np.ndarray:
     primaries = header.get("chromaticities", SRGB_CHROMATICITIES)
     if "R" in channels and not np.allclose(primaries, SRGB_CHROMATICITIES, atol=CHROMATICITY_TOLERANCE):
         raise InputError(f"{path}: chromaticities: not those of sRGB; convert the image to linear sRGB")
-    for names in ("RGBA", "RGB", "XYZ"):
+    for names in ("RGBA", "RGB", "XYZ", "YA"):
         if set(names) <= channels.keys():
             return np.stack([channels[name] for name in names], axis=-1)
     if len(channels) == 1:
         return next(iter(channels.values()))[..., None]
     found = ", ".join(sorted(channels))
-    raise InputError(f"{path}: channels: found {found}; export R, G, B (and A), or X, Y, Z, or one channel")
+    raise InputError(
+        f"{path}: channels: found {found}; export R, G, B (and A), X, Y, Z, or one channel (and A)"
+    )
 
 
 def exr_size(path: Path) -> tuple[int, int]:

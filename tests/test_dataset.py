@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,9 @@ from integrator_scenes import sky
 from mi_refgs.data import pathtrace
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.make_dataset import make_dataset
+from mi_refgs.data.scene_file import load_scene, under_light
 from mi_refgs.errors import InputError
-from mi_refgs.exr import read_exr_image
+from mi_refgs.exr import read_exr_image, write_exr
 from mi_refgs.images import srgb_from_linear
 from mi_refgs.shade import lobe_matrices
 
@@ -95,18 +97,22 @@ def test_png_is_the_exr_as_displayed(made: Path, train: Dataset) -> None:
 
 def test_brightness_is_the_lit_sphere(train: Dataset) -> None:
     """Radiance of the whole set against an independent estimate, albedo × irradiance / π."""
-    scene = mi.load_string(SCENE)
-    light = pathtrace.environment_image(scene, 16).reshape(-1, 3)
+    data = read_dataset(train.path, "train", images="exr", background="black")
+    check_brightness(data, data, pathtrace.environment_image(mi.load_string(SCENE), 16))
+
+
+def check_brightness(radiance: Dataset, shape: Dataset, light: np.ndarray) -> None:
+    """Views of the sphere are as bright as albedo × irradiance / π of a light (16, 32, 3), by its normals."""
     row, column = np.divmod(np.arange(16 * 32), 32)
     theta, phi = lobe_matrices.row_angles(16)[row], lobe_matrices.column_angles(32)[column]
     direction = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=1)
     weight = lobe_matrices.row_areas(16)[row] * (np.pi / 16)
-    for view in read_dataset(train.path, "train", images="exr", background="black").views:
-        assert view.normal is not None and view.alpha is not None
-        inside = view.alpha == 1
-        cosine = np.maximum(view.normal[inside] @ direction.T, 0)
-        expected = 0.5 / math.pi * (cosine * weight) @ light
-        assert abs(view.image[inside].mean() / expected.mean() - 1) < 0.03
+    for view, known in zip(radiance.views, shape.views, strict=True):
+        assert known.normal is not None and view.alpha is not None
+        inside = (view.alpha == 1) & np.any(known.normal != 0, axis=-1)
+        cosine = np.maximum(known.normal[inside] @ direction.T, 0)
+        expected = 0.5 / math.pi * (cosine * weight) @ light.reshape(-1, 3)
+        np.testing.assert_allclose(view.image[inside].mean(0), expected.mean(0), rtol=0.04)
 
 
 def test_environment_in_mitsuba_orientation(made: Path, train: Dataset) -> None:
@@ -179,23 +185,45 @@ def test_cameras_are_seeded_and_spread() -> None:
     assert apart.min() > 7 and np.median(apart) > 15  # a perfect lattice: 22°
 
 
-def test_unfinished_folder_is_continued(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def traced(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Seeds of the pictures that are path-traced from now on."""
+    seeds: list[int] = []
+    picture = pathtrace.Tracer.picture
+
+    def counted(self: pathtrace.Tracer, pose: np.ndarray, seed: int) -> np.ndarray:
+        seeds.append(seed)
+        return picture(self, pose, seed)
+
+    monkeypatch.setattr(pathtrace.Tracer, "picture", counted)
+    return seeds
+
+
+def test_unfinished_folder_is_continued(made: Path, traced: list[int]) -> None:
     scene, before = made.parent / "ball.xml", files(made)
-    traced: list[int] = []
-    trace = pathtrace.Tracer.trace
-
-    def counted(self: pathtrace.Tracer, pose: np.ndarray, seed: int) -> tuple:
-        traced.append(seed)
-        return trace(self, pose, seed)
-
-    monkeypatch.setattr(pathtrace.Tracer, "trace", counted)
     make_dataset(scene, made, **OPTIONS)
     assert not traced
     (made / "train/r_001.png").unlink()
     (made / "test/r_000_depth.exr").write_bytes(b"cut short")
     (made / "transforms_train.json").unlink()
     make_dataset(scene, made, **OPTIONS)
-    assert len(traced) == 2 and files(made) == before
+    assert len(traced) == 1 and files(made) == before  # a map takes no path
+
+
+def test_a_folder_of_the_version_before_gets_what_it_lacks(
+    made: Path, tmp_path: Path, traced: list[int]
+) -> None:
+    """Without materials, surface, and the settings that came later: nothing is traced again."""
+    before, old = files(made), tmp_path / "old"
+    shutil.copytree(made, old)
+    for pattern in ("*/*_albedo.exr", "*/*_roughness.exr", "*/*_metallic.exr", "surface.ply"):
+        for path in old.glob(pattern):
+            path.unlink()
+    record = json.loads((old / "dataset.json").read_text())
+    later = ("light", "light_sha256", "relight")
+    (old / "dataset.json").write_text(json.dumps({k: v for k, v in record.items() if k not in later}))
+    make_dataset(made.parent / "ball.xml", old, **OPTIONS)
+    assert not traced and files(old) == before
 
 
 def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
@@ -219,11 +247,11 @@ def test_passes_average(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = mi.load_string(SCENE)
     pose = pathtrace.camera_poses(1, CENTRE, 3.0, (0, 30), np.random.default_rng(0))[0]
     options: dict[str, Any] = {"size": 8, "fov": 30, "spp": 64, "max_depth": 3, "near": 0.1, "far": 50}
-    whole = pathtrace.Tracer(scene, **options).trace(pose, 5)[0]
+    whole = pathtrace.Tracer(scene, **options).picture(pose, 5)
     monkeypatch.setattr(pathtrace, "SAMPLES_PER_LAUNCH", 8 * 8 * 16)
     split = pathtrace.Tracer(scene, **options)
     assert (split.passes, split.spp) == (4, 16)
-    np.testing.assert_allclose(split.trace(pose, 5)[0].mean(), whole.mean(), rtol=0.02)
+    np.testing.assert_allclose(split.picture(pose, 5).mean(), whole.mean(), rtol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -302,4 +330,89 @@ def test_settings_are_recorded(made: Path) -> None:
     record = json.loads((made / "dataset.json").read_text())
     assert record["spp"] == OPTIONS["spp"] and record["scene"] == "ball.xml"
     frame = json.loads((made / "transforms_train.json").read_text())["frames"][0]
-    assert {"file_path", "exr_path", "normal_path", "depth_path", "transform_matrix"} <= frame.keys()
+    named = {"exr_path", "normal_path", "depth_path", "albedo_path", "roughness_path", "metallic_path"}
+    assert named | {"file_path", "transform_matrix"} <= frame.keys()
+    assert all((made / frame[key]).is_file() for key in named)
+
+
+# ---------------- lights ----------------
+
+
+@pytest.fixture(scope="module")
+def relit(made: Path) -> Path:
+    """A copy of the data set with two lights more: one of the scene's size, one of another, both HDR."""
+    folder = made.parent
+    write_exr(folder / "warm.exr", sky(32))
+    write_exr(folder / "cold sky.exr", 3 * sky(16)[:, ::-1, ::-1])
+    out = folder / "relit"
+    shutil.copytree(made, out)
+    lights = [folder / "warm.exr", folder / "cold sky.exr"]
+    return make_dataset(folder / "ball.xml", out, **OPTIONS, relight=lights)
+
+
+def test_lights_are_added_without_tracing_the_rest(relit: Path, made: Path, traced: list[int]) -> None:
+    folder, before = made.parent, files(relit)
+    inherited = {k: v for k, v in files(made).items() if k != "dataset.json"}
+    assert before.items() >= inherited.items()
+    again = make_dataset(folder / "ball.xml", relit, **OPTIONS, relight=[folder / "warm.exr"])
+    assert not traced and files(again) == before  # the other light stays, too
+    make_dataset(folder / "ball.xml", relit, **OPTIONS)
+    assert not traced and files(relit) == before
+    assert set(json.loads(before["dataset.json"])["relight"]) == {"warm", "cold_sky"}
+
+
+def test_relit_views_have_the_cameras_and_shape_of_the_test_views(relit: Path) -> None:
+    own = read_dataset(relit, "test", images="exr", background="black")
+    other = read_dataset(relit / "relight" / "warm", "test", images="exr", background="black")
+    for a, b in zip(own.views, other.views, strict=True):
+        np.testing.assert_array_equal(a.to_world, b.to_world)
+        assert a.alpha is not None and b.alpha is not None
+        np.testing.assert_allclose(a.alpha, b.alpha, atol=0.15)
+        assert np.abs(a.image - b.image).max() > 0.1
+
+
+def test_relit_brightness_is_that_of_the_light_beside_it(relit: Path) -> None:
+    """environment.exr of each light, in Mitsuba's orientation, accounts for the pictures under it."""
+    for name in ("warm", "cold_sky"):
+        data = read_dataset(relit / "relight" / name, "test", images="exr", background="black")
+        assert data.environment is not None
+        lit = mi.load_dict({"type": "scene", "e": {"type": "envmap", "filename": str(data.environment)}})
+        check_brightness(data, read_dataset(relit, "test"), pathtrace.environment_image(lit, 16))
+
+
+def test_a_light_is_turned_as_the_scenes_own(made: Path, tmp_path: Path) -> None:
+    """The scene's own map, given as `--light`: the same pictures; and a scene without a map is z up."""
+    options = {**OPTIONS, "views": 1, "test_views": 1}
+    scene = made.parent / "ball.xml"
+    same = make_dataset(scene, tmp_path / "same", **options, light=SCENES / "lights" / "studio.exr")
+    assert (same / "environment.exr").read_bytes() == (made / "environment.exr").read_bytes()
+    record = json.loads((same / "dataset.json").read_text())
+    assert record["light"] == "studio.exr" and record["light_sha256"]
+    with pytest.raises(InputError, match="light"):
+        make_dataset(scene, same, **options)
+    (tmp_path / "plain.xml").write_text(
+        '<scene version="3.0.0"><emitter type="constant"/><emitter type="point"/>'
+        '<shape type="sphere"/></scene>'
+    )
+    light = np.full((16, 32, 3), 0.1, np.float32)
+    light[:4] = 5  # the map's y, which becomes z
+    write_exr(tmp_path / "top.exr", light)
+    changed = under_light(load_scene(tmp_path / "plain.xml"), tmp_path / "top.exr")
+    si = dr.zeros(mi.SurfaceInteraction3f, 2)
+    si.wi = -mi.Vector3f([0, 0], [0, 1], [1, 0])
+    np.testing.assert_allclose(changed.environment().eval(si).numpy()[0], [5, 0.1], rtol=1e-5)
+    assert len(changed.emitters()) == 2  # the lamp stays
+
+
+def test_lights_that_cannot_be_used(relit: Path, made: Path, tmp_path: Path) -> None:
+    scene = made.parent / "ball.xml"
+    (tmp_path / "warm.exr").write_bytes((made.parent / "cold sky.exr").read_bytes())
+    with pytest.raises(InputError, match=r"dataset.json: relight warm: .*overwrite"):
+        make_dataset(scene, relit, **OPTIONS, relight=[tmp_path / "warm.exr"])
+    with pytest.raises(InputError, match="two have one name"):
+        make_dataset(scene, relit, **OPTIONS, relight=[tmp_path / "warm.exr", made.parent / "warm.exr"])
+    (tmp_path / "bad.exr").write_text("no picture")
+    for light in ({"light": tmp_path / "bad.exr"}, {"relight": [tmp_path / "none.exr"]}):
+        with pytest.raises(InputError, match=r"(bad|none)\.exr"):
+            make_dataset(scene, tmp_path / "out", **OPTIONS, **light)
+    assert not (tmp_path / "out").exists()

@@ -85,13 +85,13 @@ from pathlib import Path
 import mi_refgs, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 dr.set_thread_count(1)
-from mi_refgs.data.make_dataset import _load_scene
+from mi_refgs.data.scene_file import load_scene
 from mi_refgs.exr import mitsuba_exr
 from mi_refgs.shade.envmap import EnvironmentLight
 folder = Path(sys.argv[1])
 EnvironmentLight.constant(0.5, 8).write(folder / "light.exr")
 assert EnvironmentLight.from_file(folder / "light.exr").height == 8
-_load_scene(folder / "scene.xml")
+load_scene(folder / "scene.xml")
 with mitsuba_exr():
     mi.Bitmap(str(folder / "light.exr")).write(str(folder / "mitsuba.hdr"))
 assert dr.thread_count() == 1

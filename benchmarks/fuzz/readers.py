@@ -21,7 +21,7 @@ import trimesh
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import read_dataset
-from mi_refgs.data.make_dataset import Settings, _prepare_folder
+from mi_refgs.data.settings import Settings, prepare_folder
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.exr import read_exr_image, write_exr
@@ -303,7 +303,7 @@ def _settings(folder: Path) -> list[bytes]:
 def _read_settings(path: Path) -> None:
     """dataset.json of a data set, before it is written anew."""
     (path.parent / "transforms_train.json").write_text("{}")
-    _prepare_folder(path.parent, Settings("a.xml", "0", 3, 1, 8, 1, 0, 3, (-30.0, 80.0), 40.0, 0.9, 0), False)
+    prepare_folder(path.parent, Settings("a.xml", "0", 3, 1, 8, 1, 0, 3, (-30.0, 80.0), 40.0, 0.9, 0), False)
 
 
 def _logs(folder: Path) -> list[bytes]:

@@ -13,7 +13,9 @@ EXAMPLE = "refgs dataset scenes/glossy_demo.xml -o data/glossy --views 80 --size
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    summary = "path-trace a multi-view data set of a Mitsuba scene: pictures, normals, depth, light, cameras"
+    summary = (
+        "path-trace a multi-view data set of a Mitsuba scene: pictures, materials, shape, light, cameras"
+    )
     parser = add_command(commands, "dataset", summary, EXAMPLE, run)
     parser.add_argument(
         "scene", type=Path, metavar="SCENE.xml", help="a Mitsuba scene with an environment emitter"
@@ -49,6 +51,20 @@ def add(commands: Any) -> None:
         "--fov", type=float, default=40.0, metavar="DEG", help="field of view (default %(default)s)"
     )
     parser.add_argument(
+        "--light",
+        type=Path,
+        metavar="ENV",
+        help="a lat-long map (EXR, HDR) in place of the scene's environment",
+    )
+    parser.add_argument(
+        "--relight",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="ENV",
+        help="trace the test views under these maps, too, into relight/NAME; also later",
+    )
+    parser.add_argument(
         "--overwrite", action="store_true", help="replace a data set that was made with other settings"
     )
 
@@ -68,11 +84,15 @@ def run(args: argparse.Namespace) -> Result:
         max_depth=args.max_depth,
         elevation=tuple(args.elevation),
         fov=args.fov,
+        light=args.light,
+        relight=args.relight,
         overwrite=args.overwrite,
     )
     counts = {split: len(list((folder / split).glob("r_*.png"))) for split in ("train", "test")}
+    lights = sorted(path.parent.name for path in folder.glob("relight/*/transforms_test.json"))
     text = (
-        f"{folder}: {counts['train']} training and {counts['test']} test views; "
+        f"{folder}: {counts['train']} training and {counts['test']} test views"
+        f"{', these also under ' if lights else ''}{', '.join(lights)}; "
         f"next: refgs train {folder} -o runs/{folder.name}"
     )
     return Result(
@@ -81,6 +101,7 @@ def run(args: argparse.Namespace) -> Result:
             "train_views": counts["train"],
             "test_views": counts["test"],
             "size": args.size,
+            "relight": lights,
         },
         text,
     )

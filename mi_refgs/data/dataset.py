@@ -60,7 +60,7 @@ def read_dataset(
     `downscale` averages blocks of so many pixels squared, colour premultiplied by alpha; without it pictures
     are read whole. Pixels at the right and the bottom that fill no block are left out. Where the data set
     names no test views, every eighth picture, in the order of their paths, is one and no training view.
-    `truth` reads normals and depth where there are any.
+    `truth` reads normals, depth and materials where there are any.
 
     Raises InputError for anything missing, unreadable or inconsistent: file, field and remedy are named.
     """

@@ -54,6 +54,8 @@ class FrameReader:
             alpha = None if alpha is None else straight.resample(alpha[..., None])[..., 0]
         normal = self._map(index, frame, "normal_path", (*source, 3), straight)
         depth = self._map(index, frame, "depth_path", (*source, 1), straight)
+        channels = {"albedo": 4, "roughness": 2, "metallic": 2}
+        known = {n: self._map(index, frame, f"{n}_path", (*source, c), straight) for n, c in channels.items()}
         if normal is not None:
             length = np.linalg.norm(normal, axis=-1, keepdims=True)
             normal = np.where(length > 0, normal / np.maximum(length, 1e-12), 0).astype(np.float32)
@@ -73,6 +75,7 @@ class FrameReader:
             normal=normal,
             depth=None if depth is None else depth[..., 0],
             linear=self.options.images == "exr",
+            materials={name: values for name, values in known.items() if values is not None},
         )
 
     def size(self, index: int, frame: Any) -> tuple[int, int]:
@@ -141,7 +144,8 @@ class FrameReader:
     ) -> np.ndarray | None:
         """A ground-truth map at the wanted size, each pixel a mean over the surface in its block.
 
-        `expected` is the shape that the file must have: the picture's.
+        `expected` is the shape that the file must have: the picture's. Of two or four channels the last says
+        where the others count, and comes back as the share of the block that does.
         """
         file = self._path(index, frame, key) if self.options.truth else None
         if file is None:
@@ -152,11 +156,17 @@ class FrameReader:
                 f"{file}: frames[{index}].{key}: has shape {pixels.shape} but the picture needs {expected}; "
                 "export both at one size or remove the key"
             )
-        covered = np.any(pixels != 0, axis=-1, keepdims=True).astype(np.float32)
+        masked = expected[-1] in (2, 4)
+        covered = np.clip(pixels[..., -1:], 0, 1) if masked else np.any(pixels != 0, axis=-1, keepdims=True)
+        covered = covered.astype(np.float32)
+        pixels = pixels * covered if masked else pixels
         share, total = box_downscale(covered, self.options.downscale), box_downscale(pixels, self.options.downscale)
         if straight is not None:  # linear, so that no weight is negative
             share, total = straight.resample(share, order=1), straight.resample(total, order=1)
-        return (total / np.maximum(share, 1e-12)).astype(np.float32)
+        mean = total / np.maximum(share, 1e-12)
+        if masked:
+            mean = np.concatenate([np.where(share > 0, mean[..., :-1], 0), share], axis=-1)
+        return mean.astype(np.float32)
 
     def _to_world(self, index: int, frame: dict[str, Any]) -> np.ndarray:
         field = f"{self.transforms}: frames[{index}].transform_matrix"

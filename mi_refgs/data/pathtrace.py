@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_refgs.data.materials import materials_at
 from mi_refgs.shade import lobe_matrices
 
 SAMPLES_PER_LAUNCH = 1 << 24
@@ -17,6 +18,8 @@ ENVIRONMENT_OVERSAMPLING = 4
 """Directions per texel and axis of an environment that is turned, so that a small sun keeps its energy."""
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 """Azimuth between neighbours of a spherical Fibonacci lattice, radians."""
+MAPS = {"normal": "XYZ", "depth": "Y", "albedo": "RGBA", "roughness": "YA", "metallic": "YA"}
+"""Channels of the maps of a view; A is 1 where the BSDF defines the material, 0 where it does not."""
 
 
 def bounding_sphere(scene: Any) -> tuple[np.ndarray, float]:
@@ -124,30 +127,55 @@ class Tracer:
         )
         self.params = mi.traverse(self.sensor)
 
-    def trace(self, pose: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Premultiplied linear RGBA, normals (H, W, 3) and depth (H, W) of one view."""
+    def picture(self, pose: np.ndarray, seed: int) -> np.ndarray:
+        """Premultiplied linear RGBA (H, W, 4) of one view."""
         import drjit as dr
         import mitsuba as mi
 
-        self.params["to_world"] = mi.ScalarTransform4f(pose)
-        self.params.update()
-        size = self.size
+        self._look(pose)
         seeds = [seed, *np.random.SeedSequence(seed).generate_state(self.passes)[1:]]
-        image = np.zeros((size, size, 4))
+        image = np.zeros((self.size, self.size, 4))
         with dr.suspend_grad():
             for s in seeds:
                 part = mi.render(
                     self.scene, sensor=self.sensor, integrator=self.integrator, spp=self.spp, seed=int(s)
                 )
                 image += np.array(part) / self.passes
-            # Normals and depth are those of the pixel's centre: a mean over an edge belongs to no surface.
+        return image
+
+    def maps(self, pose: np.ndarray, covered: np.ndarray) -> dict[str, np.ndarray]:
+        """The maps of MAPS at the pixels' centres, where `covered` (H, W): a lamp that the picture hides has none.
+
+        A mean over a pixel at an edge would belong to no surface.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        self._look(pose)
+        size = self.size
+
+        def plane(array: Any) -> np.ndarray:
+            return np.broadcast_to(np.array(array, dtype=np.float64), size * size).reshape(size, size)
+
+        with dr.suspend_grad():
             index = dr.arange(mi.UInt32, size * size)
             film = mi.Point2f((index % size + 0.5) / size, (index // size + 0.5) / size)
             ray, _ = self.sensor.sample_ray(0, 0.5, film, mi.Point2f(0.5))
             si = self.scene.ray_intersect(ray)
             normal = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
-            # A lamp that the picture hides has no normal either.
-            hit = np.array(si.is_valid()).reshape(size, size) & (image[..., 3] > 0)
+            hit = plane(si.is_valid()).astype(bool) & covered
             depth = ((np.array(si.p).T - pose[:3, 3]) @ pose[:3, 2]).reshape(size, size)
-            normal = np.array(normal).T.reshape(size, size, 3)
-        return image, np.where(hit[..., None], normal, 0), np.where(hit, depth, 0)
+            found = {
+                "normal": np.array(normal).T.reshape(size, size, 3),
+                "depth": depth[..., None],
+            }
+            for name, (value, known) in vars(materials_at(self.scene, si)).items():
+                planes = [plane(x) for x in (value if dr.depth_v(value) > 1 else [value])]
+                found[name] = np.stack([*planes, plane(known)], axis=-1)
+        return {name: np.where(hit[..., None], array, 0) for name, array in found.items()}
+
+    def _look(self, pose: np.ndarray) -> None:
+        import mitsuba as mi
+
+        self.params["to_world"] = mi.ScalarTransform4f(pose)
+        self.params.update()

@@ -29,7 +29,7 @@ class ReadOptions:
     downscale: int = 1  # pixels of a file along a pixel's side
     background: float = 1.0  # 0 … 1, in the space of the pictures, behind their alpha
     images: str = "png"  # "png": as displayed, or "exr": linear radiance
-    truth: bool = True  # with normals and depth where there are any
+    truth: bool = True  # with normals, depth and materials where there are any
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,8 +3,9 @@
 Keys: `camera_angle_x` (radians) or `fl_x`, and `camera_angle_y`, `fl_y`, `cx`, `cy`, `w`, `h` (pixels), each
 in a frame or for the whole file; `k1` … `k4`, `p1`, `p2`, `is_fisheye`, `camera_model` (`data.lens` undoes the
 distortion); `frames` with `file_path` (with or without extension) and `transform_matrix`
-(camera to world, OpenGL axes); optional `exr_path`, `normal_path` (X, Y, Z, world) and `depth_path` (along
-the viewing axis) as `data.make_dataset` writes them.
+(camera to world, OpenGL axes); optional `exr_path`, `normal_path` (X, Y, Z, world), `depth_path` (along
+the viewing axis), `albedo_path` (R, G, B, A), `roughness_path` and `metallic_path` (Y, A; A: defined there) as
+`data.make_dataset` writes them.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +34,9 @@ class View:
     normal: np.ndarray | None  # (H, W, 3) float32, world space, 0 off the object
     depth: np.ndarray | None  # (H, W) float32 along the viewing axis, 0 off the object
     linear: bool  # whether `image` is linear radiance (EXR) or sRGB-encoded (PNG)
+    materials: dict[str, np.ndarray] = field(default_factory=dict)
+    """Of albedo, roughness, metallic those that are known: (H, W, C + 1) float32, the last the share of the pixel
+    for which the others stand; all 0 where it is 0."""
     near: float = 0.0  # depth of the near plane, scene units; `read_dataset` derives it from all cameras
 
     def camera(self) -> Camera:

@@ -221,15 +221,9 @@ class EnvironmentLight:
         Without `height`: the image's own rows, to the next lower multiple of 4. Raises InputError when it is
         no such image.
         """
-        image = _read_image(Path(path))
-        if image.ndim != 3 or min(image.shape[:2]) < 2:
-            raise InputError(
-                f"{path}: environment: {image.shape} is no lat-long image; give one of at least 2 × 2 texels"
-            )
-        if not np.isfinite(image).all():
-            raise InputError(f"{path}: environment: holds NaN or infinity; replace those texels")
+        image = read_radiance(path)
         rows = height if height is not None else max(MIN_HEIGHT, image.shape[0] // 4 * 4)
-        return cls.from_radiance(lobe_matrices.resample(np.maximum(image, 0), rows))
+        return cls.from_radiance(lobe_matrices.resample(image, rows))
 
     @property
     def height(self) -> int:
@@ -265,6 +259,21 @@ class EnvironmentLight:
         with suppress(OSError):  # a folder that cannot be made cannot be written to either
             path.parent.mkdir(parents=True, exist_ok=True)
         write_exr(path, self.radiance().numpy())
+
+
+def read_radiance(path: str | os.PathLike[str]) -> np.ndarray:
+    """Linear radiance (H, W, 3), at least 0, of a lat-long EXR, HDR, PNG or JPEG file.
+
+    Raises InputError when it is no such image.
+    """
+    image = _read_image(Path(path))
+    if image.ndim != 3 or min(image.shape[:2]) < 2:
+        raise InputError(
+            f"{path}: environment: {image.shape} is no lat-long image; give one of at least 2 × 2 texels"
+        )
+    if not np.isfinite(image).all():
+        raise InputError(f"{path}: environment: holds NaN or infinity; replace those texels")
+    return np.maximum(image, 0)
 
 
 def _read_image(path: Path) -> np.ndarray:

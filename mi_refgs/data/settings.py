@@ -1,0 +1,109 @@
+"""The settings of a path-traced data set, and the folder that records them in dataset.json."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Sequence
+from dataclasses import MISSING, asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from mi_refgs.data.scene_file import LightFile
+from mi_refgs.errors import InputError
+from mi_refgs.files import read_json, write_bytes
+
+SURFACE = "surface.ply"
+RELIGHT = "relight"
+"""Folder of the test views under further lights."""
+OWN_FILES = (
+    "transforms_*.json",
+    "environment.exr",
+    *(f"{split}/*.{ending}" for split in ("train", "test") for ending in ("png", "exr")),
+)
+VIEW_FILES = (*OWN_FILES, SURFACE, *(f"{RELIGHT}/*/{pattern}" for pattern in OWN_FILES))
+"""What a data set consists of beside its settings, and what overwriting it removes."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides every pixel of a data set."""
+
+    scene: str  # file name, without its folder
+    scene_sha256: str  # of the XML and the files that it names
+    views: int
+    test_views: int
+    size: int  # pixels, square
+    spp: int
+    seed: int
+    max_depth: int
+    elevation: tuple[float, float]  # degrees above the horizon, z up
+    fov: float  # degrees
+    fill: float  # radius of the bounding sphere / (distance · sin(fov / 2)); at 1 it touches the edge
+    environment_height: int  # rows; 0 writes no environment
+    light: str = ""  # file name of the map in place of the scene's environment
+    light_sha256: str = ""
+
+    def check(self) -> None:
+        """Raise InputError for a setting that makes no sense."""
+
+        def need(good: bool, field: str, remedy: str) -> None:
+            if not good:
+                value = getattr(self, field)
+                raise InputError(f"{self.scene}: {field}: {value} is out of range; {remedy}")
+
+        for field in ("views", "test_views", "size", "spp", "max_depth"):
+            need(getattr(self, field) >= 1, field, "give a number of at least 1")
+        low, high = self.elevation
+        need(-90 < low < high < 90, "elevation", "give two angles in degrees, -90 < low < high < 90")
+        need(0 < self.fov < 170, "fov", "give degrees between 0 and 170")
+        need(0 < self.fill <= 1, "fill", "give a fraction between 0 and 1")
+        need(self.seed >= 0, "seed", "give a number of at least 0")
+
+
+def prepare_folder(out: Path, settings: Settings, overwrite: bool, relight: Sequence[LightFile] = ()) -> None:
+    """Make the folders and record the settings; stop at a folder that holds anything else, or empty it."""
+    record = out / "dataset.json"
+    # What an older version did not know has its default there.
+    known: dict[str, Any] = {f.name: f.default for f in fields(Settings) if f.default is not MISSING}
+    wanted = json.loads(json.dumps(asdict(settings)))
+    found: Any = None
+    if record.is_file():
+        with contextlib.suppress(InputError):
+            found = known | read_json(record)
+    lights = _lights(found)
+    same = found is not None and {name: found.get(name) for name in wanted} == wanted
+    stale = [] if same else [f for pattern in VIEW_FILES for f in sorted(out.glob(pattern))]
+    changed = [k for k in wanted if k not in found or found[k] != wanted[k]] if found else []
+    if len({light.name for light in relight}) < len(relight):
+        names = ", ".join(str(light.path) for light in relight)
+        raise InputError(f"{names}: --relight: two have one name; rename one of the files")
+    for light in relight if same else ():
+        if lights.get(light.name, light.sha256) != light.sha256:
+            stale += [f for pattern in OWN_FILES for f in sorted((out / RELIGHT / light.name).glob(pattern))]
+            changed.append(f"{RELIGHT} {light.name}")
+    if stale and not overwrite:
+        raise InputError(
+            f"{record if found else out}: {', '.join(changed) or 'output'}: the folder holds another "
+            "data set; give another folder, the same settings, or --overwrite"
+        )
+    lights = (lights if same else {}) | {light.name: light.sha256 for light in relight}
+    try:
+        for folder in (out / "train", out / "test", *(out / RELIGHT / name / "test" for name in lights)):
+            folder.mkdir(parents=True, exist_ok=True)
+        for file in stale:
+            file.unlink()
+    except OSError as error:
+        raise InputError(f"{out}: output: cannot be written ({error}); choose a writable folder") from error
+    write_json(record, wanted | {RELIGHT: lights})
+
+
+def _lights(record: Any) -> dict[str, str]:
+    """Name and SHA-256 of the further lights that dataset.json records."""
+    lights = record.get(RELIGHT) if isinstance(record, dict) else None
+    return {k: v for k, v in lights.items() if isinstance(v, str)} if isinstance(lights, dict) else {}
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file, whole or not at all."""
+    write_bytes(path, f"{json.dumps(value, indent=1)}\n".encode())

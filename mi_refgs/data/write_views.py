@@ -1,0 +1,122 @@
+"""Path-traces the views of a data set into its folder, whatever of them is missing there."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.data.frames import MITSUBA_FROM_OPENGL
+from mi_refgs.data.pathtrace import MAPS, Tracer, camera_poses, environment_image
+from mi_refgs.data.settings import Settings, write_json
+from mi_refgs.errors import InputError
+from mi_refgs.exr import read_exr, read_exr_image, write_exr
+from mi_refgs.images import read_png, srgb_from_linear, write_png
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """The cameras of a data set around a scene's bounding sphere."""
+
+    settings: Settings
+    centre: np.ndarray
+    radius: float
+
+    @property
+    def distance(self) -> float:
+        """From the centre to each camera."""
+        return self.radius / (self.settings.fill * math.sin(math.radians(self.settings.fov) / 2))
+
+    def tracer(self, scene: Any) -> Tracer:
+        """What traces views of a scene of this size."""
+        s = self.settings
+        near, far = 0.1 * (self.distance - self.radius), 10 * (self.distance + self.radius)
+        return Tracer(scene, size=s.size, fov=s.fov, spp=s.spp, max_depth=s.max_depth, near=near, far=far)
+
+    def of(self, split: str) -> list[tuple[np.ndarray, int]]:
+        """Pose and seed of each view of a split.
+
+        Independent streams: one per split for the cameras, one per view for its paths.
+        """
+        s, index = self.settings, ("train", "test").index(split)
+        rng = np.random.default_rng([s.seed, index])
+        count = s.test_views if index else s.views
+        poses = camera_poses(count, self.centre, self.distance, s.elevation, rng)
+        streams = (np.random.SeedSequence([s.seed, index, i]) for i in range(count))
+        return [(p, int(stream.generate_state(1)[0])) for p, stream in zip(poses, streams, strict=True)]
+
+
+def write_views(
+    out: Path, splits: Sequence[str], cameras: Cameras, tracer: Tracer, maps: bool, progress: bool
+) -> None:
+    """The light, the views and then the transforms of some splits under one light; `maps`: with those."""
+    from tqdm import tqdm
+
+    light, height = out / "environment.exr", cameras.settings.environment_height
+    if height and tracer.scene.environment() is not None and not light.exists():
+        write_exr(light, environment_image(tracer.scene, height))
+    jobs = [(f"{split}/r_{i:03d}", *job) for split in splits for i, job in enumerate(cameras.of(split))]
+    bar = tqdm(jobs, desc=f"dataset {out.name}", unit="view", file=sys.stderr, disable=not progress)
+    for name, pose, seed in bar:
+        _trace_view(tracer, out / name, pose, seed, maps)
+    for split in splits:
+        frames = [_frame(split, i, pose, maps) for i, (pose, _) in enumerate(cameras.of(split))]
+        write_json(out / f"transforms_{split}.json", _transforms(cameras.settings, frames))
+
+
+def _trace_view(tracer: Tracer, stem: Path, pose: np.ndarray, seed: int, maps: bool) -> None:
+    """Trace what a view lacks; a broken file is missing."""
+    if _whole(read_png, f"{stem}.png") and _whole(read_exr, f"{stem}.exr"):
+        rgba = None
+    else:
+        rgba = tracer.picture(pose, seed)
+        alpha = rgba[..., 3:]
+        colour = srgb_from_linear(rgba[..., :3] / np.maximum(alpha, 1e-8))
+        write_exr(f"{stem}.exr", rgba)
+        write_png(f"{stem}.png", np.concatenate([colour, alpha], axis=-1))
+    files = {name: f"{stem}_{name}.exr" for name in MAPS} if maps else {}
+    missing = [name for name, file in files.items() if not _whole(read_exr, file)]
+    if missing:
+        covered = (read_exr_image(f"{stem}.exr") if rgba is None else rgba)[..., 3] > 0
+        found = tracer.maps(pose, covered)
+        for name in missing:
+            write_exr(files[name], found[name], names=MAPS[name])
+
+
+def _whole(read: Any, file: str) -> bool:
+    """Whether a file is there and can be read."""
+    try:
+        read(file)
+    except InputError:
+        return False
+    return True
+
+
+def _frame(split: str, index: int, pose: np.ndarray, maps: bool) -> dict[str, Any]:
+    stem = f"./{split}/r_{index:03d}"
+    return {
+        "file_path": stem,
+        "exr_path": f"{stem}.exr",
+        **({f"{name}_path": f"{stem}_{name}.exr" for name in MAPS} if maps else {}),
+        "transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist(),
+    }
+
+
+def _transforms(settings: Settings, frames: list[dict[str, Any]]) -> dict[str, Any]:
+    angle = math.radians(settings.fov)
+    focal = 0.5 * settings.size / math.tan(angle / 2)
+    return {
+        "camera_angle_x": angle,
+        "w": settings.size,
+        "h": settings.size,
+        "fl_x": focal,
+        "fl_y": focal,
+        "cx": settings.size / 2,
+        "cy": settings.size / 2,
+        "frames": frames,
+    }
