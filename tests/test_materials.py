@@ -91,7 +91,7 @@ def test_a_metals_albedo_is_what_it_reflects(name: str) -> None:
 @pytest.mark.parametrize("nonlinear", [False, True])
 @pytest.mark.parametrize("name", ["plastic", "roughplastic"])
 def test_a_plastics_albedo_is_what_the_base_reflects(name: str, nonlinear: bool) -> None:
-    """All that leaves at normal incidence is F + (1 - F) albedo, F being Fresnel's; 3 % less where it is rough."""
+    """All that leaves at normal incidence is F + (1 - F) albedo, F being Fresnel's; less if rough."""
     plastic = {"type": name, "diffuse_reflectance": RGB, "nonlinear": nonlinear}
     fresnel = ((1.49 - 1.000277) / (1.49 + 1.000277)) ** 2
     reflected = weight_of_samples(plastic).mean(axis=1)

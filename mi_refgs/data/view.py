@@ -47,7 +47,7 @@ class View:
         return Camera.from_pose(self.width, self.height, *focal, self.cx, self.cy, self.to_world, self.near)
 
     def averaged(self, block: int) -> View:
-        """The same view with each square of `block` × `block` pixels as one, and without normals and depth.
+        """The same view with each square of `block` × `block` pixels as one, and without true maps.
 
         Pixels at the right and the bottom that fill no square are left out. Raises InputError for a picture
         of less than one square.
@@ -70,6 +70,7 @@ class View:
             alpha=alpha,
             normal=None,
             depth=None,
+            materials={},
         )
 
     def colour(self, background: np.ndarray) -> np.ndarray:
