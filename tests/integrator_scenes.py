@@ -105,3 +105,14 @@ def plane_mesh(folder: Path) -> str:
     path = folder / "mesh.ply"
     write_mesh(path, Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), 0.05))
     return str(path)
+
+
+def hollow_mesh(folder: Path) -> str:
+    """The sphere and a wall that touches it: each takes light from the other."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    wall = trimesh.creation.box((0.2, 4, 4))
+    wall.apply_translation((-1.1, 1, 0))
+    mesh: Any = trimesh.util.concatenate([ball, wall.subdivide_to_size(0.5)])
+    path = folder / "hollow.ply"
+    write_mesh(path, Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), 0.02))
+    return str(path)

@@ -19,6 +19,7 @@ from mi_refgs.shade.split_sum import shade
 
 N = 50
 CASES = [(d, o) for d in ("sh", "irradiance") for o in ("open", "visibility", "indirect")]
+CASES += [("irradiance", "ambient")]
 
 
 def scene(rng: np.random.Generator, occlusion: str) -> dict[str, Any]:
@@ -35,6 +36,7 @@ def scene(rng: np.random.Generator, occlusion: str) -> dict[str, Any]:
         "radiance": rng.uniform(0.1, 2, (N, 3)),
         "visibility": None if occlusion == "open" else rng.uniform(0, 1, N),
         "indirect": rng.uniform(0.1, 1, (N, 3)) if occlusion == "indirect" else None,
+        "ambient": rng.uniform(0, 2, (N, 3)) if occlusion == "ambient" else None,
     }
 
 
@@ -45,8 +47,8 @@ def points_of(values: dict[str, Any]) -> ShadingPoints:
         return mi.Float(x.astype(np.float32)) if x.ndim == 1 else mi.Vector3f(x.T.astype(np.float32))
 
     arrays = {name: array(x) for name, x in values.items()}
-    for name in ("albedo", "radiance", "indirect"):
-        arrays[name] = None if arrays[name] is None else mi.Color3f(arrays[name])
+    for name in ("albedo", "radiance", "indirect", "ambient"):
+        arrays[name] = None if arrays.get(name) is None else mi.Color3f(arrays[name])
     return ShadingPoints(**arrays)
 
 

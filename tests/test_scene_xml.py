@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from integrator_scenes import HEIGHT, WIDTH, image, plane_mesh, raw_channels, sensor, sky
+from integrator_scenes import HEIGHT, WIDTH, hollow_mesh, image, plane_mesh, raw_channels, sensor, sky
 
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import read_mesh
@@ -30,6 +30,7 @@ OTHER: dict[str, Any] = {
     "multiscatter": True,
     "visibility_rays": 3,
     "traced_bounces": 1,
+    "ambient_rays": 16,
     "light_levels": 2,
     "directions": 5,
 }
@@ -44,7 +45,8 @@ def shading_with(option: str) -> Shading:
 
 
 def fitted(folder: Path, shading: Shading) -> TrainedScene:
-    mesh = read_mesh(plane_mesh(folder)) if shading.occlusion else None
+    made = hollow_mesh if shading.accuracy.ambient_rays else plane_mesh
+    mesh = read_mesh(made(folder)) if shading.occlusion else None
     surfels = Surfels.from_numpy(raw_channels())
     return TrainedScene(surfels, EnvironmentLight.from_radiance(sky()), mesh, shading, 7, 1.5)
 

@@ -76,8 +76,15 @@ def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
             {"reflectance": "radiance", "accuracy": Accuracy(dominant=True)},
             "dominant: needs reflectance",
         ),
-        ({"accuracy": Accuracy(visibility_rays=4)}, "visibility_rays, traced_bounces: need occlusion"),
-        ({"accuracy": {"traced_bounces": 1}}, "visibility_rays, traced_bounces: need occlusion"),
+        (
+            {"accuracy": Accuracy(visibility_rays=4)},
+            "visibility_rays, traced_bounces, ambient_rays: need occlusion",
+        ),
+        ({"diffuse": "sh", "accuracy": {"ambient_rays": 9}}, "need diffuse = irradiance"),
+        (
+            {"accuracy": {"traced_bounces": 1}},
+            "visibility_rays, traced_bounces, ambient_rays: need occlusion",
+        ),
     ],
 )
 def test_what_is_not_allowed_together_is_refused(options: dict, words: str) -> None:

@@ -114,8 +114,14 @@ def test_the_loss_falls_and_everything_trains(method: Method) -> None:
         assert not np.array_equal(before[name], tensor.numpy()), name
 
 
-def test_resume_repeats_a_straight_run_bit_for_bit(method: Method, tmp_path: Path, one_thread: None) -> None:
+@pytest.mark.parametrize("ambient", [0, 5])
+def test_resume_repeats_a_straight_run_bit_for_bit(
+    ambient: int, method: Method, tmp_path: Path, one_thread: None
+) -> None:
     data = ball()
+    if ambient:
+        deferred = dataclasses.replace(method.stage["deferred"], diffuse="irradiance", ambient_rays=ambient)
+        method = dataclasses.replace(method, stage=method.stage | {"deferred": deferred})
     straight = Trainer(method, data, run_folder(tmp_path / "straight", method))
     straight.train()
     first = Trainer(method, data, run_folder(tmp_path / "resumed", method))
@@ -133,7 +139,7 @@ def test_resume_repeats_a_straight_run_bit_for_bit(method: Method, tmp_path: Pat
     assert expected.keys() == got.keys()
     for name in expected.keys() - {"seconds"}:
         assert np.array_equal(expected[name], got[name]), name
-    assert "mesh/faces" in expected
+    assert "mesh/faces" in expected and ("mesh/ambient" in expected) == bool(ambient)
 
 
 def test_an_edit_clears_the_moments_of_what_it_changed(method: Method) -> None:

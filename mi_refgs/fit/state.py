@@ -10,6 +10,8 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.occlusion.vertex_colours import VertexColours
+from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, part
 
 if TYPE_CHECKING:
@@ -44,6 +46,8 @@ def packed(trainer: Trainer) -> dict[str, np.ndarray]:
             "mesh/faces": mesh.faces,
             "mesh/voxel": np.array(mesh.voxel),
         }
+    if trainer.occluder.ambient is not None:
+        state["mesh/ambient"] = trainer.occluder.ambient.numpy()
     return state
 
 
@@ -55,11 +59,15 @@ def decisions_of(state: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     return found
 
 
-def mesh_of(state: dict[str, np.ndarray]) -> Mesh | None:
-    """The occluder, if there is one."""
-    if "mesh/faces" not in state:
-        return None
-    return Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
+def occluder_of(state: dict[str, np.ndarray]) -> Occluder:
+    """The occluder, with its ambient ratios if it has any."""
+    occluder = Occluder()
+    if "mesh/faces" in state:
+        mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
+        occluder.update(mesh)
+        if "mesh/ambient" in state:
+            occluder.ambient = VertexColours.of(mesh, state["mesh/ambient"])
+    return occluder
 
 
 def require_fit(method: Method, state: dict[str, np.ndarray]) -> None:

@@ -22,9 +22,8 @@ from mi_refgs.fit.initial import initial_surfels
 from mi_refgs.fit.light_window import LightWindow
 from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.optim import Adam
-from mi_refgs.fit.rates import Group
 from mi_refgs.fit.schedule import Schedule
-from mi_refgs.fit.state import decisions_of, mesh_of, packed, require_fit
+from mi_refgs.fit.state import decisions_of, occluder_of, packed, require_fit
 from mi_refgs.fit.surface import surface_of
 from mi_refgs.methods.method import Method, Stage
 from mi_refgs.occlusion.mesh import Mesh
@@ -33,6 +32,7 @@ from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.runs.checkpoint import LIGHT, OPTIMISER, PARAMS, part, tensors
 from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
+from mi_refgs.shade.ambient import prepare
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
@@ -74,7 +74,7 @@ class Trainer:
         self.params |= initial_surfels(method, data, self.schedule.rng(0)).raw
         if method.light is not None:
             self.params[LIGHT] = first_light(method.light).raw
-        self.optimiser = Adam(self.params, self._groups())
+        self.optimiser = Adam(self.params, self.schedule.groups(self.extent))
         self.control.clear()
 
     def adopt(self, method: Method, data: Dataset, state: dict[str, np.ndarray]) -> None:
@@ -230,7 +230,13 @@ class Trainer:
         cameras = [target.camera for target in self.targets]
         mesh = surface_of(self.surfels.detach(), cameras, self.method.mesh.resolution)
         self.occluder.update(mesh)
+        self._prepare(self.shading())
         return mesh
+
+    def _prepare(self, shading: Shading) -> None:
+        """Give the mesh what the shading asks of it, by the present surfels and light."""
+        with dr.suspend_grad():
+            prepare(self.occluder, self.surfels, shading.light_of(self.light), shading.accuracy)
 
     # ---------------- one step ----------------
 
@@ -240,6 +246,8 @@ class Trainer:
         shift = mi.Point2f(dr.opaque(mi.Float, 0, surfels.count), dr.opaque(mi.Float, 0, surfels.count))
         dr.enable_grad(shift)
         shading = self._shading(stage)
+        if shading.accuracy.ambient_rays and self.occluder.ambient is None:  # a mesh of the stage before
+            self._prepare(shading)
         frame = render(
             surfels,
             camera,
@@ -270,9 +278,6 @@ class Trainer:
     def _shading(self, stage: Stage) -> Shading:
         return Shading.of(stage, not self.occluder.empty)
 
-    def _groups(self) -> dict[str, Group]:
-        return self.schedule.groups(self.extent)
-
     # ---------------- state ----------------
 
     def state(self) -> dict[str, np.ndarray]:
@@ -284,11 +289,11 @@ class Trainer:
         self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
         self._checked = self.iteration
         self.params = tensors(state, PARAMS)
-        self.optimiser = Adam(self.params, self._groups())
+        self.optimiser = Adam(self.params, self.schedule.groups(self.extent))
         self.optimiser.load_state_dict(part(state, OPTIMISER))
         self.control.gradient_sum = upload(state["gradient_sum"])
         self.control.gradient_count = upload(state["gradient_count"])
         self.control.held_until = int(state["held_until"])
         self.decisions = decisions_of(state)
-        self.occluder = Occluder(mesh_of(state))
+        self.occluder = occluder_of(state)
         self.window.restore(self.light, self.shading(), state)

@@ -82,6 +82,7 @@ class Stage:
     reflectance: str = "split_sum"  # a model of `shade.reflectance`
     diffuse: Literal["sh", "irradiance"] = "sh"
     visibility_rays: int = 1  # of the lobe, where there is a mesh; 1: the mirror ray
+    ambient_rays: int = 0  # of a vertex, where there is a mesh, for diffuse = irradiance
     light_levels: int = MAX_LEVELS  # of roughness, that the light is filtered to
     directions: int = DIRECTIONS  # of the hemisphere, for models that sum light over it
     restart: tuple[str, ...] = ()  # channels, and `light`, that start anew when the stage begins

@@ -12,6 +12,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.mesh_compat import make_mesh, update_mesh
 from mi_refgs.occlusion.surface_materials import Surface, VertexSurfels
+from mi_refgs.occlusion.vertex_colours import VertexColours
 from mi_refgs.surfels.table import Surfels
 
 OFFSET_VOXELS = 2.0
@@ -49,6 +50,7 @@ class Occluder:
         self._params: Any = None
         self._variant: str | None = None
         self._around: VertexSurfels | None = None
+        self.ambient: VertexColours | None = None  # share of diffuse light that arrives, of this mesh
         if mesh is not None:
             self.update(mesh)
 
@@ -58,7 +60,7 @@ class Occluder:
 
     def update(self, mesh: Mesh) -> None:
         """Replace the mesh. Vertex and face counts may change, to zero too; compiled kernels stay valid."""
-        self._mesh, self._around = mesh, None
+        self._mesh, self._around, self.ambient = mesh, None, None
         if not len(mesh.faces):
             return
         if self._scene is None or self._variant != mi.variant():

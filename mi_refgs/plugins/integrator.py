@@ -27,6 +27,7 @@ from mi_refgs.plugins.properties import (
 from mi_refgs.plugins.unusable import UnusableValues
 from mi_refgs.primitives import primitive_of, widths_of
 from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.shade.ambient import prepare
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.channels import CHANNELS
@@ -86,10 +87,11 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - Buy accuracy: look the light up along the GGX lobe's dominant direction; add what bounces between
          facets. (Default: false)
 
-     * - visibility_rays, traced_bounces
+     * - visibility_rays, traced_bounces, ambient_rays
        - |int|
-       - Rays of the lobe that visibility is averaged over, 1 is the mirror ray; and how often what blocks
-         rays is shaded, in place of the surfels' indirect light. (Default: 1, 0)
+       - Rays of the lobe that visibility is averaged over, 1 is the mirror ray; how often what blocks rays is
+         shaded, in place of the surfels' indirect light; and rays from each vertex of the mesh for the share
+         of diffuse light that arrives, with ``irradiance``. (Default: 1, 0, 0: all of it)
 
      * - directions, light_levels
        - |int|
@@ -169,6 +171,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.terms = read_terms(props)
         self.background = read_background(props)
         self.aovs = read_aovs(props)
+        self.prepared = False  # what rays meet is as the parameters say
         self.check()
         self.unusable = UnusableValues(self.surfels, self.light)
 
@@ -196,9 +199,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def parameters_changed(self, keys: list[str]) -> None:
         self.check()
         self.unusable.changed = True
-        moved = not keys or not {*keys}.isdisjoint(self.surfels.primitive.widths)
-        if moved and self.occluder is not None and self.shading.accuracy.traced_bounces:
-            self.occluder.set_materials(self.surfels)
+        self.prepared = self.prepared and not self.shading.accuracy.ambient_rays
+        self.prepared = self.prepared and {*keys}.isdisjoint(self.surfels.primitive.widths) and bool(keys)
 
     def aov_names(self) -> list[str]:
         return [channel for aov in self.aovs for channel in aov.channels()]
@@ -268,11 +270,16 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     def _frame(self, scene: Any, camera: Camera) -> Frame:
         aovs = len(self.terms) < len(TERMS) or any(aov.type in (*CHANNELS, *TERMS) for aov in self.aovs)
+        light = light_of(self.shading, self.light, self.light_rotation, scene)
+        if self.occluder is not None and not self.prepared:
+            prepare(self.occluder, self.surfels.detach(), light, self.shading.accuracy)
+            # No one is told when a light of the scene changes.
+            self.prepared = self.light is not None or not self.shading.accuracy.ambient_rays
         return render(
             Surfels(self.surfels.raw, screened=True),
             camera,
             self.shading,
-            light_of(self.shading, self.light, self.light_rotation, scene),
+            light,
             self.occluder,
             aovs=aovs,
             normals=any(aov.type == "normal" for aov in self.aovs),

@@ -124,10 +124,7 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     shading.check(surfels.raw, mesh=mesh is not None)
     if not (occlusion and mesh):
         return shading, None
-    occluder = Occluder(read_mesh(mesh))
-    if shading.accuracy.traced_bounces:
-        occluder.set_materials(surfels)
-    return shading, occluder
+    return shading, Occluder(read_mesh(mesh))
 
 
 def _accuracy(props: Any) -> Accuracy:

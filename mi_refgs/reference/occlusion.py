@@ -133,25 +133,31 @@ def fuse_point(
     return total / weight if weight else 1.0
 
 
+def mesh_hit(
+    vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, direction: np.ndarray
+) -> tuple[float, int, np.ndarray]:
+    """Distance along one ray to the nearest of all triangles, either side, infinite for a miss; the triangle;
+    and the shares (3,) of its corners. [Möller and Trumbore 1997]"""
+    a, b, c = (np.asarray(vertices, np.float64)[np.asarray(faces, int)[:, k]] for k in range(3))
+    across = np.cross(direction, c - a)
+    determinant = np.sum((b - a) * across, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1 / determinant
+        u = np.sum((origin - a) * across, axis=1) * inverse
+        beside = np.cross(origin - a, b - a)
+        v = (beside @ direction) * inverse
+        t = np.sum((c - a) * beside, axis=1) * inverse
+    hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & np.isfinite(t)
+    first = int(np.argmin(np.where(hit, t, np.inf)))
+    return (
+        float(t[first]) if hit[first] else np.inf,
+        first,
+        np.array([1 - u[first] - v[first], u[first], v[first]]),
+    )
+
+
 def mesh_distance(
     vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, direction: np.ndarray
 ) -> np.ndarray:
-    """Distance (n,) along rays to the nearest of all triangles, either side; infinite for a miss.
-
-    [Möller and Trumbore 1997], every ray with every triangle.
-    """
-    a, b, c = (np.asarray(vertices, np.float64)[np.asarray(faces, int)[:, k]] for k in range(3))
-    best = np.full(len(origin), np.inf)
-    for ray in range(len(origin)):
-        o, d = origin[ray], direction[ray]
-        across = np.cross(d, c - a)
-        determinant = np.sum((b - a) * across, axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = 1 / determinant
-            u = np.sum((o - a) * across, axis=1) * inverse
-            beside = np.cross(o - a, b - a)
-            v = (beside @ d) * inverse
-            t = np.sum((c - a) * beside, axis=1) * inverse
-        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & np.isfinite(t)
-        best[ray] = t[hit].min(initial=np.inf)
-    return best
+    """Distance (n,) along rays to the nearest of all triangles, either side; infinite for a miss."""
+    return np.array([mesh_hit(vertices, faces, o, d)[0] for o, d in zip(origin, direction, strict=True)])

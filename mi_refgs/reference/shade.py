@@ -152,6 +152,7 @@ def shade(
     visibility: float | None,
     indirect: np.ndarray | None,
     diffuse: str,
+    ambient: np.ndarray | None = None,
     dominant: bool = False,
     multiscatter: bool = False,
 ) -> np.ndarray:
@@ -170,8 +171,9 @@ def shade(
         reflectance = reflectance + further
     visible = 1.0 if visibility is None else visibility
     out = np.zeros((3, 3))
+    arriving = bilinear(levels[-1], n) * (1.0 if ambient is None else ambient)
     out[0] = (1 - metallic) * (
-        radiance if diffuse == "sh" else np.maximum(1 - reflectance, 0) * albedo * bilinear(levels[-1], n)
+        radiance if diffuse == "sh" else np.maximum(1 - reflectance, 0) * albedo * arriving
     )
     out[1] = visible * reflected
     if visibility is not None and indirect is not None:

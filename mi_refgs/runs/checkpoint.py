@@ -100,6 +100,8 @@ def check(state: Mapping[str, np.ndarray]) -> None:
         faces, vertices = state[f"{MESH}faces"], state[f"{MESH}vertices"]
         if faces.dtype.kind != "u" or (faces.size and faces.max() >= len(vertices)):
             raise DamagedError(f"{MESH}faces: names vertices that are not there")
+        if f"{MESH}ambient" in state:
+            _check(state, [f"{MESH}ambient"], vertices.shape)
 
 
 def _check(

@@ -33,6 +33,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.render.samples import supersampled
 from mi_refgs.render.scene_xml import write_scene_xml
+from mi_refgs.shade.ambient import prepare
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
@@ -128,8 +129,7 @@ class TrainedScene:
         with dr.suspend_grad():
             light = self.shading.light_of(self.light)
         occluder = Occluder(self.mesh)
-        if self.shading.accuracy.traced_bounces:
-            occluder.set_materials(self.surfels)
+        prepare(occluder, self.surfels, light, self.shading.accuracy)
 
         def once(camera: Camera) -> Frame:
             return render(self.surfels, camera, self.shading, light, occluder, aovs=aovs, normals=aovs)

@@ -20,7 +20,7 @@ MAX_DIRECTIONS = 64
 MAX_LEVELS = len(LEVEL_ROUGHNESS)
 """Filtered levels of a light, at most: as many as there are matrices for."""
 
-NEED_OCCLUSION = ("visibility_rays", "traced_bounces")
+NEED_OCCLUSION = ("visibility_rays", "traced_bounces", "ambient_rays")
 """Options that do nothing where no ray is traced."""
 
 
@@ -35,6 +35,7 @@ class Accuracy:
     multiscatter: bool = False  # add the light that leaves after several bounces between facets
     visibility_rays: int = 1  # rays of the GGX lobe that the visibility is averaged over; 1: the mirror ray
     traced_bounces: int = 0  # times that what a blocked ray hits is shaded, in place of the indirect channel
+    ambient_rays: int = 0  # of a mesh's vertex, for the share of diffuse light that arrives; 0: all of it
     directions: int = DIRECTIONS  # from which models that sum over the hemisphere take light
     light_levels: int = MAX_LEVELS  # levels of roughness that the light is filtered to; fewer cost less
 
@@ -45,6 +46,7 @@ class Accuracy:
         for name, what, least, most in (
             ("visibility_rays", "rays", 1, MAX_RAYS),
             ("traced_bounces", "bounces", 0, MAX_RAYS),
+            ("ambient_rays", "rays", 0, MAX_RAYS),
             ("directions", "directions", 1, MAX_DIRECTIONS),
             ("light_levels", "levels", 2, MAX_LEVELS),
         ):

@@ -53,6 +53,8 @@ class Shading:
             raise InputError(
                 f"shading: occlusion: needs shade_at = pixel and reflectance = {mirrors}; set these"
             )
+        if self.accuracy.ambient_rays and self.diffuse != "irradiance":
+            raise InputError("shading: ambient_rays: need diffuse = irradiance; set it")
         chosen = self.accuracy.chosen()
         if not self.occlusion and {*chosen} & {*NEED_OCCLUSION}:
             raise InputError(f"shading: {', '.join(NEED_OCCLUSION)}: need occlusion; trace a `mesh`")
@@ -71,7 +73,7 @@ class Shading:
         shading = Shading(stage.at, stage.reflectance, stage.diffuse, accuracy=accuracy)
         if not (mesh and shading.traceable):
             return shading
-        accuracy = replace(accuracy, visibility_rays=stage.visibility_rays)
+        accuracy = replace(accuracy, visibility_rays=stage.visibility_rays, ambient_rays=stage.ambient_rays)
         return replace(shading, occlusion=True, accuracy=accuracy)
 
     @staticmethod

@@ -82,8 +82,9 @@ def shade(
 
     With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected direction
     r: specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, and diffuse = (1 - metallic) radiance
-    ("sh") or (1 - S) (1 - metallic) albedo irradiance(n) ("irradiance"). n·v is clamped to [0, 1]: a point
-    seen from behind keeps its mirror direction, with the reflectance at grazing incidence.
+    ("sh") or (1 - S) (1 - metallic) albedo irradiance(n) ambient ("irradiance"; see `shade.ambient`, 1 where
+    the points have none). n·v is clamped to [0, 1]: a point seen from behind keeps its mirror direction, with
+    the reflectance at grazing incidence.
 
     `accuracy.dominant` turns r to `dominant_direction`; with `accuracy.multiscatter` and M of
     `multiple_scattering`, specular = V (L(r, roughness) S + irradiance(n) M),
@@ -119,7 +120,11 @@ def _diffuse(points: ShadingPoints, normal: Any, light: Light, diffuse: Diffuse,
     if diffuse == "irradiance":
         # The table, extrapolated, exceeds 1 by up to 1e-4: no negative light from that.
         left = dr.maximum(1 - reflectance, 0)
-        return left * (1 - points.metallic) * points.albedo * light.irradiance(normal)
+        arriving = light.irradiance(normal)
+        share = points.get("ambient")
+        if share is not None:
+            arriving *= share
+        return left * (1 - points.metallic) * points.albedo * arriving
     if diffuse != "sh":
         raise InputError(f'shade: diffuse: "{diffuse}" is unknown; choose "sh" or "irradiance"')
     if points.get("radiance") is None:

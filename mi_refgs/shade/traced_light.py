@@ -97,6 +97,9 @@ class MeshRadiance:
                 dr.gather(mi.Color3f, self.harmonics, row + i, hit.valid) for i in range(self.count)
             ]
             own = clamp_positive(eval_sh(coefficients, direction) + 0.5)
+        ambient = None
+        if self.occluder.ambient is not None:
+            ambient = self.occluder.ambient.at(hit.triangle, hit.barycentric, hit.valid)
         indirect = None
         if hit.next is not None:
             indirect = self.radiance(hit.next, reflect(view=-direction, normal=normal))
@@ -109,6 +112,7 @@ class MeshRadiance:
             radiance=own,
             visibility=hit.visibility,
             indirect=indirect,
+            ambient=ambient,
         )
         return shade(points, self.light, self.diffuse, self.accuracy).total()
 

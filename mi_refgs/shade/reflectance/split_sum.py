@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs.shade import split_sum
+from mi_refgs.shade.ambient import ambient_of_pixels
 from mi_refgs.shade.points import ShadingPoints, Terms, reflect
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, Surroundings
 from mi_refgs.shade.reflection import reflection
@@ -24,7 +25,7 @@ class SplitSum(Reflectance):
 
     name = "split_sum"
     visibility = "mirror"
-    accuracy = ("dominant", "multiscatter", "visibility_rays", "traced_bounces")
+    accuracy = ("dominant", "multiscatter", "visibility_rays", "traced_bounces", "ambient_rays")
 
     def channels(self, diffuse: str) -> tuple[str, ...]:
         return (*MATERIALS, "radiance_sh") if diffuse == "sh" else MATERIALS
@@ -44,4 +45,8 @@ class SplitSum(Reflectance):
         return split_sum.shade(points, light, shading.diffuse, shading.accuracy)
 
     def trace(self, points: ShadingPoints, around: Surroundings, shading: Shading) -> ShadingPoints:
-        return reflection(points, around, shading.diffuse, shading.accuracy)
+        points = reflection(points, around, shading.diffuse, shading.accuracy)
+        if not shading.accuracy.ambient_rays:
+            return points
+        ratio = ambient_of_pixels(around.occluder, around.origin, around.ray, around.covered)
+        return points.replaced(ambient=ratio)
