@@ -41,7 +41,7 @@ def write_curves(folder: Path, scene: Scene, path: Path) -> bool:
 
     One colour a method, one line a seed. Raises InputError if the file cannot be written.
     """
-    lines = [(row, _curve(folder / run)) for row in scene.rows for run in row.runs]
+    lines = [(row, read_curve(folder / run)) for row in scene.rows for run in row.runs]
     lines = [(row, curve) for row, curve in lines if curve]
     if not lines:
         return False
@@ -69,7 +69,7 @@ def write_curves(folder: Path, scene: Scene, path: Path) -> bool:
     return True
 
 
-def _curve(run: Path) -> list[dict[str, Any]]:
+def read_curve(run: Path) -> list[dict[str, Any]]:
     """The points of a run's curve, without half a line that a killed process may leave."""
     try:
         lines = (run / CURVE).read_text(encoding="utf-8").splitlines()

@@ -28,7 +28,7 @@ from mi_refgs.runs.interrupt import TerminatedError
 DONE, FAILURE, STOPPED = 0, 2, 143
 """Exit codes."""
 CURVE = "curve.jsonl"
-CURVE_POINTS, CURVE_VIEWS = 10, 4
+CURVE_POINTS, CURVE_VIEWS = 20, 8
 """Measurements during a fit, evenly spread over it, and the test views of each, spread over the split."""
 PATIENCE = 60.0
 """Seconds to wait for the process that worked in the folder before to save its state."""
