@@ -366,6 +366,11 @@ def test_unwritable_output(
         (["train"], ["DATA"]),
         (["train", "here", "-o", "there", "--preset", "fast"], ["--preset", "quick, standard, paper"]),
         (["train", "here", "-o", "there", "--variant", "nothing"], ["--variant", "nothing"]),
+        (["train", "here", "-o", "there", "--for", "nothing"], ["--for", "nothing", "relighting"]),
+        (
+            ["train", "here", "-o", "there", "--for", "relighting", "--variant", "no_pbr"],
+            ["--for", "--variant no_pbr", "one of the two"],
+        ),
         (["train", "here", "-o", "there", "--threads", "0"], ["--threads"]),
         (
             ["train", "here", "-o", "there", "--mitsuba-variant", "scalar_rgb"],

@@ -274,3 +274,31 @@ def test_an_unknown_primitive_is_refused() -> None:
         InputError, match=r"surfels\.primitive: 'ball' is unknown; use one of surfel, gaussian"
     ):
         methods.load("ref_gaussian", "quick", ["surfels.primitive='ball'"])
+
+
+def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
+    """`--for` finds one method; a file that extends it is for something else."""
+    assert methods.for_purpose("relighting") == "relighting"
+    purposes = [methods.load(name).about.purpose for name in methods.names()]
+    assert len([*filter(None, purposes)]) == len({*filter(None, purposes)}) == 1
+    own = tmp_path / "own.toml"
+    own.write_text('extends = "relighting"\n[about]\nname = "mine"\n')
+    assert methods.load(str(own)).about.purpose == ""
+    for word in ("", "speed"):
+        with pytest.raises(InputError, match=r"--for.*relighting"):
+            methods.for_purpose(word)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("stage.deferred.rates.tint=2.0", "rates: there is no 'tint'"),
+        ("stage.deferred.rates.metallic=-1.0", "metallic: -1.0 is no factor"),
+        ("stage.deferred.rates.light=nan", "out of range|no factor"),
+        ("surfels.from_pictures=['metallic']", "metallic"),
+        ("surfels.channels=['metallic', 'roughness']", "albedo"),
+    ],
+)
+def test_bad_settings_of_relighting_are_named(assignment: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        methods.load("relighting", "quick", [assignment])

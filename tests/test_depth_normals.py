@@ -157,7 +157,7 @@ def test_empty_image_gives_finite_gradients() -> None:
         losses.l1(image, target)
         + losses.d_ssim(image, target, WIDTH, HEIGHT)
         + losses.normal_consistency(mi.Vector3f(*leaves[:3]), depth_normal, valid, leaves[4])
-        + losses.normal_smoothness(leaves[:3], target, WIDTH, HEIGHT)
+        + losses.smoothness(leaves[:3], target, WIDTH, HEIGHT)
         + losses.alpha_loss(leaves[4], dr.zeros(mi.Float, size))
     )
     dr.backward(total)

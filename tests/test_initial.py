@@ -31,8 +31,9 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> dataset.Dataset:
     )
 
 
-def start(ball: dataset.Dataset, inside: float, seed: int = 0) -> dict[str, np.ndarray]:
-    method = methods.load("ref_gaussian", "quick", [f"surfels.count={COUNT}", f"surfels.inside={inside}"])
+def start(ball: dataset.Dataset, inside: float, seed: int = 0, *settings: str) -> dict[str, np.ndarray]:
+    assigned = [f"surfels.count={COUNT}", f"surfels.inside={inside}", *settings]
+    method = methods.load("ref_gaussian", "quick", assigned)
     surfels = initial_surfels(method, ball, np.random.default_rng(seed))
     return surfels.to_numpy() | {"normal": np.array(surfels.frame()[2]).T}
 
@@ -64,6 +65,17 @@ def test_normals_and_colours_of_both_kinds(ball: dataset.Dataset) -> None:
 def init_colour(table: dict[str, np.ndarray]) -> np.ndarray:
     """What a surfel's constant harmonic adds to grey."""
     return table["radiance_sh"][:, :3] * 0.28209479
+
+
+def test_albedo_starts_with_the_hue_of_the_pictures(ball: dataset.Dataset) -> None:
+    """As bright everywhere as its initial value; without it, it is grey."""
+    table = start(ball, 0.5, 0, "surfels.from_pictures=['albedo']", "surfels.initial.albedo=0.6")
+    albedo, colour = 1 / (1 + np.exp(-table["albedo"])), 0.5 + init_colour(table)
+    hue = 0.6 * colour / colour.max(axis=1, keepdims=True)
+    # Its own jitter breaks ties, and its ends are cut off.
+    assert np.abs(albedo - np.clip(hue, 0.02, 0.9)).max() < 0.026
+    assert np.abs(albedo - 0.6).max() > 0.3
+    assert np.abs(1 / (1 + np.exp(-start(ball, 0.5)["albedo"])) - 0.5).max() < 0.026
 
 
 def test_the_same_seed_gives_the_same_start(ball: dataset.Dataset) -> None:

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import level_maps
 from image_checks import GRADIENT, HEIGHT, STEP, VALUE, WIDTH, check, gradient, planes, stack
 
 from mi_refgs.data.dataset import View
@@ -17,6 +18,7 @@ from mi_refgs.fit.ssim import ssim
 from mi_refgs.images import srgb_from_linear
 from mi_refgs.reference import losses as reference
 from mi_refgs.render import display
+from mi_refgs.shade.envmap import EnvironmentLight
 
 
 @pytest.fixture
@@ -191,14 +193,57 @@ def test_display_image_shows_the_background_of_empty_pixels() -> None:
     np.testing.assert_allclose(np.array(dr.grad(alpha)), -0.25)
 
 
-def test_normal_smoothness(images: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(("count", "edge"), [(3, 1.0), (2, 10.0)])
+def test_smoothness(
+    count: int, edge: float, images: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
+) -> None:
     guide, _ = images
     check(
-        lambda x: losses.normal_smoothness(x, planes(guide), WIDTH, HEIGHT),
-        lambda x: reference.normal_smoothness(x, guide),
-        rng.normal(size=(HEIGHT, WIDTH, 3)),
+        lambda x: losses.smoothness(x, planes(guide), WIDTH, HEIGHT, edge),
+        lambda x: reference.smoothness(x, guide, edge),
+        rng.normal(size=(HEIGHT, WIDTH, count)),
         share=0.04,
     )
+
+
+def test_half_metal(rng: np.random.Generator) -> None:
+    """Alpha says what counts and gets no gradient; metals and dielectrics cost nothing."""
+    alpha = rng.random((HEIGHT, WIDTH, 1)).astype(np.float32)
+    check(
+        lambda x: losses.half_metal(x[0], planes(alpha)[0]),
+        lambda x: reference.half_metal(x, alpha),
+        0.1 + 0.8 * rng.random((HEIGHT, WIDTH, 1)),
+    )
+    weight = mi.Float(1, 1, 0.5)
+    dr.enable_grad(weight)
+    value = losses.half_metal(mi.Float(0, 1, 0), weight)
+    assert float(value[0]) == 0
+    assert not dr.grad_enabled(losses.half_metal(mi.Float(0.5, 0.5, 0.5), weight))
+
+
+def test_the_colour_of_a_light(rng: np.random.Generator) -> None:
+    """Against the definition, by the light's texels; a grey light, however uneven, costs nothing."""
+    texels = rng.uniform(0.1, 2, (8, 16, 3))
+
+    def loss(light: EnvironmentLight) -> Any:
+        return losses.light_colour(light.prefilter())
+
+    def define(values: np.ndarray, scale: float) -> float:
+        level = level_maps(EnvironmentLight.from_radiance(values).prefilter())[-1]
+        return reference.light_colour(level, scale)
+
+    light = EnvironmentLight.from_radiance(texels)
+    scale = reference.mean_irradiance(level_maps(light.prefilter())[-1])
+    dr.enable_grad(light.raw)
+    value = loss(light)
+    assert float(value[0]) == pytest.approx(define(texels, scale), rel=1e-4) and float(value[0]) > 0.01
+    dr.backward(value)
+    slope = dr.grad(light.raw).numpy() / -np.expm1(-texels)  # softplus' slope, in terms of softplus
+    step = rng.normal(size=texels.shape)
+    difference = (define(texels + 0.01 * step, scale) - define(texels - 0.01 * step, scale)) / 0.02
+    assert np.sum(slope * step) == pytest.approx(difference, rel=2e-2)
+    grey = EnvironmentLight.from_radiance(np.repeat(texels[..., :1], 3, axis=-1))
+    assert float(loss(grey)[0]) < 1e-6
 
 
 def test_second_call_compiles_nothing(images: tuple[np.ndarray, np.ndarray]) -> None:

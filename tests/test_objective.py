@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ from image_checks import HEIGHT, WIDTH
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View, read_dataset
 from mi_refgs.device import upload
+from mi_refgs.fit import losses
 from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.train import Trainer
 from mi_refgs.images import linear_from_srgb
 from mi_refgs.methods.method import LossWeights
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
+from mi_refgs.shade.envmap import EnvironmentLight
 
 BACKGROUND = np.array([1.0, 0.5, 0.25], np.float32)
 
@@ -76,6 +79,34 @@ def test_terms_are_weighed_as_the_method_says(
     expected += 0.4 * reference.alpha_loss(alpha, picture[1])
     assert float(loss[0]) == pytest.approx(expected, abs=2e-5)
     assert float(error[0]) == pytest.approx(np.mean((shown - goal) ** 2), rel=1e-4)
+
+
+def test_priors_are_weighed_as_the_method_says(
+    picture: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
+) -> None:
+    data, target = made(True, *picture)
+    radiance, alpha = picture
+    maps = {name: rng.uniform(0, 1, alpha.shape) for name in ("metallic", "roughness")}
+    frame = dataclasses.replace(
+        frame_of(radiance, alpha), maps={name: upload(x.astype(np.float32)) for name, x in maps.items()}
+    )
+    light = EnvironmentLight.from_radiance(rng.uniform(0.1, 2, (8, 16, 3))).prefilter()
+
+    def loss(iteration: int = 1, **weights: Any) -> float:
+        chosen = LossWeights(ssim=0, normal=0, **weights)
+        return float(objective(frame, target, data, chosen, iteration, light)[0][0])
+
+    rest, half = loss(), reference.half_metal(maps["metallic"], alpha)
+    assert loss(half_metal=0.3) - rest == pytest.approx(0.3 * half, rel=1e-3)
+    rise: dict[str, Any] = {"half_metal": 0.3, "half_metal_start": 10, "half_metal_rise": 100}
+    for iteration, share in ((10, 0), (11, 0.01), (60, 0.5), (500, 1)):
+        assert loss(iteration, **rise) - rest == pytest.approx(share * 0.3 * half, rel=1e-2, abs=1e-6)
+    smooth = np.stack([alpha * maps["roughness"], alpha * maps["metallic"]], axis=-1)
+    guide = np.stack([np.array(plane).reshape(alpha.shape) for plane in target.image], axis=-1)
+    expected = 0.2 * reference.smoothness(smooth, guide, 10.0)
+    assert loss(materials=0.2) - rest == pytest.approx(expected, rel=1e-3)
+    expected = 0.4 * float(losses.light_colour(light)[0])
+    assert loss(light_colour=0.4) - rest == pytest.approx(expected, rel=1e-3) and expected > 0.01
 
 
 def test_the_weight_of_normals_rises_linearly(data: Path, method: Path) -> None:

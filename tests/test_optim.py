@@ -313,3 +313,27 @@ def test_steps_compile_nothing_after_the_second(rng: np.random.Generator) -> Non
                 params[name] = tensor(params[name].numpy()[:20])
             optimiser.gather(parent, list(params))
     assert misses[3:] == [0] * 5
+
+
+def test_factors_of_a_stage() -> None:
+    """They multiply the rate beside those that `set_factor` sets; 0 keeps a tensor still."""
+    params = {"x": tensor(np.zeros((2, 1))), "y": tensor(np.zeros((2, 1)))}
+    optimiser = Adam(params, {"x": Group(0.1), "y": Group(0.1)})
+    optimiser.set_factor("x", 0.5)
+    optimiser.stage = {"x": 0.2, "y": 0.0}
+    assert optimiser.rate("x", 0) == pytest.approx(0.01)
+    for name in params:
+        give(optimiser, name, np.ones((2, 1)))
+    optimiser.step(0)
+    assert np.allclose(params["x"].numpy(), -0.01, rtol=1e-3) and np.all(params["y"].numpy() == 0)
+
+
+def test_lamps_grow_by_shares() -> None:
+    """A relative group: what is above 1 moves by the rate times itself, what is below by the rate."""
+    start = np.array([[-3.0], [0.5], [1.0], [4.0], [50.0]])
+    params = {"x": tensor(start)}
+    optimiser = Adam(params, {"x": Group(0.1, relative=True)})
+    give(optimiser, "x", -np.ones((5, 1)))
+    optimiser.step(0)
+    moved = params["x"].numpy() - start
+    np.testing.assert_allclose(moved, 0.1 * np.maximum(start, 1), rtol=1e-3)

@@ -142,6 +142,25 @@ def test_resume_repeats_a_straight_run_bit_for_bit(
     assert "mesh/faces" in expected and ("mesh/ambient" in expected) == bool(ambient)
 
 
+def test_a_stage_has_its_own_rates(method: Method) -> None:
+    initial = dataclasses.replace(method.stage["initial"], rates={"metallic": 0.0, "light": 0.1})
+    slow = dataclasses.replace(method, stage=method.stage | {"initial": initial}, refine=methods.Refine())
+    first = {}
+    for name, chosen in (("slow", slow), ("own", dataclasses.replace(slow, stage=method.stage))):
+        trainer = Trainer(chosen, ball())
+        before = {key: tensor.numpy().copy() for key, tensor in trainer.params.items()}
+        trainer.step()
+        first[name] = {key: np.abs(x.numpy() - before[key]).max() for key, x in trainer.params.items()}
+    assert first["slow"]["metallic"] == 0 < first["own"]["metallic"]
+    assert first["slow"]["light"] == pytest.approx(0.1 * first["own"]["light"], rel=1e-3)
+    assert first["slow"]["albedo"] == pytest.approx(first["own"]["albedo"], rel=1e-3)
+    while trainer.iteration < 8:
+        trainer.step()
+    before_deferred = trainer.params["metallic"].numpy().copy()
+    trainer.step()
+    assert np.abs(trainer.params["metallic"].numpy() - before_deferred).max() > 0
+
+
 def test_an_edit_clears_the_moments_of_what_it_changed(method: Method) -> None:
     """The propagation of iteration 5 changes opacities and scales."""
     trainer = Trainer(method, ball())

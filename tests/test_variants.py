@@ -99,6 +99,20 @@ DIFFERENCES: dict[str, set[str]] = {
         "surfels.primitive",
     },
     "auto": {"select"},
+    "relighting": {
+        "loss.half_metal",
+        "loss.half_metal_rise",
+        "loss.half_metal_start",
+        "loss.light_colour",
+        "loss.materials",
+        "rates.light_relative",
+        "stage.deferred",
+        "stage.initial",
+        "surfels.channels",
+        "surfels.degree",
+        "surfels.from_pictures",
+        "surfels.initial",
+    },
 }
 """Keys, to the second level, by which a method differs from the full one; `about` aside."""
 

@@ -41,6 +41,9 @@ def add(commands: Any) -> None:
     add_output(parser, "run folder", "RUN")
     parser.add_argument("--variant", metavar="V", help="method: a name or a .toml (default: the full method)")
     parser.add_argument(
+        "--for", dest="purpose", metavar="PURPOSE", help="the method for a purpose, such as relighting"
+    )
+    parser.add_argument(
         "--preset", metavar="P", help=f"quick, standard or paper: how long (default {DEFAULT_PRESET})"
     )
     add_settings(parser)
@@ -51,7 +54,8 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Fit, from the start or from the newest checkpoint."""
-    trainer = fit(args.data, args.output, args.variant, args.preset, args.set, args.resume)
+    variant = variant_of(args.variant, args.purpose)
+    trainer = fit(args.data, args.output, variant, args.preset, args.set, args.resume)
     last = trainer.statistics() if trainer.loss is not None else {}
     data = {
         "run": str(args.output),
@@ -72,6 +76,17 @@ def run(args: argparse.Namespace) -> Result:
         data |= {"terms": list(trainer.method.terms), "decisions": trainer.decisions}
         text = f"{table(trainer.decisions)}\n{text}"
     return Result(data, text)
+
+
+def variant_of(variant: str | None, purpose: str | None) -> str | None:
+    """The method that one of the two options names; raises InputError for both or an unknown purpose."""
+    from mi_refgs import methods
+
+    if purpose is None:
+        return variant
+    if variant is not None:
+        raise InputError(f"--for: {purpose}: --variant {variant} names a method already; give one of the two")
+    return methods.for_purpose(purpose)
 
 
 def load_method(variant: str | None, preset: str | None, assignments: list[str] | None) -> Method:

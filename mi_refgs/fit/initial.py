@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from mi_refgs.data import hull
@@ -11,6 +13,9 @@ from mi_refgs.methods.method import Method
 from mi_refgs.surfels import init
 from mi_refgs.surfels.order import morton_order
 from mi_refgs.surfels.table import Surfels
+
+ALBEDO_RANGE = (0.02, 0.9)
+"""Where an albedo from pictures starts: away from the ends, where the sigmoid has no slope."""
 
 
 def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> Surfels:
@@ -50,6 +55,12 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
         normals = init.random_normals(options.count, rng)
         colours = hull.median_colours(points, views, behind)
     order = morton_order(points)
+    from_pictures: dict[str, Any] = {}
+    if "albedo" in options.from_pictures and method.light is not None:
+        # The hue alone: how bright a place is, is left to the light until it has been found.
+        brightest = colours[order].max(axis=1, keepdims=True)
+        hue = np.where(brightest > 0, colours[order] / np.maximum(brightest, 1e-9), 1)
+        from_pictures["albedo"] = np.clip(hue * options.start("albedo"), *ALBEDO_RANGE)
     return init.from_points(
         points[order],
         normals[order],
@@ -58,5 +69,5 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
         primitive=options.primitive,
         channels=options.channels,
         degree={name: options.degree_of(name) for name in options.channels},
-        **options.initial,
+        **(options.initial | from_pictures),
     )

@@ -7,6 +7,7 @@ input. Targets, weights and masks have no derivative. SSIM is in `fit.ssim`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -15,9 +16,14 @@ import mitsuba as mi
 
 from mi_refgs.fit.ssim import ssim
 from mi_refgs.render.stencil import neighbours
+from mi_refgs.shade.light import Light
 
 # An 8-bit target value of 255 stands for everything from here up: the sensor clipped.
 SATURATED = 254.5 / 255.0
+DIRECTIONS = 256
+"""Directions that tell the colour of an irradiance: 13° from one to the next."""
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+"""Azimuth between neighbours of a spherical Fibonacci lattice, radians."""
 
 
 def saturated(
@@ -77,19 +83,21 @@ def normal_consistency(normal: Any, depth_normal: Any, valid: Any, alpha: Any) -
     return _mean(weight * (weight - dr.dot(mi.Vector3f(normal), mi.Vector3f(depth_normal))))
 
 
-def normal_smoothness(normal: Iterable[Any], image: Iterable[Any], width: int, height: int) -> Any:
-    """Edge-aware normal smoothness ‖∇N‖ exp(-‖∇I‖) (Ref-Gaussian §3.3): pixel mean, sum over axes.
+def smoothness(
+    planes: Iterable[Any], image: Iterable[Any], width: int, height: int, edge: float = 1.0
+) -> Any:
+    """Edge-aware smoothness ‖∇M‖ exp(-edge ‖∇I‖) of the maps M (`planes`): pixel mean, sum over axes.
 
-    ∇ is Sobel / 8 with the border repeated; ‖·‖ is the mean absolute value over the three planes. Gradients
-    flow to N only.
+    With the normals' planes and edge = 1 this is the smoothness of Ref-Gaussian (§3.3). ∇ is Sobel / 8 with
+    the border repeated; ‖·‖ is the mean absolute value over the planes. Gradients flow to M only.
     """
     total = mi.Float(0)
-    normal_slopes = [sobel(plane, width, height) for plane in normal]
+    map_slopes = [sobel(plane, width, height) for plane in planes]
     image_slopes = [sobel(dr.detach(plane), width, height) for plane in image]
     for axis in (0, 1):
-        bend = sum((_abs(slopes[axis]) for slopes in normal_slopes), mi.Float(0)) / len(normal_slopes)
-        edge = sum((dr.abs(slopes[axis]) for slopes in image_slopes), mi.Float(0)) / len(image_slopes)
-        total += bend * dr.exp(-edge)
+        bend = sum((_abs(slopes[axis]) for slopes in map_slopes), mi.Float(0)) / len(map_slopes)
+        step = sum((dr.abs(slopes[axis]) for slopes in image_slopes), mi.Float(0)) / len(image_slopes)
+        total += bend * dr.exp(-edge * step)
     return _mean(total)
 
 
@@ -100,6 +108,35 @@ def sobel(plane: Any, width: int, height: int) -> tuple[Any, Any]:
     along_x = at[1, -1] - at[-1, -1] + 2 * (at[1, 0] - at[-1, 0]) + at[1, 1] - at[-1, 1]
     along_y = at[-1, 1] - at[-1, -1] + 2 * (at[0, 1] - at[0, -1]) + at[1, 1] - at[1, -1]
     return along_x / 8, along_y / 8
+
+
+# ---------------- priors ----------------
+
+
+def half_metal(metallic: Any, alpha: Any) -> Any:
+    """Mean over all pixels of A m (1 - m), with A detached: 0 where every surface is a metal or none.
+
+    Surfaces are one or the other; what is between them fits pictures with a light of any colour.
+    """
+    return _mean(dr.detach(alpha) * metallic * (1 - metallic))
+
+
+def light_colour(light: Light) -> Any:
+    """How coloured the light is that a matt surface gets: mean of |E - grey E| over that of E.
+
+    E is the irradiance in DIRECTIONS all around. Pictures fix albedo times light only: whatever factor one
+    gains a channel, the other may lose, and no picture tells. This prior gives the colour to the albedo; what
+    mirrors and highlights show of the light, lamp by lamp, is finer than E. Of the scale, which no picture
+    tells either, a dielectric's highlights know; for other surfaces it is that of the light at the start.
+    """
+    index = dr.arange(mi.Float, DIRECTIONS)
+    height = 1 - (index + 0.5) * (2 / DIRECTIONS)
+    sin, cos = dr.sincos(index * GOLDEN_ANGLE)
+    ring = dr.sqrt(1 - dr.square(height))
+    irradiance = light.irradiance(mi.Vector3f(ring * cos, ring * sin, height))
+    grey = (irradiance.x + irradiance.y + irradiance.z) / 3
+    off = sum((_abs(part - grey) for part in irradiance), mi.Float(0)) / 3
+    return dr.sum(off) / dr.detach(dr.sum(grey))
 
 
 def _abs(difference: Any) -> Any:

@@ -18,6 +18,11 @@ from mi_refgs.render.display import displayed, srgb_from_linear
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.splat import Camera
 
+MATERIALS = ("roughness", "metallic")
+"""Maps that neighbours of like colour share."""
+MATERIAL_EDGE = 10.0
+"""Steepness of edges that are kept: a step of 0.1 in the picture from a pixel to the next counts a third."""
+
 
 @dataclass(frozen=True)
 class Target:
@@ -41,7 +46,7 @@ class Target:
 
 
 def objective(
-    frame: Frame, target: Target, data: Dataset, weights: LossWeights, iteration: int
+    frame: Frame, target: Target, data: Dataset, weights: LossWeights, iteration: int, light: Any = None
 ) -> tuple[Any, Any]:
     """Weighted sum of the losses of a frame (mi.Float of width 1), and its mean squared error, detached.
 
@@ -55,15 +60,29 @@ def objective(
     if weights.ssim:
         loss += weights.ssim * losses.d_ssim(image, target.image, width, height)
     if weights.normal and iteration > weights.normal_start:
-        since = iteration - weights.normal_start
-        risen = min(since / weights.normal_rise, 1) if weights.normal_rise else 1
-        # Opaque: it changes from step to step, and a literal would be compiled into each one's kernels.
-        weight = dr.opaque(mi.Float, weights.normal * risen)
+        weight = _risen(weights.normal, iteration - weights.normal_start, weights.normal_rise)
         depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, target.camera)
         loss += weight * losses.normal_consistency(frame.normal, depth_normal, valid, frame.alpha)
     if weights.smooth and iteration <= weights.smooth_until:
-        loss += weights.smooth * losses.normal_smoothness(list(frame.normal), target.image, width, height)
+        loss += weights.smooth * losses.smoothness(list(frame.normal), target.image, width, height)
+    if weights.half_metal and "metallic" in frame.maps and iteration > weights.half_metal_start:
+        since = iteration - weights.half_metal_start
+        weight = _risen(weights.half_metal, since, weights.half_metal_rise)
+        loss += weight * losses.half_metal(frame.maps["metallic"], frame.alpha)
+    if weights.materials and {*MATERIALS} <= {*frame.maps}:
+        maps = [dr.detach(frame.alpha) * frame.maps[name] for name in MATERIALS]
+        loss += weights.materials * losses.smoothness(maps, target.image, width, height, MATERIAL_EDGE)
+    if weights.light_colour and light is not None:
+        loss += weights.light_colour * losses.light_colour(light)
     if weights.alpha and target.alpha is not None:
         loss += weights.alpha * losses.alpha_loss(frame.alpha, target.alpha)
     squares = (dr.square(dr.detach(a) - b) for a, b in zip(image, target.image, strict=True))
     return loss, dr.mean(sum(squares, mi.Float(0))) / 3
+
+
+def _risen(weight: float, since: int, rise: int) -> Any:
+    """A weight that rises linearly from 0 in `rise` iterations.
+
+    Opaque: it changes from step to step, and a literal would be compiled into each one's kernels.
+    """
+    return dr.opaque(mi.Float, weight * (min(since / rise, 1) if rise else 1))

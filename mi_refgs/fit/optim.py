@@ -61,6 +61,7 @@ class Adam:
         self.params = params
         self.groups = dict(groups)
         self.factors: dict[str, float] = {}
+        self.stage: Mapping[str, float] = {}  # factors of the present stage of a fit
         self._first: dict[str, Any] = {}
         self._second: dict[str, Any] = {}
         self._steps: dict[str, int] = {}
@@ -79,7 +80,7 @@ class Adam:
 
     def rate(self, name: str, iteration: int) -> float:
         """Learning rate of a tensor's head columns at this iteration."""
-        return self.groups[name].at(iteration) * self.factors.get(name, 1.0)
+        return self.groups[name].at(iteration) * self.factors.get(name, 1.0) * self.stage.get(name, 1.0)
 
     def report(self) -> Skipped:
         """The steps that were skipped since the last call; waits for the device, so not for every step."""
@@ -115,6 +116,8 @@ class Adam:
                 column = dr.arange(mi.UInt32, math.prod(shape)) % shape[-1]
                 η = η * dr.select(column < group.head, 1.0, group.tail)
             θ = dr.detach(self.params[name].array)
+            if group.relative:
+                η = η * dr.maximum(θ, 1)
             updated[name] = (dr.select(good, θ - η * m / (dr.sqrt(v) + EPSILON), θ), shape)
             self._first[name] = dr.select(good, m, self._first[name])
             self._second[name] = dr.select(good, v, self._second[name])

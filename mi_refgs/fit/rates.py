@@ -19,6 +19,7 @@ class Group:
     steps: int = 1  # iterations
     head: int = 0  # columns; 0: every column
     tail: float = 1.0  # factor
+    relative: bool = False  # what is above 1 learns at the rate times itself: a lamp grows by shares
     unit: float = 1.0  # of the raw tensor, to which the moments refer: ε, and what float32 squares, have none
 
     def at(self, iteration: int) -> float:

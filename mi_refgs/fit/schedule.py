@@ -55,5 +55,6 @@ class Schedule:
         start, final = rates.of("position") * extent, rates.position_final * extent
         groups["position"] = Group(start, final, steps, unit=extent)
         if self.method.light is not None:
-            groups[LIGHT] = Group(rates.light, rates.light * rates.decay, iterations)
+            texels = rates.light, rates.light * rates.decay, iterations
+            groups[LIGHT] = Group(*texels, relative=rates.light_relative)
         return groups

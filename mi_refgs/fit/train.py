@@ -248,17 +248,18 @@ class Trainer:
         shading = self._shading(stage)
         if shading.accuracy.ambient_rays and self.occluder.ambient is None:  # a mesh of the stage before
             self._prepare(shading)
+        light = self.window.light(self.light, shading)
         frame = render(
             surfels,
             camera,
             shading,
-            self.window.light(self.light, shading),
+            light,
             self.occluder,
             sh_degree=self.schedule.sh_degree(iteration),
             shift=shift,
             normals=self.method.loss.uses_normals,
         )
-        loss, self.error = objective(frame, target, self.data, self.method.loss, iteration)
+        loss, self.error = objective(frame, target, self.data, self.method.loss, iteration, light)
         self.loss = dr.detach(loss)
         phase("loss backward")(dr.backward)(loss)
         if self.schedule.light_learns(iteration):
@@ -267,6 +268,7 @@ class Trainer:
         self.control.observe(dr.grad(shift), camera, iteration)
         if iteration % self.method.log_every == 0:
             dr.schedule(self.loss, self.error)
+        self.optimiser.stage = stage.rates
         self.optimiser.step(iteration - 1, self.loss)
         self.control.wander(iteration)
 

@@ -29,6 +29,7 @@ class About:
     name: str = ""
     paper: str = ""
     deviations: tuple[str, ...] = ()
+    purpose: str = ""  # a word, one file's alone, by which `refgs train --for` finds it
     paper_row: str = ""  # what the paper's tables call it, as in compare/paper.json
 
 
@@ -44,6 +45,7 @@ class SurfelOptions:
     degree: dict[str, int] = field(default_factory=dict)  # of spherical harmonics by channel; else 3
     sh_raise: Window = AT_ONCE  # one more degree of radiance_sh each time it is due
     initial: dict[str, float] = field(default_factory=dict)  # activated, by channel; else the channel's own
+    from_pictures: tuple[Literal["albedo"], ...] = ()  # channels that start with the hue of the pictures
 
     def degree_of(self, name: str) -> int:
         """Degree of the spherical harmonics of a channel."""
@@ -86,6 +88,7 @@ class Stage:
     light_levels: int = MAX_LEVELS  # of roughness, that the light is filtered to
     directions: int = DIRECTIONS  # of the hemisphere, for models that sum light over it
     restart: tuple[str, ...] = ()  # channels, and `light`, that start anew when the stage begins
+    rates: dict[str, float] = field(default_factory=dict)  # factors of the rates of channels, and of `light`
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,10 @@ class MeshOptions:
 
 @dataclass(frozen=True)
 class LossWeights:
-    """L = (1 - ssim) L1 + ssim (1 - SSIM) + normal L_n + smooth L_s + alpha L_α."""
+    """L = (1 - ssim) L1 + ssim (1 - SSIM) + normal L_n + smooth L_s + alpha L_α, and priors.
+
+    Those are named as their functions in `fit.losses`, and say what pictures do not.
+    """
 
     ssim: float = 0.2
     normal: float = 0.05
@@ -153,6 +159,11 @@ class LossWeights:
     smooth: float = 0.0
     smooth_until: int = 18_000
     alpha: float = 0.0
+    half_metal: float = 0.0  # metals or dielectrics, not half of each
+    half_metal_start: int = 0  # iterations before that counts: pictures decide which it is
+    half_metal_rise: int = 0  # iterations in which this weight then rises linearly from 0
+    materials: float = 0.0  # neighbours of like colour share roughness and metallic
+    light_colour: float = 0.0  # colour belongs to the albedo rather than to the light
 
     @property
     def uses_normals(self) -> bool:
@@ -167,6 +178,7 @@ class Rates:
     channel: dict[str, float] = field(default_factory=dict)  # by channel; else the channel's own
     rest: dict[str, float] = field(default_factory=dict)  # factor of the higher degrees; likewise
     light: float = 0.01  # texels of the environment
+    light_relative: bool = False  # those brighter than 1: times their radiance, so that they grow to lamps
     position_final: float = 1.6e-6  # of positions, at 0.6 of the iterations
     decay: float = 1.0  # factor that all but the position's rate reach, log-linearly, at the last iteration
 

@@ -28,7 +28,18 @@ MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
 
 # Fields that count iterations, and so scale with the preset, as windows do.
-_SCALED = {"iterations", "until", "normal_start", "normal_rise", "smooth_until", "hold", "after", "trial"}
+_SCALED = {
+    "iterations",
+    "until",
+    "normal_start",
+    "normal_rise",
+    "half_metal_start",
+    "half_metal_rise",
+    "smooth_until",
+    "hold",
+    "after",
+    "trial",
+}
 
 
 def load(
@@ -110,6 +121,7 @@ def _checked(method: Method, where: str) -> Method:
         ("surfels.channels", surfels.channels, {name for name, x in CHANNELS.items() if not x.geometry}),
         ("surfels.initial", surfels.initial, channels),
         ("surfels.degree", surfels.degree, {name for name in CHANNELS if CHANNELS[name].harmonics}),
+        ("surfels.from_pictures", surfels.from_pictures, {*surfels.channels}),
         ("rates.channel", rates.channel, set(CHANNELS)),
         ("rates.rest", rates.rest, {name for name in CHANNELS if CHANNELS[name].harmonics}),
         ("refine.reset_raise", method.refine.reset_raise, bounded),
@@ -130,9 +142,16 @@ def _checked(method: Method, where: str) -> Method:
             Shading.of(stage, method.mesh is not None).check(channels, method.light is not None)
         except InputError as error:
             raise InputError(f"{where}: stage.{name}: {error}") from error
-        there = {*surfels.channels} | ({LIGHT} if method.light is not None else set())
-        if absent := [restarted for restarted in stage.restart if restarted not in there]:
-            raise InputError(f"{where}: stage.{name}: restart: there is no '{absent[0]}'; remove it")
+        light = {LIGHT} if method.light is not None else set()
+        for key, named, there in (
+            ("restart", stage.restart, {*surfels.channels} | light),
+            ("rates", stage.rates, channels | light),
+        ):
+            if absent := [one for one in named if one not in there]:
+                raise InputError(f"{where}: stage.{name}: {key}: there is no '{absent[0]}'; remove it")
+        if worst := [one for one, factor in stage.rates.items() if not 0 <= factor < float("inf")]:
+            found = f"{worst[0]}: {stage.rates[worst[0]]}"
+            raise InputError(f"{where}: stage.{name}: rates: {found} is no factor; give 0 or more")
     if method.refine.propagate is not None and "metallic" not in surfels.channels:
         raise InputError(f"{where}: refine.propagate: there is no channel 'metallic'; add it, or drop this")
     return method
@@ -150,7 +169,22 @@ def dump(method: Method) -> str:
 
 def names() -> list[str]:
     """The methods that ship with the package."""
-    return sorted(path.stem for path in resource_dir("variants").glob("*.toml"))
+    return [path.stem for path in _shipped()]
+
+
+def for_purpose(purpose: str) -> str:
+    """The shipped method that says it is for this; raises InputError if none is."""
+    found = {_read(path).get("about", {}).get("purpose"): path.stem for path in _shipped()}
+    if not purpose or purpose not in found:
+        known = ", ".join(sorted(filter(None, found)))
+        raise InputError(
+            f"--for: {purpose}: no method is for that; use one of {known}, or choose a --variant"
+        )
+    return found[purpose]
+
+
+def _shipped() -> list[Path]:
+    return sorted(resource_dir("variants").glob("*.toml"))
 
 
 def _find(variant: str, where: str, folder: Path) -> Path:
@@ -181,7 +215,8 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
         raise InputError(f"{path}: drop: expected a list of keys, such as ['mesh', 'loss.alpha']; correct it")
     parent = _extended(_find(base, f"{path}: extends", path.parent), [*above, path.resolve()])
     if "about" in table:  # what another file deviates from is not what this one does
-        parent.get("about", {}).pop("deviations", None)
+        for key in ("deviations", "purpose"):
+            parent.get("about", {}).pop(key, None)
     for name in dropped:
         _drop(parent, name, path)
     return _merge(parent, table)

@@ -9,6 +9,8 @@ import math
 
 import numpy as np
 
+from mi_refgs.reference.shade import bilinear
+
 
 def srgb(linear: float) -> float:
     """sRGB encoding of one value (IEC 61966-2-1), unbounded above."""
@@ -117,19 +119,46 @@ def normal_consistency(
     return float(total / valid.size)
 
 
-def normal_smoothness(normal: np.ndarray, image: np.ndarray) -> float:
-    """Mean over pixels of Σ_axis ‖∂N‖ exp(-‖∂I‖), ‖·‖ the mean absolute value of three planes."""
-    height, width, _ = normal.shape
+def smoothness(maps: np.ndarray, image: np.ndarray, edge: float = 1.0) -> float:
+    """Mean over pixels of Σ_axis ‖∂M‖ exp(-edge ‖∂I‖), ‖·‖ the mean absolute value of the planes."""
+    height, width, _ = maps.shape
     kernel = np.array([[-1, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 8
-    padded = [np.pad(array, ((1, 1), (1, 1), (0, 0)), mode="edge") for array in (normal, image)]
+    padded = [np.pad(array, ((1, 1), (1, 1), (0, 0)), mode="edge") for array in (maps, image)]
     total = np.float64(0)
     for row, column in np.ndindex(height, width):
         for stencil in (kernel, kernel.T):
-            bend, edge = (
+            bend, step = (
                 np.mean(np.abs(np.tensordot(stencil, p[row : row + 3, column : column + 3]))) for p in padded
             )
-            total += bend * math.exp(-edge)
+            total += bend * math.exp(-edge * step)
     return float(total / (height * width))
+
+
+def half_metal(metallic: np.ndarray, alpha: np.ndarray) -> float:
+    """Mean over pixels of A m (1 - m)."""
+    return float(np.mean(alpha * metallic * (1 - metallic)))
+
+
+def _irradiances(level: np.ndarray, count: int = 256) -> np.ndarray:
+    """Colours (count, 3) of an irradiance map in the directions of a spherical Fibonacci lattice around y."""
+    found = []
+    for i in range(count):
+        z = 1 - (2 * i + 1) / count
+        φ = i * math.pi * (3 - math.sqrt(5))
+        ring = math.sqrt(1 - z * z)
+        found.append(bilinear(level, np.array([ring * math.cos(φ), ring * math.sin(φ), z])))
+    return np.array(found)
+
+
+def mean_irradiance(level: np.ndarray) -> float:
+    """Mean over directions and channels of an irradiance map (h, 2h, 3)."""
+    return float(_irradiances(level).mean())
+
+
+def light_colour(level: np.ndarray, scale: float) -> float:
+    """Mean over directions of the mean |E - grey E| of the channels, over `scale`, which is a constant."""
+    irradiance = _irradiances(level)
+    return float(np.mean(np.abs(irradiance - irradiance.mean(1, keepdims=True))) / scale)
 
 
 def adam(

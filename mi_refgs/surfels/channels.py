@@ -71,7 +71,7 @@ class Channel:
         return sh_columns(degree) if self.harmonics else self.widths[0]
 
     def start(
-        self, count: int, width: int, rng: np.random.Generator, value: float | None = None
+        self, count: int, width: int, rng: np.random.Generator, value: float | np.ndarray | None = None
     ) -> np.ndarray:
         """Initial raw values (count, width) float64 around `value` (activated; absent: `initial`).
 
@@ -80,12 +80,12 @@ class Channel:
         """
         value = self.initial if value is None else value
         if self.activation == "sigmoid":
-            if not 0 <= value <= 1:
+            if not np.all((np.asarray(value) >= 0) & (np.asarray(value) <= 1)):
                 raise InputError(f"surfels: {self.name}: {value} is no share; start it between 0 and 1")
             if self.jitter:
                 noise = rng.uniform(-self.jitter, self.jitter, (count, width))
                 return logit(np.clip(value + noise, *JITTER_RANGE))
-            return np.full((count, width), logit(value))
+            return np.broadcast_to(logit(value), (count, width)).copy()
         if self.activation == "exp":
             if not 0 < value < np.inf:
                 raise InputError(f"surfels: {self.name}: {value} is no size; start it above 0")

@@ -30,7 +30,7 @@ def from_points(
     channels: Sequence[str] | None = None,
     degree: Mapping[str, int] | None = None,
     scale_factor: float = 1.0,
-    **initial: float,
+    **initial: float | np.ndarray,
 ) -> Surfels:
     """One `primitive` per point: size from its 3 nearest neighbours, normal as given or uniform at random.
 
