@@ -18,7 +18,7 @@ from mi_refgs.fit import losses
 from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.train import Trainer
 from mi_refgs.images import linear_from_srgb
-from mi_refgs.methods.method import LossWeights
+from mi_refgs.methods.weights import LossWeights
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.envmap import EnvironmentLight

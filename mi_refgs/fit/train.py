@@ -118,6 +118,7 @@ class Trainer:
         """Render a view of the present state, without derivatives."""
         with dr.suspend_grad():
             shading = self.shading()
+            self._prepare(shading)
             return render(
                 self.surfels,
                 camera,
@@ -230,12 +231,11 @@ class Trainer:
         cameras = [target.camera for target in self.targets]
         mesh = surface_of(self.surfels.detach(), cameras, self.method.mesh.resolution)
         self.occluder.update(mesh)
-        self._prepare(self.shading())
         return mesh
 
     def _prepare(self, shading: Shading) -> None:
-        """Give the mesh what the shading asks of it, by the present surfels and light."""
-        with dr.suspend_grad():
+        """Give a new mesh the ambient ratios that the shading asks for, of the present surfels and light."""
+        if shading.accuracy.ambient_rays and self.occluder.ambient is None:
             prepare(self.occluder, self.surfels, shading.light_of(self.light), shading.accuracy)
 
     # ---------------- one step ----------------
@@ -246,8 +246,7 @@ class Trainer:
         shift = mi.Point2f(dr.opaque(mi.Float, 0, surfels.count), dr.opaque(mi.Float, 0, surfels.count))
         dr.enable_grad(shift)
         shading = self._shading(stage)
-        if shading.accuracy.ambient_rays and self.occluder.ambient is None:  # a mesh of the stage before
-            self._prepare(shading)
+        self._prepare(shading)
         light = self.window.light(self.light, shading)
         frame = render(
             surfels,

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from mi_refgs.methods.weights import LossWeights
 from mi_refgs.methods.window import Window
 from mi_refgs.primitives import primitive_named
 from mi_refgs.shade.accuracy import DIRECTIONS, MAX_LEVELS
@@ -146,32 +147,6 @@ class MeshOptions:
 
 
 @dataclass(frozen=True)
-class LossWeights:
-    """L = (1 - ssim) L1 + ssim (1 - SSIM) + normal L_n + smooth L_s + alpha L_α, and priors.
-
-    Those are named as their functions in `fit.losses`, and say what pictures do not.
-    """
-
-    ssim: float = 0.2
-    normal: float = 0.05
-    normal_start: int = 0  # iterations before L_n counts
-    normal_rise: int = 0  # iterations in which its weight then rises linearly from 0
-    smooth: float = 0.0
-    smooth_until: int = 18_000
-    alpha: float = 0.0
-    half_metal: float = 0.0  # metals or dielectrics, not half of each
-    half_metal_start: int = 0  # iterations before that counts: pictures decide which it is
-    half_metal_rise: int = 0  # iterations in which this weight then rises linearly from 0
-    materials: float = 0.0  # neighbours of like colour share roughness and metallic
-    light_colour: float = 0.0  # colour belongs to the albedo rather than to the light
-
-    @property
-    def uses_normals(self) -> bool:
-        """Whether a loss looks at the blended normals."""
-        return self.normal > 0 or self.smooth > 0
-
-
-@dataclass(frozen=True)
 class Rates:
     """Adam learning rates, raw units a step; of positions in scene extents."""
 
@@ -253,7 +228,7 @@ class Method:
     light: LightOptions | None = None
     refine: Refine = Refine()
     mesh: MeshOptions | None = None
-    loss: LossWeights = LossWeights()
+    loss: LossWeights = field(default_factory=LossWeights)
     rates: Rates = Rates()
     data: DataOptions = DataOptions()
     seed: int = 0

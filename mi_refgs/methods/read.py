@@ -28,18 +28,8 @@ MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
 
 # Fields that count iterations, and so scale with the preset, as windows do.
-_SCALED = {
-    "iterations",
-    "until",
-    "normal_start",
-    "normal_rise",
-    "half_metal_start",
-    "half_metal_rise",
-    "smooth_until",
-    "hold",
-    "after",
-    "trial",
-}
+_SCALED = {"iterations", "until", "normal_start", "normal_rise", "half_metal_start", "half_metal_rise"}
+_SCALED |= {"smooth_until", "hold", "after", "trial"}
 
 
 def load(

@@ -1,0 +1,31 @@
+"""The weights of the losses, as a method file has them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """L = (1 - ssim) L1 + ssim (1 - SSIM) + normal L_n + smooth L_s + alpha L_α, and priors.
+
+    Those are named as their functions in `fit.losses`, and say what pictures do not.
+    """
+
+    ssim: float = 0.2
+    normal: float = 0.05
+    normal_start: int = 0  # iterations before L_n counts
+    normal_rise: int = 0  # iterations in which its weight then rises linearly from 0
+    smooth: float = 0.0
+    smooth_until: int = 18_000
+    alpha: float = 0.0
+    half_metal: float = 0.0  # metals or dielectrics, not half of each
+    half_metal_start: int = 0  # iterations before that counts: pictures decide which it is
+    half_metal_rise: int = 0  # iterations in which this weight then rises linearly from 0
+    materials: float = 0.0  # neighbours of like colour share roughness and metallic
+    light_colour: float = 0.0  # colour belongs to the albedo rather than to the light
+
+    @property
+    def uses_normals(self) -> bool:
+        """Whether a loss looks at the blended normals."""
+        return self.normal > 0 or self.smooth > 0
