@@ -16,6 +16,7 @@ from mi_refgs.methods.build import plain
 
 FULL = "ref_gaussian"
 GEOMETRY_LOSS = {"loss.normal", "loss.normal_rise"}
+OWN_LIGHT = {"light.every", "rates.light"}
 COLOUR_ONLY = {
     "light",
     "mesh",
@@ -35,6 +36,7 @@ DIFFERENCES: dict[str, set[str]] = {
     "ref_gaussian": set(),
     "ref_gaussian_paper": {
         "iterations",
+        "light.every",
         "loss.normal",
         "loss.normal_rise",
         "loss.smooth",
@@ -53,7 +55,7 @@ DIFFERENCES: dict[str, set[str]] = {
         "surfels.initial",
         "surfels.sh_raise",
     },
-    "no_pbr": NO_MESH | {"stage.deferred", "stage.initial", "surfels.initial"},
+    "no_pbr": NO_MESH | OWN_LIGHT | {"stage.deferred", "stage.initial", "surfels.initial"},
     "no_interreflection": NO_MESH,
     "no_deferred": NO_MESH | {"stage.deferred"},
     "no_initial_stage": {"stage.initial"},
@@ -63,6 +65,7 @@ DIFFERENCES: dict[str, set[str]] = {
     "base_3dgs": COLOUR_ONLY | GEOMETRY_LOSS | {"surfels.primitive"},
     "base_3dgs_dr": NO_MESH
     | GEOMETRY_LOSS
+    | OWN_LIGHT
     | {
         "refine.propagate",
         "stage.deferred",
@@ -72,6 +75,7 @@ DIFFERENCES: dict[str, set[str]] = {
         "surfels.sh_raise",
     },
     "base_gaussian_shader": NO_MESH
+    | OWN_LIGHT
     | {
         "light.radiance",
         "loss.normal_rise",
@@ -82,7 +86,8 @@ DIFFERENCES: dict[str, set[str]] = {
         "surfels.initial",
         "surfels.primitive",
     },
-    "base_r3dg": {
+    "base_r3dg": OWN_LIGHT
+    | {
         "light.height",
         "light.radiance",
         "mesh.extract",
