@@ -33,6 +33,7 @@ OTHER: dict[str, Any] = {
     "ambient_rays": 16,
     "light_levels": 2,
     "directions": 5,
+    "antialias": True,
 }
 """A value for each option that is not its default."""
 

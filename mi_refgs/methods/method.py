@@ -84,6 +84,7 @@ class Stage:
     at: Literal["surfel", "pixel"] = "pixel"
     reflectance: str = "split_sum"  # a model of `shade.reflectance`
     diffuse: Literal["sh", "irradiance"] = "sh"
+    antialias: bool = False  # roughness widened by how much normals turn within a pixel
     visibility_rays: int = 1  # of the lobe, where there is a mesh; 1: the mirror ray
     ambient_rays: int = 0  # of a vertex, where there is a mesh, for diffuse = irradiance
     light_levels: int = MAX_LEVELS  # of roughness, that the light is filtered to

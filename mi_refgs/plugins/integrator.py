@@ -82,10 +82,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times the light that the specular term
          leaves). (Default: ``sh`` if there is one)
 
-     * - dominant, multiscatter
+     * - dominant, multiscatter, antialias
        - |bool|
        - Buy accuracy: look the light up along the GGX lobe's dominant direction; add what bounces between
-         facets. (Default: false)
+         facets; widen roughness by how much normals turn within a pixel. (Default: false)
 
      * - visibility_rays, traced_bounces, ambient_rays
        - |int|

@@ -19,6 +19,7 @@ import mitsuba as mi
 from mi_refgs.constants import COVERAGE_FLOOR, FACING_TOLERANCE
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.primitives import primitive_of, widths_of
+from mi_refgs.render.antialias import widened
 from mi_refgs.render.gbuffer import GBuffer, inverse_alpha
 from mi_refgs.shade.light import Light
 from mi_refgs.shade.points import ShadingPoints, Terms, safe_normalize
@@ -174,6 +175,8 @@ def _shade_at_pixels(scene: _Scene, aovs: bool) -> Frame:
     values = {name: buffer.divided(name) for name in slots if name != "normal"}
     normal, ray = buffer.slots["normal"], camera.rays()
     attributes = {name: values[name] for name in scene.named}
+    if shading.accuracy.antialias:
+        attributes["roughness"] = widened(attributes["roughness"], normal, buffer.alpha, camera)
     points = ShadingPoints(normal, -dr.normalize(ray), attributes)
     maps = {name: values[name] for name in scene.surfels.raw if name in values}
     if shading.occlusion:

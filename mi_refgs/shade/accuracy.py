@@ -38,9 +38,10 @@ class Accuracy:
     ambient_rays: int = 0  # of a mesh's vertex, for the share of diffuse light that arrives; 0: all of it
     directions: int = DIRECTIONS  # from which models that sum over the hemisphere take light
     light_levels: int = MAX_LEVELS  # levels of roughness that the light is filtered to; fewer cost less
+    antialias: bool = False  # widen roughness by how much normals turn within a pixel
 
     def __post_init__(self) -> None:
-        for name in ("dominant", "multiscatter"):
+        for name in ("dominant", "multiscatter", "antialias"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"accuracy: {name}: {shown(getattr(self, name))} is neither True nor False")
         for name, what, least, most in (

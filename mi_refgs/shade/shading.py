@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args, get_type_hints
 
 from mi_refgs.errors import InputError, shown
@@ -58,6 +58,8 @@ class Shading:
         chosen = self.accuracy.chosen()
         if not self.occlusion and {*chosen} & {*NEED_OCCLUSION}:
             raise InputError(f"shading: {', '.join(NEED_OCCLUSION)}: need occlusion; trace a `mesh`")
+        if self.accuracy.antialias and self.at != "pixel":
+            raise InputError("shading: antialias: needs shade_at = pixel; set it, or leave it out")
         for name in chosen:
             if name not in self.model.honours:
                 able = " or ".join(other for other, model in MODELS.items() if name in model.honours)
@@ -69,12 +71,14 @@ class Shading:
 
         It is occluded if there is a `mesh` and the model can trace it in this order.
         """
-        accuracy = Accuracy(light_levels=stage.light_levels, directions=stage.directions)
-        shading = Shading(stage.at, stage.reflectance, stage.diffuse, accuracy=accuracy)
+        given: dict[str, Any] = {
+            option.name: getattr(stage, option.name, option.default) for option in fields(Accuracy)
+        }
+        free = {name: value for name, value in given.items() if name not in NEED_OCCLUSION}
+        shading = Shading(stage.at, stage.reflectance, stage.diffuse, accuracy=Accuracy(**free))
         if not (mesh and shading.traceable):
             return shading
-        accuracy = replace(accuracy, visibility_rays=stage.visibility_rays, ambient_rays=stage.ambient_rays)
-        return replace(shading, occlusion=True, accuracy=accuracy)
+        return replace(shading, occlusion=True, accuracy=Accuracy(**given))
 
     @staticmethod
     def default_reflectance(channels: Collection[str]) -> str:

@@ -25,7 +25,14 @@ class SplitSum(Reflectance):
 
     name = "split_sum"
     visibility = "mirror"
-    accuracy = ("dominant", "multiscatter", "visibility_rays", "traced_bounces", "ambient_rays")
+    accuracy = (
+        "dominant",
+        "multiscatter",
+        "antialias",
+        "visibility_rays",
+        "traced_bounces",
+        "ambient_rays",
+    )
 
     def channels(self, diffuse: str) -> tuple[str, ...]:
         return (*MATERIALS, "radiance_sh") if diffuse == "sh" else MATERIALS
