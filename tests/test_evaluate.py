@@ -16,7 +16,8 @@ from tiny_scene import SETTINGS, SIZE, write_data, write_method
 from mi_refgs import methods
 from mi_refgs.data import dataset
 from mi_refgs.evaluation import metrics, pictures
-from mi_refgs.evaluation.evaluate import TIMED_FRAMES, WARM_UP_FRAMES, evaluate
+from mi_refgs.evaluation.evaluate import evaluate
+from mi_refgs.evaluation.speed import TIMED_FRAMES, WARM_UP_FRAMES
 from mi_refgs.fit.train import Trainer
 from mi_refgs.images import read_png
 from mi_refgs.render.display import displayed

@@ -15,8 +15,13 @@ ROWS = (
     ("lpips", "LPIPS", "{:.4f}"),
     ("normal_mae_deg", "normal error, foreground", "{:.2f}°"),
     ("normal_mae_deg_full", "normal error, whole image", "{:.2f}°"),
+    ("albedo_psnr", "albedo, PSNR after scale", "{:.2f} dB"),
+    ("roughness_mae", "roughness, mean error", "{:.3f}"),
+    ("metallic_mae", "metallic, mean error", "{:.3f}"),
     ("env_psnr", "light, PSNR after scale", "{:.2f} dB"),
     ("env_correlation", "light, correlation", "{:.3f}"),
+    ("surface_distance", "surface distance", "{:.2f} % of the size"),
+    ("concave_share", "concave pixels", "{:.1%} of the foreground"),
     ("surfels", "surfels", "{}"),
     ("pruned", "pruned", "from {0[surfels]} surfels, training views within {0[psnr]:.1f} dB"),
     ("iterations", "iterations", "{}"),
@@ -25,13 +30,25 @@ ROWS = (
     ("ms_per_frame", "frame", "{:.1f} ms"),
 )
 """Key of metrics.json, name and format of what people read."""
-REASONS = {"flip": "flip", "lpips": "lpips", "normal_mae_deg": "normal", "env_psnr": "env"}
+CONCAVE_ROWS = ("psnr", "normal_mae_deg", "albedo_psnr", "roughness_mae", "metallic_mae", "surface_distance")
+"""Rows whose number on concave pixels stands behind them."""
+REASONS = {
+    "flip": "flip",
+    "lpips": "lpips",
+    "normal_mae_deg": "normal",
+    "env_psnr": "env",
+    "albedo_psnr": "albedo",
+    "roughness_mae": "roughness",
+    "metallic_mae": "metallic",
+    "surface_distance": "surface",
+    "concave_share": "concave",
+}
 """Which `…_reason` explains a missing number."""
 
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    summary = "measure a run on the test views: metrics.json, renders, a contact sheet"
+    summary = "measure a run on the test views: metrics.json, renders, sheets of ours beside the truth"
     parser = add_command(commands, "eval", summary, "refgs eval runs/glossy --json", run)
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="run folder that `refgs train` wrote")
     parser.add_argument(
@@ -49,11 +66,11 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Evaluate."""
-    from mi_refgs.evaluation.evaluate import SHEET, evaluate
+    from mi_refgs.evaluation.evaluate import DECOMPOSITION, SHEET, evaluate
     from mi_refgs.runs.run import Run
 
     result = evaluate(Run(args.run_folder), args.data, progress=True, samples=args.samples)
-    return Result(result, f"{table(result)}\ncontact sheet: {args.run_folder / SHEET}")
+    return Result(result, f"{table(result)}\nsheets: {args.run_folder / SHEET}, {DECOMPOSITION}")
 
 
 def table(result: dict[str, Any]) -> str:
@@ -61,7 +78,9 @@ def table(result: dict[str, Any]) -> str:
     lines = []
     for key, name, form in ROWS:
         if result[key] is not None:
-            lines.append(f"{name:<27}{form.format(result[key])}")
+            concave = result.get(f"{key}_concave") if key in CONCAVE_ROWS else None
+            apart = "" if concave is None else f"  (concave: {form.format(concave)})"
+            lines.append(f"{name:<27}{form.format(result[key])}{apart}")
         elif key in REASONS:
             lines.append(f"{name:<27}none: {result[f'{REASONS[key]}_reason']}")
     return "\n".join(lines)

@@ -3,43 +3,33 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import platform
 import re
 import sys
-import time
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation import metrics, pictures
+from mi_refgs.evaluation import decomposition, metrics, pictures
+from mi_refgs.evaluation.speed import machine, milliseconds
+from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.exr import read_exr_image
 from mi_refgs.files import read_json
 from mi_refgs.fit.whole import read_views
 from mi_refgs.images import write_png
 from mi_refgs.methods.method import Method
-from mi_refgs.render.display import displayed
-from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.export import TrainedScene, up_to_date
 from mi_refgs.runs.run import Run
-from mi_refgs.splat import Camera
 
 FOLDER = "eval"
 SHEET = "contact_sheet.png"
+DECOMPOSITION = "decomposition.png"
 METRICS = "metrics.json"
 SHEET_VIEWS = 4
-"""Rows of the contact sheet, spread evenly over the test views."""
-WARM_UP_FRAMES = 2
-"""Frames before the timing: the first compiles or loads the kernels, the second fills the memory pools."""
-TIMED_FRAMES = 20
-"""Frames whose median is reported; the views repeat if there are fewer."""
+"""Rows of either sheet, spread evenly over the test views."""
 NORMAL_KEYS = ("normal_mae_deg", "normal_mae_deg_full")
 LIGHT_KEYS = ("env_scale", "env_mae", "env_psnr", "env_correlation")
 
@@ -65,13 +55,15 @@ def load_split(run: Run, method: Method, split: str, path: Path | None = None) -
 
 
 def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples: int = 1) -> dict[str, Any]:
-    """Render the test views, measure them, and write metrics.json, renders and a contact sheet into the run.
+    """Render the test views, measure them, and write metrics.json, renders and two sheets into the run.
 
     Evaluates the artefacts as they lie in the folder, after writing what a newer checkpoint makes stale.
     Every key is always there: null, with a `…_reason`, where it does not apply. Normals count where the true
-    alpha is above ½ and there is a true normal. `ms_per_frame` is the median over single synchronised frames
-    of the displayed picture alone, light filtered beforehand. `pruned` is null for a
-    whole scene. All that is rendered has `samples` a pixel, box filtered (`render.samples`).
+    alpha is above ½ and there is a true normal, materials (`evaluation.decomposition`) where the data defines
+    them; keys that end in `_concave` count pixels where the true surface is (`evaluation.surface`).
+    `ms_per_frame` is the median over single synchronised frames of the displayed picture alone, light
+    filtered beforehand. `pruned` is null for a whole scene. All that is rendered has `samples` a pixel, box filtered
+    (`render.samples`).
 
     Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, and for data
     that is gone.
@@ -92,7 +84,10 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
 
     shown = set(np.linspace(0, len(views.views) - 1, SHEET_VIEWS).round().astype(int).tolist())
     rows: list[dict[str, np.ndarray]] = []
+    kept: list[Any] = []
     per_view: list[dict[str, Any]] = []
+    surface, errors = TrueSurface.read(views.path), decomposition.Decomposition()
+    materials = decomposition.material_maps(fitted)
     for index, truth in enumerate(
         tqdm(views.views, desc="eval", unit="view", file=sys.stderr, disable=not progress)
     ):
@@ -113,9 +108,13 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
             covered = np.linalg.norm(truth.normal, axis=-1) if truth.alpha is None else truth.alpha
             scores |= metrics.normal_mae_deg(shot.normal, truth.normal, covered)
         per_view.append(scores)
+        maps = materials(truth.camera(), shot)
+        concave = None if surface is None else surface.concave(truth)
+        errors.add(shot, maps, truth, concave)
         write_png(run.path / render_name(truth), shot.image)
         if index in shown:
             rows.append(pictures.panels(shot, truth))
+            kept.append((shot, maps, truth, concave))
 
     result: dict[str, Any] = {
         name: _mean(per_view, name) for name in ("psnr", "ssim", "flip", "lpips", *NORMAL_KEYS)
@@ -126,7 +125,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
         None if result["normal_mae_deg"] is not None else "the data set has no true normals"
     )
     light, light_panels = _light(fitted, views)
-    result |= light
+    result |= light | errors.result()
+    result |= surface_scores(fitted.mesh, surface, views.views)
     result |= {
         "train_seconds": fitted.seconds,
         "iterations": fitted.iteration,
@@ -148,6 +148,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
         ],
     }
     write_png(run.path / SHEET, pictures.sheet(rows, light_panels))
+    rows = [decomposition.panels(s, m, v, errors.scale(), c) for s, m, v, c in kept]
+    write_png(run.path / DECOMPOSITION, pictures.sheet(rows, light_panels))
     run.write_json(METRICS, result)
     return result
 
@@ -155,25 +157,6 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
 def render_name(view: View) -> str:
     """Path, below the run folder, of the picture that `evaluate` writes of a test view."""
     return f"{FOLDER}/{re.sub(r'[^0-9A-Za-z]+', '_', view.name).strip('_')}.png"
-
-
-def machine() -> dict[str, Any]:
-    """What the numbers were measured on."""
-    try:
-        found = re.search(
-            r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE
-        )
-    except OSError:
-        found = None
-    return {
-        "cpu": found.group(1) if found else platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "threads": int(dr.thread_count()),
-        "system": f"{platform.system()} {platform.machine()}",
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
-        "mitsuba_variant": mi.variant(),
-    }
 
 
 def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
@@ -187,21 +170,6 @@ def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[st
         return nothing | {"env_reason": "the data set has no environment.exr"}, pictures.lights(light)
     truth = read_exr_image(data.environment)[..., :3]
     return metrics.environment(light, truth) | {"env_reason": None}, pictures.lights(light, truth)
-
-
-def milliseconds(
-    scenes: Sequence[Callable[[Camera], Frame]], cameras: list[Camera], data: Dataset
-) -> list[float]:
-    """Median time of a frame up to the displayed image, each waited for; of several scenes in turn."""
-    seconds: list[list[float]] = [[] for _ in scenes]
-    for i in range(WARM_UP_FRAMES + TIMED_FRAMES):
-        for view, times in zip(scenes, seconds, strict=True):
-            dr.sync_thread()
-            begin = time.perf_counter()
-            dr.eval(displayed(view(cameras[i % len(cameras)]), data.background, data.linear))
-            dr.sync_thread()
-            times.append(time.perf_counter() - begin)
-    return [1000 * float(np.median(times[WARM_UP_FRAMES:])) for times in seconds]
 
 
 def _mean(per_view: list[dict[str, Any]], name: str) -> float | None:

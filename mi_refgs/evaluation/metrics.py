@@ -33,7 +33,11 @@ LPIPS_NETWORK = "alex"
 def psnr(image: np.ndarray, truth: np.ndarray) -> float:
     """Peak signal-to-noise ratio in dB over all pixels and channels, background included; at most 100."""
     image, truth = _pair(image, truth)
-    error = float(np.mean((image - truth) ** 2))
+    return psnr_of(float(np.mean((image - truth) ** 2)))
+
+
+def psnr_of(error: float) -> float:
+    """PSNR in dB of a mean squared error of values up to 1; at most 100."""
     return PSNR_MAX if error <= 0 else min(PSNR_MAX, -10 * float(np.log10(error)))
 
 
@@ -121,15 +125,20 @@ def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> 
         sizes = f"{normal.shape}, {truth.shape}, {np.shape(alpha)}"
         raise InputError(f"metrics: normal: shapes {sizes} do not fit; render at the size of the data set")
     foreground = (np.asarray(alpha) > FOREGROUND_ALPHA) & (np.linalg.norm(truth, axis=-1) > 0)
-    # atan2 keeps small angles exact, where acos of a float32 dot product cannot go below 0.03°.
-    cosine = np.sum(normal * truth, axis=-1)
-    sine = np.linalg.norm(np.cross(normal, truth), axis=-1)
-    angle = np.where((cosine == 0) & (sine == 0), 90.0, np.degrees(np.arctan2(sine, cosine)))
-    total = float(np.sum(angle[foreground]))
+    total = float(np.sum(angle_deg(normal, truth)[foreground]))
     return {
         "normal_mae_deg": total / max(int(foreground.sum()), 1),
         "normal_mae_deg_full": total / foreground.size,
     }
+
+
+def angle_deg(normal: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Angle (H, W) in degrees between normals of any length; 90° where one is 0."""
+    normal, truth = np.asarray(normal, np.float64), np.asarray(truth, np.float64)
+    # atan2 keeps small angles exact, where acos of a float32 dot product cannot go below 0.03°.
+    cosine = np.sum(normal * truth, axis=-1)
+    sine = np.linalg.norm(np.cross(normal, truth), axis=-1)
+    return np.where((cosine == 0) & (sine == 0), 90.0, np.degrees(np.arctan2(sine, cosine)))
 
 
 # ---------------- light ----------------
@@ -164,7 +173,7 @@ def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     return {
         "env_scale": [float(value) for value in scale],
         "env_mae": float(np.average(np.abs(fitted - truth), weights=weight)),
-        "env_psnr": PSNR_MAX if error <= 0 else min(PSNR_MAX, -10 * float(np.log10(error))),
+        "env_psnr": psnr_of(error),
         "env_correlation": float(np.sum(weight * shown * goal)) / spread
         if spread > FLAT * weight.sum()
         else 0.0,

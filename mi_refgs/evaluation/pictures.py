@@ -44,24 +44,28 @@ class RenderedView:
     @staticmethod
     def of(frame: Frame, data: Dataset) -> RenderedView:
         """Copy a frame of the data set's size; waits for the device."""
-        view = data.views[0]
-
-        def plane(array: Any) -> np.ndarray:
-            values = np.array(array, dtype=np.float32).ravel()
-            return np.broadcast_to(values, view.width * view.height).reshape(view.height, view.width)
-
-        def planes(arrays: Any) -> np.ndarray:
-            return np.stack([plane(array) for array in arrays], axis=-1)
-
-        normal = planes(frame.normal)
+        size = data.views[0].height, data.views[0].width
+        normal = planes(frame.normal, *size)
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
-        maps = {name: planes(m) if dr.depth_v(m) > 1 else plane(m) for name, m in frame.maps.items()}
         return RenderedView(
-            planes(displayed(frame, data.background, data.linear)),
-            plane(frame.alpha),
+            planes(displayed(frame, data.background, data.linear), *size),
+            planes(frame.alpha, *size),
             np.where(length > 1e-6, normal / np.maximum(length, 1e-6), 0),
-            maps,
+            RenderedView.maps_of(frame, *size),
         )
+
+    @staticmethod
+    def maps_of(frame: Frame, height: int, width: int) -> dict[str, np.ndarray]:
+        """The maps of a frame alone."""
+        return {name: planes(m, height, width) for name, m in frame.maps.items()}
+
+
+def planes(array: Any, height: int, width: int) -> np.ndarray:
+    """An array over pixels as (H, W), one of colours or vectors as (H, W, 3), float32."""
+    if isinstance(array, list) or dr.depth_v(array) > 1:
+        return np.stack([planes(part, height, width) for part in array], axis=-1)
+    values = np.array(array, dtype=np.float32).ravel()
+    return np.broadcast_to(values, height * width).reshape(height, width)
 
 
 def target(view: View) -> np.ndarray:
@@ -74,13 +78,13 @@ def panels(shot: RenderedView, view: View) -> dict[str, np.ndarray]:
     shown = {"ground truth": target(view), "render": shot.image}
     if view.normal is not None:
         covered = np.linalg.norm(view.normal, axis=-1)
-        shown["true normals"] = _on_white(0.5 + 0.5 * view.normal, covered)
-    shown["normals"] = _on_white(0.5 + 0.5 * shot.normal, shot.alpha)
+        shown["true normals"] = on_white(0.5 + 0.5 * view.normal, covered)
+    shown["normals"] = on_white(0.5 + 0.5 * shot.normal, shot.alpha)
     for name in (*(name for name, channel in CHANNELS.items() if channel.aov), "visibility"):
         if name in shot.maps:
             values = shot.maps[name]
             grey = srgb_from_linear(values) if values.ndim == 3 else np.repeat(values[..., None], 3, axis=-1)
-            shown[name] = _on_white(grey, shot.alpha)
+            shown[name] = on_white(grey, shot.alpha)
     return {title: np.clip(picture, 0, 1) for title, picture in shown.items()}
 
 
@@ -155,7 +159,15 @@ def _fit_width(picture: np.ndarray, width: int) -> np.ndarray:
     return np.stack([np.asarray(plane.resize(size, Image.Resampling.BOX)) for plane in planes], axis=-1)
 
 
-def _on_white(picture: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+def beside(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Pictures of one height side by side."""
+    gap = np.ones((pictures[0].shape[0], MARGIN // 2, 3))
+    parts = [part for picture in pictures for part in (gap, picture)]
+    return np.concatenate(parts[1:], axis=1)
+
+
+def on_white(picture: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """A picture (H, W, 3) over white."""
     alpha = np.clip(alpha, 0, 1)[..., None]
     return alpha * picture + (1 - alpha)
 

@@ -1,0 +1,170 @@
+"""How near a mesh is to the true surface, and where that surface is concave."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from mi_refgs.data.settings import SURFACE
+from mi_refgs.data.view import View
+from mi_refgs.occlusion.mesh import Mesh, read_mesh
+from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
+from mi_refgs.shade.ambient import ambient_direction
+from mi_refgs.shade.ggx_sampling import lobe_turn
+
+OPEN_RAYS = 64
+"""Rays of the hemisphere of each point: the share of free ones is known to 1/64 and better."""
+CONCAVE_BELOW = 0.9
+"""Ambient visibility below which a point counts as occluded or concave. On a convex object it is 1, in the
+corner of two walls ½, everywhere inside a cap of a sphere that is h high and its radius R 1 - h / 2R. At 0.9
+a tenth of the diffuse light is not that of the environment; the error of OPEN_RAYS stays below that."""
+QUERIES = 20_000
+"""Points whose distances are averaged, on either surface."""
+TARGETS = 200_000
+"""Points on the surface whose triangles are tried: an object of size 2 has one each 0.01."""
+CANDIDATES = 8
+"""Nearest of these points, whose triangles are tried exactly."""
+GRAZING = 0.1
+"""Cosine to the viewing ray below which a view does not see a point: its pixel may see the back."""
+SEED = 0
+SURFACE_KEYS = ("surface_distance", "surface_accuracy", "surface_completeness")
+NO_SURFACE = f"the data set has no {SURFACE}; make it again with this version of `refgs dataset`"
+
+
+@dataclass(frozen=True, eq=False)
+class TrueSurface:
+    """The surface of the scene, and rays against it."""
+
+    mesh: Mesh
+    occluder: Occluder
+
+    @staticmethod
+    def read(folder: Path) -> TrueSurface | None:
+        """That of a data set; None where there is none. Raises InputError for a file that cannot be read."""
+        path = folder / SURFACE
+        if not path.is_file():
+            return None
+        mesh = read_mesh(path)
+        return TrueSurface(mesh, Occluder(mesh)) if len(mesh.faces) else None
+
+    def concave(self, view: View) -> np.ndarray | None:
+        """Pixels (H, W) whose point on the true surface has an ambient visibility below CONCAVE_BELOW.
+
+        None where the view has no true depth and normals; false off the object.
+        """
+        if view.depth is None or view.normal is None:
+            return None
+        camera = view.camera()
+        depth = mi.Float(view.depth.ravel())
+        point = mi.Point3f(camera.origin + camera.rays() * depth)
+        open_ = openness(self.occluder, point, mi.Vector3f(view.normal.reshape(-1, 3).T), depth > 0)
+        return (open_.numpy().reshape(view.depth.shape) < CONCAVE_BELOW) & (view.depth > 0)
+
+
+def openness(occluder: Occluder, point: Any, normal: Any, active: Any = True) -> Any:
+    """Ambient visibility (mi.Float): share of cosine-weighted rays that leave the mesh; 1 if not `active`."""
+    frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
+    count = dr.opaque(mi.UInt32, OPEN_RAYS)
+    active = mi.Bool(active) & (dr.squared_norm(normal) > 0)
+
+    def body(index: Any, free: Any) -> tuple[Any, Any]:
+        direction = ambient_direction(frame, turn, index, count)
+        return index + 1, free + occluder.visible(point, direction, normal, active)
+
+    start = (mi.UInt32(0), dr.zeros(mi.Float, dr.width(normal)))
+    _, free = dr.while_loop(start, lambda index, _: active & (index < count), body, label="openness")
+    return dr.select(active, free / OPEN_RAYS, 1)
+
+
+def surface_scores(mesh: Mesh | None, truth: TrueSurface | None, views: Sequence[View]) -> dict[str, Any]:
+    """`surface_distance`, or None by its keys, and `surface_reason`, which says why."""
+    found: dict[str, Any] = dict.fromkeys((*SURFACE_KEYS, *(f"{key}_concave" for key in SURFACE_KEYS)))
+    if mesh is None or not len(mesh.faces):
+        return found | {"surface_reason": "the run has no mesh"}
+    if truth is None:
+        return found | {"surface_reason": NO_SURFACE}
+    found |= surface_distance(mesh, truth, views)
+    unseen = "no view sees both the mesh and the true surface"
+    return found | {"surface_reason": unseen if found["surface_distance"] is None else None}
+
+
+def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> dict[str, float]:
+    """Distance between a mesh and the true surface in percent of the size, where some view sees either.
+
+    Size is the diameter of the sphere around the truth's bounding box's centre that holds it. Keys:
+    `surface_accuracy`, mean distance from points of the mesh to the true surface; `surface_completeness`,
+    from points of the true surface to the mesh; `surface_distance`, the mean of both (Chamfer distance); and
+    each with `_concave`, of points whose (nearest) point on the true surface is concave, if there are any.
+    Points are spread evenly over the area that the views see, each surface in front of itself.
+    """
+    corners = np.asarray(truth.mesh.vertices, np.float64)
+    centre = (corners.min(0) + corners.max(0)) / 2
+    percent = 100 / (2 * np.linalg.norm(corners - centre, axis=1).max())
+    (ours, _), (true, facing) = _seen(mesh, Occluder(mesh), views), _seen(truth.mesh, truth.occluder, views)
+    result: dict[str, float] = {}
+    if not len(ours) or not len(true):
+        return result
+    open_ = openness(truth.occluder, mi.Point3f(true.T), mi.Vector3f(facing.T)).numpy()
+    _, nearest = cKDTree(true).query(ours)
+    accuracy, completeness = percent * distance_to(truth.mesh, ours), percent * distance_to(mesh, true)
+    for suffix, counted in (("", np.ones(len(true), bool)), ("_concave", open_ < CONCAVE_BELOW)):
+        if counted[nearest].any():
+            means = float(accuracy[counted[nearest]].mean()), float(completeness[counted].mean())
+            result[f"surface_accuracy{suffix}"], result[f"surface_completeness{suffix}"] = means
+            result[f"surface_distance{suffix}"] = sum(means) / 2
+    return result
+
+
+def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+    """Even points (P, 3) of a mesh that some view sees past the mesh itself, and normals towards it."""
+    position, triangle = sample(mesh, QUERIES)
+    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces[triangle]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    facing, best = np.zeros_like(normal), np.full(len(position), GRAZING)
+    for view in views:
+        origin = view.to_world[:3, 3]
+        ray = position - origin
+        reach = np.maximum(np.linalg.norm(ray, axis=1), 1e-30)
+        cosine = np.sum(normal * ray, axis=1) / reach
+        better = view.project(position)[2] & (np.abs(cosine) > best)
+        start = mi.Point3f(np.tile(origin, (len(ray), 1)).T)
+        hit, stopped = occluder.first_hit(start, mi.Vector3f(ray.T), mi.Bool(better))
+        # In lengths of the ray: what stands in the way does so by more than rays are moved off a surface.
+        margin = 1 - OFFSET_VOXELS * mesh.voxel / reach
+        better &= ~stopped.numpy() | (hit.numpy() > margin)
+        facing[better] = (-np.sign(cosine)[:, None] * normal)[better]
+        best[better] = np.abs(cosine)[better]
+    found = best > GRAZING
+    return position[found], facing[found]
+
+
+def sample(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (count, 3) spread evenly over the area of a mesh, and the triangle (count,) of each."""
+    rng = np.random.default_rng(SEED)
+    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
+    edges = corners[:, 1:] - corners[:, :1]
+    until = np.cumsum(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
+    place = (np.arange(count) + rng.random(count)) / count * until[-1]
+    triangle = np.minimum(np.searchsorted(until, place, side="right"), len(until) - 1)
+    share = rng.random((count, 2))
+    share = np.where(share.sum(1, keepdims=True) > 1, 1 - share, share)
+    return corners[triangle, 0] + np.einsum("pe,pec->pc", share, edges[triangle]), triangle
+
+
+def distance_to(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """Distance (P,) from points (P, 3) to a mesh: to the nearest of the triangles around each."""
+    targets, triangle = sample(mesh, TARGETS)
+    near = triangle[cKDTree(targets).query(points, k=CANDIDATES)[1]]
+    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces[near.ravel()]]
+    again = np.repeat(points, CANDIDATES, axis=0)
+    closest = trimesh.triangles.closest_point(corners, again)
+    return np.linalg.norm(closest - again, axis=1).reshape(near.shape).min(axis=1)
