@@ -28,6 +28,9 @@ from mi_refgs.surfels.ply import write_ply
 
 KEYS = (
     "psnr ssim flip flip_reason lpips lpips_reason normal_mae_deg normal_mae_deg_full normal_reason "
+    "albedo_psnr albedo_scale albedo_reason roughness_mae roughness_reason metallic_mae metallic_reason "
+    "surface_distance surface_accuracy surface_completeness surface_reason concave_share concave_reason "
+    "psnr_concave normal_mae_deg_concave albedo_psnr_concave surface_distance_concave "
     "env_scale env_mae env_psnr env_correlation env_reason "
     "train_seconds iterations surfels ms_per_frame variant preset dataset machine"
 ).split()
@@ -62,8 +65,8 @@ def test_every_key_is_there_and_json_can_hold_it(run: Run) -> None:
     assert result["iterations"] == 6 and result["variant"] == "tiny" and result["preset"] == "quick"
     assert 0 < result["ms_per_frame"] and result["train_seconds"] > 0
     assert 0 <= result["normal_mae_deg_full"] < result["normal_mae_deg"] <= 180
-    for key in ("flip", "lpips", "normal", "env"):
-        names = [name for name in result if name.startswith(key) and not name.endswith("reason")]
+    for key in ("flip", "lpips", "normal", "env", "albedo", "roughness", "metallic", "surface", "concave"):
+        names = [name for name in result if name.startswith(key) and not name.endswith(("reason", "concave"))]
         missing = any(result[name] is None for name in names)
         assert missing == bool(result[f"{key}_reason"]), key
 
@@ -119,7 +122,7 @@ def test_the_artefacts_are_what_is_measured(run: Run) -> None:
 
 
 def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Test views are rendered with materials and normals, the timed frames without."""
+    """Test views are rendered with materials and normals, also for the albedo; the timed frames without."""
     asked: list[bool] = []
 
     def rendered(*arguments: Any, aovs: bool, normals: bool) -> Frame:
@@ -128,7 +131,7 @@ def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: 
 
     monkeypatch.setattr("mi_refgs.runs.export.render", rendered)
     evaluate(run)
-    assert asked == [True] * 2 + [False] * (WARM_UP_FRAMES + TIMED_FRAMES)
+    assert asked == [True] * 4 + [False] * (WARM_UP_FRAMES + TIMED_FRAMES)
 
 
 def test_an_export_without_light_or_mesh_leaves_no_stale_one(run: Run, folder: Path) -> None:

@@ -62,8 +62,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     alpha is above ½ and there is a true normal, materials (`evaluation.decomposition`) where the data defines
     them; keys that end in `_concave` count pixels where the true surface is (`evaluation.surface`).
     `ms_per_frame` is the median over single synchronised frames of the displayed picture alone, light
-    filtered beforehand. `pruned` is null for a whole scene. All that is rendered has `samples` a pixel, box filtered
-    (`render.samples`).
+    filtered beforehand. `pruned` is null for a whole scene. All that is rendered has `samples` a pixel, box
+    filtered (`render.samples`).
 
     Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, and for data
     that is gone.
