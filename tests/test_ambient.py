@@ -81,21 +81,36 @@ def test_ratios_against_rays_one_by_one() -> None:
         return np.asarray(terms.sum(0))
 
     blur = ambient.ray_roughness(RAYS)
-    expected = exact(
-        mesh.vertices.astype(np.float64),
-        mesh.faces.astype(int),
-        normals,
-        directions(normals, RAYS).astype(np.float64),
-        lambda ω: reference.specular(levels, LEVEL_ROUGHNESS, ω, blur),
-        outgoing,
-        offset=OFFSET_VOXELS * VOXEL,
-        bounces=ambient.BOUNCES,
-        brightest=ambient.BRIGHTEST,
+    expected, once = (
+        exact(
+            mesh.vertices.astype(np.float64),
+            mesh.faces.astype(int),
+            normals,
+            directions(normals, RAYS).astype(np.float64),
+            lambda ω: reference.specular(levels, LEVEL_ROUGHNESS, ω, blur),
+            outgoing,
+            offset=OFFSET_VOXELS * VOXEL,
+            bounces=bounces,
+            brightest=ambient.BRIGHTEST,
+        )
+        for bounces in (ambient.BOUNCES, 1)
     )
+    assert np.abs(once - expected).max() > 5e-3
     assert found.min() < 0.9 and np.ptp(found, axis=1).max() > 0.05
     # A ray may pass an edge on this side in one and on that side in the other.
     off = np.abs(found - expected).max(1)
     assert np.sort(off)[: int(0.9 * len(off))].max() < 2e-3 and off.max() < 0.1
+
+
+def test_a_white_furnace_stays_white() -> None:
+    """Between two plates of albedo 1 nothing is lost: what is blocked comes back from the other plate."""
+    mesh, surfels = parted_corner(), wall_surfels(albedo=np.full((400, 3), 9.0), metallic=-9.0, roughness=3.0)
+    occluder = Occluder(mesh)
+    ambient.prepare(
+        occluder, surfels, EnvironmentLight.constant(1.0, 8).prefilter(), Accuracy(ambient_rays=9)
+    )
+    assert occluder.ambient is not None
+    np.testing.assert_allclose(occluder.ambient.numpy(), 1, atol=1e-3)
 
 
 def test_rays_are_spread_as_the_cosine() -> None:

@@ -31,7 +31,7 @@ def ambient(
     surface.
     """
     ratio = np.ones((len(vertices), 3))
-    for bounce in range(bounces + 1):
+    for _ in range(bounces):
         found = np.zeros_like(ratio)
         for vertex, (place, normal) in enumerate(zip(vertices, normals, strict=True)):
             start = place + offset * normal
@@ -42,7 +42,7 @@ def ambient(
                 distance, face, shares = mesh_hit(vertices, faces, start, direction)
                 if not np.isfinite(distance):
                     arrives += radiance
-                elif bounce:
+                else:
                     there = shares @ normals[faces[face]]
                     there = there / np.linalg.norm(there)
                     there = -there if there @ direction > 0 else there

@@ -11,8 +11,8 @@ the pixel's normal × ratio. Where nothing is in the way it is 1, whatever the r
 
 L is looked up in the lobe that is as wide as the part of the hemisphere a ray stands for, so that no lamp
 falls between them. B is shaded by the split sum as traced light is (`shade.traced_light`), with the ratios
-of the round before at what is hit: each of BOUNCES rounds adds a bounce. Ratios are detached, and stay until
-they are found again.
+of the round before at what is hit, 1 in the first: each of BOUNCES rounds adds a bounce. Ratios are detached,
+and stay until they are found again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from mi_refgs.shade.traced_light import MeshRadiance
 from mi_refgs.surfels.table import Surfels
 
 BOUNCES = 2
-"""Rounds with light from what stands in the way; the first round has none."""
+"""Times that light bounces from what stands in the way before it is taken as unblocked."""
 
 BRIGHTEST = 4.0
 """Largest ratio: a mirror that sends a lamp to one of a few rays makes a vertex shine otherwise."""
@@ -63,12 +63,9 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, accuracy: Accura
     place = mi.Point3f(mesh.vertices.T)
     normal = safe_normalize(occluder.surface(surfels).around.normal)
     occluder.ambient, found = None, VertexColours.of(mesh, np.ones_like(mesh.vertices))
-    for bounce in range(BOUNCES + 1):
-        scene = None
-        if bounce:
-            plain = replace(accuracy, traced_bounces=1)
-            scene = MeshRadiance.of(occluder, surfels, light, plain, "irradiance")
-        ratio = _round(occluder, place, normal, light, accuracy.ambient_rays, scene)
+    for _ in range(BOUNCES):
+        scene = MeshRadiance.of(occluder, surfels, light, replace(accuracy, traced_bounces=1), "irradiance")
+        ratio = _round(scene, place, normal, accuracy.ambient_rays)
         dr.eval(ratio)
         occluder.ambient = found = VertexColours.of(mesh, ratio.numpy().T)
     return found
@@ -87,24 +84,17 @@ def ambient_direction(frame: Any, turn: Any, ray: Any, count: Any) -> Any:
     return frame.to_world(mi.Vector3f(across * cos, across * sin, dr.sqrt(1 - along)))
 
 
-def _round(
-    occluder: Occluder, place: Any, normal: Any, light: Light, rays: int, scene: MeshRadiance | None
-) -> Any:
-    """Ratios (mi.Color3f) at vertices; without a `scene` nothing comes from what stands in the way."""
+def _round(scene: MeshRadiance, place: Any, normal: Any, rays: int) -> Any:
+    """Ratios (mi.Color3f) at vertices, with the present ones at what stands in the way."""
     frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
     count, blur = dr.opaque(mi.UInt32, rays), dr.opaque(mi.Float, ray_roughness(rays))
 
     def body(index: Any, arrives: Any, every: Any) -> tuple[Any, ...]:
         direction = ambient_direction(frame, turn, index, count)
-        radiance = light.specular(direction, blur)
-        every = every + radiance
-        if scene is None:
-            free = occluder.visible(place, direction, normal) > 0
-            arrives = arrives + dr.select(free, radiance, 0)
-        else:
-            hit = scene.trace(place, direction, normal, True, 1)
-            arrives = arrives + dr.select(hit.valid, scene.radiance(hit, direction), radiance)
-        return index + 1, arrives, every
+        radiance = scene.light.specular(direction, blur)
+        hit = scene.trace(place, direction, normal, True, 1)
+        arrives = arrives + dr.select(hit.valid, scene.radiance(hit, direction), radiance)
+        return index + 1, arrives, every + radiance
 
     start = (dr.zeros(mi.UInt32, dr.width(normal)), mi.Color3f(0), mi.Color3f(0))
     _, arrives, every = dr.while_loop(start, lambda index, *_: index < count, body, label="ambient")
