@@ -22,10 +22,12 @@ State = dict[str, np.ndarray]
 
 @pytest.fixture(scope="module")
 def state(finished: Path) -> State:
-    """What a fit of the full method has saved, with a mesh."""
+    """What a fit of the full method has saved, with a mesh whose vertices have a surfel each."""
     newest = checkpoint.read(Run(finished).checkpoints()[-1])
     assert "mesh/faces" in newest and "params/light" in newest
-    return newest
+    ones = np.ones_like(newest["mesh/vertices"].T)
+    around = {"surfels": ones[:1].astype(np.uint32), "weights": ones[:1], "normals": ones}
+    return newest | {f"mesh/{name}": values for name, values in around.items()}
 
 
 def test_what_is_written_is_read(state: State) -> None:
@@ -95,6 +97,8 @@ WRONG = {
     "NaN seconds": replaced("seconds", lambda x: np.nan),
     "negative iteration": replaced("iteration", lambda x: -1),
     "a face without its vertex": replaced("mesh/faces", spoilt(10**6)),
+    "a vertex of a surfel that is not there": replaced("mesh/surfels", spoilt(10**6)),
+    "negative weights of surfels": replaced("mesh/weights", spoilt(-1)),
     "text": replaced("params/metallic", lambda x: x.astype(str)),
     "objects": replaced("params/metallic", lambda x: x.astype(object)),
     "complex": replaced("params/metallic", lambda x: x.astype(complex)),

@@ -39,6 +39,15 @@ IMPOSSIBLE = {
         ["stage.only", "radiance_sh"],
     ),
     "a channel misspelt": (f"[surfels]\nchannels = ['albdeo']\n{STAGE}", ["'albdeo' is unknown", "albedo"]),
+    "no samples": (
+        f"[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nsamples = 0",
+        ["stage.only", "samples: 0"],
+    ),
+    "bounces of a model that traces none": (
+        f"[surfels]\nchannels = ['albedo', 'roughness']\n{LIGHT}{STAGE}reflectance = 'monte_carlo'\n"
+        "at = 'surfel'\ntraced_bounces = 1\n[mesh]",
+        ["stage.only", "traced_bounces: needs reflectance = split_sum"],
+    ),
     "materials reset that are none": (
         f"[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nrestart = ['metallic']",
         ["stage.only", "restart", "metallic"],

@@ -100,6 +100,7 @@ class AdaptiveControl:
         fit, edit = self.trainer, edit.ordered()
         parent, fresh = upload(edit.parent, mi.UInt32), mi.Bool(edit.fresh)
         self.replace(edit.surfels)
+        fit.occluder.around = None
         fit.optimiser.gather(parent, list(edit.surfels.raw), fresh)
         self.gradient_sum = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_sum, parent))
         self.gradient_count = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_count, parent))
@@ -125,6 +126,7 @@ class AdaptiveControl:
             raise InputError("surfels: none of them is finite; lower the rates (--set rates.…)")
         index = upload(parent, mi.UInt32)
         self.replace(fit.surfels.gather(index))
+        fit.occluder.around = None
         fit.optimiser.gather(index, list(fit.surfels.raw))
         self.gradient_sum = dr.gather(mi.Float, self.gradient_sum, index)
         self.gradient_count = dr.gather(mi.Float, self.gradient_count, index)

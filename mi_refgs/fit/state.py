@@ -10,9 +10,10 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.occlusion.surface_materials import VertexSurfels
 from mi_refgs.occlusion.vertex_colours import VertexColours
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, part
+from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
 
 if TYPE_CHECKING:
     from mi_refgs.fit.train import Trainer
@@ -46,6 +47,8 @@ def packed(trainer: Trainer) -> dict[str, np.ndarray]:
             "mesh/faces": mesh.faces,
             "mesh/voxel": np.array(mesh.voxel),
         }
+    if trainer.occluder.around is not None:
+        state |= {f"{MESH}{name}": values for name, values in trainer.occluder.around.arrays().items()}
     if trainer.occluder.ambient is not None:
         state["mesh/ambient"] = trainer.occluder.ambient.numpy()
     return state
@@ -60,11 +63,14 @@ def decisions_of(state: dict[str, np.ndarray]) -> list[dict[str, Any]]:
 
 
 def occluder_of(state: dict[str, np.ndarray]) -> Occluder:
-    """The occluder, with its ambient ratios if it has any."""
+    """The occluder, with its materials' surfels and its ambient ratios if it has any."""
     occluder = Occluder()
     if "mesh/faces" in state:
         mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
         occluder.update(mesh)
+        if "mesh/surfels" in state:
+            count = len(state[f"{PARAMS}position"])
+            occluder.around = VertexSurfels.restored(mesh, count, part(state, MESH))
         if "mesh/ambient" in state:
             occluder.ambient = VertexColours.of(mesh, state["mesh/ambient"])
     return occluder

@@ -1,4 +1,4 @@
-"""The surface of surfels, as a mesh of the depth that training views show."""
+"""The surface of surfels, as a mesh of the depth that training views show, and what a fit looks up on it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,11 @@ from itertools import tee
 
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
+from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import render_depth
+from mi_refgs.shade.ambient import prepare
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 
@@ -23,3 +27,16 @@ def surface_of(surfels: Surfels, cameras: Sequence[Camera], resolution: int) -> 
         resolution,
     )
     return extract_mesh(volume)
+
+
+def supply(
+    occluder: Occluder, surfels: Surfels, environment: EnvironmentLight | None, shading: Shading
+) -> None:
+    """Give an occluder what the shading asks for and what it lacks: all of it for a new mesh, the surfels of
+    its vertices also after an edit of the table. It stays as it is until the next of these.
+    """
+    accuracy = shading.accuracy
+    if accuracy.ambient_rays and occluder.ambient is None:
+        prepare(occluder, surfels, shading.light_of(environment), accuracy)
+    if accuracy.traced_bounces and occluder.around is None:
+        occluder.set_materials(surfels)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -24,15 +25,15 @@ from mi_refgs.fit.objective import Target, objective
 from mi_refgs.fit.optim import Adam
 from mi_refgs.fit.schedule import Schedule
 from mi_refgs.fit.state import decisions_of, occluder_of, packed, require_fit
-from mi_refgs.fit.surface import surface_of
+from mi_refgs.fit.surface import supply, surface_of
 from mi_refgs.methods.method import Method, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.runs.checkpoint import LIGHT, OPTIMISER, PARAMS, part, tensors
 from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
-from mi_refgs.shade.ambient import prepare
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
@@ -118,7 +119,7 @@ class Trainer:
         """Render a view of the present state, without derivatives."""
         with dr.suspend_grad():
             shading = self.shading()
-            self._prepare(shading)
+            supply(self.occluder, self.surfels, self.light, shading)
             return render(
                 self.surfels,
                 camera,
@@ -233,11 +234,6 @@ class Trainer:
         self.occluder.update(mesh)
         return mesh
 
-    def _prepare(self, shading: Shading) -> None:
-        """Give a new mesh the ambient ratios that the shading asks for, of the present surfels and light."""
-        if shading.accuracy.ambient_rays and self.occluder.ambient is None:
-            prepare(self.occluder, self.surfels, shading.light_of(self.light), shading.accuracy)
-
     # ---------------- one step ----------------
 
     def _gradient_step(self, iteration: int, stage: Stage) -> None:
@@ -246,25 +242,27 @@ class Trainer:
         shift = mi.Point2f(dr.opaque(mi.Float, 0, surfels.count), dr.opaque(mi.Float, 0, surfels.count))
         dr.enable_grad(shift)
         shading = self._shading(stage)
-        self._prepare(shading)
+        supply(self.occluder, self.surfels, self.light, shading)
         light = self.window.light(self.light, shading)
-        frame = render(
+        view = partial(
+            render,
             surfels,
-            camera,
-            shading,
-            light,
-            self.occluder,
+            shading=shading,
+            light=light,
+            occluder=self.occluder,
             sh_degree=self.schedule.sh_degree(iteration),
             shift=shift,
             normals=self.method.loss.uses_normals,
         )
+        frame = supersampled(view, camera, stage.samples, details=self.method.loss.uses_maps)
         loss, self.error = objective(frame, target, self.data, self.method.loss, iteration, light)
         self.loss = dr.detach(loss)
         phase("loss backward")(dr.backward)(loss)
         if self.schedule.light_learns(iteration):
             self.window.close()
 
-        self.control.observe(dr.grad(shift), camera, iteration)
+        fine = camera.supersampled(samples_per_axis(stage.samples))  # whose pixels the shift is in
+        self.control.observe(dr.grad(shift), fine, iteration)
         if iteration % self.method.log_every == 0:
             dr.schedule(self.loss, self.error)
         self.optimiser.stage = stage.rates

@@ -85,7 +85,9 @@ class Stage:
     reflectance: str = "split_sum"  # a model of `shade.reflectance`
     diffuse: Literal["sh", "irradiance"] = "sh"
     antialias: bool = False  # roughness widened by how much normals turn within a pixel
+    samples: int = 1  # of a pixel, k × k, in the steps of a fit
     visibility_rays: int = 1  # of the lobe, where there is a mesh; 1: the mirror ray
+    traced_bounces: int = 0  # that blocked rays are followed, where there is a mesh, in place of indirect_sh
     ambient_rays: int = 0  # of a vertex, where there is a mesh, for diffuse = irradiance
     light_levels: int = MAX_LEVELS  # of roughness, that the light is filtered to
     directions: int = DIRECTIONS  # of the hemisphere, for models that sum light over it

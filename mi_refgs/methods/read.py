@@ -19,6 +19,7 @@ from mi_refgs.files import is_file
 from mi_refgs.methods.build import build, plain
 from mi_refgs.methods.method import LIGHT, PRESETS, Method, Selection, Term
 from mi_refgs.methods.window import Window
+from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.resources import resource_dir
 from mi_refgs.shade.envmap import MIN_HEIGHT
 from mi_refgs.shade.shading import Shading
@@ -130,6 +131,7 @@ def _checked(method: Method, where: str) -> Method:
     for name, stage in method.stages():
         try:
             Shading.of(stage, method.mesh is not None).check(channels, method.light is not None)
+            samples_per_axis(stage.samples)
         except InputError as error:
             raise InputError(f"{where}: stage.{name}: {error}") from error
         light = {LIGHT} if method.light is not None else set()

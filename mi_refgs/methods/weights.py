@@ -26,6 +26,11 @@ class LossWeights:
     light_colour: float = 0.0  # colour belongs to the albedo rather than to the light
 
     @property
+    def uses_maps(self) -> bool:
+        """Whether a loss looks at the blended materials."""
+        return self.half_metal > 0 or self.materials > 0
+
+    @property
     def uses_normals(self) -> bool:
         """Whether a loss looks at the blended normals."""
         return self.normal > 0 or self.smooth > 0

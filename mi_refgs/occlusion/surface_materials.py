@@ -6,6 +6,7 @@ materials are gathered anew for every render, so that the surfels' own parameter
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
+from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.surfels.table import Surfels
@@ -95,6 +97,22 @@ class VertexSurfels:
             [mi.UInt32(column.astype(np.uint32)) for column in found.T],
             [mi.Float(column.astype(np.float32)) for column in weight.T],
             mi.Vector3f(np.ascontiguousarray(normal.T, np.float32)),
+        )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What `of` has found, for checkpoints: "surfels" and "weights" (K, V), "normals" (3, V)."""
+        surfel, weight = (np.array([np.array(x) for x in columns]) for columns in (self.surfel, self.weight))
+        return {"surfels": surfel, "weights": weight, "normals": np.array(self.normal)}
+
+    @staticmethod
+    def restored(mesh: Mesh, count: int, arrays: Mapping[str, np.ndarray]) -> VertexSurfels:
+        """That of a mesh and `count` surfels whose `arrays` were kept."""
+        return VertexSurfels(
+            count,
+            upload(mesh.faces.ravel(), mi.UInt32),
+            [upload(row, mi.UInt32) for row in arrays["surfels"]],
+            [upload(row) for row in arrays["weights"]],
+            mi.Vector3f(*(upload(row) for row in arrays["normals"])),
         )
 
     def surface(self, surfels: Surfels) -> Surface:

@@ -27,17 +27,22 @@ def samples_per_axis(samples: int) -> int:
     return math.ceil(math.sqrt(samples))
 
 
-def supersampled(view: Callable[[Camera], Frame], camera: Camera, samples: int) -> Frame:
+def supersampled(
+    view: Callable[[Camera], Frame], camera: Camera, samples: int, details: bool = True
+) -> Frame:
     """The frame of `view` with k × k samples a pixel (`samples_per_axis`), box filtered; under AD.
 
     Linear radiance, its terms, normals and alpha are averaged as they are, premultiplied; depth and maps,
     which are divided by alpha, are weighted by it. The encoding comes after: that is how a path-traced
-    picture with a box filter is made.
+    picture with a box filter is made. Without `details`, there are neither terms nor maps: each mean is a
+    kernel of its own, used or not.
     """
     factor = samples_per_axis(samples)
     fine = view(camera.supersampled(factor))
     if factor == 1:
         return fine
+    if not details:
+        fine = replace(fine, terms=None, maps={})
 
     def mean(value: Any) -> Any:
         if dr.depth_v(value) > 1:

@@ -100,6 +100,13 @@ def check(state: Mapping[str, np.ndarray]) -> None:
         faces, vertices = state[f"{MESH}faces"], state[f"{MESH}vertices"]
         if faces.dtype.kind != "u" or (faces.size and faces.max() >= len(vertices)):
             raise DamagedError(f"{MESH}faces: names vertices that are not there")
+        if f"{MESH}surfels" in state:
+            number = len(vertices)
+            _check(state, [f"{MESH}surfels", f"{MESH}weights"], (None, number))
+            _check(state, [f"{MESH}normals"], (3, number), signed=True)
+            surfels = state[f"{MESH}surfels"]
+            if surfels.dtype.kind != "u" or np.any(surfels >= table.count):
+                raise DamagedError(f"{MESH}surfels: names surfels that are not there")
         if f"{MESH}ambient" in state:
             _check(state, [f"{MESH}ambient"], vertices.shape)
 

@@ -136,7 +136,7 @@ class TrainedScene:
 
         def view(camera: Camera) -> Frame:
             with dr.suspend_grad():
-                return supersampled(once, camera, samples)
+                return supersampled(once, camera, samples, details=aovs)
 
         return view
 
