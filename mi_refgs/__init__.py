@@ -36,9 +36,12 @@ if TYPE_CHECKING:
     from mi_refgs.occlusion.visibility import Occluder as Occluder
     from mi_refgs.primitives import Primitive as Primitive
     from mi_refgs.primitives import register as register_primitive
+    from mi_refgs.relighting.light import NewLight as NewLight
+    from mi_refgs.relighting.relight import relight as relight
     from mi_refgs.render.pipeline import Frame as Frame
     from mi_refgs.render.pipeline import render as render_frame
     from mi_refgs.runs.export import TrainedScene as TrainedScene
+    from mi_refgs.runs.relightable import relightable as relightable
     from mi_refgs.runs.run import Run as Run
     from mi_refgs.shade.accuracy import Accuracy as Accuracy
     from mi_refgs.shade.envmap import EnvironmentLight as EnvironmentLight
@@ -65,6 +68,7 @@ _PUBLIC = {
     "InputError": ("errors", "InputError"),
     "Mesh": ("occlusion.mesh", "Mesh"),
     "Method": ("methods.method", "Method"),
+    "NewLight": ("relighting.light", "NewLight"),
     "Occluder": ("occlusion.visibility", "Occluder"),
     "Primitive": ("primitives", "Primitive"),
     "Reflectance": ("shade.reflectance", "Reflectance"),
@@ -85,6 +89,8 @@ _PUBLIC = {
     "register_primitive": ("primitives", "register"),
     "register_reader": ("data.readers", "register"),
     "register_reflectance": ("shade.reflectance", "register"),
+    "relight": ("relighting.relight", "relight"),
+    "relightable": ("runs.relightable", "relightable"),
     "render_frame": ("render.pipeline", "render"),
     "write_mesh": ("occlusion.mesh", "write_mesh"),
     "write_ply": ("surfels.ply", "write_ply"),
@@ -101,6 +107,7 @@ __all__ = [
     "InputError",
     "Mesh",
     "Method",
+    "NewLight",
     "Occluder",
     "Primitive",
     "Reflectance",
@@ -121,6 +128,8 @@ __all__ = [
     "register_primitive",
     "register_reader",
     "register_reflectance",
+    "relight",
+    "relightable",
     "render_frame",
     "write_mesh",
     "write_ply",

@@ -10,10 +10,9 @@ from integrator_scenes import sky
 
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.make_dataset import make_dataset
-from mi_refgs.evaluation.surface import sample
 from mi_refgs.exr import write_exr
 from mi_refgs.methods.read import load
-from mi_refgs.occlusion.mesh import Mesh, read_mesh
+from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.runs.export import TrainedScene, export
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
@@ -70,15 +69,17 @@ def other_sky() -> np.ndarray:
     return np.stack([warm, 0.7 * warm, 0.3 * warm + 0.2], axis=-1).astype(np.float32)
 
 
-def known_surfels(mesh: Mesh) -> Surfels:
-    """The balls as opaque surfels with the true materials, and a diffuse colour of nothing."""
-    points, _ = sample(mesh, SURFELS)
-    apart = np.linalg.norm(points[:, None] - CENTRES, axis=2) - RADII
-    ball = np.abs(apart).argmin(axis=1)
-    normals = points - CENTRES[ball]
+def known_surfels() -> Surfels:
+    """The balls as opaque surfels, evenly spread, with the true materials."""
+    ball = np.arange(SURFELS) % 2
+    z = 1 - (2 * (np.arange(SURFELS) // 2) + 1) / (SURFELS // 2)
+    angle = np.arange(SURFELS) // 2 * np.pi * (3 - np.sqrt(5))
+    ring = np.sqrt(1 - z**2)
+    normals = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+    points = CENTRES[ball] + RADII[ball, None] * normals
     channels = ["radiance_sh", "albedo", "metallic", "roughness"]
     rng = np.random.default_rng(0)
-    surfels = from_points(points, normals, rng=rng, channels=channels, scale_factor=0.6, opacity=0.999)
+    surfels = from_points(points, normals, rng=rng, channels=channels, scale_factor=0.8, opacity=0.999)
     raw = surfels.to_numpy()
     for name in ("albedo", "metallic", "roughness"):
         values = np.array([np.atleast_1d(material[name]) for material in (METAL, CLAY)])
@@ -94,6 +95,6 @@ def write_known_run(data: Path, folder: Path, **shading: Any) -> Run:
     chosen: dict[str, Any] = {"diffuse": "irradiance", "occlusion": True} | shading
     wanted = Shading(**chosen)
     light = EnvironmentLight.from_file(data / "environment.exr")
-    scene = TrainedScene(known_surfels(mesh), light, mesh, wanted, 1, 0.0)
+    scene = TrainedScene(known_surfels(), light, mesh, wanted, 1, 0.0)
     export(scene, run.path, read_dataset(data, "test").views[0].camera())
     return run

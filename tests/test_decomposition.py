@@ -302,7 +302,7 @@ def test_data_without_truth_says_so(data: Path, tmp_path: Path) -> None:
 def test_albedo_comes_out_of_the_fitted_radiance(data: Path, with_mesh: bool) -> None:
     """A radiance that changes with direction, (1 - S) albedo × irradiance on average over the hemisphere."""
     mesh = read_mesh(data / "surface.ply")
-    surfels = known_surfels(mesh)
+    surfels = known_surfels()
     light = EnvironmentLight.from_file(data / "environment.exr")
     normal = surfels.primitive.normal(surfels)
     irradiance = light.prefilter().irradiance(normal).numpy().T
@@ -332,9 +332,8 @@ def test_albedo_comes_out_of_the_fitted_radiance(data: Path, with_mesh: bool) ->
     np.testing.assert_allclose(albedo[~clay], 0.5, atol=0.01)  # a metal's is the channel
 
 
-def test_a_run_without_materials_or_light_cannot_be_relit(data: Path) -> None:
-    mesh = read_mesh(data / "surface.ply")
-    surfels = known_surfels(mesh)
+def test_a_run_without_materials_or_light_cannot_be_relit() -> None:
+    surfels = known_surfels()
     raw = {name: x for name, x in surfels.raw.items() if name != "metallic"}
     light = EnvironmentLight.constant(0.5, 8)
     for scene, words in (
@@ -347,7 +346,7 @@ def test_a_run_without_materials_or_light_cannot_be_relit(data: Path) -> None:
 
 def test_materials_that_are_there_stay(data: Path) -> None:
     mesh = read_mesh(data / "surface.ply")
-    surfels = known_surfels(mesh)
+    surfels = known_surfels()
     light = EnvironmentLight.constant(0.5, 8)
     scene = TrainedScene(surfels, light, mesh, Shading(diffuse="irradiance", occlusion=True), 1, 0.0)
     found = relightable(scene)

@@ -46,6 +46,7 @@ LAYERS: dict[str, set[str]] = {
     "runs": RENDERER | {"methods"},
     "fit": RENDERER | {"methods", "data", "runs"},
     "evaluation": RENDERER | {"methods", "data", "runs", "fit"},
+    "relighting": RENDERER | {"methods", "data", "runs", "fit", "evaluation"},
     "profiling": RENDERER | {"methods", "data", "fit"},
     "compare": RENDERER | {"methods", "data", "runs", "fit", "evaluation", ""},
     "doctor": {"llvm", "errors", ""},
@@ -56,6 +57,7 @@ LAYERS: dict[str, set[str]] = {
         "runs",
         "fit",
         "evaluation",
+        "relighting",
         "compare",
         "profiling",
         "resources",
@@ -65,7 +67,7 @@ LAYERS: dict[str, set[str]] = {
     },
     "__main__": {"cli"},
     "reference": {"constants"},
-    "": RENDERER | {"llvm", "plugins", "methods", "data", "runs", "fit", "evaluation"},
+    "": RENDERER | {"llvm", "plugins", "methods", "data", "runs", "fit", "evaluation", "relighting"},
 }
 """What each part of the package may import besides itself; "" is the package's own `__init__`.
 

@@ -56,10 +56,16 @@ def camera_poses(
     ring = np.sqrt(1 - z**2)
     azimuth = rng.uniform(0, 2 * math.pi) + GOLDEN_ANGLE * np.arange(count) + jitter[:, 1] * spacing / ring
     outward = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
+    return poses_around(outward, centre, distance)
+
+
+def poses_around(outward: np.ndarray, centre: np.ndarray, distance: float) -> np.ndarray:
+    """World-from-camera matrices (N, 4, 4) in Mitsuba's frame, z up, that look at `centre` from unit `outward`
+    (N, 3) directions, none of them ±z."""
     left = np.cross([0.0, 0.0, 1.0], -outward)
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     up = np.cross(-outward, left)
-    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses = np.tile(np.eye(4), (len(outward), 1, 1))
     poses[:, :3, :] = np.stack([left, up, -outward, centre + distance * outward], axis=2)
     return poses
 

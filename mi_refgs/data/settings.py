@@ -104,6 +104,14 @@ def _lights(record: Any) -> dict[str, str]:
     return {k: v for k, v in lights.items() if isinstance(v, str)} if isinstance(lights, dict) else {}
 
 
+def recorded_lights(record: Path) -> dict[str, str]:
+    """Name and SHA-256 of the further lights of a dataset.json; none where there is no such file."""
+    try:
+        return _lights(read_json(record))
+    except InputError:
+        return {}
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file, whole or not at all."""
     write_bytes(path, f"{json.dumps(value, indent=1)}\n".encode())

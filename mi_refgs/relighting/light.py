@@ -1,0 +1,81 @@
+"""The light that a scene is relit by, and where a data set has the truth under it.
+
+A panorama is stored with its zenith in the first row, Mitsuba's y axis; in the world of a scene z is up. Maps
+that this package writes (environment.exr, envmap.exr) are in world directions already.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.data.pathtrace import environment_image
+from mi_refgs.data.scene_file import Z_UP
+from mi_refgs.data.settings import RELIGHT, recorded_lights
+from mi_refgs.errors import InputError
+from mi_refgs.files import require_file
+from mi_refgs.shade.envmap import EnvironmentLight, read_radiance
+
+HEIGHT = 256
+"""Rows of a light, at most: a texel is 0.7°, an eighth of the lobe of roughness 0.1."""
+EXPOSURE_MAX = 40.0
+"""Stops; beyond, float32 has no light left."""
+
+
+@dataclass(frozen=True)
+class NewLight:
+    """A lat-long map as a light of the world."""
+
+    path: Path
+    world: bool = False  # whether the map is in world directions already, else its first row is +z
+    rotate: float = 0.0  # degrees about +z, counter-clockwise seen from above
+    exposure: float = 0.0  # stops: radiance times 2^exposure
+
+    def __post_init__(self) -> None:
+        """Raise InputError if there is no such file, or a number makes no sense."""
+        require_file(self.path)
+        if not (np.isfinite(self.rotate) and abs(self.exposure) <= EXPOSURE_MAX):
+            raise InputError(
+                f"{self.path}: --rotate, --exposure: {self.rotate}, {self.exposure} are out of range; give "
+                f"degrees, and stops from {-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
+            )
+
+    def read(self) -> EnvironmentLight:
+        """The light, of at most HEIGHT rows; raises InputError for a file that is no lat-long image."""
+        import mitsuba as mi
+
+        radiance = np.ascontiguousarray(read_radiance(self.path), dtype=np.float32)
+        turned: Any = mi.ScalarTransform4f()
+        if self.rotate % 360:
+            turned = turned.rotate([0, 0, 1], self.rotate)
+        if not self.world:
+            turned = turned.rotate(*Z_UP)
+        emitter = {"type": "envmap", "bitmap": mi.Bitmap(radiance), "to_world": turned}
+        height = min(HEIGHT, max(len(radiance) // 4 * 4, 8))
+        image = environment_image(mi.load_dict({"type": "scene", "light": emitter}), height)
+        return EnvironmentLight.from_radiance(image * np.float32(2.0**self.exposure))
+
+
+def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:
+    """The data set with test views under this light, and the light as they were traced; None without one.
+
+    It is the map that `refgs dataset --relight` was given, by the content of the file, or an environment.exr
+    of the data set itself. A light that is turned has no truth.
+    """
+    if light.rotate % 360:
+        return None
+    content = light.path.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    lights = recorded_lights(data / "dataset.json")
+    for folder in (data, *sorted((data / RELIGHT).glob("*"))):
+        map_ = folder / "environment.exr"
+        if not (map_.is_file() and (folder / "transforms_test.json").is_file()):
+            continue
+        same = map_.read_bytes() == content if light.world else lights.get(folder.name) == digest
+        if same:
+            return folder, NewLight(map_, True, 0.0, light.exposure)
+    return None

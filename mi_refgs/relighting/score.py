@@ -1,0 +1,87 @@
+"""How near relit pictures are to the truth: as they are, and after one scale a channel.
+
+The light and the albedo of a fit share a factor a channel that no picture of it can tell; under another
+light it shows as a wrong brightness or tint of everything. So both numbers are given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from mi_refgs.evaluation import metrics
+from mi_refgs.images import srgb_from_linear
+
+SCALE_REACH = 2.0
+"""Stops around the ratio of the means in which the scale is looked for."""
+INSIDE = 0.99
+"""Alpha from which a pixel is no edge: how much an edge covers is no matter of light."""
+SCALE_PIXELS = 200_000
+"""Pixels that decide it."""
+
+
+def shown(rgba: np.ndarray, background: np.ndarray, scale: np.ndarray | float = 1.0) -> np.ndarray:
+    """What a camera shows of premultiplied linear RGBA (H, W, 4) before a background, display-encoded."""
+    alpha = np.clip(rgba[..., 3:], 0, 1)
+    colour = srgb_from_linear(np.maximum(rgba[..., :3], 0) * scale / np.maximum(alpha, 1e-6))
+    return alpha * np.clip(colour, 0, 1) + (1 - alpha) * background
+
+
+def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.ndarray:
+    """The factor of radiance, a channel (3,), with which pictures are shown nearest to the truth.
+
+    One for all pictures: where the sum of squared differences of what is shown inside the object is least.
+    (Least squares of radiance would look at lamps alone.) 1 for a channel that is black in either.
+    """
+    a, b = (
+        np.concatenate([p.reshape(-1, 4) for p in pictures]).astype(np.float64) for pictures in (ours, truth)
+    )
+    seen = np.flatnonzero(np.minimum(a[:, 3], b[:, 3]) > INSIDE)
+    chosen = seen[:: max(1, len(seen) // SCALE_PIXELS)]
+    a, b = a[chosen], b[chosen]
+    scale = np.ones(3)
+    for c in range(3):
+        goal, mean = _encoded(b[:, c], b[:, 3]), (a[:, c].sum(), b[:, c].sum())
+        if min(mean) <= 0:
+            continue
+
+        def error(stops: float, c: int = c, goal: np.ndarray = goal) -> float:
+            return float(np.mean((_encoded(a[:, c] * 2**stops, a[:, 3]) - goal) ** 2))
+
+        middle = float(np.log2(mean[1] / mean[0]))
+        found = minimize_scalar(error, bounds=(middle - SCALE_REACH, middle + SCALE_REACH))
+        scale[c] = 2.0 ** min((0.0, middle, float(found.x)), key=error)
+    return scale
+
+
+def _encoded(radiance: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """What is shown of premultiplied radiance, over black."""
+    return alpha * np.clip(srgb_from_linear(np.maximum(radiance, 0) / np.maximum(alpha, 1e-6)), 0, 1)
+
+
+def score(
+    names: Sequence[str], ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], background: np.ndarray
+) -> dict[str, Any]:
+    """`psnr`, `ssim`, both after `scale` (`psnr_scaled`, `ssim_scaled`), means over pictures; and `views`.
+
+    Pictures are premultiplied linear RGBA (H, W, 4), compared as they are shown before the background.
+    """
+    scale = common_scale(ours, truth)
+    views = []
+    for name, own, true in zip(names, ours, truth, strict=True):
+        goal = shown(true, background)
+        plain, scaled = shown(own, background), shown(own, background, scale)
+        views.append(
+            {
+                "name": name,
+                "psnr": metrics.psnr(plain, goal),
+                "psnr_scaled": metrics.psnr(scaled, goal),
+                "ssim": metrics.ssim(plain, goal),
+                "ssim_scaled": metrics.ssim(scaled, goal),
+            }
+        )
+    means = {k: float(np.mean([v[k] for v in views])) for k in views[0] if k != "name"}
+    return means | {"scale": [float(x) for x in scale], "views": views}
