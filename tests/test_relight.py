@@ -16,6 +16,7 @@ from known_scene import SIZE, other_sky, write_known_data, write_known_run
 from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
+from mi_refgs.evaluation.surface import TrueSurface
 from mi_refgs.exr import read_exr_image, write_exr
 from mi_refgs.images import read_png
 from mi_refgs.relighting.light import NewLight, truth_under
@@ -54,7 +55,20 @@ def test_a_known_scene_agrees_with_the_path_tracer(folder: Path, dusk: dict[str,
     """With 40 pixels across two balls: with 128 it is 34 dB."""
     assert dusk["psnr"] > 28 and dusk["psnr_scaled"] > dusk["psnr"] - 0.2 and dusk["score_reason"] is None
     np.testing.assert_allclose(dusk["scale"], 1, atol=0.08)
-    assert [view["name"] for view in dusk["views"]] == ["test/r_000", "test/r_001", "test/r_002"]
+
+
+def test_shadows_and_mirror_images_of_the_other_ball_are_there(folder: Path, dusk: dict[str, Any]) -> None:
+    """Mean colour where the balls are close; without rays it is off by up to 1.9 times."""
+    surface = TrueSurface.read(folder / "data")
+    assert surface is not None
+    for i, view in enumerate(read_dataset(folder / "data", "test").views):
+        places = (folder / "dusk", folder / "data/relight/dusk")
+        ours, truth = (read_exr_image(place / f"test/r_{i:03d}.exr") for place in places)
+        concave = surface.concave(view)
+        assert concave is not None
+        inside = concave & (np.minimum(ours, truth)[..., 3] > 0.99)
+        assert inside.sum() > 20
+        np.testing.assert_allclose(ours[inside].mean(axis=0), truth[inside].mean(axis=0), rtol=0.1)
 
 
 def test_the_light_that_it_was_fitted_to_is_not_that_light(folder: Path, dusk: dict[str, Any]) -> None:
