@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from integrator_scenes import sky
 
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.make_dataset import make_dataset
 from mi_refgs.exr import write_exr
 from mi_refgs.methods.read import load
-from mi_refgs.occlusion.mesh import read_mesh
+from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.export import TrainedScene, export
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
@@ -87,11 +88,19 @@ def known_surfels() -> Surfels:
     return Surfels.from_numpy(raw)
 
 
+def known_mesh() -> Mesh:
+    """The balls, of few enough triangles to be quick."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    vertices = np.concatenate([r * ball.vertices + c for c, r in zip(CENTRES, RADII, strict=True)])
+    faces = np.concatenate([ball.faces, ball.faces + len(ball.vertices)])
+    return Mesh(vertices.astype(np.float32), faces.astype(np.uint32), 2e-3)
+
+
 def write_known_run(data: Path, folder: Path, **shading: Any) -> Run:
     """The run that has found everything: true materials, surface and light; `shading` as in `Shading`."""
     run = Run(folder)
     run.create(load("ref_gaussian", "quick"), str(data))
-    mesh = read_mesh(data / "surface.ply")
+    mesh = known_mesh()
     chosen: dict[str, Any] = {"diffuse": "irradiance", "occlusion": True} | shading
     wanted = Shading(**chosen)
     light = EnvironmentLight.from_file(data / "environment.exr")

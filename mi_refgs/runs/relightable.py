@@ -32,7 +32,8 @@ Hanrahan 2001, eq. 8, over π]"""
 IRRADIANCE_FLOOR = 1e-4
 """Of the light's brightest irradiance: below, a surfel is dark whatever its albedo."""
 RELIGHT_RAYS = 16
-"""Rays of the lobe of each pixel."""
+"""Rays of the lobe of each pixel. Two balls of known materials, relit at 128² and 2 × 2 samples, are 33.6 dB from
+the path tracer's with one, 34.2 with 4, 34.4 with 16 and 34.5 with 64 rays."""
 RELIGHT_BOUNCES = 2
 """Times that what these rays hit is shaded. Of the self-reflecting instances of `benchmarks.visibility`, two
 bounces leave 9 % of the light in a bowl unaccounted for, one 27 %, four 3 %."""
@@ -45,8 +46,8 @@ def relightable(scene: TrainedScene) -> TrainedScene:
 
     A diffuse part that was fitted as a colour of its own ("sh") becomes an albedo (`albedo_from_radiance`).
     What is fitted to the light, the radiance and indirect channels, goes; light that other parts of the object
-    send is traced instead, where the scene has a mesh. The light stays. A scene that has only materials keeps
-    them as they are.
+    send is traced instead, where the scene has a mesh. The light stays, and so do other options of accuracy.
+    A scene that has only materials keeps them as they are.
 
     Raises InputError for a scene without light or one of the materials.
     """
@@ -58,14 +59,13 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     if scene.shading.diffuse == "sh":
         surfels = albedo_from_radiance(surfels, scene.light.prefilter(), scene.mesh)
     kept = {name: raw for name, raw in surfels.raw.items() if name not in ("radiance_sh", "indirect_sh")}
-    accuracy = Accuracy(light_levels=scene.shading.accuracy.light_levels)
-    if scene.mesh is not None:
-        accuracy = replace(
-            accuracy,
-            visibility_rays=RELIGHT_RAYS,
-            traced_bounces=RELIGHT_BOUNCES,
-            ambient_rays=AMBIENT_RAYS,
-        )
+    accuracy = scene.shading.accuracy if scene.shading.reflectance == "split_sum" else Accuracy()
+    rays, bounces, ambient_rays = (
+        (1, 0, 0) if scene.mesh is None else (RELIGHT_RAYS, RELIGHT_BOUNCES, AMBIENT_RAYS)
+    )
+    accuracy = replace(
+        accuracy, visibility_rays=rays, traced_bounces=bounces, ambient_rays=ambient_rays
+    )
     shading = Shading("pixel", "split_sum", "irradiance", scene.mesh is not None, accuracy)
     return replace(scene, surfels=Surfels(kept), shading=shading)
 
