@@ -63,6 +63,9 @@ DIFFERENCES: dict[str, set[str]] = {
     "gaussians_3d": {"surfels.primitive"},
     "base_2dgs": COLOUR_ONLY,
     "base_3dgs": COLOUR_ONLY | GEOMETRY_LOSS | {"surfels.primitive"},
+    "base_3dgs_mcmc": COLOUR_ONLY
+    | GEOMETRY_LOSS
+    | {"refine.densify", "refine.relocate", "refine.reset", "surfels.primitive"},
     "base_3dgs_dr": NO_MESH
     | GEOMETRY_LOSS
     | OWN_LIGHT
