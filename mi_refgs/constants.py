@@ -92,6 +92,11 @@ def tile_size(focal: float) -> tuple[int, int]:
     return next(size for limit, size in TILE_SIZES if focal < limit * (1 - FOCAL_TOLERANCE))
 
 
+# ---------------- directions ----------------
+
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+"""Azimuth between neighbours of a spherical Fibonacci lattice, radians."""
+
 # ---------------- surfels ----------------
 
 RAW_LIMIT = 1e18

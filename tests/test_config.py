@@ -297,8 +297,16 @@ def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
         ("stage.deferred.rates.light=nan", "out of range|no factor"),
         ("surfels.from_pictures=['metallic']", "metallic"),
         ("surfels.channels=['metallic', 'roughness']", "albedo"),
+        ("refine.relocate={when={start=0, until=9, every=3}, grow=-0.1}", r"relocate\.grow: -0\.1"),
     ],
 )
 def test_bad_settings_of_relighting_are_named(assignment: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         methods.load("relighting", "quick", [assignment])
+
+
+@pytest.mark.parametrize("prior", ["half_metal", "materials", "light_colour"])
+def test_a_prior_needs_what_it_is_about(prior: str) -> None:
+    with pytest.raises(InputError, match=rf"loss\.{prior}: .*drop it"):
+        methods.load("base_2dgs", "quick", [f"loss.{prior}=0.1"])
+    methods.load("ref_gaussian", "quick", [f"loss.{prior}=0.1"])

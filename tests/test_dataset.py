@@ -238,6 +238,9 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
         make_dataset(scene, out, **{**tiny, "views": 2})
     make_dataset(scene, out, **tiny, overwrite=True)
     assert not (out / "train/r_001.png").exists() and len(read_dataset(out, "train").views) == 1
+    (out / "dataset.json").write_text("[]")
+    with pytest.raises(InputError, match="another data set"):
+        make_dataset(scene, out, **tiny)
     (out / "dataset.json").unlink()
     with pytest.raises(InputError, match="another data set"):
         make_dataset(scene, out, **tiny)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -185,6 +186,20 @@ def test_truth_is_found_by_the_content_of_the_light(folder: Path, tmp_path: Path
     assert truth_under(NewLight(folder / "dusk.exr"), tmp_path) is None
 
 
+def test_a_data_set_may_have_the_name_of_a_light(tmp_path: Path) -> None:
+    """Its own pictures are not those under that light."""
+    data, light = tmp_path / "dusk", tmp_path / "dusk.exr"
+    write_exr(light, other_sky())
+    for folder in (data, data / "relight" / "dusk"):
+        folder.mkdir(parents=True)
+        (folder / "environment.exr").write_bytes(b"")
+        (folder / "transforms_test.json").write_text("{}")
+    digest = hashlib.sha256(light.read_bytes()).hexdigest()
+    (data / "dataset.json").write_text(json.dumps({"relight": {"dusk": digest}}))
+    found = truth_under(NewLight(light), data)
+    assert found is not None and found[0] == data / "relight" / "dusk"
+
+
 def test_exposure_brightens_ours_and_the_truth(folder: Path, dusk: dict[str, Any]) -> None:
     light = NewLight(folder / "dusk.exr", exposure=-1)
     darker = relight(Run(folder / "run"), light, folder / "dark", samples=SAMPLES).result
@@ -254,6 +269,8 @@ def test_what_cannot_be_relit(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.exr").write_text("no picture")
     with pytest.raises(InputError, match="holds a run"):
         relight(run, light, folder / "run")
+    with pytest.raises(InputError, match="a data set"):
+        relight(run, light, folder / "data")
     with pytest.raises(InputError, match="--turntable: -1"):
         relight(run, light, turntable=-1)
     with pytest.raises(InputError, match=r"bad\.exr"):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.data.materials import materials_at
 from mi_refgs.shade import lobe_matrices
 
@@ -16,8 +17,6 @@ SURFACE_SAMPLES = 4096
 """Points on each shape that measure the scene's size; the farthest is found to about 1 %."""
 ENVIRONMENT_OVERSAMPLING = 4
 """Directions per texel and axis of an environment that is turned, so that a small sun keeps its energy."""
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-"""Azimuth between neighbours of a spherical Fibonacci lattice, radians."""
 MAPS = {"normal": "XYZ", "depth": "Y", "albedo": "RGBA", "roughness": "YA", "metallic": "YA"}
 """Channels of the maps of a view; A is 1 where the BSDF defines the material, 0 where it does not."""
 

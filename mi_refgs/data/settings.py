@@ -70,7 +70,8 @@ def prepare_folder(out: Path, settings: Settings, overwrite: bool, relight: Sequ
     found: Any = None
     if record.is_file():
         with contextlib.suppress(InputError):
-            found = known | read_json(record)
+            content = read_json(record)
+            found = known | content if isinstance(content, dict) else None
     lights = _lights(found)
     same = found is not None and {name: found.get(name) for name in wanted} == wanted
     stale = [] if same else [f for pattern in VIEW_FILES for f in sorted(out.glob(pattern))]

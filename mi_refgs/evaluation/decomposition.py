@@ -128,8 +128,12 @@ def _mean(parts: list[np.ndarray]) -> float | None:
     return float(np.mean(values, dtype=np.float64)) if len(values) else None
 
 
-def material_maps(fitted: TrainedScene) -> Callable[[Camera, RenderedView], dict[str, np.ndarray]]:
+def material_maps(
+    fitted: TrainedScene, samples: int = 1
+) -> Callable[[Camera, RenderedView], dict[str, np.ndarray]]:
     """A function from a view's camera and render to its maps of materials, (H, W) or (H, W, 3) by name.
+
+    `samples` a pixel as that render has.
 
     Where the diffuse part was fitted as a colour, the albedo is that which `relightable` makes of it: the
     channel alone says what colour a metal has.
@@ -140,7 +144,7 @@ def material_maps(fitted: TrainedScene) -> Callable[[Camera, RenderedView], dict
         scene = relightable(fitted)
     except InputError:  # without light or materials there is nothing to make it of
         return lambda camera, shot: {n: m for n, m in shot.maps.items() if n != "albedo"}
-    view = replace(scene, shading=Shading("pixel", "split_sum", "irradiance")).renderer()
+    view = replace(scene, shading=Shading("pixel", "split_sum", "irradiance")).renderer(samples=samples)
     return lambda camera, shot: RenderedView.maps_of(view(camera), *shot.alpha.shape)
 
 

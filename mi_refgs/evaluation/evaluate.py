@@ -87,7 +87,7 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     kept: list[Any] = []
     per_view: list[dict[str, Any]] = []
     surface, errors = TrueSurface.read(views.path), decomposition.Decomposition()
-    materials = decomposition.material_maps(fitted)
+    materials = decomposition.material_maps(fitted, samples)
     for index, truth in enumerate(
         tqdm(views.views, desc="eval", unit="view", file=sys.stderr, disable=not progress)
     ):

@@ -7,13 +7,13 @@ input. Targets, weights and masks have no derivative. SSIM is in `fit.ssim`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.fit.ssim import ssim
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.shade.light import Light
@@ -22,8 +22,6 @@ from mi_refgs.shade.light import Light
 SATURATED = 254.5 / 255.0
 DIRECTIONS = 256
 """Directions that tell the colour of an irradiance: 13° from one to the next."""
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-"""Azimuth between neighbours of a spherical Fibonacci lattice, radians."""
 
 
 def saturated(
@@ -126,8 +124,8 @@ def light_colour(light: Light) -> Any:
 
     E is the irradiance in DIRECTIONS all around. Pictures fix albedo times light only: whatever factor one
     gains a channel, the other may lose, and no picture tells. This prior gives the colour to the albedo; what
-    mirrors and highlights show of the light, lamp by lamp, is finer than E. Of the scale, which no picture
-    tells either, a dielectric's highlights know; for other surfaces it is that of the light at the start.
+    mirrors and highlights show of the light, lamp by lamp, is finer than E. Highlights of a dielectric fix
+    the scale of the light; for other surfaces no picture tells it, and it stays near that of the start.
     """
     index = dr.arange(mi.Float, DIRECTIONS)
     height = 1 - (index + 0.5) * (2 / DIRECTIONS)

@@ -51,6 +51,7 @@ def objective(
     """Weighted sum of the losses of a frame (mi.Float of width 1), and its mean squared error, detached.
 
     The terms are those of `LossWeights`, weighted as it says for this iteration; see `render.display`.
+    `light` is the light of the step, under AD; without it there is no prior on its colour.
     """
     width, height = target.camera.width, target.camera.height
     image = displayed(frame, data.background, data.linear)

@@ -171,8 +171,8 @@ class Rates:
 
 @dataclass(frozen=True)
 class CoarsePictures:
-    """Pictures of fewer pixels for the iterations up to `until`, but for those of another table that ends
-    sooner."""
+    """Pictures of fewer pixels for the iterations up to `until`; of several such tables the one that ends
+    first counts."""
 
     until: int  # iterations
     block: int = 2  # pixels along a side of the squares that are averaged into one

@@ -144,9 +144,25 @@ def _checked(method: Method, where: str) -> Method:
         if worst := [one for one, factor in stage.rates.items() if not 0 <= factor < float("inf")]:
             found = f"{worst[0]}: {stage.rates[worst[0]]}"
             raise InputError(f"{where}: stage.{name}: rates: {found} is no factor; give 0 or more")
+    _check_priors(method, where)
+    relocate = method.refine.relocate
+    if relocate is not None and relocate.grow < 0:
+        raise InputError(f"{where}: refine.relocate.grow: {relocate.grow} is no share; give 0 or more")
     if method.refine.propagate is not None and "metallic" not in surfels.channels:
         raise InputError(f"{where}: refine.propagate: there is no channel 'metallic'; add it, or drop this")
     return method
+
+
+def _check_priors(method: Method, where: str) -> None:
+    """Raise InputError for a prior on what the method does not have."""
+    loss, pixels = method.loss, any(stage.at == "pixel" for _, stage in method.stages())
+    for name, needed in (("half_metal", {"metallic"}), ("materials", {"metallic", "roughness"})):
+        if getattr(loss, name) and not (pixels and needed <= {*method.surfels.channels}):
+            raise InputError(
+                f"{where}: loss.{name}: needs {' and '.join(sorted(needed))}, and a stage at = pixel; drop it"
+            )
+    if loss.light_colour and method.light is None:
+        raise InputError(f"{where}: loss.light_colour: there is no light; drop it")
 
 
 def load_resolved(path: Path) -> Method:

@@ -75,7 +75,8 @@ def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:
         map_ = folder / "environment.exr"
         if not (map_.is_file() and (folder / "transforms_test.json").is_file()):
             continue
-        same = map_.read_bytes() == content if light.world else lights.get(folder.name) == digest
+        recorded = lights.get(folder.name) if folder != data else None  # `data` may have a light's name
+        same = map_.read_bytes() == content if light.world else recorded == digest
         if same:
             return folder, NewLight(map_, True, 0.0, light.exposure)
     return None

@@ -141,8 +141,10 @@ def turntable_views(scene: TrainedScene, views: Sequence[View], count: int) -> l
 
 
 def _prepare(out: Path, kind: str) -> None:
-    if (out / "config.toml").exists():
-        raise InputError(f"{out}: output: holds a run, whose files would be replaced; choose another -o")
+    if (out / "config.toml").exists() or any(out.glob("transforms*.json")):
+        raise InputError(
+            f"{out}: output: holds a run or a data set, whose files would be replaced; choose another -o"
+        )
     try:
         (out / kind).mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -72,7 +72,7 @@ def supersampled(
 
 def box_mean(channel: Any, camera: Camera, factor: int) -> Any:
     """Mean of each factor × factor block of a supersampled raster; a channel of width 1 is constant."""
-    if dr.width(channel) == 1:
+    if factor == 1 or dr.width(channel) == 1:
         return channel
     sample = dr.arange(mi.UInt32, camera.width * camera.height * factor * factor)
     pixel, part = sample // (factor * factor), sample % (factor * factor)

@@ -98,7 +98,7 @@ class MeshRadiance:
             ]
             own = clamp_positive(eval_sh(coefficients, direction) + 0.5)
         ambient = None
-        if self.occluder.ambient is not None:
+        if self.accuracy.ambient_rays and self.occluder.ambient is not None:
             ambient = self.occluder.ambient.at(hit.triangle, hit.barycentric, hit.valid)
         indirect = None
         if hit.next is not None:

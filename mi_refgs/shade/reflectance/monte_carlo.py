@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.shade.points import ShadingPoints, Terms, safe_normalize
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, Surroundings
 from mi_refgs.shade.sh import clamp_positive, eval_sh
@@ -16,8 +17,6 @@ from mi_refgs.surfels.table import Surfels
 if TYPE_CHECKING:
     from mi_refgs.shade.shading import Shading
 
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-"""Radians from one direction of a Fibonacci hemisphere to the next."""
 
 LEAST_COSINE = math.sin(math.radians(10))
 """Directions lie at least 10° above the horizon. [R3DG's code]"""
