@@ -179,11 +179,12 @@ def test_truth_is_found_by_the_content_of_the_light(folder: Path, tmp_path: Path
     for light in (
         NewLight(folder / "dusk.exr", rotate=10),
         NewLight(tmp_path / "dusk.exr"),
-        NewLight(data / "environment.exr"),
         NewLight(folder / "dusk.exr", world=True),
     ):
         assert truth_under(light, data) is None
     assert truth_under(NewLight(folder / "dusk.exr"), tmp_path) is None
+    with pytest.raises(InputError, match="add --world"):
+        truth_under(NewLight(data / "environment.exr"), data)
 
 
 def test_a_data_set_may_have_the_name_of_a_light(tmp_path: Path) -> None:

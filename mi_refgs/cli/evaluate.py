@@ -62,6 +62,11 @@ def add(commands: Any) -> None:
         help="samples per pixel, box filtered: 4 are 2 × 2; 1 is the pixel's centre, as in training "
         "(default %(default)s)",
     )
+    parser.add_argument(
+        "--antialias",
+        action="store_true",
+        help="widen roughness by how much normals turn within a pixel, also where the fit did not",
+    )
 
 
 def run(args: argparse.Namespace) -> Result:
@@ -69,7 +74,9 @@ def run(args: argparse.Namespace) -> Result:
     from mi_refgs.evaluation.evaluate import DECOMPOSITION, SHEET, evaluate
     from mi_refgs.runs.run import Run
 
-    result = evaluate(Run(args.run_folder), args.data, progress=True, samples=args.samples)
+    result = evaluate(
+        Run(args.run_folder), args.data, progress=True, samples=args.samples, antialias=args.antialias
+    )
     return Result(result, f"{table(result)}\nsheets: {args.run_folder / SHEET}, {DECOMPOSITION}")
 
 

@@ -21,6 +21,7 @@ from mi_refgs.files import read_json
 from mi_refgs.fit.whole import read_views
 from mi_refgs.images import write_png
 from mi_refgs.methods.method import Method
+from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import TrainedScene, up_to_date
 from mi_refgs.runs.run import Run
 
@@ -54,7 +55,13 @@ def load_split(run: Run, method: Method, split: str, path: Path | None = None) -
     return read_views(method, path, split)
 
 
-def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples: int = 1) -> dict[str, Any]:
+def evaluate(
+    run: Run,
+    data: Path | None = None,
+    progress: bool = False,
+    samples: int = 1,
+    antialias: bool = False,
+) -> dict[str, Any]:
     """Render the test views, measure them, and write metrics.json, renders and two sheets into the run.
 
     Evaluates the artefacts as they lie in the folder, after writing what a newer checkpoint makes stale.
@@ -63,7 +70,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     them; keys that end in `_concave` count pixels where the true surface is (`evaluation.surface`).
     `ms_per_frame` is the median over single synchronised frames of the displayed picture alone, light
     filtered beforehand. `pruned` is null for a whole scene. All that is rendered has `samples` a pixel, box
-    filtered (`render.samples`).
+    filtered (`render.samples`); `antialias` asks for widened roughness (`render.antialias`) where the run was
+    fitted without.
 
     Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, and for data
     that is gone.
@@ -73,6 +81,10 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     method = run.method()
     views = load_split(run, method, "test", data)
     fitted = up_to_date(run, method, views.views[0].camera())
+    if antialias:
+        accuracy = dataclasses.replace(fitted.shading.accuracy, antialias=True)
+        shading = dataclasses.replace(fitted.shading, accuracy=accuracy)
+        fitted = dataclasses.replace(fitted, shading=shading)
     view = fitted.renderer(samples=samples)
     folder = run.path / FOLDER
     try:
@@ -132,7 +144,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
         "iterations": fitted.iteration,
         "surfels": fitted.surfels.count,
         "pruned": None if fitted.pruned is None else dataclasses.asdict(fitted.pruned),
-        "samples": samples,
+        "samples": samples_per_axis(samples) ** 2,
+        "antialias": fitted.shading.accuracy.antialias,
         "ms_per_frame": milliseconds(
             [fitted.renderer(aovs=False, samples=samples)], [v.camera() for v in views.views], views
         )[0],

@@ -22,8 +22,8 @@ from mi_refgs.shade.envmap import EnvironmentLight, read_radiance
 
 HEIGHT = 256
 """Rows of a light, at most: a texel is 0.7°, an eighth of the lobe of roughness 0.1."""
-EXPOSURE_MAX = 40.0
-"""Stops; beyond, float32 has no light left."""
+EXPOSURE_MAX = 10.0
+"""Stops; a light keeps no radiance below 1e-4, so that a much darker one would be grey."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,9 @@ def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:
     """The data set with test views under this light, and the light as they were traced; None without one.
 
     It is the map that `refgs dataset --relight` was given, by the content of the file, or an environment.exr
-    of the data set itself. A light that is turned has no truth.
+    of the data set itself. A light that is turned has no truth. Raises InputError for such an environment.exr
+    that is not said to be in world directions.
     """
-    if light.rotate % 360:
-        return None
     content = light.path.read_bytes()
     digest = hashlib.sha256(content).hexdigest()
     lights = recorded_lights(data / "dataset.json")
@@ -76,7 +75,9 @@ def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:
         if not (map_.is_file() and (folder / "transforms_test.json").is_file()):
             continue
         recorded = lights.get(folder.name) if folder != data else None  # `data` may have a light's name
-        same = map_.read_bytes() == content if light.world else recorded == digest
-        if same:
+        own = map_.read_bytes() == content
+        if own and not light.world:
+            raise InputError(f"{light.path}: --envmap: this map is in world directions; add --world")
+        if (own if light.world else recorded == digest) and not light.rotate % 360:
             return folder, NewLight(map_, True, 0.0, light.exposure)
     return None

@@ -34,6 +34,7 @@ from mi_refgs.methods.method import Method
 from mi_refgs.relighting.light import NewLight, truth_under
 from mi_refgs.relighting.score import score, shown
 from mi_refgs.render.pipeline import Frame
+from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import TrainedScene, export, up_to_date
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
@@ -101,7 +102,7 @@ def relight(
         "rotate": light.rotate,
         "exposure": light.exposure,
         "pictures": [f"{kind}/{i}" for i in _names(kind, len(shot))],
-        "samples": samples,
+        "samples": samples_per_axis(samples) ** 2,
         "psnr": None,
         "psnr_scaled": None,
         "score_reason": "a turntable has no truth" if turntable else NO_TRUTH,
