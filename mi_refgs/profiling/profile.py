@@ -136,8 +136,11 @@ def _launches(call: Callable[[], None]) -> int:
 
 @contextmanager
 def held_in_stage(trainer: Trainer, name: str) -> Iterator[Callable[[], None]]:
-    """Keep the iteration in a stage (by what is to be called before each step), and let nothing fall due."""
-    method, before = trainer.method, trainer.iteration
+    """Keep the iteration in a stage (by what is to be called before each step), and let nothing fall due.
+
+    Every step filters its light, which those of a fit may share (`light.every`), so that all steps are alike.
+    """
+    method, schedule, before = trainer.method, trainer.schedule, trainer.iteration
     stages = method.stages()
     place = [found for found, _ in stages].index(name)
     first, last = stages[place - 1][1].until if place else 0, stages[place][1].until
@@ -145,7 +148,10 @@ def held_in_stage(trainer: Trainer, name: str) -> Iterator[Callable[[], None]]:
     first = min(first + 1, last - 1)
     if not first <= before < last:
         trainer.iteration = max(first, last - 100)
-    trainer.method = replace(method, refine=Refine(), mesh=None)
+    light = None if method.light is None else replace(method.light, every=1)
+    trainer.method = replace(method, refine=Refine(), mesh=None, light=light)
+    trainer.schedule = replace(schedule, method=trainer.method)
+    trainer.window.close()
 
     def prepare() -> None:
         if trainer.iteration >= last:
@@ -154,7 +160,7 @@ def held_in_stage(trainer: Trainer, name: str) -> Iterator[Callable[[], None]]:
     try:
         yield prepare
     finally:
-        trainer.method, trainer.iteration = method, before
+        trainer.method, trainer.schedule, trainer.iteration = method, schedule, before
 
 
 def count_work(trainer: Trainer) -> Work:
