@@ -57,6 +57,11 @@ def write_bytes(path: str | Path, data: bytes) -> None:
     replace_file(path, lambda temporary: temporary.write_bytes(data))
 
 
+def write_json(path: str | Path, content: Any, indent: int = 1) -> None:
+    """Write a JSON file, whole or not at all; raises InputError as `replace_file` does."""
+    write_bytes(path, f"{json.dumps(content, indent=indent)}\n".encode())
+
+
 def remove_temporaries(folder: Path) -> None:
     """Remove what processes that were killed while writing a file have left in a folder."""
     for path in folder.iterdir():

@@ -18,6 +18,8 @@ SRGB_LINEAR_LIMIT = 0.0031308
 """Linear value below which the sRGB curve is a straight line (IEC 61966-2-1)."""
 SRGB_ENCODED_LIMIT = 0.04045
 """The same point after encoding."""
+ALPHA_FLOOR = 1e-8
+"""Alpha that radiance is divided by at least: what covers so little has no colour."""
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -32,6 +34,13 @@ def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
     encoded = np.asarray(encoded)
     curve = ((np.maximum(encoded, SRGB_ENCODED_LIMIT) + 0.055) / 1.055) ** 2.4
     return np.where(encoded <= SRGB_ENCODED_LIMIT, encoded / 12.92, curve).astype(encoded.dtype)
+
+
+def straight_srgb(rgba: np.ndarray) -> np.ndarray:
+    """What an RGBA PNG holds of premultiplied linear RGBA (H, W, 4): sRGB(radiance / alpha), and alpha."""
+    alpha = rgba[..., 3:]
+    colour = srgb_from_linear(rgba[..., :3] / np.maximum(alpha, ALPHA_FLOOR))
+    return np.concatenate([colour, alpha], axis=-1)
 
 
 def box_downscale(image: np.ndarray, factor: int) -> np.ndarray:

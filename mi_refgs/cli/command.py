@@ -84,6 +84,26 @@ def add_output(parser: Parser, what: str, metavar: str) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar=metavar, help=what)
 
 
+def add_run(parser: Parser) -> None:
+    """Add the run folder."""
+    parser.add_argument("run_folder", type=Path, metavar="RUN", help="run folder that `refgs train` wrote")
+
+
+def add_test_views(parser: Parser) -> None:
+    """Add --data and --samples: which test views are rendered, and how."""
+    parser.add_argument(
+        "--data", type=Path, metavar="DATA", help="another data set than the one it was fitted to"
+    )
+    parser.add_argument(
+        "--samples",
+        type=int,
+        default=1,
+        metavar="N",
+        help="samples per pixel, box filtered: 4 are 2 × 2; 1 is the pixel's centre, as in training "
+        "(default %(default)s)",
+    )
+
+
 def add_settings(parser: Parser) -> None:
     """Add the option --set."""
     parser.add_argument(

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from mi_refgs.cli.command import Result, add_command
+from mi_refgs.cli.command import Result, add_command, add_run, add_test_views
 
 ROWS = (
     ("psnr", "PSNR", "{:.2f} dB"),
@@ -50,18 +49,8 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     summary = "measure a run on the test views: metrics.json, renders, sheets of ours beside the truth"
     parser = add_command(commands, "eval", summary, "refgs eval runs/glossy --json", run)
-    parser.add_argument("run_folder", type=Path, metavar="RUN", help="run folder that `refgs train` wrote")
-    parser.add_argument(
-        "--data", type=Path, metavar="DATA", help="another data set than the one it was fitted to"
-    )
-    parser.add_argument(
-        "--samples",
-        type=int,
-        default=1,
-        metavar="N",
-        help="samples per pixel, box filtered: 4 are 2 × 2; 1 is the pixel's centre, as in training "
-        "(default %(default)s)",
-    )
+    add_run(parser)
+    add_test_views(parser)
     parser.add_argument(
         "--antialias",
         action="store_true",

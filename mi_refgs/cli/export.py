@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.cli.command import Result, add_command, say
+from mi_refgs.cli.command import Result, add_command, add_run, say
 from mi_refgs.errors import InputError
 
 
@@ -14,7 +14,7 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     summary = "write surfels.ply, envmap.exr, mesh.ply and scene.xml from the newest checkpoint of a run"
     parser = add_command(commands, "export", summary, "refgs export runs/glossy -o glossy_scene --prune", run)
-    parser.add_argument("run_folder", type=Path, metavar="RUN", help="run folder that `refgs train` wrote")
+    add_run(parser)
     parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="folder to write to (default: RUN itself)"
     )

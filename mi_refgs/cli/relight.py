@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.cli.command import Result, add_command, warn
+from mi_refgs.cli.command import Result, add_command, add_run, add_test_views, warn
 
 EXAMPLE = "refgs relight runs/glossy --envmap studio.hdr --rotate 90 -o relit/studio"
 
@@ -15,7 +15,7 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     summary = "show a run under another light: pictures, scene.xml, and the score where the truth is known"
     parser = add_command(commands, "relight", summary, EXAMPLE, run)
-    parser.add_argument("run_folder", type=Path, metavar="RUN", help="run folder that `refgs train` wrote")
+    add_run(parser)
     parser.add_argument(
         "--envmap",
         type=Path,
@@ -41,12 +41,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--turntable", type=int, default=0, metavar="N", help="N views around the object, not the test views"
     )
-    parser.add_argument(
-        "--samples", type=int, default=1, metavar="N", help="samples per pixel, box filtered (default 1)"
-    )
-    parser.add_argument(
-        "--data", type=Path, metavar="DATA", help="another data set than the one it was fitted to"
-    )
+    add_test_views(parser)
     parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="folder for it all (default: RUN/relight/NAME)"
     )

@@ -111,7 +111,7 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
 
     from mi_refgs.exr import mitsuba_exr
     from mi_refgs.files import replace_file
-    from mi_refgs.images import srgb_from_linear, write_png
+    from mi_refgs.images import srgb_from_linear, straight_srgb, write_png
 
     try:
         image = mi.render(scene, sensor=sensor, spp=spp)
@@ -125,9 +125,7 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
         return names
     pixels = np.array(image, dtype=np.float32)
     if "A" in names:
-        alpha = pixels[..., 3:4]
-        colour = srgb_from_linear(pixels[..., :3] / np.maximum(alpha, 1e-8))
-        write_png(path, np.concatenate([colour, alpha], axis=-1))
+        write_png(path, straight_srgb(pixels[..., :4]))
         return names[:4]
     write_png(path, srgb_from_linear(pixels[..., :3]))
     return names[:3]

@@ -14,7 +14,7 @@ from mi_refgs.compare.jobs import SETTINGS, Job
 from mi_refgs.compare.page import PAGE, write_page
 from mi_refgs.compare.table import Table, rows_or_error, table_of
 from mi_refgs.compare.text import markdown
-from mi_refgs.files import cannot_write, read_json, write_bytes
+from mi_refgs.files import cannot_write, read_json, write_bytes, write_json
 
 TABLE, TABLE_TEXT = "table.json", "table.md"
 
@@ -37,7 +37,7 @@ def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequenc
         "command": shlex.join(["refgs", *arguments]),
         "version": __version__,
     }
-    write_bytes(folder / SETTINGS, (json.dumps(about, indent=2) + "\n").encode())
+    write_json(folder / SETTINGS, about, indent=2)
 
 
 def table(folder: Path) -> Table:

@@ -11,7 +11,7 @@ from typing import Any
 
 from mi_refgs.data.scene_file import LightFile
 from mi_refgs.errors import InputError
-from mi_refgs.files import read_json, write_bytes
+from mi_refgs.files import read_json, write_json
 
 SURFACE = "surface.ply"
 RELIGHT = "relight"
@@ -111,8 +111,3 @@ def recorded_lights(record: Path) -> dict[str, str]:
         return _lights(read_json(record))
     except InputError:
         return {}
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file, whole or not at all."""
-    write_bytes(path, f"{json.dumps(value, indent=1)}\n".encode())

@@ -13,10 +13,11 @@ import numpy as np
 
 from mi_refgs.data.frames import MITSUBA_FROM_OPENGL
 from mi_refgs.data.pathtrace import MAPS, Tracer, camera_poses, environment_image
-from mi_refgs.data.settings import Settings, write_json
+from mi_refgs.data.settings import Settings
 from mi_refgs.errors import InputError
 from mi_refgs.exr import read_exr, read_exr_image, write_exr
-from mi_refgs.images import read_png, srgb_from_linear, write_png
+from mi_refgs.files import write_json
+from mi_refgs.images import read_png, straight_srgb, write_png
 
 
 @dataclass(frozen=True)
@@ -75,10 +76,8 @@ def _trace_view(tracer: Tracer, stem: Path, pose: np.ndarray, seed: int, maps: b
         rgba = None
     else:
         rgba = tracer.picture(pose, seed)
-        alpha = rgba[..., 3:]
-        colour = srgb_from_linear(rgba[..., :3] / np.maximum(alpha, 1e-8))
         write_exr(f"{stem}.exr", rgba)
-        write_png(f"{stem}.png", np.concatenate([colour, alpha], axis=-1))
+        write_png(f"{stem}.png", straight_srgb(rgba))
     files = {name: f"{stem}_{name}.exr" for name in MAPS} if maps else {}
     missing = [name for name, file in files.items() if not _whole(read_exr, file)]
     if missing:

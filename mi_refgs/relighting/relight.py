@@ -11,7 +11,6 @@ A folder of it holds
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -28,8 +27,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation import pictures
 from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.exr import write_exr
-from mi_refgs.files import cannot_write, write_bytes
-from mi_refgs.images import srgb_from_linear, write_png
+from mi_refgs.files import cannot_write, write_json
+from mi_refgs.images import straight_srgb, write_png
 from mi_refgs.methods.method import Method
 from mi_refgs.relighting.light import NewLight, truth_under
 from mi_refgs.relighting.score import score, shown
@@ -113,7 +112,7 @@ def relight(
         result |= score([view.name for view in views.views], ours, truth, views.background)
         result["score_reason"] = None
     _write_sheet(out / SHEET, ours, truth, result.get("scale"), views.background, scene)
-    write_bytes(out / RESULT, f"{json.dumps(result, indent=1)}\n".encode())
+    write_json(out / RESULT, result)
     warning = ""
     if fitted.shading.diffuse == "sh":
         warning = (
@@ -177,10 +176,8 @@ def _render(
         frame = renderer(view.camera())
         size = view.height, view.width
         rgba = pictures.planes([*frame.radiance, frame.alpha], *size)
-        alpha = rgba[..., 3:]
-        colour = srgb_from_linear(np.maximum(rgba[..., :3], 0) / np.maximum(alpha, 1e-6))
         write_exr((folder / name).with_suffix(".exr"), rgba)
-        write_png(folder / name, np.concatenate([colour, alpha], axis=-1))
+        write_png(folder / name, straight_srgb(rgba))
         found.append(rgba)
     return found
 

@@ -26,8 +26,7 @@ SCALE_PIXELS = 200_000
 def shown(rgba: np.ndarray, background: np.ndarray, scale: np.ndarray | float = 1.0) -> np.ndarray:
     """What a camera shows of premultiplied linear RGBA (H, W, 4) before a background, display-encoded."""
     alpha = np.clip(rgba[..., 3:], 0, 1)
-    colour = srgb_from_linear(np.maximum(rgba[..., :3], 0) * scale / np.maximum(alpha, 1e-6))
-    return alpha * np.clip(colour, 0, 1) + (1 - alpha) * background
+    return _encoded(rgba[..., :3] * scale, alpha) + (1 - alpha) * background
 
 
 def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 
 from mi_refgs.constants import COVERAGE_FLOOR
-from mi_refgs.splat import Blended, Camera, splat
+from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels.table import Surfels
 
 
@@ -35,7 +35,7 @@ class GBuffer:
         for name, value in slots.items():
             width = len(_parts(value))
             maps[name], rest = _joined(value, rest[:width]), rest[width:]
-        inverse = inverse_alpha(blended)
+        inverse = inverse_alpha(blended.alpha)
         return GBuffer(blended.alpha, blended.depth * inverse, maps, inverse)
 
     def divided(self, name: str) -> Any:
@@ -44,10 +44,10 @@ class GBuffer:
         return _joined(value, [part * self.inverse for part in _parts(value)])
 
 
-def inverse_alpha(blended: Blended) -> Any:
+def inverse_alpha(alpha: Any) -> Any:
     """1/A where anything is seen (COVERAGE_FLOOR), else 0, with a finite gradient everywhere."""
-    seen = blended.alpha > COVERAGE_FLOOR
-    return dr.select(seen, dr.rcp(dr.select(seen, blended.alpha, 1)), 0)
+    seen = alpha > COVERAGE_FLOOR
+    return dr.select(seen, dr.rcp(dr.select(seen, alpha, 1)), 0)
 
 
 def _parts(value: Any) -> list[Any]:

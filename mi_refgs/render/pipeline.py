@@ -83,7 +83,7 @@ def render(
 def render_depth(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
     """Expected camera-z depth (0 where nothing is seen) and alpha of a view, and nothing else."""
     blended = splat(surfels, [], camera)
-    return blended.depth * inverse_alpha(blended), blended.alpha
+    return blended.depth * inverse_alpha(blended.alpha), blended.alpha
 
 
 def _nothing(surfels: Surfels) -> Surfels:

@@ -10,8 +10,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.errors import InputError
+from mi_refgs.render.gbuffer import inverse_alpha
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.points import Terms
 from mi_refgs.splat.camera import Camera
@@ -50,8 +50,7 @@ def supersampled(
         return box_mean(value, camera, factor)
 
     alpha = mean(fine.alpha)
-    seen = alpha > COVERAGE_FLOOR
-    inverse = dr.select(seen, dr.rcp(dr.select(seen, alpha, 1)), 0)
+    inverse = inverse_alpha(alpha)
 
     def weighted(value: Any) -> Any:
         return mean(value * fine.alpha) * inverse

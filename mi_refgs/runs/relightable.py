@@ -19,13 +19,13 @@ from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ambient import ambient
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light import Light
+from mi_refgs.shade.reflectance.split_sum import MATERIALS
 from mi_refgs.shade.sh import sh_basis
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.split_sum import DIELECTRIC_F0
 from mi_refgs.surfels.channels import logit
 from mi_refgs.surfels.table import Surfels
 
-MATERIALS = ("albedo", "metallic", "roughness")
 COSINE_LOBE = (1.0, 2 / 3, 1 / 4, 0.0)
 """Factors by degree that turn harmonics into their cosine-weighted mean over a hemisphere. [Ramamoorthi and
 Hanrahan 2001, eq. 8, over π]"""

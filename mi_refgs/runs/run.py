@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import cannot_write, read_json, remove_temporaries, write_bytes
+from mi_refgs.files import cannot_write, read_json, remove_temporaries, write_bytes, write_json
 from mi_refgs.runs import checkpoint
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
@@ -139,7 +139,7 @@ class Run:
 
     def write_json(self, name: str, content: Any) -> None:
         """Write a JSON file of the run."""
-        write_bytes(self.path / name, (json.dumps(content, indent=2) + "\n").encode())
+        write_json(self.path / name, content, indent=2)
 
     def _make_folders(self) -> None:
         try:

@@ -22,7 +22,6 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.vertex_colours import VertexColours
@@ -62,11 +61,10 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, accuracy: Accura
     assert mesh is not None
     place = mi.Point3f(mesh.vertices.T)
     normal = safe_normalize(occluder.surface(surfels).around.normal)
-    occluder.ambient, found = None, VertexColours.of(mesh, np.ones_like(mesh.vertices))
+    occluder.ambient = None  # all light arrives, in the first round
     for _ in range(BOUNCES):
         scene = MeshRadiance.of(occluder, surfels, light, replace(accuracy, traced_bounces=1), "irradiance")
         ratio = _round(scene, place, normal, accuracy.ambient_rays)
-        dr.eval(ratio)
         occluder.ambient = found = VertexColours.of(mesh, ratio.numpy().T)
     return found
 
