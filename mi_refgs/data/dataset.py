@@ -6,6 +6,7 @@ A·rgb + (1 − A)·background. EXR targets are linear and premultiplied: radian
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.data.region import Region, read_region, region_of
 from mi_refgs.data.readers import PointCloud, ReadOptions, reader_of
 from mi_refgs.data.view import View
 
@@ -36,6 +38,7 @@ class Dataset:
     linear: bool  # as in View
     environment: Path | None  # ground truth of the light: lat-long EXR in Mitsuba's orientation
     points: PointCloud | None = None  # on what is seen, where the data set has some
+    region: Region | None = None  # of interest; absent where alpha says what belongs to the object
 
     @cached_property
     def scene_extent(self) -> float:
@@ -85,7 +88,12 @@ def read_dataset(
     near = NEAR_EXTENTS * _extent(views)
     views = tuple(replace(view, near=near) for view in views)
     colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
-    return Dataset(path, split, views, colour, images == "exr", found.environment, found.points)
+    region = found.region or read_region(path)
+    if region is None and any(view.alpha is None for view in views):
+        with contextlib.suppress(InputError):  # views that share no point have none
+            region = region_of(views)
+    linear = images == "exr"
+    return Dataset(path, split, views, colour, linear, found.environment, found.points, region)
 
 
 def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, int, int]:

@@ -29,14 +29,14 @@ COLOUR_VIEWS = 32
 FOCUS_CONDITION = 1e-3
 
 
-def camera_bounds(views: Sequence[View]) -> np.ndarray:
-    """A cube around the point all cameras look at, as wide as the widest view there: (2, 3).
+def view_focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+    """The point nearest to the axes of all cameras (3,), and each camera's distance from it (V,).
 
     Raises InputError if the view axes have no common point (one view, or parallel ones).
     """
     origins = np.array([view.to_world[:3, 3] for view in views], dtype=np.float64).reshape(-1, 3)
     axes = np.array([view.to_world[:3, 2] for view in views], dtype=np.float64).reshape(-1, 3)
-    # The point nearest to all axes: Σ (I - d dᵀ)(p - o) = 0.
+    # Σ (I - d dᵀ)(p - o) = 0.
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     system = projectors.mean(axis=0) if len(views) else np.zeros((3, 3))
     if np.linalg.svd(system, compute_uv=False)[-1] < FOCUS_CONDITION:
@@ -44,7 +44,15 @@ def camera_bounds(views: Sequence[View]) -> np.ndarray:
             "views: cameras: they do not look at one point from several sides; give the bounds of the scene"
         )
     focus = np.linalg.solve(system, np.einsum("nij,nj->i", projectors, origins) / len(views))
-    distance = np.linalg.norm(origins - focus, axis=1)
+    return focus, np.linalg.norm(origins - focus, axis=1)
+
+
+def camera_bounds(views: Sequence[View]) -> np.ndarray:
+    """A cube around the point all cameras look at, as wide as the widest view there: (2, 3).
+
+    Raises InputError if the view axes have no common point (one view, or parallel ones).
+    """
+    focus, distance = view_focus(views)
     reach = [max(v.width / v.fx, v.height / v.fy) / 2 for v in views]
     half = min(float(np.max(distance * reach)), float(distance.max()))
     return np.stack([focus - half, focus + half])

@@ -1,0 +1,72 @@
+"""The region of interest: contraction, the sphere that cameras suggest, its file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_refgs.data.region import REGION_FILE, Region, read_region, region_of
+from mi_refgs.data.view import View
+from mi_refgs.errors import InputError
+
+
+def view_from(origin: np.ndarray, focal: float = 100.0) -> View:
+    """A view of 100² pixels that looks at the world's origin."""
+    forward = -origin / np.linalg.norm(origin)
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    left /= np.linalg.norm(left)
+    to_world = np.eye(4)
+    to_world[:3, :3] = np.stack([left, np.cross(forward, left), forward], axis=1)
+    to_world[:3, 3] = origin
+    image = np.zeros((100, 100, 3), np.float32)
+    return View("v", 100, 100, focal, focal, 50, 50, to_world, image, None, None, None, False)
+
+
+def test_contraction_is_the_identity_inside_and_ends_at_two() -> None:
+    region = Region((1.0, 2.0, 3.0), 0.5)
+    inside = np.array([[1.1, 2.2, 2.9], [1.0, 2.0, 3.5]])
+    np.testing.assert_allclose(region.contract(inside), (inside - [1, 2, 3]) / 0.5)
+    # Twice the radius away: 2 − 1/2.
+    np.testing.assert_allclose(region.contract(np.array([[2.0, 2.0, 3.0]])), [[1.5, 0, 0]])
+    far = region.contract(np.array([[1e6, 2.0, 3.0]]))
+    assert 1.999 < np.linalg.norm(far) < 2
+
+
+def test_expansion_undoes_contraction() -> None:
+    region = Region((-1.0, 0.5, 2.0), 3.0)
+    points = np.random.default_rng(0).normal(size=(200, 3)) * 20
+    np.testing.assert_allclose(region.expand(region.contract(points)), points, rtol=1e-9, atol=1e-9)
+
+
+def test_cameras_suggest_the_sphere_that_they_show_whole() -> None:
+    origins = np.array([[4, 0, 1], [0, 4, 1], [-4, 0, 1], [0, -4, 1.0]])
+    region = region_of([view_from(origin) for origin in origins])
+    np.testing.assert_allclose(region.centre, 0, atol=1e-9)
+    # sin atan ½ = 1/√5 of the distance √17.
+    assert region.radius == pytest.approx(0.8 * np.sqrt(17 / 5))
+    wide = region_of([view_from(origin, focal=10.0) for origin in origins])
+    # Of sin atan 5 = 0.98 the cameras themselves leave 0.8 of their distance.
+    assert wide.radius == pytest.approx(0.8 * 5 / np.sqrt(26) * np.sqrt(17))
+
+
+def test_one_view_has_no_region() -> None:
+    with pytest.raises(InputError, match="do not look at one point"):
+        region_of([view_from(np.array([4.0, 0, 0]))])
+
+
+def test_a_region_file_is_read(tmp_path: Path) -> None:
+    assert read_region(tmp_path) is None
+    (tmp_path / REGION_FILE).write_text('{"centre": [1, 2, 3], "radius": 0.5}')
+    assert read_region(tmp_path) == Region((1.0, 2.0, 3.0), 0.5)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ['{"centre": [1, 2], "radius": 1}', '{"centre": [1, 2, 3], "radius": 0}', '{"radius": 1}', "[]", "{"],
+)
+def test_a_region_file_of_no_use_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / REGION_FILE).write_text(text)
+    with pytest.raises(InputError, match=REGION_FILE):
+        read_region(tmp_path)
