@@ -14,7 +14,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.envmap import PrefilteredLight
 from mi_refgs.shade.points import ShadingPoints
-from mi_refgs.shade.reflectance import Surroundings
+from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.reflection import reflection
 from mi_refgs.surfels.table import Surfels
 
@@ -115,7 +115,7 @@ def seen(
     if occluder is None:
         occluder = Occluder(corner()) if surfels is None else with_materials(corner(), surfels)
     table: Any = surfels
-    around = Surroundings(occluder, table, light, mi.Point3f(eye), vector(place - eye))
+    around = TraceContext(occluder, table, light, mi.Point3f(eye), vector(place - eye))
     return reflection(points, around, diffuse, accuracy)
 
 

@@ -22,7 +22,7 @@ from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.light import ConstantLight, RotatedLight
 from mi_refgs.shade.lobe_matrices import LEVEL_ROUGHNESS
 from mi_refgs.shade.points import ShadingPoints, Terms
-from mi_refgs.shade.reflectance import MODELS, Surroundings
+from mi_refgs.shade.reflectance import MODELS, TraceContext
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.channels import CHANNELS
@@ -297,7 +297,7 @@ def test_the_hemisphere_is_blocked_where_a_mesh_stands() -> None:
     normal = vector(np.tile([0, 1.0, 0], (n, 1)))
     points = ShadingPoints(normal, normal)
     place = mi.Point3f(vector(np.linspace(0, 0.5, n)[:, None] * [1.0, 0, 0]))
-    around = Surroundings(occluder, table(), None, place, normal)
+    around = TraceContext(occluder, table(), None, place, normal)
     shading = CASES["monte_carlo, occluded"]
     free = np.array(shading.model.trace(points, around, shading).free)
     directions = baselines.hemisphere(DIRECTIONS, np.array([0, 1.0, 0]))

@@ -19,7 +19,7 @@ from mi_refgs.shade import brdf
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ggx_sampling import Lobe, lobe_point, lobe_turn
 from mi_refgs.shade.points import ShadingPoints
-from mi_refgs.shade.reflectance import Surroundings
+from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.reflection import reflection
 
 # ---------------- the points ----------------
@@ -151,7 +151,7 @@ def test_convex_shapes_are_free_and_one_ray_is_the_mirror_ray() -> None:
     )
     for rays in (1, 2, 8):
         accuracy = Accuracy(visibility_rays=rays)
-        around = Surroundings(occluder, None, None, eye, vector(-2 * view))  # type: ignore[arg-type]
+        around = TraceContext(occluder, None, None, eye, vector(-2 * view))  # type: ignore[arg-type]
         free = reflection(points, around, "irradiance", accuracy)
         assert dr.width(free.visibility) == n
         assert float(dr.mean(free.visibility)[0]) > 0.999 and float(dr.min(free.visibility)[0]) > 0.8

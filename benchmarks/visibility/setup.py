@@ -21,7 +21,7 @@ from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import render
 from mi_refgs.shade.points import ShadingPoints
-from mi_refgs.shade.reflectance import Surroundings
+from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.reflection import reflection
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.split_sum import shade
@@ -68,7 +68,7 @@ class Setup(setup.Setup):
         at = setup.shading_points(points, self.surface)
         if not rule.rays:
             return at
-        around = Surroundings(self.occluder, self.surfels, self.light, self.origin, -points.view)
+        around = TraceContext(self.occluder, self.surfels, self.light, self.origin, -points.view)
         return reflection(at, around, "irradiance", rule.accuracy())
 
     def shaded(self, points: Points, rule: Rule) -> Any:

@@ -23,7 +23,7 @@ from mi_refgs.render.antialias import widened
 from mi_refgs.render.gbuffer import GBuffer, inverse_alpha
 from mi_refgs.shade.light import Light
 from mi_refgs.shade.points import ShadingPoints, Terms, safe_normalize
-from mi_refgs.shade.reflectance import SurfelView, Surroundings
+from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels.channels import channel
@@ -144,7 +144,7 @@ def _shade_at_surfels(scene: _Scene, aovs: bool, normals: bool) -> Frame:
     points = ShadingPoints(scene.normal, -direction, scene.named)
     if shading.occlusion:
         centre = scene.surfels.position()
-        around = Surroundings(scene.occluder, scene.surfels, scene.light, centre, direction)
+        around = TraceContext(scene.occluder, scene.surfels, scene.light, centre, direction)
         points = shading.model.trace(points, around, shading)
     terms = shade(points, scene.light, shading)
     # A feature costs time in every pair, so what is not asked for is not blended.
@@ -181,7 +181,7 @@ def _shade_at_pixels(scene: _Scene, aovs: bool) -> Frame:
     maps = {name: values[name] for name in scene.surfels.raw if name in values}
     if shading.occlusion:
         covered = dr.detach(buffer.alpha) > COVERAGE_FLOOR
-        around = Surroundings(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered)
+        around = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered)
         points = shading.model.trace(points, around, shading)
         maps["visibility"] = points.visibility
     shaded = shade(points, scene.light, shading)

@@ -16,7 +16,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ggx_sampling import Lobe
 from mi_refgs.shade.points import ShadingPoints, reflect
-from mi_refgs.shade.reflectance.model import Surroundings
+from mi_refgs.shade.reflectance.model import TraceContext
 from mi_refgs.shade.split_sum import Diffuse, base_reflectance
 from mi_refgs.shade.traced_light import MeshRadiance
 from mi_refgs.shade.visibility import mirror_visibility, start_on_mesh
@@ -28,7 +28,7 @@ CLAMP_MAX_ALPHA = 1 / 3
 
 
 def reflection(
-    points: ShadingPoints, around: Surroundings, diffuse: Diffuse, accuracy: Accuracy
+    points: ShadingPoints, around: TraceContext, diffuse: Diffuse, accuracy: Accuracy
 ) -> ShadingPoints:
     """`points` with the visibility (mi.Float, 0 … 1, detached) and indirect light that `accuracy` asks for.
 

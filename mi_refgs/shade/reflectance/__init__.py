@@ -5,7 +5,7 @@ from mi_refgs.shade.reflectance.model import (
     MODELS,
     Reflectance,
     SurfelView,
-    Surroundings,
+    TraceContext,
     register,
     unregister,
 )
@@ -16,4 +16,4 @@ register(mirror.Mirror())
 register(gaussian_shader.GaussianShader())
 register(monte_carlo.MonteCarlo())
 
-__all__ = ["MODELS", "Reflectance", "SurfelView", "Surroundings", "register", "unregister"]
+__all__ = ["MODELS", "Reflectance", "SurfelView", "TraceContext", "register", "unregister"]

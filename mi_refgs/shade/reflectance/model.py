@@ -34,7 +34,7 @@ class SurfelView:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class TraceContext:
     """What rays from shaded points may meet, and where the points come from."""
 
     occluder: Occluder
@@ -83,7 +83,7 @@ class Reflectance:
         """
         raise NotImplementedError
 
-    def trace(self, points: ShadingPoints, around: Surroundings, shading: Shading) -> ShadingPoints:
+    def trace(self, points: ShadingPoints, around: TraceContext, shading: Shading) -> ShadingPoints:
         """The points with what rays find, where `shading.occlusion` asks for it: here the visibility of the
         mirror direction."""
         visibility = mirror_visibility(

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.shade.points import ShadingPoints, Terms, safe_normalize
-from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, Surroundings
+from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, TraceContext
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
 
@@ -56,7 +56,7 @@ class MonteCarlo(Reflectance):
             values["incident"] = surfels.value("indirect_sh")
         return values
 
-    def trace(self, points: ShadingPoints, around: Surroundings, shading: Shading) -> ShadingPoints:
+    def trace(self, points: ShadingPoints, around: TraceContext, shading: Shading) -> ShadingPoints:
         """The points with `free` (mi.UInt64, detached): bit j says that light arrives from direction j."""
         count = dr.opaque(mi.UInt32, shading.accuracy.directions)
         normal, position = dr.detach(safe_normalize(points.normal)), dr.detach(around.origin)

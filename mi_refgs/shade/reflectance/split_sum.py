@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from mi_refgs.shade import split_sum
 from mi_refgs.shade.ambient import ambient_of_pixels
 from mi_refgs.shade.points import ShadingPoints, Terms, reflect
-from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, Surroundings
+from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, TraceContext
 from mi_refgs.shade.reflection import reflection
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
@@ -51,7 +51,7 @@ class SplitSum(Reflectance):
     def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
         return split_sum.shade(points, light, shading.diffuse, shading.accuracy)
 
-    def trace(self, points: ShadingPoints, around: Surroundings, shading: Shading) -> ShadingPoints:
+    def trace(self, points: ShadingPoints, around: TraceContext, shading: Shading) -> ShadingPoints:
         points = reflection(points, around, shading.diffuse, shading.accuracy)
         if not shading.accuracy.ambient_rays:
             return points
