@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from scipy.interpolate import PchipInterpolator
 from skimage import measure
 
 Distance = Callable[[np.ndarray], np.ndarray]
@@ -125,6 +126,46 @@ def cup(p: np.ndarray) -> np.ndarray:
     return union(body, np.maximum(handle, flare - 0.05 - radius), 0.06)
 
 
+def lathe(profile: np.ndarray, sections: int = 96, rows: int = 64) -> trimesh.Trimesh:
+    """Surface of revolution around z of a smooth curve through points (N, 2) of radius and height, upwards.
+
+    Both ends lie on the axis.
+    """
+    at = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
+    curve = PchipInterpolator(at, profile)
+    t = np.linspace(0, at[-1], rows)
+    (radius, height), (slope, rise) = curve(t).T, curve(t, 1).T
+    angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+    def turned(out: np.ndarray, up: np.ndarray) -> np.ndarray:
+        flat = out[:, None, None] * around
+        return np.concatenate([flat, np.broadcast_to(up[:, None, None], (rows, sections, 1))], axis=-1)
+
+    vertices, normals = turned(radius, height), turned(rise, -slope)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    row, side = np.meshgrid(np.arange(rows - 1), np.arange(sections), indexing="ij")
+    a, b = row * sections + side, row * sections + (side + 1) % sections
+    faces = np.concatenate(
+        [
+            np.stack([a, b, b + sections], -1).reshape(-1, 3),
+            np.stack([a, b + sections, a + sections], -1).reshape(-1, 3),
+        ]
+    )
+    return trimesh.Trimesh(
+        vertices.reshape(-1, 3), faces, vertex_normals=normals.reshape(-1, 3), process=False
+    )
+
+
+def jug() -> trimesh.Trimesh:
+    """The body of a jug with a closed lid, from z = -0.6 to 0.5."""
+    profile = [
+        (0, -0.6), (0.3, -0.6), (0.36, -0.58), (0.47, -0.42), (0.5, -0.22), (0.44, 0.02), (0.31, 0.2), (0.27, 0.3),
+        (0.3, 0.38), (0.29, 0.42), (0.2, 0.47), (0, 0.5),
+    ]  # fmt: skip
+    return lathe(np.array(profile))
+
+
 def brick(columns: int, rows: int) -> trimesh.Trimesh:
     """A building brick, open below: walls, a lid with studs, tubes between the studs. A stud a unit, z up."""
     wall, height, stud = 0.16, 1.2, (0.3, 0.22)
@@ -157,6 +198,7 @@ def main() -> None:
     target = Path(__file__).parent / "meshes"
     target.mkdir(exist_ok=True)
     meshes = {"torus": torus(0.82, 0.18), "trefoil": trefoil(0.27, 0.16), "rounded_cube": rounded_cube()}
+    meshes |= {"jug": jug(), "handle": torus(0.24, 0.055, 64, 20)}
     meshes |= {"hollow_block": surface(hollow_block, 0.75, 30), "shell": surface(shell, 0.95, 38)}
     whole = surface(cup, 0.9, 50)
     centres = whole.triangles_center
