@@ -1,9 +1,9 @@
-"""Makes scenes/textures/*.png, the printed surfaces of the furnished room: wood, a cloth, a rug, paper, posters.
+"""Makes scenes/textures/*.png, the printed surfaces of the furnished room: wood, cloth, rug, paper, posters.
 
 Run from the repository root: python scenes/make_textures.py
 
-Every texture is drawn from a seed. None repeats itself, so that pictures of the room can be matched by what they
-show.
+Every texture is drawn from a seed. None repeats itself, so that pictures of the room can be matched by what
+they show.
 """
 
 from __future__ import annotations
