@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,9 @@ SRGB_ENCODED_LIMIT = 0.04045
 """The same point after encoding."""
 ALPHA_FLOOR = 1e-8
 """Alpha that radiance is divided by at least: what covers so little has no colour."""
+
+JPEG_SHRINK = 8
+"""A JPEG file's blocks have 8 × 8 pixels: its decoder can give 8, 4, 2 or 1 pixels a side for each."""
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -74,13 +78,41 @@ def read_png(path: str | Path) -> np.ndarray:
 
     Raises InputError if the file is missing, unreadable or has more than 8 bits per channel.
     """
+    return read_bytes(path)[0].astype(np.float32) / np.float32(255)
+
+
+def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
+    """8-bit image file (PNG, JPEG) as uint8 (H, W, 3 or 4), and the factor by which both sides are smaller.
+
+    The factor is the largest divisor of `shrink` by which the decoder shrinks for less than a whole decoding
+    costs: of a JPEG file 2, 4 or 8, of others 1. A last block of fewer pixels counts as one, too. Raises
+    InputError as `read_png` does.
+    """
     path = Path(path)
     with _open_picture(path) as picture:
         if picture.mode.startswith(("I", "F")):
             raise InputError(f"{path}: pixels: more than 8 bits per channel; save it as 8-bit PNG or EXR")
+        factor = math.gcd(shrink, JPEG_SHRINK) if picture.format == "JPEG" else 1
+        if factor > 1:
+            picture.draft(None, tuple(max(side // factor, 1) for side in picture.size))
         transparent = picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
-        pixels = np.asarray(picture.convert("RGBA" if transparent else "RGB"))
-    return pixels.astype(np.float32) / np.float32(255)
+        return np.asarray(picture.convert("RGBA" if transparent else "RGB")), factor
+
+
+def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
+    """Brightness (H, W) of a PNG or JPEG of 8 or 16 bits, times its alpha; and the number that means white.
+
+    White is 1 where no number is larger: such a file holds labels. Raises InputError if the file is missing
+    or unreadable.
+    """
+    path = Path(path)
+    with _open_picture(path) as picture:
+        if picture.mode.startswith("I"):
+            return np.asarray(picture), 65535
+        grey, alpha = np.moveaxis(np.asarray(picture.convert("LA")), -1, 0)
+    if not (alpha == 255).all():
+        grey = np.round(grey * (alpha / np.float32(255))).astype(np.uint8)
+    return grey, 255 if grey.max() > 1 else 1
 
 
 @contextlib.contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,12 @@ import numpy as np
 from mi_refgs.constants import MAX_NUMBER, RIGID_TOLERANCE
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import is_file
-from mi_refgs.data.lens import Lens, Undistortion, undistortion
+from mi_refgs.data.lens import Lens, Undistortion
+from mi_refgs.data.picture_files import PictureFile, make_view
 from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.view import View
 from mi_refgs.exr import read_exr_image
-from mi_refgs.images import box_downscale, image_size, read_png
+from mi_refgs.images import box_downscale, image_size
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 """File name endings that `file_path` may carry or leave out, in the order in which they are tried."""
@@ -44,14 +45,12 @@ class FrameReader:
     def read(self, index: int, frame: Any) -> View:
         file = self._file(index, frame)
         to_world = self._to_world(index, frame)
-        premultiplied, alpha, source = self._picture(file)
-        height, width = premultiplied.shape[:2]
-        fx, fy, cx, cy = (x / self.options.downscale for x in self._intrinsics(frame, file, *source))
-        straight = self._undistortion(index, frame, (width, height, fx, fy, cx, cy))
-        if straight is not None:
-            fx, fy = fx * straight.zoom, fy * straight.zoom
-            premultiplied = straight.resample(premultiplied)
-            alpha = None if alpha is None else straight.resample(alpha[..., None])[..., 0]
+        picture = PictureFile.find(file, self.options.downscale)
+        intrinsics = self._intrinsics(frame, file, picture.height, picture.width)
+        where, name = f"{self.transforms}: frames[{index}]: k1 … p2", _stem(str(Path(frame["file_path"])))
+        lens = self._lens(frame)
+        view, straight = make_view(name, picture, self.options, intrinsics, lens, to_world, where)
+        source = (picture.height, picture.width)
         normal = self._map(index, frame, "normal_path", (*source, 3), straight)
         depth = self._map(index, frame, "depth_path", (*source, 1), straight)
         channels = {"albedo": 4, "roughness": 2, "metallic": 2}
@@ -59,22 +58,10 @@ class FrameReader:
         if normal is not None:
             length = np.linalg.norm(normal, axis=-1, keepdims=True)
             normal = np.where(length > 0, normal / np.maximum(length, 1e-12), 0).astype(np.float32)
-        if alpha is not None:
-            premultiplied += (1 - alpha[..., None]) * np.float32(self.options.background)
-        return View(
-            name=_stem(str(Path(frame["file_path"]))),
-            width=width,
-            height=height,
-            fx=fx,
-            fy=fy,
-            cx=cx,
-            cy=cy,
-            to_world=to_world,
-            image=premultiplied,
-            alpha=alpha,
+        return replace(
+            view,
             normal=normal,
             depth=None if depth is None else depth[..., 0],
-            linear=self.options.images == "exr",
             materials={name: values for name, values in known.items() if values is not None},
         )
 
@@ -113,26 +100,6 @@ class FrameReader:
                 "data set's folder; move the file there and give its relative path"
             )
         return self.transforms.parent / inside
-
-    def _picture(self, file: Path) -> tuple[np.ndarray, np.ndarray | None, tuple[int, int]]:
-        """Premultiplied colour and alpha at the wanted size, and the rows and columns of the file."""
-        if self.options.images == "exr":
-            pixels = read_exr_image(file)
-            if pixels.shape[-1] < 3:
-                raise InputError(f"{file}: channels: no R, G, B; export a colour picture")
-        else:
-            pixels = read_png(file)
-            if pixels.shape[-1] == 4:
-                pixels[..., :3] *= pixels[..., 3:]
-        height, width = pixels.shape[:2]
-        if min(width, height) < self.options.downscale:
-            raise InputError(
-                f"{file}: downscale: {width} × {height} pixels are less than a block of {self.options.downscale}²; "
-                "give a smaller number"
-            )
-        small = box_downscale(pixels, self.options.downscale)
-        alpha = np.ascontiguousarray(small[..., 3]) if small.shape[-1] == 4 else None
-        return np.ascontiguousarray(small[..., :3]), alpha, (height, width)
 
     def _map(
         self,
@@ -199,10 +166,8 @@ class FrameReader:
             raise InputError(f"{self.transforms}: {key}: {shown(value)} is not a number; correct it")
         return float(value)
 
-    def _undistortion(
-        self, index: int, frame: dict[str, Any], view: tuple[int, int, float, float, float, float]
-    ) -> Undistortion | None:
-        """How to undo the lens of a frame, whose size and intrinsics are given; None for a pinhole."""
+    def _lens(self, frame: dict[str, Any]) -> Lens | None:
+        """The lens of a frame; None for a pinhole."""
         model = self._given(frame, "camera_model") or "OPENCV"
         fisheye = self._given(frame, "is_fisheye") or False
         odd = [key for key in OTHER_LENSES if self._given(frame, key)]
@@ -221,11 +186,7 @@ class FrameReader:
             )
         if not (fisheye or any((k1, k2, k3, p1, p2))):
             return None
-        lens = Lens(fisheye, (k1, k2, k3, k4) if fisheye else (k1, k2, k3), (p1, p2))
-        try:
-            return undistortion(lens, *view)
-        except InputError as error:
-            raise InputError(f"{self.transforms}: frames[{index}]: k1 … p2: {error}") from None
+        return Lens(fisheye, (k1, k2, k3, k4) if fisheye else (k1, k2, k3), (p1, p2))
 
     def _intrinsics(
         self, frame: dict[str, Any], file: Path, height: int, width: int

@@ -56,7 +56,7 @@ class Lens:
         return 1 + total
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Undistortion:
     """How to resample pictures of one lens: the same size and principal point, the focal length × zoom.
 
@@ -64,17 +64,32 @@ class Undistortion:
     beyond the result's edges (barrel distortion, fisheye) is left out.
     """
 
+    lens: Lens
+    camera: tuple[int, int, float, float, float, float]  # of the distorted picture: as in `undistortion`
     zoom: float
-    rows: np.ndarray  # (H, W) row of each pixel in the distorted picture; the first pixel's centre is 0
-    columns: np.ndarray  # (H, W)
 
     def resample(self, image: np.ndarray, order: int = 3) -> np.ndarray:
         """An (H, W, C) image seen without the lens; splines of `order`, within the channel's own range."""
-        planes = []
+        planes, places = [], _places(self)
         for plane in np.moveaxis(image, -1, 0):
-            moved = ndimage.map_coordinates(plane, (self.rows, self.columns), order=order, mode="nearest")
+            moved = ndimage.map_coordinates(plane, places, order=order, mode="nearest")
             planes.append(np.clip(moved, plane.min(), plane.max()))
         return np.stack(planes, axis=-1)
+
+    def source(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Columns and rows in the distorted picture of those in the result; 0 is the first pixel's centre."""
+        _, _, fx, fy, cx, cy = self.camera
+        x, y = (columns + 0.5 - cx) / (self.zoom * fx), (rows + 0.5 - cy) / (self.zoom * fy)
+        x, y = self.lens.distort(x, y)
+        return fx * x + cx - 0.5, fy * y + cy - 0.5
+
+
+@lru_cache(maxsize=4)
+def _places(straight: Undistortion) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column in the distorted picture, (H, W) each, of every pixel of the result."""
+    width, height = straight.camera[:2]
+    columns, rows = straight.source(*np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)))
+    return rows, columns
 
 
 @lru_cache(maxsize=4)
@@ -86,17 +101,15 @@ def undistortion(
     Raises InputError, without a file's name, where no zoom up to MAX_ZOOM gives every pixel data.
     """
 
-    def source(columns: np.ndarray, rows: np.ndarray, zoom: float) -> tuple[np.ndarray, np.ndarray]:
-        x, y = lens.distort((columns + 0.5 - cx) / (zoom * fx), (rows + 0.5 - cy) / (zoom * fy))
-        return fx * x + cx - 0.5, fy * y + cy - 0.5
-
+    camera = (width, height, fx, fy, cx, cy)
     across, down = np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID))
     step = 1e-3  # pixels, for the derivatives
 
     def valid(zoom: float) -> bool:
         """Whether the image lies inside the picture and the lens does not fold it."""
-        u, v = source(across, down, zoom)
-        right, below = source(across + step, down, zoom), source(across, down + step, zoom)
+        source = Undistortion(lens, camera, zoom).source
+        u, v = source(across, down)
+        right, below = source(across + step, down), source(across, down + step)
         turn = (right[0] - u) * (below[1] - v) - (right[1] - v) * (below[0] - u)
         inside = u.min() >= -step and v.min() >= -step
         return bool(
@@ -115,6 +128,4 @@ def undistortion(
         for _ in range(ZOOM_STEPS if high > low else 0):
             middle = (low + high) / 2
             low, high = (low, middle) if valid(middle) else (middle, high)
-    grid_columns, grid_rows = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-    columns, rows = source(grid_columns, grid_rows, high)
-    return Undistortion(high, rows, columns)
+    return Undistortion(lens, camera, high)

@@ -1,0 +1,155 @@
+"""Where a picture lies, and how its file becomes the pixels of a view: one way for every reader.
+
+A file is decoded, its colour multiplied by alpha (its own, or a mask's), averaged over blocks of `downscale` pixels
+squared, resampled without the lens and laid onto the background. The rows and columns of the file count as they
+lie there: an orientation in its EXIF data turns nothing, as in COLMAP.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mi_refgs.data.lens import Lens, Undistortion, undistortion
+from mi_refgs.data.readers import ReadOptions
+from mi_refgs.data.view import View
+from mi_refgs.errors import InputError
+from mi_refgs.exr import read_exr_image
+from mi_refgs.images import box_downscale, image_size, read_bytes, read_grey
+
+BAND = 256
+"""Rows of a file that are floating-point numbers at a time: of a large picture all would be half a gigabyte."""
+
+
+@dataclass(frozen=True)
+class Mask:
+    """A picture of the size of another that says where the object is."""
+
+    path: Path
+    below: int | None = None
+    """Without it, brightness is alpha. With it, alpha is 1 where the file's own number, such as a depth of 16 bits,
+    is less, and 0 elsewhere."""
+
+    def read(self) -> np.ndarray:
+        """Alpha (H, W) float32."""
+        grey, largest = read_grey(self.path)
+        if self.below is not None:
+            return (grey < self.below).astype(np.float32)
+        return grey.astype(np.float32) / np.float32(largest)
+
+
+@dataclass(frozen=True)
+class PictureFile:
+    """A picture in a file, and what is done to it."""
+
+    path: Path
+    width: int  # pixels, of the file
+    height: int
+    downscale: int = 1
+    mask: Mask | None = None
+    straight: Undistortion | None = None  # of the averaged picture
+
+    @classmethod
+    def find(cls, path: Path, downscale: int, mask: Mask | None = None) -> PictureFile:
+        """The picture in a file, of which only the header is read.
+
+        Raises InputError for a file of no use, and for one of less than a block of pixels.
+        """
+        width, height = image_size(path)
+        if min(width, height) < downscale:
+            raise InputError(
+                f"{path}: downscale: {width} × {height} pixels are less than a block of {downscale}²; "
+                "give a smaller number"
+            )
+        return cls(path, width, height, downscale, mask)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the view's picture."""
+        return self.width // self.downscale, self.height // self.downscale
+
+    def read(self, background: float) -> tuple[np.ndarray, np.ndarray | None]:
+        """Colour (H, W, 3) on the background and alpha (H, W) or None, float32; sRGB-encoded, of EXR files linear.
+
+        Raises InputError for a file that cannot be read, or a mask of another size.
+        """
+        small = self._averaged()
+        if self.straight is not None:
+            small = self.straight.resample(small)
+        colour = np.ascontiguousarray(small[..., :3])
+        if small.shape[-1] == 3:
+            return colour, None
+        alpha = np.ascontiguousarray(small[..., 3])
+        colour += (1 - alpha[..., None]) * np.float32(background)
+        return colour, alpha
+
+    def _averaged(self) -> np.ndarray:
+        """Premultiplied colour, with alpha where there is one, of the averaged picture."""
+        linear = self.path.suffix.lower() == ".exr"
+        if linear:
+            pixels, factor = read_exr_image(self.path), 1
+            if pixels.shape[-1] < 3:
+                raise InputError(f"{self.path}: channels: no R, G, B; export a colour picture")
+        else:
+            pixels, factor = read_bytes(self.path, 1 if self.mask else self.downscale)
+        mask = self._mask()
+        width, height = self.size
+        block = self.downscale // factor
+        bands, step = [], max(BAND // block, 1)
+        for top in range(0, height, step):
+            rows = slice(top * block, min(top + step, height) * block)
+            band = pixels[rows, : width * block]
+            if not linear:
+                band = band.astype(np.float32) / np.float32(255)
+            if mask is not None:
+                covered = mask[rows, : width * block, None]
+                covered = covered * band[..., 3:] if band.shape[-1] == 4 else covered
+                band = np.concatenate([band[..., :3], covered], axis=-1)
+            if band.shape[-1] == 4 and (mask is not None or not linear):
+                band[..., :3] *= band[..., 3:]
+            bands.append(box_downscale(band, block))
+        return np.concatenate(bands)
+
+    def _mask(self) -> np.ndarray | None:
+        """Alpha from the mask, at the file's size."""
+        if self.mask is None:
+            return None
+        alpha = self.mask.read()
+        if alpha.shape != (self.height, self.width):
+            raise InputError(
+                f"{self.mask.path}: mask: {alpha.shape[1]} × {alpha.shape[0]} pixels, but {self.path.name} has "
+                f"{self.width} × {self.height}; make both of one size"
+            )
+        return alpha
+
+
+def make_view(
+    name: str,
+    picture: PictureFile,
+    options: ReadOptions,
+    intrinsics: tuple[float, float, float, float],
+    lens: Lens | None,
+    to_world: np.ndarray,
+    where: str,
+) -> tuple[View, Undistortion | None]:
+    """The view of a picture, and how maps of the averaged picture's size are undistorted like it.
+
+    `intrinsics` are fx, fy, cx, cy in pixels of the file; `to_world` as in `View`. Raises InputError, which
+    begins with `where`, for a lens that cannot be undone.
+    """
+    width, height = picture.size
+    fx, fy, cx, cy = (value / picture.downscale for value in intrinsics)
+    straight = None
+    if lens is not None:
+        try:
+            straight = undistortion(lens, width, height, fx, fy, cx, cy)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        fx, fy = fx * straight.zoom, fy * straight.zoom
+        picture = replace(picture, straight=straight)
+    image, alpha = picture.read(options.background)
+    linear = options.images == "exr"
+    view = View(name, width, height, fx, fy, cx, cy, to_world, image, alpha, None, None, linear)
+    return view, straight
