@@ -61,6 +61,10 @@ def test_maps_against_the_oracle(maps: tuple[np.ndarray, np.ndarray, np.ndarray]
     grown = expected**4 - roughness**4
     assert (grown[alpha < 1e-3] == 0).all() and grown.max() == pytest.approx(0.18)
     assert 1e-4 < np.median(grown[alpha > 1e-3]) < 1e-2
+    rough = np.full_like(roughness, 0.99)
+    expected = oracle.widened(rough, normal, alpha)
+    np.testing.assert_allclose(found(upload(rough), normal, alpha), expected.ravel(), atol=2e-6)
+    assert expected.max() == 1
     flat = np.tile([0.0, 0, 2], (*alpha.shape, 1))
     np.testing.assert_array_equal(found(upload(roughness), flat, alpha), np.float32(roughness).ravel())
 

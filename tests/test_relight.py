@@ -261,8 +261,14 @@ def test_the_command(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture)
 
 def test_a_fitted_colour_is_warned_of(folder: Path, tmp_path: Path) -> None:
     run = write_known_run(folder / "data", tmp_path / "run", diffuse="sh")
-    relit = relight(run, NewLight(folder / "dusk.exr"), turntable=1)
+    relit = relight(run, NewLight(folder / "dusk.exr"), turntable=2)
     assert "--for relighting" in relit.warning and (tmp_path / "run/relight/dusk/sheet.png").is_file()
+    turned = relight(run, NewLight(folder / "dusk.exr", rotate=90, exposure=-1), turntable=1).result
+    assert Path(turned["output"]) == tmp_path / "run/relight/dusk_r90_e-1"
+    # Fewer frames leave none of the old ones behind.
+    relight(run, NewLight(folder / "dusk.exr"), turntable=1)
+    frames = (tmp_path / "run/relight/dusk/turntable").glob("*.png")
+    assert [frame.name for frame in frames] == ["t_000.png"]
 
 
 def test_what_cannot_be_relit(folder: Path, tmp_path: Path) -> None:

@@ -23,5 +23,5 @@ def widened(roughness: np.ndarray, normal: np.ndarray, alpha: np.ndarray) -> np.
                         other = normal[j, i] / np.linalg.norm(normal[j, i])
                         turns.append(float(np.sum((own - other) ** 2)))
                 total += min(turns, default=0.0)
-            out[y, x] = (roughness[y, x] ** 4 + min(total / 12, 0.18)) ** 0.25
+            out[y, x] = min(roughness[y, x] ** 4 + min(total / 12, 0.18), 1.0) ** 0.25
     return out

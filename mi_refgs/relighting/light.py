@@ -44,6 +44,12 @@ class NewLight:
                 f"degrees, and stops from {-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
             )
 
+    @property
+    def suffix(self) -> str:
+        """What tells pictures under this light from those under the map as it is: "_r90_e-1", or nothing."""
+        turned = f"_r{self.rotate:g}" if self.rotate % 360 else ""
+        return turned + (f"_e{self.exposure:+g}" if self.exposure else "")
+
     def read(self) -> EnvironmentLight:
         """The light, of at most HEIGHT rows; raises InputError for a file that is no lat-long image."""
         import mitsuba as mi

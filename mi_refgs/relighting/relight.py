@@ -65,7 +65,9 @@ def relight(
     samples: int = 1,
     progress: bool = False,
 ) -> Relit:
-    """Render the scene of a run under another light into the folder `out` (RUN/relight/NAME by default).
+    """Render the scene of a run under another light into a folder.
+
+    `out` is RUN/relight/NAME by default, with the rotation and the exposure in its name if they are set.
 
     The scene becomes materials alone (`runs.relightable`): diffuse light is the new light's irradiance, with
     the mesh's shadows and bounces; mirrors are traced. The views are the test views of the run's data set,
@@ -87,7 +89,7 @@ def relight(
     except InputError as error:
         raise InputError(f"{run.path}: {error}") from error
     name = light.path.parent.name if known is not None else light.path.stem
-    out = run.path / "relight" / name if out is None else out
+    out = run.path / "relight" / f"{name}{light.suffix}" if out is None else out
     shot = turntable_views(scene, views.views, turntable) if turntable else views.views
     kind = "turntable" if turntable else "test"
     _prepare(out, kind)
@@ -147,12 +149,19 @@ def _prepare(out: Path, kind: str) -> None:
         )
     try:
         (out / kind).mkdir(parents=True, exist_ok=True)
+        for stale in (out / kind).glob(f"{_letter(kind)}_*.*"):  # of more views, or another data set
+            stale.unlink()
     except OSError as error:
         raise cannot_write(out, error) from error
 
 
 def _names(kind: str, count: int) -> list[str]:
-    return [f"{kind[0] if kind != 'test' else 'r'}_{i:03d}.png" for i in range(count)]
+    return [f"{_letter(kind)}_{i:03d}.png" for i in range(count)]
+
+
+def _letter(kind: str) -> str:
+    """With which the names of pictures begin; test views have the names of a data set."""
+    return "r" if kind == "test" else kind[0]
 
 
 def _render(

@@ -27,10 +27,10 @@ def widened(roughness: Any, normal: Any, alpha: Any, camera: Camera) -> Any:
     """Roughness (mi.Float) of what a whole pixel sees, for one that its centre sees; under AD.
 
     With α = roughness², α² grows by the variance of the unit normals in the pixel, (|∂n/∂x|² + |∂n/∂y|²) / 12
-    for derivatives by pixels, MAX_VARIANCE at most. Of the differences to both neighbours of an axis the
-    smaller counts, so that an edge is no curvature; pixels that see nothing (COVERAGE_FLOOR) are no
-    neighbours. normal: blended normals, raster order, of any length. Its derivative is left out: by it a
-    fit would bend normals to blur its reflections.
+    for derivatives by pixels, MAX_VARIANCE at most, and to 1 at most. Of the differences to both neighbours
+    of an axis the smaller counts, so that an edge is no curvature; pixels that see nothing (COVERAGE_FLOOR)
+    are no neighbours. normal: blended normals, raster order, of any length. Its derivative is left out: by it
+    a fit would bend normals to blur its reflections.
 
     The slopes of facets have the variance α²/2 along each axis, and those of their mean plane add up.
     [Kaplanyan et al. 2016, "Filtering Distributions of Normals for Shading Antialiasing"; isotropic and with
@@ -41,7 +41,7 @@ def widened(roughness: Any, normal: Any, alpha: Any, camera: Camera) -> Any:
         variance = PIXEL_VARIANCE * _squared_turn(safe_normalize(normal), alpha > COVERAGE_FLOOR, camera)
         variance = dr.minimum(variance, MAX_VARIANCE)
     turned = variance > 0
-    α2 = dr.square(dr.square(roughness)) + variance
+    α2 = dr.minimum(dr.square(dr.square(roughness)) + variance, 1)
     # √√ has no slope at 0, where a mirror on flat ground stays what it is.
     return dr.select(turned, dr.sqrt(dr.sqrt(dr.select(turned, α2, 1))), roughness)
 
