@@ -169,7 +169,7 @@ def test_constant_environment() -> None:
 
 def test_cameras_are_seeded_and_spread() -> None:
     def poses(seed: int) -> np.ndarray:
-        return pathtrace.camera_poses(60, CENTRE, 4.0, (-30, 80), np.random.default_rng(seed))
+        return pathtrace.camera_poses(60, CENTRE, (4.0, 4.0), (-30, 80), np.random.default_rng(seed))
 
     first = poses(1)
     np.testing.assert_array_equal(first, poses(1))
@@ -248,8 +248,8 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
 
 def test_passes_average(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = mi.load_string(SCENE)
-    pose = pathtrace.camera_poses(1, CENTRE, 3.0, (0, 30), np.random.default_rng(0))[0]
-    options: dict[str, Any] = {"size": 8, "fov": 30, "spp": 64, "max_depth": 3, "near": 0.1, "far": 50}
+    pose = pathtrace.camera_poses(1, CENTRE, (3.0, 3.0), (0, 30), np.random.default_rng(0))[0]
+    options: dict[str, Any] = {"size": (8, 8), "fov": 30, "spp": 64, "max_depth": 3, "near": 0.1, "far": 50}
     whole = pathtrace.Tracer(scene, **options).picture(pose, 5)
     monkeypatch.setattr(pathtrace, "SAMPLES_PER_LAUNCH", 8 * 8 * 16)
     split = pathtrace.Tracer(scene, **options)
@@ -306,7 +306,7 @@ def test_example_scenes(name: str) -> None:
     image = np.array(mi.render(scene))
     assert image.shape == (8, 8, 4) and np.isfinite(image).all()
     assert image[0, 0, 3] == 0 and image[3:5, 3:5, 3].min() > 0.5
-    centre, radius = pathtrace.bounding_sphere(scene)
+    centre, radius = pathtrace.bounding_sphere(scene.shapes())
     assert np.abs(centre).max() < 0.2 and 0.8 < radius < 1.15
     assert scene.environment() is not None and len(scene.emitters()) == 1
     used = {e.get("value") or "" for e in ElementTree.parse(SCENES / f"{name}.xml").iter("string")}

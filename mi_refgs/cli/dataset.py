@@ -18,7 +18,7 @@ def add(commands: Any) -> None:
     )
     parser = add_command(commands, "dataset", summary, EXAMPLE, run)
     parser.add_argument(
-        "scene", type=Path, metavar="SCENE.xml", help="a Mitsuba scene with an environment emitter"
+        "scene", type=Path, metavar="SCENE.xml", help="a Mitsuba scene with an environment emitter, or lamps"
     )
     add_output(parser, "folder of the data set; what an interrupted run left is continued", "DIR")
     parser.add_argument(
@@ -28,7 +28,28 @@ def add(commands: Any) -> None:
         "--test-views", type=int, metavar="N", help="test views (default: a quarter of --views)"
     )
     parser.add_argument(
-        "--size", type=int, default=160, metavar="S", help="pixels a side (default %(default)s)"
+        "--size",
+        type=_size,
+        default=160,
+        metavar="S",
+        help="pixels a side, or WIDTHxHEIGHT (default %(default)s)",
+    )
+    parser.add_argument(
+        "--object",
+        nargs="+",
+        default=[],
+        metavar="ID",
+        help="shapes that an open scene is about: pictures without transparency, truth of these alone",
+    )
+    parser.add_argument(
+        "--distance",
+        type=float,
+        nargs=2,
+        metavar=("NEAR", "FAR"),
+        help="cameras from the object's centre, scene units (default: as far as to show it whole)",
+    )
+    parser.add_argument(
+        "--colmap", type=Path, metavar="DIR", help="write the same as COLMAP's text files, too, with points"
     )
     parser.add_argument(
         "--spp", type=int, default=128, metavar="N", help="samples per pixel (default %(default)s)"
@@ -48,7 +69,11 @@ def add(commands: Any) -> None:
         help="camera heights, degrees",
     )
     parser.add_argument(
-        "--fov", type=float, default=40.0, metavar="DEG", help="field of view (default %(default)s)"
+        "--fov",
+        type=float,
+        default=40.0,
+        metavar="DEG",
+        help="field of view of the shorter side (default %(default)s)",
     )
     parser.add_argument(
         "--light",
@@ -69,6 +94,15 @@ def add(commands: Any) -> None:
     )
 
 
+def _size(text: str) -> int | tuple[int, int]:
+    """Pixels a side, or width and height."""
+    parts = text.lower().split("x")
+    if len(parts) > 2 or not all(part.isdecimal() and int(part) for part in parts):
+        raise argparse.ArgumentTypeError(f"{text!r}: give pixels a side, or WIDTHxHEIGHT")
+    numbers = [int(part) for part in parts]
+    return numbers[0] if len(parts) == 1 else (numbers[0], numbers[1])
+
+
 def run(args: argparse.Namespace) -> Result:
     """Trace the views."""
     from mi_refgs.data.make_dataset import make_dataset
@@ -86,6 +120,9 @@ def run(args: argparse.Namespace) -> Result:
         fov=args.fov,
         light=args.light,
         relight=args.relight,
+        objects=args.object,
+        distance=args.distance,
+        colmap=args.colmap,
         overwrite=args.overwrite,
     )
     counts = {split: len(list((folder / split).glob("r_*.png"))) for split in ("train", "test")}

@@ -12,11 +12,14 @@ A data set folder holds
     train/r_000_metallic.exr   Y: 0 … 1
     environment.exr    lat-long radiance of the environment, as a Mitsuba `envmap` without `to_world` shows it
     surface.ply        triangles of all shapes, world space
+    region.json        of an open scene: a sphere around the object
     relight/NAME/      the test views under another light, a data set with a test split: test/r_000.png and .exr,
                        environment.exr, transforms_test.json
     dataset.json       the settings, which decide whether a folder may be resumed; and further lights
 
-Maps are 0 off the object.
+Maps are 0 off the object. Of an open scene, an object in its surroundings, pictures are RGB without alpha, and
+maps, materials and surface are those of the object alone; there is no environment.exr, because a room is not lit
+by what is far away alone.
 """
 
 from __future__ import annotations
@@ -26,10 +29,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.data.pathtrace import bounding_sphere
+from mi_refgs.data.open_scene import check_cameras, named_shapes, region_around, write_region
+from mi_refgs.data.pathtrace import bounding_sphere, reach
 from mi_refgs.data.scene_file import LightFile, load_scene, scene_hash, under_light
 from mi_refgs.data.settings import RELIGHT, SURFACE, Settings, prepare_folder
 from mi_refgs.data.surface import surface_mesh
+from mi_refgs.data.write_colmap import write_colmap
 from mi_refgs.data.write_views import Cameras, write_views
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
@@ -44,7 +49,7 @@ def make_dataset(
     out: str | Path,
     *,
     views: int = 80,
-    size: int = 160,
+    size: int | tuple[int, int] = 160,
     spp: int = 128,
     seed: int = 0,
     test_views: int | None = None,
@@ -55,6 +60,9 @@ def make_dataset(
     environment_height: int = 256,
     light: str | Path | None = None,
     relight: Sequence[str | Path] = (),
+    objects: Sequence[str] = (),
+    distance: tuple[float, float] | None = None,
+    colmap: str | Path | None = None,
     overwrite: bool = False,
     progress: bool = True,
 ) -> Path:
@@ -62,8 +70,12 @@ def make_dataset(
 
     Cameras sit on a sphere around the scene's bounding sphere and look at its centre, z up; training and test
     views are two lattices, evenly spread over the band of elevations, turned and jittered by the seed.
-    `test_views` is a quarter of `views` by default. The pixel filter is a box, the light is hidden from the
-    camera (alpha 0). `light` is a lat-long map (EXR, HDR) that takes the place of the scene's environment,
+    `test_views` is a quarter of `views` by default; `size` is width and height, or both as one, in pixels; `fov`
+    is that of the shorter side, degrees. Cameras stand so far away that the sphere fills the part `fill` of the
+    shorter side, or at random distances between the two of `distance`, scene units. The pixel filter is a box,
+    the light is hidden from the camera (alpha 0). With `objects`, ids of shapes, the scene is an open one: the
+    cameras look at those shapes from among the others. `colmap` is a folder for the same as COLMAP's text files
+    (`data.write_colmap`). `light` is a lat-long map (EXR, HDR) that takes the place of the scene's environment,
     turned as that is. The test views are traced once more under each map of `relight`, in a folder of its
     file's name without suffix. Needs a Dr.Jit variant to be set.
 
@@ -72,10 +84,11 @@ def make_dataset(
     that a folder holds.
 
     Raises InputError if the scene or a light cannot be loaded, a shape has no triangles (`data.surface`), a
-    setting makes no sense, the folder cannot be written, or it holds a data set of other settings or from
+    setting makes no sense, a camera does not see the object, the folder cannot be written, or it holds a data set of other settings or from
     elsewhere and `overwrite` is false.
     """
     scene, out = Path(scene), Path(out)
+    width, height = (size, 0) if isinstance(size, int) else size
     main = None if light is None else LightFile.of(Path(light))
     others = [LightFile.of(Path(path)) for path in relight]
     settings = Settings(
@@ -83,7 +96,8 @@ def make_dataset(
         scene_sha256=scene_hash(scene),
         views=views,
         test_views=max(1, views // 4) if test_views is None else test_views,
-        size=size,
+        size=width,
+        height=0 if height == width else height,
         spp=spp,
         seed=seed,
         max_depth=max_depth,
@@ -93,22 +107,37 @@ def make_dataset(
         environment_height=environment_height,
         light="" if main is None else main.path.name,
         light_sha256="" if main is None else main.sha256,
+        objects=tuple(objects),
+        distance=(0.0, 0.0) if distance is None else (float(distance[0]), float(distance[1])),
     )
     settings.check()
-    loaded = load_scene(scene)
+    if objects and others:
+        raise InputError(f"{scene}: --relight: an open scene keeps its lamps; leave it out, or --object")
+    loaded = load_scene(scene, whole=bool(objects))
+    about = named_shapes(loaded, objects, scene) if objects else []
+    shapes = about or loaded.shapes()
     lit = loaded if main is None else under_light(loaded, main.path)
     try:
-        vertices, faces = surface_mesh(loaded)
+        vertices, faces = surface_mesh(shapes)
     except InputError as error:
         raise InputError(f"{scene}: {error}") from error
     relit = [under_light(loaded, other.path) for other in others]  # read before anything is written
+    centre, radius = bounding_sphere(shapes)
+    cameras = Cameras(settings, centre, radius, reach(loaded.shapes(), centre) if about else radius, about)
+    region = region_around(centre, radius)
+    if about:
+        poses = np.stack([pose for split in ("train", "test") for pose, _ in cameras.of(split)])
+        check_cameras(loaded, about, region, poses, scene)
     prepare_folder(out, settings, overwrite, others)
-    centre, radius = bounding_sphere(loaded)
-    cameras = Cameras(settings, centre, radius)
+    if about:
+        write_region(out, region)
     if not (out / SURFACE).exists():
         voxel = 2 * radius / SURFACE_VOXELS
         write_mesh(out / SURFACE, Mesh(vertices.astype(np.float32), faces.astype(np.uint32), voxel))
-    write_views(out, ("train", "test"), cameras, cameras.tracer(lit), True, progress)
+    tracer = cameras.tracer(lit)
+    write_views(out, ("train", "test"), cameras, tracer, True, progress)
+    if colmap is not None:
+        write_colmap(Path(colmap), out, cameras, tracer)
     for other, scene_there in zip(others, relit, strict=True):
         folder = out / RELIGHT / other.name
         write_views(folder, ("test",), cameras, cameras.tracer(scene_there), False, progress)

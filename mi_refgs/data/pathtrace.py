@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,32 +22,44 @@ MAPS = {"normal": "XYZ", "depth": "Y", "albedo": "RGBA", "roughness": "YA", "met
 """Channels of the maps of a view; A is 1 where the BSDF defines the material, 0 where it does not."""
 
 
-def bounding_sphere(scene: Any) -> tuple[np.ndarray, float]:
+def bounding_sphere(shapes: Sequence[Any]) -> tuple[np.ndarray, float]:
     """Centre (3,) of the shapes' bounding box, and the radius around it that holds every surface."""
+    boxes = [shape.bbox() for shape in shapes]
+    low = np.min([np.array(box.min, dtype=np.float64) for box in boxes], axis=0)
+    high = np.max([np.array(box.max, dtype=np.float64) for box in boxes], axis=0)
+    centre = (low + high) / 2
+    return centre, reach(shapes, centre)
+
+
+def reach(shapes: Sequence[Any], centre: np.ndarray) -> float:
+    """The radius around a centre (3,) that holds every surface of the shapes."""
     import drjit as dr
     import mitsuba as mi
 
-    box = scene.bbox()
-    centre = (np.array(box.min, dtype=np.float64) + np.array(box.max, dtype=np.float64)) / 2
     side = math.isqrt(SURFACE_SAMPLES)
     x, y = dr.meshgrid(dr.linspace(mi.Float, 0, 1 - 1e-6, side), dr.linspace(mi.Float, 0, 1 - 1e-6, side))
     radius = 0.0
-    for shape in scene.shapes():
+    for shape in shapes:
         if shape.is_mesh():
             points = np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
         else:
             points = np.array(shape.sample_position(0.0, mi.Point2f(x, y)).p, dtype=np.float64).T
         radius = max(radius, float(np.linalg.norm(points - centre, axis=1).max()))
-    return centre, radius
+    return radius
 
 
 def camera_poses(
-    count: int, centre: np.ndarray, distance: float, elevation: tuple[float, float], rng: np.random.Generator
+    count: int,
+    centre: np.ndarray,
+    distance: tuple[float, float],
+    elevation: tuple[float, float],
+    rng: np.random.Generator,
 ) -> np.ndarray:
     """World-from-camera matrices (count, 4, 4) in Mitsuba's frame that look at `centre`, z up.
 
     A spherical Fibonacci lattice over the band of elevations (degrees): equal areas, turned by a random
-    azimuth and jittered by a third of its spacing.
+    azimuth and jittered by a third of its spacing. Each camera's distance from the centre is uniform between
+    the two given.
     """
     low, high = (math.sin(math.radians(e)) for e in elevation)
     jitter = rng.uniform(-1 / 3, 1 / 3, (count, 2))
@@ -55,12 +68,12 @@ def camera_poses(
     ring = np.sqrt(1 - z**2)
     azimuth = rng.uniform(0, 2 * math.pi) + GOLDEN_ANGLE * np.arange(count) + jitter[:, 1] * spacing / ring
     outward = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
-    return poses_around(outward, centre, distance)
+    return poses_around(outward, centre, rng.uniform(*distance, (count, 1)))
 
 
-def poses_around(outward: np.ndarray, centre: np.ndarray, distance: float) -> np.ndarray:
+def poses_around(outward: np.ndarray, centre: np.ndarray, distance: float | np.ndarray) -> np.ndarray:
     """World-from-camera matrices (N, 4, 4) in Mitsuba's frame, z up, that look at `centre` from unit `outward`
-    (N, 3) directions, none of them ±z."""
+    (N, 3) directions, none of them ±z; `distance` is one, or (N, 1)."""
     left = np.cross([0.0, 0.0, 1.0], -outward)
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     up = np.cross(-outward, left)
@@ -100,31 +113,46 @@ def environment_image(scene: Any, height: int) -> np.ndarray:
 
 
 class Tracer:
-    """One sensor that moves from view to view, so that each kernel is compiled once."""
+    """One sensor that moves from view to view, so that each kernel is compiled once.
+
+    `size` is width and height, `fov` that of the shorter side in degrees. Pictures have alpha, and emitters are
+    hidden, unless `objects` name shapes of an open scene: then pictures show all, and maps are of those shapes.
+    """
 
     def __init__(
-        self, scene: Any, *, size: int, fov: float, spp: int, max_depth: int, near: float, far: float
+        self,
+        scene: Any,
+        *,
+        size: tuple[int, int],
+        fov: float,
+        spp: int,
+        max_depth: int,
+        near: float,
+        far: float,
+        objects: Sequence[Any] = (),
     ) -> None:
         import mitsuba as mi
 
-        self.scene, self.size = scene, size
-        self.passes = -(-size * size * spp // SAMPLES_PER_LAUNCH)
+        self.scene, self.objects = scene, objects
+        self.width, self.height = size
+        self.passes = -(-self.width * self.height * spp // SAMPLES_PER_LAUNCH)
         # The sampler's own grid of strata: it would round up by itself, but warn each time.
         strata = math.isqrt(-(-spp // self.passes))
         self.spp = strata * -(-spp // (self.passes * strata))
-        self.integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
+        self.integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": not objects})
         self.sensor = mi.load_dict(
             {
                 "type": "perspective",
                 "fov": fov,
+                "fov_axis": "smaller",
                 "near_clip": near,
                 "far_clip": far,
                 "sampler": {"type": "multijitter"},
                 "film": {
                     "type": "hdrfilm",
-                    "width": size,
-                    "height": size,
-                    "pixel_format": "rgba",
+                    "width": self.width,
+                    "height": self.height,
+                    "pixel_format": "rgb" if objects else "rgba",
                     "component_format": "float32",
                     "rfilter": {"type": "box"},
                 },
@@ -133,13 +161,13 @@ class Tracer:
         self.params = mi.traverse(self.sensor)
 
     def picture(self, pose: np.ndarray, seed: int) -> np.ndarray:
-        """Premultiplied linear RGBA (H, W, 4) of one view."""
+        """Premultiplied linear RGBA (H, W, 4) of one view; of an open scene RGB (H, W, 3)."""
         import drjit as dr
         import mitsuba as mi
 
         self._look(pose)
         seeds = [seed, *np.random.SeedSequence(seed).generate_state(self.passes)[1:]]
-        image = np.zeros((self.size, self.size, 4))
+        image = np.zeros((self.height, self.width, 3 if self.objects else 4))
         with dr.suspend_grad():
             for s in seeds:
                 part = mi.render(
@@ -151,33 +179,54 @@ class Tracer:
     def maps(self, pose: np.ndarray, covered: np.ndarray) -> dict[str, np.ndarray]:
         """The maps of MAPS at the pixels' centres, where `covered` (H, W): a lamp that the picture hides has none.
 
-        A mean over a pixel at an edge would belong to no surface.
+        Of an open scene only where one of its objects is seen. A mean over a pixel at an edge would belong to
+        no surface.
         """
         import drjit as dr
         import mitsuba as mi
 
         self._look(pose)
-        size = self.size
+        width, height = self.width, self.height
 
         def plane(array: Any) -> np.ndarray:
-            return np.broadcast_to(np.array(array, dtype=np.float64), size * size).reshape(size, size)
+            return np.broadcast_to(np.array(array, dtype=np.float64), width * height).reshape(height, width)
 
         with dr.suspend_grad():
-            index = dr.arange(mi.UInt32, size * size)
-            film = mi.Point2f((index % size + 0.5) / size, (index // size + 0.5) / size)
-            ray, _ = self.sensor.sample_ray(0, 0.5, film, mi.Point2f(0.5))
+            index = dr.arange(mi.UInt32, width * height)
+            ray = self._rays(mi.Point2f((index % width + 0.5) / width, (index // width + 0.5) / height))
             si = self.scene.ray_intersect(ray)
             normal = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
-            hit = plane(si.is_valid()).astype(bool) & covered
-            depth = ((np.array(si.p).T - pose[:3, 3]) @ pose[:3, 2]).reshape(size, size)
+            wanted = si.is_valid() if not self.objects else mi.Bool(False)
+            for shape in self.objects:
+                wanted |= si.shape == mi.ShapePtr(shape)
+            hit = plane(wanted).astype(bool) & covered
+            depth = ((np.array(si.p).T - pose[:3, 3]) @ pose[:3, 2]).reshape(height, width)
             found = {
-                "normal": np.array(normal).T.reshape(size, size, 3),
+                "normal": np.array(normal).T.reshape(height, width, 3),
                 "depth": depth[..., None],
             }
             for name, (value, known) in vars(materials_at(self.scene, si)).items():
                 planes = [plane(x) for x in (value if dr.depth_v(value) > 1 else [value])]
                 found[name] = np.stack([*planes, plane(known)], axis=-1)
         return {name: np.where(hit[..., None], array, 0) for name, array in found.items()}
+
+    def points(self, pose: np.ndarray, film: np.ndarray) -> np.ndarray:
+        """What a view shows at positions (N, 2) on its film, 0 … 1 from the upper left: world points (N, 3), NaN
+        where it shows nothing."""
+        import drjit as dr
+        import mitsuba as mi
+
+        self._look(pose)
+        with dr.suspend_grad():
+            si = self.scene.ray_intersect(self._rays(mi.Point2f(np.ascontiguousarray(film.T, np.float32))))
+            seen = np.array(si.is_valid()) & np.ones(len(film), dtype=bool)
+            return np.where(seen[:, None], np.array(si.p, dtype=np.float64).T, np.nan)
+
+    def _rays(self, film: Any) -> Any:
+        """Rays through positions (mi.Point2f) on the film."""
+        import mitsuba as mi
+
+        return self.sensor.sample_ray(0, 0.5, film, mi.Point2f(0.5))[0]
 
     def _look(self, pose: np.ndarray) -> None:
         import mitsuba as mi

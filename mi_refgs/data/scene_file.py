@@ -53,13 +53,16 @@ def scene_hash(scene: Path) -> str:
     return digest.hexdigest()
 
 
-def load_scene(scene: Path) -> Any:
-    """The Mitsuba scene; raises InputError if it cannot be loaded, or has no shape or no emitter."""
+def load_scene(scene: Path, whole: bool = False) -> Any:
+    """The Mitsuba scene; raises InputError if it cannot be loaded, or has no shape or no emitter.
+
+    `whole`: each shape stays on its own, with its id; Mitsuba joins meshes of one material otherwise.
+    """
     import mitsuba as mi
 
     try:
         with mitsuba_exr():
-            loaded = mi.load_file(str(scene))
+            loaded = mi.load_file(str(scene), optimize=not whole)
     except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file
         raise InputError(f"{scene}: scene: Mitsuba cannot load it: {error}; mend the scene") from error
     if not loaded.shapes():

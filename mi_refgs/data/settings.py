@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from mi_refgs.data.region import REGION_FILE
 from mi_refgs.data.scene_file import LightFile
 from mi_refgs.errors import InputError
 from mi_refgs.files import read_json, write_json
@@ -18,6 +22,7 @@ RELIGHT = "relight"
 """Folder of the test views under further lights."""
 OWN_FILES = (
     "transforms_*.json",
+    REGION_FILE,
     "environment.exr",
     *(f"{split}/*.{ending}" for split in ("train", "test") for ending in ("png", "exr")),
 )
@@ -33,16 +38,29 @@ class Settings:
     scene_sha256: str  # of the XML and the files that it names
     views: int
     test_views: int
-    size: int  # pixels, square
+    size: int  # pixels: the width
     spp: int
     seed: int
     max_depth: int
     elevation: tuple[float, float]  # degrees above the horizon, z up
-    fov: float  # degrees
+    fov: float  # degrees, of the shorter side
     fill: float  # radius of the bounding sphere / (distance · sin(fov / 2)); at 1 it touches the edge
     environment_height: int  # rows; 0 writes no environment
     light: str = ""  # file name of the map in place of the scene's environment
     light_sha256: str = ""
+    height: int = 0  # pixels; 0: as many as `size`
+    objects: tuple[str, ...] = ()  # ids of the shapes that an open scene is about; none: all, on transparency
+    distance: tuple[float, float] = (0.0, 0.0)  # nearest and farthest camera, scene units; 0: as `fill` says
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.size, self.height or self.size
+
+    @property
+    def focal(self) -> float:
+        """Focal length, pixels."""
+        return 0.5 * min(self.resolution) / math.tan(math.radians(self.fov) / 2)
 
     def check(self) -> None:
         """Raise InputError for a setting that makes no sense."""
@@ -59,14 +77,17 @@ class Settings:
         need(0 < self.fov < 170, "fov", "give degrees between 0 and 170")
         need(0 < self.fill <= 1, "fill", "give a fraction between 0 and 1")
         need(self.seed >= 0, "seed", "give a number of at least 0")
+        need(self.height >= 0, "height", "give a number of at least 0")
+        near, far = self.distance
+        need(0 < near <= far < np.inf or near == far == 0, "distance", "give two lengths, 0 < NEAR <= FAR")
 
 
 def prepare_folder(out: Path, settings: Settings, overwrite: bool, relight: Sequence[LightFile] = ()) -> None:
     """Make the folders and record the settings; stop at a folder that holds anything else, or empty it."""
     record = out / "dataset.json"
     # What an older version did not know has its default there.
-    known: dict[str, Any] = {f.name: f.default for f in fields(Settings) if f.default is not MISSING}
-    wanted = json.loads(json.dumps(asdict(settings)))
+    known = _as_json({f.name: f.default for f in fields(Settings) if f.default is not MISSING})
+    wanted = _as_json(asdict(settings))
     found: Any = None
     if record.is_file():
         with contextlib.suppress(InputError):
@@ -97,6 +118,12 @@ def prepare_folder(out: Path, settings: Settings, overwrite: bool, relight: Sequ
     except OSError as error:
         raise InputError(f"{out}: output: cannot be written ({error}); choose a writable folder") from error
     write_json(record, wanted | {RELIGHT: lights})
+
+
+def _as_json(values: dict[str, Any]) -> dict[str, Any]:
+    """What is read where these were written: tuples are lists."""
+    content: dict[str, Any] = json.loads(json.dumps(values))
+    return content
 
 
 def _lights(record: Any) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,14 @@ ROUND_SIDES = 256
 """Sides of a circle: the middle of a side lies 8e-5 radii inside it."""
 
 
-def surface_mesh(scene: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 and faces (F, 3) of all shapes of the scene, one after the other.
+def surface_mesh(shapes: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64 and faces (F, 3) of shapes of a scene, one after the other.
 
     Meshes are as they are; spheres, disks and cylinders are tessellated, their corners on the surface. Raises
     InputError that names a shape of any other kind.
     """
     vertices, faces, count = [], [], 0
-    for shape in scene.shapes():
+    for shape in shapes:
         points, triangles = _triangles(shape)
         vertices.append(points)
         faces.append(triangles + count)

@@ -17,27 +17,32 @@ from mi_refgs.data.settings import Settings
 from mi_refgs.errors import InputError
 from mi_refgs.exr import read_exr, read_exr_image, write_exr
 from mi_refgs.files import write_json
-from mi_refgs.images import read_png, straight_srgb, write_png
+from mi_refgs.images import read_png, srgb_from_linear, straight_srgb, write_png
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """The cameras of a data set around a scene's bounding sphere."""
+    """The cameras of a data set around the bounding sphere of what it is about."""
 
     settings: Settings
     centre: np.ndarray
     radius: float
+    reach: float  # around the centre, of all that is there
+    objects: Sequence[Any] = ()  # shapes that an open scene is about
 
     @property
-    def distance(self) -> float:
-        """From the centre to each camera."""
-        return self.radius / (self.settings.fill * math.sin(math.radians(self.settings.fov) / 2))
+    def distance(self) -> tuple[float, float]:
+        """From the centre to the nearest and the farthest camera."""
+        filling = self.radius / (self.settings.fill * math.sin(math.radians(self.settings.fov) / 2))
+        near, far = self.settings.distance
+        return near or filling, far or filling
 
     def tracer(self, scene: Any) -> Tracer:
         """What traces views of a scene of this size."""
-        s = self.settings
-        near, far = 0.1 * (self.distance - self.radius), 10 * (self.distance + self.radius)
-        return Tracer(scene, size=s.size, fov=s.fov, spp=s.spp, max_depth=s.max_depth, near=near, far=far)
+        s, (low, high) = self.settings, self.distance
+        near, far = 0.1 * (low - self.radius), 10 * (high + self.reach)
+        options: dict[str, Any] = {"fov": s.fov, "spp": s.spp, "max_depth": s.max_depth, "objects": self.objects}
+        return Tracer(scene, size=s.resolution, near=near, far=far, **options)
 
     def of(self, split: str) -> list[tuple[np.ndarray, int]]:
         """Pose and seed of each view of a split.
@@ -59,7 +64,8 @@ def write_views(
     from tqdm import tqdm
 
     light, height = out / "environment.exr", cameras.settings.environment_height
-    if height and tracer.scene.environment() is not None and not light.exists():
+    known = tracer.scene.environment() is not None and not cameras.objects  # a room is lit by more than it
+    if height and known and not light.exists():
         write_exr(light, environment_image(tracer.scene, height))
     jobs = [(f"{split}/r_{i:03d}", *job) for split in splits for i, job in enumerate(cameras.of(split))]
     bar = tqdm(jobs, desc=f"dataset {out.name}", unit="view", file=sys.stderr, disable=not progress)
@@ -77,12 +83,12 @@ def _trace_view(tracer: Tracer, stem: Path, pose: np.ndarray, seed: int, maps: b
     else:
         rgba = tracer.picture(pose, seed)
         write_exr(f"{stem}.exr", rgba)
-        write_png(f"{stem}.png", straight_srgb(rgba))
+        write_png(f"{stem}.png", straight_srgb(rgba) if rgba.shape[-1] == 4 else srgb_from_linear(rgba))
     files = {name: f"{stem}_{name}.exr" for name in MAPS} if maps else {}
     missing = [name for name, file in files.items() if not _whole(read_exr, file)]
     if missing:
-        covered = (read_exr_image(f"{stem}.exr") if rgba is None else rgba)[..., 3] > 0
-        found = tracer.maps(pose, covered)
+        picture = read_exr_image(f"{stem}.exr") if rgba is None else rgba
+        found = tracer.maps(pose, picture[..., -1] > 0 if picture.shape[-1] == 4 else np.array(True))
         for name in missing:
             write_exr(files[name], found[name], names=MAPS[name])
 
@@ -107,15 +113,15 @@ def _frame(split: str, index: int, pose: np.ndarray, maps: bool) -> dict[str, An
 
 
 def _transforms(settings: Settings, frames: list[dict[str, Any]]) -> dict[str, Any]:
-    angle = math.radians(settings.fov)
-    focal = 0.5 * settings.size / math.tan(angle / 2)
+    width, height = settings.resolution
+    focal = settings.focal
     return {
-        "camera_angle_x": angle,
-        "w": settings.size,
-        "h": settings.size,
+        "camera_angle_x": 2 * math.atan(0.5 * width / focal),
+        "w": width,
+        "h": height,
         "fl_x": focal,
         "fl_y": focal,
-        "cx": settings.size / 2,
-        "cy": settings.size / 2,
+        "cx": width / 2,
+        "cy": height / 2,
         "frames": frames,
     }
