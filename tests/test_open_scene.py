@@ -96,7 +96,7 @@ def test_what_is_known_is_of_the_object(made: Path) -> None:
     np.testing.assert_allclose(region.centre, CENTRE, atol=1e-6)
     np.testing.assert_allclose(region.radius, REGION_MARGIN * RADIUS, rtol=1e-3)
     assert not (made / "environment.exr").exists()
-    vertices = np.asarray(trimesh.load(made / "surface.ply", process=False).vertices)
+    vertices = np.asarray(trimesh.load_mesh(made / "surface.ply", process=False).vertices)
     np.testing.assert_allclose(np.linalg.norm(vertices - CENTRE, axis=1), RADIUS, rtol=1e-4)
 
 
