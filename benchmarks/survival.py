@@ -69,7 +69,7 @@ def settings(**windows: int) -> list[str]:
 def write_data(folder: Path) -> Path:
     """The pictures as a data set on disk."""
     from benchmarks.step import sphere_data
-    from mi_refgs.data.frames import MITSUBA_FROM_OPENGL
+    from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
     from mi_refgs.images import write_png
 
     folder.mkdir(parents=True)

@@ -77,6 +77,17 @@ def is_file(path: Path) -> bool:
         return False
 
 
+def inside(folder: Path, name: object) -> Path | None:
+    """The file of a relative name in a folder; None for one that leads out of it, or is no name.
+
+    Symbolic links are followed: they belong to whoever made the folder, not to the file that has the name.
+    """
+    parts = os.path.normpath(name) if isinstance(name, str) else os.pardir
+    if os.path.isabs(parts) or parts.split(os.sep)[0] in (os.pardir, os.curdir):
+        return None
+    return folder / parts
+
+
 def read_json(path: str | Path) -> dict[str, Any]:
     """The object in a JSON file.
 

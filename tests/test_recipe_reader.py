@@ -106,6 +106,6 @@ def test_a_reader_of_ones_own_is_asked_first() -> None:
         "import mi_refgs\nclass Own:\n    name = looks_for = 'own'\n"
         "    def recognises(self, folder): return True\n"
         "own = Own()\nmi_refgs.register_reader(own)\nfrom mi_refgs.data import dataset, readers\n"
-        "assert readers.READERS[0] is own and len(readers.READERS) == 2"
+        "assert readers.READERS[0] is own and len(readers.READERS) > 1"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.data.frames import MITSUBA_FROM_OPENGL
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.exr import write_exr
 from mi_refgs.images import write_png
 from mi_refgs.methods.method import PRESETS

@@ -39,6 +39,7 @@ class Dataset:
     environment: Path | None  # ground truth of the light: lat-long EXR in Mitsuba's orientation
     points: PointCloud | None = None  # on what is seen, where the data set has some
     region: Region | None = None  # of interest; absent where alpha says what belongs to the object
+    notes: tuple[str, ...] = ()  # as in Recording
 
     @cached_property
     def scene_extent(self) -> float:
@@ -93,7 +94,7 @@ def read_dataset(
         with contextlib.suppress(InputError):  # views that share no point have none
             region = region_of(views)
     linear = images == "exr"
-    return Dataset(path, split, views, colour, linear, found.environment, found.points, region)
+    return Dataset(path, split, views, colour, linear, found.environment, found.points, region, found.notes)
 
 
 def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, int, int]:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mi_refgs.constants import MAX_NUMBER, RIGID_TOLERANCE
+from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError, shown
-from mi_refgs.files import is_file
+from mi_refgs.files import inside, is_file
 from mi_refgs.data.lens import Lens, Undistortion
 from mi_refgs.data.picture_files import PictureFile, make_view
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.view import View
 from mi_refgs.exr import read_exr_image
@@ -30,8 +30,6 @@ CAMERA_MODELS = {
 """Values of `camera_model`, as COLMAP and nerfstudio name them, and whether each is a fisheye."""
 OTHER_LENSES = ("k5", "k6", "ftheta_p0", "latlong", "equirectangular", "orthographic")
 """Keys of lenses that are refused, unless they are 0 or false."""
-MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
-"""OpenGL's camera looks along −z with +x right, Mitsuba's along +z with +x left; its own inverse."""
 
 
 @dataclass(frozen=True)
@@ -85,21 +83,17 @@ class FrameReader:
         return file
 
     def _path(self, index: int, frame: dict[str, Any], key: str) -> Path | None:
-        """The file that a key names; None where the frame has no such key, or an empty name.
-
-        Names are relative to the transforms file and stay in its folder. Symbolic links are followed: they
-        belong to whoever made the folder, not to the file.
-        """
+        """The file that a key names; None where the frame has no such key, or an empty name."""
         name = frame.get(key)
         if name is None or name == "":
             return None
-        inside = os.path.normpath(name) if isinstance(name, str) else os.pardir
-        if os.path.isabs(inside) or inside.split(os.sep)[0] in (os.pardir, os.curdir):
+        file = inside(self.transforms.parent, name)
+        if file is None:
             raise InputError(
                 f"{self.transforms}: frames[{index}].{key}: {shown(name)} names no file in the "
                 "data set's folder; move the file there and give its relative path"
             )
-        return self.transforms.parent / inside
+        return file
 
     def _map(
         self,
@@ -143,16 +137,7 @@ class FrameReader:
             matrix = np.empty(0)
         if matrix.shape != (4, 4):
             raise InputError(f"{field}: missing or not 4 × 4 numbers; give the camera-to-world matrix")
-        rotation = matrix[:3, :3]
-        rigid = (
-            np.all(np.isfinite(matrix))
-            and np.abs(rotation.T @ rotation - np.eye(3)).max() < RIGID_TOLERANCE
-            and np.linalg.det(rotation) > 0
-            and np.abs(matrix[3] - [0, 0, 0, 1]).max() < RIGID_TOLERANCE
-        )
-        if not rigid:
-            raise InputError(f"{field}: not a rotation and a translation; remove scale, shear and mirroring")
-        return matrix @ MITSUBA_FROM_OPENGL
+        return rigid(matrix, field) @ MITSUBA_FROM_OPENGL
 
     def _given(self, frame: dict[str, Any], key: str) -> Any:
         """The value of a key in the frame, or for the whole file; None where there is neither."""

@@ -50,6 +50,7 @@ class Recording:
     region: Region | None = None  # of interest, where the data set says one
     environment: Path | None = None  # ground truth of the light: lat-long EXR in Mitsuba's orientation
     source: Path | None = None  # the file that lists the views, for messages
+    notes: tuple[str, ...] = ()  # what a person may want to mend, such as pictures without a camera
 
 
 class Reader(Protocol):

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.frames import MITSUBA_FROM_OPENGL
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.data.pathtrace import MAPS, Tracer, camera_poses, environment_image
 from mi_refgs.data.settings import Settings
 from mi_refgs.errors import InputError

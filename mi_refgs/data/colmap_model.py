@@ -1,0 +1,260 @@
+"""COLMAP's files of a reconstruction: cameras, images and points3D, as text or binary.
+
+Read here, not by COLMAP's own library, which is large and trusts what a file promises. Every number of records is
+compared with the length of its file before memory is asked for.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.constants import MAX_NUMBER
+from mi_refgs.data.lens import Lens
+from mi_refgs.errors import InputError, shown
+
+MODELS: dict[str, tuple[int, str]] = {
+    "SIMPLE_PINHOLE": (0, "f cx cy"),
+    "PINHOLE": (1, "fx fy cx cy"),
+    "SIMPLE_RADIAL": (2, "f cx cy k1"),
+    "RADIAL": (3, "f cx cy k1 k2"),
+    "OPENCV": (4, "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4"),
+    "FULL_OPENCV": (6, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    "SIMPLE_RADIAL_FISHEYE": (8, "f cx cy k1"),
+    "RADIAL_FISHEYE": (9, "f cx cy k1 k2"),
+    "SIMPLE_FISHEYE": (14, "f cx cy"),
+    "FISHEYE": (15, "fx fy cx cy"),
+}
+"""Models of cameras whose lenses can be undone: number in binary files, parameters in their order."""
+MAX_NAME = 4096
+"""Bytes of a picture's name: no path has more."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A lens and a sensor."""
+
+    model: str
+    width: int  # pixels
+    height: int
+    values: dict[str, float]  # by the names in MODELS, pixels of a picture of that size
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy, where (½, ½) is the centre of the first pixel."""
+        v = self.values
+        return v.get("fx", v.get("f", 0.0)), v.get("fy", v.get("f", 0.0)), v["cx"], v["cy"]
+
+    def lens(self) -> Lens | None:
+        """None for a pinhole; raises InputError without a file's name for coefficients that it cannot have."""
+        fisheye = self.model.endswith("FISHEYE")
+        k1, k2, k3, k4, k5, k6, p1, p2 = (
+            self.values.get(name, 0.0) for name in "k1 k2 k3 k4 k5 k6 p1 p2".split()
+        )
+        if not fisheye and (k4 or k5 or k6):
+            raise InputError("k4, k5, k6: a lens with a denominator is unknown here; undistort the pictures")
+        if not (fisheye or any((k1, k2, k3, p1, p2))):
+            return None
+        return Lens(fisheye, (k1, k2, k3, k4) if fisheye else (k1, k2, k3), (p1, p2))
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """A picture that was placed: a world point x lies at rotation @ x + translation, in OpenCV's axes."""
+
+    name: str  # path below the folder of pictures
+    camera: int
+    rotation: np.ndarray  # (3, 3) float64
+    translation: np.ndarray  # (3,)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points that several pictures show."""
+
+    position: np.ndarray  # (P, 3) float64, world
+    colour: np.ndarray  # (P, 3) uint8, sRGB-encoded
+    error: np.ndarray  # (P,) mean reprojection error, pixels; −1 or 0: unknown
+    views: np.ndarray  # (P,) pictures that show it
+
+
+class BrokenError(ValueError):
+    """What is wrong in a file, without its name."""
+
+
+class Cursor:
+    """A place in the bytes of a binary file."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        """The next values, little-endian without padding."""
+        size = struct.calcsize(f"<{layout}")
+        if self.at + size > len(self.data):
+            raise BrokenError(f"ends after {len(self.data)} bytes, within a record")
+        self.at += size
+        return struct.unpack_from(f"<{layout}", self.data, self.at - size)
+
+    def count(self, row: int) -> int:
+        """The next number, of records of at least `row` bytes that follow."""
+        (number,) = self.take("Q")
+        if number * row > len(self.data) - self.at:
+            raise BrokenError(f"{number} records are more than the file holds")
+        return int(number)
+
+    def skip(self, row: int) -> int:
+        """Pass over a list of records of `row` bytes behind their number; how many they are."""
+        number = self.count(row)
+        self.at += number * row
+        return number
+
+    def name(self) -> str:
+        """The next text, which a zero ends."""
+        end = self.data.find(b"\0", self.at, self.at + MAX_NAME)
+        if end < 0:
+            raise BrokenError("a name has no end")
+        text = self.data[self.at : end].decode()  # UnicodeDecodeError is a ValueError
+        self.at = end + 1
+        return text
+
+
+def read_cameras(path: Path) -> dict[int, Camera]:
+    """The cameras by their number; raises InputError for a file of no use and for a lens that is unknown here."""
+    rows = _rows(path, _binary_cameras, _text_cameras)
+    return {number: _camera(path, number, *rest) for number, *rest in rows}
+
+
+def read_images(path: Path) -> list[Image]:
+    """The pictures in the order of their names; raises InputError for a file of no use."""
+    images = []
+    for name, camera, quaternion, translation in _rows(path, _binary_images, _text_images):
+        values = np.array([*quaternion, *translation], dtype=np.float64)
+        length = float(np.linalg.norm(values[:4])) if np.abs(values).max() <= MAX_NUMBER else 0.0
+        if not length > 0:
+            raise InputError(
+                f"{path}: {shown(name)}: the pose has no usable numbers; remove the picture, or reconstruct again"
+            )
+        images.append(Image(name, camera, _rotation(values[:4] / length), values[4:]))
+    images.sort(key=lambda image: image.name)
+    if twice := [a.name for a, b in zip(images, images[1:], strict=False) if a.name == b.name]:
+        raise InputError(f"{path}: {shown(twice[0])}: the picture occurs twice; remove one of the two")
+    return images
+
+
+def read_points(path: Path) -> Points:
+    """The points; those without usable numbers are left out. Raises InputError for a file of no use."""
+    table = np.array([*_rows(path, _binary_points, _text_points)], dtype=np.float64).reshape(-1, 8)
+    table = table[(np.abs(table[:, :3]) <= MAX_NUMBER).all(axis=1)]
+    colour = np.clip(table[:, 3:6], 0, 255).astype(np.uint8)
+    return Points(table[:, :3], colour, table[:, 6], table[:, 7].astype(np.int64))
+
+
+def _rows(path: Path, binary: Any, text: Any) -> list[tuple[Any, ...]]:
+    """The records of a file, by its ending; raises InputError where it is missing or broken."""
+    try:
+        if path.suffix == ".bin":
+            cursor = Cursor(path.read_bytes())
+            rows = [*binary(cursor)]
+            if cursor.at < len(cursor.data):
+                raise BrokenError(f"{len(cursor.data) - cursor.at} bytes follow the last record")
+        else:
+            with path.open(encoding="utf-8") as lines:
+                rows = [*text(line.strip() for line in lines)]
+    except OSError as error:
+        raise InputError(f"{path}: file: cannot be read ({error.strerror}); restore it") from error
+    except (ValueError, OverflowError) as error:
+        raise InputError(
+            f"{path}: COLMAP: broken ({str(error)[:100]}); copy the file, or export the model again"
+        ) from error
+    return rows
+
+
+def _binary_cameras(cursor: Cursor) -> Iterator[tuple[Any, ...]]:
+    names = {number: name for name, (number, _) in MODELS.items()}
+    for _ in range(cursor.count(24)):
+        camera, number, width, height = cursor.take("iiQQ")
+        model = names.get(number, f"number {number}")
+        values = cursor.take("d" * len(MODELS[model][1].split())) if model in MODELS else ()
+        yield camera, model, width, height, values
+        if model not in MODELS:  # how long its record is, is unknown; `_camera` refuses it
+            cursor.at = len(cursor.data)
+            return
+
+
+def _text_cameras(lines: Iterator[str]) -> Iterator[tuple[Any, ...]]:
+    for line in _filled(lines):
+        camera, model, width, height, *values = line.split()
+        yield int(camera), model, int(width), int(height), tuple(map(float, values))
+
+
+def _camera(path: Path, number: int, model: str, width: int, height: int, values: tuple[float, ...]) -> Camera:
+    field = f"{path}: camera {number}"
+    if model not in MODELS:
+        raise InputError(
+            f"{field}: the lens model {shown(model)} is unknown here; undistort the pictures "
+            "(colmap image_undistorter), or use the model OPENCV"
+        )
+    names = MODELS[model][1].split()
+    if len(values) != len(names) or not all(abs(value) <= MAX_NUMBER for value in values):
+        raise InputError(f"{field}: {model} needs {len(names)} numbers; export the model again")
+    camera = Camera(model, width, height, dict(zip(names, values, strict=True)))
+    if not (0 < width <= MAX_NUMBER and 0 < height <= MAX_NUMBER and min(camera.intrinsics[:2]) > 0):
+        raise InputError(f"{field}: its size and focal length are not positive; export the model again")
+    return camera
+
+
+def _binary_images(cursor: Cursor) -> Iterator[tuple[Any, ...]]:
+    for _ in range(cursor.count(73)):
+        _, *pose, camera = cursor.take("i7di")
+        yield cursor.name(), camera, pose[:4], pose[4:]
+        cursor.skip(24)  # where it shows points: x, y, number of the point
+
+
+def _text_images(lines: Iterator[str]) -> Iterator[tuple[Any, ...]]:
+    for line in _filled(lines):
+        _, w, x, y, z, *translation, camera, name = line.split(maxsplit=9)
+        if len(translation) != 3:
+            raise BrokenError("an image has no pose, camera and name")
+        yield name, int(camera), [float(c) for c in (w, x, y, z)], [float(c) for c in translation]
+        if len(next(lines, "").split()) % 3:  # of the points that it shows: x, y, number
+            raise BrokenError("an image has no line of points, empty or not, behind it")
+
+
+def _binary_points(cursor: Cursor) -> Iterator[tuple[Any, ...]]:
+    for _ in range(cursor.count(51)):
+        _, *numbers = cursor.take("Q3d3Bd")
+        yield *numbers, cursor.skip(8)  # the pictures that show it, and where
+
+
+def _text_points(lines: Iterator[str]) -> Iterator[tuple[Any, ...]]:
+    for line in _filled(lines):
+        _, *words = line.split()
+        if len(words) < 7:
+            raise BrokenError("a point has no position, colour and error")
+        yield *map(float, words[:7]), len(words[7:]) // 2
+
+
+def _filled(lines: Iterator[str]) -> Iterator[str]:
+    """Lines that are neither empty nor comments; who asks for one may take the next of `lines` itself."""
+    for line in lines:
+        if line and not line.startswith("#"):
+            yield line
+
+
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    """The matrix of a unit quaternion, w first."""
+    w, (x, y, z) = quaternion[0], quaternion[1:]
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,68 @@
+"""Folders of pictures as COLMAP and LLFF have them: `images`, and smaller copies in `images_2`, `images_4`, `images_8`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mi_refgs.errors import InputError, shown
+from mi_refgs.files import inside, is_file
+
+SUFFIXES = (".png", ".jpg", ".jpeg")
+"""Endings of pictures' names, in small letters, in the order in which they are tried."""
+COPIES = (8, 4, 2)
+"""Factors by which copies are smaller than the pictures in `images`."""
+IMAGES = "images"
+
+
+@dataclass(frozen=True)
+class PictureFolders:
+    """The pictures of a data set. The largest there are have factor 1: `images`, or where it is missing a copy."""
+
+    root: Path
+    folders: dict[int, Path]  # by their factor
+
+    @classmethod
+    def of(cls, root: Path, flat: bool = False) -> PictureFolders:
+        """The folders below `root`, which itself holds the pictures if `flat` allows it and there are none.
+
+        Raises InputError without any.
+        """
+        found = {k: root / f"{IMAGES}_{k}" for k in COPIES if (root / f"{IMAGES}_{k}").is_dir()}
+        if (root / IMAGES).is_dir():
+            found[1] = root / IMAGES
+        if not found and flat and any(map(_is_picture, root.iterdir())):
+            found[1] = root
+        if not found:
+            raise InputError(f"{root}: {IMAGES}: no such folder; put the pictures there")
+        largest = min(found)
+        return cls(root, {k // largest: folder for k, folder in found.items()})
+
+    def names(self) -> list[str]:
+        """The names of the largest pictures, sorted; pictures below folders count."""
+        folder = self.folders[1]
+        pattern = "*" if folder == self.root else "**/*"
+        return sorted(str(path.relative_to(folder)) for path in folder.glob(pattern) if _is_picture(path))
+
+    def find(self, name: str, downscale: int, whole: bool = False) -> tuple[Path, int] | None:
+        """A picture's file, and by what its blocks must still be averaged; None if there is no such file.
+
+        The smallest copy whose factor divides `downscale` serves; `whole` asks for the largest. A copy may have
+        another ending than the name. Raises InputError for a name that leads out of the folder.
+        """
+        for factor, folder in sorted(self.folders.items(), reverse=True):
+            if downscale % factor or (whole and factor > 1):
+                continue
+            file = inside(folder, name)
+            if file is None:
+                raise InputError(
+                    f"{self.root}: {shown(name)} names no file in {folder.name}; move the picture there"
+                )
+            others = (file.with_suffix(ending) for s in SUFFIXES for ending in (s, s.upper()))
+            if there := next((f for f in (file, *others) if is_file(f)), None):
+                return there, downscale // factor
+        return None
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
