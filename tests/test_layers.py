@@ -12,7 +12,7 @@ from helpers import ROOT, imported_packages
 
 PACKAGE = "mi_refgs"
 
-BOTTOM = {"constants", "device", "errors", "exr", "files", "hdr", "images", "ply", "timing"}
+BOTTOM = {"constants", "contraction", "device", "errors", "exr", "files", "hdr", "images", "ply", "timing"}
 """What everything may stand on."""
 
 MAX_LINES = 300
@@ -24,6 +24,7 @@ RENDERER = {"render", "shade", "occlusion", "splat", "surfels", "primitives"} | 
 LAYERS: dict[str, set[str]] = {
     "errors": set(),
     "constants": set(),
+    "contraction": set(),
     "llvm": set(),
     "resources": {"errors"},
     "files": {"errors"},

@@ -45,12 +45,12 @@ def camera(pose: np.ndarray) -> Camera:
 
 
 def fuse(
-    depths: list[np.ndarray], poses: list[np.ndarray], resolution: int = 48, **options: bool
+    depths: list[np.ndarray], poses: list[np.ndarray], resolution: int = 48, carve: bool = True
 ) -> tsdf.TSDF:
     flat = [mi.Float(d.ravel().astype(np.float32)) for d in depths]
     alpha = [dr.select(d > 0, mi.Float(0.6), 0.4) for d in flat]
     flat = [dr.select(d > 0, d, 3.5) for d in flat]  # a faint veil is no surface, whatever its depth
-    return tsdf.fuse(flat, alpha, [camera(p) for p in poses], BOX, resolution, **options)
+    return tsdf.fuse(flat, alpha, [camera(p) for p in poses], BOX, resolution, carve=carve)
 
 
 def as_trimesh(mesh: meshes.Mesh) -> trimesh.Trimesh:

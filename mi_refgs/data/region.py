@@ -1,17 +1,13 @@
-"""The region of interest: a sphere around the object, outside of which a picture shows its surroundings.
-
-World positions in scene units. `contract` maps all of space into a ball of twice the region's radius, so that
-a grid or a random draw covers near and far at once. [Mip-NeRF 360, Barron et al. 2022, eq. 10]
-"""
+"""The region of interest of a data set: from what its cameras look at, or from its folder."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from mi_refgs.contraction import Region as Region
 from mi_refgs.data.hull import view_focus
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
@@ -23,33 +19,6 @@ REGION_SHARE = 0.8
 """Radius of the region that cameras suggest, as part of the sphere that the median view shows whole."""
 CAMERA_SHARE = 0.8
 """Its largest radius as part of the nearest camera's distance: a camera stands outside of the region."""
-
-
-@dataclass(frozen=True)
-class Region:
-    """A sphere."""
-
-    centre: tuple[float, float, float]  # world
-    radius: float  # scene units, positive
-
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Which of the points (N, 3) lie inside: (N,) bool."""
-        return np.linalg.norm(points - np.array(self.centre), axis=-1) <= self.radius
-
-    def contract(self, points: np.ndarray) -> np.ndarray:
-        """World points (N, 3) in the ball of radius 2: offset / radius inside, (2 − 1/|o|) o/|o| beyond."""
-        offset = (np.asarray(points, dtype=np.float64) - np.array(self.centre)) / self.radius
-        length = np.linalg.norm(offset, axis=-1, keepdims=True)
-        safe = np.maximum(length, 1.0)
-        return np.where(length > 1, (2 - 1 / safe) * offset / safe, offset)
-
-    def expand(self, contracted: np.ndarray) -> np.ndarray:
-        """The inverse of `contract` for points (N, 3) of length below 2."""
-        contracted = np.asarray(contracted, dtype=np.float64)
-        length = np.linalg.norm(contracted, axis=-1, keepdims=True)
-        safe = np.maximum(length, 1.0)
-        offset = np.where(length > 1, contracted / (safe * (2 - safe)), contracted)
-        return np.array(self.centre) + self.radius * offset
 
 
 def region_of(views: Sequence[View]) -> Region:

@@ -1,4 +1,4 @@
-"""Depth maps of many views, fused into one truncated signed distance field over a box.
+"""Depth maps of many views, fused into one truncated signed distance field over a box, or over all of space.
 
 The sign is positive in free space. A voxel's state follows from what the views say about it:
 
@@ -8,18 +8,24 @@ in front of the background               +1 if `carve` is set (else no vote in t
 only further behind surfaces             -1: the inside that no view reaches; no wall behind the surface
 in no view's image                       +1: nothing is known to be there
 =======================================  ===================================================================
+
+All of space is the ball of radius 2 into which a region's contraction maps it: grid, truncation and
+distances are of contracted space there. The distance of a voxel to a surface along the view's ray is that of
+both in contracted space, by the cosine between ray and viewing axis: inside of the region it is
+(depth - z) / radius, as without contraction.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.contraction import Region
 from mi_refgs.errors import InputError
 from mi_refgs.splat.camera import Camera
 
@@ -51,6 +57,10 @@ BOX_MARGIN = 0.05
 """Free space around the points, as part of the longest side: room for the truncation from 128 voxels up."""
 
 
+END_VOXELS = 2.0
+"""Contracted voxels from the border of contracted space, where the world is infinite, to the last values."""
+
+
 @dataclass(frozen=True)
 class TSDF:
     """Signed distance at the corners of a regular grid, in truncations, positive in free space."""
@@ -58,6 +68,12 @@ class TSDF:
     volume: np.ndarray  # (nx, ny, nz) float32 in [-1, 1]
     origin: np.ndarray  # (3,) float64, world position of volume[0, 0, 0]
     voxel: float  # grid spacing, scene units
+    region: Region | None = None  # whose contracted space `origin` and `voxel` are of; None: the world's
+
+    @property
+    def end(self) -> float:
+        """Largest distance from the middle of contracted space at which there are values."""
+        return 2 - END_VOXELS * self.voxel
 
 
 def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -87,6 +103,7 @@ def fuse(
     resolution: int,
     *,
     carve: bool = True,
+    region: Region | None = None,
 ) -> TSDF:
     """Fuse depth maps into a signed distance field over `bounds`.
 
@@ -94,7 +111,8 @@ def fuse(
     not premultiplied) and alpha is a `mi.Float` or `mi.TensorXf` of height·width values in raster order. The
     three iterables are read once, in step: pass generators and only one view is in memory. Depth where alpha
     < ALPHA_SOLID is ignored. `carve`: such pixels show free space (set it where the data's alpha means
-    something). Detached; every view runs the same compiled kernel.
+    something). Detached; every view runs the same compiled kernel. With a `region`, `bounds` are in its
+    contracted space, and `resolution` voxels are as long as the region is wide.
 
     Curless and Levoy 1996 (weighted running mean); weight falling behind the surface as in Bylow et al. 2013,
     so that the far side of thin parts is pushed away less. Raises InputError for an empty box or a resolution
@@ -104,15 +122,17 @@ def fuse(
     extent = hi - lo
     if not (np.all(np.isfinite(extent)) and np.all(extent > 0)):
         raise InputError(f"tsdf: bounds: box from {lo} to {hi} has no volume; give lo < hi on every axis")
-    if not 2 <= resolution <= RESOLUTION_MAX:
-        raise InputError(f"tsdf: resolution: {resolution} is outside 2..{RESOLUTION_MAX}; choose 64 to 256")
-    voxel = float(extent.max()) / resolution
+    most = RESOLUTION_MAX if region is None else RESOLUTION_MAX // 2  # all of space is twice as wide
+    if not 2 <= resolution <= most:
+        raise InputError(f"tsdf: resolution: {resolution} is outside 2..{most}; choose 64 to 256")
+    voxel = (float(extent.max()) if region is None else 2.0) / resolution
     shape = np.ceil(extent / voxel - 1e-6).astype(int) + 1
+    empty = TSDF(np.ones(0, np.float32), lo, voxel, region)
     with dr.suspend_grad():
-        grid = _Grid(shape, lo, voxel)
+        grid = _Grid(shape, empty)
         for depth, alpha, camera in zip(depths, alphas, cameras, strict=True):
             grid.integrate(_flat(depth, camera), _flat(alpha, camera), camera, carve)
-        return TSDF(grid.volume().reshape(shape), lo, voxel)
+        return replace(empty, volume=grid.volume().reshape(shape))
 
 
 def _flat(image: Any, camera: Camera) -> Any:
@@ -125,8 +145,8 @@ def _flat(image: Any, camera: Camera) -> Any:
 class _Grid:
     """The accumulators of one fusion."""
 
-    def __init__(self, shape: np.ndarray, lo: np.ndarray, voxel: float) -> None:
-        count = int(np.prod(shape))
+    def __init__(self, shape: np.ndarray, of: TSDF) -> None:
+        count = self.count = int(np.prod(shape))
         flat = dr.arange(mi.UInt32, count)
         yz = flat % dr.opaque(mi.UInt32, int(shape[1] * shape[2]))
         x, y = (
@@ -135,8 +155,15 @@ class _Grid:
         )
         # Integer division is slow and would run for every view: keep the three coordinates, 10 bits each.
         self.corner = x | (y << 10) | ((yz % dr.opaque(mi.UInt32, int(shape[2]))) << 20)
-        self.lo = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in lo))
-        self.voxel = dr.opaque(mi.Float, voxel)
+        self.lo = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in of.origin))
+        self.voxel = dr.opaque(mi.Float, of.voxel)
+        self.space: _Contracted | None = None
+        self.index: Any = None
+        if of.region is not None:
+            self.space = _Contracted.of(of.region)
+            length = dr.norm(mi.Vector3f(self._place()))
+            self.index = dr.compress(length <= dr.opaque(mi.Float, of.end))  # space has no corners
+            self.corner, count = dr.gather(mi.UInt32, self.corner, self.index), dr.width(self.index)
         self.total = dr.zeros(mi.Float, count)
         self.weight = dr.zeros(mi.Float, count)
         self.seen = dr.zeros(mi.Float, count)
@@ -150,8 +177,9 @@ class _Grid:
         surface = dr.select((alpha >= ALPHA_SOLID) & (depth > camera.near) & dr.isfinite(depth), depth, 0)
         dr.eval(surface)
 
-        corner = mi.Point3f(self.corner & 1023, (self.corner >> 10) & 1023, self.corner >> 20)
-        point = camera.to_camera(corner * self.voxel + self.lo)
+        place = self._place()
+        world = place if self.space is None else self.space.expand(place)
+        point = camera.to_camera(world)
         in_front = point.z > camera.near
         inv_z = dr.rcp(dr.select(in_front, point.z, 1))
         # Relative to the centre of pixel (0, 0), where its texel sits.
@@ -164,10 +192,15 @@ class _Grid:
             & (px < mi.Float(width) - 0.5)
             & (py < mi.Float(height) - 0.5)
         )
-        near, same_surface, background = _sample(surface, px, py, width, height, self.voxel, in_image)
-
         trunc = TRUNCATION_VOXELS * self.voxel
+        ray = (world - camera.origin) * inv_z
+        apart = trunc if self.space is None else trunc * self.space.stretch(place, ray)
+        near, same_surface, background = _sample(surface, px, py, width, height, apart, in_image)
+
         distance = near - point.z
+        if self.space is not None:
+            met = self.space.contract(camera.origin + near * ray)
+            distance = dr.copysign(dr.norm(met - place) * dr.rcp(dr.norm(ray)), distance)
         hit = in_image & same_surface
         banded = hit & (distance > -trunc)
         # Full weight down to one voxel behind the surface, then falling to 0 at the truncation.
@@ -189,16 +222,60 @@ class _Grid:
         observed = self.weight > 0
         mean = self.total / dr.select(observed, self.weight, 1)
         value = dr.select(inside, -1, dr.select(observed, mean, 1))
+        if self.index is not None:
+            everywhere = dr.full(mi.Float, 1, self.count)
+            dr.scatter(everywhere, value, self.index)
+            value = everywhere
         return np.array(value, dtype=np.float32)
+
+    def _place(self) -> Any:
+        """Positions of the voxels (mi.Point3f): world, or contracted."""
+        corner = mi.Point3f(self.corner & 1023, (self.corner >> 10) & 1023, self.corner >> 20)
+        return corner * self.voxel + self.lo
+
+
+@dataclass(frozen=True)
+class _Contracted:
+    """A region's contraction for Dr.Jit; `contraction.Region` says what it is."""
+
+    centre: Any  # mi.Point3f
+    radius: Any  # mi.Float
+
+    @staticmethod
+    def of(region: Region) -> _Contracted:
+        centre = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in region.centre))
+        return _Contracted(centre, dr.opaque(mi.Float, region.radius))
+
+    def contract(self, world: Any) -> Any:
+        offset = (world - self.centre) / self.radius
+        inverse = dr.rcp(dr.maximum(dr.norm(offset), 1))
+        return mi.Point3f(offset * ((2 - inverse) * inverse))
+
+    def expand(self, place: Any) -> Any:
+        length = dr.maximum(dr.norm(mi.Vector3f(place)), 1)
+        return self.centre + self.radius * mi.Vector3f(place) * dr.rcp(length * (2 - length))
+
+    def stretch(self, place: Any, ray: Any) -> Any:
+        """Depth per unit of contracted distance (see above) at contracted positions, along `ray` per depth.
+
+        The contraction shrinks by 1/r² along the offset of length r, and by (2 - 1/r)/r across it.
+        """
+        offset = mi.Vector3f(place)
+        length = dr.norm(offset)
+        inverse = 2 - dr.maximum(length, 1)  # 1/r
+        along = dr.dot(ray, offset) * dr.rcp(dr.maximum(length, 1e-6))
+        across = dr.maximum(dr.squared_norm(ray) - dr.square(along), 0)
+        shrunk = dr.square(dr.square(inverse) * along) + dr.square((2 - inverse) * inverse) * across
+        return self.radius * dr.norm(ray) * dr.rsqrt(shrunk)
 
 
 def _sample(
-    surface: Any, px: Any, py: Any, width: Any, height: Any, voxel: Any, active: Any
+    surface: Any, px: Any, py: Any, width: Any, height: Any, apart: Any, active: Any
 ) -> tuple[Any, Any, Any]:
     """Depth at a pixel position, whether it is a surface, and whether it is certainly background.
 
-    Bilinear where the four texels lie on one surface (they differ by less than the truncation); else the
-    nearest texel, because a mean across a depth edge lies on no surface. A silhouette pixel is neither
+    Bilinear where the four texels lie on one surface (they differ by less than `apart`, the truncation); else
+    the nearest texel, because a mean across a depth edge lies on no surface. A silhouette pixel is neither
     surface nor background unless its nearest texel is solid: carving with half-covered pixels would eat the
     object's rim."""
     fx, fy = dr.floor(px), dr.floor(py)
@@ -210,7 +287,7 @@ def _sample(
         taps += [dr.gather(mi.Float, surface, row + dr.clip(x0 + dx, 0, width - 1), active) for dx in (0, 1)]
     least = dr.minimum(dr.minimum(taps[0], taps[1]), dr.minimum(taps[2], taps[3]))
     most = dr.maximum(dr.maximum(taps[0], taps[1]), dr.maximum(taps[2], taps[3]))
-    smooth = (least > 0) & (most - least < TRUNCATION_VOXELS * voxel)
+    smooth = (least > 0) & (most - least < apart)
     bilinear = dr.lerp(dr.lerp(taps[0], taps[1], wx), dr.lerp(taps[2], taps[3], wx), wy)
     right, lower = wx >= 0.5, wy >= 0.5
     nearest = dr.select(lower, dr.select(right, taps[3], taps[2]), dr.select(right, taps[1], taps[0]))

@@ -81,6 +81,13 @@ def visible(shape: Shape, points: np.ndarray, direction: np.ndarray, clearance: 
     return ~np.isfinite(trace(shape, points + clearance * normal(shape, points), direction))
 
 
+def contracted(point: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    """A world point (3,) in the ball of radius 2. [Barron et al. 2022, eq. 10]"""
+    offset = (point - centre) / radius
+    length = float(np.linalg.norm(offset))
+    return offset if length <= 1 else (2 - 1 / length) * offset / length
+
+
 def fuse_point(
     point: np.ndarray,
     depths: list[np.ndarray],
@@ -90,9 +97,10 @@ def fuse_point(
     carve: bool,
     truncation_voxels: float,
     unseen_vote: float,
+    region: tuple[np.ndarray, float] | None = None,
 ) -> float:
     """Fused signed distance of one point, in truncations: the table at the top of `occlusion.tsdf`, word by
-    word."""
+    word. With a region (centre, radius), `voxel` is of its contracted space."""
     truncation = truncation_voxels * voxel
     total = weight = sightings = covered = 0.0
     for depth, (to_world, focal, size) in zip(depths, views, strict=True):
@@ -118,9 +126,19 @@ def fuse_point(
         surface = tap[int(dv >= 0.5), int(du >= 0.5)]
         if surface == 0:  # half-covered pixel
             continue
-        if tap.min() > 0 and np.ptp(tap) < truncation:
+        eye = to_world[:3, 3]
+        ray = (point - eye) / z
+        scale = 1.0
+        if region is not None:
+            step = 1e-6 * z
+            moved = contracted(point + step * ray, *region) - contracted(point - step * ray, *region)
+            scale = float(np.linalg.norm(moved)) / (2 * step * float(np.linalg.norm(ray)))
+        if tap.min() > 0 and np.ptp(tap) * scale < truncation:
             surface = np.array([1 - dv, dv]) @ tap @ np.array([1 - du, du])
         distance = surface - z
+        if region is not None:
+            apart = contracted(eye + surface * ray, *region) - contracted(point, *region)
+            distance = np.sign(distance) * float(np.linalg.norm(apart)) / float(np.linalg.norm(ray))
         if distance <= -truncation:
             covered += 1
             continue
