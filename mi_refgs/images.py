@@ -68,7 +68,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
     path = Path(path)
     if path.suffix.lower() == ".exr":
         return exr_size(path)
-    with _open_picture(path) as picture:
+    with open_picture(path) as picture:
         width, height = picture.size
         return int(width), int(height)
 
@@ -89,7 +89,7 @@ def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
     InputError as `read_png` does.
     """
     path = Path(path)
-    with _open_picture(path) as picture:
+    with open_picture(path) as picture:
         if picture.mode.startswith(("I", "F")):
             raise InputError(f"{path}: pixels: more than 8 bits per channel; save it as 8-bit PNG or EXR")
         factor = math.gcd(shrink, JPEG_SHRINK) if picture.format == "JPEG" else 1
@@ -106,7 +106,7 @@ def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
     or unreadable.
     """
     path = Path(path)
-    with _open_picture(path) as picture:
+    with open_picture(path) as picture:
         if picture.mode.startswith("I"):
             return np.asarray(picture), 65535
         grey, alpha = np.moveaxis(np.asarray(picture.convert("LA")), -1, 0)
@@ -116,7 +116,7 @@ def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
 
 
 @contextlib.contextmanager
-def _open_picture(path: Path) -> Iterator[Any]:
+def open_picture(path: Path) -> Iterator[Any]:
     """A PNG or JPEG file whose header is read and whose size is believable."""
     from PIL import Image
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.step import make_trainer, sphere_data
 from mi_refgs.device import upload_tensor
-from mi_refgs.fit.objective import Target
+from mi_refgs.fit.targets import Targets
 from mi_refgs.runs.checkpoint import LIGHT
 
 SURFELS, SIZE, VIEWS, STEPS = 300, 32, 3, 24
@@ -47,7 +47,7 @@ def fit(name: str) -> dict[str, Any]:
     if "view" in case:
         views = tuple(replace(view, **case["view"](view)) for view in trainer.data.views)
         trainer.data = replace(trainer.data, views=views, linear=views[0].linear)
-        trainer.targets = [Target.of(view, trainer.data.background) for view in views]
+        trainer.targets = Targets(trainer.data, method.data)
     if "light" in case:
         raw = trainer.params[LIGHT].numpy()
         trainer.params[LIGHT] = upload_tensor(case["light"](raw.ravel()).reshape(raw.shape))

@@ -9,6 +9,7 @@ from mi_refgs.cli.command import Result, add_command, add_run, add_test_views
 
 ROWS = (
     ("psnr", "PSNR", "{:.2f} dB"),
+    ("psnr_gain", "PSNR, exposure fitted", "{:.2f} dB"),
     ("ssim", "SSIM", "{:.4f}"),
     ("flip", "FLIP", "{:.4f}"),
     ("lpips", "LPIPS", "{:.4f}"),

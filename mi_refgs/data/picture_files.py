@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mi_refgs.data.exposure import log_exposure
 from mi_refgs.data.lens import Lens, Undistortion, undistortion
 from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.view import View
@@ -150,6 +151,7 @@ def make_view(
         fx, fy = fx * straight.zoom, fy * straight.zoom
         picture = replace(picture, straight=straight)
     image, alpha = picture.read(options.background)
+    exposure = log_exposure(picture.path)
     linear = options.images == "exr"
-    view = View(name, width, height, fx, fy, cx, cy, to_world, image, alpha, None, None, linear)
+    view = View(name, width, height, fx, fy, cx, cy, to_world, image, alpha, None, None, linear, exposure=exposure)
     return view, straight

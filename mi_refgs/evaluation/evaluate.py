@@ -18,6 +18,7 @@ from mi_refgs.evaluation.speed import machine, milliseconds
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.exr import read_exr_image
 from mi_refgs.files import read_json
+from mi_refgs.fit.exposure import EXPOSURE_FILE, with_gain
 from mi_refgs.fit.whole import read_views
 from mi_refgs.images import write_png
 from mi_refgs.methods.method import Method
@@ -68,7 +69,9 @@ def evaluate(
     Every key is always there: null, with a `…_reason`, where it does not apply. Normals count where the true
     alpha is above ½ and there is a true normal, materials (`evaluation.decomposition`) where the data defines
     them; keys that end in `_concave` count pixels where the true surface is (`evaluation.surface`).
-    `ms_per_frame` is the median over single synchronised frames of the displayed picture alone, light
+    `psnr_gain` is that after `data.exposure.fitted_gain`, a gain a channel of every view: what pictures of
+    different exposure are judged by, for every method alike. `exposure` is what the fit decided about its own
+    gains. `ms_per_frame` is the median over single synchronised frames of the displayed picture alone, light
     filtered beforehand. `pruned` is null for a whole scene. All that is rendered has `samples` a pixel, box
     filtered (`render.samples`); `antialias` asks for widened roughness (`render.antialias`) where the run was
     fitted without.
@@ -103,11 +106,15 @@ def evaluate(
     for index, truth in enumerate(
         tqdm(views.views, desc="eval", unit="view", file=sys.stderr, disable=not progress)
     ):
-        shot = pictures.RenderedView.of(view(truth.camera()), views)
+        frame = view(truth.camera())
+        shot = pictures.RenderedView.of(frame, views)
+        gain, gained = with_gain(frame, truth, views)
         goal = pictures.target(truth)
         scores: dict[str, Any] = {
             "name": truth.name,
             "psnr": metrics.psnr(shot.image, goal),
+            "psnr_gain": metrics.psnr(gained, goal),
+            "gain": gain.round(4).tolist(),
             "ssim": metrics.ssim(shot.image, goal),
         }
         for name, measure in (("flip", metrics.flip), ("lpips", metrics.lpips)):
@@ -129,7 +136,7 @@ def evaluate(
             kept.append((shot, maps, truth, concave))
 
     result: dict[str, Any] = {
-        name: _mean(per_view, name) for name in ("psnr", "ssim", "flip", "lpips", *NORMAL_KEYS)
+        name: _mean(per_view, name) for name in ("psnr", "psnr_gain", "ssim", "flip", "lpips", *NORMAL_KEYS)
     }
     for name in ("flip", "lpips"):
         result[f"{name}_reason"] = per_view[0][f"{name}_reason"] or None
@@ -140,6 +147,7 @@ def evaluate(
     result |= light | errors.result()
     result |= surface_scores(fitted.mesh, surface, views.views)
     result |= {
+        "exposure": _exposure(run),
         "train_seconds": fitted.seconds,
         "iterations": fitted.iteration,
         "surfels": fitted.surfels.count,
@@ -165,6 +173,13 @@ def evaluate(
     write_png(run.path / DECOMPOSITION, pictures.sheet(rows, light_panels))
     run.write_json(METRICS, result)
     return result
+
+
+def _exposure(run: Run) -> dict[str, Any] | None:
+    """What the fit decided about gains; None if it decided nothing."""
+    if not (run.path / EXPOSURE_FILE).is_file():
+        return None
+    return {name: value for name, value in read_json(run.path / EXPOSURE_FILE).items() if name != "gain"}
 
 
 def render_name(view: View) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.fit.skips import Skipped
-from mi_refgs.methods.method import LIGHT
+from mi_refgs.methods.method import APART
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 
@@ -31,7 +31,7 @@ def culprits(surfels: Surfels, skipped: Skipped) -> dict[str, np.ndarray]:
     """
     if unusable := surfels.unusable():
         return unusable
-    found = {name: rows for name, rows in skipped.rows.items() if name != LIGHT}
+    found = {name: rows for name, rows in skipped.rows.items() if name not in APART}
     return found if len(together(found)) <= CULL_SHARE * surfels.count else {}
 
 

@@ -19,10 +19,9 @@ from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fit.branch import branched
+from mi_refgs.fit.exposure import displayed_of, picture, psnr
 from mi_refgs.fit.train import Trainer
-from mi_refgs.images import srgb_from_linear
 from mi_refgs.methods.method import Method, Selection
-from mi_refgs.render.display import displayed
 
 MOMENTS = 3
 """Arrays of float32 that a parameter needs: itself, and Adam's first and second moment."""
@@ -154,15 +153,8 @@ def _run(trainer: Trainer, steps: int, judges: Dataset, release: Callable[[], No
 
 def held_out_psnr(trainer: Trainer, judges: Dataset) -> float:
     """Mean PSNR (dB) of the present state on views that it was not fitted to; waits for the device."""
-    found = []
-    for view in judges.views:
-        frame = trainer.view(view.camera(), aovs=False)
-        planes = [np.array(plane) for plane in displayed(frame, judges.background, judges.linear)]
-        image = np.stack(planes, axis=-1).reshape(view.image.shape)
-        target = srgb_from_linear(view.image) if view.linear else view.image
-        square = np.square(np.clip(image, 0, 1) - np.clip(target, 0, 1))
-        found.append(-10 * np.log10(max(float(square.mean()), 1e-10)))
-    return float(np.mean(found))
+    shown = [(trainer.view(view.camera(), aovs=False), view) for view in judges.views]
+    return float(np.mean([psnr(picture(displayed_of(frame, judges), view), view) for frame, view in shown]))
 
 
 def sentence(decision: Decision) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.methods.method import LIGHT, Method
+from mi_refgs.methods.method import GAIN, LIGHT, Method
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import VertexSurfels
 from mi_refgs.occlusion.vertex_colours import VertexColours
@@ -38,7 +38,7 @@ def packed(trainer: Trainer) -> dict[str, np.ndarray]:
     }
     state |= {"iteration": np.array(trainer.iteration), "seconds": np.array(trainer.seconds)}
     state["held_until"] = np.array(trainer.control.held_until)
-    state |= trainer.window.state()
+    state |= trainer.window.state() | trainer.exposure.state()
     if trainer.decisions:
         state["decisions"] = np.frombuffer(json.dumps(trainer.decisions).encode(), np.uint8)
     if mesh is not None:
@@ -79,7 +79,7 @@ def occluder_of(state: dict[str, np.ndarray]) -> Occluder:
 def require_fit(method: Method, state: dict[str, np.ndarray]) -> None:
     """Raise InputError if the method has changed since the state was written."""
     expected = shapes(method)
-    found = {name: value.shape[1:] for name, value in part(state, PARAMS).items()}
+    found = {name: value.shape[1:] for name, value in part(state, PARAMS).items() if name != GAIN}
     for name in expected.keys() | found.keys():
         if found.get(name) != expected.get(name):
             raise InputError(

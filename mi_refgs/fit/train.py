@@ -19,14 +19,16 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.device import upload
 from mi_refgs.fit import health
 from mi_refgs.fit.control import AdaptiveControl, first_light
+from mi_refgs.fit.exposure import Exposure
 from mi_refgs.fit.initial import initial_surfels
 from mi_refgs.fit.light_window import LightWindow
-from mi_refgs.fit.objective import Target, objective
+from mi_refgs.fit.objective import objective
 from mi_refgs.fit.optim import Adam
 from mi_refgs.fit.schedule import Schedule
 from mi_refgs.fit.state import decisions_of, occluder_of, packed, require_fit
 from mi_refgs.fit.surface import supply, surface_of
-from mi_refgs.methods.method import Method, Stage
+from mi_refgs.fit.targets import Targets
+from mi_refgs.methods.method import APART, GAIN, Method, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
@@ -64,18 +66,21 @@ class Trainer:
         self.params: dict[str, Any] = {}
         self.control = AdaptiveControl(self)
         self.window = LightWindow()
+        self.exposure = Exposure(self)
         self.loss: Any = None
         self.error: Any = None
         if state is None and run is not None:
             state = run.load_checkpoint()
         self._set(method, data)
         if state is not None:
-            self._restore(state)
+            self.restore(state)
             return
         self.params |= initial_surfels(method, data, self.schedule.rng(0)).raw
         if method.light is not None:
             self.params[LIGHT] = first_light(method.light).raw
-        self.optimiser = Adam(self.params, self.schedule.groups(self.extent))
+        self.params |= self.exposure.start()
+        self.optimiser = Adam(self.params, self.schedule.groups(self.extent) | self.exposure.groups())
+        self.optimiser.set_factor(GAIN, 0.0)  # until it is decided
         self.control.clear()
 
     def adopt(self, method: Method, data: Dataset, state: dict[str, np.ndarray]) -> None:
@@ -85,25 +90,21 @@ class Trainer:
         """
         self._set(method, data)
         decisions = self.decisions
-        self._restore(state)
+        self.restore(state)
         self.decisions = decisions
 
     def _set(self, method: Method, data: Dataset) -> None:
         self.method, self.data = method, data
         self.extent = data.scene_extent
         self.schedule = Schedule(method, len(data.views))
-        self.targets = [Target.of(view, data.background) for view in data.views]
-        self._coarse = {
-            block: [Target.of(view.averaged(block), data.background) for view in data.views]
-            for block in {pictures.block for pictures in method.data.coarse}
-        }
+        self.targets = Targets(data, method.data)
 
     # ---------------- what others look at ----------------
 
     @property
     def surfels(self) -> Surfels:
         """The table, attached to the leaves that the optimiser owns."""
-        return Surfels({name: tensor for name, tensor in self.params.items() if name != LIGHT})
+        return Surfels({name: tensor for name, tensor in self.params.items() if name not in APART})
 
     @property
     def light(self) -> EnvironmentLight | None:
@@ -208,6 +209,7 @@ class Trainer:
         self._gradient_step(iteration, stage)
         self.iteration = iteration
         self.control.refine(iteration)
+        self.exposure.decide(iteration)
         mesh = self.method.mesh
         if mesh is not None and self._shading(stage).traceable and mesh.extract.due(iteration):
             self.extract_mesh()
@@ -229,7 +231,7 @@ class Trainer:
         """Fuse the rendered depth of all training views into a mesh and make it the occluder."""
         self.check()
         assert self.method.mesh is not None
-        cameras = [target.camera for target in self.targets]
+        cameras = [view.camera() for view in self.data.views]
         mesh = surface_of(self.surfels.detach(), cameras, self.method.mesh.resolution)
         self.occluder.update(mesh)
         return mesh
@@ -237,7 +239,8 @@ class Trainer:
     # ---------------- one step ----------------
 
     def _gradient_step(self, iteration: int, stage: Stage) -> None:
-        target = self._targets_at(iteration)[self.schedule.view(iteration)]
+        index = self.schedule.view(iteration)
+        target = self.targets.at(iteration, index)
         camera, surfels = target.camera, self.surfels
         shift = mi.Point2f(dr.opaque(mi.Float, 0, surfels.count), dr.opaque(mi.Float, 0, surfels.count))
         dr.enable_grad(shift)
@@ -255,7 +258,8 @@ class Trainer:
             normals=self.method.loss.uses_normals,
         )
         frame = supersampled(view, camera, stage.samples, details=self.method.loss.uses_maps)
-        loss, self.error = objective(frame, target, self.data, self.method.loss, iteration, light)
+        gain = self.exposure.log_gain(index)
+        loss, self.error = objective(frame, target, self.data, self.method.loss, iteration, light, gain)
         self.loss = dr.detach(loss)
         phase("loss backward")(dr.backward)(loss)
         if self.schedule.light_learns(iteration):
@@ -269,11 +273,6 @@ class Trainer:
         self.optimiser.step(iteration - 1, self.loss)
         self.control.wander(iteration)
 
-    def _targets_at(self, iteration: int) -> list[Target]:
-        """The pictures, all of one size, that an iteration is fitted to."""
-        block = self.method.data.block_at(iteration)
-        return self.targets if block == 1 else self._coarse[block]
-
     def _shading(self, stage: Stage) -> Shading:
         return Shading.of(stage, not self.occluder.empty)
 
@@ -283,12 +282,14 @@ class Trainer:
         """Everything that a checkpoint holds."""
         return packed(self)
 
-    def _restore(self, state: dict[str, np.ndarray]) -> None:
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go on from the state of a checkpoint; raises InputError if it is not one of the method."""
         require_fit(self.method, state)
+        self.exposure.restore(state)
         self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
         self._checked = self.iteration
         self.params = tensors(state, PARAMS)
-        self.optimiser = Adam(self.params, self.schedule.groups(self.extent))
+        self.optimiser = Adam(self.params, self.schedule.groups(self.extent) | self.exposure.groups())
         self.optimiser.load_state_dict(part(state, OPTIMISER))
         self.control.gradient_sum = upload(state["gradient_sum"])
         self.control.gradient_count = upload(state["gradient_count"])

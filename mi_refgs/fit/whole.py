@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
 from mi_refgs.errors import InputError
+from mi_refgs.fit.exposure import EXPOSURE_FILE
 from mi_refgs.fit.select import DECISIONS, select_terms, with_terms
 from mi_refgs.fit.state import decisions_of
 from mi_refgs.fit.train import Trainer
@@ -61,6 +62,7 @@ def begin(method: Method, views: Dataset, run: Run, tell: Callable[[str], None] 
     if state is not None:
         method = with_terms(method, decisions_of(state))
     trainer = Trainer(method, views, run, state)
+    trainer.exposure.tell = tell
     if resumed:
         run.rewind(trainer.iteration)
     else:
@@ -80,6 +82,8 @@ def finish(trainer: Trainer, run: Run) -> str | None:
     if trainer.decisions:
         run.write_method(trainer.method)
         run.write_json(DECISIONS, trainer.decisions)
+    if (exposure := trainer.exposure.record()) is not None:
+        run.write_json(EXPOSURE_FILE, exposure)
     warning = None
     try:
         first = read_views(trainer.method, trainer.data.path, "test").views[0]

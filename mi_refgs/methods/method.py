@@ -17,6 +17,10 @@ from mi_refgs.surfels.channels import MAX_SH_DEGREE, channel
 
 LIGHT = "light"
 """Name of the environment among the parameters of a fit; the others are channels of the surfels."""
+GAIN = "gain"
+"""Name of the log gains of the training views among them."""
+APART = (LIGHT, GAIN)
+"""Parameters that are no channels of the surfels."""
 AT_ONCE = Window(0, 3, 1)
 """One degree of spherical harmonics more in each of the first three iterations."""
 MESH_WINDOW = Window(20_000, 50_000, 2_000)
@@ -170,6 +174,16 @@ class Rates:
 
 
 @dataclass(frozen=True)
+class ExposureOptions:
+    """A gain a channel of each training view, on the linear radiance; decided once (`fit.exposure`)."""
+
+    gains: Literal["auto", "on", "off"] = "auto"  # auto: if they pay
+    after: int = 600  # iterations, then it is decided
+    worth: float = 0.5  # dB that the training views must gain, on pixels that the gains were not fitted to
+    rate: float = 1e-3  # of log gains, a step; a tenth at the end
+
+
+@dataclass(frozen=True)
 class CoarsePictures:
     """Pictures of fewer pixels for the iterations up to `until`; of several such tables the one that ends
     first counts."""
@@ -234,6 +248,7 @@ class Method:
     loss: LossWeights = field(default_factory=LossWeights)
     rates: Rates = Rates()
     data: DataOptions = DataOptions()
+    exposure: ExposureOptions | None = None
     seed: int = 0
     checkpoint_every: int = 1_000  # iterations; a kill loses at most so many
     preview_every: int = 1_000

@@ -145,6 +145,8 @@ def _checked(method: Method, where: str) -> Method:
             found = f"{worst[0]}: {stage.rates[worst[0]]}"
             raise InputError(f"{where}: stage.{name}: rates: {found} is no factor; give 0 or more")
     _check_priors(method, where)
+    if method.exposure is not None and method.exposure.rate < 0:
+        raise InputError(f"{where}: exposure.rate: {method.exposure.rate} is no rate; give 0 or more")
     relocate = method.refine.relocate
     if relocate is not None and relocate.grow < 0:
         raise InputError(f"{where}: refine.relocate.grow: {relocate.grow} is no share; give 0 or more")

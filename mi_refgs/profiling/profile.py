@@ -149,7 +149,7 @@ def held_in_stage(trainer: Trainer, name: str) -> Iterator[Callable[[], None]]:
     if not first <= before < last:
         trainer.iteration = max(first, last - 100)
     light = None if method.light is None else replace(method.light, every=1)
-    trainer.method = replace(method, refine=Refine(), mesh=None, light=light)
+    trainer.method = replace(method, refine=Refine(), mesh=None, light=light, exposure=None)
     trainer.schedule = replace(schedule, method=trainer.method)
     trainer.window.close()
 

@@ -5,7 +5,7 @@ Images are planes: lists of mi.Float of width H·W in raster order (or a mi.Colo
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -42,13 +42,18 @@ def display_image(radiance: Iterable[Any], alpha: Any, background: Iterable[Any]
     ]
 
 
-def displayed(frame: Frame, background: np.ndarray, linear: bool) -> list[Any]:
+def displayed(
+    frame: Frame, background: np.ndarray, linear: bool, gain: Sequence[Any] | None = None
+) -> list[Any]:
     """What the camera shows of a frame, display-encoded planes.
 
     Pictures with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it.
+    `gain` is a factor a channel of the radiance, ahead of both.
     """
     behind = [float(x) for x in background]
     radiance = list(frame.radiance)
+    if gain is not None:
+        radiance = [plane * factor for plane, factor in zip(radiance, gain, strict=True)]
     if not linear:
         return display_image(radiance, frame.alpha, behind)
     return [

@@ -17,7 +17,7 @@ import numpy as np
 
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
-from mi_refgs.methods.method import LIGHT
+from mi_refgs.methods.method import APART, LIGHT
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 
@@ -78,7 +78,7 @@ def check(state: Mapping[str, np.ndarray]) -> None:
     """Raise DamagedError unless every array that a fit goes on from is there, finite and of its shape."""
     params = part(state, PARAMS)
     try:
-        table = Surfels({name: value for name, value in params.items() if name != LIGHT})
+        table = Surfels({name: value for name, value in params.items() if name not in APART})
         geometry = table.primitive.widths
         if LIGHT in params:
             EnvironmentLight(params[LIGHT])

@@ -27,7 +27,7 @@ from mi_refgs.files import read_json
 from mi_refgs.runs.checkpoint import PARAMS, tensors
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.run import Run
-from mi_refgs.methods.method import LIGHT
+from mi_refgs.methods.method import GAIN, LIGHT
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
@@ -74,6 +74,7 @@ class TrainedScene:
         """Take the state of a `Trainer`, as a checkpoint holds it."""
         params = tensors(state, PARAMS)
         light = params.pop(LIGHT, None)
+        params.pop(GAIN, None)  # of training views, no part of the scene
         mesh = None
         if len(state.get("mesh/faces", ())):
             mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))

@@ -1,0 +1,56 @@
+"""The pictures of a fit on the device: uploaded at once where memory allows, else when a step needs them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.fit.objective import Target
+from mi_refgs.methods.method import DataOptions
+
+BUDGET = 2**30
+"""Bytes of targets that stay on the device: a thousand pictures of 200², or ten of 2000²."""
+PIXEL_BYTES = 4 * 4 + 3
+"""Bytes of a pixel of a target: three colours and alpha as float32, and where each colour is clipped."""
+
+
+class Targets:
+    """Targets by the index of their view; those that were used last stay on the device."""
+
+    def __init__(self, data: Dataset, options: DataOptions, budget: int = BUDGET) -> None:
+        self.data, self.options, self.budget = data, options, budget
+        self._kept: OrderedDict[tuple[int, int], Target] = OrderedDict()
+        self._bytes = 0
+        blocks = {1, *(pictures.block for pictures in options.coarse)}
+        pixels = sum(view.width * view.height for view in data.views)
+        if sum(PIXEL_BYTES * pixels // block**2 for block in blocks) <= budget:
+            for block in blocks:
+                for index in range(len(data.views)):
+                    self._target(index, block)
+
+    def __len__(self) -> int:
+        return len(self.data.views)
+
+    def __getitem__(self, index: int) -> Target:
+        return self._target(index, 1)
+
+    def at(self, iteration: int, index: int) -> Target:
+        """What a (1-based) iteration is fitted to: the picture of a view, of the size that is due."""
+        return self._target(index, self.options.block_at(iteration))
+
+    def _target(self, index: int, block: int) -> Target:
+        key = index, block
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key]
+        view = self.data.views[index]
+        target = Target.of(view if block == 1 else view.averaged(block), self.data.background)
+        self._kept[key] = target
+        self._bytes += _size(target)
+        while self._bytes > self.budget and len(self._kept) > 1:
+            self._bytes -= _size(self._kept.popitem(last=False)[1])
+        return target
+
+
+def _size(target: Target) -> int:
+    return PIXEL_BYTES * target.camera.width * target.camera.height
