@@ -287,9 +287,10 @@ def photograph(path: Path, settings: dict[int, Any] | None) -> Path:
 def test_exif_data_tell_the_exposure(tmp_path: Path, method: Method) -> None:
     """A stop is a factor of two; what lacks one of the three numbers, or has nonsense, tells nothing."""
     usual: dict[int, Any] = {EXPOSURE_TIME: 0.01, F_NUMBER: 2.0, ISO: 100}
+    changes: list[dict[int, Any]] = [{}, {EXPOSURE_TIME: 0.02}, {ISO: 50}, {F_NUMBER: 4.0}]
     log = [
         log_exposure(photograph(tmp_path / f"{i}.jpg", {**usual, **change}))
-        for i, change in enumerate([{}, {EXPOSURE_TIME: 0.02}, {ISO: 50}, {F_NUMBER: 4.0}])
+        for i, change in enumerate(changes)
     ]
     assert log[0] == pytest.approx(np.log(0.01 * 100 / 4), rel=1e-6)
     assert [value - log[0] for value in log if value is not None and log[0] is not None] == pytest.approx(

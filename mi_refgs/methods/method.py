@@ -177,7 +177,7 @@ class Rates:
 class ExposureOptions:
     """A gain a channel of each training view, on the linear radiance; decided once (`fit.exposure`)."""
 
-    gains: Literal["auto", "on", "off"] = "auto"  # auto: if they pay
+    gains: Literal["judged", "on", "off"] = "judged"  # judged: if they pay
     after: int = 600  # iterations, then it is decided
     worth: float = 0.5  # dB that the training views must gain, on pixels that the gains were not fitted to
     rate: float = 1e-3  # of log gains, a step; a tenth at the end
