@@ -90,7 +90,7 @@ def test_matches_the_float64_specification() -> None:
 
 
 def test_inside_of_the_region_it_is_the_bounded_field() -> None:
-    """The same voxels in the same places have the same values, where all that they are told of lies inside."""
+    """The same voxels in the same places have the same values, if all that they are told of lies inside."""
     poses = ring_of_views(6)
     depths = [ref.depth_map(ref.sphere(tuple(BALL), BALL_RADIUS), pose, FOCAL, SIZE) for pose in poses]
     opened = fuse(depths, poses, 40, REGION)
@@ -142,7 +142,7 @@ def test_it_is_closed_but_for_the_end_of_space_and_winds_outward(ball_mesh: Mesh
 
 
 def test_a_room_is_a_cavity_that_stays() -> None:
-    """A ball in a closed box: all that is behind the walls was never seen, and a small thing near is no floater."""
+    """A ball in a closed box: what is behind walls was never seen, and a small thing near is no floater."""
     half = np.full(3, 4.0)
 
     def shape(points: np.ndarray) -> np.ndarray:

@@ -164,6 +164,20 @@ def test_colmap_says_the_same(made: Path) -> None:
     assert json.loads((colmap / "region.json").read_text()) == json.loads((made / "region.json").read_text())
 
 
+def test_the_reader_of_colmap_finds_the_same_views(made: Path) -> None:
+    """Pictures, cameras, region and split; two of eight are more than every eighth."""
+    colmap = made.parent / "colmap"
+    for split in ("train", "test"):
+        original, copy = read_dataset(made, split), read_dataset(colmap, split)
+        assert len(original.views) == len(copy.views)
+        assert copy.region == original.region and copy.points is not None
+        for view in original.views:
+            same = [other for other in copy.views if np.array_equal(other.image, view.image)]
+            assert len(same) == 1
+            np.testing.assert_allclose(same[0].to_world, view.to_world, atol=1e-9)
+            assert (same[0].fx, same[0].cy) == pytest.approx((view.fx, view.cy))
+
+
 def test_every_eighth_picture_is_a_test_view(made: Path, tmp_path: Path) -> None:
     """As readers of COLMAP hold them out, where the numbers are those of such a split."""
     tiny = {**OPTIONS, "views": 8, "test_views": 2, "size": 8, "spp": 1}

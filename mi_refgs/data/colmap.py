@@ -2,7 +2,8 @@
 
 The folders `images_2`, `images_4` and `images_8` may hold smaller copies, as in the scenes of Ref-Real and Mip-NeRF
 360; `masks` may hold what belongs to the object, as NAME.png, with the picture's ending before or without. Every eighth
-picture in the order of names is a test view.
+picture in the order of names is a test view, unless `test.txt` beside the reconstruction lists the names of those,
+one a line, as 3D Gaussian Splatting reads it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 """Where a reconstruction may lie, in the order in which they are tried."""
 ENDINGS = ("bin", "txt")
 MASKS = "masks"
+TEST_LIST = "test.txt"
 MIN_VIEWS, MAX_ERROR = 3, 2.0
 """A point that two pictures show lies anywhere along a line for a single wrong match; errors beyond 2 pixels mean
 such a match."""
@@ -79,7 +81,11 @@ class Reconstruction:
                 f"{self.source}: none of its {len(self.images)} pictures lies in {self.pictures.folders[1]}; "
                 "put them there under the same names"
             )
-        chosen = held_out(there, split)
+        named = self._test_names()
+        if named is None:
+            chosen = held_out(there, split)
+        else:
+            chosen = [image for image in there if (image.name in named) == (split == "test")]
         if not chosen:
             raise InputError(f"{self.source}: zero {split} views; add pictures")
         return [(image, *self.found[image.name]) for image in chosen]
@@ -122,6 +128,13 @@ class Reconstruction:
         if (other := self.source.parent.with_name("1")).is_dir() and self.source.parent.name == "0":
             notes.append(f"{other.parent.name}/1 holds another reconstruction, which is left out")
         return tuple(notes)
+
+    def _test_names(self) -> set[str] | None:
+        """The names that test.txt lists; None without that file."""
+        file = self.source.with_name(TEST_LIST)
+        if not is_file(file):
+            return None
+        return {line.strip() for line in file.read_bytes().decode("utf-8", "replace").splitlines()}
 
     def _find(self, name: str) -> tuple[Path, int] | None:
         return self.pictures.find(name, self.options.downscale, whole=self.masks is not None)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mi_refgs.data.colmap import TEST_LIST
 from mi_refgs.data.pathtrace import Tracer
 from mi_refgs.data.readers import HOLDOUT
 from mi_refgs.data.region import REGION_FILE
@@ -77,7 +78,7 @@ def write_colmap(folder: Path, data: Path, cameras: Cameras, tracer: Tracer) -> 
         stems += [f"{i + 1} {' '.join(repr(float(x)) for x in numbers)} 1 {picture}", " ".join(seen[i])]
     comment = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of X Y POINT3D_ID"
     write_bytes(sparse / "images.txt", lines(comment, stems))
-    write_bytes(sparse / "test.txt", "".join(f"{pictures[i]}\n" for i in tests).encode())
+    write_bytes(sparse / TEST_LIST, "".join(f"{pictures[i]}\n" for i in tests).encode())
     if (data / REGION_FILE).is_file():
         _copy(data / REGION_FILE, folder / REGION_FILE)
 
