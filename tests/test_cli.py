@@ -24,7 +24,19 @@ from mi_refgs.images import read_png, srgb_from_linear, write_png
 from mi_refgs.methods.method import PRESETS
 from mi_refgs.methods.read import load_resolved
 
-COMMANDS = ("doctor", "demo", "dataset", "train", "eval", "compare", "render", "relight", "export", "profile")
+COMMANDS = (
+    "doctor",
+    "demo",
+    "capture",
+    "dataset",
+    "train",
+    "eval",
+    "compare",
+    "render",
+    "relight",
+    "export",
+    "profile",
+)
 ARTEFACTS = ("surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "config.toml", "metrics.jsonl")
 
 

@@ -13,7 +13,19 @@ import sys
 from collections.abc import Iterator, Sequence
 
 from mi_refgs import __version__
-from mi_refgs.cli import compare, dataset, demo, doctor, evaluate, export, profile, relight, render, train
+from mi_refgs.cli import (
+    capture,
+    compare,
+    dataset,
+    demo,
+    doctor,
+    evaluate,
+    export,
+    profile,
+    relight,
+    render,
+    train,
+)
 from mi_refgs.cli.command import Parser, Result, UnusableError, finite, prepare
 from mi_refgs.errors import InputError
 from mi_refgs.runs.interrupt import TerminatedError
@@ -29,7 +41,19 @@ def build_parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"mi_refgs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=Parser)
-    for module in (doctor, demo, dataset, train, evaluate, compare, render, relight, export, profile):
+    for module in (
+        doctor,
+        demo,
+        capture,
+        dataset,
+        train,
+        evaluate,
+        compare,
+        render,
+        relight,
+        export,
+        profile,
+    ):
         module.add(commands)
     return parser
 

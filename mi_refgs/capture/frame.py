@@ -1,0 +1,149 @@
+"""A world to work in: +z against gravity, the region of interest the unit ball around the origin.
+
+Structure from motion leaves direction, place and scale of its world open; the way people hold a camera and
+what they point it at say them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mi_refgs.capture.solved import Solved
+from mi_refgs.data.region import CAMERA_SHARE, REGION_SHARE, Region
+from mi_refgs.errors import InputError
+
+ROUNDS = 50
+"""Of reweighted least squares, which approach the least sum of absolute values."""
+LEVEL_SPREAD = 0.02
+"""Share of the cameras' right-hand directions off their main line below which they fix no plane: ± 8°."""
+AXES_SPREAD = 1e-3
+"""Smallest singular value of the mean of I − a aᵀ over view axes a that meet; 0 for parallel ones."""
+SEEN_SHARE = 0.5
+"""Of the cameras in whose picture a point lies: what fewer show is surroundings."""
+REGION_POINTS = 50
+"""Points that place a region; fewer leave it where the view axes meet."""
+REGION_QUANTILE = 0.9
+"""Share of the points around the focus that the region takes in."""
+LEAST_SHARE = 0.5
+"""Of the radius that the cameras suggest, the least of the region: points lie where there is texture, not on
+all of the object."""
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """World points x become scale · rotation x + translation."""
+
+    scale: float
+    rotation: np.ndarray  # (3, 3)
+    translation: np.ndarray  # (3,)
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) in the new world."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+
+def up_direction(solved: Solved, up: np.ndarray) -> np.ndarray:
+    """The direction (3,) against gravity; `up` (V, 2): right and down of what was up in each picture.
+
+    People hold a camera level, whichever way they tilt it: the direction that is orthogonal to the right-hand
+    direction of all pictures, by least absolute values, so that some rolled ones do not matter. Where all
+    look the same way that leaves the tilt open; then it is the mean of what was up, orthogonal to the mean
+    right.
+    """
+    right = np.stack([-up[:, 1], up[:, 0]], axis=1)
+    to_world = solved.rotation.transpose(0, 2, 1)[:, :, :2]
+    rights, ups = np.einsum("vij,vj->vi", to_world, right), np.einsum("vij,vj->vi", to_world, up)
+    mean = ups.mean(axis=0)
+    weight = np.ones(len(rights))
+    for _ in range(ROUNDS):
+        values, vectors = np.linalg.eigh(np.einsum("v,vi,vj->ij", weight, rights, rights) / weight.sum())
+        weight = 1 / np.maximum(abs(rights @ vectors[:, 0]), 1e-3)
+    if values[1] < LEVEL_SPREAD * values.sum():
+        line = vectors[:, 2]
+        direction = mean - (mean @ line) * line
+    else:
+        direction = vectors[:, 0] * (1 if vectors[:, 0] @ mean >= 0 else -1)
+    return direction / max(float(np.linalg.norm(direction)), 1e-12)
+
+
+def focus_of(solved: Solved) -> np.ndarray:
+    """The point (3,) with the least sum of distances to the view axes; the median point where they are
+    parallel."""
+    projectors = np.eye(3) - solved.axis[:, :, None] * solved.axis[:, None, :]
+    if np.linalg.svd(projectors.mean(axis=0), compute_uv=False)[-1] < AXES_SPREAD:
+        return np.median(solved.points, axis=0)
+    weight = np.ones(len(projectors))
+    for _ in range(ROUNDS):
+        weighted = weight[:, None, None] * projectors
+        focus = np.linalg.solve(weighted.sum(axis=0), np.einsum("vij,vj->i", weighted, solved.origin))
+        distance = np.linalg.norm(np.einsum("vij,vj->vi", projectors, focus - solved.origin), axis=1)
+        weight = 1 / np.maximum(distance, 1e-3 * np.median(distance) + 1e-12)
+    return focus
+
+
+def seen_share(solved: Solved, points: np.ndarray) -> np.ndarray:
+    """Share (N,) of the cameras that have the points (N, 3) in the cone that fits into their picture."""
+    share = np.zeros(len(points))
+    for origin, axis, angle in zip(solved.origin, solved.axis, solved.half_angle, strict=True):
+        offset = points - origin
+        share += offset @ axis > np.cos(angle) * np.linalg.norm(offset, axis=1)
+    return share / len(solved.origin)
+
+
+def region_of_interest(solved: Solved) -> Region:
+    """A sphere around what most cameras look at.
+
+    Its centre is the focus: points lie on the sides that were photographed, and on what stands behind. Its
+    radius is what the median camera sees whole, or less where the points that at least half of the cameras
+    have in their picture, each as often as it was seen, lie closer.
+    """
+    focus = focus_of(solved)
+    distance = np.linalg.norm(solved.origin - focus, axis=1)
+    whole = float(np.median(distance * np.sin(solved.half_angle)))
+    radius = min(REGION_SHARE * whole, CAMERA_SHARE * float(distance.min()))
+    if not radius > 0:
+        raise InputError(
+            "photographs: a camera stands in the middle of what all look at; walk around an object"
+        )
+    offset = np.linalg.norm(solved.points - focus, axis=1)
+    near = offset < radius
+    near[near] = seen_share(solved, solved.points[near]) >= SEEN_SHARE
+    if np.count_nonzero(near) >= REGION_POINTS:
+        reach = _weighted_quantile(offset[near], solved.length[near], REGION_QUANTILE)
+        radius = max(reach, LEAST_SHARE * radius)
+    x, y, z = (float(c) for c in focus)
+    return Region((x, y, z), radius)
+
+
+def _weighted_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, share * total[-1])])
+
+
+def upright_unit(solved: Solved, up: np.ndarray) -> Similarity:
+    """The similarity to a world with +z up in which the region of interest is the unit ball around 0.
+
+    The first camera looks along +y, as seen from above. `up` as in `up_direction`.
+    """
+    z = up_direction(solved, up)
+    forward = solved.axis[0] - (solved.axis[0] @ z) * z
+    if np.linalg.norm(forward) < 1e-3:  # it looks straight down
+        forward = np.cross(z, np.eye(3)[np.argmin(abs(z))])
+    y = forward / np.linalg.norm(forward)
+    rotation = np.stack([np.cross(y, z), y, z])
+    region = region_of_interest(solved)
+    scale = 1 / region.radius
+    return Similarity(scale, rotation, -scale * rotation @ np.array(region.centre))
+
+
+def moved(solved: Solved, similarity: Similarity) -> Solved:
+    """Cameras and points in the new world."""
+    return replace(
+        solved,
+        rotation=solved.rotation @ similarity.rotation.T,
+        origin=similarity.apply(solved.origin),
+        points=similarity.apply(solved.points),
+    )

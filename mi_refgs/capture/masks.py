@@ -1,0 +1,68 @@
+"""Masks made elsewhere: white where the object is, one picture for each photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mi_refgs.capture.photographs import ORIENTATION, Photograph
+from mi_refgs.errors import InputError
+from mi_refgs.images import open_picture
+
+ENDINGS = (".png", ".jpg", ".jpeg")
+
+
+def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:
+    """The mask of each photograph by the photograph's name; none without a folder.
+
+    PHOTO.jpg's is PHOTO.png, PHOTO.jpg.png or PHOTO.jpg, of the photograph's size as stored or as displayed.
+    Raises InputError for a photograph without a mask and for a mask of another size.
+    """
+    if folder is None:
+        return {}
+    if not folder.is_dir():
+        raise InputError(f"{folder}: --masks: no such folder; give one with a PNG file for each photograph")
+    there = {path.name.lower(): path for path in sorted(folder.iterdir()) if path.is_file()}
+    masks: dict[str, Path] = {}
+    for photograph in photographs:
+        name, stem = photograph.name.lower(), photograph.path.stem.lower()
+        candidates = [name + ".png", *(stem + ending for ending in ENDINGS)]
+        path = next((there[candidate] for candidate in candidates if candidate in there), None)
+        if path is None:
+            raise InputError(
+                f"{folder}: --masks: none for {photograph.name}; add {photograph.path.stem}.png, white where "
+                "the object is"
+            )
+        with open_picture(path) as picture:
+            size = picture.size
+        if size not in (photograph.size, photograph.stored_size):
+            raise InputError(
+                f"{path}: --masks: {size[0]} × {size[1]} pixels, but {photograph.name} has "
+                f"{photograph.size[0]} × {photograph.size[1]}; make masks of the photographs' size"
+            )
+        masks[photograph.name] = path
+    return masks
+
+
+def mask_pixels(path: Path, photograph: Photograph) -> np.ndarray:
+    """The mask as the photograph lies in the data set, (H, W, 1) uint8, 255 on the object.
+
+    A mask of the stored size is turned as the photograph is, unless that is the displayed size, too. Of
+    a file with transparent pixels alpha is the mask. Files whose brightest value is 1 count from 0 to 1.
+    """
+    from PIL import Image, ImageOps
+
+    with open_picture(path) as picture:
+        alpha = picture.convert("RGBA").getchannel("A")
+        grey = picture.convert("L") if alpha.getextrema()[0] == 255 else alpha
+    grey.info = {}
+    if grey.size != photograph.size:
+        exif = grey.getexif()
+        exif[ORIENTATION] = photograph.orientation
+        grey = ImageOps.exif_transpose(grey)
+    if photograph.lying:
+        grey = grey.transpose(Image.Transpose.ROTATE_90)
+    pixels = np.asarray(grey)[..., None]
+    return pixels * np.uint8(255) if pixels.max(initial=0) == 1 else pixels

@@ -1,0 +1,161 @@
+"""The data set of a capture: pictures and masks without their lens, and COLMAP's files of pinhole cameras."""
+
+from __future__ import annotations
+
+import copy
+import os
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.capture import colmap
+from mi_refgs.capture.frame import Similarity
+from mi_refgs.capture.masks import mask_pixels
+from mi_refgs.capture.photographs import Photograph
+from mi_refgs.data.lens import Lens, Undistortion, undistortion
+from mi_refgs.errors import InputError
+from mi_refgs.files import replace_file
+
+QUALITY = 95
+"""Of JPEG files: below it, blocks show in what a fit learns."""
+SPLINE_PIXELS = 2_000_000
+"""Pixels up to which pictures are resampled with cubic splines; larger ones are reduced before a fit sees
+them."""
+LENSES: dict[str, tuple[bool, str]] = {
+    "SIMPLE_PINHOLE": (False, "f cx cy"),
+    "PINHOLE": (False, "fx fy cx cy"),
+    "SIMPLE_RADIAL": (False, "f cx cy k1"),
+    "RADIAL": (False, "f cx cy k1 k2"),
+    "OPENCV": (False, "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": (True, "fx fy cx cy k1 k2 k3 k4"),
+    "SIMPLE_RADIAL_FISHEYE": (True, "f cx cy k1"),
+    "RADIAL_FISHEYE": (True, "f cx cy k1 k2"),
+}
+"""COLMAP's camera models whose lenses can be undone: whether they are fisheyes, and their parameters."""
+
+
+@dataclass(frozen=True)
+class Straight:
+    """The pinhole camera of a group of pictures, and how their lens is undone."""
+
+    size: tuple[int, int]  # pixels, as the photographs lie
+    focal: tuple[float, float]  # pixels
+    centre: tuple[float, float]
+    undo: Undistortion | None  # None where there is no distortion: pictures stay as they are
+
+    @classmethod
+    def of(cls, camera: Any, size: tuple[int, int]) -> Straight:
+        """Of a pycolmap.Camera of the working copies, for pictures of `size`; InputError for a lens beyond
+        reason."""
+        fisheye, names = LENSES[camera.model_name]
+        values = dict(zip(names.split(), camera.params, strict=True))
+        across, down = size[0] / camera.width, size[1] / camera.height
+        fx, fy = (
+            values.get("fx", values.get("f", 0.0)) * across,
+            values.get("fy", values.get("f", 0.0)) * down,
+        )
+        cx, cy = values["cx"] * across, values["cy"] * down
+        radial = [values.get(f"k{i}", 0.0) for i in range(1, 5 if fisheye else 4)]
+        lens = Lens(fisheye, tuple(radial), (values.get("p1", 0.0), values.get("p2", 0.0)))
+        if not fisheye and not any((*lens.radial, *lens.tangential)):
+            return cls(size, (fx, fy), (cx, cy), None)
+        try:
+            undo = undistortion(lens, *size, fx, fy, cx, cy)
+        except InputError as error:
+            raise InputError(
+                f"photographs: the lens found has {error}; give --camera another model, such as SIMPLE_RADIAL"
+            ) from None
+        return cls(size, (fx * undo.zoom, fy * undo.zoom), (cx, cy), undo)
+
+    def resample(self, pixels: np.ndarray) -> np.ndarray:
+        """An (H, W, C) uint8 picture without the lens."""
+        if self.undo is None:
+            return pixels
+        order = 3 if pixels.shape[0] * pixels.shape[1] <= SPLINE_PIXELS else 1
+        return np.rint(self.undo.resample(pixels.astype(np.float32), order=order)).astype(np.uint8)
+
+
+def straighten(model: Any, photographs: dict[str, Photograph]) -> dict[str, Straight]:
+    """How the lens of each placed picture is undone, by the name of its working copy."""
+    sizes: dict[int, tuple[int, int]] = {}
+    images = [model.images[i] for i in model.reg_image_ids()]
+    for image in images:
+        sizes[image.camera_id] = photographs[image.name].kept_size
+    straight = {i: Straight.of(model.cameras[i], size) for i, size in sizes.items()}
+    return {image.name: straight[image.camera_id] for image in images}
+
+
+def write_pictures(
+    placed: Sequence[Photograph],
+    straight: Callable[[Photograph], Straight],
+    masks: dict[str, Path],
+    folder: Path,
+    progress: Callable[[Sequence[Photograph]], Iterable[Photograph]],
+) -> None:
+    """images/NAME, and masks/NAME.png where there are masks, those that are not there yet."""
+    for part in ("images", *(["masks"] if masks else [])):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+
+    def write(photograph: Photograph) -> None:
+        from PIL import Image
+
+        camera, picture = straight(photograph), folder / "images" / photograph.name
+        if not picture.is_file():
+            if camera.undo is None and photograph.as_displayed:
+                replace_file(picture, partial(shutil.copyfile, photograph.path))
+            else:
+                pixels = Image.fromarray(camera.resample(np.asarray(photograph.load())))
+                replace_file(picture, partial(_save, pixels, photograph))
+        if masks:
+            mask = folder / "masks" / f"{photograph.name}.png"
+            pixels = Image.fromarray(camera.resample(mask_pixels(masks[photograph.name], photograph))[..., 0])
+            replace_file(mask, lambda path: pixels.save(path, format="PNG"))
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for written, _ in zip(pool.map(write, placed), progress(placed), strict=True):
+            assert written is None
+
+
+def _save(picture: Any, photograph: Photograph, path: Path) -> None:
+    jpeg = photograph.path.suffix.lower() in (".jpg", ".jpeg")
+    options = {"format": "JPEG", "quality": QUALITY, "subsampling": 0} if jpeg else {"format": "PNG"}
+    picture.save(path, exif=photograph.exif(), **options)
+
+
+def write_model(
+    model: Any,
+    photographs: dict[str, Photograph],
+    straight: dict[str, Straight],
+    similarity: Similarity,
+    folder: Path,
+) -> None:
+    """COLMAP's binary files of the moved, straightened reconstruction, in a folder that is there whole or
+    not."""
+    pycolmap = colmap.load()
+    moved = pycolmap.Reconstruction(model)
+    pose = pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation)
+    moved.transform(pose)
+    lenses = {i: copy.deepcopy(camera) for i, camera in moved.cameras.items()}
+    for i in moved.reg_image_ids():
+        image = moved.images[i]
+        camera, lens = straight[image.name], lenses[image.camera_id]
+        rays = lens.cam_from_img(np.array([point.xy for point in image.points2D]).reshape(-1, 2))
+        for point, ray in zip(image.points2D, np.asarray(rays, dtype=np.float64), strict=True):
+            seen = ray * camera.focal + camera.centre
+            point.xy = np.where(np.isfinite(seen), seen, 0)
+        own = moved.cameras[image.camera_id]
+        own.model, own.width, own.height = pycolmap.CameraModelId.PINHOLE, *camera.size
+        own.params = [*camera.focal, *camera.centre]
+        image.name = photographs[image.name].name
+    temporary = folder.with_name(f".{folder.name}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    moved.write_binary(temporary)
+    shutil.rmtree(folder, ignore_errors=True)
+    temporary.rename(folder)

@@ -1,0 +1,225 @@
+"""A whole capture: photographs in, a COLMAP data set with cameras, points and a region of interest out.
+
+What a step makes has a name with the hash of all that went into it, and appears whole or not at all: a run
+that was interrupted, or repeated with other pictures or options, does again only what has changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.capture import colmap, failure, output
+from mi_refgs.capture.frame import moved, upright_unit
+from mi_refgs.capture.masks import find_masks
+from mi_refgs.capture.pairs import pairs_to_match
+from mi_refgs.capture.photographs import Photograph, cameras_of, copy_name, find_photographs, write_copies
+from mi_refgs.capture.report import Report, draw
+from mi_refgs.capture.solved import Solved, adjust, best_lens
+from mi_refgs.data.region import REGION_FILE, Region
+from mi_refgs.errors import InputError
+from mi_refgs.files import cannot_write, read_json, remove_temporaries, write_json
+
+WORK = ".work"
+"""Folder of working copies, features, matches and models, which may be removed when all is done."""
+REPORT, PLOT = "capture.json", "capture.png"
+PARTS = ("images", "masks", "sparse")
+VERSION = 1
+"""Of what the steps do: another one begins anew."""
+
+FIRST_MODEL = "SIMPLE_RADIAL"
+"""Lens with which pictures are placed where none is asked for; one parameter can hardly go astray."""
+FOCAL_GUESS = 1.2
+"""Focal length over the longest side where EXIF does not tell it: 45° across, COLMAP's own guess."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is captured, and where to."""
+
+    photographs: list[Photograph]
+    masks: dict[str, Path]
+    source: Path
+    folder: Path
+    camera: str | None
+
+    @property
+    def work(self) -> Path:
+        return self.folder / WORK
+
+    @property
+    def copies(self) -> dict[str, Photograph]:
+        """The photographs by the names of their working copies."""
+        return {copy_name(photograph): photograph for photograph in self.photographs}
+
+    def key(self, *more: Any) -> str:
+        """A hash of the photographs, how they lie, and what else a step depends on."""
+        parts = [VERSION, [(p.name, p.digest, p.lying) for p in self.photographs], *more]
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
+
+
+def capture(
+    source: Path,
+    folder: Path,
+    *,
+    masks: Path | None = None,
+    camera: str | None = None,
+    region: Region | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Report:
+    """Place the photographs of folder `source` and write the data set `folder`.
+
+    `masks`: a folder as in `find_masks`. `camera`: COLMAP's name of the lens model, or None for the
+    simplest of three that fits. `region`: of interest, in the data set's world, in place of the one that is
+    found. `tell` is called with what is done.
+
+    Raises InputError for input of no use, with the remedy, and where pycolmap is missing.
+    """
+    colmap.load()
+    if camera not in (None, *output.LENSES):
+        raise InputError(f"--camera: {camera}: unknown lens model; give one of {', '.join(output.LENSES)}")
+    photographs = find_photographs(source)
+    job = Job(photographs, find_masks(masks, photographs), source, folder, camera)
+    _prepare(job)
+    began = time.perf_counter()
+    model, groups = _model(job, tell)
+    failure.check_placed(source, len(photographs), groups, _beside_gap(job, groups[0]))
+    straight = output.straighten(model, job.copies)
+    solved = Solved.of(model)
+    similarity = upright_unit(solved, np.array([job.copies[name].up for name in solved.names]))
+    world = moved(solved, similarity)
+    found = region or Region((0.0, 0.0, 0.0), 1.0)
+    placed = [job.copies[name] for name in solved.names]
+    key = job.key(camera, [hashlib.sha256(path.read_bytes()).hexdigest() for path in job.masks.values()])
+    _write_pictures(job, placed, straight, key)
+    output.write_model(model, job.copies, straight, similarity, folder / "sparse" / "0")
+    write_json(folder / REGION_FILE, {"centre": list(found.centre), "radius": found.radius})
+    report = Report.of(job, model, world, groups, straight, found, key, time.perf_counter() - began)
+    draw(folder / PLOT, world, found)
+    write_json(folder / REPORT, report.content)
+    return report
+
+
+def _prepare(job: Job) -> None:
+    """The output folder; raises InputError for one that holds something else."""
+    folder = job.folder
+    if folder.resolve() == job.source.resolve():
+        raise InputError(f"{folder}: output: the folder of the photographs; choose another")
+    try:
+        strange = folder.is_dir() and any(folder.iterdir()) and not (folder / WORK).is_dir()
+        if strange and not (folder / REPORT).is_file():
+            raise InputError(f"{folder}: output: not empty, and no capture; choose another folder")
+        job.work.mkdir(parents=True, exist_ok=True)
+        remove_temporaries(folder)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+
+
+def _model(job: Job, tell: Callable[[str], None]) -> tuple[Any, list[list[str]]]:
+    """The largest group's reconstruction, its lens decided, and the names in each group."""
+    pycolmap = colmap.load()
+    size, names = colmap.WORKING_SIZE, sorted(job.copies)
+    pictures = job.work / f"pictures-{job.key(size)}"
+    features = job.key(size, colmap.MOST_FEATURES, pycolmap.__version__, _first_model(job))
+    database, result = (
+        job.work / f"features-{features}.db",
+        job.work / f"model-{job.key(features, job.camera)}",
+    )
+    if not result.is_dir():
+        for path in job.work.iterdir():  # of other pictures or options
+            if path != pictures and not path.name.startswith(database.stem):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        write_copies(job.photographs, pictures, size, colmap.progress("pictures"))
+        if not database.is_file():
+            colmap.begin(database, pictures, _groups(job, pictures))
+        colmap.extract(database, pictures, names)
+        found = colmap.features(database)
+        failure.check_features(job.source, [len(found[name]) for name in names], _contrast(pictures, names))
+        pairs = pairs_to_match(found)
+        tell(
+            f"{len(names)} photographs, {sum(map(len, found.values()))} features, {len(pairs)} pairs to match"
+        )
+        colmap.match(database, pairs)
+        raw = job.work / "unfinished"
+        shutil.rmtree(raw, ignore_errors=True)
+        models = colmap.reconstruct(database, pictures, raw, len(names))
+        if not models:
+            raise failure.no_model(job.source, len(names), colmap.verified(database))
+        groups = [Solved.of(model).names for model in models]
+        best = models[0]
+        if job.camera is None:
+            best = best_lens(best)
+        else:
+            adjust(best)
+        shutil.rmtree(raw)
+        raw.mkdir()
+        best.write_binary(raw)
+        write_json(raw / "groups.json", {"groups": groups})
+        raw.rename(result)
+    return pycolmap.Reconstruction(result), read_json(result / "groups.json")["groups"]
+
+
+def _first_model(job: Job) -> str:
+    return job.camera or FIRST_MODEL
+
+
+def _groups(job: Job, pictures: Path) -> list[tuple[list[str], str, list[float]]]:
+    """Pictures, lens model and first parameters of each camera; no parameters where EXIF tells no focal
+    length."""
+    from mi_refgs.images import image_size
+
+    groups = []
+    for photographs in cameras_of(job.photographs):
+        copies = [copy_name(photograph) for photograph in photographs]
+        size = image_size(pictures / copies[0])
+        focal, model = photographs[0].focal_pixels(size), _first_model(job)
+        parameters: list[float] = []
+        if focal is not None:
+            known = {"f": focal, "fx": focal, "fy": focal, "cx": size[0] / 2, "cy": size[1] / 2}
+            parameters = [known.get(name, 0.0) for name in output.LENSES[model][1].split()]
+        groups.append((copies, model, parameters))
+    return groups
+
+
+def _contrast(pictures: Path, names: Sequence[str]) -> float:
+    """Standard deviation of brightness, 0 … 1, of the median picture."""
+    from mi_refgs.images import read_png
+
+    few = names[:: max(1, len(names) // 10)]
+    return float(np.median([read_png(pictures / name).mean(axis=2).std() for name in few]))
+
+
+def _beside_gap(job: Job, placed: Sequence[str]) -> str:
+    """The first photograph that was not placed next to one that was."""
+    known = {job.copies[name].name for name in placed}
+    names = [photograph.name for photograph in job.photographs]
+    edges = [b for a, b in pairwise(names) if (a in known) != (b in known)]
+    return edges[0] if edges else names[-1]
+
+
+def _write_pictures(
+    job: Job, placed: Sequence[Photograph], straight: dict[str, output.Straight], key: str
+) -> None:
+    """Pictures and masks, moved to their place when all are there."""
+    done = job.work / "output.json"
+    if done.is_file() and read_json(done).get("key") == key:
+        return
+    done.unlink(missing_ok=True)
+    made = job.work / f"output-{key}"
+    write = colmap.progress("undistorted")
+    output.write_pictures(placed, lambda p: straight[copy_name(p)], job.masks, made, write)
+    for part in PARTS:
+        shutil.rmtree(job.folder / part, ignore_errors=True)
+    for ready in made.iterdir():
+        ready.rename(job.folder / ready.name)
+    made.rmdir()
+    write_json(done, {"key": key})
