@@ -18,6 +18,23 @@ from mi_refgs.reference import losses as reference
 from mi_refgs.shade.envmap import EnvironmentLight
 
 
+def test_scores_of_some_pixels() -> None:
+    """Those pixels alone count; where they are all, nothing changes; SSIM's windows reach beyond them."""
+    rng = np.random.default_rng(5)
+    truth = rng.random((24, 20, 3))
+    image = np.clip(truth + 0.05 * rng.normal(size=truth.shape), 0, 1)
+    where = np.zeros((24, 20), bool)
+    where[4:9, 3:15] = True
+    image[~where] = 1 - image[~where]
+    assert metrics.psnr(image, truth, where) == pytest.approx(
+        -10 * np.log10(np.mean((image[4:9, 3:15] - truth[4:9, 3:15]) ** 2))
+    )
+    everywhere = np.ones_like(where)
+    assert metrics.psnr(image, truth, everywhere) == pytest.approx(metrics.psnr(image, truth))
+    assert metrics.ssim(image, truth, everywhere) == pytest.approx(metrics.ssim(image, truth), abs=1e-9)
+    assert metrics.ssim(image, truth) < metrics.ssim(image, truth, where) < 1
+
+
 def test_psnr(rng: np.random.Generator) -> None:
     truth = rng.uniform(0.2, 0.8, (8, 9, 3))
     assert metrics.psnr(truth + 0.1, truth) == pytest.approx(20)

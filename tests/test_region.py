@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mi_refgs.data.region import REGION_FILE, Region, read_region, region_of
+from mi_refgs.data.region import REGION_FILE, Region, read_region, region_of, region_pixels
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
@@ -22,6 +23,23 @@ def view_from(origin: np.ndarray, focal: float = 100.0) -> View:
     to_world[:3, 3] = origin
     image = np.zeros((100, 100, 3), np.float32)
     return View("v", 100, 100, focal, focal, 50, 50, to_world, image, None, None, None, False)
+
+
+def test_pixels_of_the_region_are_those_whose_rays_meet_it() -> None:
+    """Against points along the rays of the view's own camera, for a sphere off the axis, and from within."""
+    region = Region((0.3, -0.2, 0.1), 0.4)
+    for origin in (np.array([2.0, 1.0, 0.5]), np.array([0.4, -0.1, 0.2]), np.array([-0.5, 0.6, -1.5])):
+        view = replace(view_from(origin), width=30, height=20, fx=25.0, fy=28.0, cx=12.0, cy=11.0)
+        rays = np.array(view.camera().rays()).T
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        steps = origin + np.linspace(0, 6, 1500)[:, None, None] * rays
+        nearest = np.linalg.norm(steps - np.array(region.centre), axis=-1).min(axis=0)
+        found = region_pixels(view, region).ravel()
+        clear = np.abs(nearest - region.radius) > 1e-3
+        np.testing.assert_array_equal(found[clear], nearest[clear] < region.radius)
+        assert found.any()
+    behind = Region((6.0, 3.0, 1.5), 0.4)
+    assert not region_pixels(view_from(np.array([2.0, 1.0, 0.5])), behind).any()
 
 
 def test_contraction_is_the_identity_inside_and_ends_at_two() -> None:

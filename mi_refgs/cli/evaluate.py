@@ -11,6 +11,8 @@ ROWS = (
     ("psnr", "PSNR", "{:.2f} dB"),
     ("psnr_gain", "PSNR, exposure fitted", "{:.2f} dB"),
     ("ssim", "SSIM", "{:.4f}"),
+    ("psnr_region", "PSNR, region of interest", "{:.2f} dB"),
+    ("ssim_region", "SSIM, region of interest", "{:.4f}"),
     ("flip", "FLIP", "{:.4f}"),
     ("lpips", "LPIPS", "{:.4f}"),
     ("normal_mae_deg", "normal error, foreground", "{:.2f}°"),

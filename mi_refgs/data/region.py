@@ -34,6 +34,19 @@ def region_of(views: Sequence[View]) -> Region:
     return Region((x, y, z), radius)
 
 
+def region_pixels(view: View, region: Region) -> np.ndarray:
+    """Pixels (H, W) whose ray, through their centre, meets the region's sphere in front of the camera."""
+    across = (view.cx - 0.5 - np.arange(view.width)) / view.fx
+    up = (view.cy - 0.5 - np.arange(view.height)) / view.fy
+    local = np.stack([*np.meshgrid(across, up), np.ones((view.height, view.width))], axis=-1)
+    toward = (np.array(region.centre) - view.to_world[:3, 3]) @ view.to_world[:3, :3]
+    length = np.linalg.norm(local, axis=-1)
+    along = (local @ toward) / length
+    beside = np.sum(toward**2) - along**2
+    inside = float(np.sum(toward**2)) < region.radius**2
+    return (beside <= region.radius**2) & ((along > 0) | inside)
+
+
 def read_region(folder: Path) -> Region | None:
     """The region that a data set's folder records; None without the file, InputError for one of no use."""
     path = folder / REGION_FILE

@@ -47,6 +47,19 @@ class View:
         focal = (-self.fx, -self.fy)
         return Camera.from_pose(self.width, self.height, *focal, self.cx, self.cy, self.to_world, self.near)
 
+    def covered(self) -> np.ndarray:
+        """What part of each pixel the object covers, (H, W): alpha.
+
+        Without it 1 where something true is recorded of a surface, and of all pixels where nothing is.
+        """
+        if self.alpha is not None:
+            return self.alpha
+        if self.normal is not None:
+            return np.any(self.normal != 0, axis=-1).astype(np.float32)
+        if self.depth is not None:
+            return (self.depth > 0).astype(np.float32)
+        return np.ones((self.height, self.width), np.float32)
+
     def averaged(self, block: int) -> View:
         """The same view with each square of `block` × `block` pixels as one, and without true maps.
 

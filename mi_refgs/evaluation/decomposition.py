@@ -82,8 +82,7 @@ class Decomposition:
         self, shot: RenderedView, maps: dict[str, np.ndarray], view: View, concave: np.ndarray | None
     ) -> None:
         """Count a view: its picture and normals, our maps by material, and which pixels are concave."""
-        alpha = np.ones(shot.alpha.shape) if view.alpha is None else view.alpha
-        front = alpha > metrics.FOREGROUND_ALPHA
+        front = view.covered() > metrics.FOREGROUND_ALPHA
         self.foreground += int(front.sum())
         places = {"": front}
         if concave is not None:
@@ -153,7 +152,7 @@ def panels(
 ) -> dict[str, np.ndarray]:
     """Ours beside the truth, map by map, by title; albedo after its scale."""
     pairs: dict[str, tuple[np.ndarray, ...]] = {"picture": (shot.image, target(view))}
-    covered = shot.alpha if view.alpha is None else view.alpha
+    covered = view.covered()
     if view.normal is not None:
         normals = on_white(0.5 + 0.5 * shot.normal, shot.alpha), on_white(0.5 + 0.5 * view.normal, covered)
         pairs["normals"] = normals

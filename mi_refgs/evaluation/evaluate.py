@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.region import region_pixels
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import decomposition, metrics, pictures
@@ -32,6 +33,7 @@ DECOMPOSITION = "decomposition.png"
 METRICS = "metrics.json"
 SHEET_VIEWS = 4
 """Rows of either sheet, spread evenly over the test views."""
+REGION_KEYS = ("psnr_region", "ssim_region", "region_share")
 NORMAL_KEYS = ("normal_mae_deg", "normal_mae_deg_full")
 LIGHT_KEYS = ("env_scale", "env_mae", "env_psnr", "env_correlation")
 
@@ -66,8 +68,10 @@ def evaluate(
     """Render the test views, measure them, and write metrics.json, renders and two sheets into the run.
 
     Evaluates the artefacts as they lie in the folder, after writing what a newer checkpoint makes stale.
-    Every key is always there: null, with a `…_reason`, where it does not apply. Normals count where the true
-    alpha is above ½ and there is a true normal, materials (`evaluation.decomposition`) where the data defines
+    Every key is always there: null, with a `…_reason`, where it does not apply. `psnr_region` and
+    `ssim_region` are of pixels whose ray meets the data's region of interest (`data.region.region_pixels`),
+    `region_share` is their part of all. Normals count where the true alpha is above ½ and there is a true
+    normal (without alpha, where there is one), materials (`evaluation.decomposition`) where the data defines
     them; keys that end in `_concave` count pixels where the true surface is (`evaluation.surface`).
     `psnr_gain` is that after `data.exposure.fitted_gain`, a gain a channel of every view: what pictures of
     different exposure are judged by, for every method alike. `exposure` is what the fit decided about its own
@@ -123,9 +127,12 @@ def evaluate(
                 scores[name], scores[f"{name}_reason"] = None, previous[f"{name}_reason"]
             else:
                 scores[name], scores[f"{name}_reason"] = measure(shot.image, goal)
+        if views.region is not None and (where := region_pixels(truth, views.region)).any():
+            scores["psnr_region"] = metrics.psnr(shot.image, goal, where)
+            scores["ssim_region"] = metrics.ssim(shot.image, goal, where)
+            scores["region_share"] = float(where.mean())
         if truth.normal is not None:
-            covered = np.linalg.norm(truth.normal, axis=-1) if truth.alpha is None else truth.alpha
-            scores |= metrics.normal_mae_deg(shot.normal, truth.normal, covered)
+            scores |= metrics.normal_mae_deg(shot.normal, truth.normal, truth.covered())
         per_view.append(scores)
         maps = materials(truth.camera(), shot)
         concave = None if surface is None else surface.concave(truth)
@@ -136,10 +143,14 @@ def evaluate(
             kept.append((shot, maps, truth, concave))
 
     result: dict[str, Any] = {
-        name: _mean(per_view, name) for name in ("psnr", "psnr_gain", "ssim", "flip", "lpips", *NORMAL_KEYS)
+        name: _mean(per_view, name)
+        for name in ("psnr", "psnr_gain", "ssim", "flip", "lpips", *REGION_KEYS, *NORMAL_KEYS)
     }
     for name in ("flip", "lpips"):
         result[f"{name}_reason"] = per_view[0][f"{name}_reason"] or None
+    result["region_reason"] = (
+        None if result["psnr_region"] is not None else "the data set has alpha and no region of interest"
+    )
     result["normal_reason"] = (
         None if result["normal_mae_deg"] is not None else "the data set has no true normals"
     )

@@ -30,10 +30,13 @@ LPIPS_NETWORK = "alex"
 # ---------------- images ----------------
 
 
-def psnr(image: np.ndarray, truth: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB over all pixels and channels, background included; at most 100."""
+def psnr(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
+    """Peak signal-to-noise ratio in dB over all pixels and channels, background included; at most 100.
+
+    `where` (H, W) chooses pixels, at least one.
+    """
     image, truth = _pair(image, truth)
-    return psnr_of(float(np.mean((image - truth) ** 2)))
+    return psnr_of(float(np.mean((image - truth)[where] ** 2)))
 
 
 def psnr_of(error: float) -> float:
@@ -41,8 +44,8 @@ def psnr_of(error: float) -> float:
     return PSNR_MAX if error <= 0 else min(PSNR_MAX, -10 * float(np.log10(error)))
 
 
-def ssim(image: np.ndarray, truth: np.ndarray) -> float:
-    """Structural similarity as `fit.ssim` trains with it, by scikit-image.
+def ssim(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
+    """Structural similarity as `fit.ssim` trains with it, by scikit-image; `where` as in `psnr`.
 
     scikit-image reflects at the border and leaves it out of the mean; padding by the window's radius with
     zeros turns that into the zero padding and the mean over every pixel that 3DGS and Ref-Gaussian report.
@@ -51,18 +54,19 @@ def ssim(image: np.ndarray, truth: np.ndarray) -> float:
 
     border = ((WINDOW_RADIUS, WINDOW_RADIUS), (WINDOW_RADIUS, WINDOW_RADIUS), (0, 0))
     image, truth = (np.pad(array, border) for array in _pair(image, truth))
-    return float(
-        structural_similarity(
-            image,
-            truth,
-            win_size=2 * WINDOW_RADIUS + 1,
-            gaussian_weights=True,
-            sigma=WINDOW_SIGMA,
-            use_sample_covariance=False,
-            data_range=1.0,
-            channel_axis=-1,
-        )
+    _, similar = structural_similarity(
+        image,
+        truth,
+        win_size=2 * WINDOW_RADIUS + 1,
+        gaussian_weights=True,
+        sigma=WINDOW_SIGMA,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+        full=True,
     )
+    whole = slice(WINDOW_RADIUS, -WINDOW_RADIUS)
+    return float(similar[whole, whole][where].mean())
 
 
 def lpips(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:

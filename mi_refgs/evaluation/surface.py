@@ -34,6 +34,8 @@ CANDIDATES = 8
 """Nearest of these points, whose triangles are tried exactly."""
 GRAZING = 0.1
 """Cosine to the viewing ray below which a view does not see a point: its pixel may see the back."""
+NEAR_TRUTH = 1.2
+"""Radius around the truth, in its own, of what is compared with it where a mesh has surroundings."""
 SEED = 0
 SURFACE_KEYS = ("surface_distance", "surface_accuracy", "surface_completeness")
 NO_SURFACE = f"the data set has no {SURFACE}; make it again with this version of `refgs dataset`"
@@ -103,11 +105,17 @@ def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> d
     `surface_accuracy`, mean distance from points of the mesh to the true surface; `surface_completeness`,
     from points of the true surface to the mesh; `surface_distance`, the mean of both (Chamfer distance); and
     each with `_concave`, of points whose (nearest) point on the true surface is concave, if there are any.
-    Points are spread evenly over the area that the views see, each surface in front of itself.
+    Points are spread evenly over the area that the views see, each surface in front of itself. Of a mesh with
+    surroundings (views without alpha) what is near the truth counts, in pixels that show the object.
     """
     corners = np.asarray(truth.mesh.vertices, np.float64)
     centre = (corners.min(0) + corners.max(0)) / 2
-    percent = 100 / (2 * np.linalg.norm(corners - centre, axis=1).max())
+    radius = np.linalg.norm(corners - centre, axis=1).max()
+    percent = 100 / (2 * radius)
+    if views and views[0].alpha is None:
+        mesh = _cut(mesh, centre, NEAR_TRUTH * radius)
+        if not len(mesh.faces):
+            return {}
     (ours, _), (true, facing) = _seen(mesh, Occluder(mesh), views), _seen(truth.mesh, truth.occluder, views)
     result: dict[str, float] = {}
     if not len(ours) or not len(true):
@@ -123,6 +131,12 @@ def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> d
     return result
 
 
+def _cut(mesh: Mesh, centre: np.ndarray, radius: float) -> Mesh:
+    """The triangles of a mesh that lie whole in a sphere."""
+    inside = np.linalg.norm(mesh.vertices - centre, axis=1) <= radius
+    return Mesh(mesh.vertices, mesh.faces[inside[mesh.faces].all(axis=1)], mesh.voxel)
+
+
 def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     """Even points (P, 3) of a mesh that some view sees past the mesh itself, and normals towards it."""
     position, triangle = sample(mesh, QUERIES)
@@ -135,7 +149,12 @@ def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.nda
         ray = position - origin
         reach = np.maximum(np.linalg.norm(ray, axis=1), 1e-30)
         cosine = np.sum(normal * ray, axis=1) / reach
-        better = view.project(position)[2] & (np.abs(cosine) > best)
+        row, column, inside = view.project(position)
+        better = inside & (np.abs(cosine) > best)
+        if view.alpha is None:
+            at = np.rint(np.where(inside, [row, column], 0)).astype(int)
+            at = np.clip(at, 0, np.array([[view.height - 1], [view.width - 1]]))
+            better &= view.covered()[*at] > 0
         start = mi.Point3f(np.tile(origin, (len(ray), 1)).T)
         hit, stopped = occluder.first_hit(start, mi.Vector3f(ray.T), mi.Bool(better))
         # In lengths of the ray: what stands in the way does so by more than rays are moved off a surface.
