@@ -95,8 +95,7 @@ def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
         factor = math.gcd(shrink, JPEG_SHRINK) if picture.format == "JPEG" else 1
         if factor > 1:
             picture.draft(None, tuple(max(side // factor, 1) for side in picture.size))
-        transparent = picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
-        return np.asarray(picture.convert("RGBA" if transparent else "RGB")), factor
+        return np.asarray(picture.convert("RGBA" if _transparent(picture) else "RGB")), factor
 
 
 def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
@@ -115,16 +114,39 @@ def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
     return grey, 255 if grey.max() > 1 else 1
 
 
+def read_tiff(path: str | Path) -> np.ndarray:
+    """The numbers (H, W) float32 of a TIFF file with one channel, floating-point or of 16 bits as 0 … 1.
+
+    Raises InputError if the file is missing, unreadable or holds something else.
+    """
+    path = Path(path)
+    with open_picture(path, "TIFF") as picture:
+        if picture.mode != "F" and not picture.mode.startswith("I;16"):
+            raise InputError(f"{path}: pixels: not one channel of floats or 16 bits; export it again")
+        scale = 1 if picture.mode == "F" else 65535
+        return np.nan_to_num(np.asarray(picture, dtype=np.float32) / np.float32(scale))
+
+
+def has_alpha(path: str | Path) -> bool:
+    """Whether a PNG or JPEG file has alpha, from its header; raises InputError as `read_png` does."""
+    with open_picture(Path(path)) as picture:
+        return _transparent(picture)
+
+
+def _transparent(picture: Any) -> bool:
+    return picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
+
+
 @contextlib.contextmanager
-def open_picture(path: Path) -> Iterator[Any]:
-    """A PNG or JPEG file whose header is read and whose size is believable."""
+def open_picture(path: Path, *formats: str) -> Iterator[Any]:
+    """A PNG or JPEG file, or one of `formats`, whose header is read and whose size is believable."""
     from PIL import Image
 
     require_file(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `check_size` is stricter
-            picture = Image.open(path, formats=("PNG", "JPEG"))
+            picture = Image.open(path, formats=formats or ("PNG", "JPEG"))
         with picture:
             check_size(path, *picture.size, len(picture.getbands()))
             yield picture

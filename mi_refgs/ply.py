@@ -1,4 +1,4 @@
-"""The header of a PLY file, checked against the length of the file before memory is asked for."""
+"""The header and the vertices of a PLY file, checked against its length before memory is asked for."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
+
+import numpy as np
 
 from mi_refgs.errors import InputError
 
@@ -98,3 +100,37 @@ def read_header(path: Path, file: BinaryIO) -> Header:
                 "truncated, copy or export it again"
             )
     return Header(order, elements, (*comments,))
+
+
+def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
+    """The `vertex` element as a structured array.
+
+    Raises InputError as `read_header` does, and for vertices that do not come first or have lists.
+    """
+    header = read_header(path, file)
+    vertex = header.elements[0]
+    if vertex.name != "vertex":
+        raise InputError(f"{path}: {vertex.name}: the vertices must come first; export it as a surfel PLY")
+    if vertex.lists:
+        raise InputError(
+            f"{path}: {vertex.lists[0][0]}: not a number property; export the vertices without lists"
+        )
+    if header.order == "a":
+        values = _read_ascii(path, file, vertex.count, len(vertex.fields))
+        dtype = np.dtype([(name, "f8") for name, _ in vertex.fields])
+        return np.ascontiguousarray(values).view(dtype).reshape(vertex.count)
+    dtype = np.dtype([(name, header.order + code) for name, code in vertex.fields])
+    return np.frombuffer(file.read(vertex.count * dtype.itemsize), dtype=dtype)
+
+
+def _read_ascii(path: Path, file: BinaryIO, count: int, width: int) -> np.ndarray:
+    values = np.empty((count, width))
+    for row in range(count):
+        words = file.readline().split()
+        try:
+            values[row] = [float(word) for word in words]
+        except ValueError as error:
+            raise InputError(
+                f"{path}: vertex: row {row} is broken or missing; copy or export the file again"
+            ) from error
+    return values

@@ -13,12 +13,13 @@ from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import inside, is_file
 from mi_refgs.data.lens import Lens, Undistortion
-from mi_refgs.data.picture_files import PictureFile, make_view
+from mi_refgs.data.picture_files import Mask, PictureFile, make_view
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.readers import ReadOptions
+from mi_refgs.data.truth_maps import ALPHA, beside, block_mean, shiny_maps, unit
 from mi_refgs.data.view import View
 from mi_refgs.exr import read_exr_image
-from mi_refgs.images import box_downscale, image_size
+from mi_refgs.images import has_alpha, image_size
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 """File name endings that `file_path` may carry or leave out, in the order in which they are tried."""
@@ -43,25 +44,24 @@ class FrameReader:
     def read(self, index: int, frame: Any) -> View:
         file = self._file(index, frame)
         to_world = self._to_world(index, frame)
-        picture = PictureFile.find(file, self.options.downscale)
+        picture = PictureFile.find(file, self.options.downscale, self._mask(index, frame, file))
         intrinsics = self._intrinsics(frame, file, picture.height, picture.width)
         where, name = f"{self.transforms}: frames[{index}]: k1 … p2", _stem(str(Path(frame["file_path"])))
         lens = self._lens(frame)
         view, straight = make_view(name, picture, self.options, intrinsics, lens, to_world, where)
+        if not self.options.truth:
+            return view
         source = (picture.height, picture.width)
         normal = self._map(index, frame, "normal_path", (*source, 3), straight)
         depth = self._map(index, frame, "depth_path", (*source, 1), straight)
         channels = {"albedo": 4, "roughness": 2, "metallic": 2}
         known = {n: self._map(index, frame, f"{n}_path", (*source, c), straight) for n, c in channels.items()}
-        if normal is not None:
-            length = np.linalg.norm(normal, axis=-1, keepdims=True)
-            normal = np.where(length > 0, normal / np.maximum(length, 1e-12), 0).astype(np.float32)
-        return replace(
-            view,
-            normal=normal,
-            depth=None if depth is None else depth[..., 0],
-            materials={name: values for name, values in known.items() if values is not None},
-        )
+        normal = None if normal is None else unit(normal)
+        depth = None if depth is None else depth[..., 0]
+        if normal is depth is None:
+            normal, depth = shiny_maps(file, source, self.options.downscale, straight)
+        materials = {name: values for name, values in known.items() if values is not None}
+        return replace(view, normal=normal, depth=depth, materials=materials)
 
     def size(self, index: int, frame: Any) -> tuple[int, int]:
         """Width and height of a frame's picture as it lies in the file."""
@@ -108,7 +108,7 @@ class FrameReader:
         `expected` is the shape that the file must have: the picture's. Of two or four channels the last says
         where the others count, and comes back as the share of the block that does.
         """
-        file = self._path(index, frame, key) if self.options.truth else None
+        file = self._path(index, frame, key)
         if file is None:
             return None
         pixels = read_exr_image(file)
@@ -119,15 +119,17 @@ class FrameReader:
             )
         masked = expected[-1] in (2, 4)
         covered = np.clip(pixels[..., -1:], 0, 1) if masked else np.any(pixels != 0, axis=-1, keepdims=True)
-        covered = covered.astype(np.float32)
-        pixels = pixels * covered if masked else pixels
-        share, total = box_downscale(covered, self.options.downscale), box_downscale(pixels, self.options.downscale)
-        if straight is not None:  # linear, so that no weight is negative
-            share, total = straight.resample(share, order=1), straight.resample(total, order=1)
-        mean = total / np.maximum(share, 1e-12)
-        if masked:
-            mean = np.concatenate([np.where(share > 0, mean[..., :-1], 0), share], axis=-1)
-        return mean.astype(np.float32)
+        mean, share = block_mean(pixels, covered, self.options.downscale, straight)
+        return np.concatenate([mean[..., :-1], share], axis=-1) if masked else mean
+
+    def _mask(self, index: int, frame: dict[str, Any], picture: Path) -> Mask | None:
+        """What belongs to the object: `mask_path`, or beside a picture without alpha a file of that name."""
+        if self.options.images == "exr":
+            return None
+        file = self._path(index, frame, "mask_path")
+        if file is None and not has_alpha(picture):
+            file = beside(picture, ALPHA)
+        return None if file is None else Mask(file)
 
     def _to_world(self, index: int, frame: dict[str, Any]) -> np.ndarray:
         field = f"{self.transforms}: frames[{index}].transform_matrix"

@@ -5,7 +5,10 @@ in a frame or for the whole file; `k1` … `k4`, `p1`, `p2`, `is_fisheye`, `came
 distortion); `frames` with `file_path` (with or without extension) and `transform_matrix`
 (camera to world, OpenGL axes); optional `exr_path`, `normal_path` (X, Y, Z, world), `depth_path` (along
 the viewing axis), `albedo_path` (R, G, B, A), `roughness_path` and `metallic_path` (Y, A; A: defined there) as
-`data.make_dataset` writes them.
+`data.make_dataset` writes them. Shiny Blender's maps beside the pictures are found by their names (`truth_maps`).
+
+nerfstudio's `mask_path` (bright: object) becomes alpha; `ply_file_path` names points, which lie in the frame of the
+poses: `applied_transform` is in both. `train_filenames` and `test_filenames` (or `val_filenames`) name a split's pictures.
 """
 
 from __future__ import annotations
@@ -14,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs.data.frames import FrameReader
-from mi_refgs.data.readers import ReadOptions, Recording, held_out
-from mi_refgs.errors import InputError
-from mi_refgs.files import read_json
+from mi_refgs.data.point_file import read_points
+from mi_refgs.data.readers import PointCloud, ReadOptions, Recording, held_out
+from mi_refgs.errors import InputError, shown
+from mi_refgs.files import inside, read_json
 
 
 class TransformsReader:
@@ -40,7 +44,8 @@ class TransformsReader:
         reader = FrameReader(transforms, content, options)
         light = folder / "environment.exr"
         views = tuple(reader.read(i, frame) for i, frame in frames)
-        return Recording(views, environment=light if light.is_file() else None, source=transforms)
+        there = light if light.is_file() else None
+        return Recording(views, _points(transforms, content), environment=there, source=transforms)
 
 
 def _frames(path: Path, split: str) -> tuple[Path, dict[str, Any], list[tuple[int, Any]]]:
@@ -60,11 +65,45 @@ def _frames(path: Path, split: str) -> tuple[Path, dict[str, Any], list[tuple[in
         raise InputError(f"{transforms}: frames: missing or not a list; add one entry for each picture")
     selected = list(enumerate(frames))
     if not whole:
-        selected = held_out(sorted(selected, key=lambda item: _file_path(item[1])), split)
+        named = _named(transforms, content, split)
+        if named is not None:
+            selected = [item for item in selected if _file_path(item[1]) in named]
+        else:
+            selected = held_out(sorted(selected, key=lambda item: _file_path(item[1])), split)
     if not selected:
         kind = {"train": "training", "test": "test"}.get(split, split)
         raise InputError(f"{transforms}: frames: zero {kind} views; add pictures")
     return transforms, content, selected
+
+
+def _named(transforms: Path, content: dict[str, Any], split: str) -> set[str] | None:
+    """The file paths of a split's frames; None where the file names no test pictures."""
+    lists = {}
+    for key in ("train", "val", "test"):
+        names = content.get(f"{key}_filenames") or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"{transforms}: {key}_filenames: not a list of paths; correct it, or remove it")
+        lists[key] = {*names}
+    test = lists["test"] or lists["val"]
+    if not test:
+        return None
+    if split == "test":
+        return test
+    every = {_file_path(frame) for frame in content["frames"]}
+    return lists["train"] or every - test - lists["val"]
+
+
+def _points(transforms: Path, content: dict[str, Any]) -> PointCloud | None:
+    """The points that `ply_file_path` names; None without the key, or without points of usable numbers."""
+    name = content.get("ply_file_path")
+    if not name:
+        return None
+    file = inside(transforms.parent, name)
+    if file is None:
+        raise InputError(
+            f"{transforms}: ply_file_path: {shown(name)} names no file in the data set's folder; move it there"
+        )
+    return read_points(file)
 
 
 def _file_path(frame: Any) -> str:

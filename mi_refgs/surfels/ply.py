@@ -13,13 +13,12 @@ every other coefficient of r, of g, of b. The table's own column order is 3 coef
 from __future__ import annotations
 
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
-from mi_refgs.ply import read_header
+from mi_refgs.ply import read_vertices
 from mi_refgs.primitives import nearest_primitive, widths_of
 from mi_refgs.surfels.channels import CHANNELS, MAX_SH_DEGREE, sh_columns
 from mi_refgs.surfels.table import Surfels
@@ -37,7 +36,7 @@ def read_ply(path: str | Path) -> Surfels:
     path = Path(path)
     try:
         with path.open("rb") as file:
-            vertices = _read_vertices(path, file)
+            vertices = read_vertices(path, file)
     except OSError as error:
         raise InputError(f"{path}: file: cannot be read ({error.strerror}); check the path") from error
 
@@ -56,37 +55,6 @@ def read_ply(path: str | Path) -> Surfels:
     for name in missing:
         _columns(path, vertices, CHANNELS[name].properties[: primitive.widths[name]])  # says what is missing
     return Surfels.from_numpy(arrays)
-
-
-def _read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
-    """The `vertex` element as a structured array."""
-    header = read_header(path, file)
-    vertex = header.elements[0]
-    if vertex.name != "vertex":
-        raise InputError(f"{path}: {vertex.name}: the vertices must come first; export it as a surfel PLY")
-    if vertex.lists:
-        raise InputError(
-            f"{path}: {vertex.lists[0][0]}: not a number property; export the vertices without lists"
-        )
-    if header.order == "a":
-        values = _read_ascii(path, file, vertex.count, len(vertex.fields))
-        dtype = np.dtype([(name, "f8") for name, _ in vertex.fields])
-        return np.ascontiguousarray(values).view(dtype).reshape(vertex.count)
-    dtype = np.dtype([(name, header.order + code) for name, code in vertex.fields])
-    return np.frombuffer(file.read(vertex.count * dtype.itemsize), dtype=dtype)
-
-
-def _read_ascii(path: Path, file: BinaryIO, count: int, width: int) -> np.ndarray:
-    values = np.empty((count, width))
-    for row in range(count):
-        words = file.readline().split()
-        try:
-            values[row] = [float(word) for word in words]
-        except ValueError as error:
-            raise InputError(
-                f"{path}: vertex: row {row} is broken or missing; copy or export the file again"
-            ) from error
-    return values
 
 
 def _columns(path: Path, vertices: np.ndarray, properties: tuple[str, ...]) -> np.ndarray:

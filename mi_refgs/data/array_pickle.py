@@ -1,0 +1,109 @@
+"""Arrays in pickles of strangers: nothing of the file is called, only arrays of plain numbers are made of it.
+
+A pickle is a program. Here its instructions are compared with a list first; the few names of NumPy that it may ask
+for become records of what was asked; and the arrays are made of these records, after checks of our own.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import pickletools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+
+MAX_BYTES = 2**16
+"""Of a file: a camera has a few hundred."""
+MAX_ITEMS = 1000
+"""Of a list."""
+NAMES = {
+    **{(f"numpy.{core}.multiarray", "_reconstruct"): "array" for core in ("core", "_core")},
+    ("numpy", "ndarray"): "kind",
+    ("numpy", "dtype"): "dtype",
+    ("_codecs", "encode"): "bytes",  # how protocols 0 to 2 write bytes
+}
+CODES = {"f4", "f8", "i4", "i8"}
+"""Types of the numbers in an array."""
+INSTRUCTIONS = {
+    *"PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE MEMOIZE PUT BINPUT LONG_BINPUT".split(),
+    *"GET BINGET LONG_BINGET INT BININT BININT1 BININT2 LONG LONG1 FLOAT BINFLOAT STRING BINSTRING".split(),
+    *"SHORT_BINSTRING BINBYTES SHORT_BINBYTES UNICODE BINUNICODE SHORT_BINUNICODE LIST EMPTY_LIST APPEND".split(),
+    *"APPENDS TUPLE EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3 GLOBAL STACK_GLOBAL REDUCE BUILD".split(),
+}
+
+
+class Record:
+    """A name that a pickle asks for, the arguments it is called with, and the state it is given."""
+
+    __slots__ = ("arguments", "kind", "state")
+
+    def __init__(self, kind: str, arguments: tuple[Any, ...] = ()) -> None:
+        self.kind, self.arguments, self.state = kind, arguments, None
+
+    def __call__(self, *arguments: Any) -> Record:
+        return Record(self.kind, arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        kind = NAMES.get((module, name))
+        if kind is None:
+            raise pickle.UnpicklingError(f"it asks for {module[:40]}.{name[:40]}, which is no array")
+        return Record(kind)
+
+    def persistent_load(self, _: Any) -> Any:
+        raise pickle.UnpicklingError("it refers to something outside of the file")
+
+
+def read_arrays(path: Path) -> list[np.ndarray]:
+    """The arrays, float64, of a pickled list of them.
+
+    Raises InputError for a file that is missing, broken, or holds anything else.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise ValueError("it is too long")
+        _check(data)
+        found = _Unpickler(io.BytesIO(data), encoding="latin1").load()
+        if not isinstance(found, list | tuple) or len(found) > MAX_ITEMS:
+            raise ValueError("it is no list")
+        return [_array(item) for item in found]
+    except Exception as error:  # what a broken pickle raises has no common type
+        raise InputError(
+            f"{path}: pickle: no list of arrays ({str(error)[:100]}); copy the file again, or do not trust it"
+        ) from error
+
+
+def _check(data: bytes) -> None:
+    """Raise ValueError for an instruction that arrays do not need, and for places that memory does not have."""
+    for instruction, argument, _ in pickletools.genops(io.BytesIO(data)):
+        if instruction.name not in INSTRUCTIONS:
+            raise ValueError(f"it has the instruction {instruction.name}")
+        if instruction.name.endswith("PUT") and not (argument or 0) <= len(data):
+            raise ValueError("it has more places than bytes")
+
+
+def _array(item: Any) -> np.ndarray:
+    if not isinstance(item, Record) or item.kind != "array" or not isinstance(item.state, tuple):
+        raise ValueError("it holds something else")
+    _, shape, dtype, by_columns, values = item.state
+    code, order = dtype.arguments[0], dtype.state[1]
+    if isinstance(values, Record):
+        values = values.arguments[0].encode("latin1")
+    if code not in CODES or order not in ("<", ">") or not isinstance(values, bytes):
+        raise ValueError("it holds no plain numbers")
+    size = math.prod(side for side in shape if type(side) is int and 0 <= side <= MAX_BYTES)
+    if len(shape) > 2 or size * int(code[1]) != len(values):
+        raise ValueError("an array has another size than its numbers")
+    array = np.frombuffer(values, dtype=order + code).astype(np.float64)
+    return array.reshape(shape, order="F" if by_columns else "C")
