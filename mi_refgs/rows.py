@@ -121,3 +121,48 @@ class _OddColumns(dr.CustomOp):
 
     def name(self) -> str:
         return "columns"
+
+
+def joined(first: list[Any], second: list[Any]) -> list[Any]:
+    """Each mi.Float of `first` with that of `second` after it, under AD; both lists are of one length.
+
+    The adjoints go to arrays of their own, so that nothing else that reads an input writes there too.
+    """
+    return list(dr.custom(_Joined, first, second))
+
+
+class _Joined(dr.CustomOp):
+    """Two lists of arrays → a list of longer ones; one kernel for each distinct width that is read."""
+
+    def eval(self, first: list[Any], second: list[Any]) -> list[Any]:
+        self.widths = [[dr.width(array) for array in part] for part in (first, second)]
+        return self._join(first, second)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._join(self.grad_in("first"), self.grad_in("second")))
+
+    def backward(self) -> None:
+        δout = self.grad_out()
+        dr.eval(δout)
+        starts = [[mi.UInt32(0)] * len(δout), [dr.opaque(mi.UInt32, width) for width in self.widths[0]]]
+        for name, widths, start in zip(("first", "second"), self.widths, starts, strict=True):
+            places = [dr.arange(mi.UInt32, width) + begin for width, begin in zip(widths, start, strict=True)]
+            self.set_grad_in(
+                name, [dr.gather(mi.Float, δ, place) for δ, place in zip(δout, places, strict=True)]
+            )
+
+    def name(self) -> str:
+        return "joined"
+
+    def _join(self, first: list[Any], second: list[Any]) -> list[Any]:
+        out = []
+        for a, b, width, other in zip(first, second, *self.widths, strict=True):
+            whole = dr.empty(mi.Float, width + other)
+            place, begin = dr.arange(mi.UInt32, width), dr.opaque(mi.UInt32, width)
+            # Without the promise of no conflicts every array would be a kernel of its own.
+            dr.scatter(whole, dr.detach(a), place, mode=dr.ReduceMode.NoConflicts)
+            place = dr.arange(mi.UInt32, other) + begin
+            dr.scatter(whole, dr.detach(b), place, mode=dr.ReduceMode.NoConflicts)
+            out.append(whole)
+        dr.eval(out)
+        return out

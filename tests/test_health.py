@@ -73,7 +73,7 @@ def test_surfels_with_a_gradient_that_is_not_finite_are_removed_and_named(
     assert trainer.skipped == 1 and trainer.surfels.count == len(before) - 2
     [said] = trainer.notices
     assert said == f"iteration {failed[0]}, view 2: albedo not finite at surfels 17, 52: 2 were removed"
-    assert len(trainer.control.gradient_sum) == trainer.surfels.count
+    assert len(trainer.control.table.gradient_sum) == trainer.surfels.count
     lines = (run.path / "metrics.jsonl").read_text().splitlines()
     assert json.loads(lines[-1])["skipped_steps"] == 1
 
@@ -87,7 +87,7 @@ def test_surfels_that_are_not_finite_are_removed_and_the_fit_goes_on(
     trainer.step()
     raw = trainer.surfels.to_numpy()
     raw[name][[3, 9], 0] = value
-    trainer.control.replace(Surfels.from_numpy(raw))
+    trainer.control.table.replace(Surfels.from_numpy(raw))
     trainer.train()
     assert (
         "2 were removed" in trainer.notices[0] and f"{name} not finite at surfels 3, 9" in trainer.notices[0]

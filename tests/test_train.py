@@ -205,7 +205,7 @@ def test_the_screen_gradient_is_in_half_pictures(
     trainer.step()
     expected = 0.5 * (SIZE // 3) * factor * np.linalg.norm(np.array(dr.grad(shifts[0])), axis=0)
     assert expected.max() > 0
-    np.testing.assert_allclose(trainer.control.gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(trainer.control.table.gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
 
 
 def test_a_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: Path) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from mi_refgs.fit.control import first_light
+from mi_refgs.fit.initial import first_light
 from mi_refgs.fit.train import Trainer
 from mi_refgs.methods.method import LIGHT, Method
+from mi_refgs.methods.surroundings import AROUND, BACKGROUND
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.lobe_matrices import resample
@@ -29,6 +30,7 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
             wanted[name] = channel(name).start(count, width, rng, method.surfels.start(name))
         else:
             wanted[name] = _columns(old[name], width)
+    wanted |= {name: old[name] for name in old if name == BACKGROUND or name.startswith(AROUND)}
     if method.light is not None:
         height = method.light.height
         if LIGHT not in old:

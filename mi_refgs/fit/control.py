@@ -1,4 +1,4 @@
-"""What a fit does to its table beside learning: densify, prune, reset, propagate, restart, remove."""
+"""What a fit does to its tables beside learning: densify, prune, reset, propagate, restart, remove."""
 
 from __future__ import annotations
 
@@ -8,23 +8,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import upload
-from mi_refgs.errors import InputError
 from mi_refgs.fit import refine
-from mi_refgs.fit.refine import TableEdit
+from mi_refgs.fit.exchange import distances, exchanged
+from mi_refgs.fit.initial import first_light
 from mi_refgs.fit.relocate import relocate, wander
-from mi_refgs.methods.method import LIGHT, LightOptions
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.fit.tables import Table
+from mi_refgs.methods.method import LIGHT
+from mi_refgs.methods.surroundings import AROUND
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.table import Surfels
 
 if TYPE_CHECKING:
     from mi_refgs.fit.train import Trainer
-
-
-def first_light(options: LightOptions) -> EnvironmentLight:
-    """The environment that a fit starts with: one radiance everywhere."""
-    return EnvironmentLight.constant(options.radiance, options.height)
 
 
 class AdaptiveControl:
@@ -33,14 +27,18 @@ class AdaptiveControl:
     def __init__(self, trainer: Trainer) -> None:
         self.trainer = trainer
         self.held_until = 0  # iteration before which opacities do not learn
-        self.gradient_sum: Any = None  # of each surfel since it was densified last, and of how many views
-        self.gradient_count: Any = None
+        self.table = Table(trainer)
+        self.around = Table(trainer, AROUND)
+
+    @property
+    def tables(self) -> list[Table]:
+        """The object's table, and that of the surroundings if there is one."""
+        return [self.table, self.around] if self.trainer.open else [self.table]
 
     def clear(self) -> None:
         """Forget the statistics."""
-        count = self.trainer.surfels.count
-        self.gradient_sum = dr.opaque(mi.Float, 0, count)
-        self.gradient_count = dr.opaque(mi.Float, 0, count)
+        for table in self.tables:
+            table.clear()
 
     def observe(self, δshift: Any, camera: Camera, iteration: int) -> None:
         """Take in the gradients of a step with respect to the surfels' places on the screen, in pixels."""
@@ -48,27 +46,36 @@ class AdaptiveControl:
         if densify is None or iteration > densify.until:
             return
         length = dr.norm(δshift * mi.Vector2f(0.5 * camera.width, 0.5 * camera.height))
-        seen = (length > 0) & dr.isfinite(length)
-        self.gradient_sum += dr.select(seen, length, 0.0)
-        self.gradient_count += dr.select(seen, mi.Float(1), 0)
-        dr.schedule(self.gradient_sum, self.gradient_count)
+        if not self.trainer.open:
+            self.table.observe(length)
+            return
+        begin = mi.UInt32(0)
+        for table in self.tables:
+            count = dr.width(table.gradient_sum)
+            table.observe(dr.gather(mi.Float, length, dr.arange(mi.UInt32, count) + begin))
+            begin = dr.opaque(mi.UInt32, count)
 
     def refine(self, iteration: int) -> None:
-        """Edit the table by what falls due after this iteration."""
+        """Edit the tables by what falls due after this iteration."""
         fit = self.trainer
         options, surfels = fit.method.refine, fit.method.surfels
         if options.densify is not None and options.densify.due(iteration):
             self._densify(iteration)
         if options.relocate is not None and options.relocate.when.due(iteration):
             fit.check()
-            draws, limit = fit.schedule.rng(iteration), surfels.max_count
-            self._adopt(relocate(fit.surfels, options.relocate, limit, draws))
+            draws = fit.schedule.rng(iteration)
+            for table, limit in zip(self.tables, self._limits(), strict=False):
+                table.adopt(relocate(table.surfels, options.relocate, limit, draws))
+            fit.occluder.around = None
         if options.reset is not None and options.reset.due(iteration):
             floors = {name: surfels.start(name) for name in options.reset_raise}
-            self.replace(refine.reset_opacity(fit.surfels, options, floors), cleared=("opacity", *floors))
+            for table in self.tables:
+                raised = {name: floor for name, floor in floors.items() if table.surfels.has(name)}
+                reset = refine.reset_opacity(table.surfels, options, raised)
+                table.replace(reset, cleared=("opacity", *raised))
         elif options.propagate is not None and options.propagate.when.due(iteration):
             colour = ("radiance_sh",) if options.propagate.noise else ()
-            self.replace(
+            self.table.replace(
                 refine.propagate_normals(fit.surfels, options.propagate, fit.schedule.rng(iteration)),
                 cleared=("opacity", *fit.surfels.primitive.sizes, *colour),
             )
@@ -77,34 +84,45 @@ class AdaptiveControl:
         if iteration >= self.held_until:
             fit.optimiser.set_factor("opacity", 1.0)
 
+    def _limits(self) -> list[int]:
+        """Most rows of each table."""
+        around = self.trainer.method.surroundings
+        return [self.trainer.method.surfels.max_count, *([around.max_count] if around is not None else [])]
+
     def _densify(self, iteration: int) -> None:
         fit = self.trainer
         fit.check()
-        options = fit.method.refine
+        options, draws = fit.method.refine, fit.schedule.rng(iteration)
         since_reset = options.reset.since(iteration) if options.reset is not None else None
         wait = refine.prune_wait(options, fit.method.rates.of("opacity"))
-        edited = refine.densify_and_prune(
-            fit.surfels,
-            self.gradient_sum.numpy() / np.maximum(self.gradient_count.numpy(), 1),
-            fit.extent,
-            options,
-            fit.method.surfels.max_count,
-            fit.schedule.rng(iteration),
-            prune_transparent=since_reset is None or since_reset >= wait,
-        )
-        self._adopt(edited)
-        self.clear()
-
-    def _adopt(self, edit: TableEdit) -> None:
-        """Put an edited table in place of the present one; moments and statistics follow the rows."""
-        fit, edit = self.trainer, edit.ordered()
-        parent, fresh = upload(edit.parent, mi.UInt32), mi.Bool(edit.fresh)
-        self.replace(edit.surfels)
+        prune_transparent = since_reset is None or since_reset >= wait
+        for table, limit in zip(self.tables, self._limits(), strict=False):
+            extent: Any = fit.extent
+            largest = None
+            if table is self.around:
+                assert fit.data.region is not None and fit.method.surroundings is not None
+                distance = distances(table.surfels, fit.data.region)
+                largest = fit.method.surroundings.prune_extent * distance
+                extent = np.maximum(distance, fit.extent)
+            edit = refine.densify_and_prune(
+                table.surfels,
+                table.gradient,
+                extent,
+                options,
+                limit,
+                draws,
+                prune_transparent=prune_transparent,
+                largest=largest,
+            )
+            table.adopt(edit)
+        if fit.open:
+            assert fit.data.region is not None
+            inner, outer = (table.surfels for table in self.tables)
+            edits = exchanged(inner, outer, fit.method, fit.data.region, draws)
+            for table, edit in zip(self.tables, edits, strict=True):
+                table.adopt(edit)
         fit.occluder.around = None
-        fit.optimiser.gather(parent, list(edit.surfels.raw), fresh)
-        self.gradient_sum = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_sum, parent))
-        self.gradient_count = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_count, parent))
-        dr.eval(self.gradient_sum, self.gradient_count)
+        self.clear()
 
     def wander(self, iteration: int) -> None:
         """The random step of positions that follows the optimiser's."""
@@ -112,40 +130,25 @@ class AdaptiveControl:
         options = fit.method.refine.relocate
         if options is None or not options.noise or not options.when.start < iteration <= options.when.until:
             return
-        rate = fit.optimiser.rate("position", iteration - 1) / fit.extent
-        moved = wander(fit.surfels, rate, fit.extent, options, iteration, fit.method.seed)
-        dr.eval(moved)
-        dr.enable_grad(moved)
-        fit.params["position"] = moved
+        for table in self.tables:
+            name = f"{table.prefix}position"
+            rate = fit.optimiser.rate(name, iteration - 1) / fit.extent
+            moved = wander(table.surfels, rate, fit.extent, options, iteration, fit.method.seed)
+            dr.eval(moved)
+            dr.enable_grad(moved)
+            fit.params[name] = moved
 
-    def remove(self, rows: np.ndarray) -> None:
-        """Take surfels out of the table; raises InputError if none would be left."""
-        fit = self.trainer
-        parent = np.delete(np.arange(fit.surfels.count), rows)
-        if not len(parent):
-            raise InputError("surfels: none of them is finite; lower the rates (--set rates.…)")
-        index = upload(parent, mi.UInt32)
-        self.replace(fit.surfels.gather(index))
-        fit.occluder.around = None
-        fit.optimiser.gather(index, list(fit.surfels.raw))
-        self.gradient_sum = dr.gather(mi.Float, self.gradient_sum, index)
-        self.gradient_count = dr.gather(mi.Float, self.gradient_count, index)
+    def remove(self, rows: np.ndarray, table: Table | None = None) -> None:
+        """Take surfels out of a table, by default the object's; raises InputError if none would be left."""
+        (table or self.table).remove(rows)
+        self.trainer.occluder.around = None
 
     def restart(self, names: tuple[str, ...], iteration: int) -> None:
         """Channels and the light back to their initial values, without history."""
         fit = self.trainer
         starts = {name: fit.method.surfels.start(name) for name in names if name != LIGHT}
-        self.replace(refine.restart(fit.surfels, starts, fit.schedule.rng(iteration)), cleared=tuple(starts))
+        edited = refine.restart(fit.surfels, starts, fit.schedule.rng(iteration))
+        self.table.replace(edited, cleared=tuple(starts))
         if LIGHT in names and fit.method.light is not None:
             fit.params[LIGHT] = first_light(fit.method.light).raw
             fit.optimiser.reset(LIGHT)
-
-    def replace(self, surfels: Surfels, cleared: tuple[str, ...] = ()) -> None:
-        """Put a table in place of the present one; `cleared` channels lose their moments."""
-        fit = self.trainer
-        fit.params.update(surfels.raw)
-        for name in surfels.raw:
-            dr.enable_grad(fit.params[name])
-        for name in cleared:
-            if name in fit.params:
-                fit.optimiser.reset(name)

@@ -6,14 +6,20 @@ The optimiser does not apply such steps, so the state is always the last good on
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.fit.skips import Skipped
-from mi_refgs.methods.method import APART
+from mi_refgs.methods.method import LIGHT
+from mi_refgs.methods.surroundings import BACKGROUND
+from mi_refgs.runs.parameters import channels_of
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
+
+if TYPE_CHECKING:
+    from mi_refgs.fit.train import Trainer
 
 CULL_SHARE = 0.1
 """Share of the surfels from which on a fault is not theirs: a pixel has tens of them, a table thousands."""
@@ -23,15 +29,37 @@ NAMED = 5
 """Surfels that a message names."""
 
 
-def culprits(surfels: Surfels, skipped: Skipped) -> dict[str, np.ndarray]:
+def check(fit: Trainer) -> None:
+    """Remove the surfels that made steps fail since the last check; see `Trainer.check`."""
+    skipped, steps = fit.optimiser.report(), fit.iteration - fit.checked
+    fit.checked, fit.skipped = fit.iteration, fit.skipped + skipped.count
+    fit.failed = fit.failed + steps if skipped.count >= steps else 0
+    check_light(fit.light)
+    if fit.surroundings is not None:
+        check_light(fit.surroundings.background, BACKGROUND)
+    found = {table: culprits(table.surfels, skipped, table.prefix) for table in fit.control.tables}
+    rows = {table.prefix + name: at for table, names in found.items() for name, at in names.items()}
+    if not rows and not skipped.count:
+        return
+    view = fit.data.views[fit.schedule.view(skipped.iteration + 1)].name if skipped.count else ""
+    said = sentence(rows, skipped, view)
+    fit.notices.append(said)
+    if fit.failed >= PATIENCE * fit.method.log_every:
+        raise gave_up(said, fit.failed)
+    for table, names in found.items():
+        if names:
+            fit.control.remove(together(names), table)
+
+
+def culprits(surfels: Surfels, skipped: Skipped, prefix: str = "") -> dict[str, np.ndarray]:
     """Rows that spoil steps, by channel: those with values that are not usable, else those whose gradient is
     not finite.
 
-    Empty if the fault is none of the surfels'.
+    Empty if the fault is none of the surfels'. `prefix` begins the names of the table's parameters.
     """
     if unusable := surfels.unusable():
         return unusable
-    found = {name: rows for name, rows in skipped.rows.items() if name not in APART}
+    found = channels_of(skipped.rows, prefix)
     return found if len(together(found)) <= CULL_SHARE * surfels.count else {}
 
 
@@ -51,11 +79,12 @@ def sentence(rows: Mapping[str, np.ndarray], skipped: Skipped, view: str) -> str
     return f"{where}{channels} not finite at surfels {named}: {len(indices)} were removed"
 
 
-def check_light(light: EnvironmentLight | None) -> None:
+def check_light(light: EnvironmentLight | None, name: str = LIGHT) -> None:
     """Raise InputError if the environment has a texel that renders black and learns no more."""
     if light is not None and light.unusable():
+        rate = "rates.light" if name == LIGHT else "surroundings.rate"
         raise InputError(
-            "light: a texel is not finite or too large; go on from a checkpoint with a lower rates.light"
+            f"{name}: a texel is not finite or too large; go on from a checkpoint with a lower {rate}"
         )
 
 

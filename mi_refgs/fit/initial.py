@@ -1,4 +1,4 @@
-"""The surfels a fit starts from: on and inside the visual hull where pictures have alpha, else at random."""
+"""What a fit starts from: on and inside the visual hull where pictures have alpha, else at sparse points."""
 
 from __future__ import annotations
 
@@ -9,21 +9,80 @@ import numpy as np
 from mi_refgs.data import hull
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.methods.method import Method
+from mi_refgs.fit.scatter import at_points, inside_points, outside_points
+from mi_refgs.methods.method import LIGHT, LightOptions, Method
+from mi_refgs.methods.surroundings import AROUND, BACKGROUND
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.lobe_matrices import map_directions
 from mi_refgs.surfels import init
 from mi_refgs.surfels.order import morton_order
 from mi_refgs.surfels.table import Surfels
 
 ALBEDO_RANGE = (0.02, 0.9)
 """Where an albedo from pictures starts: away from the ends, where the sigmoid has no slope."""
+FAR = 1e4
+"""Scene extents at which a direction is looked up in the pictures."""
 
 
-def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> Surfels:
+def is_open(method: Method, data: Dataset) -> bool:
+    """Whether pictures show surroundings that the method keeps apart from the object."""
+    masked = all(view.alpha is not None for view in data.views)
+    return method.surroundings is not None and data.region is not None and not masked
+
+
+def initial_parameters(
+    method: Method, data: Dataset, rng: np.random.Generator, open_scene: bool
+) -> dict[str, Any]:
+    """The tensors of a fit by name; with surroundings if the scene is open.
+
+    Raises InputError as `initial_surfels` does.
+    """
+    params = initial_surfels(method, data, rng, open_scene).raw
+    if open_scene:
+        params |= initial_surroundings(method, data, rng)
+    return params if method.light is None else params | {LIGHT: first_light(method.light).raw}
+
+
+def first_light(options: LightOptions) -> EnvironmentLight:
+    """The environment that a fit starts with: one radiance everywhere."""
+    return EnvironmentLight.constant(options.radiance, options.height)
+
+
+def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator) -> dict[str, Any]:
+    """The tensors of the surroundings by name: a table, and the background with the colours that are seen in
+    its directions."""
+    options, region = method.surroundings, data.region
+    assert options is not None and region is not None
+    points, colours = outside_points(options.count, options.scattered, data, rng)
+    order = morton_order(points)
+    points, distance = points[order], np.linalg.norm(points[order] - np.array(region.centre), axis=1)
+    table = init.from_points(
+        points,
+        init.random_normals(len(points), rng),
+        colours[order],
+        rng=rng,
+        primitive=method.surfels.primitive,
+        channels=["radiance_sh"],
+        degree={"radiance_sh": options.degree},
+        largest=options.size * distance,
+        opacity=method.surfels.start("opacity"),
+    )
+    directions = map_directions(options.height)
+    far = np.array(region.centre) + FAR * data.scene_extent * directions.reshape(-1, 3)
+    seen = hull.median_colours(far, data.views, data.background)
+    background = EnvironmentLight.from_radiance(seen.reshape(directions.shape))
+    return {AROUND + name: tensor for name, tensor in table.raw.items()} | {BACKGROUND: background.raw}
+
+
+def initial_surfels(
+    method: Method, data: Dataset, rng: np.random.Generator, open_scene: bool = False
+) -> Surfels:
     """A table of `method.surfels.count` surfels with the method's channels.
 
     With alpha, a share `inside` of them is uniform in the hull's volume with normals at random, and the
     others are uniform on its surface with its normals: the surface of what is concave lies inside the hull.
-    Colours are the median over the views that see the point.
+    Colours are the median over the views that see the point. Without alpha they start at sparse points and
+    at random; those of an `open_scene` in the region, where `inside` is the share of the random ones.
 
     Raises InputError where the masks have no point in common, and for a share that is none.
     """
@@ -41,15 +100,12 @@ def initial_surfels(method: Method, data: Dataset, rng: np.random.Generator) -> 
         colours = np.concatenate(
             [hull.median_colours(outer, views, behind, facing), hull.median_colours(inner, views, behind)]
         )
-    elif data.points is not None and len(data.points.position):
-        known_points = data.points.position
-        row = rng.permutation(np.arange(options.count) % len(known_points))
-        # Copies of a point lie around it, as far off as its neighbours do: their distance is a surfel's size.
-        spread = init.neighbour_scale(known_points)[row] * (len(known_points) < options.count)
-        points = known_points[row] + spread[:, None] * rng.normal(size=(options.count, 3))
+    elif open_scene:
+        points, colours = inside_points(options.count, options.inside, data, rng)
         normals = init.random_normals(options.count, rng)
-        known = data.points.colour
-        colours = hull.median_colours(points, views, behind) if known is None else known[row]
+    elif data.points is not None and len(data.points.position):
+        points, colours = at_points(data.points, options.count, data, rng)
+        normals = init.random_normals(options.count, rng)
     else:
         points = hull.random_points(options.count, hull.camera_bounds(views), rng)
         normals = init.random_normals(options.count, rng)

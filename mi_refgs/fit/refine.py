@@ -58,17 +58,20 @@ class TableEdit:
 def densify_and_prune(
     surfels: Surfels,
     gradient: np.ndarray,
-    extent: float,
+    extent: float | np.ndarray,
     options: Refine,
     max_count: int,
     rng: np.random.Generator,
     prune_transparent: bool = True,
+    largest: np.ndarray | None = None,
 ) -> TableEdit:
     """Clone small and split large surfels with a high screen gradient; drop transparent and oversized ones.
 
     `gradient` (N,) is the mean length of the screen-translation gradient in NDC units over the views that saw
     a surfel. At most max_count surfels result: those with the highest gradient grow first. Transparent ones
-    stay unless `prune_transparent`: wait `prune_wait` iterations after an opacity reset.
+    stay unless `prune_transparent`: wait `prune_wait` iterations after an opacity reset. Sizes are compared
+    with `extent`, one for all or (N,). `largest` (N,) replaces the size from which surfels go; the most
+    opaque one then stays in any case.
 
     Raises InputError if no surfel would be left.
     """
@@ -76,9 +79,12 @@ def densify_and_prune(
     count = len(gradient)
     primitive = primitive_of(widths_of(raw))
     size = primitive.extent(raw)[1].max(axis=1)
-    keep = size <= options.prune_extent * extent
+    dense = np.broadcast_to(np.asarray(options.dense_extent * extent, size.dtype), count)
+    keep = size <= (options.prune_extent * extent if largest is None else largest)
     if prune_transparent:
         keep &= sigmoid(raw["opacity"][:, 0]) >= options.prune_opacity
+    if largest is not None and not keep.any():
+        keep[np.argmax(raw["opacity"][:, 0])] = True
     if not keep.any():
         raise InputError(
             "refine.prune_opacity: no surfel is opaque and small enough to stay; lower it, raise "
@@ -88,7 +94,7 @@ def densify_and_prune(
     hot = np.flatnonzero(keep & (gradient >= options.gradient))
     room = max(max_count - int(keep.sum()), 0)
     hot = np.sort(hot[np.argsort(-gradient[hot], kind="stable")[:room]])
-    large = size[hot] > options.dense_extent * extent
+    large = size[hot] > dense[hot]
     cloned, split = hot[~large], hot[large]
     keep[split] = False
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from mi_refgs.fit.rates import Group
 from mi_refgs.methods.method import LIGHT, Method
+from mi_refgs.methods.surroundings import AROUND, BACKGROUND
 from mi_refgs.surfels.channels import channel
 
 POSITION_STEPS = 0.6
@@ -43,18 +44,32 @@ class Schedule:
         ends = [stage.until for _, stage in self.method.stages()]
         return light is not None and (iteration % light.every == 0 or iteration in ends)
 
-    def groups(self, extent: float) -> dict[str, Group]:
-        """Learning rates of every parameter of the method; `extent` in scene units."""
+    def groups(self, extent: float, open_scene: bool = False) -> dict[str, Group]:
+        """Learning rates of every parameter of the method; `extent` in scene units.
+
+        `open_scene`: with those of the surroundings, whose positions have an extent of their own.
+        """
+        rates, iterations = self.method.rates, self.method.iterations
+        groups = self._of_table(self.method.surfels.names, extent)
+        around = self.method.surroundings
+        if open_scene and around is not None:
+            table = self._of_table(around.names(self.method.surfels.primitive), around.reach * extent)
+            groups |= {AROUND + name: group for name, group in table.items()}
+            groups[BACKGROUND] = Group(around.rate, around.rate * rates.decay, iterations)
+        if self.method.light is not None:
+            texels = rates.light, rates.light * rates.decay, iterations
+            groups[LIGHT] = Group(*texels, relative=rates.light_relative)
+        return groups
+
+    def _of_table(self, names: tuple[str, ...], extent: float) -> dict[str, Group]:
+        """Learning rates of the channels of one table."""
         rates, iterations = self.method.rates, self.method.iterations
         groups = {}
-        for name in self.method.surfels.names:
+        for name in names:
             rate = rates.of(name)
             head = 3 if channel(name).harmonics else 0
             groups[name] = Group(rate, rate * rates.decay, iterations, head, rates.rest_of(name))
         steps = int(POSITION_STEPS * iterations)
         start, final = rates.of("position") * extent, rates.position_final * extent
         groups["position"] = Group(start, final, steps, unit=extent)
-        if self.method.light is not None:
-            texels = rates.light, rates.light * rates.decay, iterations
-            groups[LIGHT] = Group(*texels, relative=rates.light_relative)
         return groups

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import GAIN, LIGHT, Method
+from mi_refgs.methods.surroundings import AROUND, BACKGROUND
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import VertexSurfels
 from mi_refgs.occlusion.vertex_colours import VertexColours
@@ -19,11 +21,14 @@ if TYPE_CHECKING:
     from mi_refgs.fit.train import Trainer
 
 
-def shapes(method: Method) -> dict[str, tuple[int, ...]]:
-    """The shape of every parameter of a method, without the first axis."""
-    found: dict[str, tuple[int, ...]] = {
-        name: (method.surfels.columns(name),) for name in method.surfels.names
-    }
+def shapes(method: Method, open_scene: bool) -> dict[str, tuple[int, ...]]:
+    """The shape of every parameter of a method, without the first axis; of surroundings if `open_scene`."""
+    surfels, around = method.surfels, method.surroundings
+    found: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
+    if open_scene and around is not None:
+        harmonics = replace(surfels, degree={"radiance_sh": around.degree})
+        found |= {AROUND + name: (harmonics.columns(name),) for name in around.names(surfels.primitive)}
+        found[BACKGROUND] = (2 * around.height, 3)
     return found if method.light is None else found | {LIGHT: (2 * method.light.height, 3)}
 
 
@@ -32,10 +37,8 @@ def packed(trainer: Trainer) -> dict[str, np.ndarray]:
     mesh = trainer.occluder.mesh()
     state = {f"{PARAMS}{name}": tensor.numpy() for name, tensor in trainer.params.items()}
     state |= {f"{OPTIMISER}{name}": value for name, value in trainer.optimiser.state_dict().items()}
-    state |= {
-        "gradient_sum": trainer.control.gradient_sum.numpy(),
-        "gradient_count": trainer.control.gradient_count.numpy(),
-    }
+    for table in trainer.control.tables:
+        state |= table.state()
     state |= {"iteration": np.array(trainer.iteration), "seconds": np.array(trainer.seconds)}
     state["held_until"] = np.array(trainer.control.held_until)
     state |= trainer.window.state() | trainer.exposure.state()
@@ -76,9 +79,9 @@ def occluder_of(state: dict[str, np.ndarray]) -> Occluder:
     return occluder
 
 
-def require_fit(method: Method, state: dict[str, np.ndarray]) -> None:
-    """Raise InputError if the method has changed since the state was written."""
-    expected = shapes(method)
+def require_fit(method: Method, state: dict[str, np.ndarray], open_scene: bool = False) -> None:
+    """Raise InputError if the method, or what its pictures show, has changed since the state was written."""
+    expected = shapes(method, open_scene)
     found = {name: value.shape[1:] for name, value in part(state, PARAMS).items() if name != GAIN}
     for name in expected.keys() | found.keys():
         if found.get(name) != expected.get(name):

@@ -16,25 +16,27 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.device import upload
 from mi_refgs.fit import health
-from mi_refgs.fit.control import AdaptiveControl, first_light
+from mi_refgs.fit.control import AdaptiveControl
 from mi_refgs.fit.exposure import Exposure
-from mi_refgs.fit.initial import initial_surfels
+from mi_refgs.fit.initial import initial_parameters, is_open
 from mi_refgs.fit.light_window import LightWindow
 from mi_refgs.fit.objective import objective
 from mi_refgs.fit.optim import Adam
+from mi_refgs.fit.rates import Group
 from mi_refgs.fit.schedule import Schedule
 from mi_refgs.fit.state import decisions_of, occluder_of, packed, require_fit
 from mi_refgs.fit.surface import supply, surface_of
 from mi_refgs.fit.targets import Targets
-from mi_refgs.methods.method import APART, GAIN, Method, Stage
+from mi_refgs.methods.method import GAIN, Method, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
-from mi_refgs.runs.checkpoint import LIGHT, OPTIMISER, PARAMS, part, tensors
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, part, tensors
 from mi_refgs.runs.interrupt import held_interrupts
+from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
@@ -62,7 +64,7 @@ class Trainer:
         self.occluder = Occluder()
         self.iteration, self.seconds = 0, 0.0
         self.skipped = 0  # steps that changed nothing, since their loss or gradient was not finite
-        self._checked, self._failed = 0, 0  # iteration of the last check; failed steps in a row
+        self.checked, self.failed = 0, 0  # iteration of the last check; failed steps in a row
         self.params: dict[str, Any] = {}
         self.control = AdaptiveControl(self)
         self.window = LightWindow()
@@ -75,11 +77,9 @@ class Trainer:
         if state is not None:
             self.restore(state)
             return
-        self.params |= initial_surfels(method, data, self.schedule.rng(0)).raw
-        if method.light is not None:
-            self.params[LIGHT] = first_light(method.light).raw
+        self.params |= initial_parameters(method, data, self.schedule.rng(0), self.open)
         self.params |= self.exposure.start()
-        self.optimiser = Adam(self.params, self.schedule.groups(self.extent) | self.exposure.groups())
+        self.optimiser = Adam(self.params, self._groups())
         self.optimiser.set_factor(GAIN, 0.0)  # until it is decided
         self.control.clear()
 
@@ -95,21 +95,29 @@ class Trainer:
 
     def _set(self, method: Method, data: Dataset) -> None:
         self.method, self.data = method, data
-        self.extent = data.scene_extent
+        self.extent, self.open = data.scene_extent, is_open(method, data)
         self.schedule = Schedule(method, len(data.views))
         self.targets = Targets(data, method.data)
+
+    def _groups(self) -> dict[str, Group]:
+        return self.schedule.groups(self.extent, self.open) | self.exposure.groups()
 
     # ---------------- what others look at ----------------
 
     @property
     def surfels(self) -> Surfels:
-        """The table, attached to the leaves that the optimiser owns."""
-        return Surfels({name: tensor for name, tensor in self.params.items() if name not in APART})
+        """The object's table, attached to the leaves that the optimiser owns."""
+        return Surfels(channels_of(self.params))
+
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """What is around the object in pictures without alpha, attached likewise."""
+        return surroundings_of(self.params)
 
     @property
     def light(self) -> EnvironmentLight | None:
         """The environment, attached likewise."""
-        return EnvironmentLight(self.params[LIGHT]) if LIGHT in self.params else None
+        return light_of(self.params)
 
     def shading(self, iteration: int | None = None) -> Shading:
         """How the present (or another) iteration shades."""
@@ -130,6 +138,7 @@ class Trainer:
                 sh_degree=self.schedule.sh_degree(self.iteration),
                 aovs=aovs,
                 normals=aovs,
+                surroundings=self.surroundings,
             )
 
     # ---------------- the loop ----------------
@@ -185,20 +194,7 @@ class Trainer:
         Raises InputError if the light is not finite, if no surfel is left, or if nothing helps. Waits for the
         device, and so is called on intervals only.
         """
-        skipped, steps = self.optimiser.report(), self.iteration - self._checked
-        self._checked, self.skipped = self.iteration, self.skipped + skipped.count
-        self._failed = self._failed + steps if skipped.count >= steps else 0
-        health.check_light(self.light)
-        rows = health.culprits(self.surfels, skipped)
-        if not rows and not skipped.count:
-            return
-        view = self.data.views[self.schedule.view(skipped.iteration + 1)].name if skipped.count else ""
-        said = health.sentence(rows, skipped, view)
-        self.notices.append(said)
-        if self._failed >= health.PATIENCE * self.method.log_every:
-            raise health.gave_up(said, self._failed)
-        if rows:
-            self.control.remove(health.together(rows))
+        health.check(self)
 
     def step(self) -> None:
         """One iteration: enter a stage if it begins, one gradient step, then what falls due."""
@@ -223,7 +219,7 @@ class Trainer:
             "stage": self.method.stage_at(self.iteration)[0],
             "loss": float(self.loss[0]),
             "psnr": round(-10 * float(np.log10(max(mse, 1e-10))), 3),
-            "surfels": self.surfels.count,
+            "surfels": sum(table.surfels.count for table in self.control.tables),
             "skipped_steps": self.skipped,
         }
 
@@ -241,8 +237,9 @@ class Trainer:
     def _gradient_step(self, iteration: int, stage: Stage) -> None:
         index = self.schedule.view(iteration)
         target = self.targets.at(iteration, index)
-        camera, surfels = target.camera, self.surfels
-        shift = mi.Point2f(dr.opaque(mi.Float, 0, surfels.count), dr.opaque(mi.Float, 0, surfels.count))
+        camera, surfels, around = target.camera, self.surfels, self.surroundings
+        rows = surfels.count + (0 if around is None else around.surfels.count)
+        shift = mi.Point2f(dr.opaque(mi.Float, 0, rows), dr.opaque(mi.Float, 0, rows))
         dr.enable_grad(shift)
         shading = self._shading(stage)
         supply(self.occluder, self.surfels, self.light, shading)
@@ -256,6 +253,7 @@ class Trainer:
             sh_degree=self.schedule.sh_degree(iteration),
             shift=shift,
             normals=self.method.loss.uses_normals,
+            surroundings=around,
         )
         frame = supersampled(view, camera, stage.samples, details=self.method.loss.uses_maps)
         gain = self.exposure.log_gain(index)
@@ -284,15 +282,15 @@ class Trainer:
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go on from the state of a checkpoint; raises InputError if it is not one of the method."""
-        require_fit(self.method, state)
+        require_fit(self.method, state, self.open)
         self.exposure.restore(state)
         self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
-        self._checked = self.iteration
+        self.checked = self.iteration
         self.params = tensors(state, PARAMS)
-        self.optimiser = Adam(self.params, self.schedule.groups(self.extent) | self.exposure.groups())
+        self.optimiser = Adam(self.params, self._groups())
         self.optimiser.load_state_dict(part(state, OPTIMISER))
-        self.control.gradient_sum = upload(state["gradient_sum"])
-        self.control.gradient_count = upload(state["gradient_count"])
+        for table in self.control.tables:
+            table.restore(state)
         self.control.held_until = int(state["held_until"])
         self.decisions = decisions_of(state)
         self.occluder = occluder_of(state)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from mi_refgs.methods.surroundings import BACKGROUND, SurroundingsOptions
 from mi_refgs.methods.weights import LossWeights
 from mi_refgs.methods.window import Window
 from mi_refgs.primitives import primitive_named
@@ -16,11 +17,11 @@ from mi_refgs.shade.accuracy import DIRECTIONS, MAX_LEVELS
 from mi_refgs.surfels.channels import MAX_SH_DEGREE, channel
 
 LIGHT = "light"
-"""Name of the environment among the parameters of a fit; the others are channels of the surfels."""
+"""Name of the environment among the parameters of a fit, beside the channels of the surfels."""
 GAIN = "gain"
 """Name of the log gains of the training views among them."""
-APART = (LIGHT, GAIN)
-"""Parameters that are no channels of the surfels."""
+APART = (LIGHT, GAIN, BACKGROUND)
+"""Parameters that are no channels of surfels."""
 AT_ONCE = Window(0, 3, 1)
 """One degree of spherical harmonics more in each of the first three iterations."""
 MESH_WINDOW = Window(20_000, 50_000, 2_000)
@@ -243,6 +244,7 @@ class Method:
     about: About = About()
     surfels: SurfelOptions = SurfelOptions()
     light: LightOptions | None = None
+    surroundings: SurroundingsOptions | None = None  # absent: everything is of the object
     refine: Refine = Refine()
     mesh: MeshOptions | None = None
     loss: LossWeights = field(default_factory=LossWeights)

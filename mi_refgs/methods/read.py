@@ -21,7 +21,7 @@ from mi_refgs.methods.method import LIGHT, PRESETS, Method, Selection, Term
 from mi_refgs.methods.window import Window
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.resources import resource_dir
-from mi_refgs.shade.envmap import MIN_HEIGHT
+from mi_refgs.shade.envmap import MIN_HEIGHT, is_height
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.channels import CHANNELS
 
@@ -53,7 +53,9 @@ def load(
     method = build(Method, table, str(path))
     method = _scale(method, chosen.iterations / method.iterations)
     table = plain(method)
-    table["surfels"] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
+    for name in ("surfels", "surroundings"):
+        if name in table:
+            table[name] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
     for assignment in assignments or []:
         _assign(table, assignment)
     where = "--set" if assignments else str(path)
@@ -120,7 +122,7 @@ def _checked(method: Method, where: str) -> Method:
         if unknown := [name for name in named if name not in known]:
             allowed = ", ".join(name for name in CHANNELS if name in known)
             raise InputError(f"{where}: {key}: '{unknown[0]}' is unknown; use some of {allowed}")
-    if method.light is not None and (method.light.height % 4 or method.light.height < MIN_HEIGHT):
+    if method.light is not None and not is_height(method.light.height):
         raise InputError(
             f"{where}: light.height: {method.light.height} is no multiple of 4 from {MIN_HEIGHT}; give one"
         )
@@ -147,6 +149,8 @@ def _checked(method: Method, where: str) -> Method:
     _check_priors(method, where)
     if method.exposure is not None and method.exposure.rate < 0:
         raise InputError(f"{where}: exposure.rate: {method.exposure.rate} is no rate; give 0 or more")
+    if method.surroundings is not None and (fault := method.surroundings.fault()):
+        raise InputError(f"{where}: surroundings.{fault}")
     relocate = method.refine.relocate
     if relocate is not None and relocate.grow < 0:
         raise InputError(f"{where}: refine.relocate.grow: {relocate.grow} is no share; give 0 or more")

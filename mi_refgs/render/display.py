@@ -47,14 +47,17 @@ def displayed(
 ) -> list[Any]:
     """What the camera shows of a frame, display-encoded planes.
 
-    Pictures with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it.
-    `gain` is a factor a channel of the radiance, ahead of both.
+    Pictures with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it,
+    and what the frame itself has behind it, in place of `background`. `gain` is a factor a channel of the
+    radiance, ahead of both, and of what the frame has behind it.
     """
-    behind = [float(x) for x in background]
     radiance = list(frame.radiance)
+    behind = [float(x) for x in background] if frame.background is None else list(frame.background)
     if gain is not None:
         radiance = [plane * factor for plane, factor in zip(radiance, gain, strict=True)]
-    if not linear:
+    if gain is not None and frame.background is not None:
+        behind = [plane * factor for plane, factor in zip(behind, gain, strict=True)]
+    if not linear and frame.background is None:
         return display_image(radiance, frame.alpha, behind)
     return [
         srgb_from_linear(plane + (1 - frame.alpha) * value)

@@ -20,28 +20,32 @@ class GBuffer:
     alpha: Any  # accumulated opacity
     depth: Any  # expected camera-z depth, 0 where nothing is seen
     slots: dict[str, Any]  # premultiplied by alpha, each of the type that was blended
-    inverse: Any  # 1/alpha where anything is seen, else 0
+    inverse: Any  # 1/alpha, or 1/share, where that is seen, else 0
 
     @staticmethod
-    def blend(surfels: Surfels, slots: Mapping[str, Any], camera: Camera, shift: Any = None) -> GBuffer:
+    def blend(
+        surfels: Surfels, slots: Mapping[str, Any], camera: Camera, shift: Any = None, share: str = ""
+    ) -> GBuffer:
         """Blend values of width N by name: mi.Float, or an array of several such as mi.Color3f.
 
         Every component is a feature, which costs time in every surfel-tile pair. `shift`: see
-        `splat.project`.
+        `splat.project`. `share` names a slot that values are `divided` by in place of alpha: the opacity of
+        the rows that have them.
         """
-        features = [part for value in slots.values() for part in _parts(value)]
+        features = [part for value in slots.values() for part in parts(value)]
         blended = splat(surfels, features, camera, shift)
         rest, maps = list(blended.features), {}
         for name, value in slots.items():
-            width = len(_parts(value))
-            maps[name], rest = _joined(value, rest[:width]), rest[width:]
+            width = len(parts(value))
+            maps[name], rest = of_parts(value, rest[:width]), rest[width:]
         inverse = inverse_alpha(blended.alpha)
-        return GBuffer(blended.alpha, blended.depth * inverse, maps, inverse)
+        own = inverse_alpha(maps[share]) if share else inverse
+        return GBuffer(blended.alpha, blended.depth * inverse, maps, own)
 
     def divided(self, name: str) -> Any:
-        """A slot divided by alpha: the mean over what is seen, 0 where nothing is."""
+        """A slot divided by alpha, or by the share: the mean over what is seen, 0 where nothing is."""
         value = self.slots[name]
-        return _joined(value, [part * self.inverse for part in _parts(value)])
+        return of_parts(value, [part * self.inverse for part in parts(value)])
 
 
 def inverse_alpha(alpha: Any) -> Any:
@@ -50,10 +54,11 @@ def inverse_alpha(alpha: Any) -> Any:
     return dr.select(seen, dr.rcp(dr.select(seen, alpha, 1)), 0)
 
 
-def _parts(value: Any) -> list[Any]:
+def parts(value: Any) -> list[Any]:
+    """The components of a value, mi.Float each."""
     return [*value] if dr.depth_v(value) > 1 else [value]
 
 
-def _joined(like: Any, parts: list[Any]) -> Any:
+def of_parts(like: Any, parts: list[Any]) -> Any:
     """The parts as an array of the type of `like`."""
     return type(like)(*parts)

@@ -10,7 +10,7 @@ camera.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -21,6 +21,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.primitives import primitive_of, widths_of
 from mi_refgs.render.antialias import widened
 from mi_refgs.render.gbuffer import GBuffer, inverse_alpha
+from mi_refgs.render.surroundings import AROUND, OBJECT, Surroundings, joined_slots, together
 from mi_refgs.shade.light import Light
 from mi_refgs.shade.points import ShadingPoints, Terms, safe_normalize
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
@@ -36,7 +37,7 @@ class Frame:
     """One rendered view: mi arrays of H·W values in raster order.
 
     Radiance and its terms are linear and premultiplied by alpha; maps are divided by it and 0 where nothing
-    is seen.
+    is seen. With `Surroundings`, alpha, depth and radiance are of both, terms and maps of the object.
     """
 
     alpha: Any  # accumulated opacity
@@ -45,6 +46,9 @@ class Frame:
     radiance: Any  # mi.Color3f, over black
     terms: Terms | None = None  # diffuse, specular, indirect, whose sum it is, where known apart
     maps: dict[str, Any] = field(default_factory=dict)  # by channel (such as albedo), visibility, where known
+    background: Any = None  # mi.Color3f: linear, seen through 1 - alpha; only with surroundings
+    share: Any = None  # opacity of the object alone, where it is known and not alpha
+    own_normal: bool = False  # `normal` is of the object alone, and premultiplied by `share`
 
 
 def render(
@@ -57,13 +61,15 @@ def render(
     shift: Any = None,
     aovs: bool = False,
     normals: bool = True,
+    surroundings: Surroundings | None = None,
 ) -> Frame:
     """Render a view.
 
     `light` is what `Shading.light_of` gives, needed unless the model asks for none. `sh_degree` limits the
     degree of the radiance channel, for coarse-to-fine schedules. `aovs` asks for the materials and the terms
     of the radiance even where the picture does not need them per pixel; without `normals`, they are absent
-    where it does not. `shift`: see `splat.project`.
+    where it does not. `shift`: see `splat.project`; with `surroundings` it is of their rows too, after the
+    object's.
     `shading.accuracy.traced_bounces` needs an occluder whose `set_materials` has seen these surfels.
     Raises InputError for what `shading.check` refuses.
     """
@@ -71,9 +77,12 @@ def render(
     shading.check(surfels.raw, light is not None, occluder is not None)
     if surfels.count == 0:
         surfels, shift = _nothing(surfels), None
+    if surroundings is not None and surroundings.surfels.count == 0:
+        surroundings, shift = replace(surroundings, surfels=_nothing(surroundings.surfels)), None
     seen = _seen(surfels, camera, sh_degree)
     attributes = shading.model.attributes(surfels, seen, shading)
-    scene = _Scene(surfels, camera, shading, light, occluder, seen, attributes, shift)
+    around = None if surroundings is None else _Around.of(surroundings, surfels, camera, sh_degree)
+    scene = _Scene(surfels, camera, shading, light, occluder, seen, attributes, shift, around)
     frame = (
         _shade_at_surfels(scene, aovs, normals) if shading.at == "surfel" else _shade_at_pixels(scene, aovs)
     )
@@ -109,6 +118,7 @@ class _Scene:
     seen: SurfelView
     attributes: dict[str, Any]  # of the model, by name
     shift: Any
+    around: _Around | None
 
     @property
     def normal(self) -> Any:
@@ -123,6 +133,38 @@ class _Scene:
     def materials(self) -> dict[str, Any]:
         """Activated channels that have an AOV, by name."""
         return {name: self.surfels.value(name) for name in self.surfels.raw if channel(name).aov}
+
+    def presence(self) -> dict[str, Any]:
+        """The slot of the object's opacity, where alpha is not that."""
+        return {} if self.around is None else {OBJECT: dr.full(mi.Float, 1, self.surfels.count)}
+
+    def blend(self, slots: dict[str, Any], others: dict[str, Any]) -> GBuffer:
+        """Slots of the object's rows, and those that the surroundings have, if there are any, in one sort."""
+        if self.around is None:
+            return GBuffer.blend(self.surfels, slots, self.camera, self.shift)
+        rows = self.surfels.count, self.around.count
+        share = OBJECT if OBJECT in slots else ""
+        joined = joined_slots(slots, others, rows)
+        return GBuffer.blend(self.around.table, joined, self.camera, self.shift, share)
+
+
+@dataclass(frozen=True)
+class _Around:
+    """Surroundings in a camera."""
+
+    table: Surfels  # geometry of the object and of them
+    count: int  # their rows
+    normal: Any  # mi.Vector3f of width `count`, towards the camera
+    radiance: Any  # mi.Color3f of width `count`
+    background: Any  # mi.Color3f, pixel by pixel
+
+    @staticmethod
+    def of(surroundings: Surroundings, surfels: Surfels, camera: Camera, sh_degree: int | None) -> _Around:
+        others = surroundings.surfels
+        seen = _seen(others, camera, sh_degree)
+        radiance = seen.harmonic_colour(others.value("radiance_sh"))
+        table = together(surfels, others)
+        return _Around(table, others.count, seen.normal, radiance, surroundings.behind(camera))
 
 
 def _seen(surfels: Surfels, camera: Camera, sh_degree: int | None) -> SurfelView:
@@ -144,15 +186,18 @@ def _shade_at_surfels(scene: _Scene, aovs: bool, normals: bool) -> Frame:
     points = ShadingPoints(scene.normal, -direction, scene.named)
     if shading.occlusion:
         centre = scene.surfels.position()
-        around = TraceContext(scene.occluder, scene.surfels, scene.light, centre, direction)
-        points = shading.model.trace(points, around, shading)
-    terms = shade(points, scene.light, shading)
+        meets = TraceContext(scene.occluder, scene.surfels, scene.light, centre, direction)
+        points = shading.model.trace(points, meets, shading)
+    terms, around = shade(points, scene.light, shading), scene.around
     # A feature costs time in every pair, so what is not asked for is not blended.
     slots = {"radiance": terms.total()} | ({"normal": scene.normal} if normals else {})
     materials = scene.materials() if aovs else {}
+    others = {}
     if aovs:
-        slots |= terms.known() | materials
-    buffer = GBuffer.blend(scene.surfels, slots, scene.camera, scene.shift)
+        slots |= terms.known() | materials | scene.presence()
+    if around is not None:
+        others = {"radiance": around.radiance} | ({"normal": around.normal} if normals else {})
+    buffer = scene.blend(slots, others)
     blended = buffer.slots
     apart = Terms(**{name: blended[name] for name in terms.known()}).filled() if aovs else None
     return Frame(
@@ -162,35 +207,42 @@ def _shade_at_surfels(scene: _Scene, aovs: bool, normals: bool) -> Frame:
         radiance=blended["radiance"],
         terms=apart,
         maps={name: buffer.divided(name) for name in materials},
+        background=None if around is None else around.background,
+        share=blended.get(OBJECT),
     )
 
 
 def _shade_at_pixels(scene: _Scene, aovs: bool) -> Frame:
     shading, camera = scene.shading, scene.camera
-    slots = {"normal": scene.normal} | scene.named
+    slots, around = {"normal": scene.normal} | scene.named, scene.around
     if aovs:
         slots |= {name: value for name, value in scene.materials().items() if name not in slots}
-    buffer = GBuffer.blend(scene.surfels, slots, camera, scene.shift)
+    others = {} if around is None else {AROUND: around.radiance}
+    buffer = scene.blend(slots | scene.presence(), others)
 
     values = {name: buffer.divided(name) for name in slots if name != "normal"}
     normal, ray = buffer.slots["normal"], camera.rays()
+    alpha = buffer.slots.get(OBJECT, buffer.alpha)
     attributes = {name: values[name] for name in scene.named}
     if shading.accuracy.antialias:
-        attributes["roughness"] = widened(attributes["roughness"], normal, buffer.alpha, camera)
+        attributes["roughness"] = widened(attributes["roughness"], normal, alpha, camera)
     points = ShadingPoints(normal, -dr.normalize(ray), attributes)
     maps = {name: values[name] for name in scene.surfels.raw if name in values}
     if shading.occlusion:
-        covered = dr.detach(buffer.alpha) > COVERAGE_FLOOR
-        around = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered)
-        points = shading.model.trace(points, around, shading)
+        covered = dr.detach(alpha) > COVERAGE_FLOOR
+        meets = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered)
+        points = shading.model.trace(points, meets, shading)
         maps["visibility"] = points.visibility
     shaded = shade(points, scene.light, shading)
-    terms = Terms(**{name: term * buffer.alpha for name, term in shaded.known().items()}).filled()
+    terms = Terms(**{name: term * alpha for name, term in shaded.known().items()}).filled()
     return Frame(
         alpha=buffer.alpha,
         depth=buffer.depth,
         normal=normal,
-        radiance=terms.total(),
+        radiance=terms.total() if around is None else terms.total() + buffer.slots[AROUND],
         terms=terms,
         maps=maps,
+        background=None if around is None else around.background,
+        share=buffer.slots.get(OBJECT),
+        own_normal=around is not None,
     )

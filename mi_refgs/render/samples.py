@@ -49,11 +49,13 @@ def supersampled(
             return type(value)(*(box_mean(part, camera, factor) for part in value))
         return box_mean(value, camera, factor)
 
-    alpha = mean(fine.alpha)
-    inverse = inverse_alpha(alpha)
+    def maybe(value: Any) -> Any:
+        return None if value is None else mean(value)
 
-    def weighted(value: Any) -> Any:
-        return mean(value * fine.alpha) * inverse
+    alpha, share = mean(fine.alpha), maybe(fine.share)
+    inverse = inverse_alpha(alpha)
+    of_object = inverse if share is None else inverse_alpha(share)
+    by = fine.alpha if share is None else fine.share
 
     terms = None
     if fine.terms is not None:
@@ -61,11 +63,13 @@ def supersampled(
     return replace(
         fine,
         alpha=alpha,
-        depth=weighted(fine.depth),
-        normal=None if fine.normal is None else mean(fine.normal),
+        depth=mean(fine.depth * fine.alpha) * inverse,
+        normal=maybe(fine.normal),
         radiance=mean(fine.radiance),
         terms=terms,
-        maps={name: weighted(value) for name, value in fine.maps.items()},
+        maps={name: mean(value * by) * of_object for name, value in fine.maps.items()},
+        background=maybe(fine.background),
+        share=share,
     )
 
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
-from mi_refgs.methods.method import APART, LIGHT
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.methods.surroundings import AROUND
+from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
 from mi_refgs.surfels.table import Surfels
 
 PARAMS, OPTIMISER, MESH = "params/", "optimiser/", "mesh/"
@@ -78,21 +78,24 @@ def check(state: Mapping[str, np.ndarray]) -> None:
     """Raise DamagedError unless every array that a fit goes on from is there, finite and of its shape."""
     params = part(state, PARAMS)
     try:
-        table = Surfels({name: value for name, value in params.items() if name not in APART})
+        table = Surfels(channels_of(params))
         geometry = table.primitive.widths
-        if LIGHT in params:
-            EnvironmentLight(params[LIGHT])
+        light_of(params)
+        around = surroundings_of(params)
+        if around is not None and around.surfels.primitive is not table.primitive:
+            raise InputError(f"{AROUND}: not the primitive of the object")
     except InputError as error:
         raise DamagedError(str(error)) from error
     scalars = ["iteration", "seconds", "held_until"]
-    rows = ["gradient_sum", "gradient_count"]
     signed = [f"{PARAMS}{name}" for name in {*geometry, *params}]
     for tensor, values in params.items():
         _check(state, [f"{OPTIMISER}{tensor}/first"], (values.size,), signed=True)
         _check(state, [f"{OPTIMISER}{tensor}/second"], (values.size,))
         scalars += [f"{OPTIMISER}{tensor}/{name}" for name in ("steps", "factor", "usual")]
     _check(state, scalars, ())
-    _check(state, rows, (table.count,))
+    tables = {"": table} | ({} if around is None else {AROUND: around.surfels})
+    for prefix, rows in tables.items():
+        _check(state, [f"{prefix}gradient_sum", f"{prefix}gradient_count"], (rows.count,))
     _check(state, signed, signed=True)
     if part(state, MESH):
         _check(state, [f"{MESH}voxel"], ())

@@ -26,13 +26,14 @@ from mi_refgs.errors import InputError
 from mi_refgs.files import read_json
 from mi_refgs.runs.checkpoint import PARAMS, tensors
 from mi_refgs.methods.method import Method
+from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
 from mi_refgs.runs.run import Run
-from mi_refgs.methods.method import GAIN, LIGHT
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.render.samples import supersampled
 from mi_refgs.render.scene_xml import write_scene_xml
+from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.ambient import prepare
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
@@ -68,25 +69,25 @@ class TrainedScene:
     iteration: int
     seconds: float  # spent training
     pruned: Pruned | None = None  # absent: all that the fit has found
+    surroundings: Surroundings | None = None  # of pictures without alpha
 
     @staticmethod
     def from_state(method: Method, state: Mapping[str, np.ndarray]) -> TrainedScene:
         """Take the state of a `Trainer`, as a checkpoint holds it."""
         params = tensors(state, PARAMS)
-        light = params.pop(LIGHT, None)
-        params.pop(GAIN, None)  # of training views, no part of the scene
         mesh = None
         if len(state.get("mesh/faces", ())):
             mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
         iteration = int(state["iteration"])
         _, stage = method.stage_at(max(iteration, 1))
         return TrainedScene(
-            Surfels(params),
-            None if light is None else EnvironmentLight(light),
+            Surfels(channels_of(params)),
+            light_of(params),
             mesh,
             Shading.of(stage, mesh is not None),
             iteration,
             float(state["seconds"]),
+            surroundings=surroundings_of(params),
         )
 
     @staticmethod
@@ -133,7 +134,16 @@ class TrainedScene:
         prepare(occluder, self.surfels, light, self.shading.accuracy)
 
         def once(camera: Camera) -> Frame:
-            return render(self.surfels, camera, self.shading, light, occluder, aovs=aovs, normals=aovs)
+            return render(
+                self.surfels,
+                camera,
+                self.shading,
+                light,
+                occluder,
+                aovs=aovs,
+                normals=aovs,
+                surroundings=self.surroundings,
+            )
 
         def view(camera: Camera) -> Frame:
             with dr.suspend_grad():

@@ -50,6 +50,11 @@ ATANH_TERMS = 7
 """Terms of the series of log(1 + e) in softplus: relative error below 1e-7 for e ≤ 1."""
 
 
+def is_height(rows: int) -> bool:
+    """Whether a learnable light may have so many rows."""
+    return rows % 4 == 0 and rows >= MIN_HEIGHT
+
+
 def softplus(x: Any) -> Any:
     """log(1 + exp x) to full relative precision for every finite x, with a finite derivative."""
     e = dr.exp(-dr.abs(x))
@@ -192,7 +197,7 @@ class EnvironmentLight:
     def __post_init__(self) -> None:
         shape = tuple(self.raw.shape)
         h = shape[0] if shape else 0
-        if shape != (h, 2 * h, 3) or h % 4 or h < MIN_HEIGHT:
+        if shape != (h, 2 * h, 3) or not is_height(h):
             raise InputError(
                 f"EnvironmentLight: raw: shape {shape}; need (h, 2h, 3), h ≥ {MIN_HEIGHT} a multiple of 4: "
                 "EnvironmentLight.from_file resamples"

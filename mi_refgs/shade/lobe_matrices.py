@@ -75,6 +75,12 @@ def column_angles(w: int) -> np.ndarray:
     return (np.arange(w) + 0.5) * (2 * np.pi / w)
 
 
+def map_directions(h: int) -> np.ndarray:
+    """Unit world directions (h, 2h, 3) of the texels of a lat-long map."""
+    θ, φ = np.meshgrid(row_angles(h), column_angles(2 * h), indexing="ij")
+    return np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], axis=-1)
+
+
 def lobe(cos_angle: np.ndarray, roughness: float) -> np.ndarray:
     """Unnormalised GGX lobe max(L·R, 0) D(R·H) of the angle between L and R, α = roughness². [Karis 2013]"""
     α2 = roughness**4

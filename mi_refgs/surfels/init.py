@@ -30,16 +30,17 @@ def from_points(
     channels: Sequence[str] | None = None,
     degree: Mapping[str, int] | None = None,
     scale_factor: float = 1.0,
+    largest: np.ndarray | None = None,  # (N,)
     **initial: float | np.ndarray,
 ) -> Surfels:
     """One `primitive` per point: size from its 3 nearest neighbours, normal as given or uniform at random.
 
-    The tangents are turned at random about the normal. `channels` beside the geometry (default: all that are
-    declared); `degree` of spherical harmonics by channel, 0 by default; `initial` activated values by
-    channel, such as `roughness=0.3`, by default those of `surfels.channels`. `colours` fill the DC of
-    radiance_sh (grey 0.5 by default). Rotations are uniform over SO(3), not over positive components as in
-    the released Ref-Gaussian. Raises InputError for wrong shapes, NaN, unknown channels or values out of
-    range.
+    Sizes are at most `largest`. The tangents are turned at random about the normal. `channels` beside the
+    geometry (default: all that are declared); `degree` of spherical harmonics by channel, 0 by default;
+    `initial` activated values by channel, such as `roughness=0.3`, by default those of `surfels.channels`.
+    `colours` fill the DC of radiance_sh (grey 0.5 by default). Rotations are uniform over SO(3), not over
+    positive components as in the released Ref-Gaussian. Raises InputError for wrong shapes, NaN, unknown
+    channels or values out of range.
     """
     points = _check("points", points, np.shape(points)[:1])
     count = len(points)
@@ -52,7 +53,9 @@ def from_points(
         normals = _check("normals", normals, (count,))
     kind = primitive_named(primitive)
     raw = {"position": points}
-    raw |= kind.start(neighbour_scale(points) * scale_factor, quaternions(normals, count, rng))
+    spacing = neighbour_scale(points) * scale_factor
+    spacing = spacing if largest is None else np.minimum(spacing, largest)
+    raw |= kind.start(spacing, quaternions(normals, count, rng))
     for name, declared in CHANNELS.items():
         chosen = not declared.geometry if channels is None else name in channels
         if name not in raw and (name in kind.widths or chosen):
