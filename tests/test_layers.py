@@ -40,7 +40,7 @@ LAYERS: dict[str, set[str]] = {
     "splat": {"surfels", "primitives", "rows"} | BOTTOM,
     "shade": {"splat.camera", "surfels", "occlusion"} | BOTTOM,
     "occlusion": {"splat.camera", "surfels", "primitives"} | BOTTOM,
-    "render": {"shade", "occlusion", "splat", "surfels", "primitives"} | BOTTOM,
+    "render": {"shade", "occlusion", "splat", "surfels", "primitives", "rows"} | BOTTOM,
     "plugins": RENDERER,
     "methods": RENDERER | {"resources"},
     "data": RENDERER,
