@@ -240,7 +240,7 @@ def warn_of_data(method: Method, views: Any) -> None:
     count, first = len(views.views), views.views[0]
     if count < FEW_VIEWS:
         warn(f"{views.path}: only {count} training views; expect surfaces that fit no others")
-    if any(view.alpha is None for view in views.views):
+    if not all(view.cut_out for view in views.views):
         warn(
             f"{views.path}: pictures without alpha: surfels start at random, "
             "and the background becomes surfels too"

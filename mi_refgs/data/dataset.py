@@ -87,10 +87,10 @@ def read_dataset(
                 f"'{first.name}' has {first.width} × {first.height}; bring all pictures to one size"
             )
     near = NEAR_EXTENTS * _extent(views)
-    views = tuple(replace(view, near=near) for view in views)
+    views = tuple(view.changed(near=near) for view in views)
     colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
     region = found.region or read_region(path)
-    if region is None and any(view.alpha is None for view in views):
+    if region is None and not all(view.cut_out for view in views):
         with contextlib.suppress(InputError):  # views that share no point have none
             region = region_of(views)
     linear = images == "exr"

@@ -61,7 +61,7 @@ class FrameReader:
         if normal is depth is None:
             normal, depth = shiny_maps(file, source, self.options.downscale, straight)
         materials = {name: values for name, values in known.items() if values is not None}
-        return replace(view, normal=normal, depth=depth, materials=materials)
+        return view.changed(normal=normal, depth=depth, materials=materials)
 
     def size(self, index: int, frame: Any) -> tuple[int, int]:
         """Width and height of a frame's picture as it lies in the file."""

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mi_refgs.data.exposure import log_exposure
 from mi_refgs.data.lens import Lens, Undistortion, undistortion
+from mi_refgs.data.picture_store import Picture
 from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.exr import read_exr_image
-from mi_refgs.images import box_downscale, image_size, read_bytes, read_grey
+from mi_refgs.images import box_downscale, has_alpha, image_size, read_bytes, read_grey
 
 BAND = 256
 """Rows of a file that are floating-point numbers at a time: of a large picture all would be half a gigabyte."""
@@ -76,13 +78,48 @@ class PictureFile:
 
         Raises InputError for a file that cannot be read, or a mask of another size.
         """
+        return self.planes(self.decode(), background)
+
+    @property
+    def largest(self) -> int:
+        """Bytes that `decode` gives at most."""
+        width, height = self.size
+        return 4 * width * height * (1 if self._as_it_is else 4)
+
+    @property
+    def _as_it_is(self) -> bool:
+        """Whether the view shows the numbers of the file."""
+        changed = self.downscale > 1 or self.mask is not None or self.straight is not None
+        return not changed and self.path.suffix.lower() != ".exr"
+
+    def cut_out(self) -> bool:
+        """Whether there is alpha: by the file's header, of an EXR file by its channels."""
+        if self.path.suffix.lower() == ".exr":
+            return self.mask is not None or self.decode().shape[-1] == 4
+        return self.mask is not None or has_alpha(self.path)
+
+    def decode(self) -> np.ndarray:
+        """What `planes` needs of the file (H, W, 3 or 4): its 8-bit numbers if nothing is done to them, else
+        float32, premultiplied.
+
+        Raises InputError for a file that cannot be read, or a mask of another size.
+        """
+        if self._as_it_is:
+            return read_bytes(self.path)[0]
         small = self._averaged()
-        if self.straight is not None:
-            small = self.straight.resample(small)
-        colour = np.ascontiguousarray(small[..., :3])
+        return small if self.straight is None else self.straight.resample(small)
+
+    def planes(self, decoded: np.ndarray, background: float) -> tuple[np.ndarray, np.ndarray | None]:
+        """Colour and alpha, as `read` gives them, of what `decode` gave."""
+        small = decoded
+        if small.dtype == np.uint8:
+            small = small.astype(np.float32) / np.float32(255)
+            if small.shape[-1] == 4:
+                small[..., :3] *= small[..., 3:]
+        colour = np.array(small[..., :3])
         if small.shape[-1] == 3:
             return colour, None
-        alpha = np.ascontiguousarray(small[..., 3])
+        alpha = np.array(small[..., 3])
         colour += (1 - alpha[..., None]) * np.float32(background)
         return colour, alpha
 
@@ -150,8 +187,9 @@ def make_view(
             raise InputError(f"{where}: {error}") from None
         fx, fy = fx * straight.zoom, fy * straight.zoom
         picture = replace(picture, straight=straight)
-    image, alpha = picture.read(options.background)
+    pixels: Any = Picture(picture, options.background)
+    alpha = pixels if pixels.cut_out else None
     exposure = log_exposure(picture.path)
     linear = options.images == "exr"
-    view = View(name, width, height, fx, fy, cx, cy, to_world, image, alpha, None, None, linear, exposure=exposure)
+    view = View(name, width, height, fx, fy, cx, cy, to_world, pixels, alpha, None, None, linear, exposure=exposure)
     return view, straight

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -15,6 +16,16 @@ if TYPE_CHECKING:
 
 ALPHA_FLOOR = 1e-3
 """Alpha by which colour is divided at least: fainter pixels have no colour of their own in 8 bits."""
+
+
+class Pixels(Protocol):
+    """Colour and alpha of a picture that is decoded when it is asked for."""
+
+    cut_out: bool
+    """Whether it has alpha."""
+
+    def planes(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """What `View.image` and `View.alpha` are; raises InputError for a file that cannot be read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +40,8 @@ class View:
     cx: float  # principal point, pixels from the left edge; the centre is width / 2
     cy: float
     to_world: np.ndarray  # (4, 4) float64, rigid, from Mitsuba's camera frame: +z forward, +x left, +y up
-    image: np.ndarray  # (H, W, 3) float32 target, composited onto the background
-    alpha: np.ndarray | None  # (H, W) float32
+    image: np.ndarray  # (H, W, 3) float32 target, composited onto the background; given as `Pixels` or array
+    alpha: np.ndarray | None  # (H, W) float32; likewise
     normal: np.ndarray | None  # (H, W, 3) float32, world space, 0 off the object
     depth: np.ndarray | None  # (H, W) float32 along the viewing axis, 0 off the object
     linear: bool  # whether `image` is linear radiance (EXR) or sRGB-encoded (PNG)
@@ -60,6 +71,19 @@ class View:
             return (self.depth > 0).astype(np.float32)
         return np.ones((self.height, self.width), np.float32)
 
+    @property
+    def cut_out(self) -> bool:
+        """Whether the picture has alpha; decodes nothing, as `alpha` may."""
+        given = self.__dict__["alpha"]
+        return given is not None and (isinstance(given, np.ndarray) or given.cut_out)
+
+    def changed(self, **fields: Any) -> View:
+        """The same view with other fields; decodes nothing, as `dataclasses.replace` would."""
+        made = copy.copy(self)
+        for name, value in fields.items():
+            object.__setattr__(made, name, value)
+        return made
+
     def averaged(self, block: int) -> View:
         """The same view with each square of `block` × `block` pixels as one, and without true maps.
 
@@ -71,7 +95,8 @@ class View:
                 f"{self.name}: data.coarse: {self.width} × {self.height} pixels are less than a block of "
                 f"{block}²; give a smaller one"
             )
-        alpha = None if self.alpha is None else box_downscale(self.alpha[..., None], block)[..., 0]
+        image, alpha = self.image, self.alpha
+        alpha = None if alpha is None else box_downscale(alpha[..., None], block)[..., 0]
         return replace(
             self,
             width=self.width // block,
@@ -80,7 +105,7 @@ class View:
             fy=self.fy / block,
             cx=self.cx / block,
             cy=self.cy / block,
-            image=box_downscale(self.image, block),
+            image=box_downscale(image, block),
             alpha=alpha,
             normal=None,
             depth=None,
@@ -105,3 +130,23 @@ class View:
             & (abs(row - (self.height - 1) / 2) <= self.height / 2)
         )
         return row, column, seen
+
+
+class _Decoded:
+    """`View.image` or `View.alpha`: an array as it was given, or decoded of `Pixels`."""
+
+    def __init__(self, name: str, plane: int) -> None:
+        self.name, self.plane = name, plane
+
+    def __get__(self, view: View | None, owner: type) -> Any:
+        if view is None:
+            return self
+        given = view.__dict__[self.name]
+        return given if given is None or isinstance(given, np.ndarray) else given.planes()[self.plane]
+
+    def __set__(self, view: View, value: np.ndarray | Pixels | None) -> None:
+        view.__dict__[self.name] = value
+
+
+for _plane, _name in enumerate(("image", "alpha")):
+    setattr(View, _name, _Decoded(_name, _plane))

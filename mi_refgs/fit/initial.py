@@ -90,7 +90,7 @@ def initial_surfels(
     if not 0 <= options.inside <= 1:
         raise InputError(f"method: surfels.inside: {options.inside} is no share; give a number from 0 to 1")
     views, behind = data.views, data.background
-    if all(view.alpha is not None for view in views):
+    if all(view.cut_out for view in views):
         shape = hull.visual_hull(views, hull.camera_bounds(views))
         inner = shape.inner_points(round(options.inside * options.count), rng)
         outer, facing = shape.surface_points(options.count - len(inner), rng)

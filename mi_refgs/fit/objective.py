@@ -40,9 +40,10 @@ class Target:
     @staticmethod
     def of(view: View, background: np.ndarray) -> Target:
         """Upload a view; `background` (3,) in the space of its picture."""
-        planes = [upload(view.image[..., i]) for i in range(3)]
+        colour, opacity = view.image, view.alpha
+        planes = [upload(colour[..., i]) for i in range(3)]
         image = [srgb_from_linear(plane) for plane in planes] if view.linear else planes
-        alpha = None if view.alpha is None else upload(view.alpha)
+        alpha = None if opacity is None else upload(opacity)
         clipped = None if view.linear else losses.saturated(image, alpha, map(float, background))
         target = Target(view.camera(), image, clipped, alpha)
         dr.eval(target.image, target.clipped, target.alpha)

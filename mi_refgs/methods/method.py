@@ -179,9 +179,9 @@ class ExposureOptions:
     """A gain a channel of each training view, on the linear radiance; decided once (`fit.exposure`)."""
 
     gains: Literal["judged", "on", "off"] = "judged"  # judged: if they pay
-    after: int = 600  # iterations, then it is decided
+    after: int = 1_200  # iterations, then it is decided
     worth: float = 0.5  # dB that the training views must gain, on pixels that the gains were not fitted to
-    rate: float = 1e-3  # of log gains, a step; a tenth at the end
+    rate: float = 3e-3  # of log gains, a step; a tenth at the end
 
 
 @dataclass(frozen=True)

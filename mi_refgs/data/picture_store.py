@@ -1,0 +1,72 @@
+"""Pictures that are decoded when they are asked for: all of 300 photographs of 12 Mpx would be 11 GB in 8 bits.
+
+What is kept of a picture is its decoded file: 8-bit numbers where the view shows them as they are, and float32
+where pixels were averaged or resampled, so a picture is the same however often it is decoded.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections import OrderedDict
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from mi_refgs.data.picture_files import PictureFile
+
+BUDGET = 2**30
+"""Bytes of decoded pictures that are kept in a process: 28 of 12 Mpx, or a thousand of 600 × 600."""
+
+
+class PictureStore:
+    """Decoded pictures; those that were asked for last are kept, and none longer than its `Picture`."""
+
+    def __init__(self, budget: int = BUDGET) -> None:
+        self.budget = budget
+        self.bytes = 0
+        self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
+
+    def pixels(self, picture: Picture) -> np.ndarray:
+        """The pixels of a picture, decoded if they are not kept; raises InputError as `PictureFile.decode`."""
+        key = id(picture)
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key]
+        decoded = picture.file.decode()
+        self._kept[key] = decoded
+        self.bytes += decoded.nbytes
+        weakref.finalize(picture, self._drop, key).atexit = False
+        while self.bytes > self.budget and self._kept:
+            self._drop(next(iter(self._kept)))
+        return decoded
+
+    def has_room(self, size: int) -> bool:
+        """Whether so many bytes more are kept without dropping others."""
+        return self.bytes + size <= self.budget
+
+    def _drop(self, key: int) -> None:
+        dropped = self._kept.pop(key, None)
+        self.bytes -= 0 if dropped is None else dropped.nbytes
+
+
+STORE = PictureStore()
+"""The pictures of this process."""
+
+
+class Picture:
+    """The pixels of a view, in a file."""
+
+    def __init__(self, file: PictureFile, background: float, store: PictureStore = STORE) -> None:
+        """Decode the file while there is room, so that what is wrong with it is said when it is read.
+
+        Raises InputError as `PictureFile.decode` does.
+        """
+        self.file, self.background, self.store = file, background, store
+        whole = store.pixels(self) if store.has_room(file.largest) else None
+        self.cut_out = file.cut_out() if whole is None else whole.shape[-1] == 4
+
+    def planes(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """Colour and alpha, as `PictureFile.read` gives them."""
+        return self.file.planes(self.store.pixels(self), self.background)
