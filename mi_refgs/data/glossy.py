@@ -73,7 +73,7 @@ def _view(folder: Path, number: int, options: ReadOptions) -> View:
         return view
     grey = read_grey(depths)[0][..., None]
     depth = grey.astype(np.float32) * np.float32(DEEPEST / NUMBERS)
-    return replace(view, depth=block_mean(depth, grey < BEHIND, options.downscale)[0][..., 0])
+    return view.changed(depth=block_mean(depth, grey < BEHIND, options.downscale)[0][..., 0])
 
 
 def _camera(path: Path) -> tuple[np.ndarray, np.ndarray]:
