@@ -46,7 +46,7 @@ LAYERS: dict[str, set[str]] = {
     "data": RENDERER,
     "capture": {"data"} | BOTTOM,
     "runs": RENDERER | {"methods"},
-    "fit": RENDERER | {"methods", "data", "runs"},
+    "fit": RENDERER | {"methods", "data", "capture", "runs"},
     "evaluation": RENDERER | {"methods", "data", "runs", "fit"},
     "relighting": RENDERER | {"methods", "data", "runs", "fit", "evaluation"},
     "profiling": RENDERER | {"methods", "data", "fit"},

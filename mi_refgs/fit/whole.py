@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from mi_refgs.capture.triangulate import with_points
 from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fit.exposure import EXPOSURE_FILE
@@ -54,13 +55,16 @@ def read_views(method: Method, path: Path, split: str, truth: bool = True) -> Da
 def begin(method: Method, views: Dataset, run: Run, tell: Callable[[str], None] = lambda _: None) -> Trainer:
     """A trainer that writes into `run`: from its newest checkpoint if the folder holds a run, else anew.
 
-    `tell` is called with what is decided about the terms of a method that selects them. Raises InputError for
-    checkpoints that are all damaged and a folder that cannot be written.
+    A new fit of pictures without alpha looks for points to start from where the data set has none. `tell` is
+    called with what is found, and what is decided about the terms of a method that selects them. Raises
+    InputError for checkpoints that are all damaged and a folder that cannot be written.
     """
     resumed = run.exists()
     state = run.load_checkpoint() if resumed else None
     if state is not None:
         method = with_terms(method, decisions_of(state))
+    else:
+        views = replace(views, points=with_points(views, run.path, tell))
     trainer = Trainer(method, views, run, state)
     trainer.exposure.tell = tell
     if resumed:
