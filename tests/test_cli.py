@@ -18,6 +18,7 @@ from tiny_scene import SIZE, train_command
 from mi_refgs.cli import demo, main
 from mi_refgs.cli.train import load_method
 from mi_refgs.exr import read_exr
+from mi_refgs.fit import plan
 from mi_refgs.fit.train import Trainer
 from mi_refgs.fit.whole import sized
 from mi_refgs.images import read_png, srgb_from_linear, write_png
@@ -115,13 +116,20 @@ def test_large_pictures_are_read_smaller_unless_told_otherwise(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The size is chosen once: config.toml records it, and evaluation reads the same."""
-    monkeypatch.setitem(PRESETS, "quick", replace(PRESETS["quick"], pixels=SIZE * SIZE // 3))
+    slow = plan.Speed({"initial": [1.0, 4.0], "deferred": [1.0, 4.0]}, 0.0, 0.0)  # 10 ms a pixel
+    for name, value in {"speed_of": lambda *_: slow, "WORTH": 0, "LEAST": 10, "SIZES": (10, 20)}.items():
+        monkeypatch.setattr(plan, name, value)
+    minutes = (
+        (plan.START + 5) / plan.SAFETY / 60
+    )  # two iterations take 8 s, or 2 s on a quarter of the pixels
+    monkeypatch.setitem(PRESETS, "quick", replace(PRESETS["quick"], minutes=minutes))
     run = tmp_path / "run"
     assert main([*train_command(data, run, method), "iterations=2"]) == 0
-    said = [
-        line for line in capsys.readouterr().err.splitlines() if "20 × 20 pixels are read as 10 × 10" in line
-    ]
-    assert len(said) == 1 and "data.downscale=1" in said[0] and "quick" in said[0]
+    out, err = capsys.readouterr()
+    assert "estimate: 12 s and 0.8 GB for 2 iterations on 10 × 10 pixels" in err
+    assert " in all, estimate 12 s), " in out
+    said = [line for line in err.splitlines() if "20 × 20 pixels are read as 10 × 10" in line]
+    assert len(said) == 1 and "data.downscale=1" in said[0] and "--minutes M" in said[0]
     assert load_resolved(run / "config.toml").data.downscale == 2
     monkeypatch.undo()
     assert main(["eval", str(run)]) == 0

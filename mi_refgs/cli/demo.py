@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> Result:
     )
     say(f"2 of 3: fitting into {output}")
     started = (output / "config.toml").is_file()
-    trainer = fit(data, output, preset=args.preset, assignments=[] if started else args.set, resume=True)
+    trainer = fit(data, output, preset=args.preset, assignments=[] if started else args.set, resume=True)[0]
     say("3 of 3: evaluating")
     folder = Run(output)
     result = read_metrics(folder)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +14,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.resources import resource_dir
 
 if TYPE_CHECKING:
+    from mi_refgs.fit.plan import Estimate
     from mi_refgs.fit.train import Trainer
     from mi_refgs.methods.method import Method
     from mi_refgs.runs.run import Run
@@ -23,8 +26,6 @@ PSNR_MEMORY = 0.9
 """Share of the old value in the running PSNR of the bar: one view's is up to 5 dB off the mean."""
 FEW_VIEWS = 20
 """Training views below which surfels overfit; published scenes have 100 and more."""
-LARGE_PICTURE = 640 * 640
-"""Pixels from which a step takes more than half a second on two cores."""
 TERMINAL_INTERVAL, LOG_INTERVAL = 0.5, 30.0
 """Seconds between refreshes of the progress bar, in a terminal and in a file."""
 
@@ -46,6 +47,9 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--preset", metavar="P", help=f"quick, standard or paper: how long (default {DEFAULT_PRESET})"
     )
+    parser.add_argument(
+        "--minutes", type=float, metavar="M", help="time that the fit may take, by smaller or larger pictures"
+    )
     add_settings(parser)
     parser.add_argument(
         "--resume", action="store_true", help="go on from the newest checkpoint, if there is one"
@@ -55,7 +59,9 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> Result:
     """Fit, from the start or from the newest checkpoint."""
     variant = variant_of(args.variant, args.purpose)
-    trainer = fit(args.data, args.output, variant, args.preset, args.set, args.resume)
+    begin = time.monotonic()
+    trainer, expected = fit(args.data, args.output, variant, args.preset, args.set, args.resume, args.minutes)
+    taken = time.monotonic() - begin
     last = trainer.statistics() if trainer.loss is not None else {}
     data = {
         "run": str(args.output),
@@ -63,11 +69,14 @@ def run(args: argparse.Namespace) -> Result:
         "preset": trainer.method.preset,
         "iterations": trainer.iteration,
         "seconds": round(trainer.seconds, 3),
+        "total_seconds": round(taken, 3),
+        "estimated_seconds": None if expected is None else round(expected.seconds, 3),
         "surfels": trainer.surfels.count,
         "loss": last.get("loss"),
     }
     text = (
-        f"{args.output}: {trainer.iteration} iterations in {trainer.seconds:.0f} s, "
+        f"{args.output}: {trainer.iteration} iterations in {trainer.seconds:.0f} s"
+        f"{_compared(taken, expected)}, "
         f"{trainer.surfels.count} surfels; next: refgs eval {args.output}"
     )
     if trainer.decisions:
@@ -97,6 +106,13 @@ def load_method(variant: str | None, preset: str | None, assignments: list[str] 
     return methods.load(path, preset or DEFAULT_PRESET, assignments)
 
 
+def _compared(taken: float, expected: Estimate | None) -> str:
+    """All of the time of a fit beside its estimate, for people."""
+    from mi_refgs.fit.plan import minutes
+
+    return "" if expected is None else f" ({minutes(taken)} in all, estimate {minutes(expected.seconds)})"
+
+
 def fit(
     data_path: Path,
     output: Path,
@@ -104,15 +120,20 @@ def fit(
     preset: str | None = None,
     assignments: list[str] | None = None,
     resume: bool = False,
-) -> Trainer:
+    limit: float | None = None,
+) -> tuple[Trainer, Estimate | None]:
     """Train with a progress bar and previews, then write the artefacts; a finished run is only loaded.
+
+    `limit` is the time in minutes that the fit may take. Returns the estimate of a new fit, too.
 
     Raises InputError for bad input, and KeyboardInterrupt or TerminatedError with a message that says how to
     go on.
     """
-    from mi_refgs.fit.whole import begin, finish, read_views, sized
+    from mi_refgs.fit.plan import planned
+    from mi_refgs.fit.whole import begin, finish, read_views
     from mi_refgs.runs.run import Run
 
+    expected: Estimate | None = None
     folder = Run(output)
     resumed = resume and folder.exists()
     if resumed:
@@ -120,7 +141,12 @@ def fit(
         _require_same(folder, method, data_path, variant, preset, assignments)
     else:
         folder.require_none()
-        method = sized(load_method(variant, preset, assignments), data_path, say)
+        if limit is not None and not 0 < limit < math.inf:
+            raise InputError(f"--minutes: {limit} is no time; give more than 0")
+        wanted = None if limit is None else 60 * limit
+        method, expected = planned(load_method(variant, preset, assignments), data_path, wanted, say)
+        if expected is not None:
+            say(expected.sentence(method.iterations))
     views = read_views(method, data_path, "train", truth=False)
     warn_of_data(method, views)
     trainer = begin(method, views, folder, say)
@@ -143,7 +169,7 @@ def fit(
     if warning := finish(trainer, folder):
         warn(warning)
     warn_of_outcome(trainer)
-    return trainer
+    return trainer, expected
 
 
 class Progress:
@@ -237,18 +263,13 @@ def _require_same(
 
 def warn_of_data(method: Method, views: Any) -> None:
     """Say what is unusual about a data set."""
-    count, first = len(views.views), views.views[0]
+    count = len(views.views)
     if count < FEW_VIEWS:
         warn(f"{views.path}: only {count} training views; expect surfaces that fit no others")
     if not all(view.cut_out for view in views.views):
         warn(
             f"{views.path}: pictures without alpha: surfels start at random, "
             "and the background becomes surfels too"
-        )
-    if first.width * first.height > LARGE_PICTURE:
-        warn(
-            f"{views.path}: {first.width} × {first.height} pixels make slow steps; "
-            "consider --set data.downscale=2"
         )
 
 

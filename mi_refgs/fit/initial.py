@@ -26,7 +26,7 @@ FAR = 1e4
 
 def is_open(method: Method, data: Dataset) -> bool:
     """Whether pictures show surroundings that the method keeps apart from the object."""
-    masked = all(view.alpha is not None for view in data.views)
+    masked = all(view.cut_out for view in data.views)
     return method.surroundings is not None and data.region is not None and not masked
 
 
