@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mi_refgs import rows as rows_module
-from mi_refgs.rows import PackedRows, columns_of
+from mi_refgs.rows import PackedRows, columns_of, joined
 
 ROWS = 37
 
@@ -72,3 +72,27 @@ def test_copies_of_a_gradient_are_bounded(
         mi.UInt32(0), [mi.Float(1)] * 24, True
     )
     assert set(used) == {mode}
+
+
+def test_joined_arrays_and_their_derivatives() -> None:
+    """Arrays of several lengths, one after the other; each part has an adjoint and a tangent of its own."""
+    rng = np.random.default_rng(0)
+    parts = [[rng.normal(size=n).astype(np.float32) for n in sizes] for sizes in ((5, 3, 7), (2, 4, 1))]
+    first, second = ([mi.Float(x) for x in part] for part in parts)
+    dr.enable_grad(first, second)
+    whole = joined(first, second)
+    weights = [rng.normal(size=dr.width(x)).astype(np.float32) for x in whole]
+    for found, a, b in zip(whole, *parts, strict=True):
+        np.testing.assert_array_equal(found.numpy(), np.concatenate([a, b]))
+    dr.backward(sum(dr.sum(x * mi.Float(w)) for x, w in zip(whole, weights, strict=True)))
+    for a, b, w in zip(first, second, weights, strict=True):
+        np.testing.assert_array_equal(dr.grad(a).numpy(), w[: dr.width(a)])
+        np.testing.assert_array_equal(dr.grad(b).numpy(), w[dr.width(a) :])
+
+    moved = mi.Float(parts[1][0])
+    dr.enable_grad(moved)
+    whole = joined([mi.Float(parts[0][0])], [moved])
+    dr.set_grad(moved, mi.Float([1, 2]))
+    dr.enqueue(dr.ADMode.Forward, moved)
+    dr.traverse(dr.ADMode.Forward)
+    np.testing.assert_array_equal(dr.grad(whole[0]).numpy(), [0] * 5 + [1, 2])

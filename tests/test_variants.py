@@ -107,6 +107,7 @@ DIFFERENCES: dict[str, set[str]] = {
         "surfels.primitive",
     },
     "auto": {"select"},
+    "photographs": {"loss.normal_rise", "mesh.extract", "stage.initial", "stage.radiance"},
     "relighting": {
         "loss.half_metal",
         "loss.half_metal_rise",

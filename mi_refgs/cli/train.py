@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 DEFAULT_METHOD = "ref_gaussian.toml"
 """File of `variants/` that is fitted when none is named: the full method."""
+OPEN_PURPOSE = "photographs"
+"""What the method that is fitted to pictures without alpha is for, when none is named."""
 DEFAULT_PRESET = "standard"
 PSNR_MEMORY = 0.9
 """Share of the old value in the running PSNR of the bar: one view's is up to 5 dB off the mean."""
@@ -98,6 +100,21 @@ def variant_of(variant: str | None, purpose: str | None) -> str | None:
     return methods.for_purpose(purpose)
 
 
+def default_variant(data_path: Path, assignments: list[str] | None = None) -> str | None:
+    """The method for pictures without alpha, where the data set has such; None for the full one."""
+    from mi_refgs import methods
+    from mi_refgs.fit.whole import read_views
+
+    # What `assignments` say of a method may be of the other one.
+    of_data = [text for text in assignments or [] if text.startswith("data.")]
+    views = read_views(load_method(None, None, of_data), data_path, "train", truth=False)
+    if views.cut_out or views.region is None:
+        return None
+    variant = methods.for_purpose(OPEN_PURPOSE)
+    say(f"{data_path}: pictures without alpha: --variant {variant} fits their surroundings too")
+    return variant
+
+
 def load_method(variant: str | None, preset: str | None, assignments: list[str] | None) -> Method:
     """The method of the options, or the full one at the preset for everyday use."""
     from mi_refgs import methods
@@ -143,6 +160,7 @@ def fit(
         folder.require_none()
         if limit is not None and not 0 < limit < math.inf:
             raise InputError(f"--minutes: {limit} is no time; give more than 0")
+        variant = variant or default_variant(data_path, assignments)
         wanted = None if limit is None else 60 * limit
         method, expected = planned(load_method(variant, preset, assignments), data_path, wanted, say)
         if expected is not None:
@@ -266,7 +284,7 @@ def warn_of_data(method: Method, views: Any) -> None:
     count = len(views.views)
     if count < FEW_VIEWS:
         warn(f"{views.path}: only {count} training views; expect surfaces that fit no others")
-    if not all(view.cut_out for view in views.views):
+    if not views.cut_out and (method.surroundings is None or views.region is None):
         warn(
             f"{views.path}: pictures without alpha: surfels start at random, "
             "and the background becomes surfels too"

@@ -41,6 +41,11 @@ class Dataset:
     region: Region | None = None  # of interest; absent where alpha says what belongs to the object
     notes: tuple[str, ...] = ()  # as in Recording
 
+    @property
+    def cut_out(self) -> bool:
+        """Whether all pictures have alpha; decodes nothing."""
+        return all(view.cut_out for view in self.views)
+
     @cached_property
     def scene_extent(self) -> float:
         """1.1 × the largest distance of a camera to their mean, scene units (3DGS).

@@ -26,8 +26,7 @@ FAR = 1e4
 
 def is_open(method: Method, data: Dataset) -> bool:
     """Whether pictures show surroundings that the method keeps apart from the object."""
-    masked = all(view.cut_out for view in data.views)
-    return method.surroundings is not None and data.region is not None and not masked
+    return method.surroundings is not None and data.region is not None and not data.cut_out
 
 
 def initial_parameters(
@@ -90,7 +89,7 @@ def initial_surfels(
     if not 0 <= options.inside <= 1:
         raise InputError(f"method: surfels.inside: {options.inside} is no share; give a number from 0 to 1")
     views, behind = data.views, data.background
-    if all(view.cut_out for view in views):
+    if data.cut_out:
         shape = hull.visual_hull(views, hull.camera_bounds(views))
         inner = shape.inner_points(round(options.inside * options.count), rng)
         outer, facing = shape.surface_points(options.count - len(inner), rng)

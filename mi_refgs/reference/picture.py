@@ -61,11 +61,11 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     camera = scene.camera
     x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
     blend = Blend.of(raw, camera, scene.order, x, y, scene.rules)
-    features_of = _Features(scene, raw)
+    features_of = Features(scene, raw)
     taps: list[tuple[Array, Array, Array]] = []
     features = features_of(features_of.columns, taps).real
     sums = blend.sums(features)
-    resolve = _Resolve(scene, features_of, x, y, sums)
+    resolve = Resolve(scene, features_of, x, y, sums)
     pixel_taps: list[tuple[Array, Array, Array]] = []
     maps = resolve.named(resolve(sums, pixel_taps).real)
 
@@ -115,7 +115,7 @@ def sample_depth(scene: Scene) -> Array:
 # ---------------- attributes of surfels ----------------
 
 
-class _Features:
+class Features:
     """Features (N, K) of raw columns (N, D): normal, materials, SH colours; or normal and radiance."""
 
     def __init__(self, scene: Scene, raw: dict[str, Array]) -> None:
@@ -154,10 +154,10 @@ class _Features:
         return np.concatenate(parts, axis=1)
 
 
-class _Resolve:
+class Resolve:
     """Maps (P, …) of blended sums (P, K + 2): features, depth, alpha."""
 
-    def __init__(self, scene: Scene, features: _Features, x: Array, y: Array, sums: Array) -> None:
+    def __init__(self, scene: Scene, features: Features, x: Array, y: Array, sums: Array) -> None:
         self.scene, self.features = scene, features
         camera = scene.camera
         ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
