@@ -147,12 +147,14 @@ def strings_outside_docstrings(source: str) -> set[str]:
 
 
 def variant_names() -> set[str]:
-    """What the variants are called: their files' names, and the names that they give themselves."""
-    names = set()
+    """What the variants are called: their files' names, and the names that they give themselves; but for the
+    purposes that they say they are for, which are what code may ask for."""
+    names, purposes = set(), set()
     for path in (ROOT / "variants").glob("*.toml"):
         about = tomllib.loads(path.read_text()).get("about", {})
         names |= {path.stem} | ({about["name"]} if "name" in about else set())
-    return names
+        purposes.add(about.get("purpose"))
+    return names - purposes
 
 
 # ---------- The rules ----------

@@ -59,7 +59,7 @@ def render(open_scene: OpenScene) -> tuple[dict[str, Array], Array]:
 
 
 def lookup(image: Array, ray: Array) -> Array:
-    """Bilinear colour (3,) of a lat-long image (h, 2h, 3) in a unit direction (3,), rows from pole to pole."""
+    """Bilinear colour (3,) of a lat-long image (h, 2h, 3) in a unit direction (3,); poles are rows."""
     h, w = image.shape[:2]
     column = np.arctan2(ray[0], -ray[2]) / (2 * np.pi) % 1 * w - 0.5
     row = np.arccos(np.clip(ray[1], -1, 1)) / np.pi * (h - 1)
