@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +13,17 @@ import photographed_scene as scene
 import pytest
 from PIL import Image
 
+from benchmarks import capture as capture_benchmark
 from mi_refgs.capture import colmap, failure
-from mi_refgs.capture.compare import best_similarity
+from mi_refgs.capture.compare import best_similarity, pose_errors
 from mi_refgs.capture.frame import Similarity, region_of_interest, up_direction
 from mi_refgs.capture.masks import find_masks, mask_pixels
 from mi_refgs.capture.pairs import EXHAUSTIVE, pairs_to_match
 from mi_refgs.capture.photographs import find_photographs
 from mi_refgs.capture.solved import Solved
 from mi_refgs.cli import main
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.images import read_png
 
@@ -115,6 +119,29 @@ def test_the_data_set_holds_pictures_masks_region_and_report(
     assert model.compute_mean_reprojection_error() == pytest.approx(
         report["mean_reprojection_error"], rel=0.1
     )
+
+
+@needs_colmap
+def test_a_fit_reads_it(captured: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Cameras, alpha from the masks, points and region, as one set that every eighth view tests."""
+    train, test = (read_dataset(captured / "data", split) for split in ("train", "test"))
+    assert [view.name for view in test.views] == ["00.png", "08.png"] and len(train.views) == COUNT - 2
+    assert all(view.alpha is not None and {0.0, 1.0} == {*np.unique(view.alpha)} for view in train.views)
+    assert train.region == Region((0, 0, 0), 1) and train.points is not None
+    shots = scene.around(COUNT)
+    truth = []
+    for i, view in [(int(view.name[:2]), view) for view in train.views]:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = shots[i].rotation.T * [-1, -1, 1], shots[i].origin
+        truth.append(replace(view, to_world=pose, fx=scene.FOCAL))
+    errors = pose_errors(train.views, truth)
+    assert errors.count == COUNT - 2 and errors.rotation.max() < 0.5 and errors.position.max() < 0.01
+    assert abs(errors.focal).max() < 0.02
+    with pytest.raises(KeyError):
+        pose_errors(train.views, test.views)
+    assert capture_benchmark.main([str(captured / "data")] * 2) == 0
+    out = capsys.readouterr().out
+    assert f"{COUNT} of {COUNT} pictures placed" in out and "| rotation, degrees | 0.000 | 0.000 |" in out
 
 
 @needs_colmap

@@ -18,7 +18,8 @@ from mi_refgs.capture import colmap
 from mi_refgs.capture.frame import Similarity
 from mi_refgs.capture.masks import mask_pixels
 from mi_refgs.capture.photographs import Photograph
-from mi_refgs.data.lens import Lens, Undistortion, undistortion
+from mi_refgs.data.colmap_model import MODELS, Camera
+from mi_refgs.data.lens import Undistortion, undistortion
 from mi_refgs.errors import InputError
 from mi_refgs.files import replace_file
 
@@ -27,17 +28,6 @@ QUALITY = 95
 SPLINE_PIXELS = 2_000_000
 """Pixels up to which pictures are resampled with cubic splines; larger ones are reduced before a fit sees
 them."""
-LENSES: dict[str, tuple[bool, str]] = {
-    "SIMPLE_PINHOLE": (False, "f cx cy"),
-    "PINHOLE": (False, "fx fy cx cy"),
-    "SIMPLE_RADIAL": (False, "f cx cy k1"),
-    "RADIAL": (False, "f cx cy k1 k2"),
-    "OPENCV": (False, "fx fy cx cy k1 k2 p1 p2"),
-    "OPENCV_FISHEYE": (True, "fx fy cx cy k1 k2 k3 k4"),
-    "SIMPLE_RADIAL_FISHEYE": (True, "f cx cy k1"),
-    "RADIAL_FISHEYE": (True, "f cx cy k1 k2"),
-}
-"""COLMAP's camera models whose lenses can be undone: whether they are fisheyes, and their parameters."""
 
 
 @dataclass(frozen=True)
@@ -53,25 +43,20 @@ class Straight:
     def of(cls, camera: Any, size: tuple[int, int]) -> Straight:
         """Of a pycolmap.Camera of the working copies, for pictures of `size`; InputError for a lens beyond
         reason."""
-        fisheye, names = LENSES[camera.model_name]
-        values = dict(zip(names.split(), camera.params, strict=True))
-        across, down = size[0] / camera.width, size[1] / camera.height
-        fx, fy = (
-            values.get("fx", values.get("f", 0.0)) * across,
-            values.get("fy", values.get("f", 0.0)) * down,
+        values = dict(zip(MODELS[camera.model_name][1].split(), camera.params, strict=True))
+        known = Camera(camera.model_name, camera.width, camera.height, values)
+        fx, fy, cx, cy = np.array(known.intrinsics) * np.tile(
+            np.divide(size, (camera.width, camera.height)), 2
         )
-        cx, cy = values["cx"] * across, values["cy"] * down
-        radial = [values.get(f"k{i}", 0.0) for i in range(1, 5 if fisheye else 4)]
-        lens = Lens(fisheye, tuple(radial), (values.get("p1", 0.0), values.get("p2", 0.0)))
-        if not fisheye and not any((*lens.radial, *lens.tangential)):
-            return cls(size, (fx, fy), (cx, cy), None)
         try:
-            undo = undistortion(lens, *size, fx, fy, cx, cy)
+            lens = known.lens()
+            undo = None if lens is None else undistortion(lens, *size, fx, fy, cx, cy)
         except InputError as error:
             raise InputError(
-                f"photographs: the lens found has {error}; give --camera another model, such as SIMPLE_RADIAL"
+                f"photographs: the lens found is of no use ({error}); give --camera another one, as RADIAL"
             ) from None
-        return cls(size, (fx * undo.zoom, fy * undo.zoom), (cx, cy), undo)
+        zoom = 1.0 if undo is None else undo.zoom
+        return cls(size, (zoom * fx, zoom * fy), (cx, cy), undo)
 
     def resample(self, pixels: np.ndarray) -> np.ndarray:
         """An (H, W, C) uint8 picture without the lens."""

@@ -25,6 +25,7 @@ from mi_refgs.capture.pairs import pairs_to_match
 from mi_refgs.capture.photographs import Photograph, cameras_of, copy_name, find_photographs, write_copies
 from mi_refgs.capture.report import Report, draw
 from mi_refgs.capture.solved import Solved, adjust, best_lens
+from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.errors import InputError
 from mi_refgs.files import cannot_write, read_json, remove_temporaries, write_json
@@ -85,8 +86,8 @@ def capture(
     Raises InputError for input of no use, with the remedy, and where pycolmap is missing.
     """
     colmap.load()
-    if camera not in (None, *output.LENSES):
-        raise InputError(f"--camera: {camera}: unknown lens model; give one of {', '.join(output.LENSES)}")
+    if camera not in (None, *MODELS):
+        raise InputError(f"--camera: {camera}: unknown lens model; give one of {', '.join(MODELS)}")
     photographs = find_photographs(source)
     job = Job(photographs, find_masks(masks, photographs), source, folder, camera)
     _prepare(job)
@@ -185,7 +186,7 @@ def _groups(job: Job, pictures: Path) -> list[tuple[list[str], str, list[float]]
         parameters: list[float] = []
         if focal is not None:
             known = {"f": focal, "fx": focal, "fy": focal, "cx": size[0] / 2, "cy": size[1] / 2}
-            parameters = [known.get(name, 0.0) for name in output.LENSES[model][1].split()]
+            parameters = [known.get(name, 0.0) for name in MODELS[model][1].split()]
         groups.append((copies, model, parameters))
     return groups
 
