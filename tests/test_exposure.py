@@ -121,6 +121,20 @@ def test_the_exposure_of_a_step_and_its_derivative(
     assert float(dr.grad(moved)[0]) == pytest.approx(expected @ [0.5, -1.0, 2.0], rel=2e-4)
 
 
+def test_the_gain_of_an_open_scene_counts_what_lies_behind(picture: tuple[np.ndarray, np.ndarray]) -> None:
+    """Pictures without alpha show object, surroundings and background at one exposure."""
+    radiance, alpha = picture
+    behind = np.array([0.3, 0.2, 0.4])
+    seen = radiance + (1 - alpha[..., None]) * behind
+    view = view_of(np.vectorize(reference.srgb)(np.minimum(seen * GAINS, 1)), None, False)
+    data = Dataset(Path("a"), "train", (view,), BACKGROUND, False, None)
+    opacity, colour = upload(alpha), mi.Color3f(*(float(x) for x in behind))
+    frame = Frame(opacity, opacity, None, mi.Color3f(*planes(radiance)), background=colour)
+    gain, image = exposure.with_gain(frame, view, data)
+    np.testing.assert_allclose(gain, GAINS, rtol=2e-3)
+    np.testing.assert_allclose(np.minimum(image, 1), view.image, atol=2e-3)
+
+
 def exposed(data: Dataset, log: np.ndarray) -> Dataset:
     """The data set with log gains (V, 3) on its 8-bit pictures with a white background."""
     views = []

@@ -189,7 +189,11 @@ def with_gain(
     frame: Frame, view: View, data: Dataset, where: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The `fitted_gain` (3,) of a rendered view, and the picture (H, W, 3) that it shows with it."""
-    radiance, alpha = picture(list(frame.radiance), view), picture([frame.alpha], view)[..., 0]
+    planes, alpha = list(frame.radiance), picture([frame.alpha], view)[..., 0]
+    if frame.background is not None:  # all that is seen, nothing is cut out
+        planes = [a + (1 - frame.alpha) * b for a, b in zip(planes, frame.background, strict=True)]
+        alpha = np.ones_like(alpha)
+    radiance = picture(planes, view)
     gain = fitted_gain(radiance, alpha, view, data.background, where)
     return gain, picture(displayed_of(frame, data, gain), view)
 

@@ -53,7 +53,7 @@ DECODING = 1.5e-8
 """Seconds for a pixel of a file, once for each picture: JPEG 8e-9, PNG 2e-8."""
 WORTH = 1e7
 """Iterations × pixels from which a fit takes minutes, and an estimate is worth its own seconds."""
-BASE, PER_PIXEL, PER_SURFEL = 0.75e9, 2.5e3, 4e3
+BASE, PER_PIXEL, PER_SURFEL = 0.5e9, 3e3, 2.5e3
 """Bytes of a process with its kernels; of a pixel of a step; of a surfel with moments and gradients."""
 SPEED_FILE = "mi_refgs_speed.json"
 KEPT = 64
