@@ -240,7 +240,9 @@ def diagonal(x: float, y: float, z: float) -> list[list[float]]:
 
 
 def resize(folder: Path) -> None:
-    write_png(folder / "train/r_5.png", np.ones((HEIGHT, WIDTH + 2, 4)))
+    """One picture more than there may be sizes."""
+    for i in range(1, 6):
+        write_png(folder / f"train/r_{i}.png", np.ones((HEIGHT, WIDTH + i, 4)))
 
 
 def nan(folder: Path) -> None:
@@ -298,7 +300,7 @@ def truncate(folder: Path) -> None:
         (lambda f: (f / "transforms_train.json").write_text("[" * 10**5), {}, ["JSON", "recursion"]),
         (truncate, {}, ["r_0.png", "readable"]),
         (sixteen_bits, {}, ["r_0.png", "8-bit"]),
-        (resize, {}, ["r_5", "one size"]),
+        (resize, {}, ["6 different sizes", "one size"]),
         (nan, {"images": "exr"}, ["r_4.exr", "NaN", "row 1, column 2"]),
         (lambda f: (f / "train/r_1.exr").write_text("no"), {"images": "exr"}, ["r_1.exr", "EXR"]),
         (lambda f: None, {"downscale": 5}, ["r_0.png", "downscale", "smaller"]),

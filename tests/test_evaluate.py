@@ -156,7 +156,7 @@ def test_panels_show_what_there_is(run: Run, folder: Path) -> None:
     trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
     views = dataset.read_dataset(folder / "ball", "test")
     view = views.views[0]
-    shot = pictures.RenderedView.of(trainer.view(view.camera()), views)
+    shot = pictures.RenderedView.of(trainer.view(view.camera()), views, view)
     panels = pictures.panels(shot, view)
     assert list(panels) == [
         "ground truth", "render", "true normals", "normals", "albedo", "metallic", "roughness", "visibility"

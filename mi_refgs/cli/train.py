@@ -240,7 +240,7 @@ class Progress:
         from mi_refgs.images import write_png
 
         view = trainer.data.views[0]
-        shot = pictures.RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data)
+        shot = pictures.RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data, view)
         light = None
         if trainer.light is not None:
             radiance = trainer.light.radiance()

@@ -104,7 +104,7 @@ class Curve:
             return
         self.due = self.due[len(passed) :]  # one point for all that a trial has passed
         values = [
-            psnr(RenderedView.of(trainer.view(view.camera()), self.data).image, target(view))
+            psnr(RenderedView.of(trainer.view(view.camera()), self.data, view).image, target(view))
             for view in self.views
         ]
         line = {"iteration": trainer.iteration, "seconds": round(trainer.seconds, 3)}

@@ -23,6 +23,8 @@ EXTENT_MARGIN = 1.1
 NEAR_EXTENTS = 2e-3
 """Depth of the near plane in scene extents, about 0.01 in the units of Blender's data sets: what is nearer
 stands in front of the lens."""
+MAX_SIZES = 4
+"""Sizes of pictures in a data set, such as upright and lying: a fit compiles every kernel for each."""
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
 IMAGE_KINDS = ("png", "exr")
 
@@ -84,13 +86,13 @@ def read_dataset(
     options = ReadOptions(downscale, BACKGROUNDS[background], images, truth)
     found = reader_of(path).read(path, split, options)
     views = found.views
-    for view in views:
-        if (view.width, view.height) != (views[0].width, views[0].height):
-            first = views[0]
-            raise InputError(
-                f"{found.source or path}: frames: '{view.name}' has {view.width} × {view.height} pixels but "
-                f"'{first.name}' has {first.width} × {first.height}; bring all pictures to one size"
-            )
+    sizes = {(view.width, view.height): view.name for view in views}
+    if len(sizes) > MAX_SIZES:
+        shown = ", ".join(f"{width} × {height} ('{name}')" for (width, height), name in [*sizes.items()][:3])
+        raise InputError(
+            f"{found.source or path}: pictures: {len(sizes)} different sizes, such as {shown}; "
+            f"bring all pictures to one size, or to {MAX_SIZES} at most"
+        )
     near = NEAR_EXTENTS * _extent(views)
     views = tuple(view.changed(near=near) for view in views)
     colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)

@@ -111,7 +111,7 @@ def evaluate(
         tqdm(views.views, desc="eval", unit="view", file=sys.stderr, disable=not progress)
     ):
         frame = view(truth.camera())
-        shot = pictures.RenderedView.of(frame, views)
+        shot = pictures.RenderedView.of(frame, views, truth)
         gain, gained = with_gain(frame, truth, views)
         goal = pictures.target(truth)
         scores: dict[str, Any] = {

@@ -42,9 +42,9 @@ class RenderedView:
     maps: dict[str, np.ndarray]  # (H, W) or (H, W, 3), linear
 
     @staticmethod
-    def of(frame: Frame, data: Dataset) -> RenderedView:
-        """Copy a frame of the data set's size; waits for the device."""
-        size = data.views[0].height, data.views[0].width
+    def of(frame: Frame, data: Dataset, view: View) -> RenderedView:
+        """Copy a frame of one of the data set's views; waits for the device."""
+        size = view.height, view.width
         normal = planes(frame.normal, *size)
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         return RenderedView(

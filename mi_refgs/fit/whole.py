@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mi_refgs.capture.triangulate import with_points
 from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
+from mi_refgs.data.survey import require_several_sides
 from mi_refgs.errors import InputError
 from mi_refgs.fit.exposure import EXPOSURE_FILE
 from mi_refgs.fit.select import DECISIONS, select_terms, with_terms
@@ -57,13 +58,17 @@ def begin(method: Method, views: Dataset, run: Run, tell: Callable[[str], None] 
 
     A new fit of pictures without alpha looks for points to start from where the data set has none. `tell` is
     called with what is found, and what is decided about the terms of a method that selects them. Raises
-    InputError for checkpoints that are all damaged and a folder that cannot be written.
+    InputError for cameras that all stand in one place, checkpoints that are all damaged and a folder that
+    cannot be written.
     """
     resumed = run.exists()
     state = run.load_checkpoint() if resumed else None
     if state is not None:
         method = with_terms(method, decisions_of(state))
     else:
+        require_several_sides(views)
+        for note in views.notes:
+            tell(f"{views.path}: {note}")
         views = replace(views, points=with_points(views, run.path, tell))
     trainer = Trainer(method, views, run, state)
     trainer.exposure.tell = tell
