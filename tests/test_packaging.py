@@ -66,7 +66,7 @@ def test_wheel_holds_every_module_and_data_file(wheel: Path) -> None:
     expected |= {
         f"mi_refgs/{path.relative_to(ROOT)}"
         for path in (ROOT / "scenes").rglob("*")
-        if path.suffix in {".xml", ".ply", ".exr"}
+        if path.suffix in {".toml", ".xml", ".ply", ".exr"}
     }
     assert expected | {"mi_refgs/py.typed"} <= packed
 

@@ -202,8 +202,9 @@ def _shipped() -> list[Path]:
 
 
 def _find(variant: str, where: str, folder: Path) -> Path:
-    """A shipped method by its name, or a path to a .toml from `folder`; `where` names what asks for it."""
-    path = folder / variant if variant.endswith(".toml") else resource_dir("variants") / f"{variant}.toml"
+    """A shipped method by its name, one of scenes/ by its path there, or a .toml in `folder`."""
+    shipped = resource_dir("scenes" if "/" in variant else "variants")
+    path = folder / variant if variant.endswith(".toml") else shipped / f"{variant}.toml"
     if not is_file(path):
         known = ", ".join(names())
         raise InputError(f"{where}: {variant}: no such method; use one of {known}, or a path to a .toml")
