@@ -54,7 +54,7 @@ def noise(seed: int, size: int = 512) -> np.ndarray:
 PATTERNS = [noise(seed) for seed in range(4)]
 
 
-def photograph(shot: Shot, k1: float = 0.0, samples: int = 2) -> np.ndarray:
+def photograph(shot: Shot, k1: float = 0.0, samples: int = 1) -> np.ndarray:
     """The picture (HEIGHT, WIDTH, 3) uint8 of a camera whose lens has the radial coefficient k1."""
     rows, columns = np.indices((HEIGHT * samples, WIDTH * samples))
     x = ((columns + 0.5) / samples - WIDTH / 2) / FOCAL

@@ -198,7 +198,7 @@ def test_an_interrupted_run_goes_on(captured: Path, tmp_path: Path, monkeypatch:
 def test_a_distorted_lens_is_found_and_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shots = scene.around(10)
     for i, shot in enumerate(shots):
-        scene.save(tmp_path / "photographs" / f"{i}.png", scene.photograph(shot, k1=-0.15, samples=1))
+        scene.save(tmp_path / "photographs" / f"{i}.png", scene.photograph(shot, k1=-0.15))
     assert main(["capture", str(tmp_path / "photographs"), "-o", str(tmp_path / "data")]) == 0
     report = json.loads((tmp_path / "data" / "capture.json").read_text())
     assert report["lens"]["model"] == "SIMPLE_RADIAL" and report["placed"] == 10
@@ -207,7 +207,7 @@ def test_a_distorted_lens_is_found_and_undone(tmp_path: Path, monkeypatch: pytes
     # The picture is what a pinhole sees whose focal length is longer by the same factor.
     zoom = pinhole["focal"][0] / report["lens"]["cameras"][0]["parameters"][0]
     monkeypatch.setattr(scene, "FOCAL", scene.FOCAL * zoom)
-    wanted = scene.photograph(shots[3]) / 255
+    wanted = scene.photograph(shots[3], samples=2) / 255
 
     def error(folder: str) -> float:
         return float(np.sqrt(np.mean((read_png(tmp_path / folder / "3.png") - wanted) ** 2)))
@@ -244,7 +244,7 @@ def _unrelated(i: int, pictures: list[np.ndarray]) -> np.ndarray:
 def _one_place(i: int, pictures: list[np.ndarray]) -> np.ndarray:
     """The camera turns on the spot."""
     target = np.array([0.35 * np.cos(i), 0.35 * np.sin(i), 0.3])
-    return scene.photograph(scene.look(np.array([3.0, 0.4, 1.6]), tuple(target)), samples=1)
+    return scene.photograph(scene.look(np.array([3.0, 0.4, 1.6]), tuple(target)))
 
 
 @needs_colmap
@@ -290,6 +290,11 @@ def test_pictures_that_are_none_are_refused(tmp_path: Path, capsys: pytest.Captu
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         scene.save(photographs / name, np.zeros((8, 8, 3), dtype=np.uint8))
     assert "choose another" in _refused(capsys, photographs, "-o", photographs)
+    scene.save(photographs / "d.jpg", np.zeros((8, 9, 3), dtype=np.uint8))
+    assert "d.jpg: photographs: 9 × 8 pixels, but most have 8 × 8" in _refused(
+        capsys, photographs, "-o", tmp_path
+    )
+    (photographs / "d.jpg").unlink()
     assert "not empty" in _refused(capsys, photographs, "-o", tmp_path)
     assert "no such folder" in _refused(
         capsys, photographs, "-o", tmp_path / "data", "--masks", tmp_path / "no"

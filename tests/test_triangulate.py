@@ -26,7 +26,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Pictures with the cameras that took them, no points, no alpha."""
     folder, frames = tmp_path_factory.mktemp("known"), []
     for i, shot in enumerate(scene.around(COUNT)):
-        scene.save(folder / f"{i}.png", scene.photograph(shot, samples=1))
+        scene.save(folder / f"{i}.png", scene.photograph(shot))
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = shot.rotation.T @ np.diag([1.0, -1, -1]), shot.origin
         frames.append({"file_path": f"{i}.png", "transform_matrix": pose.tolist()})

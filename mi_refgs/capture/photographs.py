@@ -123,7 +123,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
     Portraits among landscapes of one camera, and the reverse, are kept lying on their side: they have the
     same sensor, so one size and one lens serve all.
 
-    Raises InputError for no folder, too few pictures, and files that are none.
+    Raises InputError for no folder, too few pictures, pictures of other sizes, and files that are none.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: photographs: no such folder; give one with JPEG or PNG files")
@@ -140,7 +140,14 @@ def find_photographs(folder: Path) -> list[Photograph]:
         raise InputError(f"{folder}: photographs: {found}; {remedy}")
     found_all = [_photograph(path) for path in paths]
     most = Counter(photograph.size for photograph in found_all).most_common(1)[0][0]
-    return [replace(p, lying=p.size != most and p.size[::-1] == most) for p in found_all]
+    kept = [replace(p, lying=p.size != most and p.size[::-1] == most) for p in found_all]
+    if odd := [p for p in kept if p.kept_size != most]:
+        width, height = odd[0].kept_size
+        raise InputError(
+            f"{odd[0].path}: photographs: {width} × {height} pixels, but most have {most[0]} × {most[1]}, "
+            "and a fit needs one size; leave it out, or crop it to that size"
+        )
+    return kept
 
 
 def _photograph(path: Path) -> Photograph:
