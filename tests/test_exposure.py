@@ -198,6 +198,7 @@ def test_gains_are_switched_on_where_pictures_have_them(
     np.testing.assert_allclose(np.log(gains), log - log.mean(axis=0), atol=5e-3)
     record = trainer.exposure.record()
     assert record is not None and record["gain"]["3"] == gains[3].round(5).tolist()
+    trainer.params[GAIN] = trainer.params[GAIN] + 0.3  # what all have in common is the scene's
     used = trainer.exposure.log_gain(3)
     assert used is not None
     np.testing.assert_allclose([float(value[0]) for value in used], np.log(gains[3]), atol=1e-6)
@@ -282,12 +283,13 @@ def test_a_warm_step_with_gains_compiles_nothing(method: Method) -> None:
         trainer.step()
     dr.sync_thread()
     assert dr.detail.launch_stats()[2] == misses
-    trainer.optimiser.reset(GAIN)
-    before = trainer.params[GAIN].numpy()
-    trainer.step()
-    index = trainer.schedule.view(trainer.iteration)
-    moved = np.flatnonzero(np.any(trainer.params[GAIN].numpy() != before, axis=1))
-    assert moved.tolist() == [index]
+    for _ in range(2):
+        trainer.optimiser.reset(GAIN)
+        before = trainer.params[GAIN].numpy()
+        trainer.step()
+        index = trainer.schedule.view(trainer.iteration)
+        moved = np.flatnonzero(np.any(trainer.params[GAIN].numpy() != before, axis=1))
+        assert moved.tolist() == [index]
 
 
 def photograph(path: Path, settings: dict[int, Any] | None) -> Path:

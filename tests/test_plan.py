@@ -44,6 +44,8 @@ def test_an_estimate_is_the_sum_of_the_stages(method: Method) -> None:
     around = dataclasses.replace(method, surroundings=SurroundingsOptions(max_count=50))
     more = plan.estimate(around, SPEED, 7, (20, 20), 1).bytes - whole.bytes
     assert more == pytest.approx(50 * plan.PER_SURFEL)
+    scene = plan.estimate(method, SPEED, 7, (20, 20), 1, cut_out=False)
+    assert whole.seconds - scene.seconds == pytest.approx((plan.GROWTH - plan.OPEN_GROWTH) * at_400)
     tiny = plan.estimate(method, SPEED, 7, (1, 1), 1)
     assert tiny.seconds == pytest.approx(others + 7 * plan.DECODING + 0.5 * at_100)  # never next to nothing
 
@@ -89,6 +91,7 @@ def test_the_speed_is_measured_once(
 ) -> None:
     """Of every stage, with the mesh, and with surroundings where pictures have no alpha."""
     monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(plan, "_busy", lambda: False)
     monkeypatch.setattr(plan, "SIZES", (16, 32))
     around = SurroundingsOptions(count=60, max_count=60, height=8)
     method = dataclasses.replace(method, surroundings=around)
@@ -110,6 +113,10 @@ def test_the_speed_is_measured_once(
     assert plan.speed_of(method, not cut_out) == SPEED
     other = dataclasses.replace(method, surfels=dataclasses.replace(method.surfels, count=99))
     assert plan.speed_of(other, cut_out) == SPEED and plan.speed_of(method, cut_out) == speed
+    monkeypatch.setattr(plan, "_busy", lambda: True)  # then it is the speed of now alone
+    kept = (tmp_path / plan.SPEED_FILE).read_text()
+    assert plan.speed_of(dataclasses.replace(other, log_every=1), cut_out) == SPEED
+    assert (tmp_path / plan.SPEED_FILE).read_text() == kept
     (tmp_path / plan.SPEED_FILE).write_text("{")
     assert plan.speed_of(method, cut_out) == SPEED
 

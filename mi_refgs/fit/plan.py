@@ -45,8 +45,11 @@ WARM, TIMED = 4, 8
 """Steps before the clock runs, which compile kernels, and steps of which the faster half counts."""
 SAFETY = 0.8
 """Share of the promised time that the estimate may take: data sets differ by as much."""
-GROWTH = 1.0
-"""Mean time of a step over that at the start: tables grow, but what is opaque hides what lies behind it."""
+GROWTH, OPEN_GROWTH = 1.0, 0.6
+"""Mean time of a step over that of the stand-in, with alpha and without: tables grow, but what is opaque hides
+what lies behind it, and without alpha surfels start far larger than they end."""
+BUSY = 1.5
+"""Processes waiting for each processor from which on a speed is not kept: it is not that of the machine."""
 START = 10.0
 """Seconds for the visual hull, previews, checkpoints and artefacts."""
 DECODING = 1.5e-8
@@ -115,10 +118,11 @@ def planned(
     width, height = first.width, first.height
     if method.iterations * width * height < WORTH:
         return (whole if method.data.downscale is None else method), None
-    speed = speed_of(method, all(view.cut_out for view in data.views))
+    cut_out = all(view.cut_out for view in data.views)
+    speed = speed_of(method, cut_out)
 
     def at(factor: int) -> Estimate:
-        return estimate(method, speed, len(data.views), (width, height), factor)
+        return estimate(method, speed, len(data.views), (width, height), factor, cut_out)
 
     if method.data.downscale is None and limit is None:
         method = sized(method, path, tell)
@@ -142,8 +146,13 @@ def planned(
     return replace(method, data=replace(method.data, downscale=factor)), chosen
 
 
-def estimate(method: Method, speed: Speed, views: int, size: tuple[int, int], factor: int) -> Estimate:
-    """What a fit to so many pictures of `size` (width, height), read `factor` times smaller, will need."""
+def estimate(
+    method: Method, speed: Speed, views: int, size: tuple[int, int], factor: int, cut_out: bool = True
+) -> Estimate:
+    """What a fit to so many pictures of `size` (width, height), read `factor` times smaller, will need.
+
+    `cut_out`: whether they have alpha.
+    """
     width, height = size[0] // factor, size[1] // factor
     pixels, begin, steps = width * height, 0, 0.0
     for name, stage in method.stages():
@@ -152,7 +161,8 @@ def estimate(method: Method, speed: Speed, views: int, size: tuple[int, int], fa
         begin = stage.until
     meshes = 0 if method.mesh is None else method.mesh.extract.count(method.iterations)
     files = views * size[0] * size[1] * DECODING
-    seconds = START + files + GROWTH * steps + meshes * (speed.mesh + views * speed.mesh_view)
+    steps *= GROWTH if cut_out else OPEN_GROWTH
+    seconds = START + files + steps + meshes * (speed.mesh + views * speed.mesh_view)
     surfels = method.surfels.max_count
     surfels += method.surroundings.max_count if method.surroundings is not None else 0
     pictures = min(views * pixels * 12, PICTURE_BYTES) + min(views * pixels * PIXEL_BYTES, TARGET_BYTES)
@@ -194,12 +204,23 @@ def speed_of(method: Method, cut_out: bool) -> Speed:
         known = {}
     with contextlib.suppress(InputError):
         known = read_json(path)
+    busy = _busy()
     speed = measured(method, cut_out)
+    if busy:
+        return speed
     known = dict(list(known.items())[-KEPT:]) | {key: asdict(speed)}
     with contextlib.suppress(InputError):  # what cannot be kept is measured again
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, known)
     return speed
+
+
+def _busy() -> bool:
+    """Whether others keep the machine busy, as far as the system tells."""
+    try:
+        return os.getloadavg()[0] > BUSY * (os.cpu_count() or 1)
+    except (AttributeError, OSError):
+        return False
 
 
 def _key(method: Method, cut_out: bool) -> str:
