@@ -290,11 +290,11 @@ def test_pictures_that_are_none_are_refused(tmp_path: Path, capsys: pytest.Captu
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         scene.save(photographs / name, np.zeros((8, 8, 3), dtype=np.uint8))
     assert "choose another" in _refused(capsys, photographs, "-o", photographs)
-    scene.save(photographs / "d.jpg", np.zeros((8, 9, 3), dtype=np.uint8))
-    assert "d.jpg: photographs: 9 × 8 pixels, but most have 8 × 8" in _refused(
-        capsys, photographs, "-o", tmp_path
-    )
-    (photographs / "d.jpg").unlink()
+    for width in range(9, 13):
+        scene.save(photographs / f"{width}.jpg", np.zeros((8, width, 3), dtype=np.uint8))
+    assert "5 different sizes, such as 10 × 8 (10.jpg)" in _refused(capsys, photographs, "-o", tmp_path)
+    for width in range(9, 13):
+        (photographs / f"{width}.jpg").unlink()
     assert "not empty" in _refused(capsys, photographs, "-o", tmp_path)
     assert "no such folder" in _refused(
         capsys, photographs, "-o", tmp_path / "data", "--masks", tmp_path / "no"

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_refgs.data.dataset import MAX_SIZES
 from mi_refgs.errors import InputError
 from mi_refgs.files import replace_file
 from mi_refgs.images import open_picture
@@ -123,7 +124,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
     Portraits among landscapes of one camera, and the reverse, are kept lying on their side: they have the
     same sensor, so one size and one lens serve all.
 
-    Raises InputError for no folder, too few pictures, pictures of other sizes, and files that are none.
+    Raises InputError for no folder, too few pictures, pictures of many sizes, and files that are none.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: photographs: no such folder; give one with JPEG or PNG files")
@@ -141,11 +142,12 @@ def find_photographs(folder: Path) -> list[Photograph]:
     found_all = [_photograph(path) for path in paths]
     most = Counter(photograph.size for photograph in found_all).most_common(1)[0][0]
     kept = [replace(p, lying=p.size != most and p.size[::-1] == most) for p in found_all]
-    if odd := [p for p in kept if p.kept_size != most]:
-        width, height = odd[0].kept_size
+    sizes = {p.kept_size: p.name for p in kept}
+    if len(sizes) > MAX_SIZES:
+        some = ", ".join(f"{width} × {height} ({name})" for (width, height), name in [*sizes.items()][:3])
         raise InputError(
-            f"{odd[0].path}: photographs: {width} × {height} pixels, but most have {most[0]} × {most[1]}, "
-            "and a fit needs one size; leave it out, or crop it to that size"
+            f"{folder}: photographs: {len(sizes)} different sizes, such as {some}, and a fit takes "
+            f"{MAX_SIZES} at most; leave out those that were cropped"
         )
     return kept
 
