@@ -13,16 +13,17 @@ from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.data.picture_files import PictureFile
 from mi_refgs.fit import plan
+from mi_refgs.fit import speed as speeds
 from mi_refgs.methods.method import CoarsePictures, DataOptions, Method
 from mi_refgs.methods.surroundings import SurroundingsOptions
 
-SPEED = plan.Speed({"initial": [1.0, 5.0], "deferred": [2.0, 10.0]}, 3.0, 0.5)
+SPEED = speeds.Speed({"initial": [1.0, 5.0], "deferred": [2.0, 10.0]}, 3.0, 0.5)
 """Seconds at 10² and 20² pixels: (P - 25) / 75 and twice as long."""
 
 
 @pytest.fixture
 def method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Method:
-    monkeypatch.setattr(plan, "SIZES", (10, 20))
+    monkeypatch.setattr(speeds, "SIZES", (10, 20))
     path = tmp_path / "small.toml"
     path.write_text(METHOD)
     return dataclasses.replace(methods.load_resolved(path), data=DataOptions())
@@ -91,34 +92,34 @@ def test_the_speed_is_measured_once(
 ) -> None:
     """Of every stage, with the mesh, and with surroundings where pictures have no alpha."""
     monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(plan, "_busy", lambda: False)
-    monkeypatch.setattr(plan, "SIZES", (16, 32))
+    monkeypatch.setattr(speeds, "_busy", lambda: False)
+    monkeypatch.setattr(speeds, "SIZES", (16, 32))
     around = SurroundingsOptions(count=60, max_count=60, height=8)
     method = dataclasses.replace(method, surroundings=around)
-    meshes, real = [], plan._mesh
+    meshes, real = [], speeds._mesh
 
-    def mesh(trainer: plan.Trainer) -> tuple[float, float]:
+    def mesh(trainer: speeds.Trainer) -> tuple[float, float]:
         meshes.append((trainer.open, len(trainer.data.views)))
         return real(trainer)
 
-    monkeypatch.setattr(plan, "_mesh", mesh)
-    speed = plan.speed_of(method, cut_out)
-    assert {*speed.stages} == {"initial", "deferred"} and meshes == 2 * [(not cut_out, plan.VIEWS)]
+    monkeypatch.setattr(speeds, "_mesh", mesh)
+    speed = speeds.speed_of(method, cut_out)
+    assert {*speed.stages} == {"initial", "deferred"} and meshes == 2 * [(not cut_out, speeds.VIEWS)]
     assert all(0 < seconds < 60 for both in speed.stages.values() for seconds in both)
     assert speed.mesh + speed.mesh_view > 0
-    monkeypatch.setattr(plan, "measured", lambda *_: pytest.fail("measured again"))
-    assert plan.speed_of(method, cut_out) == speed
-    assert plan.speed_of(dataclasses.replace(method, seed=7, file="other"), cut_out) == speed
-    monkeypatch.setattr(plan, "measured", lambda *_: SPEED)
-    assert plan.speed_of(method, not cut_out) == SPEED
+    monkeypatch.setattr(speeds, "measured", lambda *_: pytest.fail("measured again"))
+    assert speeds.speed_of(method, cut_out) == speed
+    assert speeds.speed_of(dataclasses.replace(method, seed=7, file="other"), cut_out) == speed
+    monkeypatch.setattr(speeds, "measured", lambda *_: SPEED)
+    assert speeds.speed_of(method, not cut_out) == SPEED
     other = dataclasses.replace(method, surfels=dataclasses.replace(method.surfels, count=99))
-    assert plan.speed_of(other, cut_out) == SPEED and plan.speed_of(method, cut_out) == speed
-    monkeypatch.setattr(plan, "_busy", lambda: True)  # then it is the speed of now alone
-    kept = (tmp_path / plan.SPEED_FILE).read_text()
-    assert plan.speed_of(dataclasses.replace(other, log_every=1), cut_out) == SPEED
-    assert (tmp_path / plan.SPEED_FILE).read_text() == kept
-    (tmp_path / plan.SPEED_FILE).write_text("{")
-    assert plan.speed_of(method, cut_out) == SPEED
+    assert speeds.speed_of(other, cut_out) == SPEED and speeds.speed_of(method, cut_out) == speed
+    monkeypatch.setattr(speeds, "_busy", lambda: True)  # then it is the speed of now alone
+    kept = (tmp_path / speeds.SPEED_FILE).read_text()
+    assert speeds.speed_of(dataclasses.replace(other, log_every=1), cut_out) == SPEED
+    assert (tmp_path / speeds.SPEED_FILE).read_text() == kept
+    (tmp_path / speeds.SPEED_FILE).write_text("{")
+    assert speeds.speed_of(method, cut_out) == SPEED
 
 
 def test_no_time_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
