@@ -24,6 +24,9 @@ def add(commands: Any) -> None:
         "--sensor", type=int, default=0, metavar="I", help="which sensor of the scene (default %(default)s)"
     )
     parser.add_argument(
+        "--object", action="store_true", help="the object alone, on transparency, without its surroundings"
+    )
+    parser.add_argument(
         "--spp", type=int, default=0, metavar="N", help="samples per pixel (default: the scene's)"
     )
     parser.add_argument(
@@ -48,7 +51,7 @@ def run(args: argparse.Namespace) -> Result:
         )
     if args.spp < 0:
         raise InputError(f"--spp: {args.spp} is out of range; give a number from 1")
-    scene = load_scene(scene_file(args.scene), args.aov)
+    scene = load_scene(scene_file(args.scene), args.aov, args.object)
     sensors = scene.sensors()
     if not 0 <= args.sensor < len(sensors):
         raise InputError(
@@ -73,10 +76,11 @@ def scene_file(path: Path) -> Path:
     return scene
 
 
-def load_scene(path: Path, aovs: list[str]) -> Any:
+def load_scene(path: Path, aovs: list[str], alone: bool = False) -> Any:
     """Load a scene, its `refgs` integrator with these AOVs besides its own.
 
-    Raises InputError for what Mitsuba cannot load, and for AOVs without a `refgs` integrator.
+    `alone`: without the surroundings and the background of that. Raises InputError for what Mitsuba cannot
+    load, and for AOVs or `alone` without a `refgs` integrator.
     """
     import mitsuba as mi
 
@@ -90,11 +94,16 @@ def load_scene(path: Path, aovs: list[str]) -> Any:
         config = mi.parser.ParserConfig(mi.variant())
         state = mi.parser.parse_file(config, str(path))
         mi.parser.transform_all(config, state)
-        if aovs:
+        if aovs or alone:
             integrators = [node.props for node in state.nodes if node.props.plugin_name() == "refgs"]
             if not integrators:
-                raise InputError(f"{path}: --aov: the scene has no `refgs` integrator; drop --aov")
-            integrators[0]["aovs"] = ",".join(aov if ":" in aov else f"{aov}:{aov}" for aov in aovs)
+                option = "--aov" if aovs else "--object"
+                raise InputError(f"{path}: {option}: the scene has no `refgs` integrator; drop {option}")
+            if aovs:
+                integrators[0]["aovs"] = ",".join(aov if ":" in aov else f"{aov}:{aov}" for aov in aovs)
+            for name in ("surroundings", "background") if alone else ():
+                if name in integrators[0]:
+                    del integrators[0][name]
         with mitsuba_exr():
             loaded = mi.parser.instantiate(config, state)
     except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file

@@ -18,12 +18,12 @@ from mi_refgs.plugins.film import through_film
 from mi_refgs.plugins.light import light_of
 from mi_refgs.plugins.properties import (
     read_aovs,
-    read_background,
     read_light,
     read_shading,
     read_surfels,
     read_terms,
 )
+from mi_refgs.plugins.surroundings import Around
 from mi_refgs.plugins.unusable import UnusableValues
 from mi_refgs.primitives import primitive_of, widths_of
 from mi_refgs.render.pipeline import Frame, render
@@ -102,9 +102,15 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - |string|
        - Terms in the image, out of ``diffuse,specular,indirect``. (Default: all)
 
+     * - surroundings
+       - |string|
+       - PLY file with the surfels around the object, splatted with it: geometry and ``radiance_sh``. Also
+         tensors, ``surroundings_position`` and so on. (Default: none, the object alone)
+
      * - background
-       - |color|
-       - Linear radiance behind the surfels; alpha is then 1. (Default: none, transparent)
+       - |color| or |string|
+       - Linear radiance behind the surfels, or a lat-long map of it (EXR, HDR; in Python also a raw tensor as
+         of ``light``); alpha is then 1. (Default: none, transparent)
 
      * - aovs
        - |string|
@@ -124,6 +130,11 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - Raw map (h, w, 3) of the integrator's own light, if it has one: radiance =
          ``EnvironmentLight(raw).radiance()``, positive for any raw value. Light of the scene is exposed by
          its emitter instead.
+       - |exposed|, |differentiable|
+
+     * - surroundings_position, …, surroundings_radiance_sh, background
+       - |tensor|
+       - Raw channels of the surroundings, and raw map of the background as of ``light``, if there are any.
        - |exposed|, |differentiable|
 
     The keys start with the integrator's id, `refgs` unless the scene sets one: ``params['refgs.roughness']``.
@@ -169,11 +180,11 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.light, self.light_rotation = read_light(props)
         self.shading, self.occluder = read_shading(props, self.surfels)
         self.terms = read_terms(props)
-        self.background = read_background(props)
+        self.around = Around.of(props, self.surfels)
         self.aovs = read_aovs(props)
         self.prepared = False  # what rays meet is as the parameters say
         self.check()
-        self.unusable = UnusableValues(self.surfels, self.light)
+        self.unusable = UnusableValues(self.around.values(self.surfels, self.light))
 
     def check(self) -> None:
         """Raise InputError for shapes that do not fit and for channels that are needed but absent."""
@@ -183,18 +194,13 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         for name in (aov.type for aov in self.aovs if aov.type in CHANNELS):
             if not self.surfels.has(name):
                 raise InputError(f"refgs: {name}: the surfels have no such channel; add it, or do without it")
-        if self.light is not None:
-            shape = tuple(self.light.raw.shape)
-            if len(shape) != 3 or shape[2] != 3 or shape[1] != 2 * shape[0] or shape[0] % 4:
-                raise InputError(f"refgs: light: shape {shape}, expected (h, 2h, 3) with h a multiple of 4")
+        self.around.check(self.surfels, self.light)
 
     # ---------------- parameters ----------------
 
     def traverse(self, cb: Any) -> None:
-        for name, tensor in self.surfels.raw.items():
+        for name, tensor in self.around.parameters(self.surfels, self.light).items():
             cb.put(name, tensor, mi.ParamFlags.Differentiable)
-        if self.light is not None:
-            cb.put("light", self.light.raw, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
         self.check()
@@ -217,7 +223,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         evaluate: bool = True,
     ) -> Any:
         """The image (h, w, c) of a sensor; see the class for its channels."""
-        self.unusable.look(self.surfels, self.light)
+        self.unusable.look(self.around.values(self.surfels, self.light))
         image = self._image(scene, sensor, spp)
         if evaluate:
             dr.eval(image)
@@ -246,27 +252,22 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def _image(self, scene: Any, sensor: Any, spp: int) -> Any:
         """Render under whatever AD scope is active, through the sensor's film."""
         if mi.variant() != self.variant:
-            raise InputError(
-                f"refgs: variant: made under {self.variant}, not {mi.variant()}; load the scene again"
-            )
-        if isinstance(sensor, int):
-            sensor = scene.sensors()[sensor]
+            made = f"made under {self.variant}, not {mi.variant()}"
+            raise InputError(f"refgs: variant: {made}; load the scene again")
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         return through_film(sensor, spp, partial(self._channels, scene), self.aov_names())
 
     def _channels(self, scene: Any, camera: Camera, alpha: bool) -> list[Any]:
         """R, G, B, (A), W and the AOVs, as the film's blocks have them."""
         frame = self._frame(scene, camera)
         rgb = frame.radiance
-        if len(self.terms) < len(TERMS):
+        if len(self.terms) < len(TERMS):  # of the object alone
             rgb = sum((getattr(frame.terms, name) for name in self.terms), start=mi.Color3f(0))
-        coverage = frame.alpha
-        if self.background is not None:
-            rgb = rgb + (1 - frame.alpha) * self.background
-            coverage = mi.Float(1)
-        channels = [*rgb, *([coverage] if alpha else []), mi.Float(1)]
-        for aov in self.aovs:
-            channels += aov_values(aov.type, frame, camera)
-        return channels
+        behind, coverage = self.around.behind(frame), frame.alpha
+        if behind is not None:
+            rgb, coverage = rgb + (1 - frame.alpha) * behind, mi.Float(1)
+        more = [value for aov in self.aovs for value in aov_values(aov.type, frame, camera)]
+        return [*rgb, *([coverage] if alpha else []), mi.Float(1), *more]
 
     def _frame(self, scene: Any, camera: Camera) -> Frame:
         aovs = len(self.terms) < len(TERMS) or any(aov.type in (*CHANNELS, *TERMS) for aov in self.aovs)
@@ -283,17 +284,13 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             self.occluder,
             aovs=aovs,
             normals=any(aov.type == "normal" for aov in self.aovs),
+            surroundings=self.around.splatted(self.surfels),
         )
 
     def to_string(self) -> str:
         size = "x".join(str(x) for x in self.light.raw.shape[:2]) if self.light is not None else "the scene's"
-        lines = [
-            f"surfels = {self.surfels.count}",
-            f"channels = {', '.join(self.surfels.raw)}",
-            f"light = {size}",
-            f"shading = {self.shading}",
-        ]
-        return "RefGSIntegrator[\n  " + ",\n  ".join(lines) + "\n]"
+        what = f"surfels = {self.surfels.count},\n  channels = {', '.join(self.surfels.raw)}"
+        return f"RefGSIntegrator[\n  {what},\n  light = {size},\n  shading = {self.shading}\n]"
 
 
 mi.register_integrator("refgs", RefGSIntegrator)

@@ -6,6 +6,7 @@ No Mitsuba class is defined here, so that this module need not be reloaded when 
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -15,6 +16,7 @@ from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.plugins.aovs import AOV, parse_aovs
 from mi_refgs.plugins.light import own_light
+from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.points import TERMS
@@ -23,6 +25,9 @@ from mi_refgs.shade.shading import DIFFUSE, Shading
 from mi_refgs.surfels.channels import CHANNELS
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
+
+AROUND = "surroundings_"
+"""What the names of the surroundings' channels begin with."""
 
 
 def _get(props: Any, name: str, default: Any) -> Any:
@@ -75,29 +80,51 @@ def _tensor(props: Any, name: str) -> Any:
 
 
 def read_background(props: Any) -> Any:
-    """The colour behind the surfels (mi.Color3f); None: transparent."""
+    """What is behind everything: a colour (mi.Color3f), an EnvironmentLight, or None: transparent."""
     value = _get(props, "background", None)
+    if isinstance(value, str):
+        return EnvironmentLight.from_file(Path(_path(props, "background") or ""))
     try:
-        if isinstance(value, str):
-            raise TypeError("a string")
+        if getattr(value, "ndim", 0) == 3:
+            return EnvironmentLight(mi.TensorXf(value))
         return None if value is None else mi.Color3f(value)
+    except InputError:
+        raise
     except Exception as error:
-        raise InputError(f"refgs: background: {shown(value)} is no colour; give an rgb value") from error
+        raise InputError(
+            f"refgs: background: {shown(value)} is no colour; give an rgb value or a map"
+        ) from error
 
 
 def read_surfels(props: Any) -> Surfels:
     """The table of the PLY file, with channels replaced by those given as tensors."""
-    path = _path(props, "filename")
-    raw = {} if path is None else dict(read_ply(path).raw)
-    for name in CHANNELS:
-        value = _tensor(props, name)
-        if value is not None:
-            raw[name] = value
+    raw = _channels(props, "filename", "")
     if not raw:
         raise InputError(
             "refgs: filename: there are no surfels; name a PLY file, or give the channels as tensors"
         )
     return Surfels(raw)
+
+
+def read_surroundings(props: Any, surfels: Surfels) -> Surfels | None:
+    """The surfels around the object, of a PLY file or tensors likewise; None without either."""
+    raw = _channels(props, "surroundings", AROUND)
+    if not raw:
+        return None
+    found = Surfels({name: raw[name] for name in (*surfels.primitive.widths, "radiance_sh") if name in raw})
+    Surroundings(found).check(surfels)
+    return found
+
+
+def _channels(props: Any, file: str, prefix: str) -> dict[str, Any]:
+    """Raw channels of the PLY file that a property names, and those given as tensors, `prefix` + name."""
+    path = _path(props, file)
+    raw = {} if path is None else dict(read_ply(path).raw)
+    for name in CHANNELS:
+        value = _tensor(props, prefix + name)
+        if value is not None:
+            raw[name] = value
+    return raw
 
 
 def read_light(props: Any) -> tuple[Any, Any]:

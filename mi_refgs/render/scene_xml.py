@@ -28,14 +28,16 @@ def write_scene_xml(
     mesh: str | None = None,
     shading: Shading,
     camera: Camera,
-    background: Sequence[float] | None = None,
+    surroundings: str | None = None,
+    background: Sequence[float] | str | None = None,
     remark: str = "",
 ) -> None:
     """Write a Mitsuba scene with one `refgs` integrator and one perspective sensor, atomically.
 
-    ply, envmap, mesh: file names relative to the folder of the XML, so that the folder can be moved.
-    background: linear radiance (r, g, b) composited under alpha, or None for a transparent image. The scene
-    has a parameter `spp`, as in `mi.load_file(path, spp=4)`, 1 by default: pixel centres, as in training.
+    ply, envmap, mesh, surroundings: file names relative to the folder of the XML, so that it can be moved.
+    background: linear radiance (r, g, b) composited under alpha, the name of a lat-long map of it, or None
+    for a transparent image. The scene has a parameter `spp`, as in `mi.load_file(path, spp=4)`, 1 by default:
+    pixel centres, as in training.
     remark: a comment in the file, if not empty.
 
     Mitsuba's `perspective` sensor has square pixels. Where those of the camera are not (fx ≠ fy), the film
@@ -62,7 +64,12 @@ def write_scene_xml(
         _put(integrator, "boolean" if isinstance(value, bool) else "integer", name, str(value).lower())
     if mesh is not None:
         _put(integrator, "string", "mesh", mesh)
-    if background is not None:
+    if surroundings is not None:
+        integrator.append(ElementTree.Comment(" without these two: the object alone, on transparency "))
+        _put(integrator, "string", "surroundings", surroundings)
+    if isinstance(background, str):
+        _put(integrator, "string", "background", background)
+    elif background is not None:
         _put(integrator, "rgb", "background", _numbers(background))
     if envmap is not None:
         light = ElementTree.SubElement(integrator, "emitter", type="envmap", name="light")

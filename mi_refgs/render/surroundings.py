@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.errors import InputError
 from mi_refgs.render.gbuffer import of_parts, parts
 from mi_refgs.rows import joined
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
 
 OBJECT, AROUND = "object", "surroundings"
@@ -33,11 +36,32 @@ class Surroundings:
     surfels: Surfels
     background: EnvironmentLight | None = None
 
+    @staticmethod
+    def read(ply: str | Path, background: str | Path | None) -> Surroundings:
+        """From the files of a run; raises InputError for one that cannot be used."""
+        light = None if background is None else EnvironmentLight.from_file(Path(background))
+        return Surroundings(read_ply(ply), light)
+
+    def check(self, surfels: Surfels) -> None:
+        """Raise InputError unless these can surround an object's surfels."""
+        if not self.surfels.has("radiance_sh"):
+            raise InputError("surroundings: radiance_sh: the surfels have no such channel; add it")
+        if self.surfels.primitive is not surfels.primitive:
+            raise InputError(
+                "surroundings: scale: not the primitive of the object; give both the same columns"
+            )
+
     def behind(self, camera: Camera) -> Any:
         """Radiance (mi.Color3f) of the background at the pixels of a camera, in raster order, under AD."""
         if self.background is None:
             return dr.zeros(mi.Color3f, camera.width * camera.height)
         return self.background.unfiltered().radiance(dr.normalize(camera.rays()))
+
+
+def nothing_around(surfels: Surfels) -> Surfels:
+    """A table without rows, for an object that has a background alone."""
+    widths = {**surfels.primitive.widths, "radiance_sh": 3}
+    return Surfels({name: dr.zeros(mi.TensorXf, (0, width)) for name, width in widths.items()})
 
 
 def together(first: Surfels, second: Surfels) -> Surfels:

@@ -1,12 +1,14 @@
 """The artefacts of a run, which need nothing of ours to be read.
 
-    surfels.ply   raw channels, with 2DGS's property names
+    surfels.ply   raw channels, with 2DGS's property names: the object
     envmap.exr    lat-long radiance, Mitsuba's orientation
     mesh.ply      the occluder
+    surroundings.ply  what is around the object, likewise, with radiance_sh alone
+    background.exr    what is behind everything, lat-long radiance
     scene.xml     what `mi.load_file` renders
     model.json    the iteration and the seconds that they stand for, and how they are shaded
 
-What a method does not have (a light, a mesh) has no file.
+What a method does not have (a light, a mesh), and surroundings of pictures with alpha, have no file.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
 
 SURFELS, LIGHT_MAP, MESH, SCENE, MODEL = "surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "model.json"
-"""Prefix of the surfels' channels and of the light in a checkpoint."""
+AROUND_FILE, BACKGROUND_MAP = "surroundings.ply", "background.exr"
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ class TrainedScene:
                 f"{note}: cannot be read ({error}); write it again with `refgs export {folder}`"
             ) from error
         light, mesh = folder / LIGHT_MAP, folder / MESH
+        around, behind = folder / AROUND_FILE, folder / BACKGROUND_MAP
         fitted = TrainedScene(
             read_ply(folder / SURFELS),
             EnvironmentLight.from_file(light) if light.is_file() else None,
@@ -116,9 +119,12 @@ class TrainedScene:
             iteration,
             seconds,
             pruned,
+            Surroundings.read(around, behind if behind.is_file() else None) if around.is_file() else None,
         )
         try:
             shading.check(fitted.surfels.raw, fitted.light is not None)
+            if fitted.surroundings is not None:
+                fitted.surroundings.check(fitted.surfels)
         except InputError as error:
             raise InputError(f"{folder}: {error}; or write it again with `refgs export {folder}`") from error
         return fitted
@@ -160,13 +166,19 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera) -> list[Path]:
     """
     light = LIGHT_MAP if fitted.light is not None else None
     mesh = MESH if fitted.mesh is not None else None
-    for stale in {LIGHT_MAP, MESH} - {light, mesh}:
+    around = AROUND_FILE if fitted.surroundings is not None else None
+    behind = BACKGROUND_MAP if fitted.surroundings and fitted.surroundings.background else None
+    for stale in {LIGHT_MAP, MESH, AROUND_FILE, BACKGROUND_MAP} - {light, mesh, around, behind}:
         (folder / stale).unlink(missing_ok=True)
     write_ply(folder / SURFELS, fitted.surfels)
     if fitted.light is not None:
         fitted.light.write(folder / LIGHT_MAP)
     if fitted.mesh is not None:
         write_mesh(folder / MESH, fitted.mesh)
+    if fitted.surroundings is not None:
+        write_ply(folder / AROUND_FILE, fitted.surroundings.surfels)
+        if fitted.surroundings.background is not None:
+            fitted.surroundings.background.write(folder / BACKGROUND_MAP)
     # Transparent: pictures with alpha are composited after the sRGB encoding, which no scene can say.
     write_scene_xml(
         folder / SCENE,
@@ -175,7 +187,8 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera) -> list[Path]:
         mesh=mesh,
         shading=fitted.shading,
         camera=camera,
-        background=None,
+        surroundings=around,
+        background=behind,
         remark="" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels",
     )
     # Written last: where it is, the other files are complete.
@@ -187,7 +200,8 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera) -> list[Path]:
     if fitted.pruned is not None:
         note["pruned"] = dataclasses.asdict(fitted.pruned)
     Run(folder).write_json(MODEL, note | {"shading": dataclasses.asdict(fitted.shading)})
-    return [folder / name for name in (SURFELS, light, mesh, SCENE, MODEL) if name is not None]
+    written = (SURFELS, light, mesh, around, behind, SCENE, MODEL)
+    return [folder / name for name in written if name is not None]
 
 
 def load_if_newer(run: Run, method: Method) -> TrainedScene | None:

@@ -47,6 +47,7 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     A diffuse part that was fitted as a colour of its own ("sh") becomes an albedo (`albedo_from_radiance`).
     What is fitted to the light, the radiance and indirect channels, goes; light that other parts of the object
     send is traced instead, where the scene has a mesh. The light stays, and so do other options of accuracy.
+    Surroundings go: they are as bright as they were photographed.
     A scene that has only materials keeps them as they are.
 
     Raises InputError for a scene without light or one of the materials.
@@ -64,10 +65,13 @@ def relightable(scene: TrainedScene) -> TrainedScene:
         (1, 0, 0) if scene.mesh is None else (RELIGHT_RAYS, RELIGHT_BOUNCES, AMBIENT_RAYS)
     )
     accuracy = replace(
-        accuracy, visibility_rays=rays, traced_bounces=bounces, ambient_rays=ambient_rays
+        accuracy,
+        visibility_rays=rays,
+        traced_bounces=bounces,
+        ambient_rays=ambient_rays,
     )
     shading = Shading("pixel", "split_sum", "irradiance", scene.mesh is not None, accuracy)
-    return replace(scene, surfels=Surfels(kept), shading=shading)
+    return replace(scene, surfels=Surfels(kept), shading=shading, surroundings=None)
 
 
 def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> Surfels:
