@@ -18,9 +18,10 @@ from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.fit import exchange
 from mi_refgs.fit.initial import initial_parameters, is_open
 from mi_refgs.fit.train import Trainer
-from mi_refgs.images import read_png, write_png
+from mi_refgs.images import linear_from_srgb, read_png, write_png
 from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
 from mi_refgs.runs.export import TrainedScene
+from mi_refgs.shade.lobe_matrices import map_directions
 from mi_refgs.surfels.table import Surfels
 
 REGION = Region((0.0, 0.0, 0.0), 0.7)
@@ -75,11 +76,15 @@ def test_what_an_open_fit_starts_from(data: Dataset, method: Method) -> None:
     assert np.exp(params["scale"].numpy()).max() < REGION.radius
     views = [view.project(outer)[2] for view in data.views]
     assert np.mean(np.any(views, axis=0)) > 0.99
-    # The sky is 0.5 + 0.3 d in the direction d, encoded.
+    # The sky is 0.5 + 0.3 d in the direction d, encoded; what no view sees is grey.
     scene = TrainedScene.from_state(method, Trainer(method, data).state())
     assert scene.surroundings is not None and scene.surroundings.background is not None
-    sky = scene.surroundings.background.radiance().numpy()
-    assert sky.shape == (8, 16, 3) and sky[4, 12, 0] < sky[4, 4, 0]  # -x and +x, where views see them
+    assert np.ptp(scene.surroundings.background.radiance().numpy(), axis=(0, 1)).max() < 1e-6
+    assert scene.light is not None
+    sky = scene.light.radiance().numpy()
+    seen = np.abs(sky - 0.5).max(axis=-1) > 1e-3
+    error = np.abs(sky - linear_from_srgb(0.5 + 0.3 * map_directions(8))).max(axis=-1)[seen]
+    assert 0.1 < seen.mean() < 0.9 and np.mean(error < 0.05) > 0.2  # the ball hides the rest
 
 
 def test_sparse_points_start_on_their_side_of_the_border(data: Dataset, method: Method) -> None:

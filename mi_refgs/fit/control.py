@@ -69,10 +69,10 @@ class AdaptiveControl:
             fit.occluder.around = None
         if options.reset is not None and options.reset.due(iteration):
             floors = {name: surfels.start(name) for name in options.reset_raise}
-            for table in self.tables:
-                raised = {name: floor for name, floor in floors.items() if table.surfels.has(name)}
-                reset = refine.reset_opacity(table.surfels, options, raised)
-                table.replace(reset, cleared=("opacity", *raised))
+            # Surroundings keep theirs: without, the background takes their place, blurred.
+            self.table.replace(
+                refine.reset_opacity(fit.surfels, options, floors), cleared=("opacity", *floors)
+            )
         elif options.propagate is not None and options.propagate.when.due(iteration):
             colour = ("radiance_sh",) if options.propagate.noise else ()
             self.table.replace(

@@ -39,7 +39,10 @@ def initial_parameters(
     params = initial_surfels(method, data, rng, open_scene).raw
     if open_scene:
         params |= initial_surroundings(method, data, rng)
-    return params if method.light is None else params | {LIGHT: first_light(method.light).raw}
+    if method.light is None:
+        return params
+    light = seen_around(data, method.light.height) if open_scene else first_light(method.light)
+    return params | {LIGHT: light.raw}
 
 
 def first_light(options: LightOptions) -> EnvironmentLight:
@@ -47,9 +50,25 @@ def first_light(options: LightOptions) -> EnvironmentLight:
     return EnvironmentLight.constant(options.radiance, options.height)
 
 
+def seen_around(data: Dataset, height: int) -> EnvironmentLight:
+    """What pictures show around the region, as a map: colours as far off as sparse points are, else far away.
+
+    The object reflects that, so it is a better start of the light than one radiance everywhere.
+    """
+    assert data.region is not None
+    directions, centre = map_directions(height), np.array(data.region.centre)
+    distance = FAR * data.scene_extent
+    if data.points is not None:
+        outside = data.points.position[~data.region.contains(data.points.position)]
+        if len(outside):
+            distance = float(np.median(np.linalg.norm(outside - centre, axis=1)))
+    points = centre + distance * directions.reshape(-1, 3)
+    seen = hull.median_colours(points, data.views, data.background)
+    return EnvironmentLight.from_radiance(seen.reshape(directions.shape))
+
+
 def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator) -> dict[str, Any]:
-    """The tensors of the surroundings by name: a table, and the background with the colours that are seen in
-    its directions."""
+    """The tensors of the surroundings by name: a table, and the background in the median of its colours."""
     options, region = method.surroundings, data.region
     assert options is not None and region is not None
     points, colours = outside_points(options.count, options.scattered, data, rng)
@@ -66,10 +85,9 @@ def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator
         largest=options.size * distance,
         opacity=method.surfels.start("opacity"),
     )
-    directions = map_directions(options.height)
-    far = np.array(region.centre) + FAR * data.scene_extent * directions.reshape(-1, 3)
-    seen = hull.median_colours(far, data.views, data.background)
-    background = EnvironmentLight.from_radiance(seen.reshape(directions.shape))
+    # One colour everywhere: a picture of what is there would leave the surfels nothing to explain.
+    shape = (options.height, 2 * options.height, 3)
+    background = EnvironmentLight.from_radiance(np.broadcast_to(np.median(colours, axis=0), shape))
     return {AROUND + name: tensor for name, tensor in table.raw.items()} | {BACKGROUND: background.raw}
 
 
