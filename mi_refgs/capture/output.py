@@ -25,6 +25,8 @@ from mi_refgs.files import replace_file
 
 QUALITY = 95
 """Of JPEG files: below it, blocks show in what a fit learns."""
+WRITERS = 4
+"""Pictures that are straightened at once: one of 12 Mpx takes half a gigabyte."""
 SPLINE_PIXELS = 2_000_000
 """Pixels up to which pictures are resampled with cubic splines; larger ones are reduced before a fit sees
 them."""
@@ -102,7 +104,7 @@ def write_pictures(
             pixels = Image.fromarray(camera.resample(mask_pixels(masks[photograph.name], photograph))[..., 0])
             replace_file(mask, lambda path: pixels.save(path, format="PNG"))
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, WRITERS)) as pool:
         for written, _ in zip(pool.map(write, placed), progress(placed), strict=True):
             assert written is None
 
