@@ -19,6 +19,7 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 import mitsuba as mi  # isort: skip
 import trimesh
 
+from benchmarks.fuzz import layouts
 from mi_refgs import methods
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.settings import Settings, prepare_folder
@@ -206,10 +207,13 @@ def _transforms(folder: Path) -> list[bytes]:
         )
     camera = {"fl_x": 9.0, "fl_y": 9.5, "cx": 4.2, "cy": 3.1, "w": 8, "h": 6, "aabb_scale": 4}
     lens = {"k1": 0.03, "k2": -0.01, "p1": 1e-3, "p2": -1e-3, "camera_model": "OPENCV"}
+    (folder / "points.ply").write_bytes(layouts.point_files(folder)[1])
+    named = {"ply_file_path": "points.ply", "train_filenames": ["./r_1"], "test_filenames": ["./r_0"]}
     contents = [
         {**camera, **lens, "frames": frames},
         {**camera, "k1": 0.1, "k4": 0.01, "is_fisheye": True, "frames": frames},
         {"camera_angle_x": 0.7, "camera_angle_y": 0.6, "frames": [{**frames[0], "fl_x": 7}, *frames[1:]]},
+        {**camera, **named, "frames": [{**frame, "mask_path": "r_1.png"} for frame in frames]},
     ]
     return [json.dumps(content).encode() for content in contents]
 
@@ -354,6 +358,11 @@ READERS = {
         _file("mesh", "", _meshes, _read_mesh, "x.ply"),
         Reader("mesh-other", "", _foreign_meshes, _read_foreign_mesh),
         _file("transforms", "json", _transforms, _read_transforms, "transforms_train.json"),
+        Reader("colmap", "", layouts.colmap_files, layouts.read_colmap),
+        _file("pickle", "", layouts.pickles, layouts.read_pickle, "0-camera.pkl"),
+        _file("llff", "", layouts.pose_tables, layouts.read_pose_table, "poses_bounds.npy"),
+        _file("points", "", layouts.point_files, layouts.read_point_file, "x.ply"),
+        _file("disparity", "", layouts.disparities, layouts.read_disparity, "x.tiff"),
         # A method may extend one elsewhere: it is the user's own file.
         _file("method", "toml", _methods, _read_method, "x.toml", inside=False),
         _file("exr", "", _exr_files, lambda path: [read_exr_image(path)], "x.exr"),
