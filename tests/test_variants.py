@@ -107,7 +107,14 @@ DIFFERENCES: dict[str, set[str]] = {
         "surfels.primitive",
     },
     "auto": {"select"},
-    "photographs": {"loss.normal_rise", "mesh.extract", "stage.initial", "stage.radiance"},
+    "photographs": {
+        "loss.normal_rise",
+        "mesh.extract",
+        "refine.reset",
+        "refine.reset_raise",
+        "stage.initial",
+        "stage.radiance",
+    },
     "relighting": {
         "loss.half_metal",
         "loss.half_metal_rise",
