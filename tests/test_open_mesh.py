@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -9,11 +12,19 @@ import pytest
 import trimesh
 
 from mi_refgs.contraction import Region
+from mi_refgs.fit.surface import surface_of
 from mi_refgs.occlusion import tsdf
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.reference import occlusion as ref
 from mi_refgs.reference.camera import look_at
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.relightable import relightable
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.init import from_points
+from mi_refgs.surfels.table import Surfels
 
 SIZE = 80
 FOCAL = SIZE / (2 * np.tan(np.radians(30)))
@@ -172,3 +183,57 @@ def test_all_views_and_regions_share_one_kernel() -> None:
     before = dr.detail.launch_stats()
     run(Region((0.5, 0.0, 0.0), 0.7), 8)
     assert dr.detail.launch_stats()[1:] == before[1:], "recompiled"
+
+
+def sheet(normal: np.ndarray, points: np.ndarray, size: float) -> Surfels:
+    """Opaque round surfels of one normal."""
+    made = from_points(
+        points,
+        np.tile(normal, (len(points), 1)),
+        rng=np.random.default_rng(0),
+        channels=["radiance_sh"],
+        opacity=0.99,
+    )
+    raw = made.to_numpy()
+    raw["scale"] = np.full_like(raw["scale"], np.log(size))
+    return Surfels.from_numpy(raw)
+
+
+def test_surroundings_are_in_the_mesh_where_it_is_unbounded() -> None:
+    """A small sheet in the region above a wide floor, which is there with its surfels and a region."""
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21)), axis=-1).reshape(-1, 2)
+    up = np.array([0.0, 0.0, 1.0])
+    own = sheet(up, np.column_stack([0.35 * grid + [0.1, -0.1], np.full(len(grid), 0.2)]), 0.03)
+    floor = sheet(up, np.column_stack([5 * grid, np.full(len(grid), -0.6)]), 0.4)
+    cameras = [
+        Camera.from_pose(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, look_at(eye, np.zeros(3)))
+        for eye in (np.array([x, y, 2.0]) for x, y in ((2, 0), (0, 2), (-2, 0.1), (0.1, -2)))
+    ]
+    with dr.suspend_grad():
+        both = surface_of(own, cameras, 64, floor, REGION)
+        alone = surface_of(own, cameras, 64)
+    assert np.abs(alone.vertices[:, :2]).max() < 1
+    far = np.linalg.norm(both.vertices[:, :2], axis=1) > 2.5
+    assert far.sum() > 100
+    top = both.vertices[far & (both.vertices[:, 2] > -0.75)]
+    assert len(top) > 50 and np.abs(top[:, 2] + 0.6).mean() < 3 * both.voxel
+    on_sheet = np.abs(both.vertices - [0.1, -0.1, 0.2]).max(axis=1) < 0.3
+    assert np.abs(both.vertices[on_sheet][:, 2] - 0.2).min() < both.voxel
+
+
+def test_relighting_keeps_what_is_around_out_of_the_mesh() -> None:
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), axis=-1).reshape(-1, 2)
+    raw = sheet(np.array([0.0, 0.0, 1.0]), np.column_stack([grid, np.zeros(len(grid))]), 0.1).to_numpy()
+    raw |= {"albedo": np.zeros((81, 3)), "metallic": np.zeros((81, 1)), "roughness": np.zeros((81, 1))}
+    balls = [trimesh.creation.icosphere(2, 0.08), trimesh.creation.icosphere(2, 0.5)]
+    balls[1].apply_translation([6, 0, 0])
+    joined: Any = trimesh.util.concatenate(balls)
+    mesh = Mesh(np.asarray(joined.vertices, np.float32), np.asarray(joined.faces, np.uint32), 0.01)
+    surfels = Surfels.from_numpy({name: np.asarray(values, np.float32) for name, values in raw.items()})
+    shading = Shading(diffuse="irradiance", occlusion=True)
+    scene = TrainedScene(surfels, EnvironmentLight.constant(1.0, 8), mesh, shading, 1, 0.0)
+    assert relightable(scene).mesh is mesh
+    lit = relightable(replace(scene, surroundings=Surroundings(surfels)))
+    assert lit.mesh is not None and lit.surroundings is None
+    np.testing.assert_allclose(np.linalg.norm(lit.mesh.vertices, axis=1), 0.08, rtol=1e-3)
+    assert len(lit.mesh.faces) == len(balls[0].faces)

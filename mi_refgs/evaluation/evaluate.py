@@ -93,6 +93,8 @@ def evaluate(
         shading = dataclasses.replace(fitted.shading, accuracy=accuracy)
         fitted = dataclasses.replace(fitted, shading=shading)
     view = fitted.renderer(samples=samples)
+    alone = None if fitted.surroundings is None else dataclasses.replace(fitted, surroundings=None)
+    object_view = None if alone is None else alone.renderer(samples=samples)
     folder = run.path / FOLDER
     try:
         folder.mkdir(exist_ok=True)
@@ -139,7 +141,12 @@ def evaluate(
         errors.add(shot, maps, truth, concave)
         write_png(run.path / render_name(truth), shot.image)
         if index in shown:
-            rows.append(pictures.panels(shot, truth))
+            found = pictures.panels(shot, truth)
+            if object_view is not None:
+                found["object alone"] = pictures.RenderedView.of(
+                    object_view(truth.camera()), views, truth
+                ).image
+            rows.append(found)
             kept.append((shot, maps, truth, concave))
 
     result: dict[str, Any] = {

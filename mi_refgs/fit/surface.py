@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import tee
 
+import numpy as np
+
+from mi_refgs.contraction import Region
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
 from mi_refgs.occlusion.visibility import Occluder
@@ -16,15 +19,35 @@ from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 
 
-def surface_of(surfels: Surfels, cameras: Sequence[Camera], resolution: int) -> Mesh:
-    """The mesh of the depth rendered in all cameras, fused in `resolution` voxels along the longest side."""
-    views = tee(render_depth(surfels, camera) for camera in cameras)
+def surface_of(
+    surfels: Surfels,
+    cameras: Sequence[Camera],
+    resolution: int,
+    around: Surfels | None = None,
+    region: Region | None = None,
+) -> Mesh:
+    """The mesh of the depth rendered in all cameras, fused in `resolution` voxels along the longest side.
+
+    With a region of both surfels and those `around` them, in all of space by the region's contraction, so
+    many voxels along its diameter.
+    """
+    points = surfels.to_numpy()["position"]
+    if around is None or region is None:
+        around, region = None, None
+        bounds = bounds_from_points(points)
+    else:
+        points = np.concatenate([points, around.to_numpy()["position"]])
+        low, high = bounds_from_points(region.contract(points[np.isfinite(points).all(axis=1)]))
+        bounds = np.maximum(low, -2), np.minimum(high, 2)
+    views = tee(render_depth(surfels, camera, around) for camera in cameras)
     volume = fuse(
         (depth for depth, _ in views[0]),
         (alpha for _, alpha in views[1]),
         iter(cameras),
-        bounds_from_points(surfels.to_numpy()["position"]),
+        bounds,
         resolution,
+        carve=region is None,
+        region=region,
     )
     return extract_mesh(volume)
 

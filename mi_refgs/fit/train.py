@@ -228,7 +228,9 @@ class Trainer:
         self.check()
         assert self.method.mesh is not None
         cameras = [view.camera() for view in self.data.views]
-        mesh = surface_of(self.surfels.detach(), cameras, self.method.mesh.resolution)
+        options, around = self.method.mesh, self.surroundings
+        far = around.surfels.detach() if around is not None and options.unbounded else None
+        mesh = surface_of(self.surfels.detach(), cameras, options.resolution, far, self.data.region)
         self.occluder.update(mesh)
         return mesh
 

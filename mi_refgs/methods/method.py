@@ -151,7 +151,8 @@ class MeshOptions:
     """Extraction of the occluding mesh, when due."""
 
     extract: Window = MESH_WINDOW
-    resolution: int = 128  # voxels along the longest side
+    resolution: int = 128  # voxels along the longest side; unbounded, along the region's diameter
+    unbounded: bool = False  # of pictures without alpha: with the surroundings, in all of space
 
 
 @dataclass(frozen=True)

@@ -89,8 +89,13 @@ def render(
     return boundary(frame, "shade backward")
 
 
-def render_depth(surfels: Surfels, camera: Camera) -> tuple[Any, Any]:
-    """Expected camera-z depth (0 where nothing is seen) and alpha of a view, and nothing else."""
+def render_depth(surfels: Surfels, camera: Camera, around: Surfels | None = None) -> tuple[Any, Any]:
+    """Expected camera-z depth (0 where nothing is seen) and alpha of a view, and nothing else.
+
+    `around`: of the surfels and of these, which surround them, together.
+    """
+    if around is not None:
+        surfels = together(surfels, around)
     blended = splat(surfels, [], camera)
     return blended.depth * inverse_alpha(blended.alpha), blended.alpha
 

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.occlusion.tsdf import bounds_from_points
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.shade.accuracy import Accuracy
@@ -57,21 +58,29 @@ def relightable(scene: TrainedScene) -> TrainedScene:
         what = ", ".join(missing) or "light"
         raise InputError(f"{what}: the run has none; fit one with materials and a light, as `--for relighting` does")
     surfels = scene.surfels.detach()
+    mesh = scene.mesh
+    if mesh is not None and scene.surroundings is not None:
+        mesh = _near(mesh, surfels)
     if scene.shading.diffuse == "sh":
-        surfels = albedo_from_radiance(surfels, scene.light.prefilter(), scene.mesh)
+        surfels = albedo_from_radiance(surfels, scene.light.prefilter(), mesh)
     kept = {name: raw for name, raw in surfels.raw.items() if name not in ("radiance_sh", "indirect_sh")}
     accuracy = scene.shading.accuracy if scene.shading.reflectance == "split_sum" else Accuracy()
     rays, bounces, ambient_rays = (
-        (1, 0, 0) if scene.mesh is None else (RELIGHT_RAYS, RELIGHT_BOUNCES, AMBIENT_RAYS)
+        (1, 0, 0) if mesh is None else (RELIGHT_RAYS, RELIGHT_BOUNCES, AMBIENT_RAYS)
     )
     accuracy = replace(
-        accuracy,
-        visibility_rays=rays,
-        traced_bounces=bounces,
-        ambient_rays=ambient_rays,
+        accuracy, visibility_rays=rays, traced_bounces=bounces, ambient_rays=ambient_rays
     )
-    shading = Shading("pixel", "split_sum", "irradiance", scene.mesh is not None, accuracy)
-    return replace(scene, surfels=Surfels(kept), shading=shading, surroundings=None)
+    shading = Shading("pixel", "split_sum", "irradiance", mesh is not None, accuracy)
+    return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, surroundings=None)
+
+
+def _near(mesh: Mesh, surfels: Surfels) -> Mesh:
+    """The triangles in the box of the surfels: what is around them stands in no other light's way."""
+    low, high = bounds_from_points(surfels.to_numpy()["position"])
+    inside = np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1)[mesh.faces].all(axis=1)
+    used, faces = np.unique(mesh.faces[inside], return_inverse=True)
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.uint32), mesh.voxel)
 
 
 def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> Surfels:
