@@ -125,9 +125,9 @@ def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: 
     """Test views are rendered with materials and normals, also for the albedo; the timed frames without."""
     asked: list[bool] = []
 
-    def rendered(*arguments: Any, aovs: bool, normals: bool) -> Frame:
+    def rendered(*arguments: Any, aovs: bool, normals: bool, **others: Any) -> Frame:
         asked.append(aovs or normals)
-        return render(*arguments, aovs=aovs, normals=normals)  # type: ignore[misc]
+        return render(*arguments, aovs=aovs, normals=normals, **others)  # type: ignore[misc]
 
     monkeypatch.setattr("mi_refgs.runs.export.render", rendered)
     evaluate(run)
