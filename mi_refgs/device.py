@@ -12,18 +12,27 @@ import mitsuba as mi
 import numpy as np
 
 
+LOOK_AHEAD = 64
+"""Elements by which kernels read beyond the last one of an array, at most: a packet of the widest machine."""
+
+
 def upload(values: np.ndarray, kind: Any = None) -> Any:
     """A flat mi.Float (or another `kind` of array) with the values, in memory that Dr.Jit has allocated.
 
-    `mi.Float(values)` wraps NumPy's memory on the CPU, and that may be aligned to packets or not: each array
-    then has two kernels, and which one a training step needs, and compiles, changes from view to view.
+    `mi.Float(values)` wraps NumPy's memory on the CPU. A kernel reads whole packets of it, and so beyond its
+    end: the process ends where the next page of memory is nobody's. Also, that memory may be aligned to
+    packets or not: each array then has two kernels, and which one a training step needs, and compiles, changes
+    from view to view.
     """
     kind = mi.Float if kind is None else kind
     dtype = np.uint32 if kind is mi.UInt32 else np.float32
-    wrapped = kind(np.ascontiguousarray(values, dtype=dtype).ravel())
-    own = dr.empty(kind, dr.width(wrapped))
-    if dr.width(wrapped):
-        dr.scatter(own, wrapped, dr.arange(mi.UInt32, dr.width(wrapped)))
+    count = np.size(values)
+    padded = np.zeros(count + LOOK_AHEAD, dtype)
+    padded[:count] = np.ravel(values)
+    own = dr.empty(kind, count)
+    if count:
+        index = dr.arange(mi.UInt32, count)
+        dr.scatter(own, dr.gather(kind, kind(padded), index), index)
         dr.eval(own)
         dr.sync_thread()  # the kernel reads NumPy's memory, which may go with the caller's last reference
     return own
