@@ -22,6 +22,8 @@ SRGB_ENCODED_LIMIT = 0.04045
 ALPHA_FLOOR = 1e-8
 """Alpha that radiance is divided by at least: what covers so little has no colour."""
 
+EXIF_IFD = 0x8769
+"""Tag of EXIF 2.3: the table of the camera's settings."""
 JPEG_SHRINK = 8
 """A JPEG file's blocks have 8 × 8 pixels: its decoder can give 8, 4, 2 or 1 pixels a side for each."""
 
@@ -154,6 +156,21 @@ def open_picture(path: Path, *formats: str) -> Iterator[Any]:
         raise
     except Exception as error:  # Pillow raises half a dozen types for broken files
         raise InputError(f"{path}: pixels: not a readable image ({error}); export it again") from error
+
+
+def exif_tags(picture: Any) -> tuple[dict[int, Any], dict[int, Any]]:
+    """EXIF data of a PIL image: the tags of the picture and of the camera's settings, less what is broken."""
+    tags: dict[int, Any] = {}
+    settings: dict[int, Any] = {}
+    with contextlib.suppress(
+        Exception
+    ):  # Pillow raises many types for broken EXIF data, which no picture needs
+        exif = picture.getexif()
+        for tag in exif:
+            with contextlib.suppress(Exception):
+                tags[tag] = exif[tag]
+        settings.update(exif.get_ifd(EXIF_IFD))
+    return tags, settings
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:

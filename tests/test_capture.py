@@ -28,6 +28,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.images import read_png
 
 COUNT = 9
+NAMES = [f"{i:02} ({i}).png" for i in range(COUNT)]
 needs_colmap = pytest.mark.skipif(not colmap.installed(), reason='pip install "mi_refgs[capture]"')
 
 
@@ -39,16 +40,16 @@ def pictures() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def captured(pictures: Sequence[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with photographs, and data made of them: one lies on its side for EXIF to turn, masks are
-    given."""
-    folder = tmp_path_factory.mktemp("capture")
+    """A folder with photographs, and data made of them: names have spaces, one lies on its side for EXIF to
+    turn, masks are given."""
+    folder = tmp_path_factory.mktemp("with space")
     for i, picture in enumerate(pictures):
         stored = np.rot90(picture) if i == 4 else picture
         options = {"orientation": 6} if i == 4 else {}
-        scene.save(folder / "photographs" / f"{i:02}.png", stored, focal35=38, **options)
+        scene.save(folder / "photographs" / NAMES[i], stored, focal35=38, **options)
         mask = np.zeros(stored.shape[:2], dtype=np.uint8)
         mask[: len(mask) // 2] = 255
-        Image.fromarray(mask).save(_made(folder / "masks") / f"{i:02}.png")
+        Image.fromarray(mask).save(_made(folder / "masks") / NAMES[i])
     arguments = ["--masks", str(folder / "masks")]
     assert main(["capture", str(folder / "photographs"), "-o", str(folder / "data"), *arguments]) == 0
     return folder
@@ -70,7 +71,7 @@ def _model(data: Path) -> Solved:
 def test_cameras_are_found_up_to_a_similarity(captured: Path) -> None:
     solved = _model(captured / "data")
     shots = scene.around(COUNT)
-    assert solved.names == [f"{i:02}.png" for i in range(COUNT)]
+    assert solved.names == NAMES
     true = np.array([shot.origin for shot in shots])
     similarity = best_similarity(solved.origin, true)
     extent = np.linalg.norm(true - true.mean(axis=0), axis=1).max()
@@ -112,8 +113,8 @@ def test_the_data_set_holds_pictures_masks_region_and_report(
     assert camera.model_name == "PINHOLE" and (camera.width, camera.height) == (scene.WIDTH, scene.HEIGHT)
     assert camera.focal_length_x == pytest.approx(scene.FOCAL, rel=0.02)
     # The picture that lay on its side stands, and its mask with it.
-    assert np.array_equal(read_png(data / "images" / "04.png") * 255, pictures[4])
-    mask = np.asarray(Image.open(data / "masks" / "04.png.png"))
+    assert np.array_equal(read_png(data / "images" / NAMES[4]) * 255, pictures[4])
+    mask = np.asarray(Image.open(data / "masks" / f"{NAMES[4]}.png"))
     half = scene.WIDTH // 2
     assert mask.shape == (scene.HEIGHT, scene.WIDTH) and not mask[:, :half].any() and mask[:, half:].all()
     assert model.compute_mean_reprojection_error() == pytest.approx(
@@ -125,7 +126,7 @@ def test_the_data_set_holds_pictures_masks_region_and_report(
 def test_a_fit_reads_it(captured: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Cameras, alpha from the masks, points and region, as one set that every eighth view tests."""
     train, test = (read_dataset(captured / "data", split) for split in ("train", "test"))
-    assert [view.name for view in test.views] == ["00.png", "08.png"] and len(train.views) == COUNT - 2
+    assert [view.name for view in test.views] == [NAMES[0], NAMES[8]] and len(train.views) == COUNT - 2
     assert all(view.alpha is not None and {0.0, 1.0} == {*np.unique(view.alpha)} for view in train.views)
     assert train.region == Region((0, 0, 0), 1) and train.points is not None
     shots = scene.around(COUNT)
@@ -330,6 +331,17 @@ def test_exif_says_which_way_up_and_how_long_the_lens_is(tmp_path: Path) -> None
         np.testing.assert_array_equal(np.asarray(photograph.load()), lying)
         assert photograph.up == ((-1, 0) if photograph.lying else (0, -1))
     assert len({photograph.kept_size for photograph in found.values()}) == 1
+
+
+def test_broken_exif_data_are_left_out(tmp_path: Path) -> None:
+    pixels = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+    for name in ("a.jpg", "b.jpg", "c.png"):
+        Image.fromarray(pixels).save(tmp_path / name, exif=b"Exif\0\0garbage")
+    for photograph in find_photographs(tmp_path):
+        assert (photograph.orientation, photograph.focal) == (1, None)
+        assert photograph.load().size == (6, 4) and photograph.load(3).size == (3, 2)
+        Image.fromarray(pixels).save(tmp_path / f"again{photograph.path.suffix}", exif=photograph.exif())
+    np.testing.assert_array_equal(np.asarray(photograph.load()), pixels)
 
 
 def test_a_mask_has_the_name_and_size_of_its_photograph(tmp_path: Path) -> None:

@@ -16,14 +16,14 @@ from test_train import METHOD, ball, run_folder
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View
-from mi_refgs.data.exposure import EXIF_IFD, EXPOSURE_TIME, F_NUMBER, ISO, fitted_gain, log_exposure
+from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, fitted_gain, log_exposure
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.fit import exposure
 from mi_refgs.fit.exposure import Exposure, exif_gains
 from mi_refgs.fit.objective import GAIN_PRIOR, Target, objective
 from mi_refgs.fit.train import Trainer
-from mi_refgs.images import srgb_from_linear
+from mi_refgs.images import EXIF_IFD, srgb_from_linear
 from mi_refgs.methods.method import GAIN, DataOptions, ExposureOptions, Method, Refine
 from mi_refgs.methods.weights import LossWeights
 from mi_refgs.reference import losses as reference
@@ -321,6 +321,9 @@ def test_exif_data_tell_the_exposure(tmp_path: Path, method: Method) -> None:
     for settings in broken:
         assert log_exposure(photograph(tmp_path / "none.jpg", settings)) is None
     assert log_exposure(tmp_path / "picture.exr") is None
+    for name in ("garbage.jpg", "garbage.png"):
+        Image.new("RGB", (8, 8)).save(tmp_path / name, exif=b"Exif\0\0garbage")
+        assert log_exposure(tmp_path / name) is None
     data = ball(views=4)
     known = [dataclasses.replace(view, exposure=x) for view, x in zip(data.views, log, strict=True)]
     gains = exif_gains(dataclasses.replace(data, views=tuple(known)))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.capture.photographs import ORIENTATION, Photograph
+from mi_refgs.capture.photographs import Photograph
 from mi_refgs.errors import InputError
 from mi_refgs.images import open_picture
 
@@ -52,17 +53,11 @@ def mask_pixels(path: Path, photograph: Photograph) -> np.ndarray:
     A mask of the stored size is turned as the photograph is, unless that is the displayed size, too. Of
     a file with transparent pixels alpha is the mask. Files whose brightest value is 1 count from 0 to 1.
     """
-    from PIL import Image, ImageOps
-
     with open_picture(path) as picture:
         alpha = picture.convert("RGBA").getchannel("A")
         grey = picture.convert("L") if alpha.getextrema()[0] == 255 else alpha
-    grey.info = {}
-    if grey.size != photograph.size:
-        exif = grey.getexif()
-        exif[ORIENTATION] = photograph.orientation
-        grey = ImageOps.exif_transpose(grey)
-    if photograph.lying:
-        grey = grey.transpose(Image.Transpose.ROTATE_90)
-    pixels = np.asarray(grey)[..., None]
+    displayed = grey.size == photograph.size
+    pixels = np.asarray((replace(photograph, orientation=1) if displayed else photograph).turned(grey))[
+        ..., None
+    ]
     return pixels * np.uint8(255) if pixels.max(initial=0) == 1 else pixels

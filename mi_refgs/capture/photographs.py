@@ -15,7 +15,7 @@ import numpy as np
 from mi_refgs.data.dataset import MAX_SIZES
 from mi_refgs.errors import InputError
 from mi_refgs.files import replace_file
-from mi_refgs.images import open_picture
+from mi_refgs.images import exif_tags, open_picture
 
 ENDINGS = (".jpg", ".jpeg", ".png")
 OTHER_ENDINGS = (
@@ -37,8 +37,18 @@ FEWEST = 3
 """Photographs with which a triangulated point can be checked by a third view."""
 DIAGONAL_35MM = 43.2666
 """Diagonal of a frame of 36 mm × 24 mm, mm, to which EXIF's 35 mm equivalent of a focal length relates."""
-ORIENTATION, MAKE, MODEL, EXIF_IFD, FOCAL, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x8769, 0x920A, 0xA405
+ORIENTATION, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x920A, 0xA405
 """EXIF tags."""
+TURNS = {
+    2: "FLIP_LEFT_RIGHT",
+    3: "ROTATE_180",
+    4: "FLIP_TOP_BOTTOM",
+    5: "TRANSPOSE",
+    6: "ROTATE_270",
+    7: "TRANSVERSE",
+    8: "ROTATE_90",
+}
+"""Pillow's names of what displays stored pixels upright, by EXIF's orientation."""
 SIDEWAYS = (5, 6, 7, 8)
 """Values of EXIF's orientation that swap width and height."""
 
@@ -55,11 +65,17 @@ class Photograph:
     plain: bool = True  # colour or grey without alpha
     orientation: int = 1  # EXIF's: how the stored pixels are turned for display
     lying: bool = False  # whether it is kept a quarter turn anticlockwise, as the others' sensor lay
+    number: int = 0  # its place in the order of names
 
     @property
     def name(self) -> str:
         """Of its picture in the data set."""
         return self.path.name
+
+    @property
+    def copy(self) -> str:
+        """File name of its working copy; without spaces, at which COLMAP splits lists of names."""
+        return f"{self.number:05}.png"
 
     @property
     def stored_size(self) -> tuple[int, int]:
@@ -90,7 +106,7 @@ class Photograph:
 
         Raises InputError for a file that is no readable picture of 8 bits a channel.
         """
-        from PIL import Image, ImageOps
+        from PIL import Image
 
         with open_picture(self.path) as picture:
             if picture.mode.startswith(("I", "F")):
@@ -102,20 +118,29 @@ class Photograph:
             if factor >= 2:
                 picture.draft("RGB", wanted)  # JPEG decodes smaller for less
             copy = picture.convert("RGB")
-            copy.info = {"exif": picture.info["exif"]} if "exif" in picture.info else {}
+            copy.info = {}
         if copy.size != wanted:
-            exif = copy.info
             copy = copy.resize(wanted, Image.Resampling.LANCZOS)
-            copy.info = exif
-        upright = ImageOps.exif_transpose(copy)
-        return upright.transpose(Image.Transpose.ROTATE_90) if self.lying else upright
+        return self.turned(copy)
+
+    def turned(self, stored: Any) -> Any:
+        """A PIL image that lies as the stored pixels do, turned as the picture lies in the data set."""
+        from PIL.Image import Transpose
+
+        upright = (
+            stored.transpose(Transpose[TURNS[self.orientation]]) if self.orientation in TURNS else stored
+        )
+        return upright.transpose(Transpose.ROTATE_90) if self.lying else upright
 
     def exif(self) -> bytes:
-        """The EXIF data of a picture that lies as displayed."""
+        """The EXIF data of a picture that lies as displayed; empty where the file's are broken."""
         with open_picture(self.path) as picture:
-            data = picture.getexif()
-            data[ORIENTATION] = 1
-            return bytes(data.tobytes())
+            try:
+                data = picture.getexif()
+                data[ORIENTATION] = 1
+                return bytes(data.tobytes())
+            except Exception:  # Pillow raises many types for broken EXIF data
+                return b""
 
 
 def find_photographs(folder: Path) -> list[Photograph]:
@@ -141,7 +166,9 @@ def find_photographs(folder: Path) -> list[Photograph]:
         raise InputError(f"{folder}: photographs: {found}; {remedy}")
     found_all = [_photograph(path) for path in paths]
     most = Counter(photograph.size for photograph in found_all).most_common(1)[0][0]
-    kept = [replace(p, lying=p.size != most and p.size[::-1] == most) for p in found_all]
+    kept = [
+        replace(p, lying=p.size != most and p.size[::-1] == most, number=i) for i, p in enumerate(found_all)
+    ]
     sizes = {p.kept_size: p.name for p in kept}
     if len(sizes) > MAX_SIZES:
         some = ", ".join(f"{width} × {height} ({name})" for (width, height), name in [*sizes.items()][:3])
@@ -154,8 +181,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
 
 def _photograph(path: Path) -> Photograph:
     with open_picture(path) as picture:
-        exif = picture.getexif()
-        detail = exif.get_ifd(EXIF_IFD)
+        exif, detail = exif_tags(picture)
         size, plain = picture.size, picture.mode in ("RGB", "L")
     orientation = exif.get(ORIENTATION)
     orientation = orientation if orientation in range(1, 9) else 1
@@ -177,18 +203,13 @@ def _positive(value: Any) -> float | None:
 
 
 def write_copies(photographs: Sequence[Photograph], folder: Path, longest: int, progress: Any) -> None:
-    """Copies to work on, NAME.png of at most `longest` pixels a side, those that are not there yet."""
+    """Copies to work on, of at most `longest` pixels a side, those that are not there yet."""
     folder.mkdir(parents=True, exist_ok=True)
     for photograph in progress(photographs):
-        file = folder / copy_name(photograph)
+        file = folder / photograph.copy
         if not file.is_file():
             picture = photograph.load(longest)
             replace_file(file, partial(picture.save, format="PNG", compress_level=1))
-
-
-def copy_name(photograph: Photograph) -> str:
-    """File name of a photograph's working copy."""
-    return f"{photograph.name}.png"
 
 
 def cameras_of(photographs: Sequence[Photograph]) -> list[list[Photograph]]:

@@ -22,7 +22,7 @@ from mi_refgs.capture import colmap, failure, output
 from mi_refgs.capture.frame import moved, upright_unit
 from mi_refgs.capture.masks import find_masks
 from mi_refgs.capture.pairs import pairs_to_match
-from mi_refgs.capture.photographs import Photograph, cameras_of, copy_name, find_photographs, write_copies
+from mi_refgs.capture.photographs import Photograph, cameras_of, find_photographs, write_copies
 from mi_refgs.capture.report import Report, draw
 from mi_refgs.capture.solved import Solved, adjust, best_lens
 from mi_refgs.data.colmap_model import MODELS
@@ -34,8 +34,8 @@ WORK = ".work"
 """Folder of working copies, features, matches and models, which may be removed when all is done."""
 REPORT, PLOT = "capture.json", "capture.png"
 PARTS = ("images", "masks", "sparse")
-VERSION = 1
-"""Of what the steps do: another one begins anew."""
+VERSION = 2
+"""Number of the algorithm of the steps. Results of another number are made anew."""
 
 FIRST_MODEL = "SIMPLE_RADIAL"
 """Lens with which pictures are placed where none is asked for; one parameter can hardly go astray."""
@@ -60,7 +60,7 @@ class Job:
     @property
     def copies(self) -> dict[str, Photograph]:
         """The photographs by the names of their working copies."""
-        return {copy_name(photograph): photograph for photograph in self.photographs}
+        return {photograph.copy: photograph for photograph in self.photographs}
 
     def key(self, *more: Any) -> str:
         """A hash of the photographs, how they lie, and what else a step depends on."""
@@ -180,7 +180,7 @@ def _groups(job: Job, pictures: Path) -> list[tuple[list[str], str, list[float]]
 
     groups = []
     for photographs in cameras_of(job.photographs):
-        copies = [copy_name(photograph) for photograph in photographs]
+        copies = [photograph.copy for photograph in photographs]
         size = image_size(pictures / copies[0])
         focal, model = photographs[0].focal_pixels(size), _first_model(job)
         parameters: list[float] = []
@@ -217,7 +217,7 @@ def _write_pictures(
     done.unlink(missing_ok=True)
     made = job.work / f"output-{key}"
     write = colmap.progress("undistorted")
-    output.write_pictures(placed, lambda p: straight[copy_name(p)], job.masks, made, write)
+    output.write_pictures(placed, lambda p: straight[p.copy], job.masks, made, write)
     for part in PARTS:
         shutil.rmtree(job.folder / part, ignore_errors=True)
     for ready in made.iterdir():

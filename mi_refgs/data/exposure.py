@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.data.view import View
-from mi_refgs.images import SRGB_LINEAR_LIMIT, linear_from_srgb, open_picture
+from mi_refgs.images import SRGB_LINEAR_LIMIT, exif_tags, linear_from_srgb, open_picture
 
-EXIF_IFD, EXPOSURE_TIME, F_NUMBER, ISO = 0x8769, 33434, 33437, 34855
-"""Tags of EXIF 2.3: the table of the camera's settings; in it seconds, the f-number, and the sensitivity."""
+EXPOSURE_TIME, F_NUMBER, ISO = 33434, 33437, 34855
+"""Tags of EXIF 2.3 in the table of the camera's settings: seconds, the f-number, and the sensitivity."""
 CLIPPED = float(linear_from_srgb(np.array(254.5 / 255)))
 """Linear value from which an 8-bit picture says only "at least this bright"."""
 MAX_GAIN = 16.0
@@ -26,14 +26,14 @@ def log_exposure(path: Path) -> float | None:
     if path.suffix.lower() == ".exr":
         return None
     with open_picture(path) as picture:
-        try:
-            settings = picture.getexif().get_ifd(EXIF_IFD)
-            sensitivity = settings[ISO]
-            iso = sensitivity[0] if isinstance(sensitivity, tuple) else sensitivity
-            exposure = float(settings[EXPOSURE_TIME]) * float(iso) / float(settings[F_NUMBER]) ** 2
-            return math.log(exposure) if 0 < exposure < math.inf else None
-        except Exception:  # Pillow raises many types for broken EXIF data, which no picture needs
-            return None
+        _, settings = exif_tags(picture)
+    try:
+        sensitivity = settings[ISO]
+        iso = sensitivity[0] if isinstance(sensitivity, tuple) else sensitivity
+        exposure = float(settings[EXPOSURE_TIME]) * float(iso) / float(settings[F_NUMBER]) ** 2
+    except (KeyError, IndexError, TypeError, ValueError, ArithmeticError):  # missing, or nonsense
+        return None
+    return math.log(exposure) if 0 < exposure < math.inf else None
 
 
 def fitted_gain(
