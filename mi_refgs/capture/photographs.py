@@ -183,14 +183,14 @@ def _photograph(path: Path) -> Photograph:
     with open_picture(path) as picture:
         exif, detail = exif_tags(picture)
         size, plain = picture.size, picture.mode in ("RGB", "L")
-    orientation = exif.get(ORIENTATION)
-    orientation = orientation if orientation in range(1, 9) else 1
+    said = exif.get(ORIENTATION, 1)
+    orientation = int(said) if said in range(1, 9) else 1
     size = size[::-1] if orientation in SIDEWAYS else size
     equivalent, own = _positive(detail.get(FOCAL_35MM)), _positive(detail.get(FOCAL))
     device = f"{exif.get(MAKE, '')} {exif.get(MODEL, '')} {own or equivalent or ''}"
     focal = None if equivalent is None else equivalent / DIAGONAL_35MM
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return Photograph(path, digest, size, focal, device, plain, int(orientation))
+    return Photograph(path, digest, size, focal, device, plain, orientation)
 
 
 def _positive(value: Any) -> float | None:
