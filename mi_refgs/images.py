@@ -103,17 +103,19 @@ def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
 def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
     """Brightness (H, W) of a PNG or JPEG of 8 or 16 bits, times its alpha; and the number that means white.
 
-    White is 1 where no number is larger: such a file holds labels. Raises InputError if the file is missing
-    or unreadable.
+    White is the smallest of 1, 255 and 65535 that no number of the file exceeds: files of 8 and 16 bits may
+    hold labels, and files of 16 bits the numbers of 8. Raises InputError if the file is missing or
+    unreadable.
     """
     path = Path(path)
     with open_picture(path) as picture:
         if picture.mode.startswith("I"):
-            return np.asarray(picture), 65535
-        grey, alpha = np.moveaxis(np.asarray(picture.convert("LA")), -1, 0)
-    if not (alpha == 255).all():
-        grey = np.round(grey * (alpha / np.float32(255))).astype(np.uint8)
-    return grey, 255 if grey.max() > 1 else 1
+            grey = np.asarray(picture)
+        else:
+            grey, alpha = np.moveaxis(np.asarray(picture.convert("LA")), -1, 0)
+            if not (alpha == 255).all():
+                grey = np.round(grey * (alpha / np.float32(255))).astype(np.uint8)
+    return grey, next((white for white in (1, 255) if grey.max() <= white), 65535)
 
 
 def read_tiff(path: str | Path) -> np.ndarray:

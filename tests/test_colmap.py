@@ -284,6 +284,14 @@ def test_cameras_that_make_no_sense(line: str, tmp_path: Path) -> None:
         read_dataset(data, "test")
 
 
+def test_a_focal_length_that_no_camera_has(tmp_path: Path) -> None:
+    data = write(tmp_path, "txt")
+    for focal in ("1e-30", "1e-10"):
+        (data / "sparse/0/cameras.txt").write_text(f"7 PINHOLE 96 72 {focal} 104 50 34")
+        with pytest.raises(InputError, match=r"images\.txt: .*camera 7: focal length: .* out of range"):
+            read_dataset(data, "train")
+
+
 def test_a_picture_of_another_shape_is_refused(tmp_path: Path) -> None:
     """As turned upright by its EXIF data, after COLMAP saw it."""
     data = write(tmp_path)

@@ -16,7 +16,7 @@ from test_train import METHOD, ball, run_folder
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View
-from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, fitted_gain, log_exposure
+from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, MAX_GAIN, fitted_gain, log_exposure
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.fit import exposure
@@ -336,3 +336,7 @@ def test_exif_data_tell_the_exposure(tmp_path: Path, method: Method) -> None:
     alike = tuple(dataclasses.replace(view, exposure=log[0]) for view in known)
     assert exif_gains(dataclasses.replace(data, views=alike)) is None
     assert exif_gains(dataclasses.replace(data, views=(*known[:-1], data.views[-1]))) is None
+    wild = [dataclasses.replace(v, exposure=x) for v, x in zip(data.views, (-600, 0, 0.1, 600), strict=True)]
+    gains = exif_gains(dataclasses.replace(data, views=tuple(wild)))
+    assert gains is not None
+    np.testing.assert_allclose(np.exp(gains[[0, 3], 0]), [1 / MAX_GAIN, MAX_GAIN], rtol=1e-6)

@@ -245,6 +245,10 @@ def test_llff_that_makes_no_sense(tmp_path: Path) -> None:
         saved(data, array)
         with pytest.raises(InputError, match=said):
             read_dataset(data, "train")
+    with path.open("wb") as file:
+        np.savez(file, good)
+    with pytest.raises(InputError, match=r"poses_bounds\.npy: NumPy: cannot be read"):
+        read_dataset(data, "train")
 
 
 class Code:
@@ -298,13 +302,35 @@ class Global:
         return (np.memmap, ("/etc/passwd",))
 
 
+def shared(depth: int = 60) -> bytes:
+    """Instructions that leave a tuple of 2^depth leaves, each level of which holds the next one twice."""
+    return b")" + b"2\x86" * depth
+
+
+def array_of(
+    shape: bytes = b"(K\x03t", code: bytes = b"X\x02\0\0\0f8", order: bytes = b"X\x01\0\0\0<"
+) -> bytes:
+    """A list of one array of three numbers, by instructions for its shape and for their type and order."""
+    made = b"cnumpy.core.multiarray\n_reconstruct\n)R"
+    dtype = b"cnumpy\ndtype\n" + code + b"\x85R(K\x03" + order + b"tb"
+    return b"\x80\x03]" + made + b"(K\x01" + shape + dtype + b"\x89" + b"C\x18" + bytes(24) + b"tba."
+
+
 def test_pickles_that_are_no_arrays(tmp_path: Path) -> None:
     path = tmp_path / "0-camera.pkl"
     array = np.eye(3)
     good = pickle.dumps([array, array], 4)
     path.write_bytes(good)
     np.testing.assert_array_equal(read_arrays(path)[1], array)
+    path.write_bytes(array_of())
+    np.testing.assert_array_equal(read_arrays(path), [np.zeros(3)])
     hostile = {
+        "code of shared tuples": array_of(code=shared()),
+        "order of shared tuples": array_of(order=shared()),
+        "shape of shared tuples": array_of(shape=shared()),
+        "side of shared tuples": array_of(shape=b"(K\x03" + shared() + b"t"),
+        "name of shared tuples": b"\x80\x04" + shared() + b"2\x93.",
+        "sum of shared tuples": b"\x80\x04]" + shared() + b"a.",
         "code": pickle.dumps([Code(), array]),
         "global": pickle.dumps([Global()]),
         "object array": pickle.dumps([np.array([Code()], dtype=object)]),

@@ -145,7 +145,7 @@ def test_surfels_that_cross_the_border_change_tables(method: Method) -> None:
     assert exchange.exchanged(gone, outer, method, REGION, rng)[0].surfels.count == 2  # one left, one came
 
 
-def test_resume_repeats_a_straight_run_bit_for_bit(data: Dataset, method: Method) -> None:
+def test_resume_repeats_a_straight_run_bit_for_bit(data: Dataset, method: Method, one_thread: None) -> None:
     """Both tables, the background and their history, across edits of the tables."""
     straight = Trainer(method, data)
     for _ in range(5):

@@ -80,21 +80,24 @@ def test_a_mask_is_alpha(tmp_path: Path) -> None:
 
 
 def test_what_a_mask_may_hold(tmp_path: Path) -> None:
-    """8 bits, labels 0 and 1, colours with alpha, 16 bits; as depth, what is nearer."""
+    """8 bits, labels 0 and 1, colours with alpha, 16 bits, used in full or not; as depth, what is nearer."""
     bits = np.array([[0, 255, 128]], dtype=np.uint8)
     for name, image in {
         "grey": Image.fromarray(bits),
         "labels": Image.fromarray((bits == 255).astype(np.uint8)),
         "alpha": Image.merge("LA", [Image.fromarray(np.full_like(bits, 255)), Image.fromarray(bits)]),
         "deep": Image.fromarray(bits.astype(np.uint16) * 257),
+        "deep labels": Image.fromarray((bits == 255).astype(np.uint16)),
+        "shallow": Image.fromarray(bits.astype(np.uint16)),
         "black": Image.fromarray(0 * bits),
     }.items():
         image.save(tmp_path / f"{name}.png")
-    expected = {"labels": [[0, 1, 0]], "black": [[0, 0, 0]]}
-    for name in ("grey", "labels", "alpha", "deep", "black"):
+    expected = {"labels": [[0, 1, 0]], "deep labels": [[0, 1, 0]], "black": [[0, 0, 0]]}
+    for name in ("grey", "labels", "alpha", "deep", "deep labels", "shallow", "black"):
         alpha = Mask(tmp_path / f"{name}.png").read()
         np.testing.assert_allclose(alpha, expected.get(name, [[0, 1, 128 / 255]]), atol=1e-6)
     assert read_grey(tmp_path / "deep.png")[1] == 65535
+    np.testing.assert_array_equal(read_grey(tmp_path / "shallow.png")[0], bits)  # raw numbers, as of depths
     np.testing.assert_array_equal(Mask(tmp_path / "deep.png", below=128 * 257).read(), [[1, 0, 0]])
 
 

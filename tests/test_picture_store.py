@@ -7,6 +7,7 @@ import gc
 import json
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,7 @@ def test_a_picture_is_the_same_however_often_it_is_decoded(
             image[:] = 0  # the caller's own
         assert store.pixels(picture).dtype == (np.uint8 if name in ("rgb.png", "rgba.png") else np.float32)
         assert file.largest >= store.pixels(picture).nbytes
+        assert weakref.getweakrefcount(picture) == 1  # however often it was decoded
     assert store.bytes <= budget
 
 

@@ -74,6 +74,24 @@ def test_one_view_has_no_region() -> None:
         region_of([view_from(np.array([4.0, 0, 0]))])
 
 
+def test_cameras_that_look_outward_or_stand_in_one_place_have_no_region() -> None:
+    origins = np.array([[4, 0, 1], [0, 4, 1], [-4, 0, 1], [0, -4, 1.0]])
+    turn = np.diag([-1.0, 1, -1, 1])
+    outward = [replace(v, to_world=v.to_world @ turn) for v in map(view_from, origins)]
+    with pytest.raises(InputError, match="in front of them"):
+        region_of(outward)
+    inward = [view_from(origin) for origin in origins]
+    assert region_of([*inward, view_from(np.array([4.0, 4, 1])), *outward[:2]]).radius > 0
+    for place in ([0.0, 0, 0], [3.7, -1.9, 100.3]):
+        panorama = []
+        for view in outward:
+            pose = view.to_world.copy()
+            pose[:3, 3] = place
+            panorama.append(replace(view, to_world=pose))
+        with pytest.raises(InputError, match="in front of them"):
+            region_of(panorama)
+
+
 def test_a_region_file_is_read(tmp_path: Path) -> None:
     assert read_region(tmp_path) is None
     (tmp_path / REGION_FILE).write_text('{"centre": [1, 2, 3], "radius": 0.5}')
@@ -82,9 +100,13 @@ def test_a_region_file_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ['{"centre": [1, 2], "radius": 1}', '{"centre": [1, 2, 3], "radius": 0}', '{"radius": 1}', "[]", "{"],
-)
-def test_a_region_file_of_no_use_is_named(tmp_path: Path, text: str) -> None:
+    ['{"centre": [1, 2], "radius": 1}', '{"centre": [1, 2, 3], "radius": 0}', '{"radius": 1}', "[]", "{",
+     '{"centre": [1, 2, 1e10], "radius": 1}', '{"centre": [1, 2, NaN], "radius": 1}',
+     '{"centre": [1, 2, true], "radius": 1}', '{"centre": [1, 2, "3"], "radius": 1}',
+     '{"centre": [1, 2, 3], "radius": true}', '{"centre": [1, 2, 3], "radius": 1e10}',
+     '{"centre": [1, 2, 3], "radius": 1e-300}', '{"centre": "123", "radius": 1}'],
+)  # fmt: skip
+def test_a_region_file_that_cannot_be_used_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / REGION_FILE).write_text(text)
     with pytest.raises(InputError, match=REGION_FILE):
         read_region(tmp_path)

@@ -1,7 +1,8 @@
-"""Arrays in pickles of strangers: nothing of the file is called, only arrays of plain numbers are made of it.
+"""Arrays in untrusted pickle files: nothing of the file is called, only arrays of plain numbers are made of it.
 
 A pickle is a program. Here its instructions are compared with a list first; the few names of NumPy that it may ask
-for become records of what was asked; and the arrays are made of these records, after checks of our own.
+for become records of what was asked; and the arrays are made of these records, after checks of our own. A value is
+hashed, compared or shown only after its type is known: tuples that share their parts take exponential time.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ import numpy as np
 from mi_refgs.errors import InputError
 
 MAX_BYTES = 2**16
-"""Of a file: a camera has a few hundred."""
+"""Largest length of a file: a camera has a few hundred bytes."""
 MAX_ITEMS = 1000
-"""Of a list."""
+"""Largest number of arrays in a list."""
 NAMES = {
     **{(f"numpy.{core}.multiarray", "_reconstruct"): "array" for core in ("core", "_core")},
     ("numpy", "ndarray"): "kind",
@@ -100,10 +101,16 @@ def _array(item: Any) -> np.ndarray:
     code, order = dtype.arguments[0], dtype.state[1]
     if isinstance(values, Record):
         values = values.arguments[0].encode("latin1")
-    if code not in CODES or order not in ("<", ">") or not isinstance(values, bytes):
+    # Types come first: see the module's docstring.
+    if not isinstance(code, str) or not isinstance(order, str) or not isinstance(values, bytes):
         raise ValueError("it holds no plain numbers")
-    size = math.prod(side for side in shape if type(side) is int and 0 <= side <= MAX_BYTES)
-    if len(shape) > 2 or size * int(code[1]) != len(values):
+    if code not in CODES or order not in ("<", ">"):
+        raise ValueError("it holds no plain numbers")
+    if not isinstance(shape, tuple) or not all(
+        type(side) is int and 0 <= side <= MAX_BYTES for side in shape
+    ):
+        raise ValueError("an array has no shape")
+    if len(shape) > 2 or math.prod(shape) * int(code[1]) != len(values):
         raise ValueError("an array has another size than its numbers")
     array = np.frombuffer(values, dtype=order + code).astype(np.float64)
     return array.reshape(shape, order="F" if by_columns else "C")

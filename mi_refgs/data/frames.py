@@ -46,7 +46,7 @@ class FrameReader:
         to_world = self._to_world(index, frame)
         picture = PictureFile.find(file, self.options.downscale, self._mask(index, frame, file))
         intrinsics = self._intrinsics(frame, file, picture.height, picture.width)
-        where, name = f"{self.transforms}: frames[{index}]: k1 … p2", _stem(str(Path(frame["file_path"])))
+        where, name = f"{self.transforms}: frames[{index}]", _stem(str(Path(frame["file_path"])))
         lens = self._lens(frame)
         view, straight = make_view(name, picture, self.options, intrinsics, lens, to_world, where)
         if not self.options.truth:

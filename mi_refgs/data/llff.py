@@ -67,12 +67,17 @@ def _placed(folder: Path, split: str, options: ReadOptions) -> list[tuple[str, n
 def read_poses(path: Path) -> np.ndarray:
     """The (N, 17) float64 table; raises InputError for a file of no use."""
     try:
-        # Mapped, so that a promise of more numbers than the file has is refused, not kept.
-        table = np.load(path, mmap_mode="r", allow_pickle=False)
+        # Mapped, so that a promise of more numbers than the file has is refused, not kept. `np.load` would also
+        # take archives and pickles.
+        table = np.lib.format.open_memmap(path, mode="r")
     except Exception as error:  # NumPy raises half a dozen types for broken headers
-        raise InputError(f"{path}: NumPy: cannot be read ({str(error)[:100]}); copy the file again") from error
+        raise InputError(
+            f"{path}: NumPy: cannot be read ({str(error)[:100]}); copy the file again"
+        ) from error
     if table.ndim != 2 or table.shape[1] != COLUMNS or not len(table) or table.dtype.kind not in "fiu":
-        raise InputError(f"{path}: has shape {table.shape}, not N × {COLUMNS} numbers; export the poses again")
+        raise InputError(
+            f"{path}: has shape {table.shape}, not N × {COLUMNS} numbers; export the poses again"
+        )
     rows = np.array(table, dtype=np.float64)
     if not (np.abs(rows) <= MAX_NUMBER).all():
         raise InputError(f"{path}: some numbers are infinite or no numbers; export the poses again")

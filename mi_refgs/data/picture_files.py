@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.exposure import log_exposure
 from mi_refgs.data.lens import Lens, Undistortion, undistortion
 from mi_refgs.data.picture_store import Picture
@@ -175,8 +176,11 @@ def make_view(
     """The view of a picture, and how maps of the averaged picture's size are undistorted like it.
 
     `intrinsics` are fx, fy, cx, cy in pixels of the file; `to_world` as in `View`. Raises InputError, which
-    begins with `where`, for a lens that cannot be undone.
+    begins with `where`, for a focal length that no camera has and for a lens that cannot be undone.
     """
+    for focal in intrinsics[:2]:
+        if not 1 / MAX_NUMBER <= focal <= MAX_NUMBER:
+            raise InputError(f"{where}: focal length: {focal:.3g} pixels is out of range; correct it")
     width, height = picture.size
     fx, fy, cx, cy = (value / picture.downscale for value in intrinsics)
     straight = None
@@ -184,12 +188,14 @@ def make_view(
         try:
             straight = undistortion(lens, width, height, fx, fy, cx, cy)
         except InputError as error:
-            raise InputError(f"{where}: {error}") from None
+            raise InputError(f"{where}: k1 … p2: {error}") from None
         fx, fy = fx * straight.zoom, fy * straight.zoom
         picture = replace(picture, straight=straight)
     pixels: Any = Picture(picture, options.background)
     alpha = pixels if pixels.cut_out else None
     exposure = log_exposure(picture.path)
     linear = options.images == "exr"
-    view = View(name, width, height, fx, fy, cx, cy, to_world, pixels, alpha, None, None, linear, exposure=exposure)
+    view = View(
+        name, width, height, fx, fy, cx, cy, to_world, pixels, alpha, None, None, linear, exposure=exposure
+    )
     return view, straight

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import weakref
 from collections import OrderedDict
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,16 +36,16 @@ class PictureStore:
         decoded = picture.file.decode()
         self._kept[key] = decoded
         self.bytes += decoded.nbytes
-        weakref.finalize(picture, self._drop, key).atexit = False
         while self.bytes > self.budget and self._kept:
-            self._drop(next(iter(self._kept)))
+            self.drop(next(iter(self._kept)))
         return decoded
 
     def has_room(self, size: int) -> bool:
         """Whether so many bytes more are kept without dropping others."""
         return self.bytes + size <= self.budget
 
-    def _drop(self, key: int) -> None:
+    def drop(self, key: int) -> None:
+        """Keep the picture of this `id` no longer."""
         dropped = self._kept.pop(key, None)
         self.bytes -= 0 if dropped is None else dropped.nbytes
 
@@ -64,6 +63,7 @@ class Picture:
         Raises InputError as `PictureFile.decode` does.
         """
         self.file, self.background, self.store = file, background, store
+        weakref.finalize(self, store.drop, id(self)).atexit = False
         whole = store.pixels(self) if store.has_room(file.largest) else None
         self.cut_out = file.cut_out() if whole is None else whole.shape[-1] == 4
 

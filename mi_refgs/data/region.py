@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.contraction import Region as Region
 from mi_refgs.data.hull import view_focus
 from mi_refgs.data.view import View
@@ -19,17 +20,24 @@ REGION_SHARE = 0.8
 """Radius of the region that cameras suggest, as part of the sphere that the median view shows whole."""
 CAMERA_SHARE = 0.8
 """Its largest radius as part of the nearest camera's distance: a camera stands outside of the region."""
+SMALLEST = 1e-6
+"""Its smallest radius as part of the largest coordinate of a camera: float32 resolves no smaller lengths."""
 
 
 def region_of(views: Sequence[View]) -> Region:
     """The sphere around what all cameras look at, as large as the median view shows whole.
 
-    Raises InputError if the view axes have no common point (one view, or parallel ones).
+    Raises InputError if the view axes have no common point (one view, or parallel ones), if that point lies
+    behind half of the cameras (they look outward), and if a camera stands at that point.
     """
     focus, distance = view_focus(views)
+    origins = np.array([view.to_world[:3, 3] for view in views])
+    ahead = [float((focus - view.to_world[:3, 3]) @ view.to_world[:3, 2]) > 0 for view in views]
     half_angle = np.array([np.arctan(min(v.width / v.fx, v.height / v.fy) / 2) for v in views])
     whole = float(np.median(distance * np.sin(half_angle)))
     radius = min(REGION_SHARE * whole, CAMERA_SHARE * float(distance.min()))
+    if 2 * sum(ahead) <= len(views) or not radius > SMALLEST * float(np.abs(origins).max()):
+        raise InputError("views: cameras: they do not look at one point in front of them; give a region.json")
     x, y, z = (float(c) for c in focus)
     return Region((x, y, z), radius)
 
@@ -48,19 +56,20 @@ def region_pixels(view: View, region: Region) -> np.ndarray:
 
 
 def read_region(folder: Path) -> Region | None:
-    """The region that a data set's folder records; None without the file, InputError for one of no use."""
+    """The region that a data set's folder records; None without the file.
+
+    Raises InputError for a file that cannot be used.
+    """
     path = folder / REGION_FILE
     if not path.is_file():
         return None
     content = read_json(path)
-    try:
-        centre = np.array(content["centre"], dtype=np.float64)
-        radius = float(content["radius"])
-    except (KeyError, TypeError, ValueError, OverflowError):
-        centre, radius = np.empty(0), 0.0
-    if centre.shape != (3,) or not np.isfinite(centre).all() or not 0 < radius < np.inf:
+    centre = content.get("centre")
+    numbers = [*centre, content.get("radius")] if isinstance(centre, list) else []
+    usable = all(type(number) in (int, float) and abs(number) <= MAX_NUMBER for number in numbers)
+    if len(numbers) != 4 or not usable or not numbers[3] >= 1 / MAX_NUMBER:
         raise InputError(
             f"{path}: centre, radius: not three numbers and a positive one; correct them, or remove the file"
         )
-    x, y, z = (float(c) for c in centre)
+    x, y, z, radius = map(float, numbers)
     return Region((x, y, z), radius)

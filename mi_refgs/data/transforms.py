@@ -107,4 +107,6 @@ def _points(transforms: Path, content: dict[str, Any]) -> PointCloud | None:
 
 
 def _file_path(frame: Any) -> str:
-    return str(frame.get("file_path", "")) if isinstance(frame, dict) else ""
+    """The path that a frame names; empty where it names none."""
+    path = frame.get("file_path") if isinstance(frame, dict) else None
+    return path if isinstance(path, str) else ""

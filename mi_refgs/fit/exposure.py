@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.exposure import fitted_gain
+from mi_refgs.data.exposure import MAX_GAIN, fitted_gain
 from mi_refgs.data.view import View
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
@@ -175,14 +175,19 @@ class Exposure:
 
 
 def exif_gains(data: Dataset) -> np.ndarray | None:
-    """Log gains (V, 3) by EXIF data, 0 for the median; None where a view has none or all have the same."""
+    """Log gains (V, 3) by EXIF data, 0 for the median, within the limits of `fitted_gain`.
+
+    None where a view has no such data or all have the same.
+    """
     log = [view.exposure for view in data.views]
     if any(value is None for value in log):
         return None
     values = np.array(log, dtype=np.float64)
     if values.std() < EXIF_SPREAD:
         return None
-    return np.repeat((values - np.median(values))[:, None], 3, axis=1).astype(np.float32)
+    limit = np.log(MAX_GAIN)
+    gains = np.clip(values - np.median(values), -limit, limit)
+    return np.repeat(gains[:, None], 3, axis=1).astype(np.float32)
 
 
 def with_gain(
