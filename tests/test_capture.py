@@ -4,9 +4,11 @@ that fail."""
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import photographed_scene as scene
@@ -14,8 +16,9 @@ import pytest
 from PIL import Image
 
 from benchmarks import capture as capture_benchmark
-from mi_refgs.capture import colmap, failure
+from mi_refgs.capture import colmap, failure, output
 from mi_refgs.capture.compare import best_similarity, pose_errors
+from mi_refgs.capture.folder import LAST, holds, prepare, replace_output
 from mi_refgs.capture.frame import Similarity, region_of_interest, up_direction
 from mi_refgs.capture.masks import find_masks, mask_pixels
 from mi_refgs.capture.pairs import EXHAUSTIVE, pairs_to_match
@@ -219,6 +222,99 @@ def test_a_distorted_lens_is_found_and_undone(tmp_path: Path, monkeypatch: pytes
     assert model.compute_mean_reprojection_error() < 0.6
 
 
+@needs_colmap
+def test_another_lens_makes_other_pictures(
+    captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pictures and cameras are of one lens; files that a person added stay."""
+    data = tmp_path / "data"
+    shutil.copytree(captured / "data", data)
+    (data / "sparse" / "0" / "test.txt").write_text(NAMES[3])
+    whole, inode = output.straighten, (data / "images" / NAMES[0]).stat().st_ino
+
+    def longer(*arguments: Any) -> dict[str, output.Straight]:
+        found = whole(*arguments)
+        return {name: replace(s, focal=(s.focal[0] * 1.01, s.focal[1] * 1.01)) for name, s in found.items()}
+
+    monkeypatch.setattr(output, "straighten", longer)
+    [before] = colmap.load().Reconstruction(data / "sparse" / "0").cameras.values()
+    assert main(["capture", str(captured / "photographs"), "-o", str(data)]) == 0
+    [after] = colmap.load().Reconstruction(data / "sparse" / "0").cameras.values()
+    assert after.focal_length_x == pytest.approx(1.01 * before.focal_length_x)
+    assert (data / "images" / NAMES[0]).stat().st_ino != inode and not (data / "masks").exists()
+    assert [view.name for view in read_dataset(data, "test").views] == [NAMES[3]]
+
+
+# ---------- The folder ----------
+
+
+def _output(folder: Path, *names: str) -> Path:
+    for name in names:
+        (_made((folder / name).parent) / folder.joinpath(name).name).write_text(folder.name)
+    return folder
+
+
+def _files(folder: Path) -> dict[str, str]:
+    """What the files of a data set hold; none of those that record it."""
+    files = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+    return {name: path.read_text() for name, path in files.items() if not name.startswith(".")}
+
+
+def test_a_capture_removes_what_the_last_one_wrote(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, own = tmp_path / "data", {"masks/x.png": "own", "sparse/0/test.txt": "own"}
+    prepare(data, [tmp_path / "photographs"])
+    first = ("images/a.png", "images/b.png", "masks/a.png", LAST)
+    replace_output(data, _output(tmp_path / "1", *first, "images/.a.png.0123456789ab.tmp.png"), "1")
+    assert _files(data) == dict.fromkeys(first, "1") and holds(data, "1") and not holds(data, "2")
+    for name, text in own.items():
+        (data / name).write_text(text)
+    prepare(data, [])
+    second = ("images/a.png", "images/c.png", LAST)
+    replace_output(data, _output(tmp_path / "2", *second), "2")
+    assert _files(data) == dict.fromkeys(second, "2") | own and holds(data, "2")
+    with pytest.raises(InputError, match=r"masks/x\.png: output: not written by a capture; move it"):
+        replace_output(data, _output(tmp_path / "3", "masks/x.png", LAST), "3")
+    assert _files(data) == dict.fromkeys(second, "2") | own and holds(data, "2")
+    # Between two files of the next output the process ends; the next one completes it.
+    whole = Path.rename
+    moved: list[Path] = []
+
+    def interrupted(path: Path, target: Path) -> Path:
+        if moved:
+            raise KeyboardInterrupt
+        moved.append(path)
+        return whole(path, target)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        replace_output(data, _output(tmp_path / "4", *first), "4")
+    assert not (data / LAST).exists() and not holds(data, "4")
+    monkeypatch.setattr(Path, "rename", whole)
+    replace_output(data, _output(tmp_path / "4", *first), "4")
+    assert _files(data) == dict.fromkeys(first, "4") | own and holds(data, "4")
+    (data / "images" / "b.png").unlink()
+    assert not holds(data, "4")
+
+
+@needs_colmap
+def test_a_folder_that_is_read_is_not_written(captured: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, photographs = captured / "data", captured / "photographs"
+    before = sorted(data.rglob("*"))
+    for arguments in [(data / "images", "-o", data), (photographs, "-o", captured)]:
+        assert "are read, and lie in it; choose another" in _refused(capsys, *arguments)
+    assert "are read" in _refused(capsys, photographs, "-o", data, "--masks", data / "masks")
+    assert sorted(data.rglob("*")) == before
+
+
+def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
+    """Whatever its folders are called."""
+    kept = _made(tmp_path / ".work") / "thesis.txt"
+    kept.write_text("own")
+    (tmp_path / "capture.json").write_text("{}")
+    with pytest.raises(InputError, match="not empty, and no capture"):
+        prepare(tmp_path, [])
+
+
 # ---------- The sentences ----------
 
 
@@ -296,7 +392,8 @@ def test_pictures_that_are_none_are_refused(tmp_path: Path, capsys: pytest.Captu
     assert "5 different sizes, such as 10 × 8 (10.jpg)" in _refused(capsys, photographs, "-o", tmp_path)
     for width in range(9, 13):
         (photographs / f"{width}.jpg").unlink()
-    assert "not empty" in _refused(capsys, photographs, "-o", tmp_path)
+    (_made(tmp_path / "other") / "file").touch()
+    assert "not empty" in _refused(capsys, photographs, "-o", tmp_path / "other")
     assert "no such folder" in _refused(
         capsys, photographs, "-o", tmp_path / "data", "--masks", tmp_path / "no"
     )

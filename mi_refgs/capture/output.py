@@ -43,8 +43,10 @@ class Straight:
 
     @classmethod
     def of(cls, camera: Any, size: tuple[int, int]) -> Straight:
-        """Of a pycolmap.Camera of the working copies, for pictures of `size`; InputError for a lens beyond
-        reason."""
+        """The camera for pictures of `size`, from a pycolmap.Camera of the working copies.
+
+        Raises InputError where the lens cannot be undone.
+        """
         values = dict(zip(MODELS[camera.model_name][1].split(), camera.params, strict=True))
         known = Camera(camera.model_name, camera.width, camera.height, values)
         fx, fy, cx, cy = np.array(known.intrinsics) * np.tile(
@@ -55,7 +57,8 @@ class Straight:
             undo = None if lens is None else undistortion(lens, *size, fx, fy, cx, cy)
         except InputError as error:
             raise InputError(
-                f"photographs: the lens found is of no use ({error}); give --camera another one, as RADIAL"
+                f"photographs: the lens found cannot be undone ({error}); choose another lens model, such as "
+                "--camera RADIAL"
             ) from None
         zoom = 1.0 if undo is None else undo.zoom
         return cls(size, (zoom * fx, zoom * fy), (cx, cy), undo)
@@ -65,7 +68,11 @@ class Straight:
         if self.undo is None:
             return pixels
         order = 3 if pixels.shape[0] * pixels.shape[1] <= SPLINE_PIXELS else 1
-        return np.rint(self.undo.resample(pixels.astype(np.float32), order=order)).astype(np.uint8)
+        result = np.empty_like(pixels)
+        for i in range(pixels.shape[2]):  # one channel at a time, for less memory
+            plane = pixels[..., i : i + 1].astype(np.float32)
+            result[..., i : i + 1] = np.rint(self.undo.resample(plane, order=order))
+        return result
 
 
 def straighten(model: Any, photographs: dict[str, Photograph]) -> dict[str, Straight]:
@@ -122,8 +129,7 @@ def write_model(
     similarity: Similarity,
     folder: Path,
 ) -> None:
-    """COLMAP's binary files of the moved, straightened reconstruction, in a folder that is there whole or
-    not."""
+    """COLMAP's binary files of the moved, straightened reconstruction."""
     pycolmap = colmap.load()
     moved = pycolmap.Reconstruction(model)
     pose = pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation)
@@ -140,9 +146,5 @@ def write_model(
         own.model, own.width, own.height = pycolmap.CameraModelId.PINHOLE, *camera.size
         own.params = [*camera.focal, *camera.centre]
         image.name = photographs[image.name].name
-    temporary = folder.with_name(f".{folder.name}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    moved.write_binary(temporary)
-    shutil.rmtree(folder, ignore_errors=True)
-    temporary.rename(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    moved.write_binary(folder)

@@ -10,7 +10,7 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.capture import colmap, failure, output
+from mi_refgs.capture.folder import WORK, holds, prepare, replace_output
 from mi_refgs.capture.frame import moved, upright_unit
 from mi_refgs.capture.masks import find_masks
 from mi_refgs.capture.pairs import pairs_to_match
@@ -28,19 +29,15 @@ from mi_refgs.capture.solved import Solved, adjust, best_lens
 from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.errors import InputError
-from mi_refgs.files import cannot_write, read_json, remove_temporaries, write_json
+from mi_refgs.files import read_json, write_json
 
-WORK = ".work"
-"""Folder of working copies, features, matches and models, which may be removed when all is done."""
 REPORT, PLOT = "capture.json", "capture.png"
-PARTS = ("images", "masks", "sparse")
 VERSION = 2
 """Number of the algorithm of the steps. Results of another number are made anew."""
 
 FIRST_MODEL = "SIMPLE_RADIAL"
-"""Lens with which pictures are placed where none is asked for; one parameter can hardly go astray."""
-FOCAL_GUESS = 1.2
-"""Focal length over the longest side where EXIF does not tell it: 45° across, COLMAP's own guess."""
+"""Lens model with which pictures are placed where none is asked for. It has one parameter, which few matches
+determine."""
 
 
 @dataclass(frozen=True)
@@ -90,19 +87,28 @@ def capture(
         raise InputError(f"--camera: {camera}: unknown lens model; give one of {', '.join(MODELS)}")
     photographs = find_photographs(source)
     job = Job(photographs, find_masks(masks, photographs), source, folder, camera)
-    _prepare(job)
+    prepare(folder, [source] if masks is None else [source, masks])
     began = time.perf_counter()
-    model, groups = _model(job, tell)
+    result = _solve(job, tell)
+    model, groups = colmap.load().Reconstruction(result), read_json(result / "groups.json")["groups"]
     failure.check_placed(source, len(photographs), groups, _beside_gap(job, groups[0]))
     straight = output.straighten(model, job.copies)
     solved = Solved.of(model)
     similarity = upright_unit(solved, np.array([job.copies[name].up for name in solved.names]))
     world = moved(solved, similarity)
     found = region or Region((0.0, 0.0, 0.0), 1.0)
-    placed = [job.copies[name] for name in solved.names]
-    key = job.key(camera, [hashlib.sha256(path.read_bytes()).hexdigest() for path in job.masks.values()])
-    _write_pictures(job, placed, straight, key)
-    output.write_model(model, job.copies, straight, similarity, folder / "sparse" / "0")
+    lenses = [(name, repr(straight[name])) for name in solved.names]
+    key = job.key(lenses, _digests(sorted(result.glob("*.bin"))), _digests(job.masks.values()))
+    if not holds(folder, key):
+        made = job.work / f"output-{key}"
+        for stale in {*job.work.glob("output-*")} - {made}:
+            shutil.rmtree(stale)
+        placed = [job.copies[name] for name in solved.names]
+        write = colmap.progress("undistorted")
+        output.write_pictures(placed, lambda p: straight[p.copy], job.masks, made, write)
+        output.write_model(model, job.copies, straight, similarity, made / "sparse" / "0")
+        replace_output(folder, made, key)
+        shutil.rmtree(made)
     write_json(folder / REGION_FILE, {"centre": list(found.centre), "radius": found.radius})
     report = Report.of(job, model, world, groups, straight, found, key, time.perf_counter() - began)
     draw(folder / PLOT, world, found)
@@ -110,23 +116,13 @@ def capture(
     return report
 
 
-def _prepare(job: Job) -> None:
-    """The output folder; raises InputError for one that holds something else."""
-    folder = job.folder
-    if folder.resolve() == job.source.resolve():
-        raise InputError(f"{folder}: output: the folder of the photographs; choose another")
-    try:
-        strange = folder.is_dir() and any(folder.iterdir()) and not (folder / WORK).is_dir()
-        if strange and not (folder / REPORT).is_file():
-            raise InputError(f"{folder}: output: not empty, and no capture; choose another folder")
-        job.work.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(folder)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
+def _digests(files: Iterable[Path]) -> list[str]:
+    """SHA-256 of files."""
+    return [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
 
 
-def _model(job: Job, tell: Callable[[str], None]) -> tuple[Any, list[list[str]]]:
-    """The largest group's reconstruction, its lens decided, and the names in each group."""
+def _solve(job: Job, tell: Callable[[str], None]) -> Path:
+    """The folder of the largest group's reconstruction, its lens decided, and groups.json: names in each."""
     pycolmap = colmap.load()
     size, names = colmap.WORKING_SIZE, sorted(job.copies)
     pictures = job.work / f"pictures-{job.key(size)}"
@@ -166,7 +162,7 @@ def _model(job: Job, tell: Callable[[str], None]) -> tuple[Any, list[list[str]]]
         best.write_binary(raw)
         write_json(raw / "groups.json", {"groups": groups})
         raw.rename(result)
-    return pycolmap.Reconstruction(result), read_json(result / "groups.json")["groups"]
+    return result
 
 
 def _first_model(job: Job) -> str:
@@ -205,22 +201,3 @@ def _beside_gap(job: Job, placed: Sequence[str]) -> str:
     names = [photograph.name for photograph in job.photographs]
     edges = [b for a, b in pairwise(names) if (a in known) != (b in known)]
     return edges[0] if edges else names[-1]
-
-
-def _write_pictures(
-    job: Job, placed: Sequence[Photograph], straight: dict[str, output.Straight], key: str
-) -> None:
-    """Pictures and masks, moved to their place when all are there."""
-    done = job.work / "output.json"
-    if done.is_file() and read_json(done).get("key") == key:
-        return
-    done.unlink(missing_ok=True)
-    made = job.work / f"output-{key}"
-    write = colmap.progress("undistorted")
-    output.write_pictures(placed, lambda p: straight[p.copy], job.masks, made, write)
-    for part in PARTS:
-        shutil.rmtree(job.folder / part, ignore_errors=True)
-    for ready in made.iterdir():
-        ready.rename(job.folder / ready.name)
-    made.rmdir()
-    write_json(done, {"key": key})
