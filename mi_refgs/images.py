@@ -22,6 +22,8 @@ SRGB_ENCODED_LIMIT = 0.04045
 ALPHA_FLOOR = 1e-8
 """Alpha that radiance is divided by at least: what covers so little has no colour."""
 
+ENDINGS = (".png", ".jpg", ".jpeg")
+"""Endings of the names of 8-bit image files, in small letters, in the order in which they are tried."""
 EXIF_IFD = 0x8769
 """Tag of EXIF 2.3: the table of the camera's settings."""
 JPEG_SHRINK = 8

@@ -88,8 +88,20 @@ def test_a_fit_starts_from_them(
     again = triangulate.with_points(data, tmp_path / "run", said.append)
     assert again is not None and len(calls) == 1
     np.testing.assert_array_equal(again.position, points.position)
-    (tmp_path / "run" / triangulate.POINTS_FILE).write_bytes(b"damaged")
-    assert triangulate.with_points(data, tmp_path / "run", said.append) is points
+    file = tmp_path / "run" / triangulate.POINTS_FILE
+    whole = file.read_bytes()
+    for size in (0, 10, len(whole) // 2, len(whole) - 1):
+        file.write_bytes(whole[:size])
+        assert triangulate.with_points(data, tmp_path / "run", said.append) is points
+    for at in range(100, len(whole), len(whole) // 20):  # whatever was damaged
+        file.write_bytes(whole[:at] + bytes([whole[at] ^ 255]) + whole[at + 1 :])
+        assert triangulate.with_points(data, tmp_path / "run", said.append) is not None
+    file.write_bytes(whole)
+    calls.clear()
+    turned = replace(data.views[0], to_world=data.views[1].to_world)
+    for other in (replace(data, path=tmp_path), replace(data, views=(turned, *data.views[1:]))):
+        assert triangulate.with_points(other, tmp_path / "run", said.append) is points
+    assert len(calls) == 2
 
 
 def test_points_are_looked_for_only_where_they_help(

@@ -18,21 +18,21 @@ import numpy as np
 from mi_refgs.errors import InputError
 
 SEED = 0
-"""Of every random draw, so that a run can be repeated."""
+"""Seed of all random numbers; with it, a second run gives the same result."""
 WORKING_SIZE = 1600
-"""Longest side, pixels, of the pictures that features are found in: twice as much finds hardly more places
-that last from view to view, in four times the time."""
+"""Longest side, pixels, of the pictures in which features are found. Pictures of twice that size take four
+times as long and give hardly more features that several views share."""
 MOST_FEATURES = 3000
-"""A picture. The time of matching grows with their square: at 3,000 two cores match about 30 pairs a
-second."""
+"""Most features of a picture; matching time grows with their square. With 3,000, two cores match about 30
+pairs a second."""
 POLL = 0.25
-"""Seconds between looks at how far COLMAP has come."""
+"""Seconds between two updates of the progress bar."""
 PICTURES_AT_ONCE, PAIRS_AT_ONCE = 8, 200
-"""Parts of the work after each of which the progress bar moves."""
+"""Pictures or pairs that one call of COLMAP processes; the progress bar moves after each call."""
 SMALLEST_MODEL = 3
-"""Pictures; COLMAP's own 10 would refuse small sets."""
+"""Least number of pictures in a model; COLMAP's default of 10 would refuse small sets."""
 MOST_MODELS = 5
-"""Disconnected groups that are looked for, for the message that says so."""
+"""Largest number of separate groups of pictures that are reconstructed, for the message that counts them."""
 
 Result = TypeVar("Result")
 Item = TypeVar("Item")
@@ -211,9 +211,9 @@ def options_of_mapping() -> Any:
 
 
 def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[Any]:
-    """Cameras and points of groups of pictures that hang together, the largest group first.
+    """Cameras and points of each connected group of pictures, the largest group first.
 
-    None where no two pictures are fit to begin with.
+    An empty list where no two pictures are fit to begin with.
     """
     pycolmap = load()
     output.mkdir(parents=True, exist_ok=True)

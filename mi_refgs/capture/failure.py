@@ -10,8 +10,8 @@ import numpy as np
 from mi_refgs.errors import InputError
 
 FEW_FEATURES = 60
-"""Of the median picture: a pair needs 15 matches that agree, and a quarter of the features is a good
-share."""
+"""Least number of features of the median picture: a pair needs 15 matches that agree, and a quarter of the
+features is a good share."""
 FLAT_CONTRAST = 0.04
 """Standard deviation of a picture's brightness, 0 … 1, below which it shows one even colour."""
 LEAST_PLACED = 0.5
@@ -20,7 +20,7 @@ TURN_SHARE = 0.8
 """Share of the matched pairs that a turn or a plane explains, from which the camera has probably only
 turned."""
 NAMED = 5
-"""Photographs that a message names."""
+"""Largest number of photographs that a message names."""
 
 
 def check_features(folder: Path, counts: Sequence[int], contrast: float) -> None:

@@ -11,24 +11,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mi_refgs.capture.solved import Solved
-from mi_refgs.data.region import CAMERA_SHARE, REGION_SHARE, Region
+from mi_refgs.data.region import Region, region_radius
 from mi_refgs.errors import InputError
 
 ROUNDS = 50
-"""Of reweighted least squares, which approach the least sum of absolute values."""
+"""Iterations of reweighted least squares, which approach the least sum of absolute values."""
 LEVEL_SPREAD = 0.02
 """Share of the cameras' right-hand directions off their main line below which they fix no plane: ± 8°."""
 AXES_SPREAD = 1e-3
 """Smallest singular value of the mean of I − a aᵀ over view axes a that meet; 0 for parallel ones."""
 SEEN_SHARE = 0.5
-"""Of the cameras in whose picture a point lies: what fewer show is surroundings."""
+"""Share of the cameras whose pictures must show a point; other points are surroundings."""
 REGION_POINTS = 50
-"""Points that place a region; fewer leave it where the view axes meet."""
+"""Number of points that determine the region's radius; with fewer, the cameras alone do."""
 REGION_QUANTILE = 0.9
 """Share of the points around the focus that the region takes in."""
 LEAST_SHARE = 0.5
-"""Of the radius that the cameras suggest, the least of the region: points lie where there is texture, not on
-all of the object."""
+"""Least radius of the region as part of the radius that the cameras suggest: points lie only where the object
+has texture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +101,7 @@ def region_of_interest(solved: Solved) -> Region:
     """
     focus = focus_of(solved)
     distance = np.linalg.norm(solved.origin - focus, axis=1)
-    whole = float(np.median(distance * np.sin(solved.half_angle)))
-    radius = min(REGION_SHARE * whole, CAMERA_SHARE * float(distance.min()))
+    radius = region_radius(distance, solved.half_angle)
     if not radius > 0:
         raise InputError(
             "photographs: a camera stands in the middle of what all look at; walk around an object"

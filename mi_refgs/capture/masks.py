@@ -10,9 +10,7 @@ import numpy as np
 
 from mi_refgs.capture.photographs import Photograph
 from mi_refgs.errors import InputError
-from mi_refgs.images import open_picture
-
-ENDINGS = (".png", ".jpg", ".jpeg")
+from mi_refgs.images import ENDINGS, open_picture
 
 
 def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:

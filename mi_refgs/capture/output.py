@@ -24,7 +24,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.files import replace_file
 
 QUALITY = 95
-"""Of JPEG files: below it, blocks show in what a fit learns."""
+"""Quality of JPEG files; with a lower one, a fit learns the edges of their blocks."""
 WRITERS = 4
 """Pictures that are straightened at once: one of 12 Mpx takes half a gigabyte."""
 SPLINE_PIXELS = 2_000_000

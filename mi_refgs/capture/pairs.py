@@ -10,15 +10,14 @@ import numpy as np
 from scipy.cluster.vq import kmeans2, vq
 
 EXHAUSTIVE = 150
-"""Pictures up to which every pair is matched: 11,175 pairs, some minutes."""
+"""Largest number of pictures of which every pair is matched: 11,175 pairs take some minutes."""
 IN_ORDER = 8
-"""Pictures taken before and after, by name, that are matched in larger sets: an even walk overlaps with
-them."""
+"""In larger sets each picture is matched with this many before and after it in the order of names, which show
+much of the same on a walk around an object."""
 ALIKE = 20
-"""Most similar pictures that are matched in larger sets: they close loops and find what the order does not
-say."""
+"""In larger sets each picture is also matched with this many of the most similar ones, which close loops."""
 WORDS, SAMPLES, ROUNDS = 64, 400, 12
-"""Of the vocabulary, which the set's own features make: its size, features of a picture, rounds of
+"""Size of the vocabulary, number of features of each picture from which it is made, and iterations of
 k-means."""
 
 

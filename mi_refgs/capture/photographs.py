@@ -15,9 +15,8 @@ import numpy as np
 from mi_refgs.data.dataset import MAX_SIZES
 from mi_refgs.errors import InputError
 from mi_refgs.files import replace_file
-from mi_refgs.images import exif_tags, open_picture
+from mi_refgs.images import ENDINGS, exif_tags, open_picture
 
-ENDINGS = (".jpg", ".jpeg", ".png")
 OTHER_ENDINGS = (
     ".heic",
     ".heif",

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import io
 import tempfile
 import time
+import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,18 +24,20 @@ from mi_refgs.files import write_bytes
 from mi_refgs.images import linear_from_srgb, srgb_from_linear, write_png
 
 POINTS_FILE = "points.npz"
-"""In a run's folder: position (P, 3), colour (P, 3) linear."""
+"""File in a run's folder: position (P, 3), colour (P, 3) linear, and key, a hash of their source."""
+DAMAGED = (OSError, ValueError, KeyError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error)
+"""Errors of a file that is missing or damaged."""
 PIXELS = 1600 * 1200
-"""Of a picture in which features are found, at most."""
+"""Largest number of pixels of a picture in which features are found."""
 LEAST_SIDE = 96
-"""Pixels: smaller pictures have too few features to look for them."""
+"""Shortest side, pixels, of pictures in which features are found: smaller ones have too few."""
 CLOSE, APART = 6, range(8, 24, 4)
-"""Views nearest to each that it is matched with: all of the first, and every fourth of some more, whose wider
-baselines place points better. On 43 hand-held pictures 303 pairs give as many points as all 903."""
+"""Each view is matched with its CLOSE nearest views and with some further ones, whose wider baselines place
+points better. On 43 hand-held pictures 303 pairs give as many points as all 903."""
 MIN_LENGTH, MIN_POINTS = 3, 100
-"""Pictures that must have seen a point, unless fewer points than that are left."""
+"""Number of pictures that must have seen a point, and number of points below which two pictures suffice."""
 MAX_ERROR, MIN_ANGLE = 2.0, 1.5
-"""Of a point: mean reprojection error, pixels, and largest angle between its rays, degrees."""
+"""Largest mean reprojection error of a point, pixels, and least angle between its rays, degrees."""
 
 
 def with_points(data: Dataset, folder: Path, tell: Callable[[str], None]) -> PointCloud | None:
@@ -41,14 +47,16 @@ def with_points(data: Dataset, folder: Path, tell: Callable[[str], None]) -> Poi
     kept in `folder` for an interrupted start. `tell` is called with what was done, or what would help.
     """
     enough = len(data.views) >= MIN_LENGTH and min(min(v.width, v.height) for v in data.views) >= LEAST_SIDE
-    if data.points is not None or not enough or all(view.alpha is not None for view in data.views):
+    if data.points is not None or not enough or data.cut_out:
         return data.points
-    kept = folder / POINTS_FILE
-    try:
-        with np.load(kept, allow_pickle=False) as file:
+    kept, key = folder / POINTS_FILE, _key(data)
+    with (
+        contextlib.suppress(*DAMAGED),
+        kept.open("rb") as opened,
+        np.load(opened, allow_pickle=False) as file,
+    ):
+        if file["key"] == key:
             return PointCloud(file["position"], file["colour"])
-    except (OSError, ValueError, KeyError, EOFError):  # missing, or damaged
-        pass
     if not colmap.installed():
         tell('no points to start from; pip install "mi_refgs[capture]" finds some, for better surfaces')
         return None
@@ -62,10 +70,19 @@ def with_points(data: Dataset, folder: Path, tell: Callable[[str], None]) -> Poi
         f"{len(points.position)} points to start from, triangulated in {seconds:.0f} s with the known cameras"
     )
     content = io.BytesIO()
-    np.savez_compressed(content, position=points.position, colour=np.asarray(points.colour))
+    np.savez_compressed(content, key=key, position=points.position, colour=np.asarray(points.colour))
     folder.mkdir(parents=True, exist_ok=True)
     write_bytes(kept, content.getvalue())
     return points
+
+
+def _key(data: Dataset) -> str:
+    """A hash of the folder of a data set, and of the names, sizes and cameras of its views."""
+    key = hashlib.sha256(str(data.path.resolve()).encode(errors="surrogateescape"))
+    for view in data.views:
+        numbers = [view.width, view.height, view.fx, view.fy, view.cx, view.cy, *view.to_world.ravel()]
+        key.update(repr((view.name, [float(number) for number in numbers])).encode(errors="surrogateescape"))
+    return key.hexdigest()
 
 
 def triangulated(data: Dataset) -> PointCloud | None:

@@ -19,9 +19,9 @@ from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.truth_maps import ALPHA, beside, block_mean, shiny_maps, unit
 from mi_refgs.data.view import View
 from mi_refgs.exr import read_exr_image
-from mi_refgs.images import has_alpha, image_size
+from mi_refgs.images import ENDINGS, has_alpha, image_size
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
+SUFFIXES = (*ENDINGS, ".exr")
 """File name endings that `file_path` may carry or leave out, in the order in which they are tried."""
 LENS_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 CAMERA_MODELS = {
@@ -76,7 +76,7 @@ class FrameReader:
             raise InputError(f"{self.transforms}: frames[{index}].file_path: missing; name the picture")
         if self.options.images == "exr":
             return self._path(index, frame, "exr_path") or named.with_name(f"{_stem(named.name)}.exr")
-        candidates = [named.with_name(_stem(named.name) + suffix) for suffix in SUFFIXES[:-1]]
+        candidates = [named.with_name(_stem(named.name) + suffix) for suffix in ENDINGS]
         file = next((c for c in (named, *candidates) if is_file(c)), candidates[0])
         if file.suffix.lower() == ".exr":
             raise InputError(f"{file}: images: the picture is an EXR file; read this data set as 'exr'")

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import inside, is_file
+from mi_refgs.images import ENDINGS
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
-"""Endings of pictures' names, in small letters, in the order in which they are tried."""
 COPIES = (8, 4, 2)
 """Factors by which copies are smaller than the pictures in `images`."""
 IMAGES = "images"
@@ -58,11 +57,11 @@ class PictureFolders:
                 raise InputError(
                     f"{self.root}: {shown(name)} names no file in {folder.name}; move the picture there"
                 )
-            others = (file.with_suffix(ending) for s in SUFFIXES for ending in (s, s.upper()))
+            others = (file.with_suffix(ending) for s in ENDINGS for ending in (s, s.upper()))
             if there := next((f for f in (file, *others) if is_file(f)), None):
                 return there, downscale // factor
         return None
 
 
 def _is_picture(path: Path) -> bool:
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+    return path.suffix.lower() in ENDINGS and not path.name.startswith(".")

@@ -34,12 +34,17 @@ def region_of(views: Sequence[View]) -> Region:
     origins = np.array([view.to_world[:3, 3] for view in views])
     ahead = [float((focus - view.to_world[:3, 3]) @ view.to_world[:3, 2]) > 0 for view in views]
     half_angle = np.array([np.arctan(min(v.width / v.fx, v.height / v.fy) / 2) for v in views])
-    whole = float(np.median(distance * np.sin(half_angle)))
-    radius = min(REGION_SHARE * whole, CAMERA_SHARE * float(distance.min()))
+    radius = region_radius(distance, half_angle)
     if 2 * sum(ahead) <= len(views) or not radius > SMALLEST * float(np.abs(origins).max()):
         raise InputError("views: cameras: they do not look at one point in front of them; give a region.json")
     x, y, z = (float(c) for c in focus)
     return Region((x, y, z), radius)
+
+
+def region_radius(distance: np.ndarray, half_angle: np.ndarray) -> float:
+    """The radius that cameras suggest at distances (V,) from its centre, with half angles of view (V,), radians."""
+    whole = float(np.median(distance * np.sin(half_angle)))
+    return min(REGION_SHARE * whole, CAMERA_SHARE * float(distance.min()))
 
 
 def region_pixels(view: View, region: Region) -> np.ndarray:
