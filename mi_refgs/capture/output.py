@@ -26,7 +26,8 @@ from mi_refgs.files import replace_file
 QUALITY = 95
 """Quality of JPEG files; with a lower one, a fit learns the edges of their blocks."""
 WRITERS = 4
-"""Pictures that are straightened at once: one of 12 Mpx takes half a gigabyte."""
+"""Largest number of pictures that are straightened at once. Peak memory of the process, measured with
+pictures of 12 Mpx of one lens: 0.5 GB with one at once, 1.3 GB with four."""
 SPLINE_PIXELS = 2_000_000
 """Pixels up to which pictures are resampled with cubic splines; larger ones are reduced before a fit sees
 them."""

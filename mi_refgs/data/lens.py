@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from threading import Lock
 
 import numpy as np
 from scipy import ndimage
@@ -25,6 +26,9 @@ ZOOM_STEPS = 30
 """Bisections: 1e-9 of the focal length, 1e-6 pixels."""
 GRID = 65
 """Points along each side at which a zoom is tried; between them an edge's image bends by < 0.01 pixels."""
+ROWS = 64
+"""Rows of a picture whose places in the distorted one are computed together."""
+_lock = Lock()
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,9 @@ class Undistortion:
 
     def resample(self, image: np.ndarray, order: int = 3) -> np.ndarray:
         """An (H, W, C) image seen without the lens; splines of `order`, within the channel's own range."""
-        planes, places = [], _places(self)
+        planes = []
+        with _lock:  # several threads that need the same places would each make them
+            places = _places(self)
         for plane in np.moveaxis(image, -1, 0):
             moved = ndimage.map_coordinates(plane, places, order=order, mode="nearest")
             planes.append(np.clip(moved, plane.min(), plane.max()))
@@ -84,12 +90,16 @@ class Undistortion:
         return fx * x + cx - 0.5, fy * y + cy - 0.5
 
 
-@lru_cache(maxsize=4)
-def _places(straight: Undistortion) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column in the distorted picture, (H, W) each, of every pixel of the result."""
+@lru_cache(maxsize=2)
+def _places(straight: Undistortion) -> np.ndarray:
+    """Row and column in the distorted picture, (2, H, W) float32, of every pixel of the result."""
     width, height = straight.camera[:2]
-    columns, rows = straight.source(*np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)))
-    return rows, columns
+    places = np.empty((2, height, width), dtype=np.float32)
+    for start in range(0, height, ROWS):  # all at once would take ten times the memory
+        rows = np.arange(start, min(start + ROWS, height), dtype=float)
+        columns, lines = straight.source(*np.meshgrid(np.arange(width, dtype=float), rows))
+        places[:, start : start + ROWS] = lines, columns
+    return places
 
 
 @lru_cache(maxsize=4)
