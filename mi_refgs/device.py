@@ -21,15 +21,15 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
     """A flat mi.Float (or another `kind` of DTYPES) with the values, in memory that Dr.Jit has allocated.
 
     `mi.Float(values)` wraps NumPy's memory on the CPU. A kernel reads whole packets of it, and so beyond its
-    end: the process ends where the next page of memory is nobody's. Gathers read single numbers, but several of
-    a mi.Bool. Also, that memory may be aligned to packets or not: each array then has two kernels, and which
-    one a training step needs, and compiles, changes from view to view. Dr.Jit copies arrays of vectors, such as
-    `mi.Point3f(table.T)`, by elements: they need none of this.
+    end: the process ends where the next page of memory is nobody's. Also, that memory may be aligned to
+    packets or not: each array has two kernels, and which one a training step needs, and compiles, changes
+    from view to view. Dr.Jit copies arrays of vectors, such as `mi.Point3f(table.T)`, by elements: they need
+    none of this.
     """
     kind = mi.Float if kind is None else kind
     dtype = {getattr(mi, name): dtype for name, dtype in DTYPES.items()}[kind]
     count = np.size(values)
-    padded = np.zeros(count + LOOK_AHEAD, dtype)
+    padded: np.ndarray = np.zeros(count + LOOK_AHEAD, dtype)
     padded[:count] = np.ravel(values)
     own = dr.empty(kind, count)
     if count:
