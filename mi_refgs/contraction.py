@@ -7,8 +7,13 @@ World positions in scene units. A grid or a random draw in contracted space cove
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from mi_refgs.constants import MAX_NUMBER
+from mi_refgs.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -17,6 +22,22 @@ class Region:
 
     centre: tuple[float, float, float]  # world
     radius: float  # scene units, positive
+
+    @staticmethod
+    def of(content: Any, source: Path) -> Region:
+        """The region {"centre": [x, y, z], "radius": r} of a JSON file `source`.
+
+        Raises InputError for anything else, and for numbers that no scene has.
+        """
+        centre = content.get("centre") if isinstance(content, dict) else None
+        numbers = [*centre, content.get("radius")] if isinstance(centre, list) else []
+        usable = all(type(number) in (int, float) and abs(number) <= MAX_NUMBER for number in numbers)
+        if len(numbers) != 4 or not usable or not numbers[3] >= 1 / MAX_NUMBER:
+            raise InputError(
+                f"{source}: centre, radius: not three numbers and a positive one; correct or remove them"
+            )
+        x, y, z, radius = map(float, numbers)
+        return Region((x, y, z), radius)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Which of the points (N, 3) lie inside: (N,) bool."""

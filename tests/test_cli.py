@@ -23,7 +23,7 @@ from mi_refgs.fit import speed as speeds
 from mi_refgs.fit.train import Trainer
 from mi_refgs.fit.whole import sized
 from mi_refgs.images import read_png, srgb_from_linear, write_png
-from mi_refgs.methods.method import PRESETS
+from mi_refgs.methods.presets import PRESETS
 from mi_refgs.methods.read import load_resolved
 
 COMMANDS = (

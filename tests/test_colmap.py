@@ -15,6 +15,7 @@ from dot_scene import COLOURS, POINTS, Shot, check
 from mi_refgs.data.colmap_model import MODELS, read_cameras, read_images, read_points
 from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
 from mi_refgs.data.lens import Lens
+from mi_refgs.data.region import region_of
 from mi_refgs.errors import InputError
 from mi_refgs.images import box_downscale, linear_from_srgb, read_png, write_png
 
@@ -282,6 +283,17 @@ def test_cameras_that_make_no_sense(line: str, tmp_path: Path) -> None:
     (data / "sparse/0/cameras.txt").write_text(line)
     with pytest.raises(InputError, match=r"cameras\.txt: "):
         read_dataset(data, "test")
+
+
+def test_both_splits_mean_the_region_of_the_training_cameras(tmp_path: Path) -> None:
+    """Also a split of one view, whose camera alone looks at no point."""
+    data = write(tmp_path)
+    train, test = read_dataset(data, "train"), read_dataset(data, "test")
+    assert train.region is not None and test.region == train.region
+    assert train.region == region_of(train.views) != region_of(test.views)
+    (data / "sparse/0/test.txt").write_text("d.png\n")
+    train, test = read_dataset(data, "train"), read_dataset(data, "test")
+    assert len(test.views) == 1 and test.region == train.region == region_of(train.views)
 
 
 def test_a_focal_length_that_no_camera_has(tmp_path: Path) -> None:

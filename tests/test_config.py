@@ -19,7 +19,7 @@ from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.fit import refine
 from mi_refgs.fit.train import Trainer
-from mi_refgs.methods import read
+from mi_refgs.methods.presets import scaled
 from mi_refgs.surfels.table import Surfels
 
 
@@ -79,14 +79,14 @@ def test_a_scaled_window_keeps_its_events(start: int, length: int, every: int, f
     """The k-th event of the file is the k-th of the preset, at its own time times the factor, rounded."""
     until = start + length
     events = [k for k in range(1, until // every + 1) if k * every > start]
-    scaled = read._scale(methods.Window(start, until, every), factor)
+    window = scaled(methods.Window(start, until, every), factor)
     last = math.ceil(factor * until) + 1
-    assert scaled.count(last) == len(events)
-    due = [i for i in range(last + 1) if scaled.due(i)]
+    assert window.count(last) == len(events)
+    due = [i for i in range(last + 1) if window.due(i)]
     if factor * every >= 1:
         np.testing.assert_allclose(due, [factor * every * k for k in events], atol=0.5 + 1e-6)
         expected = [None, *np.diff(due).tolist()]
-        assert [scaled.since(i) for i in due] == expected[: len(due)]
+        assert [window.since(i) for i in due] == expected[: len(due)]
 
 
 MANY_EVENTS = """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,14 +14,19 @@ from tiny_scene import FOCAL, METHOD, SIZE, write_data
 from mi_refgs import methods
 from mi_refgs.cli.train import default_variant
 from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.picture_files import PictureFile
 from mi_refgs.data.readers import PointCloud
 from mi_refgs.data.region import REGION_FILE, Region
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.fit import exchange
 from mi_refgs.fit.initial import initial_parameters, is_open
 from mi_refgs.fit.train import Trainer
+from mi_refgs.fit.whole import begin
 from mi_refgs.images import linear_from_srgb, read_png, write_png
 from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
 from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.run import Run
 from mi_refgs.shade.lobe_matrices import map_directions
 from mi_refgs.surfels.table import Surfels
 
@@ -161,6 +167,29 @@ def test_resume_repeats_a_straight_run_bit_for_bit(data: Dataset, method: Method
     assert len(one["params/surroundings/position"]) != 60  # it was edited
 
 
+def test_a_run_keeps_the_region_that_it_was_started_with(
+    data: Dataset, method: Method, tmp_path: Path
+) -> None:
+    """However region.json is edited: a resumed fit says so, and what evaluates the run goes by its own."""
+    folder, run, said = shutil.copytree(data.path, tmp_path / "data"), Run(tmp_path / "run"), list[str]()
+    begin(method, read_dataset(folder, "train"), run)
+    assert run.region() == REGION
+    begin(method, read_dataset(folder, "train"), run, said.append)
+    assert said == [] and load_split(run, method, "test").region == REGION
+    for text in ('{"centre": [0, 0, 0.1], "radius": 0.7}', '{"centre": [0, 0, 0], "radius": 0.5}', None):
+        (folder / REGION_FILE).unlink()
+        if text is not None:
+            (folder / REGION_FILE).write_text(text)
+        else:
+            (folder / REGION_FILE).symlink_to("nowhere")
+        resumed = begin(method, read_dataset(folder, "train"), run, said.append)
+        assert resumed.data.region == REGION and load_split(run, method, "test").region == REGION
+        assert "region: it has changed" in said.pop() and not said
+    (run.path / "dataset.json").write_text(json.dumps({"path": str(folder), "region": {"radius": 1}}))
+    with pytest.raises(InputError, match=r"dataset\.json: centre, radius"):
+        load_split(run, method, "test")
+
+
 def test_a_fit_of_an_open_scene_improves(data: Dataset, method: Method) -> None:
     """Object, surroundings and background learn; whatever is of alpha has no part in it."""
     trainer = Trainer(replace(method, iterations=100, refine=Refine()), data)
@@ -195,6 +224,13 @@ def test_the_method_for_photographs_is_the_default_without_alpha(
     assert "without alpha" in capsys.readouterr().err
     assert default_variant(write_data(tmp_path, views=3, truth=False)) is None
     assert capsys.readouterr().err == ""
+
+
+def test_the_default_method_is_chosen_without_decoding_pictures(
+    data: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PictureFile, "decode", lambda _: pytest.fail("a picture was decoded"))
+    assert default_variant(data.path) == "photographs"
 
 
 @pytest.mark.parametrize(

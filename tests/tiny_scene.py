@@ -10,7 +10,7 @@ import numpy as np
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.exr import write_exr
 from mi_refgs.images import write_png
-from mi_refgs.methods.method import PRESETS
+from mi_refgs.methods.presets import PRESETS
 from mi_refgs.reference.camera import look_at
 
 SIZE = 20

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs.cli.command import Result, add_command, add_output, add_settings, say, warn
+from mi_refgs.cli.progress import Progress
 from mi_refgs.errors import InputError
 from mi_refgs.resources import resource_dir
 
@@ -24,12 +24,6 @@ DEFAULT_METHOD = "ref_gaussian.toml"
 OPEN_PURPOSE = "photographs"
 """What the method that is fitted to pictures without alpha is for, when none is named."""
 DEFAULT_PRESET = "standard"
-PSNR_MEMORY = 0.9
-"""Share of the old value in the running PSNR of the bar: one view's is up to 5 dB off the mean."""
-FEW_VIEWS = 20
-"""Training views below which surfels overfit; published scenes have 100 and more."""
-TERMINAL_INTERVAL, LOG_INTERVAL = 0.5, 30.0
-"""Seconds between refreshes of the progress bar, in a terminal and in a file."""
 
 EXAMPLE = "refgs train data/glossy -o runs/glossy --preset quick --set loss.alpha=0.1"
 
@@ -103,11 +97,13 @@ def variant_of(variant: str | None, purpose: str | None) -> str | None:
 def default_variant(data_path: Path, assignments: list[str] | None = None) -> str | None:
     """The method for pictures without alpha, where the data set has such; None for the full one."""
     from mi_refgs import methods
+    from mi_refgs.data.picture_store import undecoded
     from mi_refgs.fit.whole import read_views
 
     # What `assignments` say of a method may be of the other one.
     of_data = [text for text in assignments or [] if text.startswith("data.")]
-    views = read_views(load_method(None, None, of_data), data_path, "train", truth=False)
+    with undecoded():
+        views = read_views(load_method(None, None, of_data), data_path, "train", truth=False)
     if views.cut_out or views.region is None:
         return None
     variant = methods.for_purpose(OPEN_PURPOSE)
@@ -190,65 +186,6 @@ def fit(
     return trainer, expected
 
 
-class Progress:
-    """The progress bar on standard error, and the previews; called by the trainer after each step."""
-
-    def __init__(self, trainer: Trainer, folder: Run) -> None:
-        from tqdm import tqdm
-
-        self.folder = folder
-        self.psnr: float | None = None
-        self.bar = tqdm(
-            total=trainer.method.iterations,
-            initial=trainer.iteration,
-            desc=trainer.method.variant,
-            unit="it",
-            file=sys.stderr,
-            dynamic_ncols=True,
-            smoothing=0.05,  # a short memory: the first steps compile kernels
-            mininterval=TERMINAL_INTERVAL if sys.stderr.isatty() else LOG_INTERVAL,
-        )
-
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.close()
-
-    def __call__(self, trainer: Trainer) -> None:
-        method = trainer.method
-        while trainer.notices:
-            warn(trainer.notices.pop(0))
-        if trainer.iteration % method.log_every == 0:
-            # The numbers wait for the device, as the log of this iteration did already.
-            numbers = trainer.statistics()
-            new = float(numbers["psnr"])
-            self.psnr = new if self.psnr is None else PSNR_MEMORY * self.psnr + (1 - PSNR_MEMORY) * new
-            self.bar.set_postfix_str(
-                f"loss {numbers['loss']:.4f}, PSNR {self.psnr:.1f} dB, {numbers['surfels']} surfels",
-                refresh=False,
-            )
-        if trainer.iteration % method.preview_every == 0:
-            self._preview(trainer)
-        self.bar.update(trainer.iteration - self.bar.n)  # a trial is many iterations
-
-    def _preview(self, trainer: Trainer) -> None:
-        """The first training view and the light, as previews/<iteration>.png."""
-        import numpy as np
-
-        from mi_refgs.evaluation import pictures
-        from mi_refgs.images import write_png
-
-        view = trainer.data.views[0]
-        shot = pictures.RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data, view)
-        light = None
-        if trainer.light is not None:
-            radiance = trainer.light.radiance()
-            light = pictures.lights(np.array(radiance, dtype=np.float32).reshape(radiance.shape))
-        image = pictures.sheet([pictures.panels(shot, view)], light)
-        write_png(self.folder.path / "previews" / f"{trainer.iteration:07d}.png", image)
-
-
 def _require_same(
     folder: Run,
     method: Method,
@@ -281,9 +218,10 @@ def _require_same(
 
 def warn_of_data(method: Method, views: Any) -> None:
     """Say what is unusual about a data set."""
-    count = len(views.views)
-    if count < FEW_VIEWS:
-        warn(f"{views.path}: only {count} training views; expect surfaces that fit no others")
+    from mi_refgs.data.survey import few_views
+
+    if note := few_views(len(views.views)):
+        warn(f"{views.path}: {note}")
     if not views.cut_out and (method.surroundings is None or views.region is None):
         warn(
             f"{views.path}: pictures without alpha: surfels start at random, "

@@ -6,6 +6,7 @@ compared with the length of its file before memory is asked for.
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -54,14 +55,9 @@ class Camera:
     def lens(self) -> Lens | None:
         """None for a pinhole; raises InputError without a file's name for coefficients that it cannot have."""
         fisheye = self.model.endswith("FISHEYE")
-        k1, k2, k3, k4, k5, k6, p1, p2 = (
-            self.values.get(name, 0.0) for name in "k1 k2 k3 k4 k5 k6 p1 p2".split()
-        )
-        if not fisheye and (k4 or k5 or k6):
+        if not fisheye and any(self.values.get(name) for name in ("k4", "k5", "k6")):
             raise InputError("k4, k5, k6: a lens with a denominator is unknown here; undistort the pictures")
-        if not (fisheye or any((k1, k2, k3, p1, p2))):
-            return None
-        return Lens(fisheye, (k1, k2, k3, k4) if fisheye else (k1, k2, k3), (p1, p2))
+        return Lens.of(fisheye, self.values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +139,7 @@ def read_images(path: Path) -> list[Image]:
             )
         images.append(Image(name, camera, _rotation(values[:4] / length), values[4:]))
     images.sort(key=lambda image: image.name)
-    if twice := [a.name for a, b in zip(images, images[1:], strict=False) if a.name == b.name]:
+    if twice := [a.name for a, b in itertools.pairwise(images) if a.name == b.name]:
         raise InputError(f"{path}: {shown(twice[0])}: the picture occurs twice; remove one of the two")
     return images
 
@@ -194,7 +190,9 @@ def _text_cameras(lines: Iterator[str]) -> Iterator[tuple[Any, ...]]:
         yield int(camera), model, int(width), int(height), tuple(map(float, values))
 
 
-def _camera(path: Path, number: int, model: str, width: int, height: int, values: tuple[float, ...]) -> Camera:
+def _camera(
+    path: Path, number: int, model: str, width: int, height: int, values: tuple[float, ...]
+) -> Camera:
     field = f"{path}: camera {number}"
     if model not in MODELS:
         raise InputError(

@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.errors import InputError
-from mi_refgs.data.region import Region, read_region, region_of
+from mi_refgs.data.picture_store import undecoded
 from mi_refgs.data.readers import PointCloud, ReadOptions, reader_of
+from mi_refgs.data.region import Region, read_region, region_of
 from mi_refgs.data.view import View
+from mi_refgs.errors import InputError
 
 EXTENT_MARGIN = 1.1
 """Scene extent over the largest distance of a training camera to their mean (3DGS)."""
@@ -40,7 +41,7 @@ class Dataset:
     linear: bool  # as in View
     environment: Path | None  # ground truth of the light: lat-long EXR in Mitsuba's orientation
     points: PointCloud | None = None  # on what is seen, where the data set has some
-    region: Region | None = None  # of interest; absent where alpha says what belongs to the object
+    region: Region | None = None  # of interest, of all splits; absent where alpha says what is the object's
     notes: tuple[str, ...] = ()  # as in Recording
 
     @property
@@ -71,7 +72,8 @@ def read_dataset(
     `downscale` averages blocks of so many pixels squared, colour premultiplied by alpha; without it pictures
     are read whole. Pixels at the right and the bottom that fill no block are left out. Where the data set
     names no test views, every eighth picture, in the order of their paths, is one and no training view.
-    `truth` reads normals, depth and materials where there are any.
+    `truth` reads normals, depth and materials where there are any. The region of interest is what region.json
+    says; without it, and without alpha, what the training cameras look at, for every split.
 
     Raises InputError for anything missing, unreadable or inconsistent: file, field and remedy are named.
     """
@@ -96,10 +98,12 @@ def read_dataset(
     near = NEAR_EXTENTS * _extent(views)
     views = tuple(view.changed(near=near) for view in views)
     colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
-    region = found.region or read_region(path)
+    region = read_region(path)
     if region is None and not all(view.cut_out for view in views):
-        with contextlib.suppress(InputError):  # views that share no point have none
-            region = region_of(views)
+        with contextlib.suppress(InputError), undecoded():  # views that share no point have none
+            # Every split has that of the training cameras: a fit and its evaluation mean the same sphere.
+            training = views if split == "train" else _training_views(path, options)
+            region = region_of(training)
     linear = images == "exr"
     return Dataset(path, split, views, colour, linear, found.environment, found.points, region, found.notes)
 
@@ -114,6 +118,10 @@ def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, 
     while factor < min(width, height) and (width // factor) * (height // factor) > pixels:
         factor += 1
     return factor, width, height
+
+
+def _training_views(path: Path, options: ReadOptions) -> tuple[View, ...]:
+    return reader_of(path).read(path, "train", replace(options, truth=False)).views
 
 
 def _extent(views: tuple[View, ...]) -> float:

@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
-from mi_refgs.errors import InputError, shown
-from mi_refgs.files import inside, is_file
-from mi_refgs.data.lens import Lens, Undistortion
+from mi_refgs.data.lens import COEFFICIENTS, Lens, Undistortion
 from mi_refgs.data.picture_files import Mask, PictureFile, make_view
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.truth_maps import ALPHA, beside, block_mean, shiny_maps, unit
 from mi_refgs.data.view import View
+from mi_refgs.errors import InputError, shown
 from mi_refgs.exr import read_exr_image
+from mi_refgs.files import inside, is_file
 from mi_refgs.images import ENDINGS, has_alpha, image_size
 
 SUFFIXES = (*ENDINGS, ".exr")
 """File name endings that `file_path` may carry or leave out, in the order in which they are tried."""
-LENS_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 CAMERA_MODELS = {
     **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), False),
     **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), True),
@@ -164,16 +163,14 @@ class FrameReader:
                 "undistort the pictures, or give OpenCV's perspective or fisheye coefficients"
             )
         fisheye = fisheye or CAMERA_MODELS[model]
-        k1, k2, k3, k4, p1, p2 = (self._number(frame, key) or 0.0 for key in LENS_KEYS)
-        if (p1 or p2) if fisheye else k4:
+        given = {key: self._number(frame, key) or 0.0 for key in COEFFICIENTS}
+        if (given["p1"] or given["p2"]) if fisheye else given["k4"]:
             field, kind = ("p1, p2", "fisheye") if fisheye else ("k4", "perspective")
             raise InputError(
                 f"{self.transforms}: {field}: a {kind} lens has none here; undistort the pictures, "
                 "or set it to 0"
             )
-        if not (fisheye or any((k1, k2, k3, p1, p2))):
-            return None
-        return Lens(fisheye, (k1, k2, k3, k4) if fisheye else (k1, k2, k3), (p1, p2))
+        return Lens.of(fisheye, given)
 
     def _intrinsics(
         self, frame: dict[str, Any], file: Path, height: int, width: int

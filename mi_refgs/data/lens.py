@@ -11,6 +11,7 @@ and to the pixel (fx x' + cx, fy y' + cy), where the centre of the first pixel i
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
@@ -20,6 +21,7 @@ from scipy import ndimage
 
 from mi_refgs.errors import InputError
 
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 MAX_ZOOM = 2.0
 """Factor of the focal length beyond which less than a quarter of the picture would be left."""
 ZOOM_STEPS = 30
@@ -38,6 +40,14 @@ class Lens:
     fisheye: bool
     radial: tuple[float, ...]  # k1, k2, k3, k4; a perspective lens has no k4
     tangential: tuple[float, float] = (0.0, 0.0)  # p1, p2
+
+    @staticmethod
+    def of(fisheye: bool, given: Mapping[str, float]) -> Lens | None:
+        """The lens of coefficients by their names, which are 0 where absent; None for a pinhole."""
+        k1, k2, k3, k4, p1, p2 = (given.get(name, 0.0) for name in COEFFICIENTS)
+        if not (fisheye or any((k1, k2, k3, p1, p2))):
+            return None
+        return Lens(fisheye, (k1, k2, k3, k4) if fisheye else (k1, k2, k3), (p1, p2))
 
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where a pinhole's image points x, y (one unit before the eye) land, in the same unit."""

@@ -6,8 +6,10 @@ where pixels were averaged or resampled, so a picture is the same however often 
 
 from __future__ import annotations
 
+import contextlib
 import weakref
 from collections import OrderedDict
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,6 +54,16 @@ class PictureStore:
 
 STORE = PictureStore()
 """The pictures of this process."""
+
+
+@contextlib.contextmanager
+def undecoded() -> Iterator[None]:
+    """Within it, data sets are read without decoding pictures."""
+    budget, STORE.budget = STORE.budget, 0
+    try:
+        yield
+    finally:
+        STORE.budget = budget
 
 
 class Picture:

@@ -13,7 +13,6 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from mi_refgs.data.region import Region
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
@@ -47,7 +46,6 @@ class Recording:
 
     views: tuple[View, ...]
     points: PointCloud | None = None
-    region: Region | None = None  # of interest, where the data set says one
     environment: Path | None = None  # ground truth of the light: lat-long EXR in Mitsuba's orientation
     source: Path | None = None  # the file that lists the views, for messages
     notes: tuple[str, ...] = ()  # what a person may want to mend, such as pictures without a camera

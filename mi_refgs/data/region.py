@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.contraction import Region as Region
 from mi_refgs.data.hull import view_focus
 from mi_refgs.data.view import View
@@ -68,13 +67,4 @@ def read_region(folder: Path) -> Region | None:
     path = folder / REGION_FILE
     if not path.is_file():
         return None
-    content = read_json(path)
-    centre = content.get("centre")
-    numbers = [*centre, content.get("radius")] if isinstance(centre, list) else []
-    usable = all(type(number) in (int, float) and abs(number) <= MAX_NUMBER for number in numbers)
-    if len(numbers) != 4 or not usable or not numbers[3] >= 1 / MAX_NUMBER:
-        raise InputError(
-            f"{path}: centre, radius: not three numbers and a positive one; correct them, or remove the file"
-        )
-    x, y, z, radius = map(float, numbers)
-    return Region((x, y, z), radius)
+    return Region.of(read_json(path), path)

@@ -114,12 +114,21 @@ def survey(folder: Path) -> Survey:
     return Survey(**{**vars(found), "missing": (*missing, *_unusual(found, train))})
 
 
+def few_views(count: int) -> str | None:
+    """What to say of so many training views, if they are few."""
+    return f"only {count} training views; expect surfaces that fit no others" if count < FEW_VIEWS else None
+
+
 def require_several_sides(data: Dataset) -> None:
     """Raise InputError for views that stand in one place: they show no shape."""
     origins = np.array([view.to_world[:3, 3] for view in data.views])
     spread = np.linalg.norm(origins - origins.mean(axis=0), axis=1).max()
     if spread <= SAME_PLACE * max(1.0, float(np.abs(origins).max())):
-        kind = "a lone training view shows" if len(origins) == 1 else "all training views stand in one place and show"
+        kind = (
+            "a lone training view shows"
+            if len(origins) == 1
+            else "all training views stand in one place and show"
+        )
         raise InputError(f"{data.path}: cameras: {kind} no shape; add pictures from other sides")
 
 
@@ -129,8 +138,8 @@ def _unusual(found: Survey, train: Dataset) -> list[str]:
         require_several_sides(train)
     except InputError as error:
         notes.append(str(error).partition(": cameras: ")[2])
-    if 1 < found.views["train"] < FEW_VIEWS:
-        notes.append(f"only {found.views['train']} training views; expect surfaces that fit no others")
+    if found.views["train"] > 1 and (few := few_views(found.views["train"])):
+        notes.append(few)
     if found.alpha == "none":
         notes.append("no alpha: what surrounds the object is fitted, too; masks would leave it out")
         if found.region is None:

@@ -20,7 +20,7 @@ from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.exr import read_exr_image
 from mi_refgs.files import read_json
 from mi_refgs.fit.exposure import EXPOSURE_FILE, with_gain
-from mi_refgs.fit.whole import read_views
+from mi_refgs.fit.whole import of_run, read_views
 from mi_refgs.images import write_png
 from mi_refgs.methods.method import Method
 from mi_refgs.render.samples import samples_per_axis
@@ -41,7 +41,8 @@ LIGHT_KEYS = ("env_scale", "env_mae", "env_psnr", "env_correlation")
 def load_split(run: Run, method: Method, split: str, path: Path | None = None) -> Dataset:
     """A split of the data set that a run was fitted to, or of the one at `path`, read as the method says.
 
-    Raises InputError as `read_dataset` does, and if the run does not say where its data is or it is gone.
+    Its region of interest is the run's. Raises InputError as `read_dataset` and `Run.region` do, and if the
+    run does not say where its data is or it is gone.
     """
     if path is None:
         try:
@@ -55,7 +56,7 @@ def load_split(run: Run, method: Method, split: str, path: Path | None = None) -
             raise InputError(
                 f"{run.path / 'dataset.json'}: path: {path} is gone; name the data set's folder with --data"
             )
-    return read_views(method, path, split)
+    return of_run(run, read_views(method, path, split))
 
 
 def evaluate(
@@ -156,7 +157,7 @@ def evaluate(
     for name in ("flip", "lpips"):
         result[f"{name}_reason"] = per_view[0][f"{name}_reason"] or None
     result["region_reason"] = (
-        None if result["psnr_region"] is not None else "the data set has alpha and no region of interest"
+        None if result["psnr_region"] is not None else "the data set has no region of interest"
     )
     result["normal_reason"] = (
         None if result["normal_mae_deg"] is not None else "the data set has no true normals"

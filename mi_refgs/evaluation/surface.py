@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 
 from mi_refgs.data.settings import SURFACE
 from mi_refgs.data.view import View
-from mi_refgs.device import upload
 from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
 from mi_refgs.shade.ambient import ambient_direction
@@ -66,7 +65,7 @@ class TrueSurface:
         if view.depth is None or view.normal is None:
             return None
         camera = view.camera()
-        depth = upload(view.depth)
+        depth = mi.Float(view.depth.ravel())
         point = mi.Point3f(camera.origin + camera.rays() * depth)
         open_ = openness(self.occluder, point, mi.Vector3f(view.normal.reshape(-1, 3).T), depth > 0)
         return (open_.numpy().reshape(view.depth.shape) < CONCAVE_BELOW) & (view.depth > 0)
@@ -113,7 +112,7 @@ def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> d
     centre = (corners.min(0) + corners.max(0)) / 2
     radius = np.linalg.norm(corners - centre, axis=1).max()
     percent = 100 / (2 * radius)
-    if views and views[0].alpha is None:
+    if views and not views[0].cut_out:
         mesh = _cut(mesh, centre, NEAR_TRUTH * radius)
         if not len(mesh.faces):
             return {}
@@ -157,7 +156,7 @@ def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.nda
             at = np.clip(at, 0, np.array([[view.height - 1], [view.width - 1]]))
             better &= view.covered()[*at] > 0
         start = mi.Point3f(np.tile(origin, (len(ray), 1)).T)
-        hit, stopped = occluder.first_hit(start, mi.Vector3f(ray.T), upload(better, mi.Bool))
+        hit, stopped = occluder.first_hit(start, mi.Vector3f(ray.T), mi.Bool(better))
         # In lengths of the ray: what stands in the way does so by more than rays are moved off a surface.
         margin = 1 - OFFSET_VOXELS * mesh.voxel / reach
         better &= ~stopped.numpy() | (hit.numpy() > margin)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 
 from mi_refgs.data.picture_store import BUDGET as PICTURE_BYTES
-from mi_refgs.data.picture_store import STORE
+from mi_refgs.data.picture_store import undecoded
 from mi_refgs.fit.speed import Speed, speed_of
 from mi_refgs.fit.targets import BUDGET as TARGET_BYTES
 from mi_refgs.fit.targets import PIXEL_BYTES
 from mi_refgs.fit.whole import read_views, sized
-from mi_refgs.methods.method import PRESETS, Method
+from mi_refgs.methods.method import Method
+from mi_refgs.methods.presets import PRESETS
 
 LEAST = 96
 """Pixels of the shorter side that no data set is read smaller than: what is left shows no surface."""
@@ -74,7 +73,7 @@ def planned(
     width, height = first.width, first.height
     if method.iterations * width * height < WORTH:
         return (whole if method.data.downscale is None else method), None
-    cut_out = all(view.cut_out for view in data.views)
+    cut_out = data.cut_out
     speed = speed_of(method, cut_out)
 
     def at(factor: int) -> Estimate:
@@ -134,13 +133,3 @@ def _blocks(method: Method, begin: int, end: int) -> list[tuple[int, int]]:
         for first, last in zip([begin, *ends], ends, strict=False)
         if last > first
     ]
-
-
-@contextlib.contextmanager
-def undecoded() -> Any:
-    """Within it, data sets are read without decoding pictures."""
-    budget, STORE.budget = STORE.budget, 0
-    try:
-        yield
-    finally:
-        STORE.budget = budget

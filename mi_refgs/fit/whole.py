@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from mi_refgs.capture.triangulate import with_points
 from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
 from mi_refgs.data.survey import require_several_sides
@@ -14,9 +16,13 @@ from mi_refgs.fit.exposure import EXPOSURE_FILE
 from mi_refgs.fit.select import DECISIONS, select_terms, with_terms
 from mi_refgs.fit.state import decisions_of
 from mi_refgs.fit.train import Trainer
-from mi_refgs.methods.method import PRESETS, Method
+from mi_refgs.methods.method import Method
+from mi_refgs.methods.presets import PRESETS
 from mi_refgs.runs.export import up_to_date
 from mi_refgs.runs.run import Run
+
+SAME_REGION = 1e-6
+"""Difference of two regions, in radii, up to which they are the same: solvers differ in the last digits."""
 
 
 def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> Method:
@@ -57,11 +63,12 @@ def begin(method: Method, views: Dataset, run: Run, tell: Callable[[str], None] 
     """A trainer that writes into `run`: from its newest checkpoint if the folder holds a run, else anew.
 
     A new fit of pictures without alpha looks for points to start from where the data set has none. `tell` is
-    called with what is found, and what is decided about the terms of a method that selects them. Raises
-    InputError for cameras that all stand in one place, checkpoints that are all damaged and a folder that
-    cannot be written.
+    called with what is found, and what is decided about the terms of a method that selects them. A run that
+    is resumed keeps its region of interest. Raises InputError for cameras that all stand in one place,
+    checkpoints that are all damaged and a folder that cannot be written.
     """
     resumed = run.exists()
+    views = of_run(run, views, tell)
     state = run.load_checkpoint() if resumed else None
     if state is not None:
         method = with_terms(method, decisions_of(state))
@@ -75,9 +82,26 @@ def begin(method: Method, views: Dataset, run: Run, tell: Callable[[str], None] 
     if resumed:
         run.rewind(trainer.iteration)
     else:
-        run.create(method, str(views.path.resolve()))
+        run.create(method, str(views.path.resolve()), views.region)
     select_terms(trainer, tell)
     return trainer
+
+
+def of_run(run: Run, views: Dataset, tell: Callable[[str], None] = lambda _: None) -> Dataset:
+    """The views with the region of interest that the run was started with, where it records one.
+
+    `tell` is called if the data set has another one. Raises InputError as `Run.region` does.
+    """
+    region = run.region()
+    if region is None:
+        return views
+    now = views.region
+    change = (
+        np.inf if now is None else np.subtract((*now.centre, now.radius), (*region.centre, region.radius))
+    )
+    if np.abs(change).max() > SAME_REGION * region.radius:
+        tell(f"{views.path}: region: it has changed since {run.path} was started, which keeps its own")
+    return replace(views, region=region)
 
 
 def finish(trainer: Trainer, run: Run) -> str | None:

@@ -1,6 +1,7 @@
 """A method as data: what the TOML files of `variants/` say, read strictly, scaled to a preset."""
 
-from mi_refgs.methods.method import PRESETS, LightOptions, Method, Refine, Stage, SurfelOptions
+from mi_refgs.methods.method import LightOptions, Method, Refine, Stage, SurfelOptions
+from mi_refgs.methods.presets import PRESETS
 from mi_refgs.methods.read import dump, for_purpose, load, load_resolved, names
 from mi_refgs.methods.weights import LossWeights
 from mi_refgs.methods.window import Window

@@ -276,25 +276,3 @@ class Method:
     def stage_at(self, iteration: int) -> tuple[str, Stage]:
         """The stage a (1-based) iteration belongs to."""
         return next((item for item in self.stages() if iteration <= item[1].until), self.stages()[-1])
-
-
-@dataclass(frozen=True)
-class Preset:
-    """How long to run, and how large to grow."""
-
-    iterations: int
-    surfels: int
-    max_surfels: int
-    pixels: (
-        int  # of a picture; larger ones are read smaller where methods are compared, or nothing is promised
-    )
-    minutes: float | None = None  # that a fit takes at most, on two cores; larger pictures are read smaller
-
-
-# About 4 and 11 minutes for 200² pictures on one AVX-512 core; the last follows from these. A step of 256²
-# pixels takes 1.14 times as long as one of 200², one of 400² 1.9 times; the paper's pictures have 800².
-PRESETS = {
-    "quick": Preset(2_000, 15_000, 20_000, 256 * 256, 5.0),
-    "standard": Preset(4_000, 25_000, 40_000, 256 * 256, 30.0),
-    "paper": Preset(50_000, 30_000, 100_000, 800 * 800),
-}

@@ -6,7 +6,6 @@ No other module opens a TOML file, and none contains a method's name.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,8 +16,8 @@ import tomli_w
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import is_file
 from mi_refgs.methods.build import build, plain
-from mi_refgs.methods.method import LIGHT, PRESETS, Method, Selection, Term
-from mi_refgs.methods.window import Window
+from mi_refgs.methods.method import LIGHT, Method, Selection, Term
+from mi_refgs.methods.presets import PRESETS, scaled
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.resources import resource_dir
 from mi_refgs.shade.envmap import MIN_HEIGHT, is_height
@@ -27,10 +26,6 @@ from mi_refgs.surfels.channels import CHANNELS
 
 MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
-
-# Fields that count iterations, and so scale with the preset, as windows do.
-_SCALED = {"iterations", "until", "normal_start", "normal_rise", "half_metal_start", "half_metal_rise"}
-_SCALED |= {"smooth_until", "hold", "after", "trial"}
 
 
 def load(
@@ -51,7 +46,7 @@ def load(
         table = _with_term(table, name, path)
     chosen = PRESETS[preset]
     method = build(Method, table, str(path))
-    method = _scale(method, chosen.iterations / method.iterations)
+    method = scaled(method, chosen.iterations / method.iterations)
     table = plain(method)
     for name in ("surfels", "surroundings"):
         if name in table:
@@ -282,19 +277,3 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
             raise InputError(f"--set: {key}: '{parent}' is not a table; check the key")
         table = inner
     table[last] = value
-
-
-def _scale(value: Any, factor: float, key: str = "") -> Any:
-    """Scale every field that counts iterations: windows exactly, others to a whole number of at least 1."""
-    if isinstance(value, dict):
-        return {name: _scale(inner, factor) for name, inner in value.items()}
-    if isinstance(value, tuple):
-        return tuple(_scale(inner, factor) for inner in value)
-    if isinstance(value, Window):
-        return Window(factor * value.start, factor * value.until, factor * value.every)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: _scale(getattr(value, f.name), factor, f.name) for f in dataclasses.fields(value)}
-        return dataclasses.replace(value, **fields)
-    if key in _SCALED:
-        return max(round(value * factor), 1) if value > 0 else value
-    return value

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_refgs.contraction import Region
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.pathtrace import poses_around
 from mi_refgs.data.view import View
@@ -90,7 +91,8 @@ def relight(
         raise InputError(f"{run.path}: {error}") from error
     name = light.path.parent.name if known is not None else light.path.stem
     out = run.path / "relight" / f"{name}{light.suffix}" if out is None else out
-    shot = turntable_views(scene, views.views, turntable) if turntable else views.views
+    region = None if fitted.surroundings is None else views.region
+    shot = turntable_views(scene, views.views, turntable, region) if turntable else views.views
     kind = "turntable" if turntable else "test"
     _prepare(out, kind)
     export(scene, out, shot[0].camera())
@@ -125,10 +127,18 @@ def relight(
     return Relit(result, warning)
 
 
-def turntable_views(scene: TrainedScene, views: Sequence[View], count: int) -> list[View]:
-    """Cameras on a circle around the object, z up, like the views in lens, distance and (median) height."""
-    position = scene.surfels.position().numpy().T if scene.mesh is None else scene.mesh.vertices
-    centre = (position.min(axis=0) + position.max(axis=0)).astype(np.float64) / 2
+def turntable_views(
+    scene: TrainedScene, views: Sequence[View], count: int, region: Region | None = None
+) -> list[View]:
+    """Cameras on a circle around the object, z up, like the views in lens, distance and (median) height.
+
+    The object is what lies in the `region`; without one, all of the scene.
+    """
+    if region is not None:
+        centre = np.array(region.centre)
+    else:
+        position = scene.surfels.position().numpy().T if scene.mesh is None else scene.mesh.vertices
+        centre = (position.min(axis=0) + position.max(axis=0)).astype(np.float64) / 2
     offset = np.array([view.to_world[:3, 3] for view in views]) - centre
     distance = float(np.median(np.linalg.norm(offset, axis=1)))
     height = float(np.median(offset[:, 2] / np.linalg.norm(offset, axis=1)))

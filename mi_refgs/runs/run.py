@@ -11,17 +11,21 @@ import json
 import math
 import sys
 import tempfile
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mi_refgs.contraction import Region
 from mi_refgs.errors import InputError
 from mi_refgs.files import cannot_write, read_json, remove_temporaries, write_bytes, write_json
-from mi_refgs.runs import checkpoint
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
+from mi_refgs.runs import checkpoint
 
+DATASET = "dataset.json"
+"""What the run is fitted to: the data set's folder and its region of interest."""
 LOG = "metrics.jsonl"
 """The log of training; another log of a run is another .jsonl."""
 CHECKPOINTS_KEPT = 2
@@ -45,11 +49,17 @@ class Run:
                 f"{self.path}: holds a run already; add --resume to go on with it, or choose another -o"
             )
 
-    def create(self, method: Method, dataset: str) -> None:
-        """Start a run; raises InputError if the folder holds one already or cannot be written."""
+    def create(self, method: Method, dataset: str, region: Region | None = None) -> None:
+        """Start a run on the data set in folder `dataset`, with this region of interest if there is one.
+
+        Raises InputError if the folder holds one already or cannot be written.
+        """
         self.require_none()
         self._make_folders()
-        write_bytes(self.path / "dataset.json", json.dumps({"path": dataset}).encode())
+        record: dict[str, Any] = {"path": dataset}
+        if region is not None:
+            record["region"] = asdict(region)
+        write_bytes(self.path / DATASET, json.dumps(record).encode())
         self.write_method(method)
 
     def write_method(self, method: Method) -> None:
@@ -66,7 +76,16 @@ class Run:
 
     def dataset(self) -> Path:
         """Folder of the data set that the run was fitted to."""
-        return Path(read_json(self.path / "dataset.json")["path"])
+        return Path(read_json(self.path / DATASET)["path"])
+
+    def region(self) -> Region | None:
+        """The region of interest that the run was started with; None where it records none.
+
+        Raises InputError for one that cannot be used.
+        """
+        record = self.path / DATASET
+        found = read_json(record).get("region") if record.is_file() else None
+        return None if found is None else Region.of(found, record)
 
     # ---------------- checkpoints ----------------
 
