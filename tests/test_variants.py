@@ -109,11 +109,12 @@ DIFFERENCES: dict[str, set[str]] = {
     "auto": {"select"},
     "photographs": {
         "loss.normal_rise",
+        "loss.smooth",
+        "loss.smooth_until",
         "mesh.extract",
         "refine.reset",
         "refine.reset_raise",
-        "stage.initial",
-        "stage.radiance",
+        "surfels.initial",
     },
     "relighting": {
         "loss.half_metal",
