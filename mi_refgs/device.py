@@ -11,7 +11,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-
 LOOK_AHEAD = 64
 """Elements by which kernels read beyond the last one of an array, at most: a packet of the widest machine."""
 
@@ -21,8 +20,8 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
 
     `mi.Float(values)` wraps NumPy's memory on the CPU. A kernel reads whole packets of it, and so beyond its
     end: the process ends where the next page of memory is nobody's. Also, that memory may be aligned to
-    packets or not: each array then has two kernels, and which one a training step needs, and compiles, changes
-    from view to view.
+    packets or not: each array then has two kernels, and which one a training step needs, and compiles,
+    changes from view to view.
     """
     kind = mi.Float if kind is None else kind
     dtype = np.uint32 if kind is mi.UInt32 else np.float32

@@ -1,8 +1,9 @@
-"""Arrays in untrusted pickle files: nothing of the file is called, only arrays of plain numbers are made of it.
+"""Arrays in untrusted pickle files: nothing in the file is called, and only arrays of plain numbers result.
 
-A pickle is a program. Here its instructions are compared with a list first; the few names of NumPy that it may ask
-for become records of what was asked; and the arrays are made of these records, after checks of our own. A value is
-hashed, compared or shown only after its type is known: tuples that share their parts take exponential time.
+A pickle is a program. Here its instructions are compared with a list first; the few names of NumPy that it
+may ask for become records of what was asked; and the arrays are made of these records, after checks of our
+own. A value is hashed, compared or shown only after its type is known: tuples that share their parts take
+exponential time.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ CODES = {"f4", "f8", "i4", "i8"}
 INSTRUCTIONS = {
     *"PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE MEMOIZE PUT BINPUT LONG_BINPUT".split(),
     *"GET BINGET LONG_BINGET INT BININT BININT1 BININT2 LONG LONG1 FLOAT BINFLOAT STRING BINSTRING".split(),
-    *"SHORT_BINSTRING BINBYTES SHORT_BINBYTES UNICODE BINUNICODE SHORT_BINUNICODE LIST EMPTY_LIST APPEND".split(),
-    *"APPENDS TUPLE EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3 GLOBAL STACK_GLOBAL REDUCE BUILD".split(),
+    *"SHORT_BINSTRING BINBYTES SHORT_BINBYTES UNICODE BINUNICODE SHORT_BINUNICODE LIST EMPTY_LIST".split(),
+    *"APPEND APPENDS TUPLE EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3 GLOBAL STACK_GLOBAL REDUCE BUILD".split(),
 }
 
 
@@ -86,7 +87,7 @@ def read_arrays(path: Path) -> list[np.ndarray]:
 
 
 def _check(data: bytes) -> None:
-    """Raise ValueError for an instruction that arrays do not need, and for places that memory does not have."""
+    """Raise ValueError for an instruction that arrays do not need, and for places beyond memory."""
     for instruction, argument, _ in pickletools.genops(io.BytesIO(data)):
         if instruction.name not in INSTRUCTIONS:
             raise ValueError(f"it has the instruction {instruction.name}")

@@ -1,9 +1,9 @@
 """COLMAP's layout: a reconstruction in `sparse/0`, as text or binary, and pictures in `images`.
 
-The folders `images_2`, `images_4` and `images_8` may hold smaller copies, as in the scenes of Ref-Real and Mip-NeRF
-360; `masks` may hold what belongs to the object, as NAME.png, with the picture's ending before or without. Every eighth
-picture in the order of names is a test view, unless `test.txt` beside the reconstruction lists the names of those,
-one a line, as 3D Gaussian Splatting reads it.
+The folders `images_2`, `images_4` and `images_8` may hold smaller copies, as in the scenes of Ref-Real and
+Mip-NeRF 360; `masks` may hold what belongs to the object, as NAME.png, with the picture's ending before or
+without. Every eighth picture in the order of names is a test view, unless `test.txt` beside the
+reconstruction lists the names of those, one a line, as 3D Gaussian Splatting reads it.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ ENDINGS = ("bin", "txt")
 MASKS = "masks"
 TEST_LIST = "test.txt"
 MIN_VIEWS, MAX_ERROR = 3, 2.0
-"""A point that two pictures show lies anywhere along a line for a single wrong match; errors beyond 2 pixels mean
-such a match."""
+"""A point that two pictures show lies anywhere along a line for a single wrong match; errors beyond 2 pixels
+mean such a match."""
 MIN_POINTS = 100
 """Points below which none is left out."""
 
@@ -147,7 +147,9 @@ class Reconstruction:
             file = inside(self.masks, candidate)
             if file is not None and is_file(file):
                 return Mask(file)
-        raise InputError(f"{self.masks / (name + '.png')}: mask: missing; add it, or remove the folder of masks")
+        raise InputError(
+            f"{self.masks / (name + '.png')}: mask: missing; add it, or remove the folder of masks"
+        )
 
 
 def _model(folder: Path) -> tuple[Path, str] | None:

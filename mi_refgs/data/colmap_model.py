@@ -1,7 +1,7 @@
 """COLMAP's files of a reconstruction: cameras, images and points3D, as text or binary.
 
-Read here, not by COLMAP's own library, which is large and trusts what a file promises. Every number of records is
-compared with the length of its file before memory is asked for.
+Read here, not by COLMAP's own library, which is large and trusts what a file promises. Every number of
+records is compared with the length of its file before memory is asked for.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Camera:
         return v.get("fx", v.get("f", 0.0)), v.get("fy", v.get("f", 0.0)), v["cx"], v["cy"]
 
     def lens(self) -> Lens | None:
-        """None for a pinhole; raises InputError without a file's name for coefficients that it cannot have."""
+        """None for a pinhole; raises InputError without a file's name for impossible coefficients."""
         fisheye = self.model.endswith("FISHEYE")
         if not fisheye and any(self.values.get(name) for name in ("k4", "k5", "k6")):
             raise InputError("k4, k5, k6: a lens with a denominator is unknown here; undistort the pictures")
@@ -122,20 +122,21 @@ class Cursor:
 
 
 def read_cameras(path: Path) -> dict[int, Camera]:
-    """The cameras by their number; raises InputError for a file of no use and for a lens that is unknown here."""
+    """The cameras by their number; raises InputError for an unusable file and for an unknown lens."""
     rows = _rows(path, _binary_cameras, _text_cameras)
     return {number: _camera(path, number, *rest) for number, *rest in rows}
 
 
 def read_images(path: Path) -> list[Image]:
-    """The pictures in the order of their names; raises InputError for a file of no use."""
+    """The pictures in the order of their names; raises InputError for a file that cannot be used."""
     images = []
     for name, camera, quaternion, translation in _rows(path, _binary_images, _text_images):
         values = np.array([*quaternion, *translation], dtype=np.float64)
         length = float(np.linalg.norm(values[:4])) if np.abs(values).max() <= MAX_NUMBER else 0.0
         if not length > 0:
             raise InputError(
-                f"{path}: {shown(name)}: the pose has no usable numbers; remove the picture, or reconstruct again"
+                f"{path}: {shown(name)}: the pose has no usable numbers; remove the picture, or "
+                "reconstruct again"
             )
         images.append(Image(name, camera, _rotation(values[:4] / length), values[4:]))
     images.sort(key=lambda image: image.name)
@@ -145,7 +146,7 @@ def read_images(path: Path) -> list[Image]:
 
 
 def read_points(path: Path) -> Points:
-    """The points; those without usable numbers are left out. Raises InputError for a file of no use."""
+    """The points but those without usable numbers; raises InputError for an unusable file."""
     table = np.array([*_rows(path, _binary_points, _text_points)], dtype=np.float64).reshape(-1, 8)
     table = table[(np.abs(table[:, :3]) <= MAX_NUMBER).all(axis=1)]
     colour = np.clip(table[:, 3:6], 0, 255).astype(np.uint8)

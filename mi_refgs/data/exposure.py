@@ -1,4 +1,4 @@
-"""Exposure and white balance of pictures: what EXIF says of them, and the gain that brings a render to one."""
+"""Exposure and white balance of pictures: what EXIF says, and gains that fit a render to a picture."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ MAX_GAIN = 16.0
 def log_exposure(path: Path) -> float | None:
     """log(time · ISO / f-number²) from the EXIF data of a picture; None where it does not say all three.
 
-    The values of a sensor are proportional to its exponential. Raises InputError for a file that is no picture.
+    The values of a sensor are proportional to its exponential. Raises InputError for a file that is no
+    picture.
     """
     if path.suffix.lower() == ".exr":
         return None

@@ -1,14 +1,14 @@
-"""NeRO's Glossy Synthetic: for every i a picture `i.png`, its depth `i-depth.png` and its camera `i-camera.pkl`.
+"""NeRO's Glossy Synthetic: for every i a picture `i.png`, its depth `i-depth.png` and camera `i-camera.pkl`.
 
-A camera is a pickled list of the pose (3 × 4, world to camera, OpenCV's axes) and the 3 × 3 matrix K. Depths along the
-viewing axis have 16 bits for 15 units; what is nearer than 14.5 is the object. Every eighth picture by number is a test
-view, as the splits made for 3DGS-DR and Ref-Gaussian have it. [NeRO, Liu et al., SIGGRAPH 2023]
+A camera is a pickled list of the pose (3 × 4, world to camera, OpenCV's axes) and the 3 × 3 matrix K. Depths
+along the viewing axis have 16 bits for 15 units; what is nearer than 14.5 is the object. Every eighth picture
+by number is a test view, as the splits made for 3DGS-DR and Ref-Gaussian have it. [NeRO, Liu et al., SIGGRAPH
+2023]
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np

@@ -157,8 +157,9 @@ def median_colours(
 ) -> np.ndarray:
     """Median linear colour (N, 3) of the points over the views that show them with alpha > 0.5.
 
-    `background` (3,) is that of the views. Points that no view shows are 0.5 grey. With `normals`, only views in front of a point vote. There is no
-    occlusion test: the median of many views forgives it. At most 32 views, evenly chosen, are read.
+    `background` (3,) is that of the views. Points that no view shows are 0.5 grey. With `normals`, only views
+    in front of a point vote. There is no occlusion test: the median of many views forgives it. At most 32
+    views, evenly chosen, are read.
     """
     if not views or not len(points):
         return np.full((len(points), 3), 0.5)
@@ -171,7 +172,9 @@ def median_colours(
         at = np.rint([row[seen], column[seen]]).astype(int)
         row_index, column_index = np.clip(at, 0, np.array([[view.height], [view.width]]) - 1)
         colour = view.colour(background)[row_index, column_index]
-        opaque = np.full(len(colour), True) if view.alpha is None else view.alpha[row_index, column_index] > 0.5
+        opaque = (
+            np.full(len(colour), True) if view.alpha is None else view.alpha[row_index, column_index] > 0.5
+        )
         sample[np.flatnonzero(seen)[opaque]] = colour[opaque]
     ordered = np.sort(samples, axis=0)  # NaN last
     number = np.count_nonzero(~np.isnan(ordered[..., 0]), axis=0)

@@ -1,8 +1,9 @@
-"""LLFF's layout: `poses_bounds.npy` beside `images`, of which `images_2`, `images_4`, `images_8` may be smaller copies.
+"""LLFF's layout: `poses_bounds.npy` beside `images`, and smaller copies in `images_2` and the like.
 
-A row a picture, in the order of their names: a 3 × 5 matrix by rows, then the nearest and the farthest depth. The
-matrix holds the camera's axes in the world (down, right, backwards), its position, and height, width and focal length
-in pixels. Every eighth picture is a test view. [Mildenhall et al., Local Light Field Fusion, SIGGRAPH 2019]
+A row a picture, in the order of their names: a 3 × 5 matrix by rows, then the nearest and the farthest depth.
+The matrix holds the camera's axes in the world (down, right, backwards), its position, and height, width and
+focal length in pixels. Every eighth picture is a test view. [Mildenhall et al., Local Light Field Fusion,
+SIGGRAPH 2019]
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ def _placed(folder: Path, split: str, options: ReadOptions) -> list[tuple[str, n
     names = pictures.names()
     if len(names) != len(rows):
         raise InputError(
-            f"{folder / POSES}: {len(rows)} cameras, but {pictures.folders[1].name} has {len(names)} pictures; "
+            f"{folder / POSES}: {len(rows)} cameras, but {pictures.folders[1].name} has {len(names)} "
+            "pictures; "
             "restore the pictures"
         )
     placed = []
@@ -65,10 +67,10 @@ def _placed(folder: Path, split: str, options: ReadOptions) -> list[tuple[str, n
 
 
 def read_poses(path: Path) -> np.ndarray:
-    """The (N, 17) float64 table; raises InputError for a file of no use."""
+    """The (N, 17) float64 table; raises InputError for a file that cannot be used."""
     try:
-        # Mapped, so that a promise of more numbers than the file has is refused, not kept. `np.load` would also
-        # take archives and pickles.
+        # Mapped, so that a promise of more numbers than the file has is refused, not kept. `np.load` would
+        # also take archives and pickles.
         table = np.lib.format.open_memmap(path, mode="r")
     except Exception as error:  # NumPy raises half a dozen types for broken headers
         raise InputError(

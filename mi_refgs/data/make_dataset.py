@@ -1,25 +1,29 @@
-"""Path-traces a multi-view data set of a Mitsuba scene: pictures, maps, materials, light, surface, camera files.
+"""Path-traces a multi-view data set of a Mitsuba scene: pictures, maps, light, surface and cameras.
 
 A data set folder holds
 
-    transforms_train.json, transforms_test.json   cameras in the Blender / NeRF convention, written after the views
+    transforms_train.json, transforms_test.json   cameras in the Blender / NeRF convention, written after the
+                                                  views
     train/r_000.png    RGBA, 8 bit: straight alpha, colour = sRGB(radiance / alpha), clipped
     train/r_000.exr    RGBA, float32, linear: premultiplied radiance and alpha
-    train/r_000_normal.exr     X, Y, Z: unit shading normal at the pixel centre, world space, towards the camera
+    train/r_000_normal.exr     X, Y, Z: unit shading normal at the pixel centre, world space, towards the
+                               camera
     train/r_000_depth.exr      Y: distance at the pixel centre, along the viewing axis (not along the ray)
-    train/r_000_albedo.exr     R, G, B: diffuse reflectance, or F0 of a metal, at the pixel centre (`data.materials`)
-    train/r_000_roughness.exr  Y: √α of GGX; like albedo and metallic with A = 1 where the BSDF defines it, else 0
+    train/r_000_albedo.exr     R, G, B: diffuse reflectance, or F0 of a metal, at the pixel centre
+                               (see `data.materials`)
+    train/r_000_roughness.exr  Y: √α of GGX; like albedo and metallic with A = 1 where the BSDF defines it,
+                               else 0
     train/r_000_metallic.exr   Y: 0 … 1
     environment.exr    lat-long radiance of the environment, as a Mitsuba `envmap` without `to_world` shows it
     surface.ply        triangles of all shapes, world space
     region.json        of an open scene: a sphere around the object
-    relight/NAME/      the test views under another light, a data set with a test split: test/r_000.png and .exr,
-                       environment.exr, transforms_test.json
+    relight/NAME/      the test views under another light, a data set with a test split: test/r_000.png and
+                       .exr, environment.exr, transforms_test.json
     dataset.json       the settings, which decide whether a folder may be resumed; and further lights
 
-Maps are 0 off the object. Of an open scene, an object in its surroundings, pictures are RGB without alpha, and
-maps, materials and surface are those of the object alone; there is no environment.exr, because a room is not lit
-by what is far away alone.
+Maps are 0 off the object. Of an open scene, an object in its surroundings, pictures are RGB without alpha,
+and maps, materials and surface are those of the object alone; there is no environment.exr, because a room is
+not lit by what is far away alone.
 """
 
 from __future__ import annotations
@@ -40,8 +44,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 
 SURFACE_VOXELS = 2048
-"""Voxels along the diameter of `surface.ply`, which decide how far from it rays start: 2 voxels are 0.1 % of the
-size, ten times what the tessellation of a sphere is off."""
+"""Voxels along the diameter of `surface.ply`, which decide how far from it rays start: 2 voxels are 0.1 % of
+the size, ten times what the tessellation of a sphere is off."""
 
 
 def make_dataset(
@@ -70,22 +74,22 @@ def make_dataset(
 
     Cameras sit on a sphere around the scene's bounding sphere and look at its centre, z up; training and test
     views are two lattices, evenly spread over the band of elevations, turned and jittered by the seed.
-    `test_views` is a quarter of `views` by default; `size` is width and height, or both as one, in pixels; `fov`
-    is that of the shorter side, degrees. Cameras stand so far away that the sphere fills the part `fill` of the
-    shorter side, or at random distances between the two of `distance`, scene units. The pixel filter is a box,
-    the light is hidden from the camera (alpha 0). With `objects`, ids of shapes, the scene is an open one: the
-    cameras look at those shapes from among the others. `colmap` is a folder for the same as COLMAP's text files
-    (`data.write_colmap`). `light` is a lat-long map (EXR, HDR) that takes the place of the scene's environment,
-    turned as that is. The test views are traced once more under each map of `relight`, in a folder of its
-    file's name without suffix. Needs a Dr.Jit variant to be set.
+    `test_views` is a quarter of `views` by default; `size` is width and height, or both as one, in pixels;
+    `fov` is that of the shorter side, degrees. Cameras stand so far away that the sphere fills the part
+    `fill` of the shorter side, or at random distances between the two of `distance`, scene units. The pixel
+    filter is a box, the light is hidden from the camera (alpha 0). With `objects`, ids of shapes, the scene
+    is an open one: the cameras look at those shapes from among the others. `colmap` is a folder for the same
+    as COLMAP's text files (`data.write_colmap`). `light` is a lat-long map (EXR, HDR) that takes the place of
+    the scene's environment, turned as that is. The test views are traced once more under each map of
+    `relight`, in a folder of its file's name without suffix. Needs a Dr.Jit variant to be set.
 
     A folder that the same settings left unfinished is continued: what is there is kept, what is missing is
     made, lights of `relight` among it. Every file appears whole or not at all. `overwrite` removes the views
     that a folder holds.
 
     Raises InputError if the scene or a light cannot be loaded, a shape has no triangles (`data.surface`), a
-    setting makes no sense, a camera does not see the object, the folder cannot be written, or it holds a data set of other settings or from
-    elsewhere and `overwrite` is false.
+    setting makes no sense, a camera does not see the object, the folder cannot be written, or it holds a data
+    set of other settings or from elsewhere and `overwrite` is false.
     """
     scene, out = Path(scene), Path(out)
     width, height = (size, 0) if isinstance(size, int) else size

@@ -6,22 +6,22 @@ Which of them a BSDF defines follows from the names of its parameters (T: textur
     albedo, roughness, metallic     albedo                          roughness   metallic   refgs_bsdf
     base_color, roughness           base_color                      roughness   metallic   principled
     reflectance                     reflectance                     -           0          diffuse
-    eta, k                          F0 specular_reflectance         √α          1          conductor, roughconductor
-    diffuse_reflectance             what the base reflects          √α          0          plastic, roughplastic
+    eta, k                          F0 specular_reflectance         √α          1          (rough)conductor
+    diffuse_reflectance             what the base reflects          √α          0          (rough)plastic
 
-Albedo is that of the shading here: what the diffuse base reflects of the light that reaches it, or a metal's F0.
-A plastic whose base is nonlinear multiplies the light inside by ρ (1 - Fᵢ) / (1 - ρ Fᵢ). α of an anisotropic
-metal is the geometric mean of both; a smooth interface has roughness 0. `diffuse` has no roughness: nothing
-shows it. `twosided`, `mask`, `bumpmap` and `normalmap` are what they hold, and a `blendbsdf` is the one that it
-shows alone. Anything else (glass, hair, measured, a `principled` that transmits) is unknown, and its maps have
-A = 0 there.
+Albedo is that of the shading here: what the diffuse base reflects of the light that reaches it, or a metal's
+F0. A plastic whose base is nonlinear multiplies the light inside by ρ (1 - Fᵢ) / (1 - ρ Fᵢ). α of an
+anisotropic metal is the geometric mean of both; a smooth interface has roughness 0. `diffuse` has no
+roughness: nothing shows it. `twosided`, `mask`, `bumpmap` and `normalmap` are what they hold, and a
+`blendbsdf` is the one that it shows alone. Anything else (glass, hair, measured, a `principled` that
+transmits) is unknown, and its maps have A = 0 there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, ClassVar
 
 from mi_refgs.constants import MAX_NUMBER
 
@@ -42,9 +42,7 @@ class Materials:
         import drjit as dr
 
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
-        return Materials(
-            *((dr.select(mask, a[0], b[0]), dr.select(mask, a[1], b[1])) for a, b in pairs)
-        )
+        return Materials(*((dr.select(mask, a[0], b[0]), dr.select(mask, a[1], b[1])) for a, b in pairs))
 
     def only(self, mask: Any) -> Materials:
         """These where they are under the mask, unknown elsewhere."""
@@ -99,7 +97,7 @@ class _Parameters:
         import mitsuba as mi
 
         class Children(mi.TraversalCallback):
-            found: dict[str, Any] = {}
+            found: ClassVar[dict[str, Any]] = {}
 
             def put_object(self, name: str, value: Any, flags: Any) -> None:
                 self.found[name] = value
@@ -155,9 +153,7 @@ def _declared(p: _Parameters) -> Materials:
     import mitsuba as mi
 
     yes = mi.Bool(True)
-    return Materials(
-        (p.colour("albedo"), yes), (p.number("roughness"), yes), (p.number("metallic"), yes)
-    )
+    return Materials((p.colour("albedo"), yes), (p.number("roughness"), yes), (p.number("metallic"), yes))
 
 
 def _principled(p: _Parameters) -> Materials:

@@ -1,4 +1,4 @@
-"""A data set of an object in its surroundings: which shapes it is about, its region, cameras that see them."""
+"""A data set of an object in its surroundings: which shapes it is about, its region, its cameras."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ def named_shapes(scene: Any, ids: Sequence[str], file: Path) -> list[Any]:
     missing = [name for name in ids if not name or name not in found]
     if missing:
         known = ", ".join(sorted(name for name in found if name)) or "none"
-        raise InputError(f"{file}: --object: no shape has the id '{missing[0]}'; give one of those there: {known}")
+        raise InputError(
+            f"{file}: --object: no shape has the id '{missing[0]}'; give one of those there: {known}"
+        )
     return [found[name] for name in dict.fromkeys(ids)]
 
 
@@ -47,7 +49,8 @@ def check_cameras(scene: Any, objects: Sequence[Any], region: Region, poses: np.
     distance = np.linalg.norm(toward, axis=1)
     if distance.min() <= region.radius:
         raise InputError(
-            f"{file}: --distance: {distance.min():.4g} is inside of the region around the object, whose radius is "
+            f"{file}: --distance: {distance.min():.4g} is inside of the region around the object, "
+            "whose radius is "
             f"{region.radius:.4g}; give more"
         )
     with dr.suspend_grad():
@@ -62,7 +65,9 @@ def check_cameras(scene: Any, objects: Sequence[Any], region: Region, poses: np.
         hidden = np.array(hit.is_valid() & ~own) & (np.array(hit.t) < distance - region.radius)
     if hidden.any():
         raise InputError(
-            f"{file}: --distance: something stands between {int(hidden.sum())} of {len(poses)} cameras and the "
-            f"object, at {distance[hidden].min():.4g} … {distance[hidden].max():.4g}; give a shorter distance, or "
+            f"{file}: --distance: something stands between {int(hidden.sum())} of {len(poses)} cameras "
+            "and the "
+            f"object, at {distance[hidden].min():.4g} … {distance[hidden].max():.4g}; give a "
+            "shorter distance, or "
             "another --elevation"
         )

@@ -72,8 +72,8 @@ def camera_poses(
 
 
 def poses_around(outward: np.ndarray, centre: np.ndarray, distance: float | np.ndarray) -> np.ndarray:
-    """World-from-camera matrices (N, 4, 4) in Mitsuba's frame, z up, that look at `centre` from unit `outward`
-    (N, 3) directions, none of them ±z; `distance` is one, or (N, 1)."""
+    """World-from-camera matrices (N, 4, 4) in Mitsuba's frame, z up, that look at `centre` from unit
+    `outward` (N, 3) directions, none of them ±z; `distance` is one, or (N, 1)."""
     left = np.cross([0.0, 0.0, 1.0], -outward)
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     up = np.cross(-outward, left)
@@ -115,8 +115,9 @@ def environment_image(scene: Any, height: int) -> np.ndarray:
 class Tracer:
     """One sensor that moves from view to view, so that each kernel is compiled once.
 
-    `size` is width and height, `fov` that of the shorter side in degrees. Pictures have alpha, and emitters are
-    hidden, unless `objects` name shapes of an open scene: then pictures show all, and maps are of those shapes.
+    `size` is width and height, `fov` that of the shorter side in degrees. Pictures have alpha, and emitters
+    are hidden, unless `objects` name shapes of an open scene: then pictures show all, and maps are of those
+    shapes.
     """
 
     def __init__(
@@ -177,7 +178,7 @@ class Tracer:
         return image
 
     def maps(self, pose: np.ndarray, covered: np.ndarray) -> dict[str, np.ndarray]:
-        """The maps of MAPS at the pixels' centres, where `covered` (H, W): a lamp that the picture hides has none.
+        """The maps of MAPS at the pixels' centres, where `covered` (H, W): hidden lamps have none.
 
         Of an open scene only where one of its objects is seen. A mean over a pixel at an edge would belong to
         no surface.
@@ -211,8 +212,8 @@ class Tracer:
         return {name: np.where(hit[..., None], array, 0) for name, array in found.items()}
 
     def points(self, pose: np.ndarray, film: np.ndarray) -> np.ndarray:
-        """What a view shows at positions (N, 2) on its film, 0 … 1 from the upper left: world points (N, 3), NaN
-        where it shows nothing."""
+        """What a view shows at positions (N, 2) on its film, 0 … 1 from the upper left: world points (N, 3),
+        NaN where it shows nothing."""
         import drjit as dr
         import mitsuba as mi
 

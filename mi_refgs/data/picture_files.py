@@ -1,8 +1,8 @@
 """Where a picture lies, and how its file becomes the pixels of a view: one way for every reader.
 
-A file is decoded, its colour multiplied by alpha (its own, or a mask's), averaged over blocks of `downscale` pixels
-squared, resampled without the lens and laid onto the background. The rows and columns of the file count as they
-lie there: an orientation in its EXIF data turns nothing, as in COLMAP.
+A file is decoded, its colour multiplied by alpha (its own, or a mask's), averaged over blocks of `downscale`
+pixels squared, resampled without the lens and laid onto the background. The rows and columns of the file
+count as they lie there: an orientation in its EXIF data turns nothing, as in COLMAP.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mi_refgs.exr import read_exr_image
 from mi_refgs.images import box_downscale, has_alpha, image_size, read_bytes, read_grey
 
 BAND = 256
-"""Rows of a file that are floating-point numbers at a time: of a large picture all would be half a gigabyte."""
+"""Rows of a file that are floating-point numbers at a time: a large picture would need half a gigabyte."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class Mask:
 
     path: Path
     below: int | None = None
-    """Without it, brightness is alpha. With it, alpha is 1 where the file's own number, such as a depth of 16 bits,
-    is less, and 0 elsewhere."""
+    """Without it, brightness is alpha. With it, alpha is 1 where the file's own number, such as a depth of 16
+    bits, is less, and 0 elsewhere."""
 
     def read(self) -> np.ndarray:
         """Alpha (H, W) float32."""
@@ -59,7 +59,7 @@ class PictureFile:
     def find(cls, path: Path, downscale: int, mask: Mask | None = None) -> PictureFile:
         """The picture in a file, of which only the header is read.
 
-        Raises InputError for a file of no use, and for one of less than a block of pixels.
+        Raises InputError for a file that cannot be used, and for one of less than a block of pixels.
         """
         width, height = image_size(path)
         if min(width, height) < downscale:
@@ -75,7 +75,7 @@ class PictureFile:
         return self.width // self.downscale, self.height // self.downscale
 
     def read(self, background: float) -> tuple[np.ndarray, np.ndarray | None]:
-        """Colour (H, W, 3) on the background and alpha (H, W) or None, float32; sRGB-encoded, of EXR files linear.
+        """Colour (H, W, 3) on the background and alpha (H, W) or None, float32; sRGB, or linear from EXR.
 
         Raises InputError for a file that cannot be read, or a mask of another size.
         """
@@ -158,7 +158,8 @@ class PictureFile:
         alpha = self.mask.read()
         if alpha.shape != (self.height, self.width):
             raise InputError(
-                f"{self.mask.path}: mask: {alpha.shape[1]} × {alpha.shape[0]} pixels, but {self.path.name} has "
+                f"{self.mask.path}: mask: {alpha.shape[1]} × {alpha.shape[0]} pixels, but "
+                f"{self.path.name} has "
                 f"{self.width} × {self.height}; make both of one size"
             )
         return alpha

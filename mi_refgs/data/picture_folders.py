@@ -1,4 +1,4 @@
-"""Folders of pictures as COLMAP and LLFF have them: `images`, and smaller copies in `images_2`, `images_4`, `images_8`."""
+"""Folders of pictures as COLMAP and LLFF have them: `images`, and smaller copies in `images_2` …"""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ IMAGES = "images"
 
 @dataclass(frozen=True)
 class PictureFolders:
-    """The pictures of a data set. The largest there are have factor 1: `images`, or where it is missing a copy."""
+    """The pictures of a data set. The largest have factor 1: `images`, or copies where it is missing."""
 
     root: Path
     folders: dict[int, Path]  # by their factor
@@ -46,8 +46,8 @@ class PictureFolders:
     def find(self, name: str, downscale: int, whole: bool = False) -> tuple[Path, int] | None:
         """A picture's file, and by what its blocks must still be averaged; None if there is no such file.
 
-        The smallest copy whose factor divides `downscale` serves; `whole` asks for the largest. A copy may have
-        another ending than the name. Raises InputError for a name that leads out of the folder.
+        The smallest copy whose factor divides `downscale` serves; `whole` asks for the largest. A copy may
+        have another ending than the name. Raises InputError for a name that leads out of the folder.
         """
         for factor, folder in sorted(self.folders.items(), reverse=True):
             if downscale % factor or (whole and factor > 1):

@@ -1,7 +1,7 @@
-"""Pictures that are decoded when they are asked for: all of 300 photographs of 12 Mpx would be 11 GB in 8 bits.
+"""Pictures that are decoded when they are asked for: 300 photographs of 12 Mpx would be 11 GB.
 
-What is kept of a picture is its decoded file: 8-bit numbers where the view shows them as they are, and float32
-where pixels were averaged or resampled, so a picture is the same however often it is decoded.
+What is kept of a picture is its decoded file: 8-bit numbers where the view shows them as they are, and
+float32 where pixels were averaged or resampled, so a picture is the same however often it is decoded.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class PictureStore:
         self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
 
     def pixels(self, picture: Picture) -> np.ndarray:
-        """The pixels of a picture, decoded if they are not kept; raises InputError as `PictureFile.decode`."""
+        """The pixels of a picture, decoded if they are not kept; errors as `PictureFile.decode`."""
         key = id(picture)
         if key in self._kept:
             self._kept.move_to_end(key)

@@ -14,7 +14,7 @@ MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def rigid(matrix: np.ndarray, field: str) -> np.ndarray:
-    """The (4, 4) matrix, if it is a rotation and a translation; raises InputError that begins with `field`."""
+    """The (4, 4) matrix, if it is a rotation and a translation; else InputError that begins with `field`."""
     rotation = matrix[:3, :3]
     with np.errstate(all="ignore"):  # any numbers
         fine = (
@@ -29,7 +29,7 @@ def rigid(matrix: np.ndarray, field: str) -> np.ndarray:
 
 
 def from_world_to_camera(rotation: np.ndarray, translation: np.ndarray, field: str) -> np.ndarray:
-    """`View.to_world` of a camera with OpenCV's axes that sees the world point x at rotation @ x + translation.
+    """`View.to_world` of a camera with OpenCV's axes that sees a world point x at R x + t.
 
     Raises InputError that begins with `field` unless it is rigid.
     """

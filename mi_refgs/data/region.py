@@ -41,7 +41,7 @@ def region_of(views: Sequence[View]) -> Region:
 
 
 def region_radius(distance: np.ndarray, half_angle: np.ndarray) -> float:
-    """The radius that cameras suggest at distances (V,) from its centre, with half angles of view (V,), radians."""
+    """The radius that cameras suggest at distances (V,) from its centre, half angles (V,) in radians."""
     whole = float(np.median(distance * np.sin(half_angle)))
     return min(REGION_SHARE * whole, CAMERA_SHARE * float(distance.min()))
 

@@ -17,7 +17,7 @@ from mi_refgs.files import require_file
 from mi_refgs.shade.envmap import read_radiance
 
 Z_UP = (1, 0, 0), 90.0
-"""Axis and angle in degrees that turn the y of a lat-long map to z: where a scene has no `envmap` that says so."""
+"""Axis and angle in degrees that turn the y of a lat-long map to z: for scenes without an `envmap`."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class LightFile:
 
 
 def scene_hash(scene: Path) -> str:
-    """SHA-256 of a scene's XML and of the files that it names; raises InputError if it is missing or no XML."""
+    """SHA-256 of a scene's XML and of the files that it names; InputError if it is missing or no XML."""
     if not scene.is_file():
         raise InputError(f"{scene}: scene: missing; give the path of a Mitsuba XML file")
     try:
@@ -75,8 +75,8 @@ def load_scene(scene: Path, whole: bool = False) -> Any:
 def under_light(scene: Any, light: Path) -> Any:
     """The scene with a lat-long map (EXR, HDR) in place of its environment; its other lamps stay.
 
-    The map is turned as the scene's own `envmap` is; where there is none, its y becomes z, which is up. Raises
-    InputError for a file that holds no such map.
+    The map is turned as the scene's own `envmap` is; where there is none, its y becomes z, which is up.
+    Raises InputError for a file that holds no such map.
     """
     import mitsuba as mi
 

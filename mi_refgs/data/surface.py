@@ -70,7 +70,8 @@ def _cylinder() -> tuple[np.ndarray, np.ndarray]:
     low, after = np.arange(ROUND_SIDES), (np.arange(ROUND_SIDES) + 1) % ROUND_SIDES
     first = np.stack([low, after, after + ROUND_SIDES], axis=1)
     second = np.stack([low, after + ROUND_SIDES, low + ROUND_SIDES], axis=1)
-    return np.concatenate([_circle(), _circle() + [0, 0, 1]]), np.concatenate([first, second])
+    upper = _circle() + np.array([0, 0, 1])
+    return np.concatenate([_circle(), upper]), np.concatenate([first, second])
 
 
 UNIT_SHAPES = {"Sphere": _sphere, "Disk": _disk, "Cylinder": _cylinder}

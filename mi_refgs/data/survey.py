@@ -19,8 +19,8 @@ SMALL_SIDE = 48
 FEW_VIEWS = 20
 """Training views below which surfels overfit; published scenes have 100 and more."""
 SAME_PLACE = 1e-4
-"""Distance of all cameras from their mean, as part of their distance from the origin or the length of an axis,
-below which they stand in one place."""
+"""Distance of all cameras from their mean, as part of their distance from the origin or the length of an
+axis, below which they stand in one place."""
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,16 @@
 """The Blender / NeRF layout: `transforms_{split}.json` beside pictures, and its relatives.
 
 Keys: `camera_angle_x` (radians) or `fl_x`, and `camera_angle_y`, `fl_y`, `cx`, `cy`, `w`, `h` (pixels), each
-in a frame or for the whole file; `k1` … `k4`, `p1`, `p2`, `is_fisheye`, `camera_model` (`data.lens` undoes the
-distortion); `frames` with `file_path` (with or without extension) and `transform_matrix`
-(camera to world, OpenGL axes); optional `exr_path`, `normal_path` (X, Y, Z, world), `depth_path` (along
-the viewing axis), `albedo_path` (R, G, B, A), `roughness_path` and `metallic_path` (Y, A; A: defined there) as
-`data.make_dataset` writes them. Shiny Blender's maps beside the pictures are found by their names (`truth_maps`).
+in a frame or for the whole file; `k1` … `k4`, `p1`, `p2`, `is_fisheye`, `camera_model` (`data.lens` undoes
+the distortion); `frames` with `file_path` (with or without extension) and `transform_matrix` (camera to
+world, OpenGL axes); optional `exr_path`, `normal_path` (X, Y, Z, world), `depth_path` (along the viewing
+axis), `albedo_path` (R, G, B, A), `roughness_path` and `metallic_path` (Y, A; A: defined there) as
+`data.make_dataset` writes them. Shiny Blender's maps beside the pictures are found by their names
+(`truth_maps`).
 
-nerfstudio's `mask_path` (bright: object) becomes alpha; `ply_file_path` names points, which lie in the frame of the
-poses: `applied_transform` is in both. `train_filenames` and `test_filenames` (or `val_filenames`) name a split's pictures.
+nerfstudio's `mask_path` (bright: object) becomes alpha; `ply_file_path` names points, which lie in the frame
+of the poses: `applied_transform` is in both. `train_filenames` and `test_filenames` (or `val_filenames`) name
+a split's pictures.
 """
 
 from __future__ import annotations
@@ -101,7 +103,8 @@ def _points(transforms: Path, content: dict[str, Any]) -> PointCloud | None:
     file = inside(transforms.parent, name)
     if file is None:
         raise InputError(
-            f"{transforms}: ply_file_path: {shown(name)} names no file in the data set's folder; move it there"
+            f"{transforms}: ply_file_path: {shown(name)} names no file in the data set's folder; "
+            "move it there"
         )
     return read_points(file)
 

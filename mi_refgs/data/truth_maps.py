@@ -48,9 +48,9 @@ def shiny_maps(
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """World normals (h, w, 3) and depths (h, w) of a picture of Shiny Blender, None where there are none.
 
-    Normals n are stored as (n + 1) / 2 in 8 bits, depths z along the viewing axis as 1 / (1 + z), and 0 where there
-    is nothing [Ref-NeRF, Verbin et al. 2022]. `shape` is that of the picture. Raises InputError for a map of
-    another one.
+    Normals n are stored as (n + 1) / 2 in 8 bits, depths z along the viewing axis as 1 / (1 + z), and 0 where
+    there is nothing [Ref-NeRF, Verbin et al. 2022]. `shape` is that of the picture. Raises InputError for a
+    map of another one.
     """
     normal = depth = None
     if file := beside(picture, NORMALS):

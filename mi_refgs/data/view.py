@@ -46,8 +46,8 @@ class View:
     depth: np.ndarray | None  # (H, W) float32 along the viewing axis, 0 off the object
     linear: bool  # whether `image` is linear radiance (EXR) or sRGB-encoded (PNG)
     materials: dict[str, np.ndarray] = field(default_factory=dict)
-    """Of albedo, roughness, metallic those that are known: (H, W, C + 1) float32, the last the share of the pixel
-    for which the others stand; all 0 where it is 0."""
+    """Of albedo, roughness, metallic those that are known: (H, W, C + 1) float32, the last the share of the
+    pixel for which the others stand; all 0 where it is 0."""
     exposure: float | None = None  # log(time · ISO / f-number²), where EXIF data say so
     near: float = 0.0  # depth of the near plane, scene units; `read_dataset` derives it from all cameras
 

@@ -1,8 +1,8 @@
 """A path-traced data set as COLMAP's text files: `images/`, and `sparse/0/` with true cameras and points.
 
-Pictures are named by number so that every eighth is a test view, the share that readers of COLMAP hold out, for
-as long as there are test views; `sparse/0/test.txt` lists all of them. Points are places on surfaces whose
-colour is the same in the views that see them, as structure from motion finds them: mirrors have few.
+Pictures are named by number so that every eighth is a test view, the share that readers of COLMAP hold out,
+for as long as there are test views; `sparse/0/test.txt` lists all of them. Points are places on surfaces
+whose colour is the same in the views that see them, as structure from motion finds them: mirrors have few.
 """
 
 from __future__ import annotations
@@ -58,9 +58,7 @@ def write_colmap(folder: Path, data: Path, cameras: Cameras, tracer: Tracer) -> 
         return "\n".join((f"# {comment}", *rows, "")).encode()
 
     pinhole = f"1 PINHOLE {width} {height} {focal!r} {focal!r} {width / 2} {height / 2}"
-    write_bytes(
-        sparse / "cameras.txt", lines("CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY", [pinhole])
-    )
+    write_bytes(sparse / "cameras.txt", lines("CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY", [pinhole]))
     seen: list[list[str]] = [[] for _ in pictures]
     rows = []
     for i, (point, colour) in enumerate(zip(points, colours, strict=True)):
@@ -70,7 +68,9 @@ def write_colmap(folder: Path, data: Path, cameras: Cameras, tracer: Tracer) -> 
             seen[view].append(f"{x:.3f} {y:.3f} {i + 1}")
         r, g, b = np.round(255 * colour).astype(int)
         rows.append(f"{i + 1} {' '.join(f'{c:.6f}' for c in point)} {r} {g} {b} 0 {' '.join(track)}")
-    write_bytes(sparse / "points3D.txt", lines("POINT3D_ID X Y Z R G B ERROR TRACK[IMAGE_ID POINT2D_IDX]", rows))
+    write_bytes(
+        sparse / "points3D.txt", lines("POINT3D_ID X Y Z R G B ERROR TRACK[IMAGE_ID POINT2D_IDX]", rows)
+    )
     stems = []
     for i, (picture, pose) in enumerate(zip(pictures, poses, strict=True)):
         rotation = OPENCV_FROM_MITSUBA @ pose[:3, :3].T

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.data.pathtrace import MAPS, Tracer, camera_poses, environment_image
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.data.settings import Settings
 from mi_refgs.errors import InputError
 from mi_refgs.exr import read_exr, read_exr_image, write_exr
@@ -41,7 +41,12 @@ class Cameras:
         """What traces views of a scene of this size."""
         s, (low, high) = self.settings, self.distance
         near, far = 0.1 * (low - self.radius), 10 * (high + self.reach)
-        options: dict[str, Any] = {"fov": s.fov, "spp": s.spp, "max_depth": s.max_depth, "objects": self.objects}
+        options: dict[str, Any] = {
+            "fov": s.fov,
+            "spp": s.spp,
+            "max_depth": s.max_depth,
+            "objects": self.objects,
+        }
         return Tracer(scene, size=s.resolution, near=near, far=far, **options)
 
     def of(self, split: str) -> list[tuple[np.ndarray, int]]:

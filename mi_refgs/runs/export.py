@@ -26,16 +26,16 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.files import read_json
-from mi_refgs.runs.checkpoint import PARAMS, tensors
 from mi_refgs.methods.method import Method
-from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
-from mi_refgs.runs.run import Run
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.render.samples import supersampled
 from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.checkpoint import PARAMS, tensors
+from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
+from mi_refgs.runs.run import Run
 from mi_refgs.shade.ambient import prepare
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading

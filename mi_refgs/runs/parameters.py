@@ -11,6 +11,7 @@ from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 
+
 def channels_of(params: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """The channels of the object's table by name, or with the prefix AROUND those of the surroundings."""
     if prefix:

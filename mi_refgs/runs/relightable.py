@@ -33,8 +33,8 @@ Hanrahan 2001, eq. 8, over π]"""
 IRRADIANCE_FLOOR = 1e-4
 """Of the light's brightest irradiance: below, a surfel is dark whatever its albedo."""
 RELIGHT_RAYS = 16
-"""Rays of the lobe of each pixel. Two balls of known materials, relit at 128² and 2 × 2 samples, are 33.6 dB from
-the path tracer's with one, 34.2 with 4, 34.4 with 16 and 34.5 with 64 rays."""
+"""Rays of the lobe of each pixel. Two balls of known materials, relit at 128² and 2 × 2 samples, are 33.6 dB
+from the path tracer's with one, 34.2 with 4, 34.4 with 16 and 34.5 with 64 rays."""
 RELIGHT_BOUNCES = 2
 """Times that what these rays hit is shaded. Of the self-reflecting instances of `benchmarks.visibility`, two
 bounces leave 9 % of the light in a bowl unaccounted for, one 27 %, four 3 %."""
@@ -46,17 +46,19 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     """The scene with albedo, metallic and roughness alone, shaded by whatever light it is given.
 
     A diffuse part that was fitted as a colour of its own ("sh") becomes an albedo (`albedo_from_radiance`).
-    What is fitted to the light, the radiance and indirect channels, goes; light that other parts of the object
-    send is traced instead, where the scene has a mesh. The light stays, and so do other options of accuracy.
-    Surroundings go: they are as bright as they were photographed.
-    A scene that has only materials keeps them as they are.
+    What is fitted to the light, the radiance and indirect channels, goes; light that other parts of the
+    object send is traced instead, where the scene has a mesh. The light stays, and so do other options of
+    accuracy. Surroundings go: they are as bright as they were photographed. A scene that has only materials
+    keeps them as they are.
 
     Raises InputError for a scene without light or one of the materials.
     """
     missing = [name for name in MATERIALS if not scene.surfels.has(name)]
     if scene.light is None or missing:
         what = ", ".join(missing) or "light"
-        raise InputError(f"{what}: the run has none; fit one with materials and a light, as `--for relighting` does")
+        raise InputError(
+            f"{what}: the run has none; fit one with materials and a light, as `--for relighting` does"
+        )
     surfels = scene.surfels.detach()
     mesh = scene.mesh
     if mesh is not None and scene.surroundings is not None:
@@ -65,12 +67,8 @@ def relightable(scene: TrainedScene) -> TrainedScene:
         surfels = albedo_from_radiance(surfels, scene.light.prefilter(), mesh)
     kept = {name: raw for name, raw in surfels.raw.items() if name not in ("radiance_sh", "indirect_sh")}
     accuracy = scene.shading.accuracy if scene.shading.reflectance == "split_sum" else Accuracy()
-    rays, bounces, ambient_rays = (
-        (1, 0, 0) if mesh is None else (RELIGHT_RAYS, RELIGHT_BOUNCES, AMBIENT_RAYS)
-    )
-    accuracy = replace(
-        accuracy, visibility_rays=rays, traced_bounces=bounces, ambient_rays=ambient_rays
-    )
+    rays, bounces, ambient_rays = (1, 0, 0) if mesh is None else (RELIGHT_RAYS, RELIGHT_BOUNCES, AMBIENT_RAYS)
+    accuracy = replace(accuracy, visibility_rays=rays, traced_bounces=bounces, ambient_rays=ambient_rays)
     shading = Shading("pixel", "split_sum", "irradiance", mesh is not None, accuracy)
     return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, surroundings=None)
 

@@ -122,8 +122,8 @@ class Run:
 
     def rewind(self, iteration: int) -> None:
         """Make the folder ready to go on after `iteration`: drops later checkpoints (`load_checkpoint` found
-        them damaged), later lines of the logs (*.jsonl), which a resumed run writes again, and what killed processes
-        left behind.
+        them damaged), later lines of the logs (*.jsonl), which a resumed run writes again, and what killed
+        processes left behind.
 
         Raises InputError if the folder cannot be written.
         """
