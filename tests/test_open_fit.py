@@ -76,6 +76,10 @@ def test_what_an_open_fit_starts_from(data: Dataset, method: Method) -> None:
     names = {name.removeprefix("surroundings/") for name in params if name.startswith("surroundings/")}
     assert names == {"position", "rotation", "scale", "opacity", "radiance_sh"}
     assert method.surroundings is not None
+    for name in ("opacity", "surroundings/opacity"):  # nearly transparent: pictures show through the cloud
+        np.testing.assert_allclose(
+            1 / (1 + np.exp(-params[name].numpy())), method.surroundings.opacity, atol=1e-6
+        )
     size = np.exp(params["surroundings/scale"].numpy()).max(axis=1)
     distance = np.linalg.norm(outer, axis=1)
     assert np.all(size <= 1.001 * method.surroundings.size * distance)

@@ -83,7 +83,7 @@ def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator
         channels=["radiance_sh"],
         degree={"radiance_sh": options.degree},
         largest=options.size * distance,
-        opacity=method.surfels.start("opacity"),
+        opacity=options.opacity,
     )
     # One colour everywhere: a picture of what is there would leave the surfels nothing to explain.
     shape = (options.height, 2 * options.height, 3)
@@ -107,6 +107,7 @@ def initial_surfels(
     if not 0 <= options.inside <= 1:
         raise InputError(f"method: surfels.inside: {options.inside} is no share; give a number from 0 to 1")
     views, behind = data.views, data.background
+    start: dict[str, Any] = dict(options.initial)
     if data.cut_out:
         shape = hull.visual_hull(views, hull.camera_bounds(views))
         inner = shape.inner_points(round(options.inside * options.count), rng)
@@ -118,6 +119,8 @@ def initial_surfels(
             [hull.median_colours(outer, views, behind, facing), hull.median_colours(inner, views, behind)]
         )
     elif open_scene:
+        assert method.surroundings is not None
+        start["opacity"] = method.surroundings.opacity
         points, colours = inside_points(options.count, options.inside, data, rng)
         normals = init.random_normals(options.count, rng)
     elif data.points is not None and len(data.points.position):
@@ -128,12 +131,11 @@ def initial_surfels(
         normals = init.random_normals(options.count, rng)
         colours = hull.median_colours(points, views, behind)
     order = morton_order(points)
-    from_pictures: dict[str, Any] = {}
     if "albedo" in options.from_pictures and method.light is not None:
         # The hue alone: how bright a place is, is left to the light until it has been found.
         brightest = colours[order].max(axis=1, keepdims=True)
         hue = np.where(brightest > 0, colours[order] / np.maximum(brightest, 1e-9), 1)
-        from_pictures["albedo"] = np.clip(hue * options.start("albedo"), *ALBEDO_RANGE)
+        start["albedo"] = np.clip(hue * options.start("albedo"), *ALBEDO_RANGE)
     return init.from_points(
         points[order],
         normals[order],
@@ -142,5 +144,5 @@ def initial_surfels(
         primitive=options.primitive,
         channels=options.channels,
         degree={name: options.degree_of(name) for name in options.channels},
-        **(options.initial | from_pictures),
+        **start,
     )

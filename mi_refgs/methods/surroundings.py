@@ -23,6 +23,7 @@ class SurroundingsOptions:
     max_count: int = 40_000  # densification stops here
     degree: int = 2  # of radiance_sh
     scattered: float = 0.5  # share of the initial surfels all over; the others at sparse points
+    opacity: float = 0.1  # initial, of both tables: a cloud of 0.3 closes to a shell before the object
     size: float = 0.1  # largest initial size, in distances from the region's centre
     prune_extent: float = 0.5  # distances from the region's centre; larger surfels go
     reach: float = 2.0  # of positions' rates, in scene extents
@@ -39,6 +40,7 @@ class SurroundingsOptions:
             ("count", self.count, self.count >= 1, "1 or more"),
             ("degree", self.degree, 0 <= self.degree <= MAX_SH_DEGREE, f"0 to {MAX_SH_DEGREE}"),
             ("scattered", self.scattered, 0 <= self.scattered <= 1, "a share from 0 to 1"),
+            ("opacity", self.opacity, 0 < self.opacity < 1, "a number between 0 and 1"),
             ("size", self.size, self.size > 0, "more than 0"),
             ("prune_extent", self.prune_extent, self.prune_extent > 0, "more than 0"),
             ("reach", self.reach, self.reach > 0, "more than 0"),
