@@ -288,10 +288,12 @@ def test_wrong_json(spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.C
 def test_views_of_unequal_size(
     spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_png(spoilt / "train" / "r_1.png", np.ones((SIZE, SIZE + 2, 4)))
+    """A few sizes are fitted together; five are one sentence."""
+    for i in range(4):
+        write_png(spoilt / "train" / f"r_{i}.png", np.ones((SIZE, SIZE + 2 + 2 * i, 4)))
     edit(spoilt / "transforms_train.json", lambda content: [content.pop(key) for key in "wh"])
     refused(
-        train_command(spoilt, tmp_path / "run", method), capsys, "transforms_train.json", "r_1", "one size"
+        train_command(spoilt, tmp_path / "run", method), capsys, "transforms_train.json", "5 different sizes"
     )
 
 

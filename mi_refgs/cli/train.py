@@ -32,9 +32,7 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     summary = "fit surfels with materials and a light to pictures"
     parser = add_command(commands, "train", summary, EXAMPLE, run)
-    parser.add_argument(
-        "data", type=Path, metavar="DATA", help="data set: a folder with transforms_train.json"
-    )
+    parser.add_argument("data", type=Path, metavar="DATA", help="data set: a folder of pictures with cameras")
     add_output(parser, "run folder", "RUN")
     parser.add_argument("--variant", metavar="V", help="method: a name or a .toml (default: the full method)")
     parser.add_argument(
@@ -94,7 +92,9 @@ def variant_of(variant: str | None, purpose: str | None) -> str | None:
     return methods.for_purpose(purpose)
 
 
-def default_variant(data_path: Path, assignments: list[str] | None = None) -> str | None:
+def default_variant(
+    data_path: Path, preset: str | None = None, assignments: list[str] | None = None
+) -> str | None:
     """The method for pictures without alpha, where the data set has such; None for the full one."""
     from mi_refgs import methods
     from mi_refgs.data.picture_store import undecoded
@@ -103,7 +103,7 @@ def default_variant(data_path: Path, assignments: list[str] | None = None) -> st
     # What `assignments` say of a method may be of the other one.
     of_data = [text for text in assignments or [] if text.startswith("data.")]
     with undecoded():
-        views = read_views(load_method(None, None, of_data), data_path, "train", truth=False)
+        views = read_views(load_method(None, preset, of_data), data_path, "train", truth=False)
     if views.cut_out or views.region is None:
         return None
     variant = methods.for_purpose(OPEN_PURPOSE)
@@ -156,7 +156,7 @@ def fit(
         folder.require_none()
         if limit is not None and not 0 < limit < math.inf:
             raise InputError(f"--minutes: {limit} is no time; give more than 0")
-        variant = variant or default_variant(data_path, assignments)
+        variant = variant or default_variant(data_path, preset, assignments)
         wanted = None if limit is None else 60 * limit
         method, expected = planned(load_method(variant, preset, assignments), data_path, wanted, say)
         if expected is not None:

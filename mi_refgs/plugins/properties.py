@@ -83,7 +83,10 @@ def read_background(props: Any) -> Any:
     """What is behind everything: a colour (mi.Color3f), an EnvironmentLight, or None: transparent."""
     value = _get(props, "background", None)
     if isinstance(value, str):
-        return EnvironmentLight.from_file(Path(_path(props, "background") or ""))
+        try:
+            return EnvironmentLight.from_file(Path(_path(props, "background") or ""))
+        except InputError as error:
+            raise InputError(f"refgs: background: {error}") from error
     try:
         if getattr(value, "ndim", 0) == 3:
             return EnvironmentLight(mi.TensorXf(value))
