@@ -289,9 +289,15 @@ def test_views_of_unequal_size(
     spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A few sizes are fitted together; five are one sentence."""
-    for i in range(4):
-        write_png(spoilt / "train" / f"r_{i}.png", np.ones((SIZE, SIZE + 2 + 2 * i, 4)))
-    edit(spoilt / "transforms_train.json", lambda content: [content.pop(key) for key in "wh"])
+
+    def sizes(content: dict) -> None:
+        content["frames"] = [content["frames"][0] | {"file_path": f"train/r_{i}"} for i in range(5)]
+        for key in "wh":
+            content.pop(key)
+
+    edit(spoilt / "transforms_train.json", sizes)
+    for i in range(5):
+        write_png(spoilt / "train" / f"r_{i}.png", np.ones((SIZE, SIZE + 2 * i, 4)))
     refused(
         train_command(spoilt, tmp_path / "run", method), capsys, "transforms_train.json", "5 different sizes"
     )
