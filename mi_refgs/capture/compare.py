@@ -14,7 +14,7 @@ from mi_refgs.data.view import View
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """Of the views that both have."""
+    """Errors of the views that both data sets have."""
 
     count: int
     rotation: np.ndarray  # (V,) degrees

@@ -68,7 +68,7 @@ class Photograph:
 
     @property
     def name(self) -> str:
-        """Of its picture in the data set."""
+        """File name of its picture in the data set."""
         return self.path.name
 
     @property

@@ -43,7 +43,7 @@ class Report:
         key: str,
         seconds: float,
     ) -> Report:
-        """Of a reconstruction and what was made of it."""
+        """The report on a reconstruction and on the data set that was made of it."""
         placed = {job.copies[name].name for name in world.names}
         cameras = {(s.size, s.focal): s for s in straight.values()}
         return cls(

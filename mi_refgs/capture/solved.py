@@ -34,7 +34,7 @@ class Solved:
 
     @classmethod
     def of(cls, model: Any) -> Solved:
-        """Of a pycolmap.Reconstruction; pictures in the order of their names."""
+        """What a pycolmap.Reconstruction holds; pictures in the order of their names."""
         images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
         poses = [image.cam_from_world() for image in images]
         cameras = [model.cameras[image.camera_id] for image in images]

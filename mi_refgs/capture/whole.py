@@ -80,7 +80,7 @@ def capture(
     simplest of three that fits. `region`: of interest, in the data set's world, in place of the one that is
     found. `tell` is called with what is done.
 
-    Raises InputError for input of no use, with the remedy, and where pycolmap is missing.
+    Raises InputError for unusable input, with the remedy, and where pycolmap is missing.
     """
     colmap.load()
     if camera not in (None, *MODELS):

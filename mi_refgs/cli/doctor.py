@@ -1,4 +1,4 @@
-"""`refgs doctor`: what this installation stands on, or what is in a data set."""
+"""`refgs doctor`: what is installed, or what is in a data set."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from mi_refgs.cli.command import Result, add_command
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    summary = (
-        "say what this installation stands on, or what is in a data set, what is wrong, and how to mend it"
-    )
+    summary = "say what is installed, or what is in a data set, what is wrong, and how to mend it"
     parser = add_command(commands, "doctor", summary, "refgs doctor data/glossy", run, kernels=False)
     parser.add_argument(
         "data", type=Path, nargs="?", metavar="DATA", help="data set to look at, instead of the installation"

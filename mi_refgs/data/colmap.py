@@ -87,7 +87,8 @@ class Reconstruction:
         else:
             chosen = [image for image in there if (image.name in named) == (split == "test")]
         if not chosen:
-            raise InputError(f"{self.source}: zero {split} views; add pictures")
+            remedy = "add pictures" if named is None else "name some of the pictures in test.txt, not all"
+            raise InputError(f"{self.source}: zero {split} views; {remedy}")
         return [(image, *self.found[image.name]) for image in chosen]
 
     def view(self, image: Image, file: Path, downscale: int) -> View:
@@ -167,7 +168,7 @@ def _intrinsics(camera: Camera, picture: PictureFile) -> tuple[float, float, flo
     Raises InputError for one of another shape.
     """
     across, down = picture.width / camera.width, picture.height / camera.height
-    # Of a copy, width and height are rounded by up to a pixel each.
+    # Width and height of a copy are rounded by up to a pixel each.
     if abs(picture.height - across * camera.height) > 1 + picture.height / picture.width:
         raise InputError(
             f"{picture.path}: size: {picture.width} × {picture.height} pixels are no copy of "

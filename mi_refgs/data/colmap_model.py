@@ -241,7 +241,7 @@ def _text_points(lines: Iterator[str]) -> Iterator[tuple[Any, ...]]:
 
 
 def _filled(lines: Iterator[str]) -> Iterator[str]:
-    """Lines that are neither empty nor comments; who asks for one may take the next of `lines` itself."""
+    """Lines that are neither empty nor comments; the caller may read the following line from `lines`."""
     for line in lines:
         if line and not line.startswith("#"):
             yield line

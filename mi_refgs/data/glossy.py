@@ -27,7 +27,7 @@ CAMERA = re.compile(r"(\d{1,6})-camera\.pkl")
 DEEPEST = 15.0
 """Units of the largest depth."""
 NUMBERS = 65535
-"""Its number in the file."""
+"""The number that stands for the largest depth in a file of 16 bits."""
 BEHIND = int(14.5 / DEEPEST * NUMBERS) + 1
 """The least number that is background: 14.5 units."""
 

@@ -17,7 +17,7 @@ from mi_refgs.ply import read_vertices
 def read_points(path: Path) -> PointCloud | None:
     """Points x, y, z with red, green, blue of 8 bits or 0 … 1, sRGB-encoded; None without any.
 
-    Points without usable numbers are left out. Raises InputError for a file that is missing or of no use.
+    Points without usable numbers are left out. Raises InputError for a file that is missing or unusable.
     """
     require_file(path)
     with path.open("rb") as file:

@@ -85,7 +85,7 @@ class Settings:
 def prepare_folder(out: Path, settings: Settings, overwrite: bool, relight: Sequence[LightFile] = ()) -> None:
     """Make the folders and record the settings; stop at a folder that holds anything else, or empty it."""
     record = out / "dataset.json"
-    # What an older version did not know has its default there.
+    # Settings that an older version lacked have their defaults.
     known = _as_json({f.name: f.default for f in fields(Settings) if f.default is not MISSING})
     wanted = _as_json(asdict(settings))
     found: Any = None

@@ -11,7 +11,7 @@ import trimesh
 from mi_refgs.errors import InputError
 
 SPHERE_SUBDIVISIONS = 5
-"""Of an icosahedron: 20,480 triangles, whose middles lie 1.5e-4 radii below the sphere."""
+"""Subdivisions of an icosahedron: 20,480 triangles, whose middles lie 1.5e-4 radii below the sphere."""
 ROUND_SIDES = 256
 """Sides of a circle: the middle of a side lies 8e-5 radii inside it."""
 

@@ -31,7 +31,7 @@ COSINE_LOBE = (1.0, 2 / 3, 1 / 4, 0.0)
 """Factors by degree that turn harmonics into their cosine-weighted mean over a hemisphere. [Ramamoorthi and
 Hanrahan 2001, eq. 8, over π]"""
 IRRADIANCE_FLOOR = 1e-4
-"""Of the light's brightest irradiance: below, a surfel is dark whatever its albedo."""
+"""Share of the light's brightest irradiance: below, a surfel is dark whatever its albedo."""
 RELIGHT_RAYS = 16
 """Rays of the lobe of each pixel. Two balls of known materials, relit at 128² and 2 × 2 samples, are 33.6 dB
 from the path tracer's with one, 34.2 with 4, 34.4 with 16 and 34.5 with 64 rays."""
