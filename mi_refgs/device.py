@@ -13,20 +13,23 @@ import numpy as np
 
 LOOK_AHEAD = 64
 """Elements by which kernels read beyond the last one of an array, at most: a packet of the widest machine."""
+DTYPES = {"Float": np.float32, "UInt32": np.uint32, "Int32": np.int32, "Bool": np.bool_}
+"""NumPy's types of the elements of Mitsuba's flat arrays."""
 
 
 def upload(values: np.ndarray, kind: Any = None) -> Any:
-    """A flat mi.Float (or another `kind` of array) with the values, in memory that Dr.Jit has allocated.
+    """A flat mi.Float (or another `kind` of DTYPES) with the values, in memory that Dr.Jit has allocated.
 
     `mi.Float(values)` wraps NumPy's memory on the CPU. A kernel reads whole packets of it, and so beyond its
     end: the process ends where the next page of memory is nobody's. Also, that memory may be aligned to
-    packets or not: each array then has two kernels, and which one a training step needs, and compiles,
-    changes from view to view.
+    packets or not: each array has two kernels, and which one a training step needs, and compiles, changes
+    from view to view. Dr.Jit copies arrays of vectors, such as `mi.Point3f(table.T)`, by elements: they need
+    none of this.
     """
     kind = mi.Float if kind is None else kind
-    dtype = np.uint32 if kind is mi.UInt32 else np.float32
+    dtype = {getattr(mi, name): dtype for name, dtype in DTYPES.items()}[kind]
     count = np.size(values)
-    padded = np.zeros(count + LOOK_AHEAD, dtype)
+    padded: np.ndarray = np.zeros(count + LOOK_AHEAD, dtype)
     padded[:count] = np.ravel(values)
     own = dr.empty(kind, count)
     if count:
@@ -37,9 +40,10 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
     return own
 
 
-def upload_tensor(values: np.ndarray) -> Any:
-    """The same as an mi.TensorXf of their shape."""
-    return mi.TensorXf(upload(values), shape=values.shape)
+def upload_tensor(values: np.ndarray, kind: Any = None) -> Any:
+    """The same as an mi.TensorXf (or another `kind` of tensor) of their shape."""
+    kind = mi.TensorXf if kind is None else kind
+    return kind(upload(values, dr.array_t(kind)), shape=values.shape)
 
 
 def replayed(function: Callable[..., Any], limit: int | None = None) -> Callable[..., Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import drjit as dr
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import run_python
 
-from mi_refgs.device import upload
+from mi_refgs.device import upload, upload_tensor
 
 
 @pytest.mark.parametrize("offset", range(5))
@@ -37,6 +38,60 @@ def test_other_shapes_types_and_nothing() -> None:
     assert isinstance(integers, mi.UInt32)
     np.testing.assert_array_equal(integers.numpy(), table.ravel())
     assert dr.width(upload(np.zeros((0, 3)))) == 0
+    signs = upload(table - 3, mi.Int32)
+    assert isinstance(signs, mi.Int32)
+    np.testing.assert_array_equal(signs.numpy(), table.ravel() - 3)
+    odd = upload(table % 2 == 1, mi.Bool)
+    assert isinstance(odd, mi.Bool)
+    np.testing.assert_array_equal(odd.numpy(), table.ravel() % 2 == 1)
+    tensor = upload_tensor(table, mi.TensorXu)
+    assert isinstance(tensor, mi.TensorXu)
+    np.testing.assert_array_equal(tensor.numpy(), table)
+    assert isinstance(upload_tensor(table), mi.TensorXf)
+
+
+GUARDED = """
+import ctypes, mmap, sys
+import mi_refgs, mitsuba as mi, drjit as dr, numpy as np
+mi.set_variant("llvm_ad_rgb")
+from mi_refgs.device import upload, upload_tensor
+
+def guarded(values):  # copied to the end of pages that none follows: to read beyond it ends the process
+    size, pages = values.nbytes, -(-values.nbytes // mmap.PAGESIZE)
+    memory = mmap.mmap(-1, (pages + 1) * mmap.PAGESIZE)
+    end = ctypes.addressof(ctypes.c_char.from_buffer(memory)) + pages * mmap.PAGESIZE
+    assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(end), ctypes.c_size_t(mmap.PAGESIZE), 0) == 0
+    own = np.frombuffer(memory, values.dtype, values.size, pages * mmap.PAGESIZE - size).reshape(values.shape)
+    own[...] = values
+    return own
+
+count = 1001
+values = guarded((np.arange(3 * count) % 7).astype(sys.argv[2]))[2 * count:]
+table = guarded((np.arange(3 * count) % 7).astype(sys.argv[2]).reshape(count, 3))
+array = eval(sys.argv[1])
+flat = array.array if dr.is_tensor_v(array) else dr.ravel(array)
+numbers = dr.select(flat, 1, 0) if dr.is_mask_v(flat) else flat + 0 * dr.opaque(type(flat), 1)
+dr.eval(numbers)
+expected = table if dr.is_tensor_v(array) or dr.depth_v(array) > 1 else values
+np.testing.assert_array_equal(numbers.numpy(), expected.ravel())
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pages are protected by mprotect")
+@pytest.mark.parametrize(
+    ("array", "dtype"),
+    [
+        ("upload(values)", "float32"),
+        ("upload(values, mi.UInt32)", "uint32"),
+        ("upload(values, mi.Bool)", "bool"),
+        ("upload_tensor(table)", "float32"),
+        ("mi.Point3f(table.T)", "float32"),
+        ("mi.Vector3f(np.ascontiguousarray(table.T))", "float32"),
+    ],
+)
+def test_nothing_is_read_beyond_the_end_of_an_array(array: str, dtype: str, tmp_path: Path) -> None:
+    """Kernels read whole packets of flat arrays; arrays of vectors are copied by Dr.Jit itself."""
+    run_python(GUARDED, array, dtype, folder=tmp_path)
 
 
 GARBAGE = """

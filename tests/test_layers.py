@@ -15,6 +15,12 @@ PACKAGE = "mi_refgs"
 BOTTOM = {"constants", "contraction", "device", "errors", "exr", "files", "hdr", "images", "ply", "timing"}
 """What everything may stand on."""
 
+FLAT = {"Float", "UInt32", "Int32", "Bool", "TensorXf", "TensorXu", "TensorXi", "TensorXb"}
+"""Arrays that Dr.Jit wraps around NumPy's memory, without a copy, where they are made of a NumPy array."""
+
+GATHERED = {"shade.brdf": ["mi.Float(table().ravel())"]}
+"""Wrapped arrays by module that are read by gathers alone, which do not go beyond the end."""
+
 MAX_LINES = 300
 """Lines of a file of the package."""
 
@@ -157,6 +163,76 @@ def variant_names() -> set[str]:
     return names - purposes
 
 
+def numpy_fields(modules: dict[str, str]) -> set[str]:
+    """Names of fields that are NumPy arrays in every class of the package that has them."""
+    kinds: dict[str, set[bool]] = {}
+    for source in modules.values():
+        for owner in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef)):
+            for node in (node for node in owner.body if isinstance(node, ast.AnnAssign)):
+                kinds.setdefault(ast.unparse(node.target), set()).add(is_numpy_type(node.annotation))
+    return {name for name, found in kinds.items() if found == {True}}
+
+
+def is_numpy_type(annotation: ast.expr | None) -> bool:
+    return annotation is not None and ast.unparse(annotation) in ("np.ndarray", "np.ndarray | None")
+
+
+def wrapped_arrays(source: str, fields: set[str]) -> list[str]:
+    """Calls such as `mi.Float(values)` of what is a NumPy array for all that one function shows."""
+    return [
+        ast.unparse(call)
+        for function in ast.walk(ast.parse(source))
+        if isinstance(function, ast.FunctionDef)
+        for names in [numpy_names(function, fields)]
+        for call in ast.walk(function)
+        if isinstance(call, ast.Call)
+        and isinstance(call.func, ast.Attribute)
+        and call.func.attr in FLAT
+        and call.args
+        and is_numpy(call.args[0], names, fields)
+    ]
+
+
+def numpy_names(function: ast.FunctionDef, fields: set[str]) -> set[str]:
+    """Arguments and variables of a function that are NumPy arrays wherever they get a value."""
+    every = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    names = {argument.arg for argument in every if is_numpy_type(argument.annotation)}
+    for _ in range(3):  # values may follow from later ones, in loops
+        given: dict[str, list[bool]] = {name: [True] for name in names}
+        for node in ast.walk(function):
+            if isinstance(node, ast.Assign):
+                pairs = [(target, node.value) for target in node.targets]
+            elif isinstance(node, ast.For | ast.comprehension):
+                pairs = [(node.target, node.iter)]
+            else:
+                continue
+            for target, value in pairs:
+                if isinstance(target, ast.Name):
+                    given.setdefault(target.id, []).append(is_numpy(value, names, fields))
+        names = {name for name, found in given.items() if all(found)}
+    return names
+
+
+def is_numpy(value: ast.expr, names: set[str], fields: set[str]) -> bool:
+    """Whether an expression is a NumPy array: by its function, its method, or what it is made of."""
+    match value:
+        case ast.Call(func=ast.Attribute(value=ast.Name(id="np"))):
+            return True
+        case ast.Call(func=ast.Attribute(attr="astype" | "ravel" | "reshape" | "numpy" | "flatten")):
+            return not ast.unparse(value).startswith("dr.")
+        case ast.Attribute(attr=attr):
+            return attr == "T" or attr in fields
+        case ast.Name(id=name):
+            return name in names
+        case ast.Subscript(value=inner) | ast.UnaryOp(operand=inner):
+            return is_numpy(inner, names, fields)
+        case ast.BinOp(left=left, right=right):
+            return is_numpy(left, names, fields) or is_numpy(right, names, fields)
+        case ast.Compare(left=left):
+            return is_numpy(left, names, fields)
+    return False
+
+
 # ---------- The rules ----------
 
 
@@ -182,6 +258,18 @@ def test_no_code_knows_a_variant_by_name() -> None:
     names = variant_names()
     for module, source in sources().items():
         assert not names & strings_outside_docstrings(source), module
+
+
+def test_numpy_arrays_reach_the_device_by_upload() -> None:
+    """Kernels read beyond the end of wrapped ones: `mi_refgs.device.upload` and `upload_tensor` copy them."""
+    modules = sources()
+    fields = numpy_fields(modules)
+    found = {
+        module: wrapped_arrays(source, fields)
+        for module, source in modules.items()
+        if module.partition(".")[0] not in ("reference", "device")
+    }
+    assert {module: calls for module, calls in found.items() if calls} == GATHERED
 
 
 def test_no_file_is_longer_than_one_can_survey() -> None:
@@ -237,3 +325,36 @@ def test_a_planted_name_is_found() -> None:
     )
     assert strings_outside_docstrings(source) == {"two_d", " no two_d"}
     assert strings_outside_docstrings('"""two_d"""\nWIDTH = 3\n"""two_d"""') == set()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "mi.Float(np.arange(3.0))",
+        "mi.TensorXf(np.ascontiguousarray(x, np.float32))",
+        "mi.Float(view.depth.ravel())",
+        "mi.Bool(edit.fresh)",
+        "mi.UInt32(mesh.faces[:, 0])",
+        "mi.Bool(a > 0)",
+        "[mi.Float(column) for column in a.T]",
+        "y = 2 * a; z = y[3:]; mi.Float(z)",
+    ],
+)
+def test_a_planted_wrapped_array_is_found(body: str) -> None:
+    source = f"def f(a: np.ndarray, x):\n    {body}"
+    assert wrapped_arrays(source, {"fresh", "faces"})
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "mi.Float(x)",
+        "mi.Bool(x > 0)",
+        "mi.Point3f(a.T)",
+        "mi.Float(0)",
+        "mi.TensorXf(dr.ravel(x), shape=(3, 3))",
+        "y = a; y = x; mi.Float(y)",
+    ],
+)
+def test_what_is_not_flat_or_not_of_numpy_is_no_wrapped_array(body: str) -> None:
+    assert not wrapped_arrays(f"def f(a: np.ndarray, x):\n    {body}", {"fresh"})

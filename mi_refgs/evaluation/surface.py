@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from mi_refgs.data.settings import SURFACE
 from mi_refgs.data.view import View
+from mi_refgs.device import upload
 from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
 from mi_refgs.shade.ambient import ambient_direction
@@ -65,7 +66,7 @@ class TrueSurface:
         if view.depth is None or view.normal is None:
             return None
         camera = view.camera()
-        depth = mi.Float(view.depth.ravel())
+        depth = upload(view.depth)
         point = mi.Point3f(camera.origin + camera.rays() * depth)
         open_ = openness(self.occluder, point, mi.Vector3f(view.normal.reshape(-1, 3).T), depth > 0)
         return (open_.numpy().reshape(view.depth.shape) < CONCAVE_BELOW) & (view.depth > 0)
@@ -156,7 +157,7 @@ def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.nda
             at = np.clip(at, 0, np.array([[view.height - 1], [view.width - 1]]))
             better &= view.covered()[*at] > 0
         start = mi.Point3f(np.tile(origin, (len(ray), 1)).T)
-        hit, stopped = occluder.first_hit(start, mi.Vector3f(ray.T), mi.Bool(better))
+        hit, stopped = occluder.first_hit(start, mi.Vector3f(ray.T), upload(better, mi.Bool))
         # In lengths of the ray: what stands in the way does so by more than rays are moved off a surface.
         margin = 1 - OFFSET_VOXELS * mesh.voxel / reach
         better &= ~stopped.numpy() | (hit.numpy() > margin)

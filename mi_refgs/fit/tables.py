@@ -53,7 +53,7 @@ class Table:
     def adopt(self, edit: TableEdit) -> None:
         """Put an edited table in place of the present one; moments and statistics follow the rows."""
         edit = edit.ordered()
-        parent, fresh = upload(edit.parent, mi.UInt32), mi.Bool(edit.fresh)
+        parent, fresh = upload(edit.parent, mi.UInt32), upload(edit.fresh, mi.Bool)
         self.replace(edit.surfels)
         self.trainer.optimiser.gather(parent, self._names(edit.surfels), fresh)
         self.gradient_sum = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_sum, parent))

@@ -7,6 +7,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.device import upload, upload_tensor
+
 
 def _is_3_9() -> bool:
     return hasattr(mi.Mesh, "vertex_positions_buffer")
@@ -14,11 +16,9 @@ def _is_3_9() -> bool:
 
 def mesh_values(vertices: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
     """Parameters of a `mi.Mesh` (by `mi.traverse` name) for (V, 3) world vertices and (F, 3) indices."""
-    vertices = np.ascontiguousarray(vertices, dtype=np.float32)
-    faces = np.ascontiguousarray(faces, dtype=np.uint32)
     if _is_3_9():
-        return {"vertex_positions": mi.Float(vertices.ravel()), "faces": mi.UInt32(faces.ravel())}
-    return {"positions": mi.TensorXf(vertices), "faces": mi.TensorXu(faces)}
+        return {"vertex_positions": upload(vertices), "faces": upload(faces, mi.UInt32)}
+    return {"positions": upload_tensor(vertices), "faces": upload_tensor(faces, mi.TensorXu)}
 
 
 def make_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:

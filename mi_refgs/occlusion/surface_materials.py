@@ -91,13 +91,8 @@ class VertexSurfels:
         alone = np.arange(count) == 0
         weight = np.where(total > WEIGHT_FLOOR, weight / np.maximum(total, WEIGHT_FLOOR), alone)
         normal = _normals(mesh, normal[found], weight)
-        return VertexSurfels(
-            surfels.count,
-            mi.UInt32(mesh.faces.ravel()),
-            [mi.UInt32(column.astype(np.uint32)) for column in found.T],
-            [mi.Float(column.astype(np.float32)) for column in weight.T],
-            mi.Vector3f(np.ascontiguousarray(normal.T, np.float32)),
-        )
+        arrays = {"surfels": found.T, "weights": weight.T, "normals": normal.T}
+        return VertexSurfels.restored(mesh, surfels.count, arrays)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What `of` has found, for checkpoints: "surfels" and "weights" (K, V), "normals" (3, V)."""

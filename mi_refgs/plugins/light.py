@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.shade.envmap import (
     DEFAULT_HEIGHT,
@@ -100,8 +101,7 @@ def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
     if width == 2 * rows and rows % 4 == 0 and MIN_HEIGHT <= rows <= MAX_HEIGHT:
         return radiance, ""
     height = min(MAX_HEIGHT, max(MIN_HEIGHT, 4 * (width // 8)))
-    values = resample(radiance.numpy(), height).astype(np.float32)
-    return mi.TensorXf(values), f"{rows} x {width}"
+    return upload_tensor(resample(radiance.numpy(), height)), f"{rows} x {width}"
 
 
 def _constant_radiance(params: Any, emitter: Any) -> Any:

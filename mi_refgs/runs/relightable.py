@@ -11,6 +11,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
+from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points
@@ -109,8 +110,7 @@ def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> S
         def with_shadows(ratio: Any) -> Surfels:
             diffuse = np.clip(radiance_ / np.maximum(arrives_ * ratio, floor), 0, 1)
             mixed = metallic * albedo + (1 - metallic) * diffuse
-            raw = mi.TensorXf(np.ascontiguousarray(logit(mixed), np.float32))
-            return Surfels(surfels.raw | {"albedo": raw})
+            return Surfels(surfels.raw | {"albedo": upload_tensor(logit(mixed))})
 
         found = with_shadows(1.0)
         if mesh is None or vertex is None:

@@ -99,6 +99,8 @@ def table() -> np.ndarray:
 @functools.lru_cache(maxsize=4)
 def device_table(variant: str) -> Any:
     """The table as evaluated mi.Float of the variant that is set; made on the first call, kept for others."""
+    # Gathers alone read it, by elements: NumPy's memory will do. The first one may be in a loop that is being
+    # recorded, where `upload` could not run its kernel.
     return mi.Float(table().ravel())
 
 

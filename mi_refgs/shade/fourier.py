@@ -86,7 +86,7 @@ def make_rows(firsts: list[int], limits: list[np.ndarray]) -> RowLayout:
         folding=to_device(*np.concatenate(folding, 1)),
         analysis=to_device(*np.concatenate(analysis, 1)),
         slots=to_device(*np.concatenate(slots, 1)),
-        exists=tuple(mi.Bool(row) for row in np.concatenate(exists, 1)),
+        exists=tuple(upload(row, mi.Bool) for row in np.concatenate(exists, 1)),
         synthesis=to_device(*np.concatenate(synthesis, 1)),
         twiddles=upload(np.concatenate(twiddles)),
     )

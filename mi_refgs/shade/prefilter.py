@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import replayed
+from mi_refgs.device import replayed, upload
 from mi_refgs.shade import fourier, lobe_matrices, mixing
 from mi_refgs.shade.lobe_matrices import LEVELS, Levels
 
@@ -70,9 +70,7 @@ def _build(height: int, wanted: Levels) -> Operator:
             [(m, s, slot_in, limit_in) for m, (s, _) in zip(transposed, out, strict=True)],
             base.coefficients,
         ),
-        info=mi.UInt32(
-            np.array([(f, h, 2 * h, 0) for f, h in zip(firsts, heights, strict=False)], np.uint32).ravel()
-        ),
+        info=upload(np.array([(f, h, 2 * h, 0) for f, h in zip(firsts, heights, strict=False)]), mi.UInt32),
         shapes=tuple(zip(firsts, heights, strict=False)),
         roughness=wanted.roughness,
     )
