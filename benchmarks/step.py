@@ -54,7 +54,7 @@ def sphere_data(size: int, views: int, rng: np.random.Generator) -> Any:
 def make_trainer(surfels: int, data: Any, variant: str = METHOD) -> tuple[Any, Any]:
     """A trainer at the preset `standard` that keeps its number of surfels, and its method."""
     from mi_refgs import methods
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fitting.train import Trainer
 
     settings = [f"surfels.count={surfels}", f"surfels.max_count={surfels}", "surfels.inside=0", "refine={}"]
     method = methods.load(variant, "standard", settings)

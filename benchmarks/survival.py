@@ -195,7 +195,7 @@ def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
     """One fit of so many steps; a record every INTERVAL steps is printed and, at the end, all are written."""
     from benchmarks.step import sphere_data
     from mi_refgs import methods
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fitting.train import Trainer
     from mi_refgs.runs.run import Run
 
     mi.set_variant("llvm_ad_rgb")

@@ -51,7 +51,7 @@ def fit(folder: Path, seed: int) -> dict[str, float]:
     from mi_refgs import methods
     from mi_refgs.data import dataset
     from mi_refgs.evaluation import metrics, pictures
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fitting.train import Trainer
 
     method = methods.load("ref_gaussian", "quick", [*SETTINGS, f"seed={seed}"])
     trainer = Trainer(method, dataset.read_dataset(folder, "train", truth=False))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mi_refgs.data.view import View as View
     from mi_refgs.errors import InputError as InputError
     from mi_refgs.evaluation.evaluate import evaluate as evaluate
-    from mi_refgs.fit.train import Trainer as Trainer
+    from mi_refgs.fitting.train import Trainer as Trainer
     from mi_refgs.methods.method import Method as Method
     from mi_refgs.methods.read import load as load_method
     from mi_refgs.occlusion.mesh import Mesh as Mesh
@@ -76,7 +76,7 @@ _PUBLIC = {
     "Shading": ("shade.shading", "Shading"),
     "Surfels": ("surfels.table", "Surfels"),
     "TrainedScene": ("runs.export", "TrainedScene"),
-    "Trainer": ("fit.train", "Trainer"),
+    "Trainer": ("fitting.train", "Trainer"),
     "View": ("data.view", "View"),
     "evaluate": ("evaluation.evaluate", "evaluate"),
     "from_points": ("surfels.init", "from_points"),

@@ -17,8 +17,8 @@ from test_train import ball
 
 from mi_refgs import methods
 from mi_refgs.errors import InputError
-from mi_refgs.fit import refine
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting import refine
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.presets import scaled
 from mi_refgs.surfels.table import Surfels
 

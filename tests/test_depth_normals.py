@@ -11,7 +11,7 @@ import pytest
 from image_checks import HEIGHT, STEP, VALUE, WIDTH, gradient, planes, stack
 
 from mi_refgs.constants import COVERAGE_FLOOR
-from mi_refgs.fit import losses
+from mi_refgs.fitting import losses
 from mi_refgs.reference import losses as reference
 from mi_refgs.render import display
 from mi_refgs.render.depth_normals import normals_from_depth

@@ -18,7 +18,7 @@ from mi_refgs.data import dataset
 from mi_refgs.evaluation import metrics, pictures
 from mi_refgs.evaluation.evaluate import evaluate
 from mi_refgs.evaluation.speed import TIMED_FRAMES, WARM_UP_FRAMES
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.images import read_png
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame, render

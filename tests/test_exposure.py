@@ -19,10 +19,10 @@ from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, MAX_GAIN, fitted_gain, log_exposure
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
-from mi_refgs.fit import exposure
-from mi_refgs.fit.exposure import Exposure, exif_gains
-from mi_refgs.fit.objective import GAIN_PRIOR, Target, objective
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting import exposure
+from mi_refgs.fitting.exposure import Exposure, exif_gains
+from mi_refgs.fitting.objective import GAIN_PRIOR, Target, objective
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.images import EXIF_IFD, srgb_from_linear
 from mi_refgs.methods.method import GAIN, DataOptions, ExposureOptions, Method, Refine
 from mi_refgs.methods.weights import LossWeights

@@ -26,7 +26,7 @@ from mi_refgs import constants
 from mi_refgs.cli import main
 from mi_refgs.constants import ALPHA_MIN, GAUSSIAN_LOW_PASS
 from mi_refgs.device import upload
-from mi_refgs.fit import refine
+from mi_refgs.fitting import refine
 from mi_refgs.methods import Refine
 from mi_refgs.primitives.gaussian import GaussianAdjoint
 from mi_refgs.reference import gaussian as exact

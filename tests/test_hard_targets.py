@@ -14,7 +14,7 @@ from test_train import METHOD, ball
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.images import linear_from_srgb
 
 STEPS = 14

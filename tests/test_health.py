@@ -14,10 +14,10 @@ from test_train import METHOD, ball, run_folder
 
 from mi_refgs import methods
 from mi_refgs.errors import InputError
-from mi_refgs.fit import health
-from mi_refgs.fit.optim import Adam
-from mi_refgs.fit.skips import Skipped
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting import health
+from mi_refgs.fitting.optim import Adam
+from mi_refgs.fitting.skips import Skipped
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method
 from mi_refgs.primitives.surfel import Surfel
 from mi_refgs.surfels.table import Surfels

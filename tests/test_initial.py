@@ -12,7 +12,7 @@ from tiny_scene import RADIUS, write_data
 from mi_refgs import methods
 from mi_refgs.data import dataset, hull
 from mi_refgs.errors import InputError
-from mi_refgs.fit.initial import initial_surfels
+from mi_refgs.fitting.initial import initial_surfels
 
 COUNT = 2_000
 

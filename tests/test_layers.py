@@ -52,18 +52,18 @@ LAYERS: dict[str, set[str]] = {
     "data": RENDERER,
     "capture": {"data"} | BOTTOM,
     "runs": RENDERER | {"methods"},
-    "fit": RENDERER | {"methods", "data", "capture", "runs"},
-    "evaluation": RENDERER | {"methods", "data", "runs", "fit"},
-    "relighting": RENDERER | {"methods", "data", "runs", "fit", "evaluation"},
-    "profiling": RENDERER | {"methods", "data", "fit"},
-    "compare": RENDERER | {"methods", "data", "runs", "fit", "evaluation", ""},
+    "fitting": RENDERER | {"methods", "data", "capture", "runs"},
+    "evaluation": RENDERER | {"methods", "data", "runs", "fitting"},
+    "relighting": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
+    "profiling": RENDERER | {"methods", "data", "fitting"},
+    "compare": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", ""},
     "doctor": {"llvm", "errors", ""},
     "cli": RENDERER
     | {
         "methods",
         "data",
         "runs",
-        "fit",
+        "fitting",
         "evaluation",
         "relighting",
         "compare",
@@ -76,7 +76,7 @@ LAYERS: dict[str, set[str]] = {
     },
     "__main__": {"cli"},
     "reference": {"constants"},
-    "": RENDERER | {"llvm", "plugins", "methods", "data", "runs", "fit", "evaluation", "relighting"},
+    "": RENDERER | {"llvm", "plugins", "methods", "data", "runs", "fitting", "evaluation", "relighting"},
 }
 """What each part of the package may import besides itself; "" is the package's own `__init__`.
 
@@ -285,7 +285,7 @@ def test_no_file_is_longer_than_one_can_survey() -> None:
     ("module", "source"),
     [
         ("splat.tiles", "from mi_refgs.render import pipeline"),
-        ("splat.tiles", "import mi_refgs.fit.train"),
+        ("splat.tiles", "import mi_refgs.fitting.train"),
         ("splat.tiles", "def f():\n    from mi_refgs.shade.brdf import split_sum"),
         ("shade.brdf", "from mi_refgs.splat.tiles import list_by_tile"),
         ("occlusion.mesh", "from mi_refgs.shade.brdf import split_sum"),

@@ -12,9 +12,9 @@ from helpers import level_maps
 from image_checks import GRADIENT, HEIGHT, STEP, VALUE, WIDTH, check, gradient, planes, stack
 
 from mi_refgs.data.dataset import View
-from mi_refgs.fit import losses
-from mi_refgs.fit.objective import Target
-from mi_refgs.fit.ssim import ssim
+from mi_refgs.fitting import losses
+from mi_refgs.fitting.objective import Target
+from mi_refgs.fitting.ssim import ssim
 from mi_refgs.images import srgb_from_linear
 from mi_refgs.reference import losses as reference
 from mi_refgs.render import display

@@ -13,7 +13,7 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
 from mi_refgs.exr import write_exr
-from mi_refgs.fit.ssim import ssim as training_ssim
+from mi_refgs.fitting.ssim import ssim as training_ssim
 from mi_refgs.reference import losses as reference
 from mi_refgs.shade.envmap import EnvironmentLight
 

@@ -14,9 +14,9 @@ from image_checks import HEIGHT, WIDTH
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View, read_dataset
 from mi_refgs.device import upload
-from mi_refgs.fit import losses
-from mi_refgs.fit.objective import Target, objective
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting import losses
+from mi_refgs.fitting.objective import Target, objective
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.images import linear_from_srgb
 from mi_refgs.methods.weights import LossWeights
 from mi_refgs.reference import losses as reference

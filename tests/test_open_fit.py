@@ -19,10 +19,10 @@ from mi_refgs.data.readers import PointCloud
 from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
-from mi_refgs.fit import exchange
-from mi_refgs.fit.initial import initial_parameters, is_open
-from mi_refgs.fit.train import Trainer
-from mi_refgs.fit.whole import begin
+from mi_refgs.fitting import exchange
+from mi_refgs.fitting.initial import initial_parameters, is_open
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.fitting.whole import begin
 from mi_refgs.images import linear_from_srgb, read_png, write_png
 from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
 from mi_refgs.runs.export import TrainedScene

@@ -23,7 +23,7 @@ from mi_refgs.data.picture_files import Mask, PictureFile
 from mi_refgs.data.picture_store import Picture, PictureStore
 from mi_refgs.errors import InputError
 from mi_refgs.exr import write_exr
-from mi_refgs.fit.targets import PIXEL_BYTES, Targets
+from mi_refgs.fitting.targets import PIXEL_BYTES, Targets
 from mi_refgs.images import write_png
 from mi_refgs.methods.method import CoarsePictures, DataOptions
 
@@ -135,7 +135,7 @@ mi.set_variant("llvm_ad_rgb")
 from pathlib import Path
 from mi_refgs.data import picture_store
 from mi_refgs.data.dataset import read_dataset
-from mi_refgs.fit.targets import Targets
+from mi_refgs.fitting.targets import Targets
 from mi_refgs.methods.method import DataOptions
 picture_store.STORE.budget = int(sys.argv[2])
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -12,8 +12,8 @@ from tiny_scene import write_data
 from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.data.picture_files import PictureFile
-from mi_refgs.fit import plan
-from mi_refgs.fit import speed as speeds
+from mi_refgs.fitting import plan
+from mi_refgs.fitting import speed as speeds
 from mi_refgs.methods.method import CoarsePictures, DataOptions, Method
 from mi_refgs.methods.surroundings import SurroundingsOptions
 

@@ -21,7 +21,7 @@ from tiny_scene import SETTINGS, SIZE
 from mi_refgs import methods, timing
 from mi_refgs.cli import main
 from mi_refgs.data import dataset as data_module
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import LightOptions, Method
 from mi_refgs.profiling import phases
 from mi_refgs.profiling.advice import advice

@@ -21,7 +21,7 @@ from mi_refgs.cli import main
 from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
-from mi_refgs.fit import refine
+from mi_refgs.fitting import refine
 from mi_refgs.methods import Refine
 from mi_refgs.primitives import Footprints, Primitive
 from mi_refgs.primitives.screen import reach, rectangle

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit import refine
-from mi_refgs.fit.optim import Adam
-from mi_refgs.fit.rates import Group
+from mi_refgs.fitting import refine
+from mi_refgs.fitting.optim import Adam
+from mi_refgs.fitting.rates import Group
 from mi_refgs.methods.method import Propagation, Refine
 from mi_refgs.methods.window import Window
 from mi_refgs.surfels.channels import logit, sigmoid

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.fit import relocate
+from mi_refgs.fitting import relocate
 from mi_refgs.methods.method import Relocation
 from mi_refgs.methods.window import Window
 from mi_refgs.reference import relocation as reference

@@ -15,7 +15,7 @@ from mi_refgs.data import dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.evaluate import evaluate
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.images import srgb_from_linear
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Frame

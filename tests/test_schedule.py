@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mi_refgs.fit.schedule import Schedule
+from mi_refgs.fitting.schedule import Schedule
 from mi_refgs.methods.method import LightOptions, Method, Stage, SurfelOptions
 from mi_refgs.methods.window import Window
 

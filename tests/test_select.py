@@ -19,10 +19,10 @@ from mi_refgs import methods, splat
 from mi_refgs.cli import main
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fit import select
-from mi_refgs.fit.branch import branched
-from mi_refgs.fit.train import Trainer
-from mi_refgs.fit.whole import begin
+from mi_refgs.fitting import select
+from mi_refgs.fitting.branch import branched
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.fitting.whole import begin
 from mi_refgs.images import linear_from_srgb
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.occlusion.visibility import Occluder

@@ -18,8 +18,8 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
-from mi_refgs.fit import train
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting import train
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import DataOptions, Method, Rates
 from mi_refgs.reference.camera import look_at
 from mi_refgs.runs.interrupt import TerminatedError, held_interrupts

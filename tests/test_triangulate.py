@@ -13,7 +13,7 @@ import pytest
 from mi_refgs.capture import colmap, triangulate
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.readers import PointCloud
-from mi_refgs.fit.whole import begin
+from mi_refgs.fitting.whole import begin
 from mi_refgs.methods import load
 from mi_refgs.runs.run import Run
 

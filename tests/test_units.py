@@ -16,10 +16,10 @@ from tiny_scene import write_data
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, read_dataset
-from mi_refgs.fit.initial import initial_surfels
-from mi_refgs.fit.optim import Adam
-from mi_refgs.fit.rates import Group
-from mi_refgs.fit.schedule import Schedule
+from mi_refgs.fitting.initial import initial_surfels
+from mi_refgs.fitting.optim import Adam
+from mi_refgs.fitting.rates import Group
+from mi_refgs.fitting.schedule import Schedule
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points
 from mi_refgs.occlusion.visibility import Occluder

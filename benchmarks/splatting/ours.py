@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.splatting.workload import Workload
 from mi_refgs.device import upload
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.profiling.phases import phase_times
 from mi_refgs.splat import Blended, Camera, list_by_tile, project, splat

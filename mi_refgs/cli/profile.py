@@ -12,7 +12,7 @@ from mi_refgs.cli.train import DEFAULT_PRESET, load_method
 from mi_refgs.errors import InputError
 
 if TYPE_CHECKING:
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fitting.train import Trainer
     from mi_refgs.profiling.profile import Profile
 
 DEFAULT_STEPS = 15
@@ -61,8 +61,8 @@ def run(args: argparse.Namespace) -> Result:
 def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
     """The trainer of a run or of a fresh fit, and the stages of the schedule to look at."""
     from mi_refgs.evaluation.evaluate import load_split
-    from mi_refgs.fit.train import Trainer
-    from mi_refgs.fit.whole import read_views, sized
+    from mi_refgs.fitting.train import Trainer
+    from mi_refgs.fitting.whole import read_views, sized
     from mi_refgs.runs.run import Run
 
     if not args.path.is_dir():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from mi_refgs.cli.command import warn
 
 if TYPE_CHECKING:
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fitting.train import Trainer
     from mi_refgs.runs.run import Run
 
 PSNR_MEMORY = 0.9

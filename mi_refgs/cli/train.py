@@ -14,8 +14,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.resources import resource_dir
 
 if TYPE_CHECKING:
-    from mi_refgs.fit.plan import Estimate
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fitting.plan import Estimate
+    from mi_refgs.fitting.train import Trainer
     from mi_refgs.methods.method import Method
     from mi_refgs.runs.run import Run
 
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> Result:
         f"{trainer.surfels.count} surfels; next: refgs eval {args.output}"
     )
     if trainer.decisions:
-        from mi_refgs.fit.select import table
+        from mi_refgs.fitting.select import table
 
         data |= {"terms": list(trainer.method.terms), "decisions": trainer.decisions}
         text = f"{table(trainer.decisions)}\n{text}"
@@ -98,7 +98,7 @@ def default_variant(
     """The method for pictures without alpha, where the data set has such; None for the full one."""
     from mi_refgs import methods
     from mi_refgs.data.picture_store import undecoded
-    from mi_refgs.fit.whole import read_views
+    from mi_refgs.fitting.whole import read_views
 
     # What `assignments` say of a method may be of the other one.
     of_data = [text for text in assignments or [] if text.startswith("data.")]
@@ -121,7 +121,7 @@ def load_method(variant: str | None, preset: str | None, assignments: list[str] 
 
 def _compared(taken: float, expected: Estimate | None) -> str:
     """All of the time of a fit beside its estimate, for people."""
-    from mi_refgs.fit.plan import minutes
+    from mi_refgs.fitting.plan import minutes
 
     return "" if expected is None else f" ({minutes(taken)} in all, estimate {minutes(expected.seconds)})"
 
@@ -142,8 +142,8 @@ def fit(
     Raises InputError for bad input, and KeyboardInterrupt or TerminatedError with a message that says how to
     go on.
     """
-    from mi_refgs.fit.plan import planned
-    from mi_refgs.fit.whole import begin, finish, read_views
+    from mi_refgs.fitting.plan import planned
+    from mi_refgs.fitting.whole import begin, finish, read_views
     from mi_refgs.runs.run import Run
 
     expected: Estimate | None = None

@@ -12,7 +12,7 @@ from typing import Any
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.files import read_json
-from mi_refgs.fit.whole import read_views, sized
+from mi_refgs.fitting.whole import read_views, sized
 from mi_refgs.methods.method import About, DataOptions, Method
 from mi_refgs.methods.read import load
 from mi_refgs.runs.run import Run

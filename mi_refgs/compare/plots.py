@@ -17,7 +17,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import render_name
 from mi_refgs.evaluation.pictures import sheet, target
 from mi_refgs.files import write_bytes
-from mi_refgs.fit.whole import read_views
+from mi_refgs.fitting.whole import read_views
 from mi_refgs.images import read_png, write_png
 from mi_refgs.runs.run import Run
 

@@ -19,8 +19,8 @@ from mi_refgs.evaluation.speed import machine, milliseconds
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.exr import read_exr_image
 from mi_refgs.files import read_json
-from mi_refgs.fit.exposure import EXPOSURE_FILE, with_gain
-from mi_refgs.fit.whole import of_run, read_views
+from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
+from mi_refgs.fitting.whole import of_run, read_views
 from mi_refgs.images import write_png
 from mi_refgs.methods.method import Method
 from mi_refgs.render.samples import samples_per_axis

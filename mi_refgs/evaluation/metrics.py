@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit.ssim import WINDOW_RADIUS, WINDOW_SIGMA
+from mi_refgs.fitting.ssim import WINDOW_RADIUS, WINDOW_SIGMA
 from mi_refgs.images import srgb_from_linear
 from mi_refgs.shade import lobe_matrices
 
@@ -45,7 +45,7 @@ def psnr_of(error: float) -> float:
 
 
 def ssim(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
-    """Structural similarity as `fit.ssim` trains with it, by scikit-image; `where` as in `psnr`.
+    """Structural similarity as `fitting.ssim` trains with it, by scikit-image; `where` as in `psnr`.
 
     scikit-image reflects at the border and leaves it out of the mean; padding by the window's radius with
     zeros turns that into the zero padding and the mean over every pixel that 3DGS and Ref-Gaussian report.

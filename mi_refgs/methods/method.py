@@ -177,7 +177,7 @@ class Rates:
 
 @dataclass(frozen=True)
 class ExposureOptions:
-    """A gain a channel of each training view, on the linear radiance; decided once (`fit.exposure`)."""
+    """A gain a channel of each training view, on the linear radiance; decided once (`fitting.exposure`)."""
 
     gains: Literal["judged", "on", "off"] = "judged"  # judged: if they pay
     after: int = 1_200  # iterations, then it is decided

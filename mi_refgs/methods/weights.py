@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class LossWeights:
     """L = (1 - ssim) L1 + ssim (1 - SSIM) + normal L_n + smooth L_s + alpha L_α, and priors.
 
-    Those are named as their functions in `fit.losses`, and say what pictures do not. Priors on maps of
+    Those are named as their functions in `fitting.losses`, and say what pictures do not. Priors on maps of
     materials count in stages that shade at pixels: others blend no materials.
     """
 

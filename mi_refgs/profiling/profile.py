@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Refine
 from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.profiling.phases import phase_times

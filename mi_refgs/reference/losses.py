@@ -1,4 +1,4 @@
-"""Losses, depth normals and Adam in float64, pixel by pixel: what `render.display`, `fit.optim` must equal.
+"""Losses, depth normals and Adam in float64, pixel by pixel: what `render.display` and `fitting.optim` equal.
 
 Images are (H, W, 3), planes (H, W); row first. No helper is shared with the fast path.
 """

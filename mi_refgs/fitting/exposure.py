@@ -23,7 +23,7 @@ from mi_refgs.data.exposure import MAX_GAIN, fitted_gain
 from mi_refgs.data.view import View
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
-from mi_refgs.fit.rates import Group
+from mi_refgs.fitting.rates import Group
 from mi_refgs.images import srgb_from_linear
 from mi_refgs.methods.method import GAIN, ExposureOptions
 from mi_refgs.render.display import displayed
@@ -31,7 +31,7 @@ from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS
 
 if TYPE_CHECKING:
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fitting.train import Trainer
 
 JUDGES = 32
 """Views that judge, spread evenly: the mean over them has an error of a tenth of a dB."""

@@ -12,10 +12,10 @@ from mi_refgs.capture.triangulate import with_points
 from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
 from mi_refgs.data.survey import require_several_sides
 from mi_refgs.errors import InputError
-from mi_refgs.fit.exposure import EXPOSURE_FILE
-from mi_refgs.fit.select import DECISIONS, select_terms, with_terms
-from mi_refgs.fit.state import decisions_of
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting.exposure import EXPOSURE_FILE
+from mi_refgs.fitting.select import DECISIONS, select_terms, with_terms
+from mi_refgs.fitting.state import decisions_of
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.presets import PRESETS
 from mi_refgs.runs.export import up_to_date

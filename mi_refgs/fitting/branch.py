@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mi_refgs.fit.initial import first_light
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting.initial import first_light
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.methods.surroundings import AROUND, BACKGROUND
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part

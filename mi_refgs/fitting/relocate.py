@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.fit.refine import TableEdit
+from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.methods.method import Relocation
 from mi_refgs.primitives import primitive_of, widths_of
 from mi_refgs.surfels.channels import logit, sigmoid

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import GOLDEN_ANGLE
-from mi_refgs.fit.ssim import ssim
+from mi_refgs.fitting.ssim import ssim
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.shade.light import Light
 

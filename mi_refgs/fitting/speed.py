@@ -25,7 +25,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.files import read_json, write_json
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method, Refine
 from mi_refgs.methods.read import dump
 

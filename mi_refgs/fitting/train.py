@@ -16,18 +16,18 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.fit import health
-from mi_refgs.fit.control import AdaptiveControl
-from mi_refgs.fit.exposure import Exposure
-from mi_refgs.fit.initial import initial_parameters, is_open
-from mi_refgs.fit.light_window import LightWindow
-from mi_refgs.fit.objective import objective
-from mi_refgs.fit.optim import Adam
-from mi_refgs.fit.rates import Group
-from mi_refgs.fit.schedule import Schedule
-from mi_refgs.fit.state import decisions_of, occluder_of, packed, require_fit
-from mi_refgs.fit.surface import supply, surface_of
-from mi_refgs.fit.targets import Targets
+from mi_refgs.fitting import health
+from mi_refgs.fitting.control import AdaptiveControl
+from mi_refgs.fitting.exposure import Exposure
+from mi_refgs.fitting.initial import initial_parameters, is_open
+from mi_refgs.fitting.light_window import LightWindow
+from mi_refgs.fitting.objective import objective
+from mi_refgs.fitting.optim import Adam
+from mi_refgs.fitting.rates import Group
+from mi_refgs.fitting.schedule import Schedule
+from mi_refgs.fitting.state import decisions_of, occluder_of, packed, require_fit
+from mi_refgs.fitting.surface import supply, surface_of
+from mi_refgs.fitting.targets import Targets
 from mi_refgs.methods.method import GAIN, Method, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.fit.rates import Group
+from mi_refgs.fitting.rates import Group
 
 WIDE_ROW = 64
 """Columns beyond which rows are not told apart: harmonics have 48, a row of the light hundreds."""

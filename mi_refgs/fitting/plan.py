@@ -10,10 +10,10 @@ import drjit as dr
 
 from mi_refgs.data.picture_store import BUDGET as PICTURE_BYTES
 from mi_refgs.data.picture_store import undecoded
-from mi_refgs.fit.speed import Speed, speed_of
-from mi_refgs.fit.targets import BUDGET as TARGET_BYTES
-from mi_refgs.fit.targets import PIXEL_BYTES
-from mi_refgs.fit.whole import read_views, sized
+from mi_refgs.fitting.speed import Speed, speed_of
+from mi_refgs.fitting.targets import BUDGET as TARGET_BYTES
+from mi_refgs.fitting.targets import PIXEL_BYTES
+from mi_refgs.fitting.whole import read_views, sized
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.presets import PRESETS
 

@@ -26,8 +26,8 @@ import numpy as np
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
-from mi_refgs.fit.rates import Group
-from mi_refgs.fit.skips import Skipped, Skips
+from mi_refgs.fitting.rates import Group
+from mi_refgs.fitting.skips import Skipped, Skips
 from mi_refgs.surfels.table import gather_rows
 from mi_refgs.timing import phase
 

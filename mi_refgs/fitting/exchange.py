@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from mi_refgs.data.region import Region
-from mi_refgs.fit.refine import TableEdit
+from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.methods.method import Method
 from mi_refgs.surfels.channels import channel
 from mi_refgs.surfels.table import Surfels

@@ -9,7 +9,7 @@ import numpy as np
 from mi_refgs.data import hull
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fit.scatter import at_points, inside_points, outside_points
+from mi_refgs.fitting.scatter import at_points, inside_points, outside_points
 from mi_refgs.methods.method import LIGHT, LightOptions, Method
 from mi_refgs.methods.surroundings import AROUND, BACKGROUND
 from mi_refgs.shade.envmap import EnvironmentLight

@@ -8,17 +8,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.fit import refine
-from mi_refgs.fit.exchange import distances, exchanged
-from mi_refgs.fit.initial import first_light
-from mi_refgs.fit.relocate import relocate, wander
-from mi_refgs.fit.tables import Table
+from mi_refgs.fitting import refine
+from mi_refgs.fitting.exchange import distances, exchanged
+from mi_refgs.fitting.initial import first_light
+from mi_refgs.fitting.relocate import relocate, wander
+from mi_refgs.fitting.tables import Table
 from mi_refgs.methods.method import LIGHT
 from mi_refgs.methods.surroundings import AROUND
 from mi_refgs.splat import Camera
 
 if TYPE_CHECKING:
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fitting.train import Trainer
 
 
 class AdaptiveControl:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.fit.objective import Target
+from mi_refgs.fitting.objective import Target
 from mi_refgs.methods.method import DataOptions
 
 BUDGET = 2**30

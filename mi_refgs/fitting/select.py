@@ -18,9 +18,9 @@ import numpy as np
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fit.branch import branched
-from mi_refgs.fit.exposure import displayed_of, picture, psnr
-from mi_refgs.fit.train import Trainer
+from mi_refgs.fitting.branch import branched
+from mi_refgs.fitting.exposure import displayed_of, picture, psnr
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method, Selection
 
 MOMENTS = 3

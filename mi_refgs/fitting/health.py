@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.fit.skips import Skipped
+from mi_refgs.fitting.skips import Skipped
 from mi_refgs.methods.method import LIGHT
 from mi_refgs.methods.surroundings import BACKGROUND
 from mi_refgs.runs.parameters import channels_of
@@ -19,7 +19,7 @@ from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 
 if TYPE_CHECKING:
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fitting.train import Trainer
 
 CULL_SHARE = 0.1
 """Share of the surfels from which on a fault is not theirs: a pixel has tens of them, a table thousands."""

@@ -18,7 +18,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
 
 if TYPE_CHECKING:
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fitting.train import Trainer
 
 
 def shapes(method: Method, open_scene: bool) -> dict[str, tuple[int, ...]]:

@@ -10,12 +10,12 @@ import numpy as np
 
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
-from mi_refgs.fit.refine import TableEdit
+from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.runs.parameters import channels_of
 from mi_refgs.surfels.table import Surfels
 
 if TYPE_CHECKING:
-    from mi_refgs.fit.train import Trainer
+    from mi_refgs.fitting.train import Trainer
 
 
 class Table:

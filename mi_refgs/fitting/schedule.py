@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_refgs.fit.rates import Group
+from mi_refgs.fitting.rates import Group
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.methods.surroundings import AROUND, BACKGROUND
 from mi_refgs.surfels.channels import channel
