@@ -31,6 +31,16 @@ def cannot_write(path: Path, error: Exception) -> InputError:
     return InputError(f"{path}: output: cannot be written ({reason}); {remedy}")
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder, and those above it; raises InputError if that fails."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{path}: output: cannot be created ({error.strerror}); choose a writable folder with -o"
+        ) from error
+
+
 def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
     """Let `write(temporary)` make a file beside `path`, then move it there: readers see the old or the new.
 

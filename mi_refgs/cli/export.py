@@ -1,4 +1,4 @@
-"""`refgs export`: the files of a run that other programs read."""
+"""`refgs export`: the files of a run, its own and those of other programs."""
 
 from __future__ import annotations
 
@@ -12,12 +12,30 @@ from mi_refgs.errors import InputError
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    summary = "write surfels.ply, envmap.exr, mesh.ply and scene.xml from the newest checkpoint of a run"
-    parser = add_command(commands, "export", summary, "refgs export runs/glossy -o glossy_scene --prune", run)
+    from mi_refgs.formats import FORMATS, options_of
+
+    summary = "write a run's surfels.ply, envmap.exr, mesh.ply and scene.xml anew, or files of other programs"
+    example = "refgs export runs/glossy --to 3dgs-ply,cameras -o taken_along"
+    parser = add_command(commands, "export", summary, example, run)
     add_run(parser)
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="folder to write to (default: RUN itself)"
+        "-o",
+        "--output",
+        type=Path,
+        metavar="PATH",
+        help="folder to write to (default: RUN itself); with --to the file, or the folder of several",
     )
+    formats = parser.add_argument_group(
+        "formats of other programs", "\n".join(f"{made.name:<14}{made.summary}" for made in FORMATS.values())
+    )
+    formats.add_argument("--to", metavar="NAME[,NAME…]", help="the formats to write")
+    for option in options_of(FORMATS).values():
+        flag = f"--{option.name.replace('_', '-')}"
+        if option.default is False:
+            formats.add_argument(flag, action="store_true", default=None, help=option.help)
+        else:
+            text = f"{option.help} (default {option.default})"
+            formats.add_argument(flag, type=type(option.default), metavar=option.name[0].upper(), help=text)
     parser.add_argument(
         "--data", type=Path, metavar="DATA", help="data set of the cameras, if not that of the fit"
     )
@@ -37,23 +55,25 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> Result:
     """Export."""
     from mi_refgs.evaluation.evaluate import load_split
+    from mi_refgs.files import make_folder
+    from mi_refgs.formats import FORMATS, options_of, write
+    from mi_refgs.formats.shots import shots_of
     from mi_refgs.runs.export import TrainedScene, export
     from mi_refgs.runs.run import Run
 
     if args.limit is not None and not args.prune:
         raise InputError("--limit: limits what --prune drops; add --prune, or leave it out")
+    options = {name: getattr(args, name) for name in options_of(FORMATS) if getattr(args, name) is not None}
+    if args.to is None and options:
+        raise InputError(f"--{next(iter(options)).replace('_', '-')}: belongs to a format; name it with --to")
+    if args.to is not None and args.output is None:
+        raise InputError("--to: names no place; say with -o which file or folder to write")
     folder = Run(args.run_folder)
     method = folder.method()
-    views = load_split(folder, method, "test", args.data)
     state = folder.load_checkpoint()
     fitted = TrainedScene.read(folder.path) if state is None else TrainedScene.from_state(method, state)
+    shots = shots_of(folder, method, fitted.surfels, args.data)
     target = args.output or folder.path
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{target}: output: cannot be created ({error.strerror}); choose a writable folder with -o"
-        ) from error
     report: dict[str, Any] = {}
     if args.prune:
         from mi_refgs.evaluation.prune import LIMIT, prune
@@ -63,10 +83,14 @@ def run(args: argparse.Namespace) -> Result:
                 f"{folder.path}: checkpoints: none is left to bring the whole scene back from; write the "
                 "pruned one to another folder with -o"
             )
-        training = load_split(folder, method, "train", args.data)
-        limit = LIMIT if args.limit is None else args.limit
-        fitted, report = prune(fitted, training, views, limit, say)
-    files = [str(path) for path in export(fitted, target, views.views[0].camera())]
+        training, views = (load_split(folder, method, split, args.data) for split in ("train", "test"))
+        fitted, report = prune(fitted, training, views, LIMIT if args.limit is None else args.limit, say)
+    if args.to is not None:
+        written = write(fitted, args.to.split(","), target, shots, options)
+        files = [str(path) for paths in written.values() for path in paths]
+    else:
+        make_folder(target)
+        files = [str(path) for path in export(fitted, target, shots[0].camera)]
     data = {"files": files, "iteration": fitted.iteration, "surfels": fitted.surfels.count}
     if not args.prune:
         return Result(data, "\n".join(files))

@@ -8,17 +8,16 @@ whose colour is the same in the views that see them, as structure from motion fi
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.data.colmap import TEST_LIST
+from mi_refgs.data.colmap_text import write_cameras, write_images, write_points, write_test_list
 from mi_refgs.data.pathtrace import Tracer
 from mi_refgs.data.readers import HOLDOUT
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.data.write_views import Cameras
-from mi_refgs.files import cannot_write, replace_file, write_bytes
+from mi_refgs.files import cannot_write, replace_file
 from mi_refgs.images import read_png
 
 CANDIDATES = 40_000
@@ -30,8 +29,6 @@ SAME_COLOUR = 0.04
 noise of 64 samples a pixel is."""
 SAME_PLACE = 1e-3
 """Difference of depths, as part of them, within which a view sees a place and nothing before it."""
-OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0])
-"""OpenCV's camera has +x right and +y down, Mitsuba's +x left and +y up."""
 
 
 def write_colmap(folder: Path, data: Path, cameras: Cameras, tracer: Tracer) -> None:
@@ -54,11 +51,7 @@ def write_colmap(folder: Path, data: Path, cameras: Cameras, tracer: Tracer) -> 
     shown = np.stack([read_png(images / picture)[..., :3] for picture in pictures])
     points, colours, tracks, places = _points(shown, poses, tracer, focal, settings.seed)
 
-    def lines(comment: str, rows: Sequence[str]) -> bytes:
-        return "\n".join((f"# {comment}", *rows, "")).encode()
-
-    pinhole = f"1 PINHOLE {width} {height} {focal!r} {focal!r} {width / 2} {height / 2}"
-    write_bytes(sparse / "cameras.txt", lines("CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY", [pinhole]))
+    write_cameras(sparse, [(width, height, focal, focal, width / 2, height / 2)])
     seen: list[list[str]] = [[] for _ in pictures]
     rows = []
     for i, (point, colour) in enumerate(zip(points, colours, strict=True)):
@@ -68,17 +61,9 @@ def write_colmap(folder: Path, data: Path, cameras: Cameras, tracer: Tracer) -> 
             seen[view].append(f"{x:.3f} {y:.3f} {i + 1}")
         r, g, b = np.round(255 * colour).astype(int)
         rows.append(f"{i + 1} {' '.join(f'{c:.6f}' for c in point)} {r} {g} {b} 0 {' '.join(track)}")
-    write_bytes(
-        sparse / "points3D.txt", lines("POINT3D_ID X Y Z R G B ERROR TRACK[IMAGE_ID POINT2D_IDX]", rows)
-    )
-    stems = []
-    for i, (picture, pose) in enumerate(zip(pictures, poses, strict=True)):
-        rotation = OPENCV_FROM_MITSUBA @ pose[:3, :3].T
-        numbers = (*_quaternion(rotation), *(-rotation @ pose[:3, 3]))
-        stems += [f"{i + 1} {' '.join(repr(float(x)) for x in numbers)} 1 {picture}", " ".join(seen[i])]
-    comment = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of X Y POINT3D_ID"
-    write_bytes(sparse / "images.txt", lines(comment, stems))
-    write_bytes(sparse / TEST_LIST, "".join(f"{pictures[i]}\n" for i in tests).encode())
+    write_points(sparse, rows)
+    write_images(sparse, pictures, poses, [1] * len(pictures), [" ".join(places) for places in seen])
+    write_test_list(sparse, [pictures[i] for i in tests])
     if (data / REGION_FILE).is_file():
         _copy(data / REGION_FILE, folder / REGION_FILE)
 
@@ -132,14 +117,6 @@ def _points(
     kept = [i for i, c in enumerate(colours) if len(c) > 1 and np.std(c, axis=0).max() < SAME_COLOUR]
     mean = np.array([np.mean(colours[i], axis=0) for i in kept]).reshape(-1, 3)
     return points[kept], mean, [np.array(views[i]) for i in kept], [np.array(places[i]) for i in kept]
-
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion (w, x, y, z) of a rotation matrix, w not negative."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-    return np.array([w, x, y, z]) * (1 if w >= 0 else -1)
 
 
 def _copy(source: Path, target: Path) -> None:

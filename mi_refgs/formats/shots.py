@@ -1,0 +1,81 @@
+"""The cameras of a run: those of its data set, or around its surfels where there is none."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from mi_refgs.constants import GOLDEN_ANGLE
+from mi_refgs.data.pathtrace import poses_around
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation.evaluate import load_split
+from mi_refgs.formats.format import Shot
+from mi_refgs.methods.method import Method
+from mi_refgs.runs.run import DATASET, Run
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.table import Surfels
+
+AROUND = {"test": 4, "train": 60}
+"""Cameras around an object without a data set."""
+SIZE, FIELD_OF_VIEW = 512, 40.0
+"""Pixels and degrees of their square pictures."""
+INSIDE = 0.98
+"""Share of the surfels, by opacity, that the sphere which fills these pictures holds: strays lie far out."""
+
+
+def shots_of(run: Run, method: Method, surfels: Surfels, data: Path | None = None) -> list[Shot]:
+    """The test views, then the training views of a run's data set, or of that in `data`.
+
+    A run that records no data set has cameras around its surfels. Raises InputError for data that is gone or
+    cannot be read.
+    """
+    if data is None and not (run.path / DATASET).is_file():
+        return shots_around(surfels)
+    return [
+        Shot(view.name, split, view.camera())
+        for split in ("test", "train")
+        for view in load_split(run, method, split, data).views
+    ]
+
+
+def shots_around(surfels: Surfels) -> list[Shot]:
+    """Cameras on a sphere that look at the surfels' middle from 10° below to 70° above its equator, z up."""
+    raw = surfels.to_numpy()
+    if not len(raw["position"]):
+        raise InputError("surfels: there are none; cameras have nothing to look at")
+    weight = 1 / (1 + np.exp(-raw["opacity"][:, 0].astype(np.float64)))
+    middle = np.array([_quantile(axis, weight, 0.5) for axis in raw["position"].T.astype(np.float64)])
+    reach = _quantile(np.linalg.norm(raw["position"] - middle, axis=1), weight, INSIDE)
+    radius = max(reach, 1e-6) * 1.1
+    distance = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
+    focal = SIZE / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
+    shots = []
+    for split, count in AROUND.items():
+        low, high = (math.sin(math.radians(e)) for e in (-10, 70))
+        up = low + (high - low) * (np.arange(count) + 0.5) / count
+        turn = GOLDEN_ANGLE * np.arange(count)
+        ring = np.sqrt(1 - up**2)
+        outward = np.stack([ring * np.cos(turn), ring * np.sin(turn), up], axis=1)
+        for i, pose in enumerate(poses_around(outward, middle, distance)):
+            camera = Camera.from_pose(
+                SIZE, SIZE, -focal, -focal, SIZE / 2, SIZE / 2, pose, near=1e-2 * distance
+            )
+            shots.append(Shot(f"{split}/r_{i:03d}", split, camera))
+    return shots
+
+
+def pose_of(camera: Camera) -> np.ndarray:
+    """World-from-camera (4, 4) float64 in Mitsuba's frame."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.array(camera.rotation, dtype=np.float64).reshape(3, 3).T
+    pose[:3, 3] = [float(a[0]) + float(b[0]) for a, b in zip(camera.origin, camera.origin_rest, strict=True)]
+    return pose
+
+
+def _quantile(values: np.ndarray, weight: np.ndarray, share: float) -> float:
+    """The value below which the share of the weight lies."""
+    order = np.argsort(values)
+    summed = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(summed, share * summed[-1])])
