@@ -60,7 +60,7 @@ def fit(folder: Path, seed: int) -> dict[str, float]:
     scores: list[dict[str, Any]] = []
     for view in test.views:
         shot = pictures.RenderedView.of(trainer.view(view.camera()), test, view)
-        psnr = metrics.psnr(shot.image, pictures.target(view))
+        psnr = metrics.psnr(shot.image, view.displayed)
         scores.append({"psnr": psnr} | metrics.normal_mae_deg(shot.normal, view.normal, view.alpha))
     means = {key: float(np.mean([s[key] for s in scores])) for key in ("psnr", "normal_mae_deg")}
     return means | {"surfels": trainer.surfels.count}

@@ -1,4 +1,4 @@
-"""8-bit image files and the sRGB transfer function in NumPy; `exr` and `hdr` hold the linear formats."""
+"""8-bit image files, sRGB's transfer function and PSNR in NumPy; `exr` and `hdr` hold the linear formats."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ ENDINGS = (".png", ".jpg", ".jpeg")
 """Endings of the names of 8-bit image files, in small letters, in the order in which they are tried."""
 EXIF_IFD = 0x8769
 """Tag of EXIF 2.3: the table of the camera's settings."""
+PSNR_MAX = 100.0
+"""What identical images read, dB: JSON has no infinity, and float32 images cannot differ by less."""
 JPEG_SHRINK = 8
 """A JPEG file's blocks have 8 × 8 pixels: its decoder can give 8, 4, 2 or 1 pixels a side for each."""
 
@@ -62,6 +64,11 @@ def box_downscale(image: np.ndarray, factor: int) -> np.ndarray:
     whole = image[: height * factor, : width * factor]
     blocks = whole.reshape(height, factor, width, factor, channels)
     return blocks.mean(axis=(1, 3), dtype=np.float64).astype(image.dtype)
+
+
+def psnr_of(error: float) -> float:
+    """PSNR in dB of a mean squared error of values up to 1; at most PSNR_MAX, NaN of NaN."""
+    return PSNR_MAX if error <= 0 else min(-10 * float(np.log10(error)), PSNR_MAX)
 
 
 def image_size(path: str | Path) -> tuple[int, int]:

@@ -40,6 +40,7 @@ def test_psnr(rng: np.random.Generator) -> None:
     assert metrics.psnr(truth + 0.1, truth) == pytest.approx(20)
     assert metrics.psnr(truth, truth) == 100
     assert metrics.psnr(np.full((2, 2, 3), 7.0), np.ones((2, 2, 3))) == 100  # clamped to [0, 1]
+    assert np.isnan(metrics.psnr(np.full_like(truth, np.nan), truth))
     with pytest.raises(InputError, match="shapes"):
         metrics.psnr(truth, truth[:4])
 

@@ -15,7 +15,7 @@ from mi_refgs.compare.table import Row, Scene
 from mi_refgs.compare.worker import CURVE
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import render_name
-from mi_refgs.evaluation.pictures import sheet, target
+from mi_refgs.evaluation.pictures import sheet
 from mi_refgs.files import write_bytes
 from mi_refgs.fitting.whole import read_views
 from mi_refgs.images import read_png, write_png
@@ -112,7 +112,7 @@ def write_crops(folder: Path, scene: Scene, path: Path) -> Region | None:
     side = max(min(views[0].width, views[0].height) // CROP_SHARE, CROP_MIN)
     side = min(side, views[0].width, views[0].height)
     for index in chosen:
-        truth = target(views[index])
+        truth = views[index].displayed
         pictures = _renders(folder, rows, render_name(views[index]))
         if pictures is None or any(picture.shape != truth.shape for picture in pictures):
             continue

@@ -95,7 +95,7 @@ class Curve:
 
     def __call__(self, trainer: Any) -> None:
         from mi_refgs.evaluation.metrics import psnr
-        from mi_refgs.evaluation.pictures import RenderedView, target
+        from mi_refgs.evaluation.pictures import RenderedView
 
         while trainer.notices:
             print(f"refgs: warning: {trainer.notices.pop(0)}", file=sys.stderr)
@@ -104,7 +104,7 @@ class Curve:
             return
         self.due = self.due[len(passed) :]  # one point for all that a trial has passed
         values = [
-            psnr(RenderedView.of(trainer.view(view.camera()), self.data, view).image, target(view))
+            psnr(RenderedView.of(trainer.view(view.camera()), self.data, view).image, view.displayed)
             for view in self.views
         ]
         line = {"iteration": trainer.iteration, "seconds": round(trainer.seconds, 3)}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.images import box_downscale, linear_from_srgb
+from mi_refgs.images import box_downscale, linear_from_srgb, srgb_from_linear
 
 if TYPE_CHECKING:
     from mi_refgs.splat.camera import Camera
@@ -70,6 +70,11 @@ class View:
         if self.depth is not None:
             return (self.depth > 0).astype(np.float32)
         return np.ones((self.height, self.width), np.float32)
+
+    @property
+    def displayed(self) -> np.ndarray:
+        """The picture (H, W, 3) that the view is fitted to or compared with, display-encoded."""
+        return srgb_from_linear(self.image) if self.linear else self.image
 
     @property
     def cut_out(self) -> bool:

@@ -16,9 +16,9 @@ import numpy as np
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
-from mi_refgs.evaluation.pictures import RenderedView, beside, on_white, target
+from mi_refgs.evaluation.pictures import RenderedView, beside, on_white
 from mi_refgs.evaluation.surface import NO_SURFACE
-from mi_refgs.images import srgb_from_linear
+from mi_refgs.images import psnr_of, srgb_from_linear
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.shade.shading import Shading
@@ -60,7 +60,7 @@ class _Sums:
         if not self.count:
             return None
         squared = scale**2 * self.own - 2 * scale * self.cross + self.true
-        return metrics.psnr_of(float(np.mean(squared)) / self.count)
+        return psnr_of(float(np.mean(squared)) / self.count)
 
     def mae(self) -> float | None:
         """Mean absolute error; None without a pixel."""
@@ -88,7 +88,7 @@ class Decomposition:
         if concave is not None:
             places[CONCAVE] = inside = front & concave
             self.concave = (self.concave or 0) + int(inside.sum())
-            self.squares.append(np.square(np.clip(shot.image, 0, 1) - np.clip(target(view), 0, 1))[inside])
+            self.squares.append(np.square(np.clip(shot.image, 0, 1) - np.clip(view.displayed, 0, 1))[inside])
             if view.normal is not None:
                 angle = metrics.angle_deg(shot.normal, view.normal)
                 self.angles.append(angle[inside & np.any(view.normal != 0, axis=-1)])
@@ -114,7 +114,7 @@ class Decomposition:
         found["concave_share"] = None if self.concave is None else self.concave / max(self.foreground, 1)
         found[f"normal_mae_deg{CONCAVE}"] = _mean(self.angles)
         error = _mean(self.squares)
-        found[f"psnr{CONCAVE}"] = None if error is None else metrics.psnr_of(error)
+        found[f"psnr{CONCAVE}"] = None if error is None else psnr_of(error)
         for name, key in zip(NAMES, KEYS, strict=True):
             why = f"the data set defines no {name}" if name in self.ours else f"the run has no {name}"
             found[f"{name}_reason"] = why if found[key] is None else None
@@ -151,7 +151,7 @@ def panels(
     shot: RenderedView, maps: dict[str, np.ndarray], view: View, scale: np.ndarray, concave: np.ndarray | None
 ) -> dict[str, np.ndarray]:
     """Ours beside the truth, map by map, by title; albedo after its scale."""
-    pairs: dict[str, tuple[np.ndarray, ...]] = {"picture": (shot.image, target(view))}
+    pairs: dict[str, tuple[np.ndarray, ...]] = {"picture": (shot.image, view.displayed)}
     covered = view.covered()
     if view.normal is not None:
         normals = on_white(0.5 + 0.5 * shot.normal, shot.alpha), on_white(0.5 + 0.5 * view.normal, covered)

@@ -116,7 +116,7 @@ def evaluate(
         frame = view(truth.camera())
         shot = pictures.RenderedView.of(frame, views, truth)
         gain, gained = with_gain(frame, truth, views)
-        goal = pictures.target(truth)
+        goal = truth.displayed
         scores: dict[str, Any] = {
             "name": truth.name,
             "psnr": metrics.psnr(shot.image, goal),

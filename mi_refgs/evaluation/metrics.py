@@ -14,11 +14,9 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.ssim import WINDOW_RADIUS, WINDOW_SIGMA
-from mi_refgs.images import srgb_from_linear
+from mi_refgs.images import psnr_of, srgb_from_linear
 from mi_refgs.shade import lobe_matrices
 
-# What identical images read, dB: JSON has no infinity, and float32 images cannot differ by less.
-PSNR_MAX = 100.0
 # A pixel is foreground where the true alpha is above this.
 FOREGROUND_ALPHA = 0.5
 # Variance of display-encoded values below which a map is constant but for rounding: it correlates with none.
@@ -37,11 +35,6 @@ def psnr(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
     """
     image, truth = _pair(image, truth)
     return psnr_of(float(np.mean((image - truth)[where] ** 2)))
-
-
-def psnr_of(error: float) -> float:
-    """PSNR in dB of a mean squared error of values up to 1; at most 100."""
-    return PSNR_MAX if error <= 0 else min(PSNR_MAX, -10 * float(np.log10(error)))
 
 
 def ssim(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:

@@ -68,14 +68,9 @@ def planes(array: Any, height: int, width: int) -> np.ndarray:
     return np.broadcast_to(values, height * width).reshape(height, width)
 
 
-def target(view: View) -> np.ndarray:
-    """The picture that a view was fitted to or is compared with, display-encoded."""
-    return srgb_from_linear(view.image) if view.linear else view.image
-
-
 def panels(shot: RenderedView, view: View) -> dict[str, np.ndarray]:
     """Everything there is to see of a view, by title."""
-    shown = {"ground truth": target(view), "render": shot.image}
+    shown = {"ground truth": view.displayed, "render": shot.image}
     if view.normal is not None:
         covered = np.linalg.norm(view.normal, axis=-1)
         shown["true normals"] = on_white(0.5 + 0.5 * view.normal, covered)

@@ -17,8 +17,9 @@ import numpy as np
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.metrics import PSNR_MAX, psnr
+from mi_refgs.evaluation.metrics import psnr
 from mi_refgs.evaluation.speed import milliseconds
+from mi_refgs.images import PSNR_MAX
 from mi_refgs.render.display import displayed
 from mi_refgs.runs.export import Pruned, TrainedScene
 from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy

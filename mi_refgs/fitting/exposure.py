@@ -24,7 +24,7 @@ from mi_refgs.data.view import View
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.rates import Group
-from mi_refgs.images import srgb_from_linear
+from mi_refgs.images import psnr_of
 from mi_refgs.methods.method import GAIN, ExposureOptions
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
@@ -211,10 +211,8 @@ def displayed_of(frame: Frame, data: Dataset, gain: np.ndarray | None = None) ->
 
 def psnr(image: np.ndarray, view: View, where: np.ndarray | None = None) -> float:
     """PSNR (dB) of a display-encoded picture (H, W, 3) of a view, over the pixels in `where` (H, W)."""
-    target = srgb_from_linear(view.image) if view.linear else view.image
-    square = np.square(np.clip(image, 0, 1) - np.clip(target, 0, 1))
-    mean = float(square.mean() if where is None else square[where].mean() if where.any() else 0)
-    return -10 * float(np.log10(max(mean, 1e-10)))
+    square = np.square(np.clip(image, 0, 1) - np.clip(view.displayed, 0, 1))
+    return psnr_of(float(square.mean() if where is None else square[where].mean() if where.any() else 0))
 
 
 def sentence(decision: dict[str, Any]) -> str:

@@ -28,6 +28,7 @@ from mi_refgs.fitting.schedule import Schedule
 from mi_refgs.fitting.state import decisions_of, occluder_of, packed, require_fit
 from mi_refgs.fitting.surface import supply, surface_of
 from mi_refgs.fitting.targets import Targets
+from mi_refgs.images import psnr_of
 from mi_refgs.methods.method import GAIN, Method, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
@@ -212,13 +213,12 @@ class Trainer:
 
     def statistics(self) -> dict[str, Any]:
         """One line of the log; waits for the device."""
-        mse = float(self.error[0])
         return {
             "iteration": self.iteration,
             "seconds": round(self.seconds, 3),
             "stage": self.method.stage_at(self.iteration)[0],
             "loss": float(self.loss[0]),
-            "psnr": round(-10 * float(np.log10(max(mse, 1e-10))), 3),
+            "psnr": round(psnr_of(float(self.error[0])), 3),
             "surfels": sum(table.surfels.count for table in self.control.tables),
             "skipped_steps": self.skipped,
         }
