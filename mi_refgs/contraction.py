@@ -24,8 +24,8 @@ class Region:
     radius: float  # scene units, positive
 
     @staticmethod
-    def of(content: Any, source: Path) -> Region:
-        """The region {"centre": [x, y, z], "radius": r} of a JSON file `source`.
+    def of(content: Any, source: Path | str) -> Region:
+        """The region {"centre": [x, y, z], "radius": r} of a JSON file or an option, `source`.
 
         Raises InputError for anything else, and for numbers that no scene has.
         """

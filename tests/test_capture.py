@@ -383,7 +383,9 @@ def test_pictures_that_are_none_are_refused(tmp_path: Path, capsys: pytest.Captu
         (photographs / name).write_bytes(b"0")
     assert "a.jpg: pixels: not a readable image" in _refused(capsys, photographs, "-o", tmp_path / "data")
     assert "unknown lens model" in _refused(capsys, photographs, "-o", tmp_path / "data", "--camera", "PIG")
-    assert "positive radius" in _refused(capsys, photographs, "-o", tmp_path, "--region", 0, 0, 0, -1)
+    for numbers in ((0, 0, 0, -1), (0, 0, float("nan"), 1), (0, 1e30, 0, 1), (0, 0, 0, 0)):
+        said = _refused(capsys, photographs, "-o", tmp_path, "--region", *numbers)
+        assert "--region: centre, radius: not three numbers and a positive one" in said
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         scene.save(photographs / name, np.zeros((8, 8, 3), dtype=np.uint8))
     assert "choose another" in _refused(capsys, photographs, "-o", photographs)

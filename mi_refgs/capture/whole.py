@@ -27,7 +27,7 @@ from mi_refgs.capture.photographs import Photograph, cameras_of, find_photograph
 from mi_refgs.capture.report import Report, draw
 from mi_refgs.capture.solved import Solved, adjust, best_lens
 from mi_refgs.data.colmap_model import MODELS
-from mi_refgs.data.region import REGION_FILE, Region
+from mi_refgs.data.region import Region, write_region
 from mi_refgs.errors import InputError
 from mi_refgs.files import read_json, write_json
 
@@ -109,7 +109,7 @@ def capture(
         output.write_model(model, job.copies, straight, similarity, made / "sparse" / "0")
         replace_output(folder, made, key)
         shutil.rmtree(made)
-    write_json(folder / REGION_FILE, {"centre": list(found.centre), "radius": found.radius})
+    write_region(folder, found)
     report = Report.of(job, model, world, groups, straight, found, key, time.perf_counter() - began)
     draw(folder / PLOT, world, found)
     write_json(folder / REPORT, report.content)

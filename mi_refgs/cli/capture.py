@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs.cli.command import Result, add_command, add_output, say
-from mi_refgs.errors import InputError
 
 EXAMPLE = "refgs capture holiday/vase -o data/vase"
 
@@ -47,10 +46,8 @@ def run(args: argparse.Namespace) -> Result:
 
     region = None
     if args.region is not None:
-        x, y, z, radius = args.region
-        if not (abs(x) + abs(y) + abs(z) < float("inf") and 0 < radius < float("inf")):
-            raise InputError("--region: not three numbers and a positive radius; read them off capture.png")
-        region = Region((x, y, z), radius)
+        *centre, radius = args.region
+        region = Region.of({"centre": centre, "radius": radius}, "--region")
     report = capture(
         args.photographs, args.output, masks=args.masks, camera=args.camera, region=region, tell=say
     )

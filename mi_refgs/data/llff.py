@@ -54,8 +54,7 @@ def _placed(folder: Path, split: str, options: ReadOptions) -> list[tuple[str, n
     if len(names) != len(rows):
         raise InputError(
             f"{folder / POSES}: {len(rows)} cameras, but {pictures.folders[1].name} has {len(names)} "
-            "pictures; "
-            "restore the pictures"
+            "pictures; restore the pictures"
         )
     placed = []
     for name, row in held_out(list(zip(names, rows, strict=True)), split):

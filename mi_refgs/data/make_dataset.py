@@ -33,8 +33,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.data.open_scene import check_cameras, named_shapes, region_around, write_region
+from mi_refgs.data.open_scene import check_cameras, named_shapes, region_around
 from mi_refgs.data.pathtrace import bounding_sphere, reach
+from mi_refgs.data.region import write_region
 from mi_refgs.data.scene_file import LightFile, load_scene, scene_hash, under_light
 from mi_refgs.data.settings import RELIGHT, SURFACE, Settings, prepare_folder
 from mi_refgs.data.surface import surface_mesh

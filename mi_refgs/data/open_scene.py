@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.region import REGION_FILE, Region
+from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
-from mi_refgs.files import write_json
 
 REGION_MARGIN = 1.2
 """Radius of the region over that of the object's bounding sphere: room for what stands against it."""
@@ -34,11 +33,6 @@ def region_around(centre: np.ndarray, radius: float) -> Region:
     return Region((x, y, z), REGION_MARGIN * radius)
 
 
-def write_region(folder: Path, region: Region) -> None:
-    """Write region.json into a data set's folder; raises InputError if it cannot be written."""
-    write_json(folder / REGION_FILE, {"centre": list(region.centre), "radius": region.radius})
-
-
 def check_cameras(scene: Any, objects: Sequence[Any], region: Region, poses: np.ndarray, file: Path) -> None:
     """Raise InputError if a camera (poses (N, 4, 4)) stands in the region, or something hides its middle."""
     import drjit as dr
@@ -49,9 +43,8 @@ def check_cameras(scene: Any, objects: Sequence[Any], region: Region, poses: np.
     distance = np.linalg.norm(toward, axis=1)
     if distance.min() <= region.radius:
         raise InputError(
-            f"{file}: --distance: {distance.min():.4g} is inside of the region around the object, "
-            "whose radius is "
-            f"{region.radius:.4g}; give more"
+            f"{file}: --distance: {distance.min():.4g} is inside of the region around the object, whose "
+            f"radius is {region.radius:.4g}; give more"
         )
     with dr.suspend_grad():
         ray = mi.Ray3f(
@@ -65,9 +58,7 @@ def check_cameras(scene: Any, objects: Sequence[Any], region: Region, poses: np.
         hidden = np.array(hit.is_valid() & ~own) & (np.array(hit.t) < distance - region.radius)
     if hidden.any():
         raise InputError(
-            f"{file}: --distance: something stands between {int(hidden.sum())} of {len(poses)} cameras "
-            "and the "
-            f"object, at {distance[hidden].min():.4g} … {distance[hidden].max():.4g}; give a "
-            "shorter distance, or "
-            "another --elevation"
+            f"{file}: --distance: something stands between {int(hidden.sum())} of {len(poses)} cameras and "
+            f"the object, at {distance[hidden].min():.4g} … {distance[hidden].max():.4g}; give a shorter "
+            "distance, or another --elevation"
         )

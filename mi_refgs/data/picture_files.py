@@ -158,9 +158,8 @@ class PictureFile:
         alpha = self.mask.read()
         if alpha.shape != (self.height, self.width):
             raise InputError(
-                f"{self.mask.path}: mask: {alpha.shape[1]} × {alpha.shape[0]} pixels, but "
-                f"{self.path.name} has "
-                f"{self.width} × {self.height}; make both of one size"
+                f"{self.mask.path}: mask: {alpha.shape[1]} × {alpha.shape[0]} pixels, but {self.path.name} "
+                f"has {self.width} × {self.height}; make both of one size"
             )
         return alpha
 

@@ -11,7 +11,7 @@ from mi_refgs.contraction import Region as Region
 from mi_refgs.data.hull import view_focus
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.files import read_json
+from mi_refgs.files import read_json, write_json
 
 REGION_FILE = "region.json"
 """Beside the pictures of a data set: {"centre": [x, y, z], "radius": r} in scene units."""
@@ -68,3 +68,8 @@ def read_region(folder: Path) -> Region | None:
     if not path.is_file():
         return None
     return Region.of(read_json(path), path)
+
+
+def write_region(folder: Path, region: Region) -> None:
+    """Write region.json into a data set's folder; raises InputError if it cannot be written."""
+    write_json(folder / REGION_FILE, {"centre": list(region.centre), "radius": region.radius})

@@ -103,8 +103,8 @@ def _points(transforms: Path, content: dict[str, Any]) -> PointCloud | None:
     file = inside(transforms.parent, name)
     if file is None:
         raise InputError(
-            f"{transforms}: ply_file_path: {shown(name)} names no file in the data set's folder; "
-            "move it there"
+            f"{transforms}: ply_file_path: {shown(name)} names no file in the data set's folder; move "
+            "it there"
         )
     return read_points(file)
 
