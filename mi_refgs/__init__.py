@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from mi_refgs.occlusion.visibility import Occluder as Occluder
     from mi_refgs.primitives import Primitive as Primitive
     from mi_refgs.primitives import register as register_primitive
+    from mi_refgs.reconstruction import Reconstruction as Reconstruction
+    from mi_refgs.reconstruction import load as load
     from mi_refgs.relighting.light import NewLight as NewLight
     from mi_refgs.relighting.relight import relight as relight
     from mi_refgs.render.pipeline import Frame as Frame
@@ -71,6 +73,7 @@ _PUBLIC = {
     "NewLight": ("relighting.light", "NewLight"),
     "Occluder": ("occlusion.visibility", "Occluder"),
     "Primitive": ("primitives", "Primitive"),
+    "Reconstruction": ("reconstruction", "Reconstruction"),
     "Reflectance": ("shade.reflectance", "Reflectance"),
     "Run": ("runs.run", "Run"),
     "Shading": ("shade.shading", "Shading"),
@@ -80,6 +83,7 @@ _PUBLIC = {
     "View": ("data.view", "View"),
     "evaluate": ("evaluation.evaluate", "evaluate"),
     "from_points": ("surfels.init", "from_points"),
+    "load": ("reconstruction", "load"),
     "load_method": ("methods.read", "load"),
     "make_dataset": ("data.make_dataset", "make_dataset"),
     "read_dataset": ("data.dataset", "read_dataset"),
@@ -110,6 +114,7 @@ __all__ = [
     "NewLight",
     "Occluder",
     "Primitive",
+    "Reconstruction",
     "Reflectance",
     "Run",
     "Shading",
@@ -119,6 +124,7 @@ __all__ = [
     "View",
     "evaluate",
     "from_points",
+    "load",
     "load_method",
     "make_dataset",
     "read_dataset",

@@ -56,6 +56,9 @@ LAYERS: dict[str, set[str]] = {
     "evaluation": RENDERER | {"methods", "data", "runs", "fitting"},
     "relighting": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
     "formats": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
+    "source": RENDERER | {"methods", "data", "runs", "fitting", "formats", "relighting"},
+    "reconstruction": RENDERER
+    | {"methods", "data", "runs", "fitting", "evaluation", "relighting", "formats", "source", "plugins"},
     "profiling": RENDERER | {"methods", "data", "fitting"},
     "compare": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", ""},
     "doctor": {"llvm", "errors", ""},
@@ -68,6 +71,7 @@ LAYERS: dict[str, set[str]] = {
         "evaluation",
         "formats",
         "relighting",
+        "reconstruction",
         "compare",
         "profiling",
         "capture",
@@ -78,7 +82,8 @@ LAYERS: dict[str, set[str]] = {
     },
     "__main__": {"cli"},
     "reference": {"constants"},
-    "": RENDERER | {"llvm", "plugins", "methods", "data", "runs", "fitting", "evaluation", "relighting"},
+    "": RENDERER
+    | {"llvm", "plugins", "methods", "data", "runs", "fitting", "evaluation", "relighting", "reconstruction"},
 }
 """What each part of the package may import besides itself; "" is the package's own `__init__`.
 

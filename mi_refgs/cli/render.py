@@ -41,6 +41,8 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Render."""
+    from mi_refgs.render.load_scene import load_scene
+
     if args.output.suffix.lower() not in SUFFIXES:
         raise InputError(
             f"{args.output}: suffix: '{args.output.suffix}' is no picture format here; use .exr or .png"
@@ -76,43 +78,6 @@ def scene_file(path: Path) -> Path:
     return scene
 
 
-def load_scene(path: Path, aovs: list[str], alone: bool = False) -> Any:
-    """Load a scene, its `refgs` integrator with these AOVs besides its own.
-
-    `alone`: without the surroundings and the background of that. Raises InputError for what Mitsuba cannot
-    load, and for AOVs or `alone` without a `refgs` integrator.
-    """
-    import mitsuba as mi
-
-    from mi_refgs.exr import mitsuba_exr
-
-    before = mi.file_resolver()
-    beside = mi.FileResolver(before)
-    beside.prepend(str(path.parent.resolve()))
-    mi.set_file_resolver(beside)
-    try:
-        config = mi.parser.ParserConfig(mi.variant())
-        state = mi.parser.parse_file(config, str(path))
-        mi.parser.transform_all(config, state)
-        if aovs or alone:
-            integrators = [node.props for node in state.nodes if node.props.plugin_name() == "refgs"]
-            if not integrators:
-                option = "--aov" if aovs else "--object"
-                raise InputError(f"{path}: {option}: the scene has no `refgs` integrator; drop {option}")
-            if aovs:
-                integrators[0]["aovs"] = ",".join(aov if ":" in aov else f"{aov}:{aov}" for aov in aovs)
-            for name in ("surroundings", "background") if alone else ():
-                if name in integrators[0]:
-                    del integrators[0][name]
-        with mitsuba_exr():
-            loaded = mi.parser.instantiate(config, state)
-    except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file
-        raise InputError(f"{path}: scene: {_reason(error)}") from error
-    finally:
-        mi.set_file_resolver(before)
-    return loaded[0] if isinstance(loaded, list) else loaded
-
-
 def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
     """Render into a file, whole or not at all; returns the names of its channels."""
     import mitsuba as mi
@@ -121,11 +86,12 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
     from mi_refgs.exr import mitsuba_exr
     from mi_refgs.files import replace_file
     from mi_refgs.images import srgb_from_linear, straight_srgb, write_png
+    from mi_refgs.render.load_scene import reason
 
     try:
         image = mi.render(scene, sensor=sensor, spp=spp)
     except RuntimeError as error:
-        raise InputError(f"{path}: render: {_reason(error)}") from error
+        raise InputError(f"{path}: render: {reason(error)}") from error
     bitmap = sensor.film().bitmap()
     names = [channel.name for channel in bitmap.struct_()]
     if path.suffix.lower() == ".exr":
@@ -138,18 +104,3 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
         return names[:4]
     write_png(path, srgb_from_linear(pixels[..., :3]))
     return names[:3]
-
-
-def _reason(error: BaseException) -> str:
-    """The sentence at the root of an error that Mitsuba wrapped: ours if there is one, else its last line."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, InputError):
-            return str(cause)
-        cause = cause.__cause__
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    for line in reversed(lines):
-        _, found, message = line.partition("InputError: ")
-        if found:
-            return message
-    return f"{lines[-1] if lines else error}; correct the scene"

@@ -92,10 +92,9 @@ def of_run(run: Run, views: Dataset, tell: Callable[[str], None] = lambda _: Non
 
     `tell` is called if the data set has another one. Raises InputError as `Run.region` does.
     """
-    region = run.region()
+    region, now = run.region(), views.region
     if region is None:
         return views
-    now = views.region
     change = (
         np.inf if now is None else np.subtract((*now.centre, now.radius), (*region.centre, region.radius))
     )

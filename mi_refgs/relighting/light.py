@@ -52,18 +52,30 @@ class NewLight:
 
     def read(self) -> EnvironmentLight:
         """The light, of at most HEIGHT rows; raises InputError for a file that is no lat-long image."""
-        import mitsuba as mi
+        return world_light(read_radiance(self.path), self.world, self.rotate, self.exposure)
 
-        radiance = np.ascontiguousarray(read_radiance(self.path), dtype=np.float32)
-        turned: Any = mi.ScalarTransform4f()
-        if self.rotate % 360:
-            turned = turned.rotate([0, 0, 1], self.rotate)
-        if not self.world:
-            turned = turned.rotate(*Z_UP)
-        emitter = {"type": "envmap", "bitmap": mi.Bitmap(radiance), "to_world": turned}
-        height = min(HEIGHT, max(len(radiance) // 4 * 4, 8))
-        image = environment_image(mi.load_dict({"type": "scene", "light": emitter}), height)
-        return EnvironmentLight.from_radiance(image * np.float32(2.0**self.exposure))
+
+def world_light(
+    radiance: np.ndarray, world: bool = False, rotate: float = 0.0, exposure: float = 0.0
+) -> EnvironmentLight:
+    """Lat-long radiance (h, w, 3) as a light of at most HEIGHT rows; the rest as in `NewLight`.
+
+    Raises InputError for an array that is no such map.
+    """
+    import mitsuba as mi
+
+    radiance = np.ascontiguousarray(radiance, dtype=np.float32)
+    if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape) < 2:
+        raise InputError(f"light: {radiance.shape} is no lat-long map; give linear radiance (h, w, 3)")
+    turned: Any = mi.ScalarTransform4f()
+    if rotate % 360:
+        turned = turned.rotate([0, 0, 1], rotate)
+    if not world:
+        turned = turned.rotate(*Z_UP)
+    emitter = {"type": "envmap", "bitmap": mi.Bitmap(radiance), "to_world": turned}
+    height = min(HEIGHT, max(len(radiance) // 4 * 4, 8))
+    image = environment_image(mi.load_dict({"type": "scene", "light": emitter}), height)
+    return EnvironmentLight.from_radiance(image * np.float32(2.0**exposure))
 
 
 def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:

@@ -130,7 +130,15 @@ def relight(
 def turntable_views(
     scene: TrainedScene, views: Sequence[View], count: int, region: Region | None = None
 ) -> list[View]:
-    """Cameras on a circle around the object, z up, like the views in lens, distance and (median) height.
+    """Cameras on a circle around the object, as of `turntable_poses`, and with the first view's lens."""
+    poses = turntable_poses(scene, [view.to_world for view in views], count, region)
+    return [views[0].changed(name=f"{i}", to_world=pose) for i, pose in enumerate(poses)]
+
+
+def turntable_poses(
+    scene: TrainedScene, poses: Sequence[np.ndarray], count: int, region: Region | None = None
+) -> np.ndarray:
+    """Poses (count, 4, 4) on a circle around the object, z up, like `poses` in distance and (median) height.
 
     The object is what lies in the `region`; without one, all of the scene.
     """
@@ -139,17 +147,14 @@ def turntable_views(
     else:
         position = scene.surfels.position().numpy().T if scene.mesh is None else scene.mesh.vertices
         centre = (position.min(axis=0) + position.max(axis=0)).astype(np.float64) / 2
-    offset = np.array([view.to_world[:3, 3] for view in views]) - centre
+    offset = np.array([pose[:3, 3] for pose in poses]) - centre
     distance = float(np.median(np.linalg.norm(offset, axis=1)))
     height = float(np.median(offset[:, 2] / np.linalg.norm(offset, axis=1)))
     height = min(max(height, -0.95), 0.95)  # not from a pole, where no side is up
     angle = 2 * np.pi * np.arange(count) / count
     ring = math.sqrt(1 - height**2)
     outward = np.stack([ring * np.cos(angle), ring * np.sin(angle), np.full(count, height)], axis=1)
-    return [
-        replace(views[0], name=f"{i}", to_world=pose)
-        for i, pose in enumerate(poses_around(outward, centre, distance))
-    ]
+    return poses_around(outward, centre, distance)
 
 
 def _prepare(out: Path, kind: str) -> None:

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import numpy as np
-
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
 from mi_refgs.shade.shading import Shading
@@ -28,12 +26,14 @@ def write_scene_xml(
     mesh: str | None = None,
     shading: Shading,
     camera: Camera,
+    more: Sequence[Camera] = (),
     surroundings: str | None = None,
     background: Sequence[float] | str | None = None,
     remark: str = "",
 ) -> None:
     """Write a Mitsuba scene with one `refgs` integrator and one perspective sensor, atomically.
 
+    more: cameras of further sensors, which follow that of `camera`.
     ply, envmap, mesh, surroundings: file names relative to the folder of the XML, so that it can be moved.
     background: linear radiance (r, g, b) composited under alpha, the name of a lat-long map of it, or None
     for a transparent image. The scene has a parameter `spp`, as in `mi.load_file(path, spp=4)`, 1 by default:
@@ -74,7 +74,8 @@ def write_scene_xml(
     if envmap is not None:
         light = ElementTree.SubElement(integrator, "emitter", type="envmap", name="light")
         _put(light, "string", "filename", envmap)
-    _add_sensor(scene, camera)
+    for index, one in enumerate([camera, *more]):
+        _add_sensor(scene, one, f"sensor_{index}" if index else "sensor")
 
     ElementTree.indent(scene, "    ")
     write_bytes(path, f"{ElementTree.tostring(scene, encoding='unicode')}\n".encode())
@@ -88,16 +89,14 @@ def _numbers(values: Any) -> str:
     return ", ".join(repr(float(x)) for x in values)
 
 
-def _add_sensor(scene: ElementTree.Element, camera: Camera) -> None:
+def _add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
     fx, fy, cx, cy, near = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy, camera.near))
     if not fx * fy > 0:
         raise InputError(
             f"camera: fx, fy: {fx:g} and {fy:g} pixels mirror the picture, as no Mitsuba sensor does; choose "
             "another view"
         )
-    to_world = np.eye(4)
-    to_world[:3, :3] = np.array(camera.rotation, dtype=np.float64).reshape(3, 3).T
-    to_world[:3, 3] = sum(np.array(x, np.float64).ravel() for x in (camera.origin, camera.origin_rest))
+    to_world = camera.pose()
     if fx > 0:  # both axes point the other way: the camera stands on its head
         to_world[:3, :2] *= -1
     focal = max(abs(fx), abs(fy))
@@ -109,7 +108,7 @@ def _add_sensor(scene: ElementTree.Element, camera: Camera) -> None:
         size = f"{camera.width} x {camera.height} pixels of focal lengths {abs(fx):g} and {abs(fy):g}"
         scene.append(ElementTree.Comment(f" the view of {size}, with square pixels "))
 
-    sensor = ElementTree.SubElement(scene, "sensor", type="perspective", id="sensor")
+    sensor = ElementTree.SubElement(scene, "sensor", type="perspective", id=name)
     _put(sensor, "string", "fov_axis", "x")
     _put(sensor, "float", "fov", repr(math.degrees(2 * math.atan(width / (2 * focal)))))
     _put(sensor, "float", "near_clip", repr(max(near, NEAR_CLIP_MIN)))

@@ -16,7 +16,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -158,11 +158,11 @@ class TrainedScene:
         return view
 
 
-def export(fitted: TrainedScene, folder: Path, camera: Camera) -> list[Path]:
+def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Camera] = ()) -> list[Path]:
     """Write the artefacts into `folder`, each whole or not at all; returns their paths.
 
-    `camera` becomes the sensor of scene.xml. Raises InputError if a file cannot be written or a value is not
-    finite.
+    `camera` becomes the sensor of scene.xml, and `more` the next ones. Raises InputError if a file cannot be
+    written or a value is not finite.
     """
     light = LIGHT_MAP if fitted.light is not None else None
     mesh = MESH if fitted.mesh is not None else None
@@ -187,6 +187,7 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera) -> list[Path]:
         mesh=mesh,
         shading=fitted.shading,
         camera=camera,
+        more=more,
         surroundings=around,
         background=behind,
         remark="" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels",
@@ -218,15 +219,16 @@ def load_if_newer(run: Run, method: Method) -> TrainedScene | None:
     return TrainedScene.from_state(method, state)
 
 
-def up_to_date(run: Run, method: Method, camera: Camera) -> TrainedScene:
+def up_to_date(run: Run, method: Method, camera: Camera | Callable[[TrainedScene], Camera]) -> TrainedScene:
     """The artefacts of a run, written first if there are none or the newest checkpoint is newer.
 
-    Raises InputError if there is nothing to write them from.
+    `camera` is that of scene.xml, or chooses one for what is written. Raises InputError if there is nothing
+    to write them from.
     """
     fresh = load_if_newer(run, method)
     if fresh is not None:
-        export(fresh, run.path, camera)
-    elif not (run.path / "model.json").is_file():
+        export(fresh, run.path, camera(fresh) if callable(camera) else camera)
+    elif not (run.path / MODEL).is_file():
         raise InputError(
             f"{run.path}: checkpoints: none yet; train it with `refgs train DATA -o {run.path} --resume`"
         )

@@ -56,11 +56,15 @@ class Run:
         """
         self.require_none()
         self._make_folders()
+        self.write_dataset(dataset, region)
+        self.write_method(method)
+
+    def write_dataset(self, dataset: str, region: Region | None) -> None:
+        """Write what the run is of: the folder of a data set, and its region of interest if there is one."""
         record: dict[str, Any] = {"path": dataset}
         if region is not None:
             record["region"] = asdict(region)
         write_bytes(self.path / DATASET, json.dumps(record).encode())
-        self.write_method(method)
 
     def write_method(self, method: Method) -> None:
         """Write the resolved method."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -90,6 +92,40 @@ class Camera:
         )
 
     @staticmethod
+    def look_at(
+        origin: Sequence[float] | np.ndarray,
+        target: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+        up: Sequence[float] | np.ndarray = (0.0, 0.0, 1.0),
+        *,
+        fov: float = 40.0,
+        size: int | tuple[int, int] = 256,
+        near: float | None = None,
+    ) -> Camera:
+        """Camera at `origin` (world) that looks at `target`, with `up` upwards in the picture.
+
+        fov: degrees across the picture's width, as of Mitsuba's `perspective`. size: width and height, or
+        both as one number, pixels. near: depth of the near plane, scene units; a thousandth of the distance
+        to the target by default. Raises InputError where these give no view.
+        """
+        width, height = (size, size) if isinstance(size, int) else size
+        eye, forward, top = (np.asarray(x, dtype=np.float64) for x in (origin, target, up))
+        forward = forward - eye
+        distance, left = float(np.linalg.norm(forward)), np.cross(top, forward)
+        if not (0 < fov < 180 and width > 0 and height > 0):
+            raise InputError(
+                f"camera: fov, size: {fov:g} degrees on {width} × {height} pixels; give an angle below 180, "
+                "and pixels"
+            )
+        if not (distance > 0 and np.linalg.norm(left) > 1e-9 * distance * np.linalg.norm(top)):
+            raise InputError("camera: up: no direction besides that of the view; move `origin`, or turn `up`")
+        left, forward = left / np.linalg.norm(left), forward / distance
+        pose = np.eye(4)
+        pose[:3] = np.stack([left, np.cross(forward, left), forward, eye], axis=1)
+        focal = -0.5 * width / math.tan(math.radians(fov) / 2)
+        near = 1e-3 * distance if near is None else near
+        return Camera.from_pose(width, height, focal, focal, width / 2, height / 2, pose, near)
+
+    @staticmethod
     def from_sensor(sensor: Any) -> Camera:
         """Camera of a Mitsuba `perspective` sensor, with its crop window and principal-point offset.
 
@@ -142,6 +178,35 @@ class Camera:
         pixel = self.pixel_centres()
         local = mi.Vector3f((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1)
         return self.rotation.T @ local
+
+    def pose(self) -> np.ndarray:
+        """The rigid world-from-camera matrix (4, 4) float64."""
+        pose = np.eye(4)
+        pose[:3, :3] = np.array(self.rotation, dtype=np.float64).reshape(3, 3).T
+        pose[:3, 3] = sum(np.array(x, np.float64).ravel() for x in (self.origin, self.origin_rest))
+        return pose
+
+    def moved(self, to_world: np.ndarray) -> Camera:
+        """The same lens at another pose (4, 4); raises InputError as `from_pose` does."""
+        lens = [float(x[0]) for x in (self.fx, self.fy, self.cx, self.cy)]
+        return Camera.from_pose(self.width, self.height, *lens, to_world, float(self.near[0]))
+
+    def resized(self, size: int | tuple[int, int]) -> Camera:
+        """The same view with other pixels: so many in width and height, or along the longer side alone.
+
+        Raises InputError for a size without pixels.
+        """
+        if isinstance(size, int):
+            ratio = size / max(self.width, self.height)
+            size = max(1, round(self.width * ratio)), max(1, round(self.height * ratio))
+        if min(size) < 1:
+            raise InputError(f"camera: size: {size[0]} × {size[1]} pixels; give whole numbers from 1")
+        x, y = size[0] / self.width, size[1] / self.height
+        scaled = {
+            name: dr.opaque(mi.Float, float(getattr(self, name)[0]) * ratio)
+            for name, ratio in (("fx", x), ("cx", x), ("fy", y), ("cy", y))
+        }
+        return replace(self, width=size[0], height=size[1], focal=self.focal * x, offset=(0, 0), **scaled)
 
     def supersampled(self, factor: int) -> Camera:
         """The same view with factor² pixels for each pixel."""

@@ -1,0 +1,60 @@
+"""A Mitsuba scene file as an object, its `refgs` integrator with what a caller asks for besides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from mi_refgs.errors import InputError
+from mi_refgs.exr import mitsuba_exr
+
+
+def load_scene(path: Path, aovs: Sequence[str] = (), alone: bool = False) -> Any:
+    """Load a scene, its `refgs` integrator with these AOVs besides its own: types, or `name:type`.
+
+    `alone`: without the surroundings and the background of that. Raises InputError for what Mitsuba cannot
+    load, and for AOVs or `alone` without a `refgs` integrator.
+    """
+    before = mi.file_resolver()
+    beside = mi.FileResolver(before)
+    beside.prepend(str(path.parent.resolve()))
+    mi.set_file_resolver(beside)
+    try:
+        config = mi.parser.ParserConfig(mi.variant())
+        state = mi.parser.parse_file(config, str(path))
+        mi.parser.transform_all(config, state)
+        if aovs or alone:
+            integrators = [node.props for node in state.nodes if node.props.plugin_name() == "refgs"]
+            if not integrators:
+                option = "--aov" if aovs else "--object"
+                raise InputError(f"{path}: {option}: the scene has no `refgs` integrator; drop {option}")
+            if aovs:
+                integrators[0]["aovs"] = ",".join(aov if ":" in aov else f"{aov}:{aov}" for aov in aovs)
+            for name in ("surroundings", "background") if alone else ():
+                if name in integrators[0]:
+                    del integrators[0][name]
+        with mitsuba_exr():
+            loaded = mi.parser.instantiate(config, state)
+    except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file
+        raise InputError(f"{path}: scene: {reason(error)}") from error
+    finally:
+        mi.set_file_resolver(before)
+    return loaded[0] if isinstance(loaded, list) else loaded
+
+
+def reason(error: BaseException) -> str:
+    """The sentence at the root of an error that Mitsuba wrapped: ours if there is one, else its last line."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, InputError):
+            return str(cause)
+        cause = cause.__cause__
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    for line in reversed(lines):
+        _, found, message = line.partition("InputError: ")
+        if found:
+            return message
+    return f"{lines[-1] if lines else error}; correct the scene"

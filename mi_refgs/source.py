@@ -1,0 +1,75 @@
+"""What a reconstruction was made from, and the cameras that follow from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mi_refgs.contraction import Region
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.picture_store import undecoded
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.whole import read_views
+from mi_refgs.formats import Shot
+from mi_refgs.formats.shots import shots_around
+from mi_refgs.methods.method import Method
+from mi_refgs.relighting.relight import turntable_poses
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.run import Run
+from mi_refgs.splat import Camera
+
+
+@dataclass(frozen=True)
+class Source:
+    """A method and, where it is known, the data set that it was fitted to, with its region of interest."""
+
+    method: Method
+    data: Path | None = None
+    region: Region | None = None  # in pictures without alpha
+
+    @staticmethod
+    def of(run: Run) -> Source:
+        """That of a run folder; raises InputError if it is none, or records a region that cannot be used."""
+        method = run.method()
+        try:
+            data: Path | None = run.dataset()
+        except (OSError, ValueError, KeyError, TypeError):
+            data = None
+        return Source(method, data, run.region())
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the folder of the data set is."""
+        return self.data is not None and self.data.is_dir()
+
+    def views(self, split: str) -> Dataset:
+        """A split of the data set; raises InputError where that is unknown, gone or unreadable."""
+        if self.data is None or not self.is_there:
+            gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
+            raise InputError(f"views: {split}: {gone}; use cameras(), or bring the data set back")
+        found = read_views(self.method, self.data, split)
+        return found if self.region is None else replace(found, region=self.region)
+
+    def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
+        """The cameras of some splits by name; without a data set those around the surfels.
+
+        Decodes no picture. Raises InputError for a data set that is there and cannot be read.
+        """
+        if not self.is_there:
+            return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
+        with undecoded():
+            return [
+                Shot(view.name, split, view.camera()) for split in splits for view in self.views(split).views
+            ]
+
+    def turntable(self, trained: TrainedScene, count: int) -> list[Camera]:
+        """Cameras on a circle around the object, z up, like the test views in lens, distance and height.
+
+        Raises InputError as `shots` does, and for a number below 1.
+        """
+        if count < 1:
+            raise InputError(f"turntable: {count} is out of range; give a number of cameras from 1")
+        cameras = [shot.camera for shot in self.shots(trained, "test")]
+        region = None if trained.surroundings is None else self.region
+        poses = turntable_poses(trained, [camera.pose() for camera in cameras], count, region)
+        return [cameras[0].moved(pose) for pose in poses]
