@@ -205,8 +205,8 @@ class Reconstruction:
         `load` of it renders the same pictures, bit for bit. Raises InputError for a folder that holds a run
         or cannot be written.
         """
-        origin = {"data": self.source.data, "region": self.source.region}
-        saving.save(self.trained, Path(folder), self.method, self.cameras()[0], **origin)
+        source, first = self.source, self.cameras()[0]
+        saving.save(self.trained, Path(folder), source.method, first, data=source.data, region=source.region)
         return load(folder)
 
     def export(self, form: str, path: str | Path, **options: Any) -> list[Path]:

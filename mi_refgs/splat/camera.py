@@ -188,8 +188,8 @@ class Camera:
 
     def moved(self, to_world: np.ndarray) -> Camera:
         """The same lens at another pose (4, 4); raises InputError as `from_pose` does."""
-        lens = [float(x[0]) for x in (self.fx, self.fy, self.cx, self.cy)]
-        return Camera.from_pose(self.width, self.height, *lens, to_world, float(self.near[0]))
+        fx, fy, cx, cy, near = (float(x[0]) for x in (self.fx, self.fy, self.cx, self.cy, self.near))
+        return Camera.from_pose(self.width, self.height, fx, fy, cx, cy, to_world, near)
 
     def resized(self, size: int | tuple[int, int]) -> Camera:
         """The same view with other pixels: so many in width and height, or along the longer side alone.
