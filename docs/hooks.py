@@ -1,0 +1,43 @@
+"""What `mkdocs` runs while it builds the site (mkdocs.yml): pages made from the code that they describe.
+
+A page that is made is never committed, so it cannot be older than the code.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File
+from site_pages import api, commands, links, methods, notebooks, plugins, settings
+
+PAGES = {
+    "api.md": api.page,
+    "cli.md": commands.page,
+    "methods.md": methods.page,
+    "plugins.md": plugins.page,
+    "settings.md": settings.page,
+}
+"""Page → the function that writes its Markdown."""
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add what is made: pages of the code, pages that stand elsewhere in the repository, notebooks."""
+    made: dict[str, str | bytes] = {name: write() for name, write in PAGES.items()}
+    made |= links.pages_from_elsewhere()
+    for file in [file for file in files if file.src_uri.endswith(".ipynb")]:
+        files.remove(file)
+        made |= notebooks.pages(file.src_uri)
+    for name, content in made.items():
+        files.append(File.generated(config, name, content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """Lead links that leave docs/ to pages of the site, and indent lists as Python-Markdown wants them."""
+    return links.for_the_site(markdown, page.file.src_uri)
+
+
+def on_post_build(config: Any) -> None:
+    """List the links that leave the site, for a person or a program to follow."""
+    Path(config.site_dir, "external_links.txt").write_text("\n".join(sorted(links.EXTERNAL)) + "\n")

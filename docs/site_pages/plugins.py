@@ -1,0 +1,87 @@
+"""The page of the Mitsuba plugins, from the docstrings of their classes.
+
+The docstrings are reStructuredText with Mitsuba's directives; what they use of it is translated here.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import textwrap
+
+from mi_refgs.plugins import PLUGINS
+from site_pages import ROOT, table
+
+FLAGS = {"exposed": "in `mi.traverse`", "differentiable": "differentiable"}
+"""Flags of a parameter, as this page says them."""
+
+
+def page() -> str:
+    """One section a plugin."""
+    text = [
+        "# Plugins",
+        "After `import mi_refgs`, Mitsuba has these plugins, in scene files and in dictionaries.",
+    ]
+    for name, (register, module) in PLUGINS.items():
+        kind = register.removeprefix("register_")
+        text += [f"## `{name}`, a plugin of kind {kind} {{#{name}}}", markdown(docstring(module))]
+    return "\n\n".join(text) + "\n"
+
+
+def docstring(module: str) -> str:
+    """The docstring of the class that a plugin module defines, read without importing the module."""
+    tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text(encoding="utf-8"))
+    found = [ast.get_docstring(node) for node in tree.body if isinstance(node, ast.ClassDef)]
+    [text] = [text for text in found if text and "pluginparameters" in text]
+    return text
+
+
+def markdown(text: str) -> str:
+    """A plugin's docstring as Markdown, without its label and title."""
+    blocks = re.split(r"\n(?=\S)", inspect.cleandoc(text))
+    written, skip = [], False
+    for i, block in enumerate(blocks):
+        following = blocks[i + 1] if i + 1 < len(blocks) else ""
+        if skip or block.startswith(".. _") or re.match(r"-{4,}", following):
+            skip = bool(re.match(r"-{4,}", following))
+        elif block.startswith(".. pluginparameters::"):
+            written.append(parameters(block))
+        elif block.startswith(".. math::"):
+            written.append("```text\n" + textwrap.dedent(block.partition("\n")[2]).strip() + "\n```")
+        elif block.startswith(".. tabs::"):
+            written.append(tabs(block))
+        else:
+            written.append(inline(block))
+    return "\n".join(written)
+
+
+def inline(text: str) -> str:
+    """Roles and literals of a paragraph."""
+    return re.sub(r"``([^`]+)``", r"`\1`", re.sub(r":\w+:`([^`]+)`", r"`\1`", text))
+
+
+def parameters(block: str) -> str:
+    """The table of a `pluginparameters` directive: name, type, meaning; flags are put to the type."""
+    rows = []
+    for entry in re.split(r"\n *\* - ", block)[1:]:
+        name, kind, *rest = (" ".join(part.split()) for part in re.split(r"\n *- ", entry))
+        names, _, other = name.partition(" *")
+        kind = inline(re.sub(r"\|(\w+)\|", r"\1", kind))
+        meaning, flags = (rest[0], rest[1:]) if rest and not rest[0].startswith("|") else ("", rest)
+        meaning = inline(re.sub(r"\|(\w+)\|", r"\1", meaning))
+        words = [FLAGS[flag] for flag in re.findall(r"\|(\w+)\|", " ".join(flags))]
+        shown = ", ".join(f"`{part.strip()}`" for part in names.split(","))
+        shown += f" *{other}" if other else ""
+        rows.append([shown, "; ".join([kind, *words]), meaning])
+    return "\n" + table(["parameter", "type", "meaning"], rows) + "\n"
+
+
+def tabs(block: str) -> str:
+    """A `tabs` directive with its code tabs."""
+    found = re.findall(r"\.\. code-tab:: (\w+)\n\n(.*?)(?=\n *\.\. code-tab|\Z)", block, flags=re.DOTALL)
+    return "\n\n".join(
+        f'=== "{language}"\n\n'
+        + textwrap.indent(f"```{language}\n{textwrap.dedent(code).strip()}\n```", "    ")
+        for language, code in found
+    )

@@ -1,0 +1,104 @@
+"""The page of a method file's keys, from the dataclasses that read it and the comments beside fields."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import re
+import typing
+from typing import Any
+
+from mi_refgs.methods.method import Method
+from mi_refgs.methods.window import Window
+from site_pages import table
+
+FILLED_IN = ("variant", "file", "preset", "assignments", "terms")
+"""Fields of `Method` that no file gives: `load` fills them in."""
+SMALL = 4
+"""Fields from which on a class is a table of its own; one with fewer, as a window, is a value."""
+
+
+def page() -> str:
+    """A section for the top level and for each table of a method file."""
+    text = [
+        "# Settings of a method",
+        "Keys of a method file, which `--set` changes for one run: `--set loss.ssim=0.1 light.height=64`. "
+        "Defaults are those of a file that says nothing; [methods](methods.md) shows what each says, and "
+        "`config.toml` in a run folder what the run was fitted with. Numbers of iterations are written for "
+        "the file's own `iterations`, and a preset scales them. A *window* is a table of `start`, `until` "
+        "and `every`: events at the multiples of `every` beyond `start`, up to `until`.",
+    ]
+    named = {name.partition(".")[0] for name in tables()}
+    for name, kind in tables().items():
+        rows = [
+            [f"`{field}`", f"`{typed}`", f"`{default}`" if default else "", comment]
+            for field, typed, default, comment in fields(kind)
+            if not (kind is Method and (field in FILLED_IN or field in named))
+        ]
+        title = f"`[{name}]`" if name else "Top level"
+        remark = (inspect.getdoc(kind) or "").split("\n\n")[0]
+        text += [
+            f"## {title} {{#{name or 'top'}}}",
+            remark,
+            table(["key", "type", "default", "meaning"], rows),
+        ]
+    return "\n\n".join(text) + "\n"
+
+
+def tables() -> dict[str, type]:
+    """Dotted name of each table of a method file → its class, the top level first."""
+    found: dict[str, type] = {"": Method}
+    waiting: list[tuple[str, type]] = [("", Method)]
+    while waiting:
+        prefix, kind = waiting.pop(0)
+        for name, hint in typing.get_type_hints(kind).items():
+            for inner, suffix in _classes(hint):
+                if len(dataclasses.fields(inner)) >= SMALL or suffix:
+                    found[f"{prefix}{name}{suffix}"] = inner
+                    waiting.append((f"{prefix}{name}{suffix}.", inner))
+    return found
+
+
+def _classes(hint: Any) -> list[tuple[type, str]]:
+    """Dataclasses in a type, and what follows a key: a dictionary's tables have names of their own."""
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return [(hint, "")]
+    inner = [found for part in typing.get_args(hint) for found in _classes(part)]
+    return [(kind, ".NAME") for kind, _ in inner] if typing.get_origin(hint) is dict else inner
+
+
+def fields(kind: type) -> list[tuple[str, str, str, str]]:
+    """Name, type, default and remark of each field; the remark is the comment beside it in the source."""
+    found = []
+    source = inspect.getsource(kind)
+    for field in dataclasses.fields(kind):
+        line = re.search(
+            rf"^    {field.name}: (?P<type>.*?)(?: = .*?)?(?:  # (?P<remark>.*))?$", source, re.M
+        )
+        assert line is not None, f"{kind.__name__}.{field.name}: its declaration is not one line"
+        found.append((field.name, _plain(line["type"]), _shown(field.default), line["remark"] or ""))
+    return found
+
+
+def _shown(default: Any) -> str:
+    """A default as TOML has it; empty for tables, and where there is none."""
+    if default is dataclasses.MISSING or (
+        dataclasses.is_dataclass(default) and not isinstance(default, Window)
+    ):
+        return ""
+    if default is None:
+        return "absent"
+    if isinstance(default, Window):
+        return f"{{ start = {default.start:g}, until = {default.until:g}, every = {default.every:g} }}"
+    if isinstance(default, tuple):
+        return f"[{', '.join(map(_shown, default))}]"
+    if isinstance(default, str | bool):
+        return json.dumps(default)
+    return f"{default:_}" if isinstance(default, int) else f"{default:g}"
+
+
+def _plain(annotation: str) -> str:
+    """A type as a writer of TOML thinks of it."""
+    annotation = annotation.replace(" | None", "").replace("Window", "window")
+    return re.sub(r"Literal\[(.*?)\]", lambda m: " or ".join(m[1].split(", ")), annotation)
