@@ -59,6 +59,7 @@ LAYERS: dict[str, set[str]] = {
     "source": RENDERER | {"methods", "data", "runs", "fitting", "formats", "relighting"},
     "reconstruction": RENDERER
     | {"methods", "data", "runs", "fitting", "evaluation", "relighting", "formats", "source", "plugins"},
+    "editing": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
     "profiling": RENDERER | {"methods", "data", "fitting"},
     "compare": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", ""},
     "doctor": {"llvm", "errors", ""},
@@ -72,6 +73,7 @@ LAYERS: dict[str, set[str]] = {
         "formats",
         "relighting",
         "reconstruction",
+        "editing",
         "compare",
         "profiling",
         "capture",

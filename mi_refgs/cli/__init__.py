@@ -19,6 +19,7 @@ from mi_refgs.cli import (
     dataset,
     demo,
     doctor,
+    edit,
     evaluate,
     export,
     profile,
@@ -51,6 +52,7 @@ def build_parser() -> Parser:
         compare,
         render,
         relight,
+        edit,
         export,
         profile,
     ):

@@ -54,6 +54,11 @@ class Mesh:
         """The mesh of an empty volume."""
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), voxel)
 
+    def part(self, kept: np.ndarray) -> Mesh:
+        """The kept triangles (F,) bool, with the vertices that they have."""
+        used, faces = np.unique(self.faces[kept], return_inverse=True)
+        return Mesh(self.vertices[used], faces.reshape(-1, 3).astype(np.uint32), self.voxel)
+
 
 def extract_mesh(tsdf: TSDF) -> Mesh:
     """Zero level set of the field by marching cubes (Lewiner et al. 2003), without floaters.

@@ -63,7 +63,7 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     surfels = scene.surfels.detach()
     mesh = scene.mesh
     if mesh is not None and scene.surroundings is not None:
-        mesh = _near(mesh, surfels)
+        mesh = near(mesh, surfels)
     if scene.shading.diffuse == "sh":
         surfels = albedo_from_radiance(surfels, scene.light.prefilter(), mesh)
     kept = {name: raw for name, raw in surfels.raw.items() if name not in ("radiance_sh", "indirect_sh")}
@@ -74,12 +74,11 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, surroundings=None)
 
 
-def _near(mesh: Mesh, surfels: Surfels) -> Mesh:
+def near(mesh: Mesh, surfels: Surfels) -> Mesh:
     """The triangles in the box of the surfels: what is around them stands in no other light's way."""
     low, high = bounds_from_points(surfels.to_numpy()["position"])
     inside = np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1)[mesh.faces].all(axis=1)
-    used, faces = np.unique(mesh.faces[inside], return_inverse=True)
-    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.uint32), mesh.voxel)
+    return mesh.part(inside)
 
 
 def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> Surfels:
@@ -93,7 +92,7 @@ def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> S
     """
     with dr.suspend_grad():
         surfels = surfels.cleaned()
-        normal, vertex = _outward(surfels, mesh)
+        normal, vertex = outward(surfels, mesh)
         facing = mi.Vector3f(normal.T)
         coefficients = surfels.radiance_sh()
         basis = sh_basis(-facing, surfels.sh_degree())
@@ -127,7 +126,7 @@ def _rows(value: Any) -> np.ndarray:
     return np.atleast_2d(np.array(value, dtype=np.float64)).T
 
 
-def _outward(surfels: Surfels, mesh: Mesh | None) -> tuple[np.ndarray, np.ndarray | None]:
+def outward(surfels: Surfels, mesh: Mesh | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Unit normals (N, 3) float32 of the surfels, turned outwards, and the nearest vertex (N) of the mesh."""
     normal = surfels.primitive.normal(surfels).numpy().T
     position = surfels.position().numpy().T

@@ -53,6 +53,7 @@ class Channel:
     initial: float = 0.0  # activated; the points decide for geometry and the first colour
     jitter: float = 0.0  # half the width of the uniform noise on it, activated
     rest_rate: float = 1.0  # factor of the rate for harmonics of degree 1 and above
+    direction: bool = False  # a vector in world directions, which turns with its primitive
     geometry: bool = False  # says where and how large a primitive is; there if its primitive has it
     aov: str = ""  # suffixes of its AOV, Mitsuba's: "RGB", "Y"; none without
 
@@ -155,6 +156,6 @@ for _declared in (
     Channel("roughness", (1,), "sigmoid", 5e-3, ("roughness",), 0.1, aov="Y"),
     Channel("indirect_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("ind",), rest_rate=0.05),
     Channel("tint", (3,), "sigmoid", 7.5e-3, _numbered("tint"), 0.5, aov="RGB"),
-    Channel("normal_offset", (3,), "identity", 1e-3, _numbered("offset")),
+    Channel("normal_offset", (3,), "identity", 1e-3, _numbered("offset"), direction=True),
 ):
     register(_declared)

@@ -1,0 +1,62 @@
+"""The occluding mesh after an edit: each triangle belongs to the surfels around it and does as they do.
+
+Extracted again from depth maps it would lose what no view sees, such as the contact of two objects, and
+it needs the views. A triangle whose surfels are gone casts no shadow and is in no mirror; where an object is
+cut the mesh is open, as the surfels are.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mi_refgs.editing.rigid import Placement
+from mi_refgs.occlusion.mesh import Mesh
+
+NEIGHBOURS = 8
+"""Surfels around the middle of a triangle that decide about it: as many as give a vertex its materials."""
+MAJORITY = 0.5
+"""Share of their opacity."""
+
+
+class Owners:
+    """The surfels around each triangle of a mesh; `position` (N, 3) and `opacity` (N,) of the whole scene.
+
+    Rows after the object's, those of surroundings, are never chosen: `padded` gives them a value.
+    """
+
+    def __init__(self, mesh: Mesh, position: np.ndarray, opacity: np.ndarray) -> None:
+        centre = mesh.vertices[mesh.faces].mean(axis=1)
+        near = np.arange(1, min(NEIGHBOURS, len(position)) + 1)
+        _, self.surfel = cKDTree(position).query(centre, k=near)
+        self.opacity = opacity
+        self.whole = np.maximum(opacity[self.surfel].sum(axis=1), np.finfo(np.float64).tiny)
+
+    def share(self, opacity: np.ndarray) -> np.ndarray:
+        """Part (F,) of the opacity around each triangle that other opacities (N,) of the surfels leave."""
+        padded = self.opacity.copy()
+        padded[: len(opacity)] = opacity
+        return np.asarray(padded[self.surfel].sum(axis=1) / self.whole)
+
+    def chosen(self, rows: np.ndarray) -> np.ndarray:
+        """The triangles (F,) bool of chosen surfels (N,) bool."""
+        others = np.zeros_like(self.opacity)
+        others[: len(rows)] = np.where(rows, self.opacity[: len(rows)], 0)
+        return np.asarray(others[self.surfel].sum(axis=1) > MAJORITY * self.whole)
+
+
+def placed(mesh: Mesh, placement: Placement) -> Mesh:
+    """The mesh moved as a whole."""
+    vertices = placement.points(mesh.vertices).astype(np.float32)
+    return Mesh(vertices, mesh.faces, mesh.voxel * placement.factor)
+
+
+def together(first: Mesh | None, second: Mesh | None) -> Mesh | None:
+    """Both meshes as one, of the coarser one's voxel: rays start as far off the surface as that needs."""
+    if first is None or second is None or not len(second.faces):
+        return second if first is None else first
+    if not len(first.faces):
+        return second
+    faces = np.concatenate([first.faces, second.faces + np.uint32(len(first.vertices))])
+    vertices = np.concatenate([first.vertices, second.vertices])
+    return Mesh(vertices, faces, max(first.voxel, second.voxel))
