@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -51,12 +52,21 @@ PYTHON = [
 SHELL = [pytest.param(page, id=name(page)) for page in PAGES if blocks(page, "sh")]
 
 
+@pytest.fixture(scope="module")
+def checkout(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder like a checkout in which `bash setup.sh demo` was run; its run is a tiny one."""
+    folder = tmp_path_factory.mktemp("checkout")
+    shutil.copytree(finished, folder / "runs" / "demo" / "quick")
+    (folder / "scenes").symlink_to(ROOT / "scenes")
+    return folder
+
+
 @pytest.mark.parametrize("code", PYTHON)
-def test_python_blocks_run(code: str, tmp_path: Path) -> None:
+def test_python_blocks_run(code: str, checkout: Path) -> None:
     """Each block in a process of its own, as a reader would paste it; warnings are errors."""
     result = subprocess.run(
         [sys.executable, "-W", "error", "-c", code],
-        cwd=tmp_path,
+        cwd=checkout,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import textwrap
 
 from mi_refgs import cli
 from mi_refgs.cli import build_parser
@@ -59,6 +60,11 @@ def command(name: str, parser: argparse.ArgumentParser) -> list[str]:
         if not isinstance(action, argparse._HelpAction)
     ]
     text.append(table(["option", "meaning"], rows))
+    text += [
+        f"{(group.title or '').capitalize()}:\n\n```text\n{textwrap.dedent(group.description).strip()}\n```"
+        for group in parser._action_groups
+        if group.description
+    ]
     if parser.epilog:
         example = parser.epilog.removeprefix("example:").strip("\n")
         text.append("```sh\n" + "\n".join(line.strip() for line in example.splitlines()) + "\n```")
