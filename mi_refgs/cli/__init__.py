@@ -16,6 +16,7 @@ from mi_refgs import __version__
 from mi_refgs.cli import (
     capture,
     compare,
+    completion,
     dataset,
     demo,
     doctor,
@@ -55,6 +56,7 @@ def build_parser() -> Parser:
         edit,
         export,
         profile,
+        completion,
     ):
         module.add(commands)
     return parser

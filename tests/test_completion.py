@@ -1,0 +1,74 @@
+"""`refgs completion`: the scripts that shells source, made of the parser as it is."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mi_refgs.cli import build_parser, main
+from mi_refgs.cli.completion import SHELLS
+
+
+def script(shell: str, capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(["completion", shell]) == 0
+    return capsys.readouterr().out
+
+
+def completed(source: str, *words: str) -> set[str]:
+    """What bash offers for the last word."""
+    code = f"""{source}
+COMP_WORDS=({" ".join(f"'{word}'" for word in words)})
+COMP_CWORD={len(words) - 1}
+COMP_LINE="${{COMP_WORDS[*]}}"
+$(complete -p refgs | sed -E 's/.*-F ([^ ]+).*/\\1/') refgs
+printf '%s\\n' "${{COMPREPLY[@]}}"
+"""
+    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    return set(done.stdout.split())
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
+def test_bash_completes_commands_and_options(capsys: pytest.CaptureFixture[str]) -> None:
+    source = script("bash", capsys)
+    [action] = build_parser()._subparsers._group_actions  # type: ignore[union-attr]
+    assert completed(source, "refgs", "") >= set(action.choices)  # type: ignore[arg-type]
+    assert completed(source, "refgs", "tr") == {"train"}
+    assert "--preset" in completed(source, "refgs", "train", "--p")
+    assert "--turntable" in completed(source, "refgs", "relight", "run", "--turn")
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
+def test_bash_completes_files(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "vase").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert "vase" in completed(script("bash", capsys), "refgs", "train", "va")
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_every_shell_has_a_script(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    text = script(shell, capsys)
+    assert "refgs" in text and "relight" in text
+    assert "--turntable" in text or shell == "tcsh"  # whose scripts by shtab complete commands alone
+
+
+def test_json_has_the_script(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", "zsh", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["shell"] == "zsh" and found["script"].startswith("#compdef refgs")
+
+
+def test_another_shell_and_a_missing_package_are_one_sentence(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["completion", "fish"]) == 2
+    assert "fish" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert main(["completion", "bash"]) == 2
+    assert 'pip install "mi_refgs[completion]"' in capsys.readouterr().err
