@@ -12,7 +12,19 @@ from helpers import ROOT, imported_packages
 
 PACKAGE = "mi_refgs"
 
-BOTTOM = {"constants", "contraction", "device", "errors", "exr", "files", "hdr", "images", "ply", "timing"}
+BOTTOM = {
+    "constants",
+    "contraction",
+    "device",
+    "errors",
+    "exr",
+    "files",
+    "hdr",
+    "images",
+    "ply",
+    "progress_bar",
+    "timing",
+}
 """What everything may stand on."""
 
 FLAT = {"Float", "UInt32", "Int32", "Bool", "TensorXf", "TensorXu", "TensorXi", "TensorXb"}
@@ -38,6 +50,7 @@ LAYERS: dict[str, set[str]] = {
     "hdr": {"files", "errors"},
     "images": {"exr", "files", "errors"},
     "ply": {"errors"},
+    "progress_bar": set(),
     "rows": set(),
     "device": set(),
     "timing": set(),

@@ -6,7 +6,6 @@ and Frahm 2016, "Structure-from-Motion Revisited"]
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
@@ -16,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.progress_bar import progress_bar
 
 SEED = 0
 """Seed of all random numbers; with it, a second run gives the same result."""
@@ -68,19 +68,11 @@ def quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def bar(total: int, what: str) -> Any:
-    """A progress bar on standard error."""
-    from tqdm import tqdm
-
-    interval = 0.5 if sys.stderr.isatty() else 30.0
-    return tqdm(total=total, desc=what, file=sys.stderr, dynamic_ncols=True, mininterval=interval)
-
-
 def progress(what: str) -> Callable[[Sequence[Item]], Iterable[Item]]:
     """A progress bar around the items of a loop."""
 
     def each(items: Sequence[Item]) -> Iterator[Item]:
-        with bar(len(items), what) as shown:
+        with progress_bar(len(items), what) as shown:
             for item in items:
                 yield item
                 shown.update()
@@ -111,7 +103,7 @@ def _in_parts(
 
     The database is left alone meanwhile: a second reader, with locks of its own, can spoil the file.
     """
-    with bar(len(items), what) as shown:
+    with progress_bar(len(items), what) as shown:
         for start in range(0, len(items), size):
             part = items[start : start + size]
             _run(lambda token, part=part: work(part, token))  # type: ignore[misc]
@@ -233,7 +225,7 @@ def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[
             cancellation_token=token,
         )
 
-    with bar(count, "cameras") as shown:
+    with progress_bar(count, "cameras") as shown:
 
         def show() -> None:
             shown.update(max(0, min(len(placed), count) - shown.n))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING
 
 from mi_refgs.cli.command import warn
+from mi_refgs.progress_bar import progress_bar
 
 if TYPE_CHECKING:
     from mi_refgs.fitting.train import Trainer
@@ -13,27 +13,19 @@ if TYPE_CHECKING:
 
 PSNR_MEMORY = 0.9
 """Share of the old value in the running PSNR of the bar: one view's is up to 5 dB off the mean."""
-TERMINAL_INTERVAL, LOG_INTERVAL = 0.5, 30.0
-"""Seconds between refreshes of the progress bar, in a terminal and in a file."""
 
 
 class Progress:
     """The progress bar on standard error, and the previews; called by the trainer after each step."""
 
     def __init__(self, trainer: Trainer, folder: Run) -> None:
-        from tqdm import tqdm
-
         self.folder = folder
         self.psnr: float | None = None
-        self.bar = tqdm(
-            total=trainer.method.iterations,
+        self.bar = progress_bar(
+            trainer.method.iterations,
+            trainer.method.variant,
             initial=trainer.iteration,
-            desc=trainer.method.variant,
-            unit="it",
-            file=sys.stderr,
-            dynamic_ncols=True,
             smoothing=0.05,  # a short memory: the first steps compile kernels
-            mininterval=TERMINAL_INTERVAL if sys.stderr.isatty() else LOG_INTERVAL,
         )
 
     def __enter__(self) -> Progress:
