@@ -87,7 +87,9 @@ def test_what_an_open_fit_starts_from(data: Dataset, method: Method) -> None:
     views = [view.project(outer)[2] for view in data.views]
     assert np.mean(np.any(views, axis=0)) > 0.99
     # The sky is 0.5 + 0.3 d in the direction d, encoded; what no view sees is grey.
-    scene = TrainedScene.from_state(method, Trainer(method, data).state())
+    trainer = Trainer(method, data)
+    assert [table.max_count for table in trainer.control.tables] == [100, 90]
+    scene = TrainedScene.from_state(method, trainer.state())
     assert scene.surroundings is not None and scene.surroundings.background is not None
     assert np.ptp(scene.surroundings.background.radiance().numpy(), axis=(0, 1)).max() < 1e-6
     assert scene.light is not None

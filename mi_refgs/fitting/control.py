@@ -64,8 +64,8 @@ class AdaptiveControl:
         if options.relocate is not None and options.relocate.when.due(iteration):
             fit.check()
             draws = fit.schedule.rng(iteration)
-            for table, limit in zip(self.tables, self._limits(), strict=False):
-                table.adopt(relocate(table.surfels, options.relocate, limit, draws))
+            for table in self.tables:
+                table.adopt(relocate(table.surfels, options.relocate, table.max_count, draws))
             fit.occluder.around = None
         if options.reset is not None and options.reset.due(iteration):
             floors = {name: surfels.start(name) for name in options.reset_raise}
@@ -84,11 +84,6 @@ class AdaptiveControl:
         if iteration >= self.held_until:
             fit.optimiser.set_factor("opacity", 1.0)
 
-    def _limits(self) -> list[int]:
-        """Most rows of each table."""
-        around = self.trainer.method.surroundings
-        return [self.trainer.method.surfels.max_count, *([around.max_count] if around is not None else [])]
-
     def _densify(self, iteration: int) -> None:
         fit = self.trainer
         fit.check()
@@ -96,7 +91,7 @@ class AdaptiveControl:
         since_reset = options.reset.since(iteration) if options.reset is not None else None
         wait = refine.prune_wait(options, fit.method.rates.of("opacity"))
         prune_transparent = since_reset is None or since_reset >= wait
-        for table, limit in zip(self.tables, self._limits(), strict=False):
+        for table in self.tables:
             extent: Any = fit.extent
             largest = None
             if table is self.around:
@@ -109,7 +104,7 @@ class AdaptiveControl:
                 table.gradient,
                 extent,
                 options,
-                limit,
+                table.max_count,
                 draws,
                 prune_transparent=prune_transparent,
                 largest=largest,

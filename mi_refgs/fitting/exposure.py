@@ -23,6 +23,7 @@ from mi_refgs.data.exposure import MAX_GAIN, fitted_gain
 from mi_refgs.data.view import View
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
+from mi_refgs.fitting.optim import Adam
 from mi_refgs.fitting.rates import Group
 from mi_refgs.images import psnr_of
 from mi_refgs.methods.method import GAIN, ExposureOptions
@@ -139,10 +140,8 @@ class Exposure:
         own = (f"{PARAMS}{GAIN}", f"{OPTIMISER}{GAIN}/")
         state = {name: value for name, value in fit.state().items() if not name.startswith(own)}
         if log is not None:
-            zeros = np.zeros(log.size, np.float32)
             state[f"{PARAMS}{GAIN}"] = (log - log.mean(axis=0)).astype(np.float32)
-            history = {"first": zeros, "second": zeros, "steps": 0, "factor": 1.0, "usual": 0.0}
-            state |= {f"{OPTIMISER}{GAIN}/{name}": np.array(value) for name, value in history.items()}
+            state |= {f"{OPTIMISER}{name}": x for name, x in Adam.fresh_state(GAIN, log.size).items()}
         fit.restore(state)
 
     # ---------------- state ----------------

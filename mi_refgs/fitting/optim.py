@@ -149,9 +149,8 @@ class Adam:
         """Let the moments of (N, D) tensors follow their rows: row i takes those of row parent[i].
 
         parent is an mi.UInt32. Call it together with replacing params[name] by the gathered tensor
-        (`Surfels.gather`). Rows where
-        `fresh` (mi.Bool) holds start with zero moments: clones and children have no history. Step counts
-        stay.
+        (`Surfels.gather`). Rows where `fresh` (mi.Bool) holds start with zero moments: clones and children
+        have no history. Step counts stay.
         """
         for name in names:
             if name not in self.groups:
@@ -187,6 +186,13 @@ class Adam:
             state[f"{name}/factor"] = np.array(self.factors.get(name, 1.0))
             state[f"{name}/usual"] = np.array(self._usual[name])
         return state
+
+    @staticmethod
+    def fresh_state(name: str, size: int) -> dict[str, np.ndarray]:
+        """What `state_dict` has of a tensor of so many numbers before its first step."""
+        zeros = np.zeros(size, np.float32)
+        parts = {"first": zeros, "second": zeros, "steps": 0, "factor": 1.0, "usual": 0.0}
+        return {f"{name}/{part}": np.array(value) for part, value in parts.items()}
 
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore `state_dict`, bit for bit; raises InputError when it does not fit the tensors."""

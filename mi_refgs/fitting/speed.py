@@ -22,6 +22,7 @@ import numpy as np
 
 from mi_refgs.contraction import Region
 from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.pathtrace import poses_around
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.files import read_json, write_json
@@ -63,13 +64,11 @@ def speed_of(method: Method, cut_out: bool) -> Speed:
     """How fast steps of a method are here, on pictures with alpha or without: from the file, or measured."""
     path = Path(os.environ.get("DRJIT_CACHE_DIR", str(Path.home() / ".drjit"))) / SPEED_FILE
     key = _key(method, cut_out)
-    try:
-        known = read_json(path)
-        return Speed(**known[key])
-    except (InputError, KeyError, TypeError):
-        known = {}
+    known: dict[str, Any] = {}
     with contextlib.suppress(InputError):
         known = read_json(path)
+    with contextlib.suppress(KeyError, TypeError):
+        return Speed(**known[key])
     busy = _busy()
     speed = measured(method, cut_out)
     if busy:
@@ -152,14 +151,9 @@ def stand_in(cut_out: bool, size: int) -> Dataset:
     y, x = (np.mgrid[0:size, 0:size] + 0.5) / size - 0.5
     alpha = (np.hypot(x, y) < np.sqrt(COVERED / np.pi)).astype(np.float32)
     views = []
-    for i in range(VIEWS):
-        angle = 2 * np.pi * i / VIEWS
-        forward = -np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), np.sqrt(0.19)])
-        left = np.cross([0.0, 0.0, 1.0], forward)
-        left /= np.linalg.norm(left)
-        to_world = np.eye(4)
-        to_world[:3, :3] = np.stack([left, np.cross(forward, left), forward], axis=1)
-        to_world[:3, 3] = -4 * forward
+    angle = 2 * np.pi * np.arange(VIEWS) / VIEWS
+    outward = np.stack([0.9 * np.cos(angle), 0.9 * np.sin(angle), np.full(VIEWS, np.sqrt(0.19))], axis=1)
+    for i, to_world in enumerate(poses_around(outward, np.zeros(3), 4.0)):
         noise = np.repeat(np.repeat(rng.random((8, 8, 3)), -(-size // 8), axis=0), -(-size // 8), axis=1)
         image = noise[:size, :size].astype(np.float32)
         if cut_out:

@@ -32,6 +32,14 @@ class Table:
         return Surfels(channels_of(self.trainer.params, self.prefix))
 
     @property
+    def max_count(self) -> int:
+        """Most rows that the method allows."""
+        method = self.trainer.method
+        options = method.surroundings if self.prefix else method.surfels
+        assert options is not None
+        return options.max_count
+
+    @property
     def gradient(self) -> np.ndarray:
         """Mean length of the gradients that were observed (N,); waits for the device."""
         mean: np.ndarray = self.gradient_sum.numpy() / np.maximum(self.gradient_count.numpy(), 1)
