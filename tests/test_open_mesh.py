@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from fusion_oracle import fused_points
 
 from mi_refgs.contraction import Region
 from mi_refgs.fitting.surface import surface_of
@@ -79,21 +80,9 @@ def test_matches_the_float64_specification() -> None:
     index = rng.integers(0, fused.volume.shape, (4000, 3))
     place = fused.origin + fused.voxel * index
     index = index[np.linalg.norm(place, axis=1) < fused.end]
-    expected = np.array(
-        [
-            ref.fuse_point(
-                REGION.expand(fused.origin + fused.voxel * k),
-                depths,
-                [(pose, FOCAL, SIZE) for pose in poses],
-                fused.voxel,
-                carve=False,
-                truncation_voxels=tsdf.TRUNCATION_VOXELS,
-                unseen_vote=tsdf.UNSEEN_VOTE,
-                region=(np.array(REGION.centre), REGION.radius),
-            )
-            for k in index
-        ]
-    )
+    points = REGION.expand(fused.origin + fused.voxel * index)
+    region = np.array(REGION.centre), REGION.radius
+    expected = fused_points(points, depths, poses, FOCAL, fused.voxel, carve=False, region=region)
     wrong = np.abs(fused.volume[tuple(index.T)] - expected) > 1e-3
     # Points within rounding of a texel border or of a threshold may fall on its other side.
     assert wrong.mean() < 0.005, wrong.mean()

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from fusion_oracle import fused_points
 from scipy.spatial import cKDTree
 
 from mi_refgs.errors import InputError
@@ -98,20 +99,8 @@ def test_matches_the_float64_specification(carve: bool) -> None:
     depths[2][40:50, 40:50] = 0
     fused = fuse(depths, poses, 40, carve=carve)
     index = np.random.default_rng(2).integers(0, fused.volume.shape, (2500, 3))
-    expected = np.array(
-        [
-            ref.fuse_point(
-                fused.origin + fused.voxel * k,
-                depths,
-                [(p, FOCAL, SIZE) for p in poses],
-                fused.voxel,
-                carve=carve,
-                truncation_voxels=tsdf.TRUNCATION_VOXELS,
-                unseen_vote=tsdf.UNSEEN_VOTE,
-            )
-            for k in index
-        ]
-    )
+    points = fused.origin + fused.voxel * index
+    expected = fused_points(points, depths, poses, FOCAL, fused.voxel, carve=carve)
     wrong = np.abs(fused.volume[tuple(index.T)] - expected) > 1e-4
     # Points within rounding of a texel border or of a threshold may fall on its other side.
     assert wrong.mean() < 0.003, wrong.mean()
@@ -228,6 +217,16 @@ def test_bad_arguments() -> None:
         tsdf.fuse([], [], [], BOX, 4096)
     with pytest.raises(ValueError, match="pixels"):
         tsdf.fuse([mi.Float(1, 2)], [mi.Float(1, 2)], [camera(np.eye(4))], BOX, 8)
+
+
+def test_a_part_of_a_mesh_has_whole_triangles_and_their_vertices_alone() -> None:
+    vertices = np.arange(15, dtype=np.float32).reshape(5, 3)
+    mesh = meshes.Mesh(vertices, np.array([[0, 1, 2], [4, 3, 1], [2, 1, 3]], np.uint32), 0.1)
+    part = mesh.of_vertices(np.array([True, True, False, True, True]))
+    np.testing.assert_array_equal(part.vertices, vertices[[1, 3, 4]])
+    np.testing.assert_array_equal(part.faces, [[2, 1, 0]])
+    assert part.voxel == 0.1 and part.faces.dtype == np.uint32
+    assert mesh.of_vertices(np.zeros(5, bool)).faces.shape == (0, 3)
 
 
 def test_mesh_file_round_trip(tmp_path: Path) -> None:

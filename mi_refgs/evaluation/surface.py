@@ -114,7 +114,7 @@ def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> d
     radius = np.linalg.norm(corners - centre, axis=1).max()
     percent = 100 / (2 * radius)
     if views and not views[0].cut_out:
-        mesh = _cut(mesh, centre, NEAR_TRUTH * radius)
+        mesh = mesh.of_vertices(np.linalg.norm(mesh.vertices - centre, axis=1) <= NEAR_TRUTH * radius)
         if not len(mesh.faces):
             return {}
     (ours, _), (true, facing) = _seen(mesh, Occluder(mesh), views), _seen(truth.mesh, truth.occluder, views)
@@ -130,12 +130,6 @@ def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> d
             result[f"surface_accuracy{suffix}"], result[f"surface_completeness{suffix}"] = means
             result[f"surface_distance{suffix}"] = sum(means) / 2
     return result
-
-
-def _cut(mesh: Mesh, centre: np.ndarray, radius: float) -> Mesh:
-    """The triangles of a mesh that lie whole in a sphere."""
-    inside = np.linalg.norm(mesh.vertices - centre, axis=1) <= radius
-    return Mesh(mesh.vertices, mesh.faces[inside[mesh.faces].all(axis=1)], mesh.voxel)
 
 
 def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:

@@ -59,6 +59,10 @@ class Mesh:
         used, faces = np.unique(self.faces[kept], return_inverse=True)
         return Mesh(self.vertices[used], faces.reshape(-1, 3).astype(np.uint32), self.voxel)
 
+    def of_vertices(self, kept: np.ndarray) -> Mesh:
+        """The triangles all of whose vertices are kept (V,) bool."""
+        return self.part(kept[self.faces].all(axis=1))
+
 
 def extract_mesh(tsdf: TSDF) -> Mesh:
     """Zero level set of the field by marching cubes (Lewiner et al. 2003), without floaters.

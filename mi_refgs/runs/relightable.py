@@ -77,8 +77,7 @@ def relightable(scene: TrainedScene) -> TrainedScene:
 def near(mesh: Mesh, surfels: Surfels) -> Mesh:
     """The triangles in the box of the surfels: what is around them stands in no other light's way."""
     low, high = bounds_from_points(surfels.to_numpy()["position"])
-    inside = np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1)[mesh.faces].all(axis=1)
-    return mesh.part(inside)
+    return mesh.of_vertices(np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1))
 
 
 def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> Surfels:
