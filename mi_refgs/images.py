@@ -110,11 +110,11 @@ def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
 
 
 def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
-    """Brightness (H, W) of a PNG or JPEG of 8 or 16 bits, times its alpha; and the number that means white.
+    """Brightness (H, W) of a PNG or JPEG of 8 or 16 bits, and the number that means white.
 
-    White is the smallest of 1, 255 and 65535 that no number of the file exceeds: files of 8 and 16 bits may
-    hold labels, and files of 16 bits the numbers of 8. Raises InputError if the file is missing or
-    unreadable.
+    Of a picture with transparent pixels, which is cut out, it is alpha. White is the smallest of 1, 255 and
+    65535 that no number of the file exceeds: files of 8 and 16 bits may hold labels, and files of 16 bits the
+    numbers of 8. Raises InputError if the file is missing or unreadable.
     """
     path = Path(path)
     with open_picture(path) as picture:
@@ -123,8 +123,14 @@ def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
         else:
             grey, alpha = np.moveaxis(np.asarray(picture.convert("LA")), -1, 0)
             if not (alpha == 255).all():
-                grey = np.round(grey * (alpha / np.float32(255))).astype(np.uint8)
+                grey = alpha
     return grey, next((white for white in (1, 255) if grey.max() <= white), 65535)
+
+
+def read_mask(path: str | Path) -> np.ndarray:
+    """Alpha (H, W) float32, 0 … 1, from a picture as `read_grey` takes it; raises InputError as it does."""
+    grey, white = read_grey(path)
+    return grey.astype(np.float32) / np.float32(white)
 
 
 def read_tiff(path: str | Path) -> np.ndarray:
@@ -173,9 +179,7 @@ def exif_tags(picture: Any) -> tuple[dict[int, Any], dict[int, Any]]:
     """EXIF data of a PIL image: the tags of the picture and of the camera's settings, less what is broken."""
     tags: dict[int, Any] = {}
     settings: dict[int, Any] = {}
-    with contextlib.suppress(
-        Exception
-    ):  # Pillow raises many types for broken EXIF data, which no picture needs
+    with contextlib.suppress(Exception):  # Pillow raises many types for broken data, which no picture needs
         exif = picture.getexif()
         for tag in exif:
             with contextlib.suppress(Exception):

@@ -80,12 +80,12 @@ def test_a_mask_is_alpha(tmp_path: Path) -> None:
 
 
 def test_what_a_mask_may_hold(tmp_path: Path) -> None:
-    """8 bits, labels 0 and 1, colours with alpha, 16 bits, used in full or not; as depth, what is nearer."""
+    """8 bits, labels 0 and 1, what is cut out, 16 bits, used in full or not; as depth, what is nearer."""
     bits = np.array([[0, 255, 128]], dtype=np.uint8)
     for name, image in {
         "grey": Image.fromarray(bits),
         "labels": Image.fromarray((bits == 255).astype(np.uint8)),
-        "alpha": Image.merge("LA", [Image.fromarray(np.full_like(bits, 255)), Image.fromarray(bits)]),
+        "alpha": Image.merge("LA", [Image.fromarray(np.full_like(bits, 9)), Image.fromarray(bits)]),
         "deep": Image.fromarray(bits.astype(np.uint16) * 257),
         "deep labels": Image.fromarray((bits == 255).astype(np.uint16)),
         "shallow": Image.fromarray(bits.astype(np.uint16)),

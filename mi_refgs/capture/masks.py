@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_refgs.capture.photographs import Photograph
 from mi_refgs.errors import InputError
-from mi_refgs.images import ENDINGS, open_picture
+from mi_refgs.images import ENDINGS, open_picture, read_mask
 
 
 def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:
@@ -48,14 +48,12 @@ def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[s
 def mask_pixels(path: Path, photograph: Photograph) -> np.ndarray:
     """The mask as the photograph lies in the data set, (H, W, 1) uint8, 255 on the object.
 
-    A mask of the stored size is turned as the photograph is, unless that is the displayed size, too. Of
-    a file with transparent pixels alpha is the mask. Files whose brightest value is 1 count from 0 to 1.
+    A mask of the stored size is turned as the photograph is, unless that is the displayed size, too. Raises
+    InputError as `read_mask` does.
     """
-    with open_picture(path) as picture:
-        alpha = picture.convert("RGBA").getchannel("A")
-        grey = picture.convert("L") if alpha.getextrema()[0] == 255 else alpha
-    displayed = grey.size == photograph.size
-    pixels = np.asarray((replace(photograph, orientation=1) if displayed else photograph).turned(grey))[
-        ..., None
-    ]
-    return pixels * np.uint8(255) if pixels.max(initial=0) == 1 else pixels
+    from PIL import Image
+
+    mask = Image.fromarray(np.round(255 * read_mask(path)).astype(np.uint8))
+    displayed = mask.size == photograph.size
+    turned = (replace(photograph, orientation=1) if displayed else photograph).turned(mask)
+    return np.asarray(turned)[..., None]

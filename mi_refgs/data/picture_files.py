@@ -21,7 +21,7 @@ from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.exr import read_exr_image
-from mi_refgs.images import box_downscale, has_alpha, image_size, read_bytes, read_grey
+from mi_refgs.images import box_downscale, has_alpha, image_size, read_bytes, read_grey, read_mask
 
 BAND = 256
 """Rows of a file that are floating-point numbers at a time: a large picture would need half a gigabyte."""
@@ -33,15 +33,14 @@ class Mask:
 
     path: Path
     below: int | None = None
-    """Without it, brightness is alpha. With it, alpha is 1 where the file's own number, such as a depth of 16
-    bits, is less, and 0 elsewhere."""
+    """Without it, alpha is that of `read_mask`. With it, alpha is 1 where the file's own number, such as a
+    depth of 16 bits, is less, and 0 elsewhere."""
 
     def read(self) -> np.ndarray:
         """Alpha (H, W) float32."""
-        grey, largest = read_grey(self.path)
         if self.below is not None:
-            return (grey < self.below).astype(np.float32)
-        return grey.astype(np.float32) / np.float32(largest)
+            return (read_grey(self.path)[0] < self.below).astype(np.float32)
+        return read_mask(self.path)
 
 
 @dataclass(frozen=True)
