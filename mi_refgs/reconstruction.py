@@ -10,12 +10,12 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, Unpack
 
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs import formats
+from mi_refgs import editing, formats
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
@@ -24,14 +24,12 @@ from mi_refgs.evaluation.pictures import planes
 from mi_refgs.methods.method import Method
 from mi_refgs.plugins import require_supported_variant
 from mi_refgs.plugins.aovs import aov_values, suffixes
-from mi_refgs.relighting.light import NewLight, world_light
+from mi_refgs.relighting.light import AnyLight, any_light
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.runs import save as saving
-from mi_refgs.runs.export import SCENE, TrainedScene, export, up_to_date
+from mi_refgs.runs.export import SCENE, TrainedScene, export, newest, up_to_date
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
-from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.source import Source
 from mi_refgs.splat import Camera
 
@@ -90,16 +88,18 @@ class Reconstruction:
         """Cameras on a circle around the object, z up, like the test views in lens, distance and height."""
         return self.source.turntable(self.trained, count)
 
-    def camera(self, camera: CameraLike = 0, size: int | tuple[int, int] | None = None) -> Camera:
+    def camera(
+        self, camera: CameraLike = 0, size: int | tuple[int, int] | None = None, split: str = "test"
+    ) -> Camera:
         """A camera of whatever stands for one, with other pixels if `size` says so (`Camera.resized`).
 
-        An index counts `cameras("test")`. Raises InputError for an index that is out of range and for what
+        An index counts `cameras(split)`. Raises InputError for an index that is out of range and for what
         is no camera.
         """
         if isinstance(camera, int):
-            known = self.cameras()
+            known = self.cameras(split)
             if not -len(known) <= camera < len(known):
-                raise InputError(f"camera: {camera}: there are {len(known)}; give 0 to {len(known) - 1}")
+                raise InputError(f"camera: {camera}: {split} has {len(known)}; give 0 to {len(known) - 1}")
             found = known[camera]
         elif isinstance(camera, View):
             found = camera.camera()
@@ -205,8 +205,7 @@ class Reconstruction:
         `load` of it renders the same pictures, bit for bit. Raises InputError for a folder that holds a run
         or cannot be written.
         """
-        source, first = self.source, self.cameras()[0]
-        saving.save(self.trained, Path(folder), source.method, first, data=source.data, region=source.region)
+        self.source.save(self.trained, Path(folder), self.cameras()[0])
         return load(folder)
 
     def export(self, form: str, path: str | Path, **options: Any) -> list[Path]:
@@ -223,7 +222,7 @@ class Reconstruction:
 
     def relight(
         self,
-        light: NewLight | EnvironmentLight | str | Path | np.ndarray,
+        light: AnyLight,
         *,
         world: bool = False,
         rotate: float = 0.0,
@@ -237,17 +236,30 @@ class Reconstruction:
         seen from above. exposure: stops. Raises InputError for a reconstruction without light or materials
         (`runs.relightable`) and a light that cannot be used.
         """
-        if isinstance(light, NewLight):
-            if world or rotate or exposure:
-                raise InputError("light: a NewLight has its own world, rotate and exposure; set them there")
-            found = light.read()
-        elif isinstance(light, EnvironmentLight):
-            found = world_light(light.radiance().numpy(), True, rotate, exposure)
-        elif isinstance(light, np.ndarray):
-            found = world_light(light, world, rotate, exposure)
-        else:
-            found = NewLight(Path(light), world, rotate, exposure).read()
-        return self.changed(replace(relightable(self.trained), light=found))
+        scene = replace(relightable(self.trained), light=any_light(light, world, rotate, exposure))
+        return self.changed(scene)
+
+    def edit(
+        self,
+        *,
+        view: CameraLike = 0,
+        split: str = "test",
+        join: Reconstruction | str | Path | None = None,
+        **options: Unpack[editing.Options],
+    ) -> Reconstruction:
+        """The same with some surfels changed, as by `refgs edit`; `source.edits[-1]` then says how many.
+
+        options: `editing.Options`, such as where="metallic > 0.5", set={"roughness": 0.3}; a `mask` is of a
+        `view`. join: what is added under the light of this; selected and changed is then that. Raises
+        InputError for what makes no sense.
+        """
+        of = self if join is None else join if isinstance(join, Reconstruction) else load(join)
+        camera = None if options.get("mask") is None else of.camera(view, split=split)
+        into = None if join is None else self.trained
+        edited = editing.edit(of.trained, camera=camera, into=into, **options)
+        record = {"run" if join is None else "join": of.folder and str(of.folder), **edited.record}
+        source = replace(self.source, edits=(*self.source.edits, record))
+        return replace(self.changed(edited.scene), source=source)
 
     def changed(self, trained: TrainedScene) -> Reconstruction:
         """Another scene of the same method and data, in memory."""
@@ -271,8 +283,8 @@ class Reconstruction:
         return evaluation.evaluate(Run(self.folder), place, progress, samples, antialias)
 
 
-def load(run: str | Path) -> Reconstruction:
-    """Read a run folder: the artefacts, written first where the newest checkpoint is newer.
+def load(run: str | Path, *, write: bool = True) -> Reconstruction:
+    """Read a run folder: the artefacts, first written unless `write` is off where a checkpoint is newer.
 
     Raises InputError for a folder that is no run, holds neither artefacts nor a checkpoint, or has a file
     that cannot be used; and where no Mitsuba variant is set that the renderer can use.
@@ -284,4 +296,5 @@ def load(run: str | Path) -> Reconstruction:
     def first(fresh: TrainedScene) -> Camera:
         return source.shots(fresh, "test")[0].camera
 
-    return Reconstruction(up_to_date(folder, source.method, first), source, folder.path)
+    trained = up_to_date(folder, source.method, first) if write else newest(folder, source.method)
+    return Reconstruction(trained, source, folder.path)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from mi_refgs.contraction import Region
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.picture_store import undecoded
 from mi_refgs.errors import InputError
+from mi_refgs.files import read_json
 from mi_refgs.fitting.whole import read_views
 from mi_refgs.formats import Shot
 from mi_refgs.formats.shots import shots_around
@@ -16,7 +18,10 @@ from mi_refgs.methods.method import Method
 from mi_refgs.relighting.relight import turntable_poses
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.save import save
 from mi_refgs.splat import Camera
+
+EDITS = "edit.json"
 
 
 @dataclass(frozen=True)
@@ -26,6 +31,7 @@ class Source:
     method: Method
     data: Path | None = None
     region: Region | None = None  # in pictures without alpha
+    edits: tuple[dict[str, Any], ...] = ()  # what was done since, in order: `editing.Edited.record`
 
     @staticmethod
     def of(run: Run) -> Source:
@@ -35,7 +41,14 @@ class Source:
             data: Path | None = run.dataset()
         except (OSError, ValueError, KeyError, TypeError):
             data = None
-        return Source(method, data, run.region())
+        record = run.path / EDITS
+        edits = read_json(record).get("edits", []) if record.is_file() else []
+        return Source(method, data, run.region(), tuple(edits))
+
+    def save(self, trained: TrainedScene, folder: Path, camera: Camera) -> None:
+        """Write a run folder of a scene (`runs.save`); raises InputError as that does."""
+        records = {EDITS: {"edits": self.edits}} if self.edits else None
+        save(trained, folder, self.method, camera, data=self.data, region=self.region, records=records)
 
     @property
     def is_there(self) -> bool:

@@ -146,7 +146,7 @@ def test_new_values_are_exact_and_others_stay_bit_for_bit(scene: TrainedScene) -
     before, fields = scene.surfels.to_numpy(), Fields(scene)
     given = {"roughness": 0.25, "metallic": 0, "albedo": (0.9, 0.6, "0.5 * albedo.b"), "opacity": "opacity"}
     edited = edit(scene, where=METAL_BALL, set=given)
-    assert (edited.selected, edited.of) == (HALF, 2 * HALF)
+    assert (edited.record["selected"], edited.record["of"]) == (HALF, 2 * HALF)
     after, now = edited.scene.surfels.to_numpy(), Fields(edited.scene)
     chosen = before["position"][:, 0] < 0
     for name in before:
@@ -327,7 +327,7 @@ def test_what_is_made_transparent_leaves_the_mesh(scene: TrainedScene) -> None:
 def test_a_duplicate_takes_the_changes_and_the_original_stays(scene: TrainedScene) -> None:
     edited = edit(scene, where=METAL_BALL, duplicate=(0, 5, 0), set=["roughness=0.75"], rotate=("z", 90))
     before, after = scene.surfels.to_numpy(), edited.scene.surfels.to_numpy()
-    assert edited.selected == HALF and edited.scene.surfels.count == 3 * HALF
+    assert edited.record["selected"] == HALF and edited.scene.surfels.count == 3 * HALF
     for name in before:
         np.testing.assert_array_equal(before[name], after[name][: 2 * HALF])
     np.testing.assert_allclose(Fields(edited.scene)["roughness"][2 * HALF :], 0.75, rtol=1e-6)
@@ -389,7 +389,7 @@ def test_materials_alone_can_be_joined() -> None:
     first, second = balls(), balls(diffuse="irradiance")
     edited = edit(second, materials=True, move=(3, 0, 0), into=first)
     assert edited.scene.shading.diffuse == "irradiance" and edited.scene.surfels.count == 4 * HALF
-    assert (edited.selected, edited.of) == (2 * HALF, 2 * HALF)
+    assert edited.record["selected"] == edited.record["of"] == 2 * HALF
 
 
 # ---------------- notes ----------------
@@ -452,8 +452,8 @@ def test_masks_and_views(
     found = json.loads(capsys.readouterr().out)
     assert 0 < found["selected"] < found["of"] / 2
     for extra, message in (
-        (["--view", "2"], "--view: 2: there are 2 test views; give 0 to 1"),
-        (["--split", "train", "--view", "3"], "there are 3 train views"),
+        (["--view", "2"], "camera: 2: test has 2; give 0 to 1"),
+        (["--split", "train", "--view", "3"], "train has 3; give 0 to 2"),
     ):
         assert main([*command, "-o", str(tmp_path / "none"), *extra]) == 2
         assert message in capsys.readouterr().err

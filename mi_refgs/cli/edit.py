@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,11 @@ from mi_refgs.errors import InputError
 EXAMPLE = 'refgs edit runs/glossy -o runs/matte --set roughness=0.6 --where "metallic > 0.5" --preview'
 
 OPTIONS = (
-    *("where", "box", "nearest", "invert", "materials"),
+    *("where", "box", "nearest", "mask", "view", "split", "invert", "materials"),
     *("set", "scale", "rotate", "move", "duplicate", "cut", "keep"),
 )
-"""Options that are keywords of `editing.edit` as they are."""
+"""Options that are keywords of `Reconstruction.edit`."""
+PREVIEW = "preview.png"
 
 
 def add(commands: Any) -> None:
@@ -97,42 +100,48 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Edit."""
-    from mi_refgs.editing import edit, folder, read_mask
-    from mi_refgs.evaluation.evaluate import load_split
-    from mi_refgs.runs.run import Run
+    from mi_refgs.images import write_png
+    from mi_refgs.reconstruction import load
 
-    folder.require_free(args.output)
-    source = Run(args.run_folder)
-    base = folder.read_scene(source)
-    # Selected and changed is what is joined, where something is.
-    of = source if args.join is None else Run(args.join)
-    scene = base if args.join is None else folder.read_scene(of)
-    camera = mask = None
-    if args.mask is not None:
-        views = load_split(of, of.method(), args.split, args.data).views
-        if not 0 <= args.view < len(views):
-            raise InputError(f"--view: {args.view}: there are {len(views)} {args.split} views; give 0 to "
-                             f"{len(views) - 1}")  # fmt: skip
-        camera = views[args.view].camera()
-        mask = read_mask(args.mask, camera)
-    given = {name: getattr(args, name) for name in OPTIONS}
-    into = None if args.join is None else base
+    _require_free(args.output)
+    whole = load(args.run_folder, write=False)
+    if args.data is not None:
+        whole = replace(whole, source=replace(whole.source, data=args.data))
+    join = None if args.join is None else load(args.join, write=False)
+    options = {name: getattr(args, name) for name in OPTIONS}
     try:
-        edited = edit(scene, **given, mask=mask, camera=camera, into=into)
+        edited = whole.edit(**options, join=join)
     except InputError as error:
-        raise InputError(f"{of.path}: {error}") from error
-    for note in edited.notes:
+        raise InputError(f"{args.run_folder if join is None else args.join}: {error}") from error
+    entry = edited.source.edits[-1]
+    for note in entry["notes"]:
         say(f"note: {note}")
-    preview = None
-    if args.preview:
-        views_shown = folder.test_views(source, args.data if args.join is None else None)
-        shown_from = folder.scene_camera(source)
-        preview = folder.before_and_after(base, edited.scene, views_shown, shown_from)
-    record = {name: value for name, value in given.items() if value not in (None, False, [], 1.0)}
-    record |= {"view": args.view, "split": args.split} if mask is not None else {}
-    files = {name: getattr(args, name) for name in ("mask", "join", "data")}
-    record |= {name: str(path.resolve()) for name, path in files.items() if path is not None}
-    entry = folder.write_edited(source, edited, args.output, record, preview, args.data)
-    total = edited.scene.surfels.count
-    text = f"{args.output}: {edited.selected} of {edited.of} surfels; it has {total}"
+    sheet = _preview(whole, edited) if args.preview else None
+    edited.save(args.output)
+    if sheet is not None:
+        write_png(args.output / PREVIEW, sheet)
+    text = f"{args.output}: {entry['selected']} of {entry['of']} surfels; it has {entry['surfels']}"
     return Result({"output": str(args.output), **entry}, text)
+
+
+def _preview(before: Any, after: Any) -> Any:
+    """Test views before and after; of cameras around the object where the data set is not there."""
+    from mi_refgs.editing.preview import before_and_after
+
+    cameras = before.cameras()
+    if not before.source.is_there:
+        return before_and_after(before.trained, after.trained, cameras)
+    views = before.views()
+    return before_and_after(before.trained, after.trained, cameras, views.background, views.linear)
+
+
+def _require_free(out: Path) -> None:
+    """Raise InputError unless a folder can be made there: nothing stands there, or an empty one."""
+    from mi_refgs.files import cannot_write
+
+    try:
+        taken = os.path.lexists(out) and not (out.is_dir() and not any(out.iterdir()))
+    except (OSError, ValueError) as error:
+        raise cannot_write(out, error) from error
+    if taken:
+        raise InputError(f"{out}: output: stands there already; choose another -o")

@@ -1,7 +1,7 @@
 """Edits of a trained scene: which surfels, what is done to them, two scenes as one, the run folder of it."""
 
 from mi_refgs.editing.change import Assignment, Change, apply, assignments
-from mi_refgs.editing.edit import Edited, edit
+from mi_refgs.editing.edit import Edited, Options, edit
 from mi_refgs.editing.join import join
 from mi_refgs.editing.select import Selection, painted, read_mask, select
 
@@ -9,6 +9,7 @@ __all__ = [
     "Assignment",
     "Change",
     "Edited",
+    "Options",
     "Selection",
     "apply",
     "assignments",

@@ -40,6 +40,7 @@ class Assignment:
     name: str
     values: tuple[Expression, ...]
     times: bool = False  # the values multiply what is there
+    text: str = ""  # as it was written
 
     @staticmethod
     def parse(text: str) -> Assignment:
@@ -50,7 +51,7 @@ class Assignment:
         found = ASSIGNMENT.fullmatch(text)
         if found is None:
             raise InputError(f"--set: {shown(text)}: no assignment; write it like roughness=0.3")
-        return Assignment(found[1], tuple(parse_numbers(found[3])), found[2] == "*=")
+        return Assignment(found[1], tuple(parse_numbers(found[3])), found[2] == "*=", text.strip())
 
 
 def assignments(given: Assignments) -> tuple[Assignment, ...]:

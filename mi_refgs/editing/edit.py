@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -17,52 +19,93 @@ from mi_refgs.runs.relightable import relightable
 from mi_refgs.splat import Camera
 
 
+class Options(TypedDict, total=False):
+    """What an edit is of, and what it does: the options of `refgs edit`. Lengths are in scene units.
+
+    Selected are the surfels that meet every condition which is given, without any all of them. What is done
+    to them is done in the order below.
+    """
+
+    where: str | None  # such as "metallic > 0.5 and z < 0"; names as in `Fields`
+    box: Sequence[float] | None  # (6,) two opposite corners, between which centres lie
+    nearest: Sequence[float] | None  # (x, y, z, r): centres within r of the surfel nearest to the point
+    mask: np.ndarray | str | Path | None  # (H, W) bool, or a picture painted white, of a view: `painted`
+    invert: bool  # the others instead
+    materials: bool  # first make materials alone of the whole scene: `runs.relightable`
+    set: Assignments  # {"roughness": 0.3, "albedo": (0.9, 0.6, "0.5 * albedo.b")}, or texts: "roughness*=0.5"
+    scale: float  # larger, about the median of the selected positions
+    rotate: Rotate | None  # ("z", degrees) about it, counter-clockwise
+    move: Sequence[float] | None  # (3,)
+    duplicate: Sequence[float] | None  # (3,) do all that to a copy moved so far; what was there stays
+    cut: bool  # remove the selected surfels
+    keep: bool  # remove the others
+
+
+DOES = ("cut", "keep", "move", "rotate", "scale", "duplicate")
+"""Options that are fields of `Change` as they are."""
+RECORDED = tuple(name for name in Options.__annotations__ if name not in ("mask", "set"))
+"""Options that a record has as they are given."""
+
+
 @dataclass(frozen=True, eq=False)
 class Edited:
     """A scene after an edit."""
 
     scene: TrainedScene
-    selected: int  # surfels that were changed, duplicated, cut or kept
-    of: int  # surfels that there were to select from
     notes: tuple[str, ...]  # what a person should know: what stayed as fitted, whose light shines
+    record: dict[str, Any]  # for JSON: the options given, `selected` surfels `of` so many, `surfels` now
 
 
 def edit(
     scene: TrainedScene,
     *,
-    where: str | None = None,
-    box: Sequence[float] | None = None,
-    nearest: Sequence[float] | None = None,
-    mask: np.ndarray | None = None,
     camera: Camera | None = None,
-    invert: bool = False,
-    materials: bool = False,
-    set: Assignments = (),
-    scale: float = 1.0,
-    rotate: Rotate | None = None,
-    move: Sequence[float] | None = None,
-    duplicate: Sequence[float] | None = None,
-    cut: bool = False,
-    keep: bool = False,
     into: TrainedScene | None = None,
+    **options: Unpack[Options],
 ) -> Edited:
-    """Change the surfels of a scene that meet every condition, and then add it `into` another scene.
+    """Change surfels of a scene, and then add it `into` another scene, if there is one.
 
-    The options are those of `refgs edit`. Conditions, see `Selection`: `where`, `box`, `nearest`, a `mask`
-    (H, W) bool painted in the view of a `camera`; `invert` takes the others. What is done, see `Change`, in
-    this order: `materials` first makes materials alone of the scene, and of `into` (`runs.relightable`);
-    `set`, by name or as texts; `scale`, `rotate`, `move`; `duplicate`; `cut` or `keep`. Raises InputError for
-    what makes no sense, a selection of nothing, and if there is nothing to do.
+    `camera` is that of the view which a mask was painted in; `materials` makes those of both scenes. Raises
+    InputError for what makes no sense, a selection of nothing, and if there is nothing to do.
     """
-    change = Change(assignments(set), cut, keep, move, rotate, scale, duplicate)
+    which = Selection(
+        options.get("where"),
+        options.get("box"),
+        options.get("nearest"),
+        options.get("mask"),
+        camera,
+        options.get("invert", False),
+    )
+    does = {name: options[name] for name in DOES if name in options}  # type: ignore[literal-required]
+    change = Change(set=assignments(options.get("set", ())), **does)
+    materials = options.get("materials", False)
     if change.nothing and not materials and into is None:
         raise InputError("edit: nothing to do; give --set, --cut, --move or another change")
     if materials:
         scene, into = relightable(scene), None if into is None else relightable(into)
-    chosen = select(scene, Selection(where, box, nearest, mask, camera, invert))
+    chosen = select(scene, which)
     told = notes(scene, change, into is not None)
     changed = scene if change.nothing else apply(scene, chosen, change)
     if into is not None:
         changed, more = join(into, changed)
         told += more
-    return Edited(changed, int(chosen.sum()), len(chosen), tuple(told))
+    counts = {"selected": int(chosen.sum()), "of": len(chosen), "surfels": changed.surfels.count}
+    return Edited(changed, tuple(told), {**_asked(options, change), **counts, "notes": told})
+
+
+def _asked(options: Options, change: Change) -> dict[str, Any]:
+    """The options that were given, as JSON has them."""
+    given: dict[str, Any] = {name: value for name, value in options.items() if name in RECORDED}
+    record = {name: _plain(value) for name, value in given.items() if value not in (None, False, 1.0)}
+    if isinstance(options.get("mask"), str | Path):
+        record["mask"] = str(options["mask"])
+    if change.set:
+        record["set"] = [assignment.text for assignment in change.set]
+    return record
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON has it."""
+    if isinstance(value, str | bool):
+        return value
+    return [_plain(part) for part in value] if isinstance(value, Iterable) else float(value)

@@ -34,7 +34,7 @@ class Selection:
     where: str | None = None  # an expression, see `expression` and `fields`
     box: Sequence[float] | None = None  # x0 y0 z0 x1 y1 z1: two opposite corners; centres lie inside
     nearest: Sequence[float] | None = None  # x y z r: centres within r of the surfel nearest to the point
-    mask: np.ndarray | None = None  # (H, W) bool, painted in the view of `camera`: see `painted`
+    mask: np.ndarray | str | Path | None = None  # of a view of `camera`: see `painted` and `read_mask`
     camera: Camera | None = None
     invert: bool = False  # take the others instead
 
@@ -60,7 +60,9 @@ def select(scene: TrainedScene, selection: Selection) -> np.ndarray:
     if selection.mask is not None:
         if selection.camera is None:
             raise InputError("--mask: the view that it was painted in is missing; give its camera")
-        chosen &= painted(scene, selection.camera, selection.mask)
+        given, camera = selection.mask, selection.camera
+        mask = given if isinstance(given, np.ndarray) else read_mask(Path(given), camera)
+        chosen &= painted(scene, camera, mask)
     chosen = ~chosen if selection.invert else chosen
     if not chosen.any():
         raise InputError(f"selection: none of the {count} surfels is in it; choose a wider one")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -76,6 +76,26 @@ def world_light(
     height = min(HEIGHT, max(len(radiance) // 4 * 4, 8))
     image = environment_image(mi.load_dict({"type": "scene", "light": emitter}), height)
     return EnvironmentLight.from_radiance(image * np.float32(2.0**exposure))
+
+
+AnyLight: TypeAlias = NewLight | EnvironmentLight | str | Path | np.ndarray
+"""A light, its file, or its radiance (h, w, 3)."""
+
+
+def any_light(light: AnyLight, world: bool, rotate: float, exposure: float) -> EnvironmentLight:
+    """A light of whatever stands for one: its file, its radiance (h, w, 3); the rest as in `NewLight`.
+
+    An `EnvironmentLight` is in world directions already. Raises InputError for what is no light.
+    """
+    if isinstance(light, NewLight):
+        if world or rotate or exposure:
+            raise InputError("light: a NewLight has its own world, rotate and exposure; set them there")
+        return light.read()
+    if isinstance(light, EnvironmentLight):
+        return world_light(light.radiance().numpy(), True, rotate, exposure)
+    if isinstance(light, np.ndarray):
+        return world_light(light, world, rotate, exposure)
+    return NewLight(Path(light), world, rotate, exposure).read()
 
 
 def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:

@@ -17,7 +17,7 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -219,6 +219,26 @@ def load_if_newer(run: Run, method: Method) -> TrainedScene | None:
     return TrainedScene.from_state(method, state)
 
 
+def newest(run: Run, method: Method) -> TrainedScene:
+    """What a run holds, of its newest checkpoint where the artefacts are older; writes nothing.
+
+    A mesh that only other programs use is there, too. Raises InputError as `TrainedScene.read` does.
+    """
+    fresh = load_if_newer(run, method)
+    if fresh is not None:
+        return fresh
+    if not (run.path / MODEL).is_file():
+        raise _no_artefacts(run)
+    scene, mesh = TrainedScene.read(run.path), run.path / MESH
+    return replace(scene, mesh=read_mesh(mesh)) if scene.mesh is None and mesh.is_file() else scene
+
+
+def _no_artefacts(run: Run) -> InputError:
+    return InputError(
+        f"{run.path}: checkpoints: none yet; train it with `refgs train DATA -o {run.path} --resume`"
+    )
+
+
 def up_to_date(run: Run, method: Method, camera: Camera | Callable[[TrainedScene], Camera]) -> TrainedScene:
     """The artefacts of a run, written first if there are none or the newest checkpoint is newer.
 
@@ -229,7 +249,5 @@ def up_to_date(run: Run, method: Method, camera: Camera | Callable[[TrainedScene
     if fresh is not None:
         export(fresh, run.path, camera(fresh) if callable(camera) else camera)
     elif not (run.path / MODEL).is_file():
-        raise InputError(
-            f"{run.path}: checkpoints: none yet; train it with `refgs train DATA -o {run.path} --resume`"
-        )
+        raise _no_artefacts(run)
     return TrainedScene.read(run.path)

@@ -5,8 +5,9 @@ It holds what a fitted run holds (`runs.run`, `runs.export`) but its checkpoints
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from mi_refgs.contraction import Region
 from mi_refgs.errors import InputError
@@ -26,12 +27,14 @@ def save(
     more: Sequence[Camera] = (),
     data: Path | None = None,
     region: Region | None = None,
+    records: Mapping[str, Any] | None = None,
 ) -> list[Path]:
     """Write a scene as a run folder, which every command that takes a run reads; returns its artefacts.
 
     `camera` and `more` become the sensors of scene.xml; `data` is the data set of its test views, and
-    `region` that of interest. config.toml is written last: where it is, the folder is complete. Raises
-    InputError for a folder that holds a run or cannot be written, and for a value that is not finite.
+    `region` that of interest; `records` are JSON files by name. config.toml is written last: where it is, the
+    folder is complete. Raises InputError for a folder that holds a run or cannot be written, and for a value
+    that is not finite.
     """
     run = Run(folder)
     if run.exists():
@@ -45,5 +48,7 @@ def save(
     written = export(trained, folder, camera, more)
     if data is not None:
         run.write_dataset(str(data.resolve()), region)
+    for name, content in (records or {}).items():
+        run.write_json(name, content)
     run.write_method(method)
     return written
