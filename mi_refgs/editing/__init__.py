@@ -1,9 +1,9 @@
 """Edits of a trained scene: which surfels, what is done to them, two scenes as one, the run folder of it."""
 
 from mi_refgs.editing.change import Assignment, Change, apply, assignments
-from mi_refgs.editing.edit import Edited, Options, edit
-from mi_refgs.editing.join import join
-from mi_refgs.editing.select import Selection, painted, read_mask, select
+from mi_refgs.editing.joining import join
+from mi_refgs.editing.options import Edited, Options, edit
+from mi_refgs.editing.selection import Selection, painted, read_mask, select
 
 __all__ = [
     "Assignment",

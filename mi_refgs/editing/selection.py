@@ -23,8 +23,9 @@ from mi_refgs.splat import Camera, splat
 PAINTED_SHARE = 0.5
 """Part of a surfel's blended weight that must lie in the painted pixels."""
 BEHIND_SIZES = 3.0
-"""Standard deviations of a surfel by which its centre may lie behind the depth that its pixels show: the
-surfels of one surface overlap, and some of them hide others nearly completely."""
+"""Standard deviations of a surfel by which its centre may lie behind the depth that its pixels show. Of a
+mirror ball of 12,000 surfels, all of it painted, 0.6 % of the far side are then selected (at 6 5 %, without a
+limit 38 %), and 99.1 % of the weight that the picture blends (at 1 96.6 %, at 6 99.7 %)."""
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 
 from mi_refgs.editing.change import Assignments, Change, Rotate, apply, assignments
-from mi_refgs.editing.join import join
+from mi_refgs.editing.joining import join
 from mi_refgs.editing.notes import notes
-from mi_refgs.editing.select import Selection, select
+from mi_refgs.editing.selection import Selection, select
 from mi_refgs.errors import InputError
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import relightable
