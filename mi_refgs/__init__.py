@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from mi_refgs.data.view import View as View
     from mi_refgs.errors import InputError as InputError
     from mi_refgs.evaluation.evaluate import evaluate as evaluate
+    from mi_refgs.fitting.progress import Progress as Progress
     from mi_refgs.fitting.train import Trainer as Trainer
     from mi_refgs.methods.method import Method as Method
     from mi_refgs.methods.read import load as load_method
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from mi_refgs.occlusion.visibility import Occluder as Occluder
     from mi_refgs.primitives import Primitive as Primitive
     from mi_refgs.primitives import register as register_primitive
+    from mi_refgs.reconstruct import fit as fit
     from mi_refgs.reconstruction import Reconstruction as Reconstruction
     from mi_refgs.reconstruction import load as load
     from mi_refgs.relighting.light import NewLight as NewLight
@@ -73,6 +75,7 @@ _PUBLIC = {
     "NewLight": ("relighting.light", "NewLight"),
     "Occluder": ("occlusion.visibility", "Occluder"),
     "Primitive": ("primitives", "Primitive"),
+    "Progress": ("fitting.progress", "Progress"),
     "Reconstruction": ("reconstruction", "Reconstruction"),
     "Reflectance": ("shade.reflectance", "Reflectance"),
     "Run": ("runs.run", "Run"),
@@ -82,6 +85,7 @@ _PUBLIC = {
     "Trainer": ("fitting.train", "Trainer"),
     "View": ("data.view", "View"),
     "evaluate": ("evaluation.evaluate", "evaluate"),
+    "fit": ("reconstruct", "fit"),
     "from_points": ("surfels.init", "from_points"),
     "load": ("reconstruction", "load"),
     "load_method": ("methods.read", "load"),
@@ -114,6 +118,7 @@ __all__ = [
     "NewLight",
     "Occluder",
     "Primitive",
+    "Progress",
     "Reconstruction",
     "Reflectance",
     "Run",
@@ -123,6 +128,7 @@ __all__ = [
     "Trainer",
     "View",
     "evaluate",
+    "fit",
     "from_points",
     "load",
     "load_method",

@@ -114,3 +114,8 @@ an 8-bit step of coverage shows nothing worth dividing by."""
 FACING_TOLERANCE = 0.25
 """Cosine by which a normal may point away from the camera before it is turned round: 14° behind the
 silhouette."""
+
+# ---------------- fits ----------------
+
+DEFAULT_PRESET = "standard"
+"""How long a fit takes where nothing is said: the preset for everyday use (`methods.presets`)."""

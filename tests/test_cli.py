@@ -16,10 +16,10 @@ import pytest
 from tiny_scene import SIZE, train_command
 
 from mi_refgs.cli import demo, main
-from mi_refgs.cli.train import load_method
 from mi_refgs.exr import read_exr
 from mi_refgs.fitting import plan
 from mi_refgs.fitting import speed as speeds
+from mi_refgs.fitting.job import load_method
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.fitting.whole import sized
 from mi_refgs.images import read_png, srgb_from_linear, write_png

@@ -46,6 +46,7 @@ LAYERS: dict[str, set[str]] = {
     "llvm": set(),
     "resources": {"errors"},
     "files": {"errors"},
+    "messages": set(),
     "exr": {"files", "errors"},
     "hdr": {"files", "errors"},
     "images": {"exr", "files", "errors"},
@@ -65,8 +66,8 @@ LAYERS: dict[str, set[str]] = {
     "data": RENDERER,
     "capture": {"data"} | BOTTOM,
     "runs": RENDERER | {"methods"},
-    "fitting": RENDERER | {"methods", "data", "capture", "runs"},
-    "evaluation": RENDERER | {"methods", "data", "runs", "fitting"},
+    "fitting": RENDERER | {"methods", "data", "capture", "runs", "resources"},
+    "evaluation": RENDERER | {"methods", "data", "runs", "fitting", "messages"},
     "relighting": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
     "formats": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
     "source": RENDERER | {"methods", "data", "runs", "fitting", "formats", "relighting"},
@@ -84,6 +85,7 @@ LAYERS: dict[str, set[str]] = {
         "editing",
     },
     "editing": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
+    "reconstruct": {"methods", "fitting", "evaluation", "plugins", "reconstruction", "errors"},
     "profiling": RENDERER | {"methods", "data", "fitting"},
     "compare": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", ""},
     "doctor": {"llvm", "errors", ""},
@@ -96,8 +98,10 @@ LAYERS: dict[str, set[str]] = {
         "evaluation",
         "formats",
         "relighting",
+        "reconstruct",
         "reconstruction",
         "editing",
+        "messages",
         "compare",
         "profiling",
         "capture",
@@ -109,7 +113,8 @@ LAYERS: dict[str, set[str]] = {
     "__main__": {"cli"},
     "reference": {"constants"},
     "": RENDERER
-    | {"llvm", "plugins", "methods", "data", "runs", "fitting", "evaluation", "relighting", "reconstruction"},
+    | {"llvm", "plugins", "methods", "data", "runs", "fitting", "evaluation", "relighting"}
+    | {"reconstruct", "reconstruction"},
 }
 """What each part of the package may import besides itself; "" is the package's own `__init__`.
 

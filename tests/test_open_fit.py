@@ -12,15 +12,16 @@ import pytest
 from tiny_scene import FOCAL, METHOD, SIZE, write_data
 
 from mi_refgs import methods
-from mi_refgs.cli.train import default_variant
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.picture_files import PictureFile
 from mi_refgs.data.readers import PointCloud
 from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
+from mi_refgs.evaluation.progress import Bar
 from mi_refgs.fitting import exchange
 from mi_refgs.fitting.initial import initial_parameters, is_open
+from mi_refgs.fitting.job import default_method
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.fitting.whole import begin
 from mi_refgs.images import linear_from_srgb, read_png, write_png
@@ -226,9 +227,9 @@ def test_a_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) ->
 def test_the_method_for_photographs_is_the_default_without_alpha(
     data: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert default_variant(data.path) == "photographs"
+    assert default_method(data.path, progress=Bar()) == "photographs"
     assert "without alpha" in capsys.readouterr().err
-    assert default_variant(write_data(tmp_path, views=3, truth=False)) is None
+    assert default_method(write_data(tmp_path, views=3, truth=False)) is None
     assert capsys.readouterr().err == ""
 
 
@@ -236,7 +237,7 @@ def test_the_default_method_is_chosen_without_decoding_pictures(
     data: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(PictureFile, "decode", lambda _: pytest.fail("a picture was decoded"))
-    assert default_variant(data.path) == "photographs"
+    assert default_method(data.path) == "photographs"
 
 
 @pytest.mark.parametrize(

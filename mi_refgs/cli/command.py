@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
 from mi_refgs.errors import InputError
+from mi_refgs.messages import say as say
+from mi_refgs.messages import warn as warn
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -141,18 +142,6 @@ def prepare(args: argparse.Namespace) -> None:
     except ImportError as error:
         raise UnusableError(f"{error} (`refgs doctor` says more)") from error
     mi.set_log_level(mi.LogLevel.Warn)
-
-
-def warn(message: str) -> None:
-    """Tell about something unusual on standard error, above a progress bar if one is shown."""
-    from tqdm import tqdm
-
-    tqdm.write(f"refgs: warning: {message}", file=sys.stderr)
-
-
-def say(message: str) -> None:
-    """Tell what is going on, on standard error."""
-    print(f"refgs: {message}", file=sys.stderr)
 
 
 def finite(value: Any) -> Any:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs.cli.command import Result, add_command, add_settings, say
-from mi_refgs.cli.train import DEFAULT_PRESET
+from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError
 
 if TYPE_CHECKING:

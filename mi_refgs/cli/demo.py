@@ -7,7 +7,6 @@ from typing import Any
 
 from mi_refgs.cli.command import Result, add_command, add_output, add_settings, say
 from mi_refgs.cli.evaluate import table
-from mi_refgs.cli.train import fit
 from mi_refgs.resources import resource_dir
 
 SCENE = "glossy_demo.xml"
@@ -28,7 +27,8 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> Result:
     """Trace, fit, evaluate; what is finished already is not done again."""
     from mi_refgs.data.make_dataset import make_dataset
-    from mi_refgs.evaluation.evaluate import SHEET, evaluate, read_metrics
+    from mi_refgs.evaluation.evaluate import SHEET, read_metrics
+    from mi_refgs.reconstruct import fit
     from mi_refgs.runs.run import Run
 
     data, output = args.output / "data", args.output / args.preset
@@ -44,12 +44,16 @@ def run(args: argparse.Namespace) -> Result:
     )
     say(f"2 of 3: fitting into {output}")
     started = (output / "config.toml").is_file()
-    trainer = fit(data, output, preset=args.preset, assignments=[] if started else args.set, resume=True)[0]
+    settings = [] if started else args.set
+    found = fit(data, preset=args.preset, settings=settings, output=output, resume=True)
     say("3 of 3: evaluating")
-    folder = Run(output)
-    result = read_metrics(folder)
-    if result is None or result.get("iterations") != trainer.iteration or not (output / SHEET).is_file():
-        result = evaluate(folder, progress=True)
+    result = read_metrics(Run(output))
+    if (
+        result is None
+        or result.get("iterations") != found.trained.iteration
+        or not (output / SHEET).is_file()
+    ):
+        result = found.evaluate(progress=True)
     sheet = output / SHEET
     text = f"{table(result)}\nlook at the contact sheet: {sheet}\nor open the scene: {output / 'scene.xml'}"
     return Result(

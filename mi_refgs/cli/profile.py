@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs.cli.command import Result, add_command, add_settings, say
-from mi_refgs.cli.train import DEFAULT_PRESET, load_method
+from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError
 
 if TYPE_CHECKING:
@@ -61,6 +61,7 @@ def run(args: argparse.Namespace) -> Result:
 def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
     """The trainer of a run or of a fresh fit, and the stages of the schedule to look at."""
     from mi_refgs.evaluation.evaluate import load_split
+    from mi_refgs.fitting.job import load_method
     from mi_refgs.fitting.train import Trainer
     from mi_refgs.fitting.whole import read_views, sized
     from mi_refgs.runs.run import Run

@@ -2,7 +2,7 @@
 
 from mi_refgs.methods.method import LightOptions, Method, Refine, Stage, SurfelOptions
 from mi_refgs.methods.presets import PRESETS
-from mi_refgs.methods.read import dump, for_purpose, load, load_resolved, names
+from mi_refgs.methods.read import assignments, dump, for_purpose, load, load_resolved, names
 from mi_refgs.methods.weights import LossWeights
 from mi_refgs.methods.window import Window
 
@@ -15,6 +15,7 @@ __all__ = [
     "Stage",
     "SurfelOptions",
     "Window",
+    "assignments",
     "dump",
     "for_purpose",
     "load",

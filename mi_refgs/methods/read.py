@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
+from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import is_file
 from mi_refgs.methods.build import build, plain
@@ -30,7 +31,7 @@ MAX_TEXT, MAX_LINE = 2**16, 2000
 
 def load(
     variant: str,
-    preset: str = "standard",
+    preset: str = DEFAULT_PRESET,
     assignments: Sequence[str] | None = None,
     terms: Sequence[str] = (),
 ) -> Method:
@@ -260,6 +261,19 @@ def _drop(table: dict[str, Any], name: str, path: Path) -> None:
     if last not in table:
         raise InputError(f"{path}: drop: no key '{name}' in the extended file; remove it from `drop`")
     del table[last]
+
+
+def assignments(settings: Mapping[str, object] | Sequence[str]) -> list[str]:
+    """Changes of a method as `key=value` with values of TOML; what is a list of such is that list.
+
+    Raises InputError for a value that TOML does not have.
+    """
+    if not isinstance(settings, Mapping):
+        return [*settings]
+    try:
+        return [f"{key}={tomli_w.dumps({'_': value})[len('_ = ') : -1]}" for key, value in settings.items()]
+    except TypeError as error:
+        raise InputError(f"settings: {error}; give numbers, texts, booleans, or lists of them") from error
 
 
 def _assign(table: dict[str, Any], assignment: str) -> None:

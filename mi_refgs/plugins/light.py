@@ -19,10 +19,10 @@ from mi_refgs.shade.envmap import (
     EnvironmentLight,
     PrefilteredLight,
     UnfilteredLight,
-    bounded,
 )
 from mi_refgs.shade.light import ConstantLight, Light, RotatedLight
 from mi_refgs.shade.lobe_matrices import LEVELS, Levels, resample
+from mi_refgs.shade.positive import bounded
 from mi_refgs.shade.prefilter import prefilter
 from mi_refgs.shade.shading import Shading
 

@@ -30,6 +30,7 @@ from mi_refgs.hdr import read_hdr
 from mi_refgs.images import linear_from_srgb, read_png
 from mi_refgs.shade import lobe_matrices
 from mi_refgs.shade.lobe_matrices import LEVELS, Levels
+from mi_refgs.shade.positive import bounded, nearest_raw, softplus
 from mi_refgs.shade.prefilter import Operator, prefilter
 from mi_refgs.timing import boundary, phase
 
@@ -46,35 +47,10 @@ RADIANCE_FLOOR = 1e-4
 POLE_SINE = 1e-4
 """Within 0.006° of a pole the azimuth is fixed, so that its derivative stays below 1e4."""
 
-ATANH_TERMS = 7
-"""Terms of the series of log(1 + e) in softplus: relative error below 1e-7 for e ≤ 1."""
-
 
 def is_height(rows: int) -> bool:
     """Whether a learnable light may have so many rows."""
     return rows % 4 == 0 and rows >= MIN_HEIGHT
-
-
-def softplus(x: Any) -> Any:
-    """log(1 + exp x) to full relative precision for every finite x, with a finite derivative."""
-    e = dr.exp(-dr.abs(x))
-    # log(1 + e) = 2 atanh(e / (2 + e)): 1 + e alone would round away all of a dark texel.
-    s = e / (2 + e)
-    series = dr.zeros(type(x), dr.width(x))
-    for n in reversed(range(ATANH_TERMS)):
-        series = dr.fma(series, s * s, 1 / (2 * n + 1))
-    return 0.5 * x + 0.5 * dr.abs(x) + 2 * s * series  # not max(0, x), whose slope at 0 is not ½
-
-
-def bounded(value: Any, raw: Any) -> Any:
-    """The value, or 0 with gradient 0 where |raw| is not < RAW_LIMIT: a NaN would spread over all levels."""
-    return dr.select(dr.abs(dr.detach(raw)) < RAW_LIMIT, value, 0)
-
-
-def inverse_softplus(radiance: np.ndarray) -> np.ndarray:
-    """Raw value of a positive radiance, float64."""
-    y = np.asarray(radiance, np.float64)
-    return y + np.log(-np.expm1(-y))
 
 
 @dataclass(frozen=True)
@@ -217,7 +193,7 @@ class EnvironmentLight:
         radiance = np.asarray(radiance, np.float64)
         if not np.isfinite(radiance).all():
             raise InputError("EnvironmentLight: radiance: holds NaN or infinity; replace those texels")
-        return cls(upload_tensor(inverse_softplus(np.maximum(radiance, RADIANCE_FLOOR))))
+        return cls(upload_tensor(nearest_raw(np.maximum(radiance, RADIANCE_FLOOR))))
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:

@@ -197,8 +197,8 @@ class Camera:
         Raises InputError for a size without pixels.
         """
         if isinstance(size, int):
-            ratio = size / max(self.width, self.height)
-            size = max(1, round(self.width * ratio)), max(1, round(self.height * ratio))
+            ratio, least = size / max(self.width, self.height), min(size, 1)
+            size = max(least, round(self.width * ratio)), max(least, round(self.height * ratio))
         if min(size) < 1:
             raise InputError(f"camera: size: {size[0]} × {size[1]} pixels; give whole numbers from 1")
         x, y = size[0] / self.width, size[1] / self.height

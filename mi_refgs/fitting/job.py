@@ -1,0 +1,174 @@
+"""One fit from data to artefacts: method chosen, size of pictures planned, run begun or resumed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from mi_refgs import methods
+from mi_refgs.constants import DEFAULT_PRESET
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.picture_store import undecoded
+from mi_refgs.data.survey import few_views
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.plan import planned
+from mi_refgs.fitting.progress import Progress
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.fitting.whole import begin, finish, read_views
+from mi_refgs.methods.method import Method
+from mi_refgs.resources import resource_dir
+from mi_refgs.runs.run import Run
+
+DEFAULT_METHOD = "ref_gaussian.toml"
+"""File of `variants/` that is fitted when none is named: the full method."""
+OPEN_PURPOSE = "photographs"
+"""What the method that is fitted to pictures without alpha is for, when none is named."""
+
+Settings = Mapping[str, object] | Sequence[str]
+"""Changes of a method: {"loss.ssim": 0.1}, or as on the command line, ["loss.ssim=0.1"]."""
+
+
+def fit(
+    data: Path,
+    output: Path,
+    method: str | Method | None = None,
+    *,
+    preset: str | None = None,
+    settings: Settings = (),
+    resume: bool = False,
+    minutes: float | None = None,
+    progress: Progress | None = None,
+) -> Trainer:
+    """Fit, from the start or from the newest checkpoint, and write the artefacts; a finished run is loaded.
+
+    method: a name, the path of a .toml, or None: the full method, and for pictures without alpha the one that
+    fits their surroundings too. A `Method` is fitted as it is. preset: how long, "standard" if it is None.
+    minutes: time that a new fit may take. resume: go on if the folder holds a run.
+
+    Raises InputError for bad input, and KeyboardInterrupt or TerminatedError with a message that says how to
+    go on.
+    """
+    progress = progress or Progress()
+    folder = Run(output)
+    resumed = resume and folder.exists()
+    if isinstance(method, Method) and (preset or settings):
+        raise InputError("method: preset, settings: a Method has its own; change it, or name one")
+    if resumed:
+        chosen = folder.method()
+        _require_same(folder, chosen, data, method, preset, settings, progress)
+    else:
+        folder.require_none()
+        if minutes is not None and not 0 < minutes < math.inf:
+            raise InputError(f"--minutes: {minutes} is no time; give more than 0")
+        if not isinstance(method, Method):
+            method = method or default_method(data, preset, settings, progress)
+            method = load_method(method, preset, settings)
+        wanted = None if minutes is None else 60 * minutes
+        chosen, progress.expected = planned(method, data, wanted, progress.say)
+        if progress.expected is not None:
+            progress.say(progress.expected.sentence(chosen.iterations))
+    views = read_views(chosen, data, "train", truth=False)
+    _warn_of_data(chosen, views, progress)
+    trainer = begin(chosen, views, folder, progress.say)
+    if resumed:
+        progress.say(f"{output}: resumed at iteration {trainer.iteration} of {chosen.iterations}")
+
+    def step(trainer: Trainer) -> None:
+        while trainer.notices:
+            progress.warn(trainer.notices.pop(0))
+        progress.step(trainer)
+
+    progress.begin(trainer)
+    try:
+        trainer.train(step)
+    except KeyboardInterrupt as error:
+        kept = "" if folder.checkpoints() else " (before the first iteration was done)"
+        raise type(error)(
+            f"interrupted at iteration {trainer.iteration}{kept}; "
+            f"resume with: refgs train {data} -o {output} --resume"
+        ) from None
+    except InputError as error:  # a full disk, no surfel left
+        saved = folder.checkpoints()
+        kept = f" (saved up to iteration {int(saved[-1].stem)}; --resume goes on from there)" if saved else ""
+        raise InputError(f"{error}{kept}") from error
+    finally:
+        progress.end()
+    if warning := finish(trainer, folder):
+        progress.warn(warning)
+    _warn_of_outcome(trainer, progress)
+    return trainer
+
+
+def load_method(method: str | None, preset: str | None, settings: Settings = ()) -> Method:
+    """The method of a name or path, or the full one, at the preset for everyday use if that is None."""
+    path = method or str(resource_dir("variants") / DEFAULT_METHOD)
+    return methods.load(path, preset or DEFAULT_PRESET, methods.assignments(settings))
+
+
+def default_method(
+    data: Path, preset: str | None = None, settings: Settings = (), progress: Progress | None = None
+) -> str | None:
+    """The method for pictures without alpha, where the data set has such; None for the full one."""
+    # What `settings` say of a method may be of the other one.
+    of_data = [text for text in methods.assignments(settings) if text.startswith("data.")]
+    with undecoded():
+        views = read_views(load_method(None, preset, of_data), data, "train", truth=False)
+    if views.cut_out or views.region is None:
+        return None
+    method = methods.for_purpose(OPEN_PURPOSE)
+    (progress or Progress()).say(
+        f"{data}: pictures without alpha: --variant {method} fits their surroundings too"
+    )
+    return method
+
+
+def _require_same(
+    folder: Run,
+    method: Method,
+    data: Path,
+    wanted: str | Method | None,
+    preset: str | None,
+    settings: Settings,
+    progress: Progress,
+) -> None:
+    """Raise InputError if a run that is resumed was started with something else."""
+    if changes := methods.assignments(settings):
+        raise InputError(
+            f"--set: {changes[0]}: a resumed run keeps its method; drop --set or choose another -o"
+        )
+    named = wanted.variant if isinstance(wanted, Method) else wanted and Path(wanted).stem
+    for option, name, found in (("--variant", named, method.variant), ("--preset", preset, method.preset)):
+        if name and name != found:
+            raise InputError(
+                f"{folder.path / 'config.toml'}: {option}: the run was started with '{found}', "
+                f"not '{preset if option == '--preset' else wanted}'; drop {option} or choose another -o"
+            )
+    try:
+        before = folder.dataset()
+    except (OSError, ValueError, KeyError, TypeError):
+        before = data.resolve()
+    if before.resolve() != data.resolve():
+        progress.warn(f"{folder.path}: was fitted to {before} before, now to {data}")
+
+
+def _warn_of_data(method: Method, views: Dataset, progress: Progress) -> None:
+    """Say what is unusual about a data set."""
+    if note := few_views(len(views.views)):
+        progress.warn(f"{views.path}: {note}")
+    if not views.cut_out and (method.surroundings is None or views.region is None):
+        progress.warn(
+            f"{views.path}: pictures without alpha: surfels start at random, "
+            "and the background becomes surfels too"
+        )
+
+
+def _warn_of_outcome(trainer: Trainer, progress: Progress) -> None:
+    """Say what is unusual about a finished fit."""
+    options, count = trainer.method.surfels, trainer.surfels.count
+    if trainer.method.refine.densify is not None and count >= options.max_count:
+        progress.warn(
+            f"all {count} surfels in use; more may help: --set surfels.max_count={2 * options.max_count}"
+        )
+    if count < options.count // 10:
+        progress.warn(f"{count} of {options.count} surfels are left; look at the previews")
