@@ -226,7 +226,7 @@ def test_a_distorted_lens_is_found_and_undone(tmp_path: Path, monkeypatch: pytes
 def test_another_lens_makes_other_pictures(
     captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Pictures and cameras are of one lens; files that a person added stay."""
+    """Pictures and cameras are of one lens; files that a person added stay, masks go where none are given."""
     data = tmp_path / "data"
     shutil.copytree(captured / "data", data)
     (data / "sparse" / "0" / "test.txt").write_text(NAMES[3])
@@ -238,10 +238,12 @@ def test_another_lens_makes_other_pictures(
 
     monkeypatch.setattr(output, "straighten", longer)
     [before] = colmap.load().Reconstruction(data / "sparse" / "0").cameras.values()
-    assert main(["capture", str(captured / "photographs"), "-o", str(data)]) == 0
+    command = ["capture", str(captured / "photographs"), "-o", str(data)]
+    assert main([*command, "--masks", str(captured / "masks")]) == 0
     [after] = colmap.load().Reconstruction(data / "sparse" / "0").cameras.values()
     assert after.focal_length_x == pytest.approx(1.01 * before.focal_length_x)
-    assert (data / "images" / NAMES[0]).stat().st_ino != inode and not (data / "masks").exists()
+    assert (data / "images" / NAMES[0]).stat().st_ino != inode and (data / "masks").is_dir()
+    assert main(command) == 0 and not (data / "masks").exists()
     assert [view.name for view in read_dataset(data, "test").views] == [NAMES[3]]
 
 
