@@ -126,7 +126,7 @@ def test_one_sample_comes_closer_to_many() -> None:
     assert errors[1] < 0.6 * errors[0]
     assert np.sqrt(np.mean((radiance(filtered, 144) - truth) ** 2)) < 0.1 * errors[0]
     own, other = (made.renderer()(camera(24, 29.0)).maps["roughness"] for made in (plain, filtered))
-    np.testing.assert_array_equal(own, other)
+    np.testing.assert_allclose(own, other, atol=1e-5)  # of one order of additions or another
 
 
 def test_it_needs_pixels() -> None:

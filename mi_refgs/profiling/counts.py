@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.splat import Camera, Footprints, TileLists
-from mi_refgs.splat.blend import advance
+from mi_refgs.splat.lanes import advance
 
 
 @dataclass(frozen=True)

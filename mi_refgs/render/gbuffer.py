@@ -9,38 +9,51 @@ from typing import Any
 import drjit as dr
 
 from mi_refgs.constants import COVERAGE_FLOOR
-from mi_refgs.splat import Camera, splat
+from mi_refgs.splat import Camera, splat, splat_shown
+from mi_refgs.splat.lanes import Places
 from mi_refgs.surfels.table import Surfels
 
 
 @dataclass(frozen=True)
 class GBuffer:
-    """Blended slots of a view: arrays of H·W values in raster order. A slot that nobody needs is absent."""
+    """Blended slots of a view: arrays of H·W values in raster order. A slot that nobody needs is absent.
+
+    Those of a picture alone are in the order of `places`.
+    """
 
     alpha: Any  # accumulated opacity
-    depth: Any  # expected camera-z depth, 0 where nothing is seen
+    depth: Any  # expected camera-z depth, 0 where nothing is seen; None where it was not asked for
     slots: dict[str, Any]  # premultiplied by alpha, each of the type that was blended
     inverse: Any  # 1/alpha, or 1/share, where that is seen, else 0
+    places: Places | None = None
 
     @staticmethod
     def blend(
-        surfels: Surfels, slots: Mapping[str, Any], camera: Camera, shift: Any = None, share: str = ""
+        surfels: Surfels,
+        slots: Mapping[str, Any],
+        camera: Camera,
+        shift: Any = None,
+        share: str = "",
+        alone: bool = False,
+        depth: bool = True,
     ) -> GBuffer:
         """Blend values of width N by name: mi.Float, or an array of several such as mi.Color3f.
 
         Every component is a feature, which costs time in every surfel-tile pair. `shift`: see
         `splat.project`. `share` names a slot that values are `divided` by in place of alpha: the opacity of
-        the rows that have them.
+        the rows that have them. For a picture `alone` there is no derivative, and `depth` only on demand.
         """
         features = [part for value in slots.values() for part in parts(value)]
-        blended = splat(surfels, features, camera, shift)
+        shown = splat_shown(surfels, features, camera, depth) if alone else None
+        blended = splat(surfels, features, camera, shift) if shown is None else shown
         rest, maps = list(blended.features), {}
         for name, value in slots.items():
             width = len(parts(value))
             maps[name], rest = of_parts(value, rest[:width]), rest[width:]
         inverse = inverse_alpha(blended.alpha)
         own = inverse_alpha(maps[share]) if share else inverse
-        return GBuffer(blended.alpha, blended.depth * inverse, maps, own)
+        mean_depth = None if blended.depth is None else blended.depth * inverse
+        return GBuffer(blended.alpha, mean_depth, maps, own, None if shown is None else shown.places)
 
     def divided(self, name: str) -> Any:
         """A slot divided by alpha, or by the share: the mean over what is seen, 0 where nothing is."""

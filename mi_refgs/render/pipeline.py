@@ -10,6 +10,7 @@ camera.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,10 +24,11 @@ from mi_refgs.render.antialias import widened
 from mi_refgs.render.gbuffer import GBuffer, inverse_alpha
 from mi_refgs.render.surroundings import AROUND, OBJECT, Surroundings, joined_slots, together
 from mi_refgs.shade.light import Light
-from mi_refgs.shade.points import ShadingPoints, Terms, safe_normalize
+from mi_refgs.shade.points import TERMS, ShadingPoints, Terms, safe_normalize
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera, splat
+from mi_refgs.splat.lanes import Places
 from mi_refgs.surfels.channels import channel
 from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
 from mi_refgs.timing import boundary
@@ -41,7 +43,7 @@ class Frame:
     """
 
     alpha: Any  # accumulated opacity
-    depth: Any  # expected camera-z depth, 0 where nothing is seen
+    depth: Any  # expected camera-z depth, 0 where nothing is seen; None if not asked for
     normal: Any  # mi.Vector3f: blended world normal towards the camera, not normalised; None if not asked for
     radiance: Any  # mi.Color3f, over black
     terms: Terms | None = None  # diffuse, specular, indirect, whose sum it is, where known apart
@@ -59,17 +61,20 @@ def render(
     occluder: Occluder | None = None,
     sh_degree: int | None = None,
     shift: Any = None,
-    aovs: bool = False,
+    aovs: bool | Collection[str] = False,
     normals: bool = True,
     surroundings: Surroundings | None = None,
+    derivatives: bool = True,
 ) -> Frame:
     """Render a view.
 
     `light` is what `Shading.light_of` gives, needed unless the model asks for none. `sh_degree` limits the
-    degree of the radiance channel, for coarse-to-fine schedules. `aovs` asks for the materials and the terms
-    of the radiance even where the picture does not need them per pixel; without `normals`, they are absent
-    where it does not. `shift`: see `splat.project`; with `surroundings` it is of their rows too, after the
-    object's.
+    degree of the radiance channel, for coarse-to-fine schedules. `aovs` asks for materials, "visibility",
+    "normal", "depth" and the terms of the radiance, by name or (True) all, even where the picture does not
+    need them per pixel; without `normals`, they are absent where it does not. `shift`: see `splat.project`;
+    with `surroundings` it is of their rows too, after the object's.
+    Without `derivatives`, the frame has radiance, alpha and what `aovs` asks for, and nothing else is made;
+    pictures differ from those with them by rounding.
     `shading.accuracy.traced_bounces` needs an occluder whose `set_materials` has seen these surfels.
     Raises InputError for what `shading.check` refuses.
     """
@@ -82,10 +87,12 @@ def render(
     seen = _seen(surfels, camera, sh_degree)
     attributes = shading.model.attributes(surfels, seen, shading)
     around = None if surroundings is None else _Around.of(surroundings, surfels, camera, sh_degree)
-    scene = _Scene(surfels, camera, shading, light, occluder, seen, attributes, shift, around)
-    frame = (
-        _shade_at_surfels(scene, aovs, normals) if shading.at == "surfel" else _shade_at_pixels(scene, aovs)
-    )
+    asked = _asked(surfels, aovs) | ({"normal"} if normals and derivatives else frozenset())
+    alone = not derivatives and not shading.accuracy.antialias  # whose neighbours are those of the image
+    scene = _Scene(surfels, camera, shading, light, occluder, seen, attributes, shift, around, asked, alone)
+    frame, buffer = _shade_at_surfels(scene) if shading.at == "surfel" else _shade_at_pixels(scene)
+    if not derivatives:
+        frame = _only(frame, asked, buffer.places)
     return boundary(frame, "shade backward")
 
 
@@ -98,6 +105,39 @@ def render_depth(surfels: Surfels, camera: Camera, around: Surfels | None = None
         surfels = together(surfels, around)
     blended = splat(surfels, [], camera)
     return blended.depth * inverse_alpha(blended.alpha), blended.alpha
+
+
+def _asked(surfels: Surfels, aovs: bool | Collection[str]) -> frozenset[str]:
+    if isinstance(aovs, bool):
+        materials = (name for name in surfels.raw if channel(name).aov)
+        return frozenset({*materials, *TERMS, "visibility", "normal", "depth"} if aovs else ())
+    return frozenset(aovs)
+
+
+def _only(frame: Frame, asked: frozenset[str], places: Places | None) -> Frame:
+    """A frame with nothing that is not asked for, in raster order."""
+    frame = replace(
+        frame,
+        depth=frame.depth if "depth" in asked else None,
+        normal=frame.normal if "normal" in asked else None,
+        terms=frame.terms if asked & {*TERMS} else None,
+        maps={name: value for name, value in frame.maps.items() if name in asked},
+    )
+    if places is None:
+        return frame
+    dr.eval(frame.alpha, frame.depth, frame.normal, frame.radiance, frame.terms, frame.maps, frame.share)
+    raster = places.to_raster
+    terms = frame.terms and Terms(**{name: raster(term) for name, term in frame.terms.known().items()})
+    return replace(
+        frame,
+        alpha=raster(frame.alpha),
+        depth=raster(frame.depth),
+        normal=raster(frame.normal),
+        radiance=raster(frame.radiance),
+        terms=terms,
+        maps={name: raster(value) for name, value in frame.maps.items()},
+        share=raster(frame.share),
+    )
 
 
 def _nothing(surfels: Surfels) -> Surfels:
@@ -124,6 +164,8 @@ class _Scene:
     attributes: dict[str, Any]  # of the model, by name
     shift: Any
     around: _Around | None
+    asked: frozenset[str]  # what the frame has beside radiance and alpha
+    alone: bool  # for a picture alone, without derivatives
 
     @property
     def normal(self) -> Any:
@@ -136,8 +178,8 @@ class _Scene:
         return {name: value for name, value in self.attributes.items() if name != "normal"}
 
     def materials(self) -> dict[str, Any]:
-        """Activated channels that have an AOV, by name."""
-        return {name: self.surfels.value(name) for name in self.surfels.raw if channel(name).aov}
+        """Activated channels that are asked for, by name."""
+        return {name: self.surfels.value(name) for name in self.surfels.raw if name in self.asked}
 
     def presence(self) -> dict[str, Any]:
         """The slot of the object's opacity, where alpha is not that."""
@@ -145,12 +187,12 @@ class _Scene:
 
     def blend(self, slots: dict[str, Any], others: dict[str, Any]) -> GBuffer:
         """Slots of the object's rows, and those that the surroundings have, if there are any, in one sort."""
-        if self.around is None:
-            return GBuffer.blend(self.surfels, slots, self.camera, self.shift)
-        rows = self.surfels.count, self.around.count
-        share = OBJECT if OBJECT in slots else ""
-        joined = joined_slots(slots, others, rows)
-        return GBuffer.blend(self.around.table, joined, self.camera, self.shift, share)
+        table, share = self.surfels, ""
+        if self.around is not None:
+            table, share = self.around.table, OBJECT if OBJECT in slots else ""
+            slots = joined_slots(slots, others, (self.surfels.count, self.around.count))
+        depth = not self.alone or "depth" in self.asked
+        return GBuffer.blend(table, slots, self.camera, self.shift, share, self.alone, depth)
 
 
 @dataclass(frozen=True)
@@ -186,8 +228,8 @@ def _seen(surfels: Surfels, camera: Camera, sh_degree: int | None) -> SurfelView
     return SurfelView(direction, facing, sh_degree)
 
 
-def _shade_at_surfels(scene: _Scene, aovs: bool, normals: bool) -> Frame:
-    shading, direction = scene.shading, scene.seen.direction
+def _shade_at_surfels(scene: _Scene) -> tuple[Frame, GBuffer]:
+    shading, direction, normals = scene.shading, scene.seen.direction, "normal" in scene.asked
     points = ShadingPoints(scene.normal, -direction, scene.named)
     if shading.occlusion:
         centre = scene.surfels.position()
@@ -196,37 +238,38 @@ def _shade_at_surfels(scene: _Scene, aovs: bool, normals: bool) -> Frame:
     terms, around = shade(points, scene.light, shading), scene.around
     # A feature costs time in every pair, so what is not asked for is not blended.
     slots = {"radiance": terms.total()} | ({"normal": scene.normal} if normals else {})
-    materials = scene.materials() if aovs else {}
-    others = {}
-    if aovs:
-        slots |= terms.known() | materials | scene.presence()
+    materials, others = scene.materials(), {}
+    apart = {name: term for name, term in terms.known().items() if name in scene.asked}
+    if scene.asked - {"normal"}:
+        slots |= apart | materials | scene.presence()
     if around is not None:
         others = {"radiance": around.radiance} | ({"normal": around.normal} if normals else {})
     buffer = scene.blend(slots, others)
     blended = buffer.slots
-    apart = Terms(**{name: blended[name] for name in terms.known()}).filled() if aovs else None
-    return Frame(
+    known = Terms(**{"diffuse": None} | {name: blended[name] for name in apart}).filled()
+    frame = Frame(
         alpha=buffer.alpha,
         depth=buffer.depth,
         normal=blended.get("normal"),
         radiance=blended["radiance"],
-        terms=apart,
+        terms=known if scene.asked & {*TERMS} else None,
         maps={name: buffer.divided(name) for name in materials},
         background=None if around is None else around.background,
         share=blended.get(OBJECT),
     )
+    return frame, buffer
 
 
-def _shade_at_pixels(scene: _Scene, aovs: bool) -> Frame:
+def _shade_at_pixels(scene: _Scene) -> tuple[Frame, GBuffer]:
     shading, camera = scene.shading, scene.camera
     slots, around = {"normal": scene.normal} | scene.named, scene.around
-    if aovs:
-        slots |= {name: value for name, value in scene.materials().items() if name not in slots}
+    slots |= {name: value for name, value in scene.materials().items() if name not in slots}
     others = {} if around is None else {AROUND: around.radiance}
     buffer = scene.blend(slots | scene.presence(), others)
 
     values = {name: buffer.divided(name) for name in slots if name != "normal"}
-    normal, ray = buffer.slots["normal"], camera.rays()
+    normal = buffer.slots["normal"]
+    ray = camera.rays(None if buffer.places is None else buffer.places.raster)
     alpha = buffer.slots.get(OBJECT, buffer.alpha)
     attributes = {name: values[name] for name in scene.named}
     if shading.accuracy.antialias:
@@ -240,7 +283,7 @@ def _shade_at_pixels(scene: _Scene, aovs: bool) -> Frame:
         maps["visibility"] = points.visibility
     shaded = shade(points, scene.light, shading)
     terms = Terms(**{name: term * alpha for name, term in shaded.known().items()}).filled()
-    return Frame(
+    frame = Frame(
         alpha=buffer.alpha,
         depth=buffer.depth,
         normal=normal,
@@ -251,3 +294,4 @@ def _shade_at_pixels(scene: _Scene, aovs: bool) -> Frame:
         share=buffer.slots.get(OBJECT),
         own_normal=around is not None,
     )
+    return frame, buffer

@@ -63,7 +63,7 @@ def supersampled(
     return replace(
         fine,
         alpha=alpha,
-        depth=mean(fine.depth * fine.alpha) * inverse,
+        depth=None if fine.depth is None else mean(fine.depth * fine.alpha) * inverse,
         normal=maybe(fine.normal),
         radiance=mean(fine.radiance),
         terms=terms,

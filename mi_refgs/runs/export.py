@@ -16,7 +16,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -129,8 +129,8 @@ class TrainedScene:
             raise InputError(f"{folder}: {error}; or write it again with `refgs export {folder}`") from error
         return fitted
 
-    def renderer(self, aovs: bool = True, samples: int = 1) -> Callable[[Camera], Frame]:
-        """A function that renders views without derivatives, with materials and normals if `aovs`.
+    def renderer(self, aovs: bool | Collection[str] = True, samples: int = 1) -> Callable[[Camera], Frame]:
+        """A function that renders views without derivatives, with the `aovs` of `render`, all or by name.
 
         `samples` a pixel as in `render.samples`. Light and mesh are prepared once.
         """
@@ -147,13 +147,14 @@ class TrainedScene:
                 light,
                 occluder,
                 aovs=aovs,
-                normals=aovs,
+                normals=aovs is True,
                 surroundings=self.surroundings,
+                derivatives=False,
             )
 
         def view(camera: Camera) -> Frame:
             with dr.suspend_grad():
-                return supersampled(once, camera, samples, details=aovs)
+                return supersampled(once, camera, samples, details=bool(aovs))
 
         return view
 

@@ -10,11 +10,24 @@ import mitsuba as mi
 from mi_refgs.primitives import Footprints
 from mi_refgs.splat.blend import Blended, blend
 from mi_refgs.splat.camera import Camera
+from mi_refgs.splat.shown import Shown, blend_shown
 from mi_refgs.splat.tiles import TileLists, list_by_tile
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.timing import boundary, phase
 
-__all__ = ["Blended", "Camera", "Footprints", "TileLists", "blend", "list_by_tile", "project", "splat"]
+__all__ = [
+    "Blended",
+    "Camera",
+    "Footprints",
+    "Shown",
+    "TileLists",
+    "blend",
+    "blend_shown",
+    "list_by_tile",
+    "project",
+    "splat",
+    "splat_shown",
+]
 
 
 @phase("project")
@@ -35,3 +48,11 @@ def splat(surfels: Surfels, features: list[Any], camera: Camera, shift: Any = No
     lists = list_by_tile(footprints, camera)
     footprints, features = boundary((footprints, features), "surfels backward")
     return boundary(blend(footprints, features, lists, camera), "splat backward")
+
+
+def splat_shown(surfels: Surfels, features: list[Any], camera: Camera, depth: bool) -> Shown | None:
+    """The maps of `splat` for a picture alone, as `blend_shown` gives them; None where nothing is seen."""
+    if surfels.count == 0:
+        return None
+    footprints = project(surfels, camera)
+    return blend_shown(footprints, features, list_by_tile(footprints, camera), camera, depth)

@@ -168,14 +168,14 @@ class Camera:
         """World point to camera frame."""
         return self.rotation @ self.towards(point)
 
-    def pixel_centres(self) -> Any:
-        """Centres (i + ½, j + ½) of all pixels in raster order, width·height values."""
-        index = dr.arange(mi.UInt32, self.width * self.height)
+    def pixel_centres(self, raster: Any = None) -> Any:
+        """Centres (i + ½, j + ½) of pixels by their index in the image (mi.UInt32); of all without one."""
+        index = dr.arange(mi.UInt32, self.width * self.height) if raster is None else raster
         return mi.Point2f(index % self.width + 0.5, index // self.width + 0.5)
 
-    def rays(self) -> Any:
-        """World directions through the pixel centres, raster order: 1 along the viewing axis, not unit."""
-        pixel = self.pixel_centres()
+    def rays(self, raster: Any = None) -> Any:
+        """World directions through `pixel_centres`: 1 along the viewing axis, not unit."""
+        pixel = self.pixel_centres(raster)
         local = mi.Vector3f((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1)
         return self.rotation.T @ local
 

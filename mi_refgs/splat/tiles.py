@@ -104,8 +104,8 @@ def _nearest_first(depth: Any) -> Any:
     least = dr.min(key)
     key = (key - least) >> (8 - dr.minimum(dr.lzcnt(dr.max(key) - least), 8))
     entries = _join(key, dr.arange(mi.UInt32, dr.width(key)))
-    for digit in range(3):
-        entries = _sorted_by(entries, 8 * digit, 8)
+    for digit in range(2):
+        entries = _sorted_by(entries, 12 * digit, 12)
     return _lower(entries)
 
 
