@@ -1,0 +1,68 @@
+"""A view of the data set beside what is drawn from its camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.view import View
+from mi_refgs.evaluation import metrics
+from mi_refgs.evaluation.pictures import planes, target
+from mi_refgs.render.display import displayed
+from mi_refgs.viewer.develop import PICTURE, Look, shown_planes, to_bytes
+from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.source import Shot, Source
+
+AROUND = 0.12
+"""Display-encoded brightness beside the two pictures."""
+GAP = 8
+"""Pixels between the two."""
+
+
+@dataclass(eq=False)
+class Compared:
+    """A view whose truth stands to the left of the picture."""
+
+    view: View
+    data: Dataset
+    told: dict[str, Any] = field(default_factory=dict)  # psnr of the last picture drawn, if it is one
+
+    def picture(self, source: Source, look: Look, window: tuple[int, int]) -> np.ndarray:
+        """Both, as large as they fit into a window: 8-bit RGB of the window's shape."""
+        view = self.view
+        frame_of = getattr(source, "frame", None)
+        truth = np.clip(target(view), 0, 1)
+        if look.what == PICTURE and frame_of is not None:
+            shown = displayed(frame_of(view.camera()), self.data.background, self.data.linear)
+            ours = planes(shown, view.height, view.width)
+            self.told["psnr"] = metrics.psnr(ours, truth)
+            drawn = to_8_bits(ours)
+        else:
+            shot = Shot(
+                Pose.of_view(view), view.width, view.height, look, settled=True, exact=view.camera()
+            )
+            drawn = to_bytes(shown_planes(source.draw(shot).planes, look), view.width, view.height)
+        return side_by_side([to_8_bits(truth), drawn], window)
+
+
+def to_8_bits(picture: np.ndarray) -> np.ndarray:
+    """8-bit values of a display-encoded picture."""
+    return np.asarray(np.clip(np.nan_to_num(picture), 0, 1) * 255 + 0.5, dtype=np.uint8)
+
+
+def side_by_side(pictures: list[np.ndarray], window: tuple[int, int]) -> np.ndarray:
+    """Pictures (H, W, 3) uint8 of one size in a row, on a canvas of the window's shape."""
+    height, width = pictures[0].shape[:2]
+    row = len(pictures) * width + (len(pictures) - 1) * GAP
+    aspect = max(window[0], 1) / max(window[1], 1)
+    canvas_width = max(row, round(height * aspect))
+    canvas_height = max(height, round(canvas_width / aspect))
+    canvas = np.full((canvas_height, canvas_width, 3), round(255 * AROUND), np.uint8)
+    left, top = (canvas_width - row) // 2, (canvas_height - height) // 2
+    for index, picture in enumerate(pictures):
+        start = left + index * (width + GAP)
+        canvas[top : top + height, start : start + width] = picture
+    return canvas

@@ -1,0 +1,93 @@
+"""Frames to what a page shows: the picture or one of its variables, as 8-bit RGB."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.plugins.aovs import aov_values, suffixes
+from mi_refgs.render.display import ALPHA_EMPTY, display_image, srgb_from_linear
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.shade.light import Light
+from mi_refgs.shade.points import TERMS
+from mi_refgs.splat.camera import Camera
+
+PICTURE = "picture"
+"""What is shown unless a variable is asked for."""
+BACKDROPS = {"white": 1.0, "grey": 0.25, "black": 0.0}
+"""Display-encoded brightness behind the object, by name."""
+LIGHT_BEHIND = "light"
+"""The backdrop that is the light."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What of the scene is shown, and how."""
+
+    what: str = PICTURE  # or a type of `plugins.aovs`
+    exposure: float = 0.0  # stops
+    backdrop: str = "white"  # one of BACKDROPS, or LIGHT_BEHIND
+    depths: tuple[float, float] = (0.0, 1.0)  # distances that are shown as white and as black
+
+
+def planes_of(frame: Frame, camera: Camera, look: Look, light: Light | None) -> list[Any]:
+    """What is averaged over samples: the planes of the picture or variable, premultiplied, and alpha.
+
+    Behind a picture with surroundings or the light, three planes of that follow.
+    """
+    if look.what == PICTURE:
+        behind = frame.background
+        if behind is None and look.backdrop == LIGHT_BEHIND and light is not None:
+            behind = light.radiance(dr.normalize(camera.rays()))
+        return [*frame.radiance, frame.alpha, *(() if behind is None else behind)]
+    coverage = frame.alpha if frame.share is None else frame.share
+    values = aov_values(look.what, frame, camera)
+    if look.what in (*TERMS, "alpha"):
+        return [*values, coverage]
+    return [*(value * coverage for value in values), coverage]
+
+
+def shown_planes(planes: list[Any], look: Look) -> list[Any]:
+    """Three display-encoded planes of the mean of `planes_of`, not clipped."""
+    backdrop = BACKDROPS.get(look.backdrop, 1.0)
+    if look.what == PICTURE:
+        gain = dr.opaque(mi.Float, 2.0**look.exposure)
+        radiance, alpha, behind = [plane * gain for plane in planes[:3]], planes[3], planes[4:]
+        if not behind:
+            return display_image(radiance, alpha, [backdrop] * 3)
+        return [
+            srgb_from_linear(plane + (1 - alpha) * value * gain)
+            for plane, value in zip(radiance, behind, strict=True)
+        ]
+    *values, alpha = planes
+    if look.what in TERMS:
+        gain = dr.opaque(mi.Float, 2.0**look.exposure)
+        return [srgb_from_linear(value * gain) for value in values]
+    if look.what == "alpha":
+        return values * 3
+    inverse = dr.select(alpha > ALPHA_EMPTY, dr.rcp(dr.maximum(alpha, ALPHA_EMPTY)), 0)
+    values = [value * inverse for value in values]
+    kind = suffixes()[look.what]
+    if kind == "XYZ":
+        values = [0.5 + 0.5 * value for value in values]
+    elif kind == "RGB":
+        values = [srgb_from_linear(value) for value in values]
+    elif kind == "T":
+        near, far = (dr.opaque(mi.Float, x) for x in look.depths)
+        values = [dr.clip((far - values[0]) / (far - near), 0, 1)]
+    shown = values * (3 // len(values))
+    return [alpha * value + (1 - alpha) * backdrop for value in shown]
+
+
+def to_bytes(shown: list[Any], width: int, height: int) -> np.ndarray:
+    """8-bit RGB (height, width, 3) of three display-encoded planes, clipped; waits for the device."""
+    packed = dr.zeros(mi.UInt32, width * height)
+    for index, plane in enumerate(shown):
+        packed |= mi.UInt32(dr.clip(plane, 0, 1) * 255 + 0.5) << (8 * index)
+    pixels = np.array(packed.numpy(), dtype="<u4").view(np.uint8)
+    return np.ascontiguousarray(pixels.reshape(height, width, 4)[..., :3])
+

@@ -1,0 +1,187 @@
+"""A reconstruction as a page shows it: its surfels with changed materials, under a light that turns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.contraction import Region
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.relightable import relightable
+from mi_refgs.shade.ambient import prepare
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light import Light, RotatedLight
+from mi_refgs.shade.points import TERMS
+from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.viewer.develop import BACKDROPS, LIGHT_BEHIND, PICTURE, planes_of
+from mi_refgs.viewer.source import Sampled, Shot
+
+OUTLIERS = 2.0
+"""Percent of the surfels along each axis and side that do not count as the object."""
+
+Change = Callable[[TrainedScene], TrainedScene]
+"""An edit of a scene that keeps its rows."""
+
+
+def bounds_of(scene: TrainedScene, region: Region | None = None) -> tuple[np.ndarray, float]:
+    """Centre (3,) and radius of the object: its region, else where most of its surfels are."""
+    if region is not None:
+        return np.array(region.centre), region.radius
+    position = scene.surfels.to_numpy()["position"].astype(np.float64)
+    if not len(position):
+        return np.zeros(3), 1.0
+    low, high = np.percentile(position, (OUTLIERS, 100 - OUTLIERS), axis=0)
+    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+
+
+def variables_of(scene: TrainedScene) -> tuple[str, ...]:
+    """The picture and the variables that the scene has."""
+    maps = [name for name in scene.surfels.raw if CHANNELS[name].aov]
+    traced = ["visibility"] if scene.shading.occlusion else []
+    terms = TERMS if scene.shading.model.light != "none" else ()
+    return (PICTURE, *maps, "normal", "depth", "alpha", *traced, *terms)
+
+
+class Fitted:
+    """A `TrainedScene` of which parts change. What costs time is made again only where it has to be."""
+
+    def __init__(self, scene: TrainedScene, region: Region | None = None) -> None:
+        """Show the scene as it is; `region` is what its data set is about."""
+        self.original = scene
+        self.centre, self.radius = bounds_of(scene, region)
+        self.turn = 0.0  # degrees that the light is turned about z, counter-clockwise from above
+        self.environment = scene.light
+        self.changes: list[Change] = []
+        self.relit = False
+        self._relightable: TrainedScene | None = None
+        self._put(scene)
+
+    # ---------------- what there is ----------------
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """See `Source`."""
+        return variables_of(self.scene)
+
+    @property
+    def backdrops(self) -> tuple[str, ...]:
+        """See `Source`; surroundings are always shown."""
+        if self.scene.surroundings is not None:
+            return ()
+        return (*BACKDROPS, LIGHT_BEHIND) if self.lit else tuple(BACKDROPS)
+
+    @property
+    def lit(self) -> bool:
+        """Whether it has a light that may turn."""
+        return self.scene.light is not None and self.scene.shading.model.light != "none"
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Channels of one number a surfel that may be set."""
+        return tuple(name for name in ("roughness", "metallic") if self.scene.surfels.has(name))
+
+    @property
+    def can_relight(self) -> bool:
+        """Whether `runs.relightable` takes it."""
+        return self.original.light is not None and all(
+            self.original.surfels.has(name) for name in ("albedo", "roughness", "metallic")
+        )
+
+    # ---------------- what changes it ----------------
+
+    def set_light(self, light: EnvironmentLight | None) -> None:
+        """Put another light in place of the scene's own; None brings that back."""
+        self.environment = self.original.light if light is None else light
+        self._filter()
+
+    def set_turn(self, degrees: float) -> None:
+        """Turn the light to this angle about z, counter-clockwise seen from above."""
+        self.turn = float(degrees)
+        self._stale = True
+
+    def set_relit(self, relit: bool) -> None:
+        """Show materials alone, as `refgs relight` does, or what was fitted; raises InputError as that does."""
+        if relit and self._relightable is None:
+            self._relightable = relightable(self.original)
+        self.relit = relit
+        self._rebuild()
+
+    def set_changes(self, changes: list[Change]) -> None:
+        """Show the scene after these edits, in order."""
+        self.changes = list(changes)
+        before = self.scene
+        scene = self._base()
+        for change in self.changes:
+            scene = change(scene)
+        self.scene = replace(before, surfels=scene.surfels)
+        self._stale = True
+
+    def _base(self) -> TrainedScene:
+        return self._relightable if self.relit and self._relightable is not None else self.original
+
+    def _rebuild(self) -> None:
+        self._put(self._base())
+        self.set_changes(self.changes)
+
+    def _put(self, scene: TrainedScene) -> None:
+        """Show a scene with a mesh of its own."""
+        self.scene = scene
+        self._occluder = Occluder(scene.mesh)
+        self._filter()
+
+    def _filter(self) -> None:
+        with dr.suspend_grad():
+            self._filtered = self.scene.shading.light_of(self.environment)
+        self._stale = True
+
+    @property
+    def light(self) -> Light | None:
+        """The light as it is turned. The angle is opaque, so that no kernel depends on it."""
+        if self._filtered is None:
+            return None
+        angle = math.radians(self.turn)
+        cos, sin = dr.opaque(mi.Float, math.cos(angle)), dr.opaque(mi.Float, math.sin(angle))
+        return RotatedLight(self._filtered, mi.Matrix3f([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]))
+
+    # ---------------- pictures ----------------
+
+    def frame(self, camera: Any, aovs: bool = False, settled: bool = True) -> Frame:
+        """A view, without derivatives; until it is `settled`, ambient shadows may be those of before."""
+        light = self.light
+        with dr.suspend_grad():
+            if self._stale and (settled or self._never):
+                prepare(self._occluder, self.scene.surfels, light, self.scene.shading.accuracy)
+                self._stale = False
+            return render(
+                self.scene.surfels,
+                camera,
+                self.scene.shading,
+                light,
+                self._occluder,
+                aovs=aovs,
+                normals=aovs,
+                surroundings=self.scene.surroundings,
+            )
+
+    @property
+    def _never(self) -> bool:
+        """Whether the mesh lacks what the shading asks for altogether."""
+        accuracy = self.scene.shading.accuracy
+        wanted = bool(accuracy.ambient_rays), bool(accuracy.traced_bounces)
+        there = self._occluder.ambient is not None, self._occluder.around is not None
+        return not self._occluder.empty and any(w and not t for w, t in zip(wanted, there, strict=True))
+
+    def draw(self, shot: Shot) -> Sampled:
+        """See `Source`."""
+        camera = shot.camera()
+        frame = self.frame(camera, shot.look.what != PICTURE, shot.settled)
+        with dr.suspend_grad():
+            return Sampled(planes_of(frame, camera, shot.look, self.light), frame.depth)

@@ -1,0 +1,224 @@
+"""The one thread that renders: for whoever looks, small pictures while something moves, better ones after.
+
+A picture is drawn in steps of one sample a pixel; what has changed meanwhile is seen between two of them, and
+what was under way is then dropped. Callbacks of the page run on other threads: they only leave a note here.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.viewer import quality
+from mi_refgs.viewer.compare import Compared
+from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
+from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.quality import COARSE, DONE, LARGE, NOTHING, SHOWN_AT
+from mi_refgs.viewer.source import Sampled, Shot, Source
+
+FAR = 160.0
+"""Depth that pages can show at most, scene units: viser packs it into 24 bits of 1e-5."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A picture for a page."""
+
+    image: np.ndarray  # (H, W, 3) uint8
+    shown: int  # how good it is, from quality.COARSE to quality.DONE
+    seconds: float  # that its last sample took
+    depth: np.ndarray | None = None  # (H, W) float32, where the page asked for it
+
+
+@dataclass(eq=False)
+class Visitor:
+    """One page: what it looks at, and how far its picture is."""
+
+    deliver: Callable[[Shown], None]
+    pose: Pose | None = None
+    window: tuple[int, int] = (0, 0)  # pixels
+    look: Look = field(default_factory=Look)
+    largest: int = quality.FINEST  # rung while nothing moves, at most
+    fixed: int | None = None  # rung while something moves; None: by the time that pictures take
+    depth: bool = False  # whether it wants depth
+    compared: Compared | None = None  # a test view that it shows beside its picture
+    side: int = quality.COARSEST  # rung of the next small picture
+    changed: float = -math.inf  # when its view or the scene changed last
+    version: int = 0  # of both
+    shown: int = DONE
+    sums: list[Any] = field(default_factory=list)  # planes, over samples of a smooth picture
+
+    def size(self, side: int) -> tuple[int, int]:
+        """Pixels of a rung in the shape of its window."""
+        return quality.size_of(side, quality.shape_of(*self.window))
+
+
+class Loop:
+    """Draws a source for visitors; `step` and `run` belong to the thread that renders, the rest to any."""
+
+    def __init__(self, source: Source, clock: Callable[[], float] = time.monotonic) -> None:
+        self.source, self.clock = source, clock
+        self.visitors: dict[int, Visitor] = {}
+        self.failed: Callable[[str], None] = lambda message: None  # told of bad input of a note
+        self.pictures = 0  # that were sent
+        self._notes: dict[Any, Callable[[], None]] = {}
+        self._wake = threading.Condition()
+        self._stopped = False
+
+    # ---------------- from any thread ----------------
+
+    def ask(self, key: Any, note: Callable[[], None], *, changes: bool = True) -> None:
+        """Let the renderer's thread call `note`; a later one with the same key takes its place.
+
+        `changes`: whether pictures are to be drawn again.
+        """
+
+        def whole() -> None:
+            note()
+            if changes:
+                self.change()
+
+        with self._wake:
+            self._notes[key] = whole
+            self._wake.notify()
+
+    def look(self, number: int, pose: Pose, window: tuple[int, int]) -> None:
+        """A visitor looks from there, with a window of so many pixels."""
+        with self._wake:
+            visitor = self.visitors.get(number)
+            if visitor is None:
+                return
+            visitor.pose, visitor.window = pose, window
+            self._restart(visitor)
+            self._wake.notify()
+
+    def change(self, **fields: Any) -> None:
+        """Every visitor's picture is old; sets these fields of all visitors."""
+        with self._wake:
+            for visitor in self.visitors.values():
+                for name, value in fields.items():
+                    setattr(visitor, name, value)
+                self._restart(visitor)
+            self._wake.notify()
+
+    def _restart(self, visitor: Visitor) -> None:
+        visitor.changed, visitor.shown, visitor.sums = self.clock(), NOTHING, []
+        visitor.version += 1
+
+    def enter(self, number: int, visitor: Visitor) -> None:
+        """A page is open."""
+        with self._wake:
+            self.visitors[number] = visitor
+
+    def leave(self, number: int) -> None:
+        """A page is closed."""
+        with self._wake:
+            self.visitors.pop(number, None)
+
+    def stop(self) -> None:
+        """Let `run` return."""
+        with self._wake:
+            self._stopped = True
+            self._wake.notify()
+
+    # ---------------- on the renderer's thread ----------------
+
+    def run(self) -> None:
+        """Draw until `stop`."""
+        while not self._stopped:
+            wait = self.step()
+            with self._wake:
+                if wait > 0 and not self._notes and not self._stopped:
+                    self._wake.wait(None if wait == math.inf else wait)
+
+    def step(self) -> float:
+        """Read the notes, then draw the sample that is due; returns the seconds until the next one is.
+
+        0 after a sample was drawn; inf while there is nothing to do.
+        """
+        with self._wake:
+            notes, self._notes = self._notes, {}
+        for note in notes.values():
+            try:
+                note()
+            except InputError as error:
+                self.failed(str(error))
+        now = self.clock()
+        waiting = [
+            (quality.due(v.shown, now - v.changed), v.shown, v)
+            for v in tuple(self.visitors.values())
+            if v.pose is not None
+        ]
+        if not waiting:
+            return math.inf
+        wait, _, visitor = min(waiting, key=lambda entry: entry[:2])  # who sees least goes first
+        if wait > 0:
+            return wait
+        self._advance(visitor)
+        return 0.0
+
+    def _advance(self, visitor: Visitor) -> None:
+        """Draw a visitor's next sample and send the picture, unless it is old by then."""
+        with self._wake:
+            version, shown, pose, compared = visitor.version, visitor.shown, visitor.pose, visitor.compared
+            sums = visitor.sums
+        assert pose is not None
+        begin = self.clock()
+        if compared is not None:
+            image, depth, reached = compared.picture(self.source, visitor.look, visitor.window), None, DONE
+        else:
+            still = quality.still_side(*visitor.window, visitor.largest)
+            moving = min(visitor.fixed or visitor.side, still)
+            side = moving if shown == NOTHING else still
+            reached = shown + 1 if shown >= LARGE else (LARGE if side == still else COARSE)
+            shot = self._shot(visitor, pose, side, reached)
+            sampled = self.source.draw(shot)
+            sums = added(sums if reached > LARGE else [], sampled.planes)
+            count = max(reached - LARGE, 1)
+            image = None
+            if reached <= LARGE or reached in SHOWN_AT:
+                mean = [plane / count for plane in sums] if count > 1 else sums
+                image = to_bytes(shown_planes(mean, visitor.look), shot.width, shot.height)
+            depth = self._depth(visitor, sampled, shot) if image is not None else None
+            dr.sync_thread()
+        taken = self.clock() - begin
+        with self._wake:
+            if visitor.version != version:
+                return
+            visitor.shown, visitor.sums = reached, sums if LARGE < reached < DONE else []
+            if compared is None and shown == NOTHING and visitor.fixed is None:
+                visitor.side = quality.moving_side(side, taken, still)
+        if image is not None:
+            self.pictures += 1
+            visitor.deliver(Shown(image, reached, taken, depth))
+
+    def _shot(self, visitor: Visitor, pose: Pose, side: int, reached: int) -> Shot:
+        width, height = visitor.size(side)
+        aspect = visitor.window[0] / max(visitor.window[1], 1)
+        index = max(reached - LARGE - 1, 0)
+        offset = quality.offsets()[index] if reached > LARGE else (0.0, 0.0)
+        pose = replace(pose, aspect=aspect)
+        return Shot(pose, width, height, visitor.look, offset, index, settled=reached >= LARGE)
+
+    def _depth(self, visitor: Visitor, sampled: Sampled, shot: Shot) -> np.ndarray | None:
+        if not visitor.depth or sampled.depth is None:
+            return None
+        depth = dr.select(sampled.depth > 0, sampled.depth, FAR) + dr.zeros(
+            type(sampled.depth), shot.width * shot.height
+        )
+        return np.array(depth.numpy(), dtype=np.float32).reshape(shot.height, shot.width)
+
+
+def added(sums: list[Any], planes: list[Any]) -> list[Any]:
+    """Sums of planes, evaluated."""
+    total = [a + b for a, b in zip(sums, planes, strict=True)] if sums else list(planes)
+    dr.eval(total)
+    return total
