@@ -27,6 +27,7 @@ from mi_refgs.cli import (
     relight,
     render,
     train,
+    view,
 )
 from mi_refgs.cli.command import Parser, Result, UnusableError, finite, prepare
 from mi_refgs.errors import InputError
@@ -56,6 +57,7 @@ def build_parser() -> Parser:
         edit,
         export,
         profile,
+        view,
         completion,
     ):
         module.add(commands)

@@ -1,1 +1,1 @@
-"""`refgs view`: a page to orbit a reconstruction on, drawn by the renderer itself. Needs viser (extra `view`)."""
+"""`refgs view`: a page to orbit a reconstruction on, drawn by the renderer itself."""

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.evaluation import metrics
-from mi_refgs.evaluation.pictures import planes, target
+from mi_refgs.evaluation.pictures import planes
 from mi_refgs.render.display import displayed
 from mi_refgs.viewer.develop import PICTURE, Look, shown_planes, to_bytes
 from mi_refgs.viewer.pose import Pose
@@ -28,22 +28,21 @@ class Compared:
 
     view: View
     data: Dataset
-    told: dict[str, Any] = field(default_factory=dict)  # psnr of the last picture drawn, if it is one
+    tell: Callable[[float | None], None]  # told the PSNR of each picture that is drawn, None of a variable
 
     def picture(self, source: Source, look: Look, window: tuple[int, int]) -> np.ndarray:
         """Both, as large as they fit into a window: 8-bit RGB of the window's shape."""
         view = self.view
         frame_of = getattr(source, "frame", None)
-        truth = np.clip(target(view), 0, 1)
+        truth = np.clip(view.displayed, 0, 1)
         if look.what == PICTURE and frame_of is not None:
             shown = displayed(frame_of(view.camera()), self.data.background, self.data.linear)
             ours = planes(shown, view.height, view.width)
-            self.told["psnr"] = metrics.psnr(ours, truth)
+            self.tell(metrics.psnr(ours, truth))
             drawn = to_8_bits(ours)
         else:
-            shot = Shot(
-                Pose.of_view(view), view.width, view.height, look, settled=True, exact=view.camera()
-            )
+            shot = Shot(Pose.of_view(view), view.width, view.height, look, settled=True, exact=view.camera())
+            self.tell(None)
             drawn = to_bytes(shown_planes(source.draw(shot).planes, look), view.width, view.height)
         return side_by_side([to_8_bits(truth), drawn], window)
 

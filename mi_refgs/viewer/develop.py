@@ -90,4 +90,3 @@ def to_bytes(shown: list[Any], width: int, height: int) -> np.ndarray:
         packed |= mi.UInt32(dr.clip(plane, 0, 1) * 255 + 0.5) << (8 * index)
     pixels = np.array(packed.numpy(), dtype="<u4").view(np.uint8)
     return np.ascontiguousarray(pixels.reshape(height, width, 4)[..., :3])
-

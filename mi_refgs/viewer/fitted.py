@@ -53,6 +53,8 @@ def variables_of(scene: TrainedScene) -> tuple[str, ...]:
 class Fitted:
     """A `TrainedScene` of which parts change. What costs time is made again only where it has to be."""
 
+    square_pixels = False
+
     def __init__(self, scene: TrainedScene, region: Region | None = None) -> None:
         """Show the scene as it is; `region` is what its data set is about."""
         self.original = scene

@@ -56,9 +56,11 @@ class Visitor:
     shown: int = DONE
     sums: list[Any] = field(default_factory=list)  # planes, over samples of a smooth picture
 
-    def size(self, side: int) -> tuple[int, int]:
-        """Pixels of a rung in the shape of its window."""
-        return quality.size_of(side, quality.shape_of(*self.window))
+    def size(self, side: int, square: bool) -> tuple[int, int]:
+        """Pixels of a rung in the shape of its window; if they are `square`, in exactly that shape."""
+        width, height = self.window
+        exact = max(width, 1) / max(height, 1)
+        return quality.size_of(side, exact if square else quality.shape_of(width, height))
 
 
 class Loop:
@@ -100,10 +102,10 @@ class Loop:
             self._restart(visitor)
             self._wake.notify()
 
-    def change(self, **fields: Any) -> None:
-        """Every visitor's picture is old; sets these fields of all visitors."""
+    def change(self, number: int | None = None, **fields: Any) -> None:
+        """The picture of a visitor, or of all, is old; sets these fields of it."""
         with self._wake:
-            for visitor in self.visitors.values():
+            for visitor in (v for n, v in self.visitors.items() if number in (None, n)):
                 for name, value in fields.items():
                     setattr(visitor, name, value)
                 self._restart(visitor)
@@ -185,7 +187,8 @@ class Loop:
             count = max(reached - LARGE, 1)
             image = None
             if reached <= LARGE or reached in SHOWN_AT:
-                mean = [plane / count for plane in sums] if count > 1 else sums
+                share = dr.opaque(type(sums[0]), 1 / count)
+                mean = [plane * share for plane in sums] if count > 1 else sums
                 image = to_bytes(shown_planes(mean, visitor.look), shot.width, shot.height)
             depth = self._depth(visitor, sampled, shot) if image is not None else None
             dr.sync_thread()
@@ -201,7 +204,7 @@ class Loop:
             visitor.deliver(Shown(image, reached, taken, depth))
 
     def _shot(self, visitor: Visitor, pose: Pose, side: int, reached: int) -> Shot:
-        width, height = visitor.size(side)
+        width, height = visitor.size(side, self.source.square_pixels)
         aspect = visitor.window[0] / max(visitor.window[1], 1)
         index = max(reached - LARGE - 1, 0)
         offset = quality.offsets()[index] if reached > LARGE else (0.0, 0.0)

@@ -26,9 +26,7 @@ class Pose:
     near: float = 0.0  # depth of the near plane, scene units
 
     @staticmethod
-    def of_page(
-        wxyz: np.ndarray, position: np.ndarray, fov: float, aspect: float, near: float = 0.0
-    ) -> Pose:
+    def of_page(wxyz: np.ndarray, position: np.ndarray, fov: float, aspect: float, near: float = 0.0) -> Pose:
         """From the numbers of a viser camera: a unit quaternion of OpenCV's axes, w first, and a position."""
         w, x, y, z = (float(c) for c in np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz))
         matrix = np.eye(4)
@@ -66,12 +64,10 @@ class Pose:
         along = float((centre - self.position) @ self.forward)
         return self.position + max(along, 1e-3 * float(np.linalg.norm(centre - self.position))) * self.forward
 
-    def near_to(self, other: Pose, tolerance: float) -> bool:
-        """Whether both see the same: positions to a part of the distance, axes to the same angle."""
-        scale = max(float(np.linalg.norm(self.position)), 1e-9)
-        moved = float(np.linalg.norm(self.position - other.position)) / scale
-        turned = float(np.linalg.norm(self.forward - other.forward))
-        return max(moved, turned, abs(self.fov - other.fov)) <= tolerance
+    def apart(self, other: Pose, distance: float) -> float:
+        """How far two views differ: positions in parts of a distance, axes and fields of view in radians."""
+        moved = float(np.linalg.norm(self.position - other.position)) / max(distance, 1e-9)
+        return max(moved, float(np.linalg.norm(self.forward - other.forward)), abs(self.fov - other.fov))
 
     def camera(self, width: int, height: int, offset: tuple[float, float] = (0.0, 0.0)) -> Camera:
         """The renderer's camera of this many pixels, whose samples lie `offset` pixels off the centres."""
@@ -110,3 +106,16 @@ def up_of(views: list[View]) -> np.ndarray:
     if length < 0.5 or mean[2] / length > UP_TOLERANCE:
         return z
     return np.asarray(mean / length)
+
+
+def page_rotation(pose: Pose) -> np.ndarray:
+    """The unit quaternion (4,), w first, of viser's axes, which are OpenCV's."""
+    m = (pose.to_world @ MITSUBA_FROM_OPENCV)[:3, :3]
+    # The largest of the four squares is at least 1/4, so that nothing small is divided by.
+    squares = np.array([1 + m[0, 0] + m[1, 1] + m[2, 2], *(1 + 2 * m[i, i] - np.trace(m) for i in range(3))])
+    first = int(np.argmax(squares))
+    x, y, z = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    rows = ((squares[0], x, y, z), (x, squares[1], xy, xz), (y, xy, squares[2], yz), (z, xz, yz, squares[3]))
+    row = np.array(rows[first], dtype=np.float64)
+    return np.asarray(row / np.linalg.norm(row))

@@ -77,7 +77,7 @@ def due(shown: int, since: float) -> float:
 
 
 def offsets() -> Sequence[tuple[float, float]]:
-    """Places of the samples in a pixel, from its centre, in pixels: each run of four has one in every quarter."""
+    """Places of the samples in a pixel, from its centre, in pixels; each four in turn lie in all quarters."""
     places = [((i + 0.5) / GRID - 0.5) for i in range(GRID)]
     half = GRID // 2
     quarter = [(x, y) for y in range(half) for x in range(half)]

@@ -49,6 +49,8 @@ class Source(Protocol):
     """World point (3,) that cameras turn around."""
     radius: float
     """Of the object around it, scene units."""
+    square_pixels: bool
+    """Whether its pixels must be square, whatever sizes that gives."""
 
     def draw(self, shot: Shot) -> Sampled:
         """One sample of every pixel."""

@@ -1,0 +1,83 @@
+"""The mesh and the training cameras, drawn by the page itself over the picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.viewer.page import Page
+from mi_refgs.viewer.pose import Pose, page_rotation
+
+FRUSTUM = 0.08
+"""Size of a camera's frustum, in radii of the object."""
+THICKNESS = 1.5
+"""Of its lines, pixels."""
+TRAINING, TEST = (90, 160, 255), (255, 160, 60)
+"""Colours of cameras."""
+MESH_COLOUR, MESH_OPACITY = (200, 200, 205), 0.55
+
+
+def add(page: Page, mesh: Mesh | None) -> None:
+    """Add the controls, as far as there is something to show."""
+    gui = page.server.gui
+    if mesh is None and not page.views.all:
+        return
+    with gui.add_folder("Overlays"):
+        if mesh is not None and len(mesh.faces):
+            shown = gui.add_checkbox("Mesh", False, hint="The occluder of reflections.")
+            toggles(shown, lambda: [add_mesh(page, mesh)])
+        if page.views.all:
+            cameras = gui.add_checkbox("Cameras", False, hint="Blue: training, orange: test.")
+            toggles(cameras, lambda: add_cameras(page))
+            cameras.on_update(lambda _: page.set(depth=cameras.value))
+
+
+def toggles(box: Any, make: Any) -> None:
+    """Nodes that are made when a box is first ticked, and shown while it is."""
+    nodes: list[Any] = []
+
+    @box.on_update
+    def _(_: Any) -> None:
+        if box.value and not nodes:
+            nodes.extend(make())
+        for node in nodes:
+            node.visible = box.value
+
+
+def add_mesh(page: Page, mesh: Mesh) -> Any:
+    """The node of a mesh."""
+    return page.server.scene.add_mesh_simple(
+        "/mesh",
+        mesh.vertices,
+        mesh.faces,
+        color=MESH_COLOUR,
+        opacity=MESH_OPACITY,
+        flat_shading=True,
+        side="double",
+        cast_shadow=False,
+        receive_shadow=False,
+    )
+
+
+def add_cameras(page: Page) -> list[Any]:
+    """The nodes of all cameras."""
+    nodes = []
+    for split, data, colour in (("train", page.views.train, TRAINING), ("test", page.views.test, TEST)):
+        for index, view in enumerate(data.views if data is not None else ()):
+            pose = Pose.of_view(view)
+            nodes.append(
+                page.server.scene.add_camera_frustum(
+                    f"/cameras/{split}/{index}",
+                    pose.fov,
+                    pose.aspect,
+                    scale=FRUSTUM * page.source.radius,
+                    thickness=THICKNESS,
+                    thickness_units="screen",
+                    color=colour,
+                    wxyz=page_rotation(pose),
+                    position=pose.position,
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+            )
+    return nodes

@@ -1,0 +1,103 @@
+"""Save what is seen: as PNG, as EXR, as a camera."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refgs.exr import write_exr
+from mi_refgs.files import make_folder, write_json
+from mi_refgs.images import straight_srgb, write_png
+from mi_refgs.viewer import quality
+from mi_refgs.viewer.develop import PICTURE, Look, shown_planes
+from mi_refgs.viewer.loop import added
+from mi_refgs.viewer.page import Page
+from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.source import Shot, Source
+
+NUMBERED = re.compile(r"view_(\d+)\.")
+CAMERA = ".json"
+
+
+def add(page: Page) -> None:
+    """Add the controls."""
+    gui = page.server.gui
+    with gui.add_folder("Save"):
+        buttons = {
+            suffix: gui.add_button(label, hint=hint)
+            for suffix, label, hint in (
+                (".png", "PNG", "The view as it is shown, 16 samples a pixel, with its camera beside it."),
+                (".exr", "EXR", "Linear radiance and alpha, or the variable, with its camera beside it."),
+                (CAMERA, "Camera", "A transforms file of this one view."),
+            )
+        }
+        saved = gui.add_markdown(f"into {page.views_folder}")
+
+    def save(suffix: str, number: int) -> None:
+        visitor = page.loop.visitors.get(number)
+        if visitor is None or visitor.pose is None:
+            return
+        path = write_view(page.source, visitor.pose, visitor.window, visitor.look, page.views_folder, suffix)
+        saved.content = f"saved {path}"
+
+    for suffix, button in buttons.items():
+
+        @button.on_click
+        def _(event: Any, suffix: str = suffix) -> None:
+            number = event.client.client_id
+            page.loop.ask(("save", suffix), lambda: save(suffix, number), changes=False)
+
+
+def write_view(
+    source: Source, pose: Pose, window: tuple[int, int], look: Look, folder: Path, suffix: str
+) -> Path:
+    """Write the next numbered view in a folder, and its camera; returns the path of the picture, or of that.
+
+    Raises InputError if it cannot be written.
+    """
+    make_folder(folder)
+    taken = [int(found[1]) for path in folder.iterdir() if (found := NUMBERED.match(path.name))]
+    stem = f"view_{max(taken, default=-1) + 1:03d}"
+    camera = folder / f"{stem}{CAMERA}"
+    if suffix != CAMERA:
+        planes = smooth_planes(source, pose, window, look)
+        write_picture(folder / f"{stem}{suffix}", planes, window, look)
+    write_json(camera, pose.transforms(*window, stem))
+    return camera if suffix == CAMERA else folder / f"{stem}{suffix}"
+
+
+def smooth_planes(source: Source, pose: Pose, window: tuple[int, int], look: Look) -> list[Any]:
+    """The mean of all samples of a picture with the window's own pixels."""
+    sums: list[Any] = []
+    for index, offset in enumerate(quality.offsets()):
+        shot = Shot(pose, *window, look, offset, index, settled=True)
+        sums = added(sums, source.draw(shot).planes)
+    return [plane / quality.SAMPLES for plane in sums]
+
+
+def write_picture(path: Path, planes: list[Any], window: tuple[int, int], look: Look) -> None:
+    """Write planes of `develop.planes_of` as PNG, as they are shown, or as EXR, linear."""
+    straight = look.what == PICTURE and len(planes) == 4  # nothing of its own behind it
+    if path.suffix == ".exr":
+        if look.what == PICTURE and not straight:
+            radiance = [a + (1 - planes[3]) * b for a, b in zip(planes[:3], planes[4:], strict=True)]
+            planes = [*radiance, dr.ones(type(planes[3]))]
+        names = {2: "YA", 4: "RGBA"}[len(planes)]
+        write_exr(path, stacked(planes, window), names)
+    elif straight:
+        rgba = stacked(planes, window)
+        rgba[..., :3] *= np.float32(2.0**look.exposure)
+        write_png(path, straight_srgb(rgba))
+    else:
+        write_png(path, stacked(shown_planes(planes, look), window))
+
+
+def stacked(planes: list[Any], window: tuple[int, int]) -> np.ndarray:
+    """Planes as an array (H, W, C) float32."""
+    width, height = window
+    full = [np.broadcast_to(np.array(plane, np.float32).ravel(), width * height) for plane in planes]
+    return np.stack(full, axis=-1).reshape(height, width, len(planes))

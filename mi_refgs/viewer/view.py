@@ -1,0 +1,100 @@
+"""`refgs view`: everything ready before the page is served, then pictures until it is stopped."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import drjit as dr
+
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.picture_store import undecoded
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation.evaluate import load_split
+from mi_refgs.runs.export import MODEL, TrainedScene, load_if_newer
+from mi_refgs.runs.run import DATASET, Run
+from mi_refgs.viewer import quality
+from mi_refgs.viewer.controls import light, look, materials, overlays, saving, tests
+from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
+from mi_refgs.viewer.fitted import Fitted
+from mi_refgs.viewer.loop import added
+from mi_refgs.viewer.page import Page, Views, require_free, require_viser
+from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.source import Shot, Source
+
+USUAL_SHAPE = 1.6
+"""Shape of the pictures that are compiled before a page asks: that of a desktop window."""
+
+Tell = Callable[[str], None]
+
+
+def page_of_run(
+    run: Run, host: str, port: int, output: Path | None = None, data: Path | None = None, tell: Tell = print
+) -> Page:
+    """A page of a run, ready to be opened, with the views of its data set as far as they are there.
+
+    Nothing is written into the run. Raises InputError for a folder that is no run or holds no fit, for a port
+    that is taken, and without viser.
+    """
+    require_viser()
+    require_free(host, port)
+    views = views_of(run, data, tell)
+    some = views.test or views.train
+    scene = scene_of(run)
+    source = Fitted(scene, None if some is None else some.region)
+    page = Page(source, views, run.path.resolve().name, host, port, output or run.path / "views")
+    page.side = warm_up(source, page.look, page.start(), tell)
+    look.add(page)
+    light.add(page, source)
+    materials.add(page, source)
+    overlays.add(page, scene.mesh)
+    tests.add(page)
+    saving.add(page)
+    page.listen()
+    return page
+
+
+def scene_of(run: Run) -> TrainedScene:
+    """What a run's newest checkpoint holds, else its artefacts; raises InputError if there are neither."""
+    fresh = load_if_newer(run, run.method())
+    if fresh is not None:
+        return fresh
+    if not (run.path / MODEL).is_file():
+        raise InputError(f"{run.path}: checkpoints: none yet; train it with `refgs train DATA -o {run.path}`")
+    return TrainedScene.read(run.path)
+
+
+def views_of(run: Run, data: Path | None, tell: Tell) -> Views:
+    """The views of a run's data set, or of that in `data`; without what cannot be read, which is told."""
+    method, found = run.method(), Views()
+    if data is None and not (run.path / DATASET).is_file():
+        return found
+    for split in ("train", "test"):
+        try:
+            with undecoded():
+                some: Dataset = load_split(run, method, split, data)
+            found = dataclasses.replace(found, **{split: some})
+        except InputError as error:
+            if data is not None:
+                raise
+            tell(f"{error}; shown without {split} views")
+    return found
+
+
+def warm_up(source: Source, look: Look, pose: Pose, tell: Tell) -> int:
+    """Compile the kernels of all sizes that a desktop window needs; returns the rung to begin moving at."""
+    tell("preparing: compiling for each size of picture")
+    chosen = quality.COARSEST
+    for side in (s for s in quality.SIDES if s <= quality.FINEST):
+        shot = Shot(pose, *quality.size_of(side, USUAL_SHAPE), look, settled=True)
+        seconds = 0.0
+        for _ in range(2):
+            begin = time.monotonic()
+            planes = added(added([], source.draw(shot).planes), source.draw(shot).planes)
+            to_bytes(shown_planes(planes, look), shot.width, shot.height)
+            seconds = (time.monotonic() - begin) / 2  # two samples
+        chosen = side if seconds < quality.SLOW else chosen
+    dr.sync_thread()
+    return chosen
