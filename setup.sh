@@ -6,7 +6,7 @@
 #   bash setup.sh test    set up with the development tools, then run every check
 #
 # Needs Python 3.11 or newer; PYTHON=... names another one than python3. Missing system packages (libllvm19, libatomic1,
-# python3-venv) are installed when this runs as root or sudo asks for no password; else the line to type is printed.
+# python3-venv; for the tests chromium) are installed when this runs as root or sudo asks for no password; else the line to type is printed.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 
@@ -52,6 +52,9 @@ if [ "$(uname)" = "Linux" ]; then
     "$python" -c 'import ctypes; ctypes.CDLL("libatomic.so.1")' 2> /dev/null || missing+=(libatomic1)
 fi
 "$python" -c 'import ensurepip, venv' 2> /dev/null || missing+=(python3-venv)
+if [ "$mode" = test ] && ! command -v chromium chromium-browser google-chrome > /dev/null; then
+    missing+=(chromium)  # tests/test_viewer.py opens pages in it
+fi
 if [ ${#missing[@]} -gt 0 ]; then
     install_packages "${missing[@]}"
     found=$("$python" -P mi_refgs/llvm.py) || fail "$found"

@@ -38,6 +38,7 @@ COMMANDS = (
     "relight",
     "export",
     "profile",
+    "view",
 )
 ARTEFACTS = ("surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "config.toml", "metrics.jsonl")
 

@@ -87,6 +87,8 @@ LAYERS: dict[str, set[str]] = {
     "editing": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
     "reconstruct": {"methods", "fitting", "evaluation", "plugins", "reconstruction", "errors"},
     "profiling": RENDERER | {"methods", "data", "fitting"},
+    "viewer": RENDERER
+    | {"methods", "data", "runs", "fitting", "evaluation", "relighting", "plugins", "editing"},
     "compare": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", ""},
     "doctor": {"llvm", "errors", ""},
     "cli": RENDERER
@@ -97,6 +99,7 @@ LAYERS: dict[str, set[str]] = {
         "fitting",
         "evaluation",
         "formats",
+        "viewer",
         "relighting",
         "reconstruct",
         "reconstruction",

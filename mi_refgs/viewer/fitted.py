@@ -46,7 +46,7 @@ def variables_of(scene: TrainedScene) -> tuple[str, ...]:
     """The picture and the variables that the scene has."""
     maps = [name for name in scene.surfels.raw if CHANNELS[name].aov]
     traced = ["visibility"] if scene.shading.occlusion else []
-    terms = TERMS if scene.shading.model.light != "none" else ()
+    terms = () if scene.shading.model.light == "none" else TERMS if traced else TERMS[:2]
     return (PICTURE, *maps, "normal", "depth", "alpha", *traced, *terms)
 
 
@@ -54,6 +54,7 @@ class Fitted:
     """A `TrainedScene` of which parts change. What costs time is made again only where it has to be."""
 
     square_pixels = False
+    scene: TrainedScene
 
     def __init__(self, scene: TrainedScene, region: Region | None = None) -> None:
         """Show the scene as it is; `region` is what its data set is about."""
@@ -110,7 +111,7 @@ class Fitted:
         self._stale = True
 
     def set_relit(self, relit: bool) -> None:
-        """Show materials alone, as `refgs relight` does, or what was fitted; raises InputError as that does."""
+        """Show materials alone, as `refgs relight` does, or what was fitted; InputError as that raises."""
         if relit and self._relightable is None:
             self._relightable = relightable(self.original)
         self.relit = relit

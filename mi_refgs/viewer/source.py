@@ -41,10 +41,14 @@ class Sampled:
 class Source(Protocol):
     """A scene as a page shows it. All but the constants is called on one thread, that of the loop."""
 
-    variables: tuple[str, ...]
-    """`develop.PICTURE` and the types of `plugins.aovs` that it has."""
-    backdrops: tuple[str, ...]
-    """Names in `develop.BACKDROPS`, and `develop.LIGHT_BEHIND`, that show; empty where nothing is behind."""
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """`develop.PICTURE` and the types of `plugins.aovs` that it has."""
+
+    @property
+    def backdrops(self) -> tuple[str, ...]:
+        """Names in `develop.BACKDROPS`, and `develop.LIGHT_BEHIND`, that show; empty where none does."""
+
     centre: np.ndarray
     """World point (3,) that cameras turn around."""
     radius: float

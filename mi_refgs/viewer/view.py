@@ -16,7 +16,7 @@ from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.runs.export import MODEL, TrainedScene, load_if_newer
 from mi_refgs.runs.run import DATASET, Run
 from mi_refgs.viewer import quality
-from mi_refgs.viewer.controls import light, look, materials, overlays, saving, tests
+from mi_refgs.viewer.controls import light, look, materials, overlays, saving, truth
 from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
 from mi_refgs.viewer.fitted import Fitted
 from mi_refgs.viewer.loop import added
@@ -50,7 +50,7 @@ def page_of_run(
     light.add(page, source)
     materials.add(page, source)
     overlays.add(page, scene.mesh)
-    tests.add(page)
+    truth.add(page)
     saving.add(page)
     page.listen()
     return page

@@ -32,9 +32,8 @@ def add(page: Page) -> None:
             (AUTOMATIC, *sizes),
             hint="Pixels while something moves: as many as can be drawn 20 times a second, or these.",
         )
-        still = gui.add_dropdown(
-            "Still", tuple(sizes), initial_value=f"{quality.FINEST}²", hint="Most pixels at rest."
-        )
+        finest = f"{quality.FINEST}²"
+        still = gui.add_dropdown("Still", tuple(sizes), initial_value=finest, hint="Most pixels at rest.")
 
     what.on_update(lambda _: page.set(what=what.value))
     exposure.on_update(lambda _: page.set(exposure=float(exposure.value)))

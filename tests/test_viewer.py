@@ -1,0 +1,404 @@
+"""`refgs view` without a browser: sizes and times of pictures, cameras, the loop, the scene that it shows."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation.pictures import planes
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.relightable import relightable
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.surfels.table import Surfels
+from mi_refgs.viewer import quality
+from mi_refgs.viewer.compare import AROUND, GAP, side_by_side
+from mi_refgs.viewer.controls.saving import write_view
+from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
+from mi_refgs.viewer.fitted import Fitted
+from mi_refgs.viewer.loop import Loop, Shown, Visitor
+from mi_refgs.viewer.pose import Pose, page_rotation
+from mi_refgs.viewer.quality import COARSE, DONE, LARGE, NOTHING
+from mi_refgs.viewer.source import Sampled, Shot
+
+
+@pytest.fixture(scope="module")
+def scene(finished: Path) -> TrainedScene:
+    """The tiny run, with an opacity that is worth looking at."""
+    mi.set_variant("llvm_ad_rgb")
+    return TrainedScene.read(finished)
+
+
+# ---------------- how large, and when ----------------
+
+
+def test_sizes_are_few_and_of_the_area_that_they_are_named_for() -> None:
+    assert quality.size_of(800, 1.0) == (800, 800)
+    for side, shape in itertools.product(quality.SIDES, quality.SHAPES):
+        width, height = quality.size_of(side, shape)
+        assert width % quality.MULTIPLE == height % quality.MULTIPLE == 0
+        assert width * height == pytest.approx(side * side, rel=0.04)
+        assert width / height == pytest.approx(shape, rel=0.04)
+
+
+def test_a_window_gets_the_nearest_shape_and_the_nearest_area() -> None:
+    assert [quality.shape_of(*w) for w in ((1280, 800), (1920, 1000), (800, 800), (400, 900))] == [
+        1.6,
+        1.6,
+        1.0,
+        0.625,
+    ]
+    assert quality.still_side(800, 800) == 800
+    assert quality.still_side(300, 200) == 283
+    assert quality.still_side(3840, 2160) == quality.FINEST
+    assert quality.still_side(3840, 2160, 400) == 400
+
+
+def test_moving_pictures_get_as_large_as_there_is_time_for() -> None:
+    assert quality.moving_side(283, 0.1, 1131) == 200
+    assert quality.moving_side(283, 0.03, 1131) == 283
+    assert quality.moving_side(283, 0.005, 1131) == 400
+    assert quality.moving_side(quality.COARSEST, 9.0, 1131) == quality.COARSEST
+    assert quality.moving_side(566, 0.001, 566) == 566
+
+
+def test_pictures_are_due_at_once_then_when_it_is_still_then_until_they_are_smooth() -> None:
+    assert quality.due(NOTHING, 0.0) == 0
+    assert quality.due(COARSE, 0.05) == pytest.approx(quality.STILL_AFTER - 0.05)
+    assert quality.due(COARSE, 1.0) == 0
+    assert quality.due(LARGE, 0.1) == pytest.approx(quality.SMOOTH_AFTER - 0.1)
+    assert quality.due(LARGE + 3, 1.0) == 0
+    assert quality.due(DONE, 99.0) == math.inf
+
+
+def test_samples_are_a_raster_of_which_each_four_lie_in_all_quarters() -> None:
+    places = np.array(quality.offsets())
+    grid = (np.arange(4) + 0.5) / 4 - 0.5
+    assert {tuple(p) for p in places} == set(itertools.product(grid, grid))
+    for four in places.reshape(4, 4, 2):
+        assert len({tuple(quarter) for quarter in four > 0}) == 4
+
+
+# ---------------- cameras ----------------
+
+
+def test_a_page_that_looks_as_a_test_view_does_sees_its_picture(scene: TrainedScene, data: Path) -> None:
+    view = read_dataset(data, "test").views[0]
+    pose = Pose.of_view(view)
+    back = Pose.of_page(page_rotation(pose), pose.position, pose.fov, pose.aspect, view.near)
+    assert np.abs(back.to_world - view.to_world).max() < 1e-12
+    draw = scene.renderer(aovs=False)
+    wanted = planes(draw(view.camera()).radiance, view.height, view.width)
+    found = planes(draw(back.camera(view.width, view.height)).radiance, view.height, view.width)
+    assert wanted.max() > 0.1
+    assert np.abs(found - wanted).max() < 1e-5
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 2, 3)])
+@pytest.mark.parametrize("degrees", [0, 90, 179.9, 180, 270])
+def test_every_rotation_survives_the_page(axis: tuple[int, int, int], degrees: float) -> None:
+    matrix = np.array(mi.ScalarTransform4f().rotate(axis, degrees).matrix, np.float64)
+    matrix[:3, :3] = np.linalg.qr(matrix[:3, :3])[0] * np.sign(np.diag(np.linalg.qr(matrix[:3, :3])[1]))
+    pose = Pose(matrix, 0.7, 1.0)
+    again = Pose.of_page(page_rotation(pose), pose.position, 0.7, 1.0)
+    assert np.abs(again.to_world - pose.to_world).max() < 1e-9
+
+
+def test_oblong_pixels_see_what_square_ones_see() -> None:
+    pose = Pose(np.eye(4), 0.8, 2.0)
+    for width, height in ((160, 80), (128, 100)):
+        camera = pose.camera(width, height)
+        slope_x, slope_y = width / 2 / abs(camera.fx[0]), height / 2 / abs(camera.fy[0])
+        assert slope_y == pytest.approx(math.tan(0.4))
+        assert slope_x == pytest.approx(2 * math.tan(0.4))
+
+
+def test_an_offset_moves_the_sample_that_way() -> None:
+    x, y = Pose(np.eye(4), 0.8, 1.0).camera(8, 8, (0.25, -0.125)).rays().numpy()[:2].reshape(2, 8, 8)
+    x0, y0 = Pose(np.eye(4), 0.8, 1.0).camera(8, 8).rays().numpy()[:2].reshape(2, 8, 8)
+    step_x, step_y = x0[0, 1] - x0[0, 0], y0[1, 0] - y0[0, 0]
+    assert np.allclose(x - x0, 0.25 * step_x, atol=1e-6)
+    assert np.allclose(y - y0, -0.125 * step_y, atol=1e-6)
+
+
+# ---------------- the loop ----------------
+
+
+class Plain:
+    """A source of one grey, which says what it was asked for."""
+
+    variables: tuple[str, ...] = ("picture",)
+    backdrops: tuple[str, ...] = ("white",)
+    centre, radius, square_pixels = np.zeros(3), 1.0, False
+
+    def __init__(self) -> None:
+        self.shots: list[Shot] = []
+        self.grey = 0.25
+        self.during: Any = None
+
+    def draw(self, shot: Shot) -> Sampled:
+        self.shots.append(shot)
+        if self.during is not None:
+            self.during()
+        one = mi.Float(1)
+        return Sampled([one * self.grey] * 3 + [one])
+
+
+class Clock:
+    """Time that passes when it is told to."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def running() -> Iterator[tuple[Loop, Plain, Clock, list[Shown]]]:
+    """A loop with one visitor, who looks at nothing yet."""
+    source, clock, seen = Plain(), Clock(), []  # type: ignore[var-annotated]
+    loop = Loop(source, clock)
+    loop.enter(7, Visitor(seen.append))
+    yield loop, source, clock, seen
+
+
+POSE = Pose(np.eye(4), 0.7, 1.0)
+
+
+def test_the_loop_waits_draws_small_then_large_then_smooth(running: Any) -> None:
+    loop, source, clock, seen = running
+    assert loop.step() == math.inf
+    loop.look(7, POSE, (640, 400))
+    assert loop.step() == 0
+    assert loop.step() == pytest.approx(quality.STILL_AFTER)
+    clock.now += quality.STILL_AFTER + 1e-6
+    assert loop.step() == 0
+    assert loop.step() == pytest.approx(quality.SMOOTH_AFTER - quality.STILL_AFTER, abs=1e-5)
+    clock.now += 1
+    for _ in range(quality.SAMPLES):
+        assert loop.step() == 0
+    assert loop.step() == math.inf
+    assert [s.shown for s in seen] == [COARSE, LARGE, LARGE + 4, DONE]
+    small, large = quality.size_of(quality.COARSEST, 1.6), quality.size_of(quality.still_side(640, 400), 1.6)
+    assert [s.image.shape[1::-1] for s in seen] == [small, large, large, large]
+    assert [shot.offset for shot in source.shots[2:]] == list(quality.offsets())
+    assert [shot.settled for shot in source.shots] == [False] + [True] * 17
+
+
+def test_what_moves_meanwhile_drops_what_was_under_way(running: Any) -> None:
+    loop, source, clock, seen = running
+    loop.look(7, POSE, (640, 400))
+    loop.step()
+    clock.now += 1
+    source.during = lambda: loop.look(7, replace(POSE, fov=0.8), (640, 400))
+    loop.step()  # a large picture, of the view before
+    source.during = None
+    assert [s.shown for s in seen] == [COARSE]
+    loop.step()
+    assert [s.shown for s in seen] == [COARSE, COARSE]
+    assert source.shots[-1].pose.fov == 0.8
+
+
+def test_a_smooth_picture_is_the_mean_of_its_samples_and_starts_anew_after_a_change(running: Any) -> None:
+    loop, source, clock, seen = running
+    loop.look(7, POSE, (640, 400))
+    loop.step()
+    clock.now += 1
+    for grey in (9.0, *[0.1, 0.3] * 8):
+        source.grey = grey
+        loop.step()
+    encoded = 255 * (1.055 * 0.2 ** (1 / 2.4) - 0.055)
+    assert seen[-1].shown == DONE
+    assert abs(int(seen[-1].image[0, 0, 0]) - encoded) <= 0.51
+    loop.change()
+    source.grey = 0.5
+    loop.step()
+    clock.now += 1
+    for _ in range(17):
+        loop.step()
+    encoded = 255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055)
+    assert abs(int(seen[-1].image[0, 0, 0]) - encoded) <= 0.51
+
+
+def test_notes_run_once_the_last_of_a_key_wins_and_bad_input_is_told(running: Any) -> None:
+    loop, _, _, seen = running
+    told: list[str] = []
+    loop.failed = told.append
+
+    def bad() -> None:
+        raise InputError("no such thing")
+
+    done: list[int] = []
+    loop.look(7, POSE, (640, 400))
+    loop.step()
+    loop.ask("a", lambda: done.append(1))
+    loop.ask("a", lambda: done.append(2))
+    loop.ask("b", bad)
+    loop.step()
+    loop.step()
+    assert (done, told) == ([2], ["no such thing"])
+    assert [s.shown for s in seen] == [COARSE, COARSE]  # the first note changed what is seen
+
+
+def test_who_sees_least_goes_first_and_who_left_is_forgotten(running: Any) -> None:
+    loop, _, clock, seen = running
+    other: list[Shown] = []
+    loop.look(7, POSE, (640, 400))
+    loop.step()
+    clock.now += 1
+    loop.enter(8, Visitor(other.append))
+    loop.look(8, POSE, (640, 400))
+    loop.step()
+    assert (len(seen), len(other)) == (1, 1)
+    loop.leave(7)
+    clock.now += 1
+    for _ in range(30):
+        loop.step()
+    assert (len(seen), other[-1].shown) == (1, DONE)
+
+
+# ---------------- the scene that is shown ----------------
+
+
+def shown(source: Fitted, look: Look, size: int = 20) -> np.ndarray:
+    """A picture of the tiny scene from a side."""
+    pose = Pose.of_page(np.array([0.5, -0.5, 0.5, -0.5]), np.array([-1.5, 0, 0]), 0.8, 1.0)
+    shot = Shot(pose, size, size, look, settled=True)
+    return to_bytes(shown_planes(source.draw(shot).planes, look), size, size).astype(int)
+
+
+def test_every_variable_that_a_scene_has_is_drawn(scene: TrainedScene) -> None:
+    source = Fitted(scene)
+    assert source.variables == (
+        "picture",
+        "albedo",
+        "metallic",
+        "roughness",
+        "normal",
+        "depth",
+        "alpha",
+        "visibility",
+        "diffuse",
+        "specular",
+        "indirect",
+    )
+    for name in source.variables:
+        picture = shown(source, Look(name, depths=(1.0, 2.0)))
+        assert picture.shape == (20, 20, 3), name
+        if name not in ("visibility", "indirect"):  # nothing stands in the way of this light
+            assert np.ptp(picture) > 0, name
+
+
+def test_the_light_turns_by_the_angle_that_is_asked_for(scene: TrainedScene) -> None:
+    source = Fitted(scene)
+    before = shown(source, Look())
+    source.set_turn(90)
+    # Directions of the world are turned back by the angle before the map is asked.
+    x = source.light.radiance(mi.Vector3f(0, 1, 0)).numpy()  # type: ignore[union-attr]
+    assert np.allclose(x, scene.light.prefilter().radiance(mi.Vector3f(1, 0, 0)).numpy(), rtol=1e-4)  # type: ignore[union-attr]
+    assert np.abs(shown(source, Look()) - before).max() > 3
+    source.set_turn(0)
+    assert np.array_equal(shown(source, Look()), before)
+    source.set_light(EnvironmentLight.constant(3.0, 8))
+    assert np.abs(shown(source, Look()) - before).max() > 3
+    source.set_light(None)
+    assert np.array_equal(shown(source, Look()), before)
+
+
+def test_materials_alone_are_those_of_relight_and_changes_stay_on_them(scene: TrainedScene) -> None:
+    source = Fitted(scene)
+    before = shown(source, Look())
+    source.set_relit(True)
+    again = Fitted(relightable(scene))
+    assert np.array_equal(shown(source, Look()), shown(again, Look()))
+    assert not np.array_equal(shown(source, Look()), before)
+
+    def black(given: TrainedScene) -> TrainedScene:
+        raw = given.surfels.to_numpy()
+        raw["albedo"][:] = -20
+        return replace(given, surfels=Surfels.from_numpy(raw))
+
+    source.set_changes([black])
+    assert shown(source, Look("albedo", backdrop="black")).max() == 0
+    source.set_relit(False)
+    assert shown(source, Look("albedo", backdrop="black")).max() == 0
+    source.set_changes([])
+    assert np.array_equal(shown(source, Look()), before)
+
+
+def test_exposure_and_backdrop_are_what_they_say(scene: TrainedScene) -> None:
+    source = Fitted(scene)
+    corner = [shown(source, Look(backdrop=name))[0, 0].tolist() for name in ("white", "grey", "black")]
+    assert corner == [[255] * 3, [64] * 3, [0] * 3]
+    light = shown(source, Look(backdrop="light"))[0, 0]
+    assert 0 < light.max()
+    dark, bright = (shown(source, Look(exposure=e, backdrop="black"))[10, 10].max() for e in (-3.0, 0.0))
+    assert 0 < dark < bright
+
+
+def test_truth_and_picture_stand_side_by_side_in_the_shape_of_the_window() -> None:
+    left, right = np.full((30, 40, 3), 10, np.uint8), np.full((30, 40, 3), 20, np.uint8)
+    for window in ((800, 400), (300, 900)):
+        canvas = side_by_side([left, right], window)
+        height, width = canvas.shape[:2]
+        assert width / height == pytest.approx(window[0] / window[1], rel=0.02)
+        row = canvas[height // 2, :, 0]
+        assert (row == 10).sum() == (row == 20).sum() == 40
+        assert np.flatnonzero(row == 20)[0] - np.flatnonzero(row == 10)[-1] == GAP + 1
+        assert canvas[0, 0, 0] == round(255 * AROUND) or height == 30
+
+
+def test_views_are_saved_under_the_next_number_with_their_camera(scene: TrainedScene, tmp_path: Path) -> None:
+    pose = Pose.of_page(np.array([0.5, -0.5, 0.5, -0.5]), np.array([-1.5, 0, 0]), 0.8, 1.6)
+    source, window = Fitted(scene), (32, 20)
+    paths = [
+        write_view(source, pose, window, Look(), tmp_path, suffix) for suffix in (".png", ".exr", ".json")
+    ]
+    assert [path.name for path in paths] == ["view_000.png", "view_001.exr", "view_002.json"]
+    for split in ("train", "test"):
+        (tmp_path / f"transforms_{split}.json").write_bytes((tmp_path / "view_000.json").read_bytes())
+    view = read_dataset(tmp_path, "train").views[0]
+    assert np.abs(view.to_world - pose.to_world).max() < 1e-6
+    wanted = planes(scene.renderer(aovs=False, samples=16)(view.camera()).alpha, 20, 32)
+    assert view.alpha is not None and np.abs(view.alpha - wanted).mean() < 0.02
+
+
+# ---------------- bad input ----------------
+
+
+def test_a_busy_port_is_one_sentence(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert main(["view", str(finished), "--port", str(port)]) == 2
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert message.startswith(f"refgs: --port: 127.0.0.1:{port} cannot be used (")
+    assert message.endswith("); give another --port")
+
+
+@pytest.mark.parametrize("more", [["--port", "70000"], ["--host", "no.such.host.invalid"]])
+def test_a_senseless_address_is_one_sentence(
+    finished: Path, more: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["view", str(finished), *more]) == 2
+    assert "--port: " in capsys.readouterr().err
+
+
+def test_without_viser_the_remedy_is_named(
+    finished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "viser", None)
+    assert main(["view", str(finished)]) == 2
+    assert capsys.readouterr().err == ('refgs: view: viser is not installed; pip install "mi_refgs[view]"\n')
