@@ -21,7 +21,9 @@ from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.light import Light, RotatedLight
 from mi_refgs.shade.points import TERMS
 from mi_refgs.surfels.channels import CHANNELS
-from mi_refgs.viewer.develop import BACKDROPS, LIGHT_BEHIND, PICTURE, planes_of
+from mi_refgs.viewer.develop import BACKDROPS, LIGHT_BEHIND, PICTURE, Look, planes_of
+from mi_refgs.viewer.fine import fine_planes
+from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.source import Sampled, Shot
 
 OUTLIERS = 2.0
@@ -188,3 +190,7 @@ class Fitted:
         frame = self.frame(camera, shot.look.what != PICTURE, shot.settled)
         with dr.suspend_grad():
             return Sampled(planes_of(frame, camera, shot.look, self.light), frame.depth)
+
+    def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
+        """See `Source`."""
+        return fine_planes(self.draw, pose, width, height, look)

@@ -58,3 +58,6 @@ class Source(Protocol):
 
     def draw(self, shot: Shot) -> Sampled:
         """One sample of every pixel."""
+
+    def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
+        """The planes of a picture to keep, of square pixels."""

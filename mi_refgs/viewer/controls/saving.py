@@ -12,12 +12,10 @@ import numpy as np
 from mi_refgs.exr import write_exr
 from mi_refgs.files import make_folder, write_json
 from mi_refgs.images import straight_srgb, write_png
-from mi_refgs.viewer import quality
 from mi_refgs.viewer.develop import PICTURE, Look, shown_planes
-from mi_refgs.viewer.loop import added
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.source import Shot, Source
+from mi_refgs.viewer.source import Source
 
 NUMBERED = re.compile(r"view_(\d+)\.")
 CAMERA = ".json"
@@ -64,19 +62,10 @@ def write_view(
     stem = f"view_{max(taken, default=-1) + 1:03d}"
     camera = folder / f"{stem}{CAMERA}"
     if suffix != CAMERA:
-        planes = smooth_planes(source, pose, window, look)
+        planes = source.fine(pose, *window, look)
         write_picture(folder / f"{stem}{suffix}", planes, window, look)
     write_json(camera, pose.transforms(*window, stem))
     return camera if suffix == CAMERA else folder / f"{stem}{suffix}"
-
-
-def smooth_planes(source: Source, pose: Pose, window: tuple[int, int], look: Look) -> list[Any]:
-    """The mean of all samples of a picture with the window's own pixels."""
-    sums: list[Any] = []
-    for index, offset in enumerate(quality.offsets()):
-        shot = Shot(pose, *window, look, offset, index, settled=True)
-        sums = added(sums, source.draw(shot).planes)
-    return [plane / quality.SAMPLES for plane in sums]
 
 
 def write_picture(path: Path, planes: list[Any], window: tuple[int, int], look: Look) -> None:
