@@ -20,7 +20,9 @@ from mi_refgs.editing.fields import Fields
 from mi_refgs.editing.rigid import rotated_harmonics
 from mi_refgs.errors import InputError
 from mi_refgs.images import write_png
+from mi_refgs.reconstruction import load
 from mi_refgs.reference.camera import look_at
+from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.envmap import EnvironmentLight
@@ -268,6 +270,19 @@ def test_a_moved_scene_is_the_view_of_the_camera_moved_back(placement: dict[str,
     assert np.abs(after - before).mean() < 0.1 * limit
 
 
+def test_gaussians_are_turned_and_grow_as_surfels_do() -> None:
+    raw = balls(reflectance="radiance", occlusion=False).surfels.to_numpy()
+    raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1] - 2], axis=1)
+    scene = replace(balls(reflectance="radiance", occlusion=False), surfels=Surfels.from_numpy(raw))
+    change = Change(rotate=("1,2,3", 130), scale=1.5, move=(0.5, 0, 0))
+    place = change.placement(raw["position"])
+    pose = FRONT.copy()
+    pose[:3, :3] = place.rotation.as_matrix() @ FRONT[:3, :3]
+    pose[:3, 3] = place.points(FRONT[None, :3, 3])[0]
+    after = picture(apply(scene, np.ones(2 * HALF, bool), change), pose)
+    np.testing.assert_allclose(after, picture(scene), atol=2e-3)
+
+
 def test_a_turned_normal_offset_and_a_zero_quaternion(scene: TrainedScene) -> None:
     raw = scene.surfels.to_numpy()
     raw["normal_offset"] = harmonics(2 * HALF, 0, 3)
@@ -315,6 +330,28 @@ def test_cut_removes_a_ball_and_its_shadow_and_mirror_image() -> None:
         np.testing.assert_allclose(picture(scene), picture(alone), atol=1e-6)
     ghost = replace(left, mesh=mesh)
     assert np.abs(picture(ghost) - picture(alone)).max() > 0.05
+
+
+def test_surroundings_stay_with_their_triangles() -> None:
+    """Of an object and a wall around it, the object's triangles alone are moved, cut and kept."""
+    whole = balls()
+    raw = whole.surfels.to_numpy()
+    chosen = raw["position"][:, 0] < 0
+    geometry = ("position", "rotation", "scale", "opacity", "radiance_sh")
+    wall = Surroundings(Surfels.from_numpy({name: raw[name][~chosen] for name in geometry}))
+    object_ = Surfels.from_numpy({name: table[chosen] for name, table in raw.items()})
+    scene = replace(whole, surfels=object_, surroundings=wall)
+    assert scene.mesh is not None
+    of_wall = scene.mesh.vertices[scene.mesh.vertices[:, 0] > 0.05]
+    moved = edit(scene, move=(0, 0, 9)).scene
+    assert moved.surroundings is wall and moved.mesh is not None
+    high = moved.mesh.vertices[:, 2] > 5
+    assert high.sum() == len(scene.mesh.vertices) / 2
+    np.testing.assert_array_equal(np.sort(moved.mesh.vertices[~high], axis=0), np.sort(of_wall, axis=0))
+    for half in (edit(scene, where="z > 0", keep=True), edit(scene, where="z > 0", cut=True)):
+        mesh = half.scene.mesh
+        assert mesh is not None and len(mesh.faces) / len(scene.mesh.faces) == pytest.approx(0.75, abs=0.02)
+        assert (mesh.vertices[:, 0] > 0.05).sum() == len(of_wall)
 
 
 def test_what_is_made_transparent_leaves_the_mesh(scene: TrainedScene) -> None:
@@ -482,6 +519,37 @@ def test_joined_runs_and_previews_without_data(
     (new / "dataset.json").unlink()
     assert main(["edit", str(new), "-o", str(newer), *move, "--preview"]) == 0
     assert (newer / "preview.png").is_file() and not (newer / "dataset.json").exists()
+
+
+def test_a_reconstruction_is_edited_alike(finished: Path, tmp_path: Path) -> None:
+    whole = load(finished, write=False)
+    red = whole.edit(where="x > 0", set={"albedo": (1, 0, 0)}, move=(0, 0, 1))
+    both = red.edit(join=whole, keep=True, where="x < 0").edit(
+        mask=np.ones((20, 20), bool), view=whole.camera(1), cut=True
+    )
+    assert whole.source.edits == () and red.folder is None
+    first, second, third = both.source.edits
+    assert (first["where"], second["where"], third.get("where")) == ("x > 0", "x < 0", None)
+    assert second["of"] == whole.trained.surfels.count == first["of"]
+    assert first["selected"] + second["selected"] <= first["of"]
+    assert third["of"] == second["surfels"] == first["of"] + second["selected"]
+    assert both.trained.surfels.count == third["of"] - third["selected"]
+    again = both.save(tmp_path / "new")
+    assert list(again.source.edits) == json.loads(json.dumps(both.source.edits))
+    with pytest.raises(InputError, match="camera: 2: test has 2; give 0 to 1"):
+        whole.edit(mask=np.ones((20, 20), bool), view=2, cut=True)
+
+
+def test_an_edited_run_is_no_fit_to_go_on_with(
+    finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Training would replace what was edited."""
+    new = tmp_path / "new"
+    assert main(["edit", str(finished), "-o", str(new), "--set", "roughness=0.5"]) == 0
+    before = files(new)
+    assert main(["train", str(data), "-o", str(new), "--resume"]) == 2
+    assert "checkpoints: none, but a scene that was edited" in capsys.readouterr().err
+    assert files(new) == before
 
 
 def test_bad_commands_leave_nothing(

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mi_refgs.editing import assignments
 from mi_refgs.editing.expression import MAX_DEPTH, parse_numbers, parse_truth
 from mi_refgs.errors import InputError
 
@@ -156,3 +157,15 @@ def test_any_text_is_a_value_of_every_surfel_or_a_sentence(text: str) -> None:
             if expression.names <= {*VALUES}:
                 found = np.broadcast_to(expression.of(VALUES), 4)
                 assert found.dtype == (bool if expression.truth else np.float64)
+
+
+@given(
+    st.lists(st.sampled_from([*WORDS, "roughness", "*=", "albedo.r"]), max_size=12).map(" ".join) | st.text()
+)
+def test_any_text_is_an_assignment_or_a_sentence(text: str) -> None:
+    try:
+        (found,) = assignments([text])
+    except InputError as error:
+        assert "\n" not in str(error)
+    else:
+        assert found.values and "=" in text

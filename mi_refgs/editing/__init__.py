@@ -3,7 +3,7 @@
 from mi_refgs.editing.change import Assignment, Change, apply, assignments
 from mi_refgs.editing.joining import join
 from mi_refgs.editing.options import Edited, Options, edit
-from mi_refgs.editing.selection import Selection, painted, read_mask, select
+from mi_refgs.editing.selection import Selection, painted, painted_pixels, select
 
 __all__ = [
     "Assignment",
@@ -16,6 +16,6 @@ __all__ = [
     "edit",
     "join",
     "painted",
-    "read_mask",
+    "painted_pixels",
     "select",
 ]

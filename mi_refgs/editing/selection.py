@@ -14,7 +14,7 @@ from mi_refgs.device import upload
 from mi_refgs.editing.expression import parse_truth
 from mi_refgs.editing.fields import Fields
 from mi_refgs.errors import InputError
-from mi_refgs.images import box_downscale, read_grey
+from mi_refgs.images import box_downscale, read_mask
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.render.surroundings import together
 from mi_refgs.runs.export import TrainedScene
@@ -35,7 +35,7 @@ class Selection:
     where: str | None = None  # an expression, see `expression` and `fields`
     box: Sequence[float] | None = None  # x0 y0 z0 x1 y1 z1: two opposite corners; centres lie inside
     nearest: Sequence[float] | None = None  # x y z r: centres within r of the surfel nearest to the point
-    mask: np.ndarray | str | Path | None = None  # of a view of `camera`: see `painted` and `read_mask`
+    mask: np.ndarray | str | Path | None = None  # of a view of `camera`: see `painted`, `painted_pixels`
     camera: Camera | None = None
     invert: bool = False  # take the others instead
 
@@ -62,7 +62,7 @@ def select(scene: TrainedScene, selection: Selection) -> np.ndarray:
         if selection.camera is None:
             raise InputError("--mask: the view that it was painted in is missing; give its camera")
         given, camera = selection.mask, selection.camera
-        mask = given if isinstance(given, np.ndarray) else read_mask(Path(given), camera)
+        mask = given if isinstance(given, np.ndarray) else painted_pixels(Path(given), camera)
         chosen &= painted(scene, camera, mask)
     chosen = ~chosen if selection.invert else chosen
     if not chosen.any():
@@ -101,19 +101,18 @@ def painted(scene: TrainedScene, camera: Camera, mask: np.ndarray) -> np.ndarray
     return (every > 0) & (inside > PAINTED_SHARE * every) & ~behind
 
 
-def read_mask(path: Path, camera: Camera) -> np.ndarray:
+def painted_pixels(path: Path, camera: Camera) -> np.ndarray:
     """The painted pixels (H, W) bool of a picture of a view: white, or opaque where the rest is transparent.
 
     A picture whose sides are a whole number of times the view's is averaged down. Raises InputError for a
     file that is no picture, is of another size, or has nothing painted.
     """
-    grey, white = read_grey(path)
-    share = (grey / np.float32(white))[..., None]
+    share = whole = read_mask(path)[..., None]
     factor = max(1, share.shape[0] // max(camera.height, 1))
     share = box_downscale(share, factor)[..., 0]
     if share.shape != (camera.height, camera.width):
         raise InputError(
-            f"{path}: mask: {grey.shape[1]} × {grey.shape[0]} pixels, but the view has {camera.width} × "
+            f"{path}: mask: {whole.shape[1]} × {whole.shape[0]} pixels, but the view has {camera.width} × "
             f"{camera.height}; paint a picture of that view"
         )
     mask = share > 0.5

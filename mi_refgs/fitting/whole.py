@@ -18,7 +18,7 @@ from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.presets import PRESETS
-from mi_refgs.runs.export import up_to_date
+from mi_refgs.runs.export import MODEL, up_to_date
 from mi_refgs.runs.run import Run
 
 SAME_REGION = 1e-6
@@ -65,11 +65,16 @@ def begin(method: Method, views: Dataset, run: Run, tell: Callable[[str], None] 
     A new fit of pictures without alpha looks for points to start from where the data set has none. `tell` is
     called with what is found, and what is decided about the terms of a method that selects them. A run that
     is resumed keeps its region of interest. Raises InputError for cameras that all stand in one place,
-    checkpoints that are all damaged and a folder that cannot be written.
+    checkpoints that are all damaged, a scene that no checkpoint is of, and a folder that cannot be written.
     """
     resumed = run.exists()
     views = of_run(run, views, tell)
     state = run.load_checkpoint() if resumed else None
+    if resumed and state is None and (run.path / MODEL).is_file():
+        raise InputError(
+            f"{run.path}: checkpoints: none, but a scene that was edited, imported or copied, which a fit "
+            "would replace; choose another -o"
+        )
     if state is not None:
         method = with_terms(method, decisions_of(state))
     else:
