@@ -21,7 +21,7 @@ from mi_refgs.data.poses import MITSUBA_FROM_OPENCV
 from mi_refgs.data.readers import PointCloud
 from mi_refgs.data.view import View
 from mi_refgs.files import write_bytes
-from mi_refgs.images import linear_from_srgb, srgb_from_linear, write_png
+from mi_refgs.images import linear_from_srgb, write_png
 
 POINTS_FILE = "points.npz"
 """File in a run's folder: position (P, 3), colour (P, 3) linear, and key, a hash of their source."""
@@ -103,7 +103,7 @@ def triangulated(data: Dataset) -> PointCloud | None:
         for part in (pictures, output):
             part.mkdir()
         for file, view in zip(names, views, strict=True):
-            write_png(pictures / file, srgb_from_linear(view.image) if view.linear else view.image)
+            write_png(pictures / file, view.displayed)
         colmap.begin(database, pictures, _cameras(names, views))
         colmap.extract(database, pictures, names)
         colmap.match(database, [(names[i], names[j]) for i, j in near_pairs(views)])
