@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
 
 TERMINAL_INTERVAL, LOG_INTERVAL = 0.5, 30.0
 """Seconds between refreshes, in a terminal and in a file."""
@@ -15,3 +18,11 @@ def progress_bar(total: int, what: str, **options: Any) -> Any:
 
     interval = TERMINAL_INTERVAL if sys.stderr.isatty() else LOG_INTERVAL
     return tqdm(total=total, desc=what, file=sys.stderr, dynamic_ncols=True, mininterval=interval, **options)
+
+
+def with_bar(items: Sequence[Item], what: str, **options: Any) -> Iterator[Item]:
+    """The items of a loop, below a bar that counts them."""
+    with progress_bar(len(items), what, **options) as shown:
+        for item in items:
+            yield item
+            shown.update()

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.progress_bar import progress_bar
+from mi_refgs.progress_bar import progress_bar, with_bar
 
 SEED = 0
 """Seed of all random numbers; with it, a second run gives the same result."""
@@ -71,13 +71,7 @@ def quiet() -> Iterator[None]:
 def progress(what: str) -> Callable[[Sequence[Item]], Iterable[Item]]:
     """A progress bar around the items of a loop."""
 
-    def each(items: Sequence[Item]) -> Iterator[Item]:
-        with progress_bar(len(items), what) as shown:
-            for item in items:
-                yield item
-                shown.update()
-
-    return each
+    return lambda items: with_bar(items, what)
 
 
 def _run(call: Callable[[Any], Result], poll: Callable[[], None] = lambda: None) -> Result:

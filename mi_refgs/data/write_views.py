@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.exr import read_exr, read_exr_image, write_exr
 from mi_refgs.files import write_json
 from mi_refgs.images import read_png, srgb_from_linear, straight_srgb, write_png
+from mi_refgs.progress_bar import with_bar
 
 
 @dataclass(frozen=True)
@@ -66,15 +66,12 @@ def write_views(
     out: Path, splits: Sequence[str], cameras: Cameras, tracer: Tracer, maps: bool, progress: bool
 ) -> None:
     """The light, the views and then the transforms of some splits under one light; `maps`: with those."""
-    from tqdm import tqdm
-
     light, height = out / "environment.exr", cameras.settings.environment_height
     known = tracer.scene.environment() is not None and not cameras.objects  # a room is lit by more than it
     if height and known and not light.exists():
         write_exr(light, environment_image(tracer.scene, height))
     jobs = [(f"{split}/r_{i:03d}", *job) for split in splits for i, job in enumerate(cameras.of(split))]
-    bar = tqdm(jobs, desc=f"dataset {out.name}", unit="view", file=sys.stderr, disable=not progress)
-    for name, pose, seed in bar:
+    for name, pose, seed in with_bar(jobs, f"dataset {out.name}", unit="view", disable=not progress):
         _trace_view(tracer, out / name, pose, seed, maps)
     for split in splits:
         frames = [_frame(split, i, pose, maps) for i, (pose, _) in enumerate(cameras.of(split))]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
 from mi_refgs.fitting.whole import of_run, read_views
 from mi_refgs.images import write_png
 from mi_refgs.methods.method import Method
+from mi_refgs.progress_bar import with_bar
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import TrainedScene, up_to_date
 from mi_refgs.runs.run import Run
@@ -84,8 +84,6 @@ def evaluate(
     Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, and for data
     that is gone.
     """
-    from tqdm import tqdm
-
     method = run.method()
     views = load_split(run, method, "test", data)
     fitted = up_to_date(run, method, views.views[0].camera())
@@ -110,9 +108,7 @@ def evaluate(
     per_view: list[dict[str, Any]] = []
     surface, errors = TrueSurface.read(views.path), decomposition.Decomposition()
     materials = decomposition.material_maps(fitted, samples)
-    for index, truth in enumerate(
-        tqdm(views.views, desc="eval", unit="view", file=sys.stderr, disable=not progress)
-    ):
+    for index, truth in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         frame = view(truth.camera())
         shot = pictures.RenderedView.of(frame, views, truth)
         gain, gained = with_gain(frame, truth, views)

@@ -12,7 +12,6 @@ A folder of it holds
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +30,7 @@ from mi_refgs.exr import write_exr
 from mi_refgs.files import cannot_write, write_json
 from mi_refgs.images import straight_srgb, write_png
 from mi_refgs.methods.method import Method
+from mi_refgs.progress_bar import with_bar
 from mi_refgs.relighting.light import NewLight, truth_under
 from mi_refgs.relighting.score import score, shown
 from mi_refgs.render.pipeline import Frame
@@ -183,20 +183,11 @@ def _render(
     scene: TrainedScene, views: Sequence[View], folder: Path, samples: int, progress: bool
 ) -> list[np.ndarray]:
     """Premultiplied linear RGBA (H, W, 4) of the views, written as a data set has them."""
-    from tqdm import tqdm
-
     renderer: Callable[[Camera], Frame] = scene.renderer(aovs=False, samples=samples)
     names = _names(folder.name, len(views))
-    bar = tqdm(
-        zip(names, views, strict=True),
-        total=len(views),
-        desc="relight",
-        unit="view",
-        file=sys.stderr,
-        disable=not progress,
-    )
+    jobs = list(zip(names, views, strict=True))
     found = []
-    for name, view in bar:
+    for name, view in with_bar(jobs, "relight", unit="view", disable=not progress):
         frame = renderer(view.camera())
         size = view.height, view.width
         rgba = pictures.planes([*frame.radiance, frame.alpha], *size)
