@@ -86,6 +86,9 @@ LAYERS: dict[str, set[str]] = {
     },
     "editing": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
     "reconstruct": {"methods", "fitting", "evaluation", "plugins", "reconstruction", "errors"},
+    "gallery": RENDERER
+    | {"methods", "data", "runs", "evaluation", "relighting", "editing", "resources", ""}
+    | {"reconstruct", "reconstruction"},
     "profiling": RENDERER | {"methods", "data", "fitting"},
     "viewer": RENDERER
     | {"methods", "data", "runs", "fitting", "evaluation", "relighting", "plugins", "editing"},
@@ -100,6 +103,7 @@ LAYERS: dict[str, set[str]] = {
         "evaluation",
         "formats",
         "viewer",
+        "gallery",
         "relighting",
         "reconstruct",
         "reconstruction",

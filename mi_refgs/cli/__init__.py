@@ -23,6 +23,7 @@ from mi_refgs.cli import (
     edit,
     evaluate,
     export,
+    gallery,
     profile,
     relight,
     render,
@@ -58,6 +59,7 @@ def build_parser() -> Parser:
         export,
         profile,
         view,
+        gallery,
         completion,
     ):
         module.add(commands)
