@@ -504,10 +504,10 @@ def test_masks_and_views(
 
 
 def test_joined_runs_and_previews_without_data(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     new, newer = tmp_path / "new", tmp_path / "newer"
-    move = ["--move", "2", "0", "0"]
+    move = ["--move", "2", "0", "-0e-1"]
     assert main(["edit", str(finished), "-o", str(new), "--join", str(finished), *move, "--json"]) == 0
     out = capsys.readouterr()
     found = json.loads(out.out)
@@ -519,6 +519,9 @@ def test_joined_runs_and_previews_without_data(
     (new / "dataset.json").unlink()
     assert main(["edit", str(new), "-o", str(newer), *move, "--preview"]) == 0
     assert (newer / "preview.png").is_file() and not (newer / "dataset.json").exists()
+    again = ["edit", str(newer), "-o", str(tmp_path / "again"), "--rotate", "-1,0,0", "-90"]
+    assert main([*again, "--data", str(data)]) == 0
+    assert main(["eval", str(tmp_path / "again")]) == 0
 
 
 def test_a_reconstruction_is_edited_alike(finished: Path, tmp_path: Path) -> None:
@@ -562,6 +565,9 @@ def test_bad_commands_leave_nothing(
         (["--set", "roughness=0.5", "--where", "__import__('os')"], "character"),
         (["--join", str(tmp_path / "none"), "--move", "1", "0", "0"], "config.toml: missing"),
         (["--cut", "--keep"], "not allowed with"),
+        (["--cut", "--data", str(tmp_path / "none")], "--data: no such folder"),
+        (["--move", "-1e999", "0", "-1e-3"], "--move: three finite numbers are needed"),
+        (["--rotate", "-1,0", "-90"], "--rotate: '-1,0': no axis"),
     ):
         assert main(["edit", str(finished), "-o", str(out), *options]) == 2
         error = capsys.readouterr().err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     summary = "write a new run with some surfels changed, cut, moved, duplicated, or with another run added"
     parser = add_command(commands, "edit", summary, EXAMPLE, run)
+    # As newer versions of argparse have it: -1e-3 and -1,0,0 are no options either.
+    parser._negative_number_matcher = re.compile(r"-\.?\d")
     add_run(parser)
     add_output(parser, "new run folder", "NEW")
     chosen = parser.add_argument_group("which surfels (those that meet all of it; default: all)")
@@ -106,13 +109,16 @@ def run(args: argparse.Namespace) -> Result:
     _require_free(args.output)
     whole = load(args.run_folder, write=False)
     if args.data is not None:
+        if not args.data.is_dir():
+            raise InputError(f"{args.data}: --data: no such folder; give that of a data set")
         whole = replace(whole, source=replace(whole.source, data=args.data))
     join = None if args.join is None else load(args.join, write=False)
     options = {name: getattr(args, name) for name in OPTIONS}
     try:
         edited = whole.edit(**options, join=join)
     except InputError as error:
-        raise InputError(f"{args.run_folder if join is None else args.join}: {error}") from error
+        runs = " + ".join(str(path) for path in (args.run_folder, args.join) if path is not None)
+        raise InputError(f"{runs}: {error}") from error
     entry = edited.source.edits[-1]
     for note in entry["notes"]:
         say(f"note: {note}")

@@ -110,7 +110,9 @@ class _Parser:
                 continue
             found = TOKEN.match(text, place)
             if found is None:
-                raise self._error("use == to compare" if text[place] == "=" else "remove it", place)
+                sign = text[place]
+                remedy = "use == to compare" if sign == "=" else f"{shown(sign)} has no meaning; remove it"
+                raise self._error(remedy, place)
             self.tokens.append((str(found.lastgroup), found[0], place))
             place = found.end()
         self.tokens.append(("end", "", len(text)))
