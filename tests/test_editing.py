@@ -258,7 +258,7 @@ def test_a_moved_scene_is_the_view_of_the_camera_moved_back(placement: dict[str,
     scene = balls(diffuse=diffuse, accuracy=Accuracy(**rays))
     change = Change(**placement)
     moved = apply(scene, np.ones(2 * HALF, bool), change)
-    place = change.placement(scene.surfels.to_numpy()["position"])
+    place = change.placement(scene.surfels.to_numpy())
     pose = FRONT.copy()
     pose[:3, :3] = place.rotation.as_matrix() @ FRONT[:3, :3]
     pose[:3, 3] = place.points(FRONT[None, :3, 3])[0]
@@ -275,7 +275,7 @@ def test_gaussians_are_turned_and_grow_as_surfels_do() -> None:
     raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1] - 2], axis=1)
     scene = replace(balls(reflectance="radiance", occlusion=False), surfels=Surfels.from_numpy(raw))
     change = Change(rotate=("1,2,3", 130), scale=1.5, move=(0.5, 0, 0))
-    place = change.placement(raw["position"])
+    place = change.placement(raw)
     pose = FRONT.copy()
     pose[:3, :3] = place.rotation.as_matrix() @ FRONT[:3, :3]
     pose[:3, 3] = place.points(FRONT[None, :3, 3])[0]
@@ -298,13 +298,23 @@ def test_a_turned_normal_offset_and_a_zero_quaternion(scene: TrainedScene) -> No
     np.testing.assert_allclose(turned["rotation"][0], (half, 0, 0, half), atol=1e-7)
 
 
+def test_a_turn_and_its_opposite_leave_everything_as_it_was(scene: TrainedScene) -> None:
+    there = edit(scene, where="z > 0.1", rotate=("1,2,3", 77), scale=2.0, move=(1, 0, 0)).scene
+    chosen = Fields(scene)["z"] > 0.1
+    back = apply(there, chosen, Change(rotate=("1,2,3", -77), scale=0.5, move=(-1, 0, 0)))
+    for name, table in scene.surfels.to_numpy().items():
+        now = back.surfels.to_numpy()[name]
+        sign = np.sign(np.sum(now * table, axis=1, keepdims=True)) if name == "rotation" else 1
+        np.testing.assert_allclose(sign * now, table, atol=2e-5)
+
+
 def test_only_the_selected_ball_and_its_triangles_move(scene: TrainedScene) -> None:
     moved = edit(scene, where=METAL_BALL, move=(0, 0, 3), scale=2.0).scene
     before, after = scene.surfels.to_numpy(), moved.surfels.to_numpy()
     chosen = before["position"][:, 0] < 0
     for name in before:
         np.testing.assert_array_equal(before[name][~chosen], after[name][~chosen])
-    middle = np.median(before["position"][chosen].astype(np.float64), axis=0)
+    middle = before["position"][chosen].astype(np.float64).mean(axis=0)
     expected = 2 * (before["position"][chosen] - middle) + middle + (0, 0, 3)
     np.testing.assert_allclose(after["position"][chosen], expected, atol=1e-5)
     np.testing.assert_allclose(np.exp(after["scale"] - before["scale"])[chosen], 2, rtol=1e-5)

@@ -76,7 +76,7 @@ def assignments(given: Assignments) -> tuple[Assignment, ...]:
 class Change:
     """What is done, in this order: set; scaled, turned and moved about the middle; duplicated; cut.
 
-    The middle is the median of the selected positions, so that floaters do not matter. A duplicate is what
+    The middle is the mean of the selected positions by opacity, as before the change. A duplicate is what
     everything is done to where there is one: the original stays as it is. Raises InputError for what makes no
     sense.
     """
@@ -122,12 +122,15 @@ class Change:
             raise InputError("--rotate: an axis without length, or an endless angle; give them like z 90")
         return rotation_about(axis, degrees) if degrees % 360 else Rotation.identity()
 
-    def placement(self, positions: np.ndarray) -> Placement:
-        """Where things at positions (N, 3) go."""
+    def placement(self, raw: Mapping[str, np.ndarray]) -> Placement:
+        """Where selected surfels of these raw channels go."""
         shift = np.zeros(3)
         for where, vector in (("--move", self.move), ("--duplicate", self.duplicate)):
             shift = shift if vector is None else shift + _vector(where, vector)
-        return Placement(np.median(positions.astype(np.float64), axis=0), shift, self.turn, float(self.scale))
+        # Not the median, which does not turn with the surfels: a turn and its opposite would shift them.
+        weight = sigmoid(raw["opacity"][:, 0]) + np.finfo(np.float64).tiny
+        middle = np.average(raw["position"].astype(np.float64), axis=0, weights=weight)
+        return Placement(middle, shift, self.turn, float(self.scale))
 
 
 def apply(scene: TrainedScene, chosen: np.ndarray, change: Change) -> TrainedScene:
@@ -142,10 +145,11 @@ def apply(scene: TrainedScene, chosen: np.ndarray, change: Change) -> TrainedSce
         raise InputError("--cut: no surfel would be left; choose fewer")
     fields = Fields(scene)
     own = {name: table[chosen] for name, table in fields.raw.items()}
+    placement = change.placement(own)
     for assignment in change.set:
         _assign(fields, own, chosen, assignment)
-    mesh = _mesh(scene, chosen, own, change)
-    change.placement(own["position"]).place(own, np.ones(len(own["position"]), bool))
+    mesh = _mesh(scene, chosen, own, change, placement)
+    placement.place(own, np.ones(len(own["position"]), bool))
     raw = fields.raw
     for name, table in raw.items():
         if change.duplicate is not None:
@@ -160,11 +164,14 @@ def apply(scene: TrainedScene, chosen: np.ndarray, change: Change) -> TrainedSce
 
 
 def _mesh(
-    scene: TrainedScene, chosen: np.ndarray, own: Mapping[str, np.ndarray], change: Change
+    scene: TrainedScene,
+    chosen: np.ndarray,
+    own: Mapping[str, np.ndarray],
+    change: Change,
+    placement: Placement,
 ) -> Mesh | None:
     """The mesh after the change; `own` has the new values of the chosen surfels at their old places."""
     mesh, raw = scene.mesh, scene.surfels.to_numpy()
-    placement = change.placement(own["position"])
     fades = not np.array_equal(raw["opacity"][chosen], own["opacity"])
     stays = placement.does_nothing and not (fades or change.cut or change.keep)
     if mesh is None or not len(mesh.faces) or (stays and change.duplicate is None):

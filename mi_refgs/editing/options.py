@@ -33,7 +33,7 @@ class Options(TypedDict, total=False):
     invert: bool  # the others instead
     materials: bool  # first make materials alone of the whole scene: `runs.relightable`
     set: Assignments  # {"roughness": 0.3, "albedo": (0.9, 0.6, "0.5 * albedo.b")}, or texts: "roughness*=0.5"
-    scale: float  # larger, about the median of the selected positions
+    scale: float  # larger, about the mean of the selected positions by opacity
     rotate: Rotate | None  # ("z", degrees) about it, counter-clockwise
     move: Sequence[float] | None  # (3,)
     duplicate: Sequence[float] | None  # (3,) do all that to a copy moved so far; what was there stays
