@@ -9,16 +9,26 @@ from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File
-from site_pages import api, commands, links, methods, notebooks, plugins, settings
+from site_pages import api, commands, exports, links, methods, notebooks, plugins, settings
 
 PAGES = {
     "api.md": api.page,
     "cli.md": commands.page,
+    "exports.md": exports.page,
     "methods.md": methods.page,
     "plugins.md": plugins.page,
     "settings.md": settings.page,
 }
 """Page → the function that writes its Markdown."""
+
+
+def on_config(config: Any) -> Any:
+    """Put the notebooks that are there below Tutorials."""
+    [tutorials] = [pages["Tutorials"] for pages in config.nav if "Tutorials" in pages]
+    folder = Path(config.docs_dir)
+    found = sorted(path.relative_to(folder) for path in (folder / "tutorials").glob("*.ipynb"))
+    tutorials[:0] = [path.with_suffix(".md").as_posix() for path in found]
+    return config
 
 
 def on_files(files: Any, config: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -23,6 +24,7 @@ MADE = {
     "changelog.md",
     "cli.md",
     "contributing.md",
+    "exports.md",
     "methods.md",
     "plugins.md",
     "scenes.md",
@@ -84,7 +86,7 @@ def test_commands_exist(page: Path) -> None:
     text = "\n".join(blocks(page, "sh")).replace("\\\n", " ")
     for line in text.splitlines():
         if line.startswith("refgs "):
-            build_parser().parse_args(line.split("#")[0].split()[1:])
+            build_parser().parse_args(shlex.split(line, comments=True)[1:])
 
 
 def test_setup_commands_of_the_readme_are_those_of_ci() -> None:

@@ -91,7 +91,7 @@ def _must(action: argparse.Action) -> bool:
     return bool(action.option_strings) and action.required
 
 
-def _folded(usage: str, width: int = 100) -> str:
+def _folded(usage: str, width: int = 80) -> str:
     """The usage in lines of that many characters, broken before an option."""
     lines = [""]
     for part in re.findall(r"\[[^\]]*\](?:[^\s]*)|\S+", usage):
