@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mi_refgs.data.make_dataset import make_dataset as make_dataset
     from mi_refgs.data.readers import register as register_reader
     from mi_refgs.data.view import View as View
+    from mi_refgs.editing.options import Options as EditOptions
     from mi_refgs.errors import InputError as InputError
     from mi_refgs.evaluation.evaluate import evaluate as evaluate
     from mi_refgs.fitting.progress import Progress as Progress
@@ -67,6 +68,7 @@ _PUBLIC = {
     "Camera": ("splat.camera", "Camera"),
     "Channel": ("surfels.channels", "Channel"),
     "Dataset": ("data.dataset", "Dataset"),
+    "EditOptions": ("editing.options", "Options"),
     "EnvironmentLight": ("shade.envmap", "EnvironmentLight"),
     "Frame": ("render.pipeline", "Frame"),
     "InputError": ("errors", "InputError"),
@@ -110,6 +112,7 @@ __all__ = [
     "Camera",
     "Channel",
     "Dataset",
+    "EditOptions",
     "EnvironmentLight",
     "Frame",
     "InputError",

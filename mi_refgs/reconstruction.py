@@ -249,7 +249,7 @@ class Reconstruction:
     ) -> Reconstruction:
         """The same with some surfels changed, as by `refgs edit`; `source.edits[-1]` then says how many.
 
-        options: `editing.Options`, such as where="metallic > 0.5", set={"roughness": 0.3}; a `mask` is of a
+        options: `EditOptions`, such as where="metallic > 0.5", set={"roughness": 0.3}; a `mask` is of a
         `view`. join: what is added under the light of this; selected and changed is then that. Raises
         InputError for what makes no sense.
         """

@@ -121,7 +121,7 @@ LAYERS: dict[str, set[str]] = {
     "reference": {"constants"},
     "": RENDERER
     | {"llvm", "plugins", "methods", "data", "runs", "fitting", "evaluation", "relighting"}
-    | {"reconstruct", "reconstruction"},
+    | {"editing", "reconstruct", "reconstruction"},
 }
 """What each part of the package may import besides itself; "" is the package's own `__init__`.
 

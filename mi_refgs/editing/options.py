@@ -20,25 +20,41 @@ from mi_refgs.splat import Camera
 
 
 class Options(TypedDict, total=False):
-    """What an edit is of, and what it does: the options of `refgs edit`. Lengths are in scene units.
+    """Keywords of `Reconstruction.edit`, options of `refgs edit`: which surfels, and what is done to them.
 
     Selected are the surfels that meet every condition which is given, without any all of them. What is done
-    to them is done in the order below.
+    is done in the order below. Lengths are in scene units.
     """
 
-    where: str | None  # such as "metallic > 0.5 and z < 0"; names as in `Fields`
-    box: Sequence[float] | None  # (6,) two opposite corners, between which centres lie
-    nearest: Sequence[float] | None  # (x, y, z, r): centres within r of the surfel nearest to the point
-    mask: np.ndarray | str | Path | None  # (H, W) bool, or a picture painted white, of a view: `painted`
-    invert: bool  # the others instead
-    materials: bool  # first make materials alone of the whole scene: `runs.relightable`
-    set: Assignments  # {"roughness": 0.3, "albedo": (0.9, 0.6, "0.5 * albedo.b")}, or texts: "roughness*=0.5"
-    scale: float  # larger, about the mean of the selected positions by opacity
-    rotate: Rotate | None  # ("z", degrees) about it, counter-clockwise
-    move: Sequence[float] | None  # (3,)
-    duplicate: Sequence[float] | None  # (3,) do all that to a copy moved so far; what was there stays
-    cut: bool  # remove the selected surfels
-    keep: bool  # remove the others
+    where: str | None
+    """An expression such as "metallic > 0.5 and z < 0", of activated values: x y z, opacity, size (the
+    largest standard deviation), normal.x … .z (outwards), the shares of the run such as albedo.r, roughness
+    and metallic, colour.r … .b (of fitted radiance, what is the same from everywhere), luminance; with
+    + - * / **, comparisons, and or not, abs sqrt min max."""
+    box: Sequence[float] | None
+    """(6,): two opposite corners, between which centres lie."""
+    nearest: Sequence[float] | None
+    """(x, y, z, r): centres within r of the surfel that is nearest to the point."""
+    mask: np.ndarray | str | Path | None
+    """(H, W) bool, or a picture painted white: what the view shows there, and not what is behind."""
+    invert: bool
+    """Select the others instead."""
+    materials: bool
+    """First make materials alone of the whole scene, so that nothing stays as fitted to its light."""
+    set: Assignments
+    """{"roughness": 0.3, "albedo": (0.9, 0.6, "0.5 * albedo.b")}, or texts such as "roughness*=0.5"."""
+    scale: float
+    """Factor of the size, about the mean of the selected positions by opacity."""
+    rotate: Rotate | None
+    """("z", degrees): a turn about an axis through there, counter-clockwise; or three numbers for it."""
+    move: Sequence[float] | None
+    """(3,)."""
+    duplicate: Sequence[float] | None
+    """(3,): do all that to a copy, which is moved so far; what was there stays."""
+    cut: bool
+    """Remove the selected surfels."""
+    keep: bool
+    """Remove the others."""
 
 
 DOES = ("cut", "keep", "move", "rotate", "scale", "duplicate")
