@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -127,13 +127,21 @@ def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, hal
     `names` holds one letter a channel; by default Y, RGB or RGBA by the number of channels. Raises InputError
     if the path cannot be written.
     """
-    import OpenEXR
-
     image = np.asarray(image)
     planes = image[..., None] if image.ndim == 2 else image
     names = names or {1: "Y", 3: "RGB", 4: "RGBA"}[planes.shape[-1]]
     dtype = np.float16 if half else np.float32
-    channels = {name: np.ascontiguousarray(planes[..., i], dtype=dtype) for i, name in enumerate(names)}
+    write_exr_layers(path, {name: planes[..., i].astype(dtype) for i, name in enumerate(names)})
+
+
+def write_exr_layers(path: str | Path, layers: Mapping[str, np.ndarray]) -> None:
+    """Write (H, W) arrays of float32 or float16 by name of channel, ZIP-compressed, atomically.
+
+    Raises InputError if the path cannot be written.
+    """
+    import OpenEXR
+
+    channels = {name: np.ascontiguousarray(plane) for name, plane in layers.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     replace_file(path, lambda temporary: OpenEXR.File(header, channels).write(str(temporary)))
 

@@ -69,7 +69,7 @@ LAYERS: dict[str, set[str]] = {
     "fitting": RENDERER | {"methods", "data", "capture", "runs", "resources"},
     "evaluation": RENDERER | {"methods", "data", "runs", "fitting", "messages"},
     "relighting": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
-    "formats": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
+    "formats": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", "plugins"},
     "source": RENDERER | {"methods", "data", "runs", "fitting", "formats", "relighting"},
     "reconstruction": RENDERER
     | {

@@ -3,9 +3,12 @@
 A new one is a file that declares a `Format`, and its line here.
 """
 
-from mi_refgs.formats import cameras
+from mi_refgs.formats import cameras, gaussian_ply, gltf_splats, layers
 from mi_refgs.formats.format import FORMATS, Format, Option, Shot, options_of, register, write
 
+register(gaussian_ply.GAUSSIAN_PLY)
+register(gltf_splats.GLTF_SPLATS)
 register(cameras.CAMERAS)
+register(layers.EXR)
 
 __all__ = ["FORMATS", "Format", "Option", "Shot", "options_of", "register", "write"]

@@ -57,6 +57,7 @@ class Reflectance:
     orders: tuple[Order, ...] = ("pixel", "surfel")  # where it may be shaded, the usual one first
     linear: bool = False  # both orders give the same picture, so that surfels are shaded, which blends less
     light: Literal["none", "radiance", "filtered"] = "filtered"  # lookups: none, `radiance` alone, all
+    encoded: bool = False  # its radiance_sh are colours as a display shows them, and blended as such
     visibility: Literal["none", "mirror", "own"] = "none"  # rays: none, of pixels in mirrors, by `trace`
     accuracy: tuple[str, ...] = ()  # options of `Accuracy` that it honours
 

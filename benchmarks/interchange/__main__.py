@@ -1,0 +1,88 @@
+"""Files of a run in other people's programs: `python -m benchmarks.interchange RUN --node FOLDER`.
+
+FOLDER is where `npm install @playcanvas/splat-transform gltf-validator @sparkjsdev/spark three` was run. For
+each view, PSNR in dB of what each program shows against our picture, both display-encoded on black.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import mi_refgs
+
+# isort: split
+import mitsuba as mi
+import numpy as np
+
+from benchmarks.interchange import programs
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--node", type=Path, required=True)
+    parser.add_argument("--views", type=int, nargs="+", default=[0])
+    parser.add_argument("--programs", nargs="+", default=["validator", "transform", "browser", "mitsuba"])
+    args = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    print(json.dumps(measured(args.run, args.node, args.views, args.programs), indent=1))
+
+
+def measured(run: Path, node: Path, views: list[int], names: list[str]) -> dict[str, Any]:
+    """What each program makes of the files of a run."""
+    from mi_refgs.formats import write
+    from mi_refgs.formats.splats import gaussians
+    from mi_refgs.render.display import display_image
+    from mi_refgs.source import Source
+
+    made = mi_refgs.load(run)
+    trained = made.trained
+    shots = Source.of(mi_refgs.Run(run)).shots(trained, "test", "train")
+    found: dict[str, Any] = {"run": str(run), "surfels": trained.surfels.count}
+    with tempfile.TemporaryDirectory() as name:
+        files = write(trained, ["3dgs-ply", "gltf-splats"], Path(name), shots)
+        ply, glb = files["3dgs-ply"][0], files["gltf-splats"][0]
+        print("exported", file=sys.stderr)
+        if "validator" in names:
+            found["validator"] = programs.validated(glb, node)
+        if "transform" in names:
+            found["splat-transform"] = programs.transformed(ply, node)
+        table = gaussians(trained, shots, 3, False)
+        view = trained.renderer(aovs=False)
+        for index in views:
+            camera = shots[index].camera
+            frame = view(camera)
+            ours = _picture(display_image(list(frame.radiance), frame.alpha, [0.0] * 3), camera)
+            pictures = {"ours, same file": _blended(table, camera)}
+            if "browser" in names:
+                pictures["Spark in Chromium"] = programs.in_browser(ply, camera, node)
+            if "mitsuba" in names:
+                pictures["volprim_rf_basic"] = programs.in_mitsuba(ply, camera)
+            found[shots[index].name] = {
+                title: round(float(-10 * np.log10(np.mean((np.clip(x, 0, 1) - ours) ** 2))), 2)
+                for title, x in pictures.items()
+            }
+    return found
+
+
+def _picture(planes: Any, camera: Any) -> np.ndarray:
+    flat = np.stack([np.array(plane, dtype=np.float64) for plane in planes], axis=-1)
+    return np.clip(flat, 0, 1).reshape(camera.height, camera.width, 3)
+
+
+def _blended(table: Any, camera: Any) -> np.ndarray:
+    """The formula of 3DGS, by our own splatter."""
+    from mi_refgs.render.pipeline import render
+    from mi_refgs.shade.shading import Shading
+
+    return _picture(render(table, camera, Shading("surfel", "radiance"), normals=False).radiance, camera)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""`refgs import`: a run folder of a PLY file that another program has written."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from mi_refgs.cli.command import Result, add_command, add_output
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    summary = "make a run folder of a PLY file of 3DGS or 2DGS, which render, view, edit and export read"
+    parser = add_command(commands, "import", summary, "refgs import point_cloud.ply -o runs/theirs", run)
+    parser.add_argument("file", type=Path, metavar="FILE.ply", help="3D Gaussians or surfels of any degree")
+    add_output(parser, "run folder to write; one that holds a run is refused", "RUN")
+    parser.add_argument(
+        "--transforms",
+        type=Path,
+        metavar="FILE.json",
+        help="cameras for scene.xml (default: cameras around the object, z up)",
+    )
+    parser.add_argument(
+        "--linear",
+        action="store_true",
+        help="colours are linear radiance, as this program fits them (default: display-encoded)",
+    )
+
+
+def run(args: argparse.Namespace) -> Result:
+    """Import."""
+    from mi_refgs.formats.incoming import method_of, read_cameras, read_splats
+    from mi_refgs.formats.shots import shots_around
+    from mi_refgs.runs.run import Run
+    from mi_refgs.runs.save import save
+
+    Run(args.output).require_none()
+    trained = read_splats(args.file, args.linear)
+    if args.transforms is None:
+        cameras = [shot.camera for shot in shots_around(trained.surfels) if shot.split == "test"]
+    else:
+        cameras = read_cameras(args.transforms)
+    method = method_of(trained, args.file.stem)
+    files = [str(path) for path in save(trained, args.output, method, cameras[0], more=cameras[1:])]
+    surfels = trained.surfels
+    kind, degree = surfels.primitive.name, surfels.sh_degree()
+    data = {"files": files, "surfels": surfels.count, "primitive": kind, "degree": degree}
+    data["cameras"] = len(cameras)
+    text = f"{args.output}: {surfels.count} {kind}s of degree {degree}, {len(cameras)} cameras in scene.xml"
+    return Result(data, text)

@@ -1,0 +1,40 @@
+"""Colours as a display shows them, blended as they are: what other programs' files of Gaussians hold."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from mi_refgs.images import SRGB_ENCODED_LIMIT
+from mi_refgs.shade.points import ShadingPoints, Terms
+from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
+from mi_refgs.surfels.table import Surfels
+
+if TYPE_CHECKING:
+    from mi_refgs.shade.shading import Shading
+
+
+class Displayed(Reflectance):
+    """c = linear(e), with e the mean of max(0, ½ + Σ c Y(d)) over what a pixel sees: sRGB-encoded colours.
+
+    3DGS and 2DGS blend encoded colours, A e = Σ w e_i, and show A e + (1 - A) background. Radiance with this
+    e, once it is encoded again, is shown as that. [3DGS, §4; 2DGS]
+    """
+
+    name = "displayed"
+    orders = ("pixel",)
+    light = "none"
+    encoded = True
+
+    def channels(self, diffuse: str) -> tuple[str, ...]:
+        return ("radiance_sh",)
+
+    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+        return {"radiance": seen.harmonic_colour(surfels.value("radiance_sh"))}
+
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+        encoded = points.radiance
+        straight = encoded <= SRGB_ENCODED_LIMIT
+        curve = dr.power((dr.select(straight, 1, encoded) + 0.055) / 1.055, 2.4)
+        return Terms(dr.select(straight, encoded / 12.92, curve))
