@@ -18,6 +18,8 @@ import numpy as np
 from PIL import Image
 
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
+from mi_refgs.formats.gltf_splats import NAME
+from mi_refgs.images import srgb_from_linear
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import read_ply
 
@@ -29,17 +31,22 @@ MINUTE = 60_000  # milliseconds
 
 VALIDATE = """
 const validator = require("gltf-validator"), fs = require("fs");
-validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1])), {maxIssues: 20})
+validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1])), {maxIssues: 0})
   .then((report) => console.log(JSON.stringify(report.issues)));
 """
 
 
 def validated(glb: Path, node: Path) -> dict[str, Any]:
-    """Issues that Khronos' validator finds in a glTF file."""
+    """Issues that Khronos' validator finds in a glTF file, but for attributes named as the extension names
+    them: it does not know the extension, and takes the colon for a mistake."""
     done = subprocess.run(
         ["node", "-e", VALIDATE, str(glb.resolve())], cwd=node, capture_output=True, text=True, check=True
     )
-    return json.loads(done.stdout)
+    issues = json.loads(done.stdout)
+    foreign = [m for m in issues["messages"] if m["pointer"].split("/")[-1].startswith(NAME)]
+    issues["messages"] = [message for message in issues["messages"] if message not in foreign]
+    issues["numErrors"] -= len(foreign)
+    return issues
 
 
 def transformed(ply: Path, node: Path) -> dict[str, float]:
@@ -101,7 +108,7 @@ class _Quiet(http.server.SimpleHTTPRequestHandler):
 def in_mitsuba(ply: Path, camera: Camera, samples: int = 16) -> np.ndarray:
     """What Mitsuba's own volprim_rf_basic makes of the file, on black (H, W, 3), display-encoded.
 
-    Its integrator blends the colours of the file as they are.
+    Its integrator blends the colours of the file as they are, and then takes the sRGB curve off.
     """
     import mitsuba as mi
 
@@ -129,4 +136,4 @@ def in_mitsuba(ply: Path, camera: Camera, samples: int = 16) -> np.ndarray:
             "splats": {"type": "ellipsoids", "filename": str(ply)},
         }
     )
-    return np.asarray(mi.render(scene, spp=samples), dtype=np.float64)[..., :3]
+    return srgb_from_linear(np.asarray(mi.render(scene, spp=samples), dtype=np.float64)[..., :3])
