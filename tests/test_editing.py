@@ -355,6 +355,9 @@ def test_surroundings_stay_with_their_triangles() -> None:
     of_wall = scene.mesh.vertices[scene.mesh.vertices[:, 0] > 0.05]
     moved = edit(scene, move=(0, 0, 9)).scene
     assert moved.surroundings is wall and moved.mesh is not None
+    joined, told = join(replace(whole, mesh=None), scene)
+    assert joined.mesh is not None and len(joined.mesh.faces) == len(scene.mesh.faces) / 2
+    assert joined.surroundings is None and "the surroundings of the joined run are left out" in told
     high = moved.mesh.vertices[:, 2] > 5
     assert high.sum() == len(scene.mesh.vertices) / 2
     np.testing.assert_array_equal(np.sort(moved.mesh.vertices[~high], axis=0), np.sort(of_wall, axis=0))

@@ -176,9 +176,7 @@ def _mesh(
     stays = placement.does_nothing and not (fades or change.cut or change.keep)
     if mesh is None or not len(mesh.faces) or (stays and change.duplicate is None):
         return mesh
-    tables = [raw] if scene.surroundings is None else [raw, scene.surroundings.surfels.to_numpy()]
-    position, logits = (np.concatenate([table[name] for table in tables]) for name in ("position", "opacity"))
-    owners = follow.Owners(mesh, position, sigmoid(logits[:, 0]))
+    owners = follow.Owners(scene)
     after = sigmoid(raw["opacity"][:, 0])
     after[chosen] = sigmoid(own["opacity"][:, 0])
     theirs = owners.chosen(chosen)

@@ -12,6 +12,8 @@ from scipy.spatial import cKDTree
 
 from mi_refgs.editing.rigid import Placement
 from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.surfels.channels import sigmoid
 
 NEIGHBOURS = 8
 """Surfels around the middle of a triangle that decide about it: as many as give a vertex its materials."""
@@ -20,12 +22,16 @@ MAJORITY = 0.5
 
 
 class Owners:
-    """The surfels around each triangle of a mesh; `position` (N, 3) and `opacity` (N,) of the whole scene.
+    """The surfels around each triangle of a scene's mesh: its own, then those of the surroundings."""
 
-    Rows after the object's, those of surroundings, are never chosen: `padded` gives them a value.
-    """
-
-    def __init__(self, mesh: Mesh, position: np.ndarray, opacity: np.ndarray) -> None:
+    def __init__(self, scene: TrainedScene) -> None:
+        assert scene.mesh is not None
+        mesh, tables = scene.mesh, [scene.surfels.to_numpy()]
+        self.own = len(tables[0]["position"])
+        if scene.surroundings is not None:
+            tables.append(scene.surroundings.surfels.to_numpy())
+        position = np.concatenate([table["position"] for table in tables])
+        opacity = sigmoid(np.concatenate([table["opacity"] for table in tables])[:, 0])
         centre = mesh.vertices[mesh.faces].mean(axis=1)
         near = np.arange(1, min(NEIGHBOURS, len(position)) + 1)
         _, self.surfel = cKDTree(position).query(centre, k=near)
@@ -33,16 +39,24 @@ class Owners:
         self.whole = np.maximum(opacity[self.surfel].sum(axis=1), np.finfo(np.float64).tiny)
 
     def share(self, opacity: np.ndarray) -> np.ndarray:
-        """Part (F,) of the opacity around each triangle that other opacities (N,) of the surfels leave."""
+        """Part (F,) of the opacity around each triangle that is left by other opacities (N,) of its own."""
         padded = self.opacity.copy()
-        padded[: len(opacity)] = opacity
+        padded[: self.own] = opacity
         return np.asarray(padded[self.surfel].sum(axis=1) / self.whole)
 
     def chosen(self, rows: np.ndarray) -> np.ndarray:
-        """The triangles (F,) bool of chosen surfels (N,) bool."""
+        """The triangles (F,) bool of chosen surfels (N,) bool of its own."""
         others = np.zeros_like(self.opacity)
-        others[: len(rows)] = np.where(rows, self.opacity[: len(rows)], 0)
+        others[: self.own] = np.where(rows, self.opacity[: self.own], 0)
         return np.asarray(others[self.surfel].sum(axis=1) > MAJORITY * self.whole)
+
+
+def without_surroundings(scene: TrainedScene) -> Mesh | None:
+    """The triangles of the object's own surfels."""
+    if scene.mesh is None or scene.surroundings is None or not len(scene.mesh.faces):
+        return scene.mesh
+    owners = Owners(scene)
+    return scene.mesh.part(owners.chosen(np.ones(owners.own, bool)))
 
 
 def placed(mesh: Mesh, placement: Placement) -> Mesh:

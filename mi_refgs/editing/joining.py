@@ -9,7 +9,6 @@ import numpy as np
 from mi_refgs.editing import follow
 from mi_refgs.errors import InputError
 from mi_refgs.runs.export import TrainedScene
-from mi_refgs.runs.relightable import near
 from mi_refgs.surfels.channels import CHANNELS
 from mi_refgs.surfels.table import Surfels
 
@@ -37,15 +36,12 @@ def join(first: TrainedScene, second: TrainedScene) -> tuple[TrainedScene, list[
     raw = {
         name: np.concatenate(_columns(name, tables)) for name in CHANNELS if any(name in t for t in tables)
     }
-    mesh = second.mesh
-    if mesh is not None and second.surroundings is not None:
-        mesh = near(mesh, second.surfels)
     traced = next((scene.shading for scene in (first, second) if scene.shading.occlusion), first.shading)
     joined = replace(
         first,
         surfels=Surfels.from_numpy(raw),
         light=first.light or second.light,
-        mesh=follow.together(first.mesh, mesh),
+        mesh=follow.together(first.mesh, follow.without_surroundings(second)),
         shading=traced,
     )
     return joined, _notes(first, second, joined)

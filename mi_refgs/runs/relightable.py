@@ -63,7 +63,7 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     surfels = scene.surfels.detach()
     mesh = scene.mesh
     if mesh is not None and scene.surroundings is not None:
-        mesh = near(mesh, surfels)
+        mesh = _near(mesh, surfels)
     if scene.shading.diffuse == "sh":
         surfels = albedo_from_radiance(surfels, scene.light.prefilter(), mesh)
     kept = {name: raw for name, raw in surfels.raw.items() if name not in ("radiance_sh", "indirect_sh")}
@@ -74,7 +74,7 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, surroundings=None)
 
 
-def near(mesh: Mesh, surfels: Surfels) -> Mesh:
+def _near(mesh: Mesh, surfels: Surfels) -> Mesh:
     """The triangles in the box of the surfels: what is around them stands in no other light's way."""
     low, high = bounds_from_points(surfels.to_numpy()["position"])
     return mesh.of_vertices(np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1))
