@@ -6,6 +6,7 @@ inside their functions.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,6 +73,14 @@ def register(made: Format) -> Format:
             raise InputError(f"formats: '{made.name}': {option.name}: another format's differs; rename it")
     FORMATS[made.name] = made
     return made
+
+
+def module(name: str) -> Any:
+    """A module of the extra `export`; raises InputError that says how to install it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise InputError(f'--to: {name} is not installed; pip install "mi_refgs[export]"') from None
 
 
 def options_of(names: Sequence[str] | Mapping[str, Format]) -> dict[str, Option]:

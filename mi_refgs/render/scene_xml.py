@@ -52,36 +52,42 @@ def write_scene_xml(
     scene.append(ElementTree.Comment(" needs `import mi_refgs` before mi.load_file "))
     if remark:
         scene.append(ElementTree.Comment(f" {remark} "))
-    _put(scene, "default", "spp", "1")
+    put(scene, "default", "spp", "1")
     integrator = ElementTree.SubElement(scene, "integrator", type="refgs", id="refgs")
-    _put(integrator, "string", "filename", ply)
-    _put(integrator, "string", "shade_at", shading.at)
-    _put(integrator, "string", "reflectance", shading.reflectance)
-    _put(integrator, "string", "diffuse", shading.diffuse)
-    _put(integrator, "boolean", "occlusion", str(shading.occlusion).lower())
+    put(integrator, "string", "filename", ply)
+    put(integrator, "string", "shade_at", shading.at)
+    put(integrator, "string", "reflectance", shading.reflectance)
+    put(integrator, "string", "diffuse", shading.diffuse)
+    put(integrator, "boolean", "occlusion", str(shading.occlusion).lower())
     for name in shading.accuracy.chosen():
         value = getattr(shading.accuracy, name)
-        _put(integrator, "boolean" if isinstance(value, bool) else "integer", name, str(value).lower())
+        put(integrator, "boolean" if isinstance(value, bool) else "integer", name, str(value).lower())
     if mesh is not None:
-        _put(integrator, "string", "mesh", mesh)
+        put(integrator, "string", "mesh", mesh)
     if surroundings is not None:
         integrator.append(ElementTree.Comment(" without these two: the object alone, on transparency "))
-        _put(integrator, "string", "surroundings", surroundings)
+        put(integrator, "string", "surroundings", surroundings)
     if isinstance(background, str):
-        _put(integrator, "string", "background", background)
+        put(integrator, "string", "background", background)
     elif background is not None:
-        _put(integrator, "rgb", "background", _numbers(background))
+        put(integrator, "rgb", "background", _numbers(background))
     if envmap is not None:
         light = ElementTree.SubElement(integrator, "emitter", type="envmap", name="light")
-        _put(light, "string", "filename", envmap)
+        put(light, "string", "filename", envmap)
     for index, one in enumerate([camera, *more]):
-        _add_sensor(scene, one, f"sensor_{index}" if index else "sensor")
+        add_sensor(scene, one, f"sensor_{index}" if index else "sensor")
 
+    write_xml(path, scene)
+
+
+def write_xml(path: str | Path, scene: ElementTree.Element) -> None:
+    """Write a scene, indented, whole or not at all; raises InputError if the path cannot be written."""
     ElementTree.indent(scene, "    ")
     write_bytes(path, f"{ElementTree.tostring(scene, encoding='unicode')}\n".encode())
 
 
-def _put(parent: ElementTree.Element, kind: str, name: str, value: str) -> None:
+def put(parent: ElementTree.Element, kind: str, name: str, value: str) -> None:
+    """Add a property to an element."""
     ElementTree.SubElement(parent, kind, name=name, value=value)
 
 
@@ -89,7 +95,7 @@ def _numbers(values: Any) -> str:
     return ", ".join(repr(float(x)) for x in values)
 
 
-def _add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
+def add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
     fx, fy, cx, cy, near = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy, camera.near))
     if not fx * fy > 0:
         raise InputError(
@@ -109,19 +115,19 @@ def _add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
         scene.append(ElementTree.Comment(f" the view of {size}, with square pixels "))
 
     sensor = ElementTree.SubElement(scene, "sensor", type="perspective", id=name)
-    _put(sensor, "string", "fov_axis", "x")
-    _put(sensor, "float", "fov", repr(math.degrees(2 * math.atan(width / (2 * focal)))))
-    _put(sensor, "float", "near_clip", repr(max(near, NEAR_CLIP_MIN)))
-    _put(sensor, "float", "far_clip", repr(max(CLIP_RANGE * near, 1.0)))
-    _put(sensor, "float", "principal_point_offset_x", repr(0.5 - cx * per_pixel[0] / width))
-    _put(sensor, "float", "principal_point_offset_y", repr(0.5 - cy * per_pixel[1] / height))
+    put(sensor, "string", "fov_axis", "x")
+    put(sensor, "float", "fov", repr(math.degrees(2 * math.atan(width / (2 * focal)))))
+    put(sensor, "float", "near_clip", repr(max(near, NEAR_CLIP_MIN)))
+    put(sensor, "float", "far_clip", repr(max(CLIP_RANGE * near, 1.0)))
+    put(sensor, "float", "principal_point_offset_x", repr(0.5 - cx * per_pixel[0] / width))
+    put(sensor, "float", "principal_point_offset_y", repr(0.5 - cy * per_pixel[1] / height))
     transform = ElementTree.SubElement(sensor, "transform", name="to_world")
     ElementTree.SubElement(transform, "matrix", value=_numbers(to_world.ravel()))
     sampler = ElementTree.SubElement(sensor, "sampler", type="independent")
-    _put(sampler, "integer", "sample_count", "$spp")
+    put(sampler, "integer", "sample_count", "$spp")
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
-    _put(film, "integer", "width", str(width))
-    _put(film, "integer", "height", str(height))
-    _put(film, "string", "pixel_format", "rgba")
-    _put(film, "string", "component_format", "float32")
+    put(film, "integer", "width", str(width))
+    put(film, "integer", "height", str(height))
+    put(film, "string", "pixel_format", "rgba")
+    put(film, "string", "component_format", "float32")
     ElementTree.SubElement(film, "rfilter", type="box")
