@@ -199,10 +199,9 @@ def _look(camera: Camera, frame: Frame, points: Any, outward: Any, reach: Any) -
         pixel = mi.UInt32(dr.select(inside, line * camera.width + column, 0))
         values = [dr.gather(mi.Float, table, (COLUMNS + 2) * pixel + i, inside) for i in range(COLUMNS + 2)]
         alpha, depth = values[COLUMNS:]
-        share = dr.maximum(1 - dr.abs(x - mi.Float(column)), 0) * dr.maximum(
-            1 - dr.abs(y - mi.Float(line)), 0
-        )
-        share = dr.select(inside & (dr.abs(depth - local.z) < reach), share * alpha * facing**2, 0)
+        beside = dr.abs(x - mi.Float(column)), dr.abs(y - mi.Float(line))
+        share = dr.maximum(1 - beside[0], 0) * dr.maximum(1 - beside[1], 0) * alpha * facing**2
+        share = dr.select(inside & (dr.abs(depth - local.z) < reach), share, 0)
         weight += share
         total = [dr.fma(share, v, sum_) for v, sum_ in zip(values[:COLUMNS], total, strict=True)]
     return weight, total
