@@ -7,12 +7,13 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import ROOT
@@ -25,10 +26,13 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import LightOptions, Method
 from mi_refgs.profiling import phases
 from mi_refgs.profiling.advice import advice
+from mi_refgs.profiling.frame import aovs_of, profile_frame
 from mi_refgs.profiling.profile import Profile, StageProfile, Work, count_work, profile_stage
 from mi_refgs.render.pipeline import Frame
+from mi_refgs.runs.export import TrainedScene
 from mi_refgs.shade.envmap import PrefilteredLight
-from mi_refgs.splat import Blended, Footprints
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Blended, Camera, Footprints
 
 PAUSE = 0.25
 """Seconds that a planted sleep takes: far more than any stage of the tiny scene, on a busy machine too."""
@@ -197,7 +201,7 @@ def files(folder: Path) -> dict[str, int]:
 def test_of_a_run(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = files(finished)
     capsys.readouterr()
-    assert main(["profile", str(finished), "--steps", "2", "--json"]) == 0
+    assert main(["profile", str(finished), "--steps", "2", "--size", "16", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert files(finished) == before  # nothing is written
     (stage,) = found["stages"]
@@ -209,6 +213,38 @@ def test_of_a_run(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert 0 < work["contributing"] < work["evaluated"] and 0 < work["share"] < 1
     assert work["share"] == pytest.approx(work["contributing"] / work["evaluated"])
     assert found["allocated"] > 1e5 and found["threads"] >= 1 and isinstance(found["advice"], list)
+    (frame,) = found["frames"]
+    assert (frame["width"], frame["height"]) == (16, 16) and frame["frame_ms"] > 0
+    traced = [] if TrainedScene.read(finished).mesh is None else ["visibility"]
+    materials = ["albedo", "metallic", "roughness"]
+    assert {*frame["aovs_ms"]} == {*materials, *traced, "normal", "depth", "diffuse", "specular", "indirect"}
+
+
+def test_what_a_picture_and_each_aov_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In turns; kernels that are compiled count for nothing, and an AOV by its difference in a round."""
+    asked: list[tuple[str, ...]] = []
+    clock = [0.0]
+
+    def draw(camera: Camera, names: Collection[str]) -> Frame:
+        asked.append(tuple(names))
+        compiling, slow_round = 9.0 * (len(asked) < 4), 0.5 * (len(asked) > 12)
+        clock[0] += 0.02 + 0.04 * ("depth" in names) + compiling + slow_round
+        return Frame(mi.Float(1), None, None, mi.Color3f(1))
+
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
+    camera = Camera.from_pose(8, 6, -8.0, -8.0, 4.0, 3.0, np.eye(4))
+    found = profile_frame(draw, ["albedo", "depth"], camera, 3)
+    assert asked == [(), ("albedo",), ("depth",)] * 5 and (found.width, found.height) == (8, 6)
+    assert found.frame_ms == pytest.approx(20)
+    assert found.aovs_ms == pytest.approx({"albedo": 0, "depth": 40}, abs=1e-6)
+
+
+def test_aovs_of_a_frame_are_those_that_it_has(finished: Path) -> None:
+    scene = TrainedScene.read(finished)
+    camera = Camera.from_pose(8, 6, -8.0, -8.0, 4.0, 3.0, np.eye(4))
+    plain = replace(scene, shading=Shading(reflectance="radiance"), mesh=None)
+    frame = plain.renderer(aovs=True)(camera)
+    assert aovs_of(frame) == ["albedo", "metallic", "roughness", "normal", "depth", "diffuse"]
 
 
 def test_of_a_data_set(data: Path, method: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -225,6 +261,7 @@ def test_of_a_data_set(data: Path, method: Path, capsys: pytest.CaptureFixture[s
     ("more", "parts"),
     [
         (["--steps", "0"], ["--steps", "give 1 to"]),
+        (["--size", "0"], ["--size", "give 1 to"]),
         (["--preset", "quick"], ["--preset", "drop"]),
         (["--set", "loss.ssim=0"], ["--set", "drop"]),
         (["--data", "nowhere"], ["nowhere", "no such folder"]),
@@ -250,8 +287,21 @@ def test_what_is_neither_run_nor_data(
     ):
         assert main(["profile", *argv]) == 2
         assert part in capsys.readouterr().err
+    assert main(["profile", str(data), "--size", "16"]) == 2
+    assert "drop --size" in capsys.readouterr().err
+
+
+def test_a_run_without_checkpoints_has_pictures(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = Path(shutil.copytree(finished, tmp_path / "run"))
     shutil.rmtree(run / "checkpoints")
+    capsys.readouterr()
+    assert main(["profile", str(run), "--size", "12", "16"]) == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head.split()[-2:] == ["12x12", "16x16"] and "training" not in head
+    assert rows[0].split()[:3] == ["radiance", "and", "alpha"] and any("depth adds" in row for row in rows)
+    (run / "model.json").unlink()
     assert main(["profile", str(run)]) == 2
     assert "checkpoints: none yet" in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""`refgs profile`: where the time of a training step goes, and what would help."""
+"""`refgs profile`: where the time of a training step and of a picture goes, and what would help."""
 
 from __future__ import annotations
 
@@ -13,22 +13,25 @@ from mi_refgs.errors import InputError
 
 if TYPE_CHECKING:
     from mi_refgs.fitting.train import Trainer
+    from mi_refgs.profiling.frame import FrameProfile
     from mi_refgs.profiling.profile import Profile
 
 DEFAULT_STEPS = 15
 MOST_STEPS = 1000
+MOST_PIXELS = 4096
 MEBIBYTE = 2**20
 
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    summary = "say where the time of a training step goes, and what would help"
+    summary = "say where the time of a training step and of a picture goes, and what would help"
     parser = add_command(commands, "profile", summary, "refgs profile runs/glossy", run)
     parser.add_argument(
         "path",
         type=Path,
         metavar="RUN|DATA",
-        help="run folder (its newest checkpoint, in its stage) or data set (a fresh fit, every stage)",
+        help="run folder (its newest checkpoint, in its stage; and its pictures) or data set (a fresh fit, "
+        "every stage)",
     )
     parser.add_argument("--data", type=Path, metavar="DATA", help="with RUN: its data set, if it has moved")
     parser.add_argument("--variant", metavar="V", help="with DATA: method (default: the full one)")
@@ -40,6 +43,13 @@ def add(commands: Any) -> None:
         metavar="N",
         help=f"steps to measure (default {DEFAULT_STEPS})",
     )
+    parser.add_argument(
+        "--size",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="with RUN: pixels along the longer side of its pictures (default 200 400 800)",
+    )
     add_settings(parser)
 
 
@@ -47,15 +57,43 @@ def run(args: argparse.Namespace) -> Result:
     """Measure, and advise. Nothing is written."""
     from mi_refgs.profiling.advice import advice
     from mi_refgs.profiling.profile import profile
+    from mi_refgs.runs.run import Run
 
     if not 1 <= args.steps <= MOST_STEPS:
         raise InputError(f"--steps: {args.steps} is out of range; give 1 to {MOST_STEPS}")
+    for size in args.size or ():
+        if not 1 <= size <= MOST_PIXELS:
+            raise InputError(f"--size: {size} is out of range; give 1 to {MOST_PIXELS}")
+    frames = _frames(args)
+    data: dict[str, Any] = {"frames": [asdict(frame) for frame in frames], "threads": _threads()}
+    if frames and not Run(args.path).checkpoints():
+        return Result(data, frames_text(frames))
     trainer, stages = _trainer(args)
     found = profile(trainer, stages, args.steps)
     said = advice(found, trainer.method)
-    data = asdict(found) | {"threads": _threads(), "advice": said}
+    data |= asdict(found) | {"advice": said}
     data["work"]["share"] = found.work.share
-    return Result(data, text(found, said))
+    return Result(data, "\n\n".join([text(found, said), *([frames_text(frames)] if frames else [])]))
+
+
+def _frames(args: argparse.Namespace) -> list[FrameProfile]:
+    """Pictures of a run at each size; none of a data set, or of a run that has found nothing yet."""
+    from mi_refgs.profiling.frame import SIZES, aovs_of, profile_frame
+    from mi_refgs.reconstruction import load
+    from mi_refgs.runs.export import MODEL
+    from mi_refgs.runs.run import Run
+
+    folder = Run(args.path)
+    if not folder.exists():
+        if args.size:
+            raise InputError(f"--size: {args.path} is no run; drop --size")
+        return []
+    if not folder.checkpoints() and not (args.path / MODEL).is_file():
+        return []
+    found = load(args.path, write=False)
+    draw, camera = found.trained.drawn(), found.camera(0)
+    names = aovs_of(draw(camera, True))
+    return [profile_frame(draw, names, camera.resized(size)) for size in args.size or SIZES]
 
 
 def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
@@ -115,6 +153,15 @@ def text(found: Profile, said: list[str]) -> str:
     ]
     lines += ["", f"a view, mean of {work.views}", *(f"{name:<28}{value}" for name, value in counts), ""]
     return "\n".join([*lines, *(said or ["Nothing stands out."])])
+
+
+def frames_text(frames: list[FrameProfile]) -> str:
+    """A table of milliseconds: the picture alone, and what each AOV adds to it."""
+    lines = [_row("a picture, ms", [f"{frame.width}x{frame.height}" for frame in frames])]
+    lines.append(_row("  radiance and alpha", [f"{frame.frame_ms:.1f}" for frame in frames]))
+    for name in frames[0].aovs_ms:
+        lines.append(_row(f"  {name} adds", [f"{frame.aovs_ms[name]:.1f}" for frame in frames]))
+    return "\n".join(lines)
 
 
 def _row(name: str, cells: list[str]) -> str:

@@ -15,7 +15,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.plugins import require_supported_variant
 from mi_refgs.plugins.aovs import aov_values
 from mi_refgs.plugins.film import through_film
-from mi_refgs.plugins.light import light_of
+from mi_refgs.plugins.light import FilteredOnce
 from mi_refgs.plugins.properties import (
     read_aovs,
     read_light,
@@ -182,6 +182,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.terms = read_terms(props)
         self.around = Around.of(props, self.surfels)
         self.aovs = read_aovs(props)
+        self.filtered = FilteredOnce()
         self.prepared = False  # what rays meet is as the parameters say
         self.check()
         self.unusable = UnusableValues(self.around.values(self.surfels, self.light))
@@ -205,6 +206,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def parameters_changed(self, keys: list[str]) -> None:
         self.check()
         self.unusable.changed = True
+        self.filtered.forget()
         self.prepared = self.prepared and not self.shading.accuracy.ambient_rays
         self.prepared = self.prepared and {*keys}.isdisjoint(self.surfels.primitive.widths) and bool(keys)
 
@@ -224,7 +226,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     ) -> Any:
         """The image (h, w, c) of a sensor; see the class for its channels."""
         self.unusable.look(self.around.values(self.surfels, self.light))
-        image = self._image(scene, sensor, spp)
+        image = self._image(scene, sensor, spp, derivatives=False)
         if evaluate:
             dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -249,17 +251,17 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def sample(self, *args: Any, **kwargs: Any) -> Any:
         raise InputError("refgs: sample: renders whole images only; do not nest it, use its own `aovs`")
 
-    def _image(self, scene: Any, sensor: Any, spp: int) -> Any:
+    def _image(self, scene: Any, sensor: Any, spp: int, derivatives: bool = True) -> Any:
         """Render under whatever AD scope is active, through the sensor's film."""
         if mi.variant() != self.variant:
             made = f"made under {self.variant}, not {mi.variant()}"
             raise InputError(f"refgs: variant: {made}; load the scene again")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        return through_film(sensor, spp, partial(self._channels, scene), self.aov_names())
+        return through_film(sensor, spp, partial(self._channels, scene, derivatives), self.aov_names())
 
-    def _channels(self, scene: Any, camera: Camera, alpha: bool) -> list[Any]:
+    def _channels(self, scene: Any, derivatives: bool, camera: Camera, alpha: bool) -> list[Any]:
         """R, G, B, (A), W and the AOVs, as the film's blocks have them."""
-        frame = self._frame(scene, camera)
+        frame = self._frame(scene, camera, derivatives)
         rgb = frame.radiance
         if len(self.terms) < len(TERMS):  # of the object alone
             rgb = sum((getattr(frame.terms, name) for name in self.terms), start=mi.Color3f(0))
@@ -269,9 +271,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         more = [value for aov in self.aovs for value in aov_values(aov.type, frame, camera)]
         return [*rgb, *([coverage] if alpha else []), mi.Float(1), *more]
 
-    def _frame(self, scene: Any, camera: Camera) -> Frame:
-        aovs = len(self.terms) < len(TERMS) or any(aov.type in (*CHANNELS, *TERMS) for aov in self.aovs)
-        light = light_of(self.shading, self.light, self.light_rotation, scene)
+    def _frame(self, scene: Any, camera: Camera, derivatives: bool) -> Frame:
+        asked = {aov.type for aov in self.aovs} | {*(self.terms if len(self.terms) < len(TERMS) else ())}
+        light = self.filtered.of(self.shading, self.light, self.light_rotation, scene, derivatives)
         if self.occluder is not None and not self.prepared:
             prepare(self.occluder, self.surfels.detach(), light, self.shading.accuracy)
             # No one is told when a light of the scene changes.
@@ -282,9 +284,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             self.shading,
             light,
             self.occluder,
-            aovs=aovs,
-            normals=any(aov.type == "normal" for aov in self.aovs),
+            aovs=asked,
+            normals=False,
             surroundings=self.around.splatted(self.surfels),
+            derivatives=derivatives,
         )
 
     def to_string(self) -> str:

@@ -134,29 +134,34 @@ class TrainedScene:
 
         `samples` a pixel as in `render.samples`. Light and mesh are prepared once.
         """
+        draw = self.drawn()
+        return lambda camera: draw(camera, aovs, samples)
+
+    def drawn(self) -> Callable[..., Frame]:
+        """`renderer`, but what it is called with is a camera, the `aovs` and, if not 1, the `samples`."""
         with dr.suspend_grad():
             light = self.shading.light_of(self.light)
         occluder = Occluder(self.mesh)
         prepare(occluder, self.surfels, light, self.shading.accuracy)
 
-        def once(camera: Camera) -> Frame:
-            return render(
-                self.surfels,
-                camera,
-                self.shading,
-                light,
-                occluder,
-                aovs=aovs,
-                normals=aovs is True,
-                surroundings=self.surroundings,
-                derivatives=False,
-            )
+        def draw(camera: Camera, aovs: bool | Collection[str], samples: int = 1) -> Frame:
+            def once(view: Camera) -> Frame:
+                return render(
+                    self.surfels,
+                    view,
+                    self.shading,
+                    light,
+                    occluder,
+                    aovs=aovs,
+                    normals=aovs is True,
+                    surroundings=self.surroundings,
+                    derivatives=False,
+                )
 
-        def view(camera: Camera) -> Frame:
             with dr.suspend_grad():
                 return supersampled(once, camera, samples, details=bool(aovs))
 
-        return view
+        return draw
 
 
 def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Camera] = ()) -> list[Path]:
