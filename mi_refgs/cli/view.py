@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mi_refgs.cli.command import Result, add_command, say
+from mi_refgs.cli.render import scene_file
+from mi_refgs.errors import InputError
+
+if TYPE_CHECKING:
+    from mi_refgs.viewer.page import Page
 
 EXAMPLE = "refgs view runs/glossy --port 8080"
 HOST, PORT = "127.0.0.1", 8080
@@ -34,10 +39,11 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Serve the page until it is interrupted."""
-    from mi_refgs.runs.run import Run
-    from mi_refgs.viewer.view import page_of_run
+    from mi_refgs.viewer.page import require_free, require_viser
 
-    page = page_of_run(Run(args.scene), args.host, args.port, args.output, args.data, say)
+    require_viser()
+    require_free(args.host, args.port)
+    page = _page_of_run(args) if args.scene.is_dir() else _page_of_scene(args)
     say(f"open {page.url} in a browser; Ctrl-C ends it")
     try:
         page.loop.run()
@@ -46,3 +52,20 @@ def run(args: argparse.Namespace) -> Result:
     finally:
         page.close()
     return Result({"url": page.url, "pictures": page.loop.pictures}, f"{page.loop.pictures} pictures shown")
+
+
+def _page_of_run(args: argparse.Namespace) -> Page:
+    from mi_refgs.runs.run import Run
+    from mi_refgs.viewer.view import page_of_run
+
+    return page_of_run(Run(args.scene), args.host, args.port, args.output, args.data, say)
+
+
+def _page_of_scene(args: argparse.Namespace) -> Page:
+    from mi_refgs.render.load_scene import load_scene
+    from mi_refgs.viewer.view import page_of_scene
+
+    if args.data is not None:
+        raise InputError(f"--data: {args.data}: a scene has no data set; give the run, or drop --data")
+    scene = load_scene(scene_file(args.scene), [])
+    return page_of_scene(scene, args.scene, args.host, args.port, args.output, say)

@@ -20,7 +20,9 @@ from mi_refgs.shade.ambient import prepare
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.light import Light, RotatedLight
 from mi_refgs.shade.points import TERMS
+from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.develop import BACKDROPS, LIGHT_BEHIND, PICTURE, Look, planes_of
 from mi_refgs.viewer.fine import fine_planes
 from mi_refgs.viewer.pose import Pose
@@ -33,22 +35,22 @@ Change = Callable[[TrainedScene], TrainedScene]
 """An edit of a scene that keeps its rows."""
 
 
-def bounds_of(scene: TrainedScene, region: Region | None = None) -> tuple[np.ndarray, float]:
+def bounds_of(surfels: Surfels, region: Region | None = None) -> tuple[np.ndarray, float]:
     """Centre (3,) and radius of the object: its region, else where most of its surfels are."""
     if region is not None:
         return np.array(region.centre), region.radius
-    position = scene.surfels.to_numpy()["position"].astype(np.float64)
+    position = surfels.to_numpy()["position"].astype(np.float64)
     if not len(position):
         return np.zeros(3), 1.0
     low, high = np.percentile(position, (OUTLIERS, 100 - OUTLIERS), axis=0)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
 
-def variables_of(scene: TrainedScene) -> tuple[str, ...]:
-    """The picture and the variables that the scene has."""
-    maps = [name for name in scene.surfels.raw if CHANNELS[name].aov]
-    traced = ["visibility"] if scene.shading.occlusion else []
-    terms = () if scene.shading.model.light == "none" else TERMS if traced else TERMS[:2]
+def variables_of(surfels: Surfels, shading: Shading) -> tuple[str, ...]:
+    """The picture and the variables that such surfels have."""
+    maps = [name for name in surfels.raw if CHANNELS[name].aov]
+    traced = ["visibility"] if shading.occlusion else []
+    terms = () if shading.model.light == "none" else TERMS if traced else TERMS[:2]
     return (PICTURE, *maps, "normal", "depth", "alpha", *traced, *terms)
 
 
@@ -61,7 +63,7 @@ class Fitted:
     def __init__(self, scene: TrainedScene, region: Region | None = None) -> None:
         """Show the scene as it is; `region` is what its data set is about."""
         self.original = scene
-        self.centre, self.radius = bounds_of(scene, region)
+        self.centre, self.radius = bounds_of(scene.surfels, region)
         self.turn = 0.0  # degrees that the light is turned about z, counter-clockwise from above
         self.environment = scene.light
         self.changes: list[Change] = []
@@ -74,7 +76,7 @@ class Fitted:
     @property
     def variables(self) -> tuple[str, ...]:
         """See `Source`."""
-        return variables_of(self.scene)
+        return variables_of(self.scene.surfels, self.scene.shading)
 
     @property
     def backdrops(self) -> tuple[str, ...]:

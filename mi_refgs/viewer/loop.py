@@ -71,6 +71,7 @@ class Loop:
         self.visitors: dict[int, Visitor] = {}
         self.failed: Callable[[str], None] = lambda message: None  # told of bad input of a note
         self.pictures = 0  # that were sent
+        self.smooth = True  # whether pictures that stay are averaged over samples
         self._notes: dict[Any, Callable[[], None]] = {}
         self._wake = threading.Condition()
         self._stopped = False
@@ -155,7 +156,7 @@ class Loop:
                 self.failed(str(error))
         now = self.clock()
         waiting = [
-            (quality.due(v.shown, now - v.changed), v.shown, v)
+            (quality.due(v.shown if self.smooth or v.shown < LARGE else DONE, now - v.changed), v.shown, v)
             for v in tuple(self.visitors.values())
             if v.pose is not None
         ]

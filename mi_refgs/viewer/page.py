@@ -75,12 +75,20 @@ class Page:
     """One server for all pages that are open; its controls are shared, cameras are each page's own."""
 
     def __init__(
-        self, source: Source, views: Views, title: str, host: str, port: int, views_folder: Path
+        self,
+        source: Source,
+        views: Views,
+        title: str,
+        host: str,
+        port: int,
+        views_folder: Path,
+        begin: Pose | None = None,
     ) -> None:
         """Listen; raises InputError if that port is taken or viser is not installed."""
         viser = require_viser()
         require_free(host, port)
         self.source, self.views, self.views_folder = source, views, views_folder
+        self.begin = begin
         self.loop = Loop(source)
         self.loop.failed = self.complain
         self.look = Look(depths=self._depths())
@@ -105,7 +113,9 @@ class Page:
     # ---------------- cameras ----------------
 
     def start(self) -> Pose:
-        """Where a page first looks from: the first test view, or from a side, a little above."""
+        """Where a page first looks from: as it was told, the first test view, or a little from above."""
+        if self.begin is not None:
+            return self.begin
         if self.views.all:
             return Pose.of_view(self.views.all[0])
         outward = np.array([math.cos(0.6), math.sin(0.6), 0.5])

@@ -6,6 +6,7 @@ import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 
@@ -20,7 +21,8 @@ from mi_refgs.viewer.controls import light, look, materials, overlays, saving, t
 from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
 from mi_refgs.viewer.fitted import Fitted
 from mi_refgs.viewer.loop import added
-from mi_refgs.viewer.page import Page, Views, require_free, require_viser
+from mi_refgs.viewer.mitsuba_scene import MitsubaScene
+from mi_refgs.viewer.page import Page, Views
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.source import Shot, Source
 
@@ -38,8 +40,6 @@ def page_of_run(
     Nothing is written into the run. Raises InputError for a folder that is no run or holds no fit, for a port
     that is taken, and without viser.
     """
-    require_viser()
-    require_free(host, port)
     views = views_of(run, data, tell)
     some = views.test or views.train
     scene = scene_of(run)
@@ -51,6 +51,18 @@ def page_of_run(
     materials.add(page, source)
     overlays.add(page, scene.mesh)
     truth.add(page)
+    saving.add(page)
+    page.listen()
+    return page
+
+
+def page_of_scene(scene: Any, path: Path, host: str, port: int, output: Path | None, tell: Tell) -> Page:
+    """A page of a loaded Mitsuba scene, drawn by its own integrator; raises InputError as `page_of_run`."""
+    source = MitsubaScene(scene, str(path))
+    page = Page(source, Views(), path.name, host, port, output or path.parent / "views", source.start())
+    page.side = warm_up(source, page.look, page.start(), tell)
+    look.add(page)
+    light.add(page, source)
     saving.add(page)
     page.listen()
     return page

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from mi_refgs.errors import InputError
 from mi_refgs.relighting.light import NewLight
@@ -31,35 +31,52 @@ if (!window.refgsDrop) {
 no script of a page but through an event handler."""
 
 
-def add(page: Page, scene: Fitted) -> None:
-    """Add the controls; nothing for a scene whose model has no light."""
+class Turning(Protocol):
+    """A scene whose light may turn."""
+
+    @property
+    def lit(self) -> bool:
+        """Whether it has one that may."""
+
+    def set_turn(self, degrees: float) -> None:
+        """Turn it."""
+
+
+def add(page: Page, scene: Turning) -> None:
+    """Add the controls; nothing for a scene without a light that may turn."""
     if not scene.lit:
         return
     gui = page.server.gui
-    with gui.add_folder("Light"):
+    folder = gui.add_folder("Light")
+    with folder:
         turn = gui.add_slider("Turn", 0.0, 360.0, 1.0, 0.0, hint="Degrees about the vertical axis.")
-        upload = gui.add_upload_button(
-            "Upload or drop an HDRI",
-            mime_type=IMAGES,
-            hint="A lat-long image (EXR, HDR) whose first row is straight up.",
-        )
-        world = gui.add_checkbox(
-            "Map has world directions", False, hint="As environment.exr and envmap.exr have."
-        )
-        own = gui.add_button("The fitted light")
-        relit = None
-        if scene.can_relight:
-            relit = gui.add_checkbox(
-                "Materials alone",
-                False,
-                hint="Shade the diffuse part by the light, too, with traced shadows, as `refgs relight` "
-                "does; without, a diffuse colour that was fitted stays.",
-            )
-        gui.add_html(DROP)
+    turn.on_update(lambda _: page.loop.ask("turn", lambda: scene.set_turn(turn.value)))
+    if isinstance(scene, Fitted):
+        with folder:
+            _add_swap(page, scene, turn)
 
-    @turn.on_update
-    def _(_: Any) -> None:
-        page.loop.ask("turn", lambda: scene.set_turn(turn.value))
+
+def _add_swap(page: Page, scene: Fitted, turn: Any) -> None:
+    """What another light takes, and the way back."""
+    gui = page.server.gui
+    upload = gui.add_upload_button(
+        "Upload or drop an HDRI",
+        mime_type=IMAGES,
+        hint="A lat-long image (EXR, HDR) whose first row is straight up.",
+    )
+    world = gui.add_checkbox(
+        "Map has world directions", False, hint="As environment.exr and envmap.exr have."
+    )
+    own = gui.add_button("The fitted light")
+    relit = None
+    if scene.can_relight:
+        relit = gui.add_checkbox(
+            "Materials alone",
+            False,
+            hint="Shade the diffuse part by the light, too, with traced shadows, as `refgs relight` "
+            "does; without, a diffuse colour that was fitted stays.",
+        )
+    gui.add_html(DROP)
 
     @upload.on_upload
     def _(_: Any) -> None:

@@ -1,0 +1,157 @@
+"""A fit as a page shows it while it runs: pictures between steps, curves of its loss and PSNR.
+
+A fit pays for it only while somebody looks, and then at most SHARE of its time.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refgs.runs.run import LOG, Run
+from mi_refgs.viewer.controls import look, overlays
+from mi_refgs.viewer.develop import BACKDROPS, PICTURE, Look, planes_of
+from mi_refgs.viewer.fine import fine_planes
+from mi_refgs.viewer.fitted import bounds_of, variables_of
+from mi_refgs.viewer.page import Page, Views
+from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.source import Sampled, Shot
+
+if TYPE_CHECKING:
+    from mi_refgs.fitting.train import Trainer
+
+SHARE = 0.25
+"""Part of the time that pictures may take while somebody looks."""
+REFRESH = 2.0
+"""Seconds after which a picture and the curves show the present state of the fit."""
+LARGEST = 400
+"""Rung of the pictures, at most: a fit of everyday size has smaller ones."""
+CURVES = {"loss": "#4dabf7", "psnr": "#ffa94d"}
+"""Numbers of the log that are plotted, and their colours."""
+
+
+class Training:
+    """A trainer as a source of pictures."""
+
+    square_pixels = False
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.trainer = trainer
+        self.centre, self.radius = bounds_of(trainer.surfels, trainer.data.region)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """See `Source`; those that the fit has from its first stage on."""
+        shading = self.trainer.shading()
+        return tuple(name for name in variables_of(self.trainer.surfels, shading) if name != "visibility")
+
+    @property
+    def backdrops(self) -> tuple[str, ...]:
+        """See `Source`."""
+        return () if self.trainer.surroundings is not None else tuple(BACKDROPS)
+
+    def draw(self, shot: Shot) -> Sampled:
+        """See `Source`."""
+        camera = shot.camera()
+        frame = self.trainer.view(camera, aovs=shot.look.what != PICTURE)
+        with dr.suspend_grad():
+            return Sampled(planes_of(frame, camera, shot.look, None), frame.depth)
+
+    def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
+        """See `Source`."""
+        return fine_planes(self.draw, pose, width, height, look)
+
+
+class Live:
+    """The page of a running fit; called after each step, as `Trainer.train` calls its progress."""
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        run: Run,
+        host: str,
+        port: int,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Serve the page; raises InputError if the port is taken, and without viser."""
+        self.page = Page(
+            Training(trainer),
+            Views(train=trainer.data),
+            run.path.resolve().name,
+            host,
+            port,
+            run.path / "views",
+        )
+        self.page.largest = LARGEST
+        self.page.loop.smooth = False
+        self.log, self.clock = run.path / LOG, clock
+        self.since, self.spent, self.refreshed = clock(), 0.0, -REFRESH
+        look.add(self.page)
+        self.curves = self._add_curves()
+        overlays.add(self.page, None)
+        self.page.listen()
+
+    def __call__(self, trainer: Trainer) -> None:
+        """Draw what somebody who looks waits for, within the share of time."""
+        loop = self.page.loop
+        now = self.clock()
+        if not loop.visitors:
+            self.since, self.spent = now, 0.0
+            return
+        if now - self.refreshed > REFRESH:
+            self.refreshed = now
+            self._show_curves()
+            loop.change()
+        if self.spent > SHARE * (now - self.since):
+            return
+        loop.step()
+        self.spent += self.clock() - now
+
+    def _add_curves(self) -> dict[str, Any]:
+        from viser import uplot
+
+        gui, empty = self.page.server.gui, np.zeros(1)
+        with gui.add_folder("Training"):
+            return {
+                name: gui.add_uplot(
+                    data=(empty, empty),
+                    series=(
+                        uplot.Series(label="iteration"),
+                        uplot.Series(label=name, stroke=colour, width=2),
+                    ),
+                    scales={"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)},
+                    title=name,
+                    aspect=2.0,
+                )
+                for name, colour in CURVES.items()
+            }
+
+    def _show_curves(self) -> None:
+        rows = read_log(self.log)
+        iteration = np.array([row["iteration"] for row in rows], np.float64)
+        for name, plot in self.curves.items():
+            if len(rows) > 1:
+                plot.data = (iteration, np.array([row[name] for row in rows], np.float64))
+
+    def close(self) -> None:
+        """Stop serving."""
+        self.page.close()
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """The whole lines of a log that have all that is plotted."""
+    rows = []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
+        try:
+            row = json.loads(line)
+        except ValueError:  # being written
+            continue
+        if all(isinstance(row.get(name), int | float) for name in ("iteration", *CURVES)):
+            rows.append(row)
+    return rows
