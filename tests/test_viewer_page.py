@@ -64,7 +64,8 @@ class Server:
         self.said: list[str] = []
         self.url = ""
         self._known = threading.Event()
-        threading.Thread(target=self._read, daemon=True).start()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
         assert self._known.wait(PATIENCE), "".join(self.said)
         assert self.url, "".join(self.said)
 
@@ -84,8 +85,10 @@ class Server:
             self.process.wait(PATIENCE)
         finally:
             self.process.kill()
-        assert self.process.stdout is not None
-        return self.process.stdout.read()
+        self._reader.join(PATIENCE)
+        assert self.process.stdout is not None and self.process.stderr is not None
+        with self.process.stdout, self.process.stderr:
+            return self.process.stdout.read()
 
 
 class Tab:
@@ -123,17 +126,22 @@ class Tab:
     def still(self) -> np.ndarray:
         """The canvas once the picture is smooth and stays."""
         self.page.get_by_text(re.compile(r"× \d+, 16 a pixel")).wait_for(timeout=1000 * PATIENCE)
-        before = self.canvas()
-        for _ in range(40):
+        before, same = self.canvas(), 0
+        for _ in range(60):
             self.page.wait_for_timeout(300)
-            if np.array_equal(now := self.canvas(), before):
+            same = same + 1 if np.array_equal(now := self.canvas(), before) else 0
+            if same == 4:  # a busy browser takes its time to decode a picture
                 return now
             before = now
         raise AssertionError("the canvas does not come to rest")
 
     def row(self, label: str) -> Any:
         """The input of the control with this label."""
-        return self.page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]").locator("input")
+        return (
+            self.page.get_by_text(label, exact=True)
+            .locator("xpath=ancestor::*[.//input][1]")
+            .locator("input")
+        )
 
     def type(self, label: str, value: str) -> None:
         """Type into a control."""
@@ -233,10 +241,9 @@ def test_the_page_shows_the_object_and_the_light_turns_on_it(tab: Tab) -> None:
     before = tab.still()
     assert len(np.unique(before.reshape(-1, 3), axis=0)) > 500
     tab.type("Turn", "120")
-    tab.until(lambda picture: bool(np.abs(picture - before).mean() > 1), "another light")
-    tab.still()
+    tab.until(lambda picture: bool(np.abs(picture - before).mean() > 5), "another light")
     tab.press("The fitted light")
-    tab.until(lambda picture: bool(np.abs(picture - before).max() <= 2), "the light as it was")
+    tab.until(lambda picture: bool(np.abs(picture - before).mean() < 0.5), "the light as it was")
 
 
 def test_the_roughness_slider_shows_and_saves_the_edited_scene(
@@ -254,10 +261,11 @@ def test_the_roughness_slider_shows_and_saves_the_edited_scene(
     chosen = select(scene, Selection(where="metallic > 0.5"))
     edited = apply(scene, chosen, Change(set=assignments({"roughness": 0.9})))
     found, camera = read_exr_image(path), camera_of(path)
-    assert np.abs(found - rendered(scene, camera)).max() > 0.1
-    assert np.abs(found - rendered(edited, camera)).max() < 1e-3
+    unlike, like = (np.abs(found - rendered(given, camera)) for given in (scene, edited))
+    assert unlike.max() > 0.1
+    assert like.max() < 0.02 and like.mean() < 1e-5  # files keep fewer digits of camera, light and channels
     tab.press("As fitted")
-    tab.until(lambda picture: bool(np.abs(picture - before).max() <= 2), "the scene as it was")
+    tab.until(lambda picture: bool(np.abs(picture - before).mean() < 0.5), "the scene as it was")
     tab.type("Where", "")
     tab.page.get_by_text("6,000 of 6,000 surfels").wait_for(timeout=1000 * PATIENCE)
 
@@ -278,15 +286,15 @@ def test_another_variable_is_shown_and_saved(tab: Tab, server: tuple[Server, Pat
     png = np.asarray(Image.open(path).convert("RGB"), np.int16)
     assert png.std() > 10 and picture.std() > 10
     tab.choose("Show", "picture")
-    tab.until(lambda picture: bool(np.abs(picture - before).max() <= 2), "the picture")
+    tab.until(lambda picture: bool(np.abs(picture - before).mean() < 0.5), "the picture")
 
 
-def test_a_light_is_uploaded(tab: Tab, scene: TrainedScene, server: tuple[Server, Path], tmp_path: Path) -> None:
+def test_a_light_is_uploaded(
+    tab: Tab, scene: TrainedScene, server: tuple[Server, Path], tmp_path: Path
+) -> None:
     before = tab.still()
     write_exr(tmp_path / "dusk.exr", other_sky())
-    tab.page.get_by_text("Map has world directions").locator("xpath=ancestor::*[.//input][1]").locator(
-        "input"
-    ).check(force=True)
+    tab.row("Map has world directions").check(force=True)
     tab.page.locator("input[type=file]").set_input_files(tmp_path / "dusk.exr")
     tab.until(lambda picture: bool(np.abs(picture - before).mean() > 1), "another light")
     known = set(server[1].iterdir())
@@ -306,7 +314,8 @@ def test_a_file_that_is_dropped_onto_the_page_becomes_the_light(tab: Tab, tmp_pa
         """(content) => {
             const data = new DataTransfer();
             data.items.add(new File([new Uint8Array(content)], 'dusk.exr'));
-            window.dispatchEvent(new DragEvent('drop', {dataTransfer: data, bubbles: true, cancelable: true}));
+            const how = {dataTransfer: data, bubbles: true, cancelable: true};
+            window.dispatchEvent(new DragEvent('drop', how));
         }""",
         content,
     )

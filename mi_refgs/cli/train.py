@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs.cli.command import Result, add_command, add_output, add_settings
+from mi_refgs.cli.view import HOST, PORT
 from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError
 
 if TYPE_CHECKING:
+    from mi_refgs.evaluation.progress import Bar
     from mi_refgs.fitting.plan import Estimate
 
 EXAMPLE = "refgs train data/glossy -o runs/glossy --preset quick --set loss.alpha=0.1"
@@ -37,6 +39,14 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--resume", action="store_true", help="go on from the newest checkpoint, if there is one"
     )
+    parser.add_argument(
+        "--view",
+        nargs="?",
+        type=int,
+        const=PORT,
+        metavar="PORT",
+        help=f"show pictures and curves of the fit in the browser (default port {PORT})",
+    )
 
 
 def run(args: argparse.Namespace) -> Result:
@@ -44,7 +54,7 @@ def run(args: argparse.Namespace) -> Result:
     from mi_refgs.evaluation.progress import Bar
     from mi_refgs.reconstruct import fit
 
-    progress, begin = Bar(), time.monotonic()
+    progress, begin = Bar() if args.view is None else _watched(args.view), time.monotonic()
     fit(
         args.data,
         variant_of(args.variant, args.purpose),
@@ -81,6 +91,13 @@ def run(args: argparse.Namespace) -> Result:
         data |= {"terms": list(trainer.method.terms), "decisions": trainer.decisions}
         text = f"{table(trainer.decisions)}\n{text}"
     return Result(data, text)
+
+
+def _watched(port: int) -> Bar:
+    """The bar of a fit with a page; raises InputError as `refgs view` does."""
+    from mi_refgs.viewer.live import Live
+
+    return Live(HOST, port)
 
 
 def variant_of(variant: str | None, purpose: str | None) -> str | None:

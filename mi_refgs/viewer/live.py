@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
+from mi_refgs.evaluation.progress import Bar
 from mi_refgs.runs.run import LOG, Run
 from mi_refgs.viewer.controls import look, overlays
 from mi_refgs.viewer.develop import BACKDROPS, PICTURE, Look, planes_of
 from mi_refgs.viewer.fine import fine_planes
 from mi_refgs.viewer.fitted import bounds_of, variables_of
-from mi_refgs.viewer.page import Page, Views
+from mi_refgs.viewer.page import Page, Views, require_free, require_viser
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.source import Sampled, Shot
 
@@ -68,8 +69,35 @@ class Training:
         return fine_planes(self.draw, pose, width, height, look)
 
 
-class Live:
-    """The page of a running fit; called after each step, as `Trainer.train` calls its progress."""
+class Live(Bar):
+    """The progress bar of a fit, and its page."""
+
+    def __init__(self, host: str, port: int) -> None:
+        """Raises InputError if the port is taken, and without viser."""
+        require_viser()
+        require_free(host, port)
+        self.host, self.port = host, port
+        self.page: TrainingPage | None = None
+
+    def begin(self, trainer: Trainer) -> None:
+        super().begin(trainer)
+        if trainer.run is not None:
+            self.page = TrainingPage(trainer, trainer.run, self.host, self.port)
+            self.say(f"open {self.page.page.url} in a browser to watch")
+
+    def step(self, trainer: Trainer) -> None:
+        super().step(trainer)
+        if self.page is not None:
+            self.page.step()
+
+    def end(self) -> None:
+        super().end()
+        if self.page is not None:
+            self.page.page.close()
+
+
+class TrainingPage:
+    """The page of a running fit; `step` is called after each of its steps."""
 
     def __init__(
         self,
@@ -97,7 +125,7 @@ class Live:
         overlays.add(self.page, None)
         self.page.listen()
 
-    def __call__(self, trainer: Trainer) -> None:
+    def step(self) -> None:
         """Draw what somebody who looks waits for, within the share of time."""
         loop = self.page.loop
         now = self.clock()
@@ -117,12 +145,13 @@ class Live:
         from viser import uplot
 
         gui, empty = self.page.server.gui, np.zeros(1)
+        x_axis = uplot.Series(label="iteration")
         with gui.add_folder("Training"):
             return {
                 name: gui.add_uplot(
                     data=(empty, empty),
                     series=(
-                        uplot.Series(label="iteration"),
+                        x_axis,
                         uplot.Series(label=name, stroke=colour, width=2),
                     ),
                     scales={"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)},
@@ -138,10 +167,6 @@ class Live:
         for name, plot in self.curves.items():
             if len(rows) > 1:
                 plot.data = (iteration, np.array([row[name] for row in rows], np.float64))
-
-    def close(self) -> None:
-        """Stop serving."""
-        self.page.close()
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:

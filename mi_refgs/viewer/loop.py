@@ -179,9 +179,9 @@ class Loop:
             image, depth, reached = compared.picture(self.source, visitor.look, visitor.window), None, DONE
         else:
             still = quality.still_side(*visitor.window, visitor.largest)
-            moving = min(visitor.fixed or visitor.side, still)
+            moving = visitor.fixed or min(visitor.side, still)
             side = moving if shown == NOTHING else still
-            reached = shown + 1 if shown >= LARGE else (LARGE if side == still else COARSE)
+            reached = shown + 1 if shown >= LARGE else (LARGE if side >= still else COARSE)
             shot = self._shot(visitor, pose, side, reached)
             sampled = self.source.draw(shot)
             sums = added(sums if reached > LARGE else [], sampled.planes)

@@ -22,7 +22,6 @@ from mi_refgs.viewer.loop import Loop, Shown, Visitor
 from mi_refgs.viewer.pose import Pose, up_of
 from mi_refgs.viewer.source import Source
 
-HOST, PORT = "127.0.0.1", 8080
 MOVING_JPEG, STILL_JPEG = 70, 92
 """JPEG qualities of pictures that are soon replaced, and of those until until a smooth one, a PNG, comes."""
 STATUS_INTERVAL = 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,8 +27,9 @@ from mi_refgs.viewer.page import Page, Views
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.source import Shot, Source
 
-USUAL_SHAPE = 1.6
-"""Shape of the pictures that are compiled before a page asks: that of a desktop window."""
+USUAL_SHAPES = (1.0, 1.6)
+"""Shapes of the pictures that are compiled before a page asks: of small and of large desktop windows, less
+the panel at their side."""
 
 Tell = Callable[[str], None]
 
@@ -99,14 +101,15 @@ def warm_up(source: Source, look: Look, pose: Pose, tell: Tell) -> int:
     """Compile the kernels of all sizes that a desktop window needs; returns the rung to begin moving at."""
     tell("preparing: compiling for each size of picture")
     chosen = quality.COARSEST
-    for side in (s for s in quality.SIDES if s <= quality.FINEST):
-        shot = Shot(pose, *quality.size_of(side, USUAL_SHAPE), look, settled=True)
-        seconds = 0.0
-        for _ in range(2):
-            begin = time.monotonic()
-            planes = added(added([], source.draw(shot).planes), source.draw(shot).planes)
-            to_bytes(shown_planes(planes, look), shot.width, shot.height)
-            seconds = (time.monotonic() - begin) / 2  # two samples
-        chosen = side if seconds < quality.SLOW else chosen
+    for shape, side in itertools.product(USUAL_SHAPES, quality.SIDES):
+        if side > quality.FINEST:
+            continue
+        shot = Shot(pose, *quality.size_of(side, shape), look, settled=True)
+        sums = added([], source.draw(shot).planes)
+        begin = time.monotonic()
+        sums = added(sums, source.draw(shot).planes)
+        to_bytes(shown_planes(sums, look), shot.width, shot.height)
+        if time.monotonic() - begin < quality.SLOW:
+            chosen = max(side, chosen)
     dr.sync_thread()
     return chosen

@@ -1,0 +1,259 @@
+"""How fast a page of `refgs view` is, and whether it lasts: in a headless browser, on a run.
+
+    python -m benchmarks.viewer RUN [--minutes 10] [--window 1000x640] [--moving 800] -o OUT.json
+
+Measures, with the viewer in a process of its own:
+
+    first_picture_s   from the page's opening until the canvas shows the object
+    orbit             while the camera is dragged round: pictures a second that the page received, and CPU
+                      milliseconds of the viewer for each (user and system, of all its threads)
+    clicks            random controls, drags and wheel turns for some minutes: errors in the console, and the
+                      viewer's resident memory at the start, after a tenth of the time, and at the end
+
+The browser draws in software and shares the machine with the viewer: what it takes is given as browser_cpu_s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+TICKS = os.sysconf("SC_CLK_TCK")
+COUNTER = """
+window.refgsPictures = 0;
+const made = URL.createObjectURL;
+URL.createObjectURL = (blob) => {
+  if (blob.type && blob.type.startsWith('image/')) window.refgsPictures += 1;
+  return made.call(URL, blob);
+};
+"""
+"""Counts the pictures that the page decodes: each becomes an object URL."""
+
+
+def cpu_seconds(pid: int) -> float:
+    """User and system time of a process and all its threads."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def resident_mb(pid: int) -> float:
+    """Resident memory of a process."""
+    found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())
+    return int(found[1]) / 1024 if found else 0.0
+
+
+def children_cpu() -> float:
+    """CPU seconds of all chromium processes that this one has started, as far as they still run."""
+    total, pids = 0.0, {os.getpid()}
+    stats = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            name, _, rest = path.read_text().rpartition(")")
+        except OSError:
+            continue
+        fields = rest.split()
+        stats[int(path.parent.name)] = (int(fields[1]), name, (int(fields[11]) + int(fields[12])) / TICKS)
+    for _ in range(8):
+        pids |= {pid for pid, (parent, _, _) in stats.items() if parent in pids}
+    for pid in pids:
+        if pid in stats and "chrom" in stats[pid][1]:
+            total += stats[pid][2]
+    return total
+
+
+class Viewer:
+    """`refgs view` in a process of its own."""
+
+    def __init__(self, run: Path, saved: Path) -> None:
+        begin = time.monotonic()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "mi_refgs", "view", str(run), "--port", "0", "-o", str(saved), "--json"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            if found := re.search(r"http://[\d.]+:\d+", line):
+                self.url = found[0]
+                break
+        else:
+            raise SystemExit(f"refgs view {run} did not start")
+        self.ready_s = time.monotonic() - begin
+
+    def stop(self) -> None:
+        """End it as Ctrl-C does."""
+        self.process.send_signal(2)
+        try:
+            self.process.wait(30)
+        finally:
+            self.process.kill()
+
+
+def first_picture(page: Any, url: str) -> float:
+    """Seconds until the canvas shows something."""
+    begin = time.monotonic()
+    page.goto(url)
+    page.wait_for_function("window.refgsPictures > 0", timeout=60000, polling=20)
+    page.wait_for_timeout(50)  # to the screen
+    return time.monotonic() - begin
+
+
+def choose(page: Any, label: str, value: str) -> None:
+    """Choose in a drop-down."""
+    page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]").locator(
+        "input"
+    ).first.click()
+    page.get_by_role("option", name=value, exact=True).click()
+
+
+def orbit(page: Any, viewer: Viewer, seconds: float) -> dict[str, float]:
+    """Drag the camera round for some time."""
+    box = page.locator("canvas").first.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    pid = viewer.process.pid
+    before, cpu, browser = page.evaluate("window.refgsPictures"), cpu_seconds(pid), children_cpu()
+    begin = time.monotonic()
+    step = 0
+    while time.monotonic() - begin < seconds:
+        step += 1
+        page.mouse.move(x + 0.3 * box["width"] * ((step % 120) / 60 - 1), y + (step % 40))
+        page.wait_for_timeout(8)
+    taken = time.monotonic() - begin
+    pictures = page.evaluate("window.refgsPictures") - before
+    result = {
+        "seconds": round(taken, 2),
+        "pictures": pictures,
+        "pictures_per_s": round(pictures / taken, 2),
+        "cpu_ms_per_picture": round(1000 * (cpu_seconds(pid) - cpu) / max(pictures, 1), 1),
+        "browser_cpu_s": round(children_cpu() - browser, 2),
+    }
+    page.mouse.up()
+    return result
+
+
+def click_about(page: Any, viewer: Viewer, seconds: float, seed: int) -> dict[str, Any]:
+    """Random use for some time."""
+    rng, pid = random.Random(seed), viewer.process.pid
+    box = page.locator("canvas").first.bounding_box()
+    begin, clicks = time.monotonic(), 0
+    memory = {"start": resident_mb(pid)}
+    while (passed := time.monotonic() - begin) < seconds:
+        if "tenth" not in memory and passed > seconds / 10:
+            memory["tenth"] = resident_mb(pid)
+        clicks += 1
+        kind = rng.random()
+        x, y = box["x"] + rng.random() * box["width"], box["y"] + rng.random() * box["height"]
+        if kind < 0.35:  # orbit or pan
+            page.mouse.move(x, y)
+            page.mouse.down(button=rng.choice(("left", "right")))
+            page.mouse.move(x + rng.uniform(-150, 150), y + rng.uniform(-80, 80), steps=6)
+            page.mouse.up(button="left")
+            page.mouse.up(button="right")
+        elif kind < 0.45:
+            page.mouse.move(x, y)
+            page.mouse.wheel(0, rng.uniform(-200, 200))
+        else:
+            inputs = page.locator(
+                "[role=slider], input[type=checkbox], button:not([aria-haspopup]), input[aria-haspopup]"
+            )
+            target = inputs.nth(rng.randrange(max(inputs.count(), 1)))
+            try:
+                target.scroll_into_view_if_needed(timeout=1000)
+                if target.get_attribute("role") == "slider":
+                    target.press(rng.choice(("ArrowLeft", "ArrowRight", "PageUp", "PageDown")), timeout=1000)
+                elif "Upload" not in (target.text_content() or ""):  # it would open a file dialogue
+                    target.click(timeout=1000)
+                    options = page.get_by_role("option")
+                    if options.count():
+                        options.nth(rng.randrange(options.count())).click(timeout=1000)
+            except Exception as error:  # covered, gone, or a folder that is closed
+                if "Timeout" not in type(error).__name__ and "Error" not in type(error).__name__:
+                    raise
+        page.wait_for_timeout(rng.choice((20, 100, 700)))
+    page.wait_for_timeout(2000)
+    memory["end"] = resident_mb(pid)
+    return {
+        "seconds": round(time.monotonic() - begin, 1),
+        "clicks": clicks,
+        "resident_mb": {name: round(value, 1) for name, value in memory.items()},
+        "alive": viewer.process.poll() is None,
+    }
+
+
+def measure(args: argparse.Namespace) -> dict[str, Any]:
+    """All of it."""
+    from playwright.sync_api import sync_playwright
+
+    browser_path = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if browser_path is None:
+        raise SystemExit("no chromium is installed; apt-get install chromium")
+    width, height = (int(x) for x in args.window.split("x"))
+    errors: list[str] = []
+    with tempfile.TemporaryDirectory() as saved, sync_playwright() as playwright:
+        viewer = Viewer(args.run, Path(saved))
+        try:
+            browser = playwright.chromium.launch(executable_path=browser_path, args=OPTIONS)
+            page = browser.new_page(viewport={"width": width, "height": height})
+            page.add_init_script(COUNTER)
+            page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
+            page.on("pageerror", lambda error: errors.append(str(error)))
+            result: dict[str, Any] = {
+                "run": str(args.run),
+                "window": args.window,
+                "cores": os.cpu_count(),
+                "load_before": os.getloadavg()[0],
+                "ready_s": round(viewer.ready_s, 2),
+                "first_picture_s": round(first_picture(page, viewer.url), 2),
+            }
+            page.wait_for_timeout(3000)
+            result["orbit"] = orbit(page, viewer, args.seconds)
+            for side in args.moving:
+                choose(page, "Moving", f"{side}²")
+                page.wait_for_timeout(3000)
+                orbit(page, viewer, 2)  # the first of this size
+                result[f"orbit_{side}"] = orbit(page, viewer, args.seconds)
+            choose(page, "Moving", "automatic")
+            if args.minutes > 0:
+                result["clicks"] = click_about(page, viewer, 60 * args.minutes, args.seed)
+            result["console_errors"] = errors
+            result["load_after"] = os.getloadavg()[0]
+            browser.close()
+        finally:
+            viewer.stop()
+    return result
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else "")
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--minutes", type=float, default=10.0, help="of random clicks; 0 for none")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each orbit")
+    parser.add_argument("--window", default="1000x640", help="pixels of the page")
+    parser.add_argument("--moving", type=int, nargs="*", default=[200, 800], help="sizes to orbit at, too")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("-o", "--output", type=Path)
+    args = parser.parse_args()
+    text = json.dumps(measure(args), indent=1)
+    print(text)
+    if args.output is not None:
+        args.output.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
