@@ -42,7 +42,7 @@ EXHIBITS: dict[str, Exhibit] = {
         {
             "silver": {"where": "metallic > 0.5", "set": ["albedo=0.95,0.93,0.88"]},
             "polished": {"where": "metallic > 0.5", "set": ["roughness=0.05"]},
-            "cut open": {"where": "y < 0", "keep": True},
+            "empty": {"where": "metallic < 0.5", "cut": True},
         },
     ),
     "studded": Exhibit(
