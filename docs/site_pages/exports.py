@@ -38,6 +38,9 @@ def section(name: str, form: Format) -> str:
     told = inspect.getdoc(sys.modules[form.write.__module__]) or form.summary
     text = [f"## {name} {{#{name}}}", told]
     if form.options:
-        rows = [[f"`--{o.name.replace('_', '-')}`", f"`{o.default}`", o.help] for o in form.options]
+        rows = [
+            [f"`--{o.name.replace('_', '-')}`", "off" if o.default is False else f"`{o.default}`", o.help]
+            for o in form.options
+        ]
         text.append(table(["option", "default", "meaning"], rows))
     return "\n\n".join(text)
