@@ -15,14 +15,19 @@ import numpy as np
 import pytest
 from integrator_scenes import sky
 from known_scene import CLAY, known_mesh, known_surfels
+from tiny_scene import SETTINGS
 
 from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.pictures import planes
 from mi_refgs.exr import read_exr_image
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.methods.read import load
+from mi_refgs.render.load_scene import load_scene
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import relightable
+from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
@@ -32,7 +37,9 @@ from mi_refgs.viewer.controls.saving import write_view
 from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
 from mi_refgs.viewer.edits import mean_of, selected, with_material
 from mi_refgs.viewer.fitted import Fitted
+from mi_refgs.viewer.live import TrainingPage, read_log
 from mi_refgs.viewer.loop import Loop, Shown, Visitor
+from mi_refgs.viewer.mitsuba_scene import MitsubaScene
 from mi_refgs.viewer.pose import Pose, page_rotation
 from mi_refgs.viewer.quality import COARSE, DONE, LARGE, NOTHING
 from mi_refgs.viewer.source import Sampled, Shot
@@ -218,6 +225,17 @@ def test_what_moves_meanwhile_drops_what_was_under_way(running: Any) -> None:
     loop.step()
     assert [s.shown for s in seen] == [COARSE, COARSE]
     assert source.shots[-1].pose.fov == 0.8
+
+
+def test_small_pictures_are_shown_while_it_keeps_moving(running: Any) -> None:
+    """Each is old by the time that it is drawn."""
+    loop, source, _, seen = running
+    source.during = lambda: loop.look(7, replace(POSE, fov=0.7 + 0.01 * len(source.shots)), (640, 400))
+    source.during()
+    for _ in range(5):
+        assert loop.step() == 0
+    assert [s.shown for s in seen] == [COARSE] * 5
+    assert [shot.pose.fov for shot in source.shots] == [0.7 + 0.01 * i for i in range(5)]
 
 
 def test_a_smooth_picture_is_the_mean_of_its_samples_and_starts_anew_after_a_change(running: Any) -> None:
@@ -441,3 +459,98 @@ def test_without_viser_the_remedy_is_named(
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
     assert main(["view", str(finished)]) == 2
     assert capsys.readouterr().err == ('refgs: view: viser is not installed; pip install "mi_refgs[view]"\n')
+
+
+# ---------------- Mitsuba scenes ----------------
+
+
+def test_a_mitsuba_scene_of_a_run_is_drawn_like_the_run(finished: Path) -> None:
+    source = MitsubaScene(load_scene(finished / "scene.xml", []), "scene.xml")
+    own = Fitted(TrainedScene.read(finished))
+    assert source.variables == own.variables
+    pose = source.start()
+    for name in ("picture", "normal", "roughness", "depth", "specular"):
+        found, wanted = (
+            to_bytes(shown_planes(each.draw(Shot(pose, 24, 24, Look(name))).planes, Look(name)), 24, 24)
+            for each in (source, own)
+        )
+        assert np.abs(found.astype(int) - wanted).max() <= 2, name
+        assert np.ptp(wanted) > 0, name
+    assert len(source.fine(pose, 12, 10, Look())) == 4
+
+
+def test_the_environment_of_a_path_traced_scene_turns() -> None:
+    light = np.full((8, 16, 3), 0.1, np.float32)
+    light[:, :8] = 2.0
+    loaded = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "hide_emitters": True},
+            "ball": {"type": "sphere"},
+            "sky": {
+                "type": "envmap",
+                "bitmap": mi.Bitmap(light),
+                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
+            },
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at([0, -4, 0], [0, 0, 0], [0, 0, 1]),
+            },
+        }
+    )
+    source = MitsubaScene(loaded, "ball.xml")
+    assert source.lit and source.variables == ("picture",)
+    assert source.radius == pytest.approx(3**0.5, rel=1e-3) and np.abs(source.centre).max() < 1e-3
+    bright = []
+    for degrees in (0.0, 90.0, 180.0, 360.0):
+        source.set_turn(degrees)
+        planes_found = source.fine(source.start(), 16, 16, Look())
+        bright.append(np.array(planes_found[0]).reshape(16, 16)[:, :8].sum())
+    assert bright[0] == pytest.approx(bright[3], rel=0.05)
+    assert max(bright) > 1.5 * min(bright)
+
+
+# ---------------- a fit that is watched ----------------
+
+
+def test_a_fit_draws_only_for_those_who_look_and_a_share_of_its_time(
+    data: Path, method: Path, tmp_path: Path
+) -> None:
+    views = read_dataset(data, "train")
+    trainer = Trainer(load(str(method), "quick", SETTINGS), views)
+    clock = Clock()
+    page = TrainingPage(trainer, Run(tmp_path), "127.0.0.1", 0, clock)
+    drawn: list[Shot] = []
+    draw = page.page.source.draw
+
+    def slow(shot: Shot) -> Sampled:
+        drawn.append(shot)
+        clock.now += 0.5
+        return draw(shot)
+
+    try:
+        page.page.source.draw = slow  # type: ignore[method-assign]
+        for _ in range(20):
+            clock.now += 0.1
+            page.step()
+        assert drawn == []
+        seen: list[Shown] = []
+        page.page.loop.enter(1, Visitor(seen.append))
+        page.page.loop.look(1, Pose.of_view(views.views[0]), (64, 40))
+        for _ in range(100):
+            clock.now += 0.1
+            page.step()
+        taken = 10 + 0.5 * len(drawn)
+        assert 0.2 * taken < 0.5 * len(drawn) < 0.25 * taken + 0.6
+        assert seen[0].image.std() > 1
+    finally:
+        page.page.close()
+
+
+def test_the_curves_are_those_of_whole_lines(tmp_path: Path) -> None:
+    log = tmp_path / "metrics.jsonl"
+    assert read_log(log) == []
+    log.write_text(
+        '{"iteration": 1, "loss": 0.5, "psnr": 20}\n{"iteration": 2, "loss": 0.4}\n{"iteration": 3, '
+    )
+    assert [row["iteration"] for row in read_log(log)] == [1]

@@ -23,7 +23,7 @@ from helpers import ROOT
 from integrator_scenes import sky
 from known_scene import known_mesh, known_surfels, other_sky
 from PIL import Image
-from tiny_scene import write_data
+from tiny_scene import train_command, write_data, write_method
 
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.editing import Change, Selection, apply, assignments, select
@@ -349,3 +349,21 @@ def test_overlays_are_drawn(tab: Tab) -> None:
     tab.row("Mesh").first.check(force=True)
     tab.until(lambda picture: bool(np.abs(picture - before).mean() > 1), "the mesh")
     tab.row("Mesh").first.uncheck(force=True)
+
+
+def test_a_fit_is_watched_while_it_runs(chromium: Any, tmp_path: Path) -> None:
+    data, method = write_data(tmp_path / "data"), write_method(tmp_path)
+    command = train_command(data, tmp_path / "run", method, "--view", "0")
+    running = Server(*command, "iterations=1000000", "checkpoint_every=100000")
+    page = chromium.new_page(viewport=WINDOW)
+    try:
+        tab = Tab(page, running.url)
+        tab.until(lambda picture: float(picture.std()) > 5, "a picture")
+        page.wait_for_function("document.querySelectorAll('.uplot').length >= 2", timeout=1000 * PATIENCE)
+        before = tab.canvas()
+        tab.until(lambda picture: bool(np.abs(picture - before).mean() > 0.1), "a later picture")
+        assert tab.errors == []
+    finally:
+        page.close()
+        running.stop()
+    assert any("resume with: refgs train" in line for line in running.said)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any
 
@@ -160,8 +160,11 @@ class Fitted:
 
     # ---------------- pictures ----------------
 
-    def frame(self, camera: Any, aovs: bool = False, settled: bool = True) -> Frame:
-        """A view, without derivatives; until it is `settled`, ambient shadows may be those of before."""
+    def frame(self, camera: Any, aovs: Collection[str] = (), settled: bool = True) -> Frame:
+        """A view, without derivatives; until it is `settled`, ambient shadows may be those of before.
+
+        `aovs` as in `render`.
+        """
         light = self.light
         with dr.suspend_grad():
             if self._stale and (settled or self._never):
@@ -174,8 +177,8 @@ class Fitted:
                 light,
                 self._occluder,
                 aovs=aovs,
-                normals=aovs,
                 surroundings=self.scene.surroundings,
+                derivatives=False,
             )
 
     @property
@@ -189,7 +192,7 @@ class Fitted:
     def draw(self, shot: Shot) -> Sampled:
         """See `Source`."""
         camera = shot.camera()
-        frame = self.frame(camera, shot.look.what != PICTURE, shot.settled)
+        frame = self.frame(camera, shot.asked, shot.settled)
         with dr.suspend_grad():
             return Sampled(planes_of(frame, camera, shot.look, self.light), frame.depth)
 

@@ -195,11 +195,12 @@ class Loop:
             dr.sync_thread()
         taken = self.clock() - begin
         with self._wake:
-            if visitor.version != version:
-                return
-            visitor.shown, visitor.sums = reached, sums if LARGE < reached < DONE else []
             if compared is None and shown == NOTHING and visitor.fixed is None:
                 visitor.side = quality.moving_side(side, taken, still)
+            if visitor.version == version:
+                visitor.shown, visitor.sums = reached, sums if LARGE < reached < DONE else []
+            elif shown != NOTHING:  # a small picture is shown all the same: else nothing is while it moves
+                return
         if image is not None:
             self.pictures += 1
             visitor.deliver(Shown(image, reached, taken, depth))
@@ -210,7 +211,8 @@ class Loop:
         index = max(reached - LARGE - 1, 0)
         offset = quality.offsets()[index] if reached > LARGE else (0.0, 0.0)
         pose = replace(pose, aspect=aspect)
-        return Shot(pose, width, height, visitor.look, offset, index, settled=reached >= LARGE)
+        settled = reached >= LARGE
+        return Shot(pose, width, height, visitor.look, offset, index, settled, depth=visitor.depth)
 
     def _depth(self, visitor: Visitor, sampled: Sampled, shot: Shot) -> np.ndarray | None:
         if not visitor.depth or sampled.depth is None:

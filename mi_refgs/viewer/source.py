@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mi_refgs.splat.camera import Camera
-from mi_refgs.viewer.develop import Look
+from mi_refgs.viewer.develop import PICTURE, Look
 from mi_refgs.viewer.pose import Pose
 
 
@@ -24,6 +24,13 @@ class Shot:
     index: int = 0  # of the sample
     settled: bool = False  # whether nothing has moved for a while, so that it may cost more
     exact: Camera | None = None  # in place of the pose, with its pixels
+    depth: bool = False  # whether depth is wanted, too
+
+    @property
+    def asked(self) -> frozenset[str]:
+        """What `render` is to make beside the picture."""
+        shown = {self.look.what} - {PICTURE, "alpha"}
+        return frozenset(shown | ({"depth"} if self.depth else set()))
 
     def camera(self) -> Camera:
         """The renderer's camera."""
