@@ -36,9 +36,12 @@ def camera_at(focal: float, offset: tuple[int, int] = (0, 0)) -> Camera:
     return replace(Camera.from_pose(45, 38, -focal, -focal, 20.0, 22.0, pose), offset=offset)
 
 
-def sphere(radius: float) -> Mesh:
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-    return Mesh(np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32), 0.05)
+def mesh() -> Mesh:
+    """A ball below the discs, and one that stands beside it in the way of its mirror rays."""
+    ball, other = (trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.8, 1.2))
+    other.apply_translation([-1.8, 1.2, 0.8])
+    both = trimesh.util.concatenate([ball, other])
+    return Mesh(np.asarray(both.vertices, np.float32), np.asarray(both.faces, np.uint32), 0.05)
 
 
 def things(gaussians: bool = False) -> Surfels:
@@ -52,7 +55,7 @@ def things(gaussians: bool = False) -> Surfels:
 def both(surfels: Surfels, view: Camera, shading: Shading, **more: Any) -> list[Frame]:
     """Frames with everything: with derivatives, and without."""
     light = EnvironmentLight.from_radiance(sky())
-    given = (surfels, view, shading, shading.light_of(light), Occluder(sphere(0.8)))
+    given = (surfels, view, shading, shading.light_of(light), Occluder(mesh()))
     return [render(*given, aovs=True, derivatives=derivatives, **more) for derivatives in (True, False)]
 
 
@@ -69,6 +72,8 @@ def assert_same(expected: Frame, found: Frame) -> None:
     assert {*wanted} == {*got}
     seen = np.array(expected.alpha) > 0.02
     assert 0.02 < seen.mean() < 0.98
+    if "visibility" in wanted:
+        assert 0.02 < wanted["visibility"][seen].mean() < 0.995
     for name, value in wanted.items():
         assert got[name].shape == value.shape, name
         part = seen if name in (*MAPS, "depth") else slice(None)
@@ -130,7 +135,7 @@ def test_a_frame_has_what_is_asked_for(at: Any, name: str, monkeypatch: pytest.M
     monkeypatch.setattr(splat, "blend_shown", counted)
     light = EnvironmentLight.from_radiance(sky())
     shading = Shading(at, "split_sum", "sh", occlusion=at == "pixel")
-    given = (things(), camera_at(30.0), shading, shading.light_of(light), Occluder(sphere(0.8)))
+    given = (things(), camera_at(30.0), shading, shading.light_of(light), Occluder(mesh()))
     asked = {name} - {""}
     found = values(render(*given, aovs=asked, derivatives=False))
     has = {*TERMS} if name in TERMS else {name} - {""}
