@@ -38,10 +38,11 @@ def camera_at(focal: float, offset: tuple[int, int] = (0, 0)) -> Camera:
 
 def mesh() -> Mesh:
     """A ball below the discs, and one that stands beside it in the way of its mirror rays."""
-    ball, other = (trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.8, 1.2))
-    other.apply_translation([-1.8, 1.2, 0.8])
-    both = trimesh.util.concatenate([ball, other])
-    return Mesh(np.asarray(both.vertices, np.float32), np.asarray(both.faces, np.uint32), 0.05)
+    balls = [trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.8, 1.2)]
+    vertices = [np.asarray(ball.vertices, np.float32) for ball in balls]
+    faces = np.asarray(balls[0].faces, np.uint32)
+    both = np.concatenate([vertices[0], vertices[1] + np.float32([-1.8, 1.2, 0.8])])
+    return Mesh(both, np.concatenate([faces, faces + len(vertices[0])]).astype(np.uint32), 0.05)
 
 
 def things(gaussians: bool = False) -> Surfels:
