@@ -41,7 +41,7 @@ def mesh() -> Mesh:
     balls = [trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.8, 1.2)]
     vertices = [np.asarray(ball.vertices, np.float32) for ball in balls]
     faces = np.asarray(balls[0].faces, np.uint32)
-    both = np.concatenate([vertices[0], vertices[1] + np.float32([-1.8, 1.2, 0.8])])
+    both = np.concatenate([vertices[0], vertices[1] + np.array([-1.8, 1.2, 0.8], np.float32)])
     return Mesh(both, np.concatenate([faces, faces + len(vertices[0])]).astype(np.uint32), 0.05)
 
 
