@@ -16,7 +16,7 @@ from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.formats import FORMATS, Format, Option, register, write
-from mi_refgs.formats.shots import pose_of, shots_around, shots_of
+from mi_refgs.formats.shots import shots_around, shots_of
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
 
@@ -145,7 +145,7 @@ def test_a_run_without_data_has_cameras_around_its_surfels(finished: Path, tmp_p
     assert len(shots) == 64 and shots[0].split == "test"
     position = trained.surfels.to_numpy()["position"]
     for shot in shots[::7]:
-        pose = pose_of(shot.camera)
+        pose = shot.camera.pose()
         local = (position - pose[:3, 3]) @ pose[:3, :3]
         pixel = np.abs(local[:, :2] / local[:, 2:]) * abs(shot.camera.fx[0])
         assert np.mean((pixel < shot.camera.width / 2).all(axis=1) & (local[:, 2] > 0)) > 0.9

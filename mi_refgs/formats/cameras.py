@@ -26,12 +26,11 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
     """Write the folder `target`; see `Format.write`."""
     from mi_refgs.data.colmap_text import write_cameras, write_images, write_points, write_test_list
     from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
-    from mi_refgs.formats.shots import pose_of
 
     sparse = target / "sparse" / "0"
     make_folder(sparse)
     names = [_file_name(shot.name) for shot in shots]
-    poses = [pose_of(shot.camera) for shot in shots]
+    poses = [shot.camera.pose() for shot in shots]
     frames = []
     for name, shot, pose in zip(names, shots, poses, strict=True):
         numbers = dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), _pinhole(shot), strict=True))

@@ -66,14 +66,6 @@ def shots_around(surfels: Surfels) -> list[Shot]:
     return shots
 
 
-def pose_of(camera: Camera) -> np.ndarray:
-    """World-from-camera (4, 4) float64 in Mitsuba's frame."""
-    pose = np.eye(4)
-    pose[:3, :3] = np.array(camera.rotation, dtype=np.float64).reshape(3, 3).T
-    pose[:3, 3] = [float(a[0]) + float(b[0]) for a, b in zip(camera.origin, camera.origin_rest, strict=True)]
-    return pose
-
-
 def _quantile(values: np.ndarray, weight: np.ndarray, share: float) -> float:
     """The value below which the share of the weight lies."""
     order = np.argsort(values)
