@@ -138,6 +138,8 @@ class Loop:
         """Draw until `stop`."""
         while not self._stopped:
             wait = self.step()
+            if wait == math.inf:
+                dr.flush_malloc_cache()  # what the sizes of pictures have left there
             with self._wake:
                 if wait > 0 and not self._notes and not self._stopped:
                     self._wake.wait(None if wait == math.inf else wait)
@@ -184,7 +186,7 @@ class Loop:
             reached = shown + 1 if shown >= LARGE else (LARGE if side >= still else COARSE)
             shot = self._shot(visitor, pose, side, reached)
             sampled = self.source.draw(shot)
-            sums = added(sums if reached > LARGE else [], sampled.planes)
+            sums = added(sums, sampled.planes)
             count = max(reached - LARGE, 1)
             image = None
             if reached <= LARGE or reached in SHOWN_AT:

@@ -112,4 +112,5 @@ def warm_up(source: Source, look: Look, pose: Pose, tell: Tell) -> int:
         if time.monotonic() - begin < quality.SLOW:
             chosen = max(side, chosen)
     dr.sync_thread()
+    dr.flush_malloc_cache()
     return chosen
