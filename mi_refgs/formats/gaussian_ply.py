@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mi_refgs.runs.export import TrainedScene
 
 DEGREE = Option("degree", 3, "degree of the spherical-harmonic colours of splats, 0 to 3")
-ALONE = Option("object", False, "the object alone, without its surroundings")
+ALONE = Option("object", False, "the object without its surroundings; no file of splats has the background")
 
 
 def write(
