@@ -16,8 +16,15 @@ from mi_refgs import __version__, llvm
 PROBE_TIMEOUT = 60.0
 """Seconds that the trial kernel may take before the machine counts as unusable; it takes about half."""
 
-EXTRAS = {"lpips": "lpips", "flip": "flip-evaluator", "capture": "pycolmap"}
-"""Distribution that each optional extra of pyproject.toml brings."""
+EXTRAS = {
+    "lpips": "lpips",
+    "flip": "flip-evaluator",
+    "capture": "pycolmap",
+    "view": "viser",
+    "export": "xatlas",
+    "completion": "shtab",
+}
+"""Distribution that each optional extra of pyproject.toml brings, of those that a command asks for."""
 
 # A process of its own, because an LLVM that cannot compile this kernel aborts instead of raising. The width
 # of the vectors is read off the kernel, since Dr.Jit does not tell it.

@@ -20,6 +20,7 @@ import pytest
 from helpers import ROOT, imported_packages
 
 import mi_refgs
+from mi_refgs.doctor import EXTRAS
 from mi_refgs.errors import InputError
 from mi_refgs.resources import resource_dir
 
@@ -227,6 +228,12 @@ def test_every_import_is_declared() -> None:
     for path in (ROOT / "mi_refgs").rglob("*.py"):
         missing = {name for name in imported(path.read_text()) if name.lower() not in known}
         assert not missing, f"{path.name} imports {missing}, which pyproject.toml does not declare"
+
+
+def test_doctor_looks_for_what_the_extras_bring() -> None:
+    extras = PROJECT["project"]["optional-dependencies"]
+    for name, distribution in EXTRAS.items():
+        assert any(line.startswith(distribution) for line in extras[name]), name
 
 
 def test_version_is_stated_once() -> None:
