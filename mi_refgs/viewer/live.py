@@ -118,6 +118,7 @@ class TrainingPage:
         )
         self.page.largest = LARGEST
         self.page.loop.smooth = False
+        self.page.loop.clock = clock
         self.log, self.clock = run.path / LOG, clock
         self.since, self.spent, self.refreshed = clock(), 0.0, -REFRESH
         look.add(self.page)

@@ -36,6 +36,7 @@ class Shown:
     shown: int  # how good it is, from quality.COARSE to quality.DONE
     seconds: float  # that its last sample took
     depth: np.ndarray | None = None  # (H, W) float32, where the page asked for it
+    samples: int = 1  # of a pixel
 
 
 @dataclass(eq=False)
@@ -205,7 +206,8 @@ class Loop:
                 return
         if image is not None:
             self.pictures += 1
-            visitor.deliver(Shown(image, reached, taken, depth))
+            samples = 1 if compared is not None else max(reached - LARGE, 1)
+            visitor.deliver(Shown(image, reached, taken, depth, samples))
 
     def _shot(self, visitor: Visitor, pose: Pose, side: int, reached: int) -> Shot:
         width, height = visitor.size(side, self.source.square_pixels)

@@ -188,7 +188,7 @@ class Page:
         if smooth or now - self._told > STATUS_INTERVAL:
             self._told = now
             height, width = shown.image.shape[:2]
-            samples = max(shown.shown - quality.LARGE, 1)
+            samples = shown.samples
             self.status(f"{width} × {height}, {samples} a pixel, {1000 * shown.seconds:.0f} ms")
 
     def close(self) -> None:
