@@ -20,12 +20,14 @@ from mi_refgs.evaluation.pictures import planes
 from mi_refgs.exr import read_exr_image
 from mi_refgs.formats import Shot, write
 from mi_refgs.formats.bake import bake
+from mi_refgs.formats.principled import base_colour, diffuse_share
 from mi_refgs.formats.shots import shots_around
 from mi_refgs.formats.surface import surface, texels, unwrap
 from mi_refgs.formats.textured import TexturedMesh
 from mi_refgs.images import linear_from_srgb, read_png
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.export import TrainedScene
+from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.channels import logit
@@ -233,8 +235,8 @@ def test_plain_mitsuba_shows_what_we_show(exported: Exported, tmp_path: Path, va
 
 def test_plain_mitsuba_reads_textures_as_they_are_meant(exported: Exported) -> None:
     folder = exported.folder / "mitsuba"
-    albedo = linear_from_srgb(read_png(folder / "albedo.png"))
-    np.testing.assert_allclose(albedo, exported.baked.albedo, atol=0.01)
+    base = base_colour(exported.baked)
+    np.testing.assert_allclose(linear_from_srgb(read_png(folder / "albedo.png")), base, atol=0.01)
     scene = mi.load_file(str(folder / "scene.xml"))
     si = dr_interaction(exported.baked)
     params = mi.traverse(scene.shapes()[0].bsdf())
@@ -243,10 +245,30 @@ def test_plain_mitsuba_reads_textures_as_they_are_meant(exported: Exported) -> N
     }
     bsdf = scene.shapes()[0].bsdf()
     shown = np.array(bsdf.eval_diffuse_reflectance(si)).T
-    ball = ball_of(exported.baked.vertices)
-    assert np.quantile(np.abs(shown - np.array([m["albedo"] for m in MATERIALS])[ball]), 0.98) < 0.02
+    assert np.quantile(np.abs(shown - at(base, exported.baked.uv)), 0.98) < 0.02
     text = (folder / "scene.xml").read_text()
     assert text.count('name="raw" value="true"') == 2 and text.count('name="raw" value="false"') == 1
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.5, 0.9])
+def test_principled_reflects_as_much_as_our_model(roughness: float) -> None:
+    """Of constant light, over all directions of view: sampled weights against the split-sum table."""
+    import drjit as dr
+
+    known, share = diffuse_share()
+    rgb = {"type": "rgb", "value": [0.6 * float(np.interp(roughness, known, share))] * 3}
+    bsdf = mi.load_dict({"type": "principled", "base_color": rgb, "roughness": roughness, "specular": 0.5})
+    count = 1 << 18
+    random = mi.PCG32(count)
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    cosine = dr.sqrt(random.next_float32())
+    si.wi = mi.Vector3f(dr.sqrt(1 - cosine * cosine), 0, cosine)
+    points = mi.Point2f(random.next_float32(), random.next_float32())
+    _, weight = bsdf.sample(mi.BSDFContext(), si, random.next_float32(), points)
+    scale, bias = split_sum(cosine, mi.Float(roughness))
+    specular = 0.04 * scale + bias
+    ours = dr.mean(specular + (1 - specular) * 0.6)
+    assert float(dr.mean(weight.x)[0]) == pytest.approx(float(ours[0]), rel=0.01)
 
 
 def dr_interaction(made: TexturedMesh) -> Any:

@@ -5,8 +5,8 @@
     albedo.png roughness.png metallic.png        textures: sRGB; linear; linear
     envmap.exr                                   the light
 
-The parameters of `principled` are those of a run: its specular 0.5 reflects 0.04 at normal incidence. Its
-diffuse part gets no less for what the specular one reflects, and is some percent brighter than ours.
+The parameters of `principled` are those of a run: its specular 0.5 reflects 0.04 at normal incidence. Only
+the base colour of dielectrics is another, by some percent (`formats.principled`).
 """
 
 from __future__ import annotations
@@ -35,13 +35,14 @@ TEXTURES = {"base_color": "albedo.png", "roughness": "roughness.png", "metallic"
 def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int, texture: int) -> list[Path]:
     """Write the folder `target`; see `Format.write`. The sensors are those of the test views."""
     from mi_refgs.formats.bake import bake
+    from mi_refgs.formats.principled import base_colour
     from mi_refgs.images import srgb_from_linear, write_png
     from mi_refgs.render.scene_xml import add_sensor, put, write_xml
 
     made = bake(trained, shots, faces, texture)
     make_folder(target)
     write_bytes(target / MESH, _ply(made))
-    write_png(target / TEXTURES["base_color"], srgb_from_linear(made.albedo))
+    write_png(target / TEXTURES["base_color"], srgb_from_linear(base_colour(made)))
     for name in ("roughness", "metallic"):
         write_png(target / TEXTURES[name], getattr(made, name))
     made.light.write(target / LIGHT)
