@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from integrator_scenes import raw_channels, sky
+from integrator_scenes import image, raw_channels, scene, sky
 from test_surroundings import around
 
 from mi_refgs import splat
@@ -176,3 +176,17 @@ def test_another_view_is_no_other_kernel() -> None:
     misses = dr.detail.launch_stats()[1:]
     frame(1.6)
     assert dr.detail.launch_stats()[1:] == misses
+
+
+def test_the_plugin_filters_a_light_that_changes_again() -> None:
+    """It keeps what it filtered for the next picture, until its parameters change."""
+    changing = scene()
+    before = image(changing)
+    params = mi.traverse(changing)
+    key = next(name for name in params.keys() if name.endswith(".light"))
+    brighter = mi.TensorXf(params[key] + 1)
+    params[key] = brighter
+    params.update()
+    after = image(changing)
+    assert np.abs(after - before).max() > 0.1
+    np.testing.assert_allclose(after, image(scene(light=brighter)), atol=1e-6)
