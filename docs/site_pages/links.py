@@ -73,7 +73,7 @@ def _link(found: re.Match[str], folder: str, page: str) -> str:
     if path in STANDS_FOR:
         there = STANDS_FOR[path]
     elif path.startswith("docs/"):
-        there = path.removeprefix("docs/")
+        there = re.sub(r"\.ipynb$", ".md", path.removeprefix("docs/"))
     elif (ROOT / path).exists() and not image:
         return text
     else:
