@@ -50,6 +50,14 @@ class Source:
         records = {EDITS: {"edits": self.edits}} if self.edits else None
         save(trained, folder, self.method, camera, data=self.data, region=self.region, records=records)
 
+    def with_data(self, folder: Path | None) -> Source:
+        """The same with another data set, or this for None; raises InputError for what is no folder."""
+        if folder is None:
+            return self
+        if not folder.is_dir():
+            raise InputError(f"{folder}: --data: no such folder; give that of a data set")
+        return replace(self, data=folder)
+
     @property
     def is_there(self) -> bool:
         """Whether the folder of the data set is."""

@@ -16,9 +16,10 @@ from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.formats import FORMATS, Format, Option, register, write
-from mi_refgs.formats.shots import shots_around, shots_of
+from mi_refgs.formats.shots import shots_around
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
+from mi_refgs.source import Source
 
 
 @pytest.fixture
@@ -141,7 +142,7 @@ def test_a_run_without_data_has_cameras_around_its_surfels(finished: Path, tmp_p
     shutil.copytree(finished, run)
     (run / "dataset.json").unlink()
     trained = TrainedScene.read(run)
-    shots = shots_of(Run(run), Run(run).method(), trained.surfels)
+    shots = Source.of(Run(run)).shots(trained, "test", "train")
     assert len(shots) == 64 and shots[0].split == "test"
     position = trained.surfels.to_numpy()["position"]
     for shot in shots[::7]:

@@ -107,6 +107,7 @@ LAYERS: dict[str, set[str]] = {
         "relighting",
         "reconstruct",
         "reconstruction",
+        "source",
         "editing",
         "messages",
         "compare",

@@ -108,10 +108,7 @@ def run(args: argparse.Namespace) -> Result:
 
     _require_free(args.output)
     whole = load(args.run_folder, write=False)
-    if args.data is not None:
-        if not args.data.is_dir():
-            raise InputError(f"{args.data}: --data: no such folder; give that of a data set")
-        whole = replace(whole, source=replace(whole.source, data=args.data))
+    whole = replace(whole, source=whole.source.with_data(args.data))
     join = None if args.join is None else load(args.join, write=False)
     options = {name: getattr(args, name) for name in OPTIONS}
     try:

@@ -57,9 +57,9 @@ def run(args: argparse.Namespace) -> Result:
     from mi_refgs.evaluation.evaluate import load_split
     from mi_refgs.files import make_folder
     from mi_refgs.formats import FORMATS, options_of, write
-    from mi_refgs.formats.shots import shots_of
     from mi_refgs.runs.export import TrainedScene, export
     from mi_refgs.runs.run import Run
+    from mi_refgs.source import Source
 
     if args.limit is not None and not args.prune:
         raise InputError("--limit: limits what --prune drops; add --prune, or leave it out")
@@ -72,7 +72,10 @@ def run(args: argparse.Namespace) -> Result:
     method = folder.method()
     state = folder.load_checkpoint()
     fitted = TrainedScene.read(folder.path) if state is None else TrainedScene.from_state(method, state)
-    shots = shots_of(folder, method, fitted.surfels, args.data)
+    source = Source.of(folder).with_data(args.data)
+    if source.data is not None and not source.is_there:
+        say(f"note: {source.data} is gone; cameras are around the object, or give its folder with --data")
+    shots = source.shots(fitted, "test", "train")
     target = args.output or folder.path
     report: dict[str, Any] = {}
     if args.prune:

@@ -1,19 +1,15 @@
-"""The cameras of a run: those of its data set, or around its surfels where there is none."""
+"""Cameras around surfels, for what has no data set."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 
 from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.data.pathtrace import poses_around
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.formats.format import Shot
-from mi_refgs.methods.method import Method
-from mi_refgs.runs.run import DATASET, Run
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 
@@ -23,21 +19,6 @@ SIZE, FIELD_OF_VIEW = 512, 40.0
 """Pixels and degrees of their square pictures."""
 INSIDE = 0.98
 """Share of the surfels, by opacity, that the sphere which fills these pictures holds: strays lie far out."""
-
-
-def shots_of(run: Run, method: Method, surfels: Surfels, data: Path | None = None) -> list[Shot]:
-    """The test views, then the training views of a run's data set, or of that in `data`.
-
-    A run that records no data set has cameras around its surfels. Raises InputError for data that is gone or
-    cannot be read.
-    """
-    if data is None and not (run.path / DATASET).is_file():
-        return shots_around(surfels)
-    return [
-        Shot(view.name, split, view.camera())
-        for split in ("test", "train")
-        for view in load_split(run, method, split, data).views
-    ]
 
 
 def shots_around(surfels: Surfels) -> list[Shot]:
