@@ -96,7 +96,7 @@ class Reconstruction:
         An index counts `cameras(split)`. Raises InputError for an index that is out of range and for what
         is no camera.
         """
-        if isinstance(camera, int):
+        if isinstance(camera, int | np.integer):
             known = self.cameras(split)
             if not -len(known) <= camera < len(known):
                 raise InputError(f"camera: {camera}: {split} has {len(known)}; give 0 to {len(known) - 1}")

@@ -205,12 +205,16 @@ def test_a_colour_scales_all_harmonics(scene: TrainedScene) -> None:
         ({}, "nothing to do"),
         ({"scale": 0.0}, "--scale: 0 is out of range"),
         ({"scale": float("nan")}, "--scale: nan is out of range"),
-        ({"move": (1, 2)}, "--move: three finite numbers are needed"),
+        ({"move": (1, 2)}, "--move: 3 finite numbers are needed"),
+        ({"move": "far"}, "--move: 3 finite numbers are needed"),
+        ({"rotate": ("z",)}, "--rotate: ('z',): no axis and angle"),
+        ({"rotate": "z"}, "--rotate: 'z': no axis and angle"),
         ({"rotate": ("w", 90)}, "--rotate: 'w': no axis"),
         ({"rotate": ("0,0,0", 90)}, "--rotate: an axis without length"),
         ({"rotate": ("z", "much")}, "--rotate: 'much': no angle"),
         ({"box": (0, 0, 0, 1, 1, float("inf")), "cut": True}, "--box: 6 finite numbers"),
         ({"nearest": (0, 0, 0, -1), "cut": True}, "--nearest: the distance -1 is negative"),
+        ({"wehre": "x > 0", "set": ["roughness=1"]}, "edit: wehre: unknown option; use some of where, box"),
     ],
 )
 def test_what_makes_no_sense_is_one_sentence(
@@ -219,6 +223,23 @@ def test_what_makes_no_sense_is_one_sentence(
     with pytest.raises(InputError) as caught:
         edit(scene, **given)
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_arrays_do_as_well_as_lists(scene: TrainedScene) -> None:
+    """What a notebook has at hand; the record of an edit is the same."""
+    given: dict[str, list[float]] = {
+        "box": [-2, -2, -2, 0, 2, 2],
+        "nearest": [-1, 0, 0, 0.5],
+        "move": [0.5, 0, 0],
+        "duplicate": [0, 0, 1],
+    }
+    ways: tuple[Any, ...] = (list, np.array)
+    every: list[dict[str, Any]] = [{name: way(value) for name, value in given.items()} for way in ways]
+    turns = [(way([0.0, 0.0, 1.0]), 90) for way in ways]
+    lists, arrays = (edit(scene, rotate=turn, **one) for turn, one in zip(turns, every, strict=True))
+    assert lists.record == json.loads(json.dumps(arrays.record))
+    for name, table in lists.scene.surfels.to_numpy().items():
+        np.testing.assert_array_equal(arrays.scene.surfels.to_numpy()[name], table)
 
 
 # ---------------- places ----------------
@@ -579,7 +600,7 @@ def test_bad_commands_leave_nothing(
         (["--join", str(tmp_path / "none"), "--move", "1", "0", "0"], "config.toml: missing"),
         (["--cut", "--keep"], "not allowed with"),
         (["--cut", "--data", str(tmp_path / "none")], "--data: no such folder"),
-        (["--move", "-1e999", "0", "-1e-3"], "--move: three finite numbers are needed"),
+        (["--move", "-1e999", "0", "-1e-3"], "--move: 3 finite numbers are needed"),
         (["--rotate", "-1,0", "-90"], "--rotate: '-1,0': no axis"),
     ):
         assert main(["edit", str(finished), "-o", str(out), *options]) == 2

@@ -137,10 +137,15 @@ def test_exported_cameras_are_those_of_the_data_set(
                 assert getattr(other, name) == pytest.approx(getattr(view, name), rel=1e-6)
 
 
-def test_a_run_without_data_has_cameras_around_its_surfels(finished: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("record", [None, "{}", '{"path": "gone"}'])
+def test_a_run_without_data_has_cameras_around_its_surfels(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], record: str | None
+) -> None:
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     (run / "dataset.json").unlink()
+    if record is not None:
+        (run / "dataset.json").write_text(record)
     trained = TrainedScene.read(run)
     shots = Source.of(Run(run)).shots(trained, "test", "train")
     assert len(shots) == 64 and shots[0].split == "test"
@@ -151,6 +156,12 @@ def test_a_run_without_data_has_cameras_around_its_surfels(finished: Path, tmp_p
         pixel = np.abs(local[:, :2] / local[:, 2:]) * abs(shot.camera.fx[0])
         assert np.mean((pixel < shot.camera.width / 2).all(axis=1) & (local[:, 2] > 0)) > 0.9
     assert main(["export", str(run)]) == 0
+    assert ("gone" in (record or "")) == ("is gone; cameras are around" in capsys.readouterr().err)
+    assert main(["export", str(run), "--data", str(tmp_path / "none")]) == 2
+    shutil.rmtree(run / "checkpoints")
+    (run / "model.json").unlink()
+    assert main(["export", str(run)]) == 2
+    assert "checkpoints: none yet" in capsys.readouterr().err
 
 
 def test_nothing_to_look_at_is_said(finished: Path) -> None:

@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> Result:
     from mi_refgs.evaluation.evaluate import load_split
     from mi_refgs.files import make_folder
     from mi_refgs.formats import FORMATS, options_of, write
-    from mi_refgs.runs.export import TrainedScene, export
+    from mi_refgs.runs.export import TrainedScene, export, newest
     from mi_refgs.runs.run import Run
     from mi_refgs.source import Source
 
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> Result:
     folder = Run(args.run_folder)
     method = folder.method()
     state = folder.load_checkpoint()
-    fitted = TrainedScene.read(folder.path) if state is None else TrainedScene.from_state(method, state)
+    fitted = newest(folder, method) if state is None else TrainedScene.from_state(method, state)
     source = Source.of(folder).with_data(args.data)
     if source.data is not None and not source.is_there:
         say(f"note: {source.data} is gone; cameras are around the object, or give its folder with --data")

@@ -14,6 +14,7 @@ from mi_refgs.editing import follow
 from mi_refgs.editing.expression import Expression, parse_numbers
 from mi_refgs.editing.fields import COLOUR, Fields, constant_colour
 from mi_refgs.editing.rigid import Placement, rotation_about
+from mi_refgs.editing.selection import finite
 from mi_refgs.errors import InputError, shown
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.export import TrainedScene
@@ -99,18 +100,22 @@ class Change:
             raise InputError(f"--scale: {self.scale:g} is out of range; give {SCALES[0]:g} to {SCALES[1]:g}")
         for where, vector in (("--move", self.move), ("--duplicate", self.duplicate)):
             if vector is not None:
-                _vector(where, vector)
+                finite(where, vector, 3)
 
     @property
     def nothing(self) -> bool:
         """Whether it does nothing."""
-        return self == Change()
+        given = (self.move, self.rotate, self.duplicate)
+        does = self.set or self.cut or self.keep or self.scale != 1
+        return not does and all(value is None for value in given)
 
     @property
     def turn(self) -> Rotation:
         """The rotation; raises InputError for an axis or an angle that is none."""
         if self.rotate is None:
             return Rotation.identity()
+        if isinstance(self.rotate, str) or len(self.rotate) != 2:
+            raise InputError(f"--rotate: {shown(self.rotate)}: no axis and angle; give two values, like z 90")
         axis = _axis(self.rotate[0])
         try:
             degrees = float(self.rotate[1])
@@ -126,7 +131,7 @@ class Change:
         """Where selected surfels of these raw channels go."""
         shift = np.zeros(3)
         for where, vector in (("--move", self.move), ("--duplicate", self.duplicate)):
-            shift = shift if vector is None else shift + _vector(where, vector)
+            shift = shift if vector is None else shift + finite(where, vector, 3)
         # Not the median, which does not turn with the surfels: a turn and its opposite would shift them.
         weight = sigmoid(raw["opacity"][:, 0]) + np.finfo(np.float64).tiny
         middle = np.average(raw["position"].astype(np.float64), axis=0, weights=weight)
@@ -228,21 +233,14 @@ def _assign(fields: Fields, own: dict[str, np.ndarray], chosen: np.ndarray, assi
         raw[:, 3 + column :: 3] *= factor[:, None].astype(np.float32)
 
 
-def _vector(where: str, numbers: Sequence[float]) -> np.ndarray:
-    found = np.asarray(numbers, dtype=np.float64)
-    if found.shape != (3,) or not np.isfinite(found).all():
-        raise InputError(f"{where}: three finite numbers are needed; give them")
-    return found
-
-
 def _axis(axis: Any) -> np.ndarray:
     if isinstance(axis, str):
         if axis not in AXES:
             try:
-                return _vector("--rotate", [float(part) for part in axis.split(",")])
+                return finite("--rotate", [float(part) for part in axis.split(",")], 3)
             except ValueError as error:
                 raise InputError(
                     f"--rotate: {shown(axis)}: no axis; give x, y, z, or three numbers like 0,0,1"
                 ) from error
         return np.array(AXES[axis])
-    return _vector("--rotate", axis)
+    return finite("--rotate", axis, 3)

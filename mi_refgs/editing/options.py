@@ -82,8 +82,11 @@ def edit(
     """Change surfels of a scene, and then add it `into` another scene, if there is one.
 
     `camera` is that of the view which a mask was painted in; `materials` makes those of both scenes. Raises
-    InputError for what makes no sense, a selection of nothing, and if there is nothing to do.
+    InputError for what makes no sense, an unknown option, a selection of nothing, and if there is nothing to
+    do.
     """
+    for name in options.keys() - Options.__annotations__:
+        raise InputError(f"edit: {name}: unknown option; use some of {', '.join(Options.__annotations__)}")
     which = Selection(
         options.get("where"),
         options.get("box"),
@@ -111,13 +114,18 @@ def edit(
 
 def _asked(options: Options, change: Change) -> dict[str, Any]:
     """The options that were given, as JSON has them."""
-    given: dict[str, Any] = {name: value for name, value in options.items() if name in RECORDED}
-    record = {name: _plain(value) for name, value in given.items() if value not in (None, False, 1.0)}
+    given = {name: value for name, value in options.items() if name in RECORDED}
+    record = {name: _plain(value) for name, value in given.items() if not _unset(name, value)}
     if isinstance(options.get("mask"), str | Path):
         record["mask"] = str(options["mask"])
     if change.set:
         record["set"] = [assignment.text for assignment in change.set]
     return record
+
+
+def _unset(name: str, value: Any) -> bool:
+    """Whether an option has the value that it has when it is left out; a value may be an array."""
+    return value is None or value is False or (name == "scale" and value == 1)
 
 
 def _plain(value: Any) -> Any:

@@ -50,10 +50,10 @@ def select(scene: TrainedScene, selection: Selection) -> np.ndarray:
         fields.check(condition.names, "--where")
         chosen &= condition.of(fields)
     if selection.box is not None:
-        corners = _finite("--box", selection.box, 6).reshape(2, 3)
+        corners = finite("--box", selection.box, 6).reshape(2, 3)
         chosen &= np.all((position >= corners.min(0)) & (position <= corners.max(0)), axis=1)
     if selection.nearest is not None and count:
-        *point, radius = _finite("--nearest", selection.nearest, 4)
+        *point, radius = finite("--nearest", selection.nearest, 4)
         if radius < 0:
             raise InputError(f"--nearest: the distance {radius:g} is negative; give one from 0")
         middle = position[np.argmin(np.linalg.norm(position - point, axis=1))]
@@ -121,8 +121,12 @@ def painted_pixels(path: Path, camera: Camera) -> np.ndarray:
     return mask
 
 
-def _finite(where: str, numbers: Sequence[float], count: int) -> np.ndarray:
-    found = np.asarray(numbers, dtype=np.float64)
+def finite(where: str, numbers: Sequence[float], count: int) -> np.ndarray:
+    """Numbers (count,) float64; raises InputError, with `where` in the message, for anything else."""
+    try:
+        found = np.asarray(numbers, dtype=np.float64)
+    except (ValueError, TypeError):
+        found = np.zeros(0)
     if found.shape != (count,) or not np.isfinite(found).all():
         raise InputError(f"{where}: {count} finite numbers are needed; give them")
     return found

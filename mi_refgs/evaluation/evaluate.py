@@ -25,7 +25,7 @@ from mi_refgs.methods.method import Method
 from mi_refgs.progress_bar import with_bar
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import TrainedScene, up_to_date
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import DATASET, Run
 
 FOLDER = "eval"
 SHEET = "contact_sheet.png"
@@ -45,6 +45,8 @@ def load_split(run: Run, method: Method, split: str, path: Path | None = None) -
     run does not say where its data is or it is gone.
     """
     if path is None:
+        if not (run.path / DATASET).is_file():
+            raise InputError(f"{run.path}: data set: the run records none; name one with --data")
         try:
             path = run.dataset()
             found = path.is_dir()
