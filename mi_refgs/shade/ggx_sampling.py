@@ -51,8 +51,14 @@ class Lobe:
     turn: Any  # of the points, see `lobe_turn`
 
     @staticmethod
-    def of(normal: mi.Vector3f, view: mi.Vector3f, roughness: mi.Float, f0: mi.Color3f) -> Lobe:
-        """Lobes around unit normals, seen from unit directions; lane i has the points of pixel i."""
+    def of(
+        normal: mi.Vector3f,
+        view: mi.Vector3f,
+        roughness: mi.Float,
+        f0: mi.Color3f,
+        pixel: mi.UInt32 | None = None,
+    ) -> Lobe:
+        """Lobes around unit normals, seen from unit directions; lane i has the points of `pixel` i."""
         frame = mi.Frame3f(normal)
         local = frame.to_local(view)
         local.z = dr.maximum(local.z, COSINE_FLOOR)
@@ -61,7 +67,7 @@ class Lobe:
             safe_normalize(local),
             dr.square(dr.clip(roughness, 0, 1)),
             dr.clip((f0.x + f0.y + f0.z) * (1 / 3), 0, 1),
-            lobe_turn(dr.arange(mi.UInt32, dr.width(normal))),
+            lobe_turn(dr.arange(mi.UInt32, dr.width(normal)) if pixel is None else pixel),
         )
 
     def sample(self, ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:

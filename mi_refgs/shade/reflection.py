@@ -51,7 +51,7 @@ def reflection(
         point, facing, seen = start_on_mesh(occluder, origin, ray, normal, covered)
     if accuracy.visibility_rays > 1:
         with dr.suspend_grad():
-            lobe = Lobe.of(facing, points.view, points.roughness, base_reflectance(points))
+            lobe = Lobe.of(facing, points.view, points.roughness, base_reflectance(points), around.pixel)
             open_ = None if scene is None else scene.light_from(facing, points.view, points.roughness)
         visibility, indirect = _average(
             occluder, scene, lobe, accuracy.visibility_rays, point, facing, seen, open_

@@ -43,6 +43,7 @@ class TraceContext:
     origin: Any  # mi.Point3f: the camera; at surfels, their positions
     ray: Any  # mi.Vector3f from `origin` to the points, not unit; at surfels, from the camera to them
     covered: Any = True  # mi.Bool: nothing is traced for the others
+    pixel: Any = None  # mi.UInt32: index in the picture, which random numbers depend on; None: their own
 
 
 class Reflectance:
