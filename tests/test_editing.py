@@ -206,6 +206,7 @@ def test_a_colour_scales_all_harmonics(scene: TrainedScene) -> None:
         ({"scale": 0.0}, "--scale: 0 is out of range"),
         ({"scale": float("nan")}, "--scale: nan is out of range"),
         ({"move": (1, 2)}, "--move: 3 finite numbers are needed"),
+        ({"move": (1e30, 0, 0)}, "--move: 3 finite numbers are needed, none beyond 1e+09"),
         ({"move": "far"}, "--move: 3 finite numbers are needed"),
         ({"rotate": ("z",)}, "--rotate: ('z',): no axis and angle"),
         ({"rotate": "z"}, "--rotate: 'z': no axis and angle"),
@@ -344,6 +345,12 @@ def test_only_the_selected_ball_and_its_triangles_move(scene: TrainedScene) -> N
     high = moved.mesh.vertices[:, 2] > 1
     assert high.sum() == len(high) / 2 == (moved.mesh.vertices[:, 2] < 0.5).sum()
     np.testing.assert_allclose(np.linalg.norm(moved.mesh.vertices[high] - (-0.5, 0, 3), axis=1), 1, atol=0.02)
+
+
+def test_a_view_that_sees_nothing_has_nothing_painted(scene: TrainedScene) -> None:
+    away = edit(scene, move=(1e4, 0, 0)).scene
+    with pytest.raises(InputError, match="none of the 6000 surfels is in it"):
+        edit(away, camera=camera_at(FRONT), mask=np.ones((SIZE, SIZE), bool), cut=True)
 
 
 def test_cut_removes_a_ball_and_its_shadow_and_mirror_image() -> None:

@@ -33,6 +33,7 @@ from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
 
 COUNT, SIZE = 1500, 64
+BACKWARDS = np.diag([-1.0, 1.0, -1.0, 1.0])  # half a turn about the camera's y axis
 
 
 def ball(rng: np.random.Generator, count: int = COUNT) -> dict[str, np.ndarray]:
@@ -147,6 +148,16 @@ def test_what_no_camera_sees_has_the_colour_of_its_neighbours(scene: TrainedScen
     column = (camera.fx * place.x / place.z + camera.cx).numpy()
     beside = column > camera.width + 8
     assert beside.sum() > 50 and np.abs(table["radiance_sh"][beside]).max(axis=1).min() > 1e-3
+
+
+def test_views_that_see_nothing_change_nothing(scene: TrainedScene, shots: list[Shot]) -> None:
+    """A camera that looks away is as good as none; where all do, there are colours all the same."""
+    away = [replace(shot, camera=shot.camera.moved(shot.camera.pose() @ BACKWARDS)) for shot in shots]
+    train = [shot for shot in shots if shot.split == "train"]
+    few, more = (gaussians(scene, given, 1, False).to_numpy() for given in (train, [*train, away[0]]))
+    np.testing.assert_allclose(more["radiance_sh"], few["radiance_sh"], atol=1e-4)
+    none = gaussians(scene, away, 1, False).to_numpy()
+    assert all(np.isfinite(table).all() for table in none.values())
 
 
 def test_surroundings_come_along_unless_the_object_is_asked_for(

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.device import upload
 from mi_refgs.editing.expression import parse_truth
 from mi_refgs.editing.fields import Fields
@@ -93,7 +94,9 @@ def painted(scene: TrainedScene, camera: Camera, mask: np.ndarray) -> np.ndarray
     for feature in features:
         dr.enable_grad(feature)
     blended = splat(table, features, camera).features
-    dr.backward(dr.sum(sum(weight * image for weight, image in zip(weights, blended, strict=True))))
+    total = dr.sum(sum(weight * image for weight, image in zip(weights, blended, strict=True)))
+    if dr.grad_enabled(total):  # unless the view sees nothing
+        dr.backward(total)
     inside, every, far = (np.array(dr.grad(x), np.float64)[: own.count] for x in features)
     centre = np.array(camera.to_camera(own.position()).z, np.float64)
     shown_depth = far / np.maximum(every, np.finfo(np.float64).tiny)
@@ -127,6 +130,6 @@ def finite(where: str, numbers: Sequence[float], count: int) -> np.ndarray:
         found = np.asarray(numbers, dtype=np.float64)
     except (ValueError, TypeError):
         found = np.zeros(0)
-    if found.shape != (count,) or not np.isfinite(found).all():
-        raise InputError(f"{where}: {count} finite numbers are needed; give them")
+    if found.shape != (count,) or not (np.abs(found) <= MAX_NUMBER).all():
+        raise InputError(f"{where}: {count} finite numbers are needed, none beyond {MAX_NUMBER:g}; give them")
     return found

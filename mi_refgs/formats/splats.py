@@ -157,7 +157,8 @@ class _Seen:
             (dr.sum(plane * x) for plane, x in zip(self.planes, [*pictures, self.alpha], strict=True)),
             mi.Float(0),
         )
-        dr.backward(total)
+        if dr.grad_enabled(total):  # unless the view sees nothing
+            dr.backward(total)
         return [np.array(dr.grad(plane), dtype=np.float64) for plane in self.inputs]
 
 
