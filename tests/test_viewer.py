@@ -13,6 +13,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import ROOT
 from integrator_scenes import sky
 from known_scene import CLAY, known_mesh, known_surfels
 from tiny_scene import SETTINGS
@@ -33,6 +34,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer import fine, quality
 from mi_refgs.viewer.compare import AROUND, GAP, side_by_side
+from mi_refgs.viewer.controls.light import light_of
 from mi_refgs.viewer.controls.saving import write_view
 from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
 from mi_refgs.viewer.edits import mean_of, selected, with_material
@@ -52,6 +54,15 @@ def scene() -> TrainedScene:
     shading = Shading(diffuse="irradiance", occlusion=True)
     light = EnvironmentLight.from_radiance(sky(32))
     return TrainedScene(known_surfels(), light, known_mesh(), shading, 1, 0.0)
+
+
+@pytest.mark.parametrize("name", ["../light.exr", f"light.{'x' * 300}", "light.\0"])
+def test_the_name_of_an_uploaded_light_is_nothing_but_a_name(name: str) -> None:
+    """What kind it is, its first bytes say; names come from a browser, and any exception but one ends it."""
+    content = (ROOT / "scenes" / "lights" / "sky.exr").read_bytes()
+    assert light_of(name, content, world=False).height == 128
+    with pytest.raises(InputError, match="not a readable image"):
+        light_of(name, b"nothing", world=False)
 
 
 # ---------------- how large, and when ----------------

@@ -101,7 +101,7 @@ def _add_swap(page: Page, scene: Fitted, turn: Any) -> None:
 def light_of(name: str, content: bytes, world: bool) -> EnvironmentLight:
     """The light of an uploaded image file; raises InputError, with its name, for one that cannot be read."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"light{Path(name).suffix}"
+        path = Path(folder) / "light"  # what kind it is, its first bytes say
         path.write_bytes(content)
         try:
             return NewLight(path, world).read()
