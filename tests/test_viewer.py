@@ -26,7 +26,8 @@ from mi_refgs.exr import read_exr_image
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.read import load
 from mi_refgs.render.load_scene import load_scene
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.export import TrainedScene, export
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
@@ -39,12 +40,12 @@ from mi_refgs.viewer.controls.saving import write_view
 from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
 from mi_refgs.viewer.edits import mean_of, selected, with_material
 from mi_refgs.viewer.fitted import Fitted
-from mi_refgs.viewer.live import TrainingPage, read_log
+from mi_refgs.viewer.live import Training, TrainingPage, read_log
 from mi_refgs.viewer.loop import Loop, Shown, Visitor
 from mi_refgs.viewer.mitsuba_scene import MitsubaScene
 from mi_refgs.viewer.pose import Pose, page_rotation
 from mi_refgs.viewer.quality import COARSE, DONE, LARGE, NOTHING
-from mi_refgs.viewer.source import Sampled, Shot
+from mi_refgs.viewer.source import Sampled, Shot, Source
 
 
 @pytest.fixture(scope="module")
@@ -321,7 +322,7 @@ FROM_THE_FRONT = np.array([0.5**0.5, -(0.5**0.5), 0, 0])
 """Towards +y, z up: a page's camera looks along +z, y down, when it is not turned."""
 
 
-def shown(source: Fitted, look: Look, size: int = 40) -> np.ndarray:
+def shown(source: Source, look: Look, size: int = 40) -> np.ndarray:
     """A picture of the tiny scene from a side."""
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.0)
     shot = Shot(pose, size, size, look, settled=True)
@@ -407,6 +408,72 @@ def test_exposure_and_backdrop_are_what_they_say(scene: TrainedScene) -> None:
     assert 0 < light.max()
     dark, bright = (shown(source, Look(exposure=e, backdrop="black"))[20, 14].max() for e in (-3.0, 0.0))
     assert 0 < dark < bright
+
+
+@pytest.fixture
+def surrounded(scene: TrainedScene) -> TrainedScene:
+    """The first ball, the second as what surrounds it, and a grey background."""
+    raw = scene.surfels.to_numpy()
+    own = raw["position"][:, 0] < 0
+    geometry = ("position", "rotation", "scale", "opacity", "radiance_sh")
+    around = Surfels.from_numpy({name: raw[name][~own] for name in geometry})
+    surfels = Surfels.from_numpy({name: table[own] for name, table in raw.items()})
+    return replace(
+        scene, surfels=surfels, surroundings=Surroundings(around, EnvironmentLight.constant(0.2, 8))
+    )
+
+
+def test_a_photographed_object_is_shown_in_its_surroundings_or_alone(surrounded: TrainedScene) -> None:
+    source, alone = Fitted(surrounded), Fitted(replace(surrounded, surroundings=None))
+    assert source.backdrops == ("surroundings", "white", "grey", "black", "light")
+    assert alone.backdrops == ("white", "grey", "black", "light")
+    whole = shown(source, Look(backdrop="surroundings"))
+    assert whole[0, 0].tolist() == [124] * 3  # 0.2 as sRGB
+    assert np.ptp(whole[:, 24:]) > 20  # the other ball
+    for backdrop in alone.backdrops:
+        assert np.array_equal(shown(source, Look(backdrop=backdrop)), shown(alone, Look(backdrop=backdrop)))
+    for name in ("alpha", "depth"):  # of what is shown
+        some = Look(name, backdrop="black", depths=(2.0, 4.0))
+        assert np.array_equal(shown(source, some), shown(alone, some))
+        assert not np.array_equal(shown(source, replace(some, backdrop="surroundings")), shown(alone, some))
+
+
+def test_what_is_saved_has_surroundings_or_is_transparent(surrounded: TrainedScene, tmp_path: Path) -> None:
+    source, pose = Fitted(surrounded), Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6)
+    found = {}
+    for backdrop in ("surroundings", "grey"):
+        path = write_view(source, pose, (32, 20), Look(backdrop=backdrop), tmp_path, ".exr")
+        found[backdrop] = read_exr_image(path)
+    assert found["surroundings"][..., 3].min() == 1
+    assert np.allclose(found["surroundings"][0, 0, :3], 0.2, rtol=1e-3)
+    assert found["grey"][..., 3].min() == 0 and found["grey"][..., 3].max() > 0.9
+    alone = replace(surrounded, surroundings=None).renderer(aovs=False, samples=16)(pose.camera(32, 20))
+    assert np.abs(found["grey"] - planes([*alone.radiance, alone.alpha], 20, 32)).max() < 1e-5
+
+
+def test_a_scene_file_with_surroundings_is_shown_with_them_or_without(
+    surrounded: TrainedScene, tmp_path: Path
+) -> None:
+    pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.0)
+    export(surrounded, tmp_path, pose.camera(24, 24))
+    source, own = MitsubaScene(load_scene(tmp_path / "scene.xml"), "scene.xml"), Fitted(surrounded)
+    assert source.backdrops == ("surroundings", "white", "grey", "black")
+    for backdrop in source.backdrops:
+        look = Look(backdrop=backdrop)
+        assert np.abs(shown(source, look) - shown(own, look)).max() <= 2, backdrop
+
+
+def test_a_watched_fit_shows_its_object_alone_too(
+    data: Path, method: Path, surrounded: TrainedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer = Trainer(load(str(method), "quick", SETTINGS), read_dataset(data, "train"))
+    source = Training(trainer)
+    assert "surroundings" not in source.backdrops
+    before = shown(source, Look())
+    monkeypatch.setattr(Trainer, "surroundings", surrounded.surroundings)
+    assert source.backdrops == ("surroundings", "white", "grey", "black")
+    assert np.array_equal(shown(source, Look()), before)
+    assert np.abs(shown(source, Look(backdrop="surroundings")) - before).max() > 50
 
 
 def test_truth_and_picture_stand_side_by_side_in_the_shape_of_the_window() -> None:

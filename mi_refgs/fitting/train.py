@@ -125,8 +125,8 @@ class Trainer:
         _, stage = self.method.stage_at(iteration or max(self.iteration, 1))
         return self._shading(stage)
 
-    def view(self, camera: Camera, aovs: bool = True) -> Frame:
-        """Render a view of the present state, without derivatives."""
+    def view(self, camera: Camera, aovs: bool = True, alone: bool = False) -> Frame:
+        """Render a view of the present state, without derivatives; `alone`: without the surroundings."""
         with dr.suspend_grad():
             shading = self.shading()
             supply(self.occluder, self.surfels, self.light, shading)
@@ -139,7 +139,7 @@ class Trainer:
                 sh_degree=self.schedule.sh_degree(self.iteration),
                 aovs=aovs,
                 normals=aovs,
-                surroundings=self.surroundings,
+                surroundings=None if alone else self.surroundings,
             )
 
     # ---------------- the loop ----------------

@@ -22,6 +22,13 @@ BACKDROPS = {"white": 1.0, "grey": 0.25, "black": 0.0}
 """Display-encoded brightness behind the object, by name."""
 LIGHT_BEHIND = "light"
 """The backdrop that is the light."""
+SURROUNDINGS = "surroundings"
+"""The backdrop that is what the object was photographed in; all others show the object alone."""
+
+
+def backdrops_of(surroundings: bool, light: bool) -> tuple[str, ...]:
+    """The backdrops of a scene that has these or not; a page begins with the first."""
+    return (*((SURROUNDINGS,) if surroundings else ()), *BACKDROPS, *((LIGHT_BEHIND,) if light else ()))
 
 
 @dataclass(frozen=True)
@@ -30,8 +37,13 @@ class Look:
 
     what: str = PICTURE  # or a type of `plugins.aovs`
     exposure: float = 0.0  # stops
-    backdrop: str = "white"  # one of BACKDROPS, or LIGHT_BEHIND
+    backdrop: str = "white"  # one of `backdrops_of`
     depths: tuple[float, float] = (0.0, 1.0)  # distances that are shown as white and as black
+
+    @property
+    def alone(self) -> bool:
+        """Whether the object is shown without its surroundings."""
+        return self.backdrop != SURROUNDINGS
 
 
 def planes_of(frame: Frame, camera: Camera, look: Look, light: Light | None) -> list[Any]:

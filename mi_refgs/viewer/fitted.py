@@ -23,7 +23,7 @@ from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.channels import CHANNELS
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer.develop import BACKDROPS, LIGHT_BEHIND, PICTURE, Look, planes_of
+from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of, planes_of
 from mi_refgs.viewer.fine import fine_planes
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.source import Sampled, Shot
@@ -80,10 +80,8 @@ class Fitted:
 
     @property
     def backdrops(self) -> tuple[str, ...]:
-        """See `Source`; surroundings are always shown."""
-        if self.scene.surroundings is not None:
-            return ()
-        return (*BACKDROPS, LIGHT_BEHIND) if self.lit else tuple(BACKDROPS)
+        """See `Source`."""
+        return backdrops_of(self.scene.surroundings is not None, self.lit)
 
     @property
     def lit(self) -> bool:
@@ -160,10 +158,12 @@ class Fitted:
 
     # ---------------- pictures ----------------
 
-    def frame(self, camera: Any, aovs: Collection[str] = (), settled: bool = True) -> Frame:
+    def frame(
+        self, camera: Any, aovs: Collection[str] = (), settled: bool = True, alone: bool = False
+    ) -> Frame:
         """A view, without derivatives; until it is `settled`, ambient shadows may be those of before.
 
-        `aovs` as in `render`.
+        `aovs` as in `render`; `alone`: without the surroundings.
         """
         light = self.light
         with dr.suspend_grad():
@@ -177,7 +177,7 @@ class Fitted:
                 light,
                 self._occluder,
                 aovs=aovs,
-                surroundings=self.scene.surroundings,
+                surroundings=None if alone else self.scene.surroundings,
                 derivatives=False,
             )
 
@@ -192,7 +192,7 @@ class Fitted:
     def draw(self, shot: Shot) -> Sampled:
         """See `Source`."""
         camera = shot.camera()
-        frame = self.frame(camera, shot.asked, shot.settled)
+        frame = self.frame(camera, shot.asked, shot.settled, shot.look.alone)
         with dr.suspend_grad():
             return Sampled(planes_of(frame, camera, shot.look, self.light), frame.depth)
 

@@ -17,7 +17,7 @@ import numpy as np
 from mi_refgs.evaluation.progress import Bar
 from mi_refgs.runs.run import LOG, Run
 from mi_refgs.viewer.controls import look, overlays
-from mi_refgs.viewer.develop import BACKDROPS, PICTURE, Look, planes_of
+from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of, planes_of
 from mi_refgs.viewer.fine import fine_planes
 from mi_refgs.viewer.fitted import bounds_of, variables_of
 from mi_refgs.viewer.page import Page, Views, require_free, require_viser
@@ -55,12 +55,12 @@ class Training:
     @property
     def backdrops(self) -> tuple[str, ...]:
         """See `Source`."""
-        return () if self.trainer.surroundings is not None else tuple(BACKDROPS)
+        return backdrops_of(self.trainer.surroundings is not None, light=False)
 
     def draw(self, shot: Shot) -> Sampled:
         """See `Source`."""
         camera = shot.camera()
-        frame = self.trainer.view(camera, aovs=shot.look.what != PICTURE)
+        frame = self.trainer.view(camera, shot.look.what != PICTURE, shot.look.alone)
         with dr.suspend_grad():
             return Sampled(planes_of(frame, camera, shot.look, None), frame.depth)
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.plugins.aovs import AOV, suffixes
+from mi_refgs.plugins.surroundings import Around
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer.develop import BACKDROPS, PICTURE, Look
+from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of
 from mi_refgs.viewer.fitted import variables_of
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.quality import SAMPLES
@@ -20,6 +21,8 @@ from mi_refgs.viewer.source import Sampled, Shot
 
 CLIP = 1e-3, 1e4
 """Near and far plane, in radii of the scene."""
+ALONE = Around(None, None, None)
+"""What is around an object without its surroundings."""
 PERCENT = 2.0, 98.0
 """Of surfels along each axis, that count for the size of a scene that has no shapes."""
 
@@ -43,7 +46,9 @@ class MitsubaScene:
         else:
             prefixes = dict.fromkeys(name.partition(".")[0] for name in integrator.aov_names())
             self.variables = (PICTURE, *(name for name in prefixes if name in suffixes()))
-        self.backdrops = tuple(BACKDROPS)
+        self._around = integrator.around if self._surfels else ALONE
+        surrounded = any(part is not None for part in vars(self._around).values())
+        self.backdrops = backdrops_of(surrounded, light=False)
         turns = [key for key in self.params.keys() if key.endswith(".to_world")]
         environment = scene.environment()
         own = None if environment is None else environment.id()
@@ -126,8 +131,10 @@ class MitsubaScene:
                 "sampler": {"type": "independent", "sample_count": spp},
             }
         )
-        if self._surfels:  # only the variable that is shown
-            self.scene.integrator().aovs = [] if look.what == PICTURE else [AOV(look.what, look.what)]
+        if self._surfels:  # only what is shown
+            integrator = self.scene.integrator()
+            integrator.aovs = [] if look.what == PICTURE else [AOV(look.what, look.what)]
+            integrator.around = ALONE if look.alone else self._around
         image = mi.render(self.scene, sensor=sensor, spp=spp, seed=seed)
         names = [channel.name for channel in sensor.film().bitmap().struct_()]
         index = dr.arange(mi.UInt32, width * height) * len(names)

@@ -7,6 +7,7 @@ import io
 import math
 import socket
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from mi_refgs.viewer.pose import Pose, up_of
 from mi_refgs.viewer.source import Source
 
 MOVING_JPEG, STILL_JPEG = 70, 92
-"""JPEG qualities of pictures that are soon replaced, and of those until until a smooth one, a PNG, comes."""
+"""JPEG qualities of pictures that are soon replaced, and of those that stay until a smooth one, a PNG."""
 STATUS_INTERVAL = 0.5
 """Seconds between updates of the line that says what is shown."""
 START_DISTANCE = 2.5
@@ -90,14 +91,17 @@ class Page:
         self.begin = begin
         self.loop = Loop(source)
         self.loop.failed = self.complain
-        self.look = Look(depths=self._depths())
+        self.look = Look(backdrop=source.backdrops[0], depths=self._depths())
         self.fixed: int | None = None
         self.largest = quality.FINEST
         self.depth = False
         self.side = quality.COARSEST
         self.status: Callable[[str], None] = lambda text: None
+        self.looked: Callable[[], None] = lambda: None  # `look` has changed
         self.moved: Callable[[int, Pose], None] = lambda number, pose: None
         self._told = 0.0
+        # A picture for a page that is closed meanwhile is nothing to tell of.
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         with contextlib.redirect_stdout(io.StringIO()):  # viser greets
             self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         if port and self.server.get_port() != port:
@@ -205,6 +209,7 @@ class Page:
             setattr(self, name, value)
         self.look = replace(self.look, **{n: v for n, v in fields.items() if n not in own})
         self.loop.change(**own, look=self.look)
+        self.looked()
 
     def complain(self, message: str) -> None:
         """Show a sentence about bad input."""

@@ -54,7 +54,7 @@ class Source(Protocol):
 
     @property
     def backdrops(self) -> tuple[str, ...]:
-        """Names in `develop.BACKDROPS`, and `develop.LIGHT_BEHIND`, that show; empty where none does."""
+        """See `develop.backdrops_of`."""
 
     centre: np.ndarray
     """World point (3,) that cameras turn around."""

@@ -51,7 +51,7 @@ def page_of_run(
     look.add(page)
     light.add(page, source)
     materials.add(page, source)
-    overlays.add(page, scene.mesh)
+    overlays.add(page, scene)
     truth.add(page)
     saving.add(page)
     page.listen()

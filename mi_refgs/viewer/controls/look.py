@@ -22,10 +22,11 @@ def add(page: Page) -> None:
             hint="The picture, or a variable of what is seen: materials, geometry, terms of the radiance.",
         )
         exposure = gui.add_slider("Exposure", -STOPS, STOPS, 0.25, 0.0, hint="Stops.")
-        backdrops = page.source.backdrops
-        if backdrops:
-            backdrop = gui.add_dropdown("Backdrop", backdrops, hint="What is seen behind the object.")
-            backdrop.on_update(lambda _: page.set(backdrop=backdrop.value))
+        backdrop = gui.add_dropdown(
+            "Backdrop",
+            page.source.backdrops,
+            hint="What is seen behind the object; it is shown alone on all but its surroundings.",
+        )
         sizes = {f"{side}²": side for side in quality.SIDES}
         moving = gui.add_dropdown(
             "Moving",
@@ -36,6 +37,7 @@ def add(page: Page) -> None:
         still = gui.add_dropdown("Still", tuple(sizes), initial_value=finest, hint="Most pixels at rest.")
 
     what.on_update(lambda _: page.set(what=what.value))
+    backdrop.on_update(lambda _: page.set(backdrop=backdrop.value))
     exposure.on_update(lambda _: page.set(exposure=float(exposure.value)))
     moving.on_update(lambda _: page.set(fixed=sizes.get(moving.value)))
     still.on_update(lambda _: page.set(largest=sizes[still.value]))

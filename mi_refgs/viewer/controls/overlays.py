@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from mi_refgs.editing.follow import without_surroundings
 from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.runs.export import TrainedScene
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.pose import Pose, page_rotation
 
@@ -17,15 +19,16 @@ TRAINING, TEST = (90, 160, 255), (255, 160, 60)
 MESH_COLOUR, MESH_OPACITY = (200, 200, 205), 0.55
 
 
-def add(page: Page, mesh: Mesh | None) -> None:
+def add(page: Page, scene: TrainedScene | None) -> None:
     """Add the controls, as far as there is something to show."""
     gui = page.server.gui
-    if mesh is None and not page.views.all:
+    meshed = scene is not None and scene.mesh is not None and len(scene.mesh.faces) > 0
+    if not meshed and not page.views.all:
         return
     with gui.add_folder("Overlays"):
-        if mesh is not None and len(mesh.faces):
+        if scene is not None and meshed:
             shown = gui.add_checkbox("Mesh", False, hint="The occluder of reflections.")
-            toggles(shown, lambda: [add_mesh(page, mesh)])
+            follows(page, shown, scene)
         if page.views.all:
             cameras = gui.add_checkbox("Cameras", False, hint="Blue: training, orange: test.")
             toggles(cameras, lambda: add_cameras(page))
@@ -44,10 +47,28 @@ def toggles(box: Any, make: Any) -> None:
             node.visible = box.value
 
 
-def add_mesh(page: Page, mesh: Mesh) -> Any:
+def follows(page: Page, box: Any, scene: TrainedScene) -> None:
+    """The mesh while a box is ticked: all of it, or the object's own while that is shown alone."""
+    nodes: dict[bool, Any] = {}
+
+    def show() -> None:
+        alone = page.look.alone and scene.surroundings is not None
+        if box.value and alone not in nodes:
+            mesh = without_surroundings(scene) if alone else scene.mesh
+            if mesh is None or not len(mesh.faces):
+                return
+            nodes[alone] = add_mesh(page, f"/mesh_{'object' if alone else 'all'}", mesh)
+        for each, node in nodes.items():
+            node.visible = box.value and each == alone
+
+    page.looked = lambda: page.loop.ask("mesh", show, changes=False)
+    box.on_update(lambda _: page.looked())
+
+
+def add_mesh(page: Page, name: str, mesh: Mesh) -> Any:
     """The node of a mesh."""
     return page.server.scene.add_mesh_simple(
-        "/mesh",
+        name,
         mesh.vertices,
         mesh.faces,
         color=MESH_COLOUR,
