@@ -349,6 +349,13 @@ def test_a_property_that_the_ply_lacks(run: Path, tmp_path: Path, capsys: pytest
     refused(["eval", str(run)], capsys, "surfels.ply", "opacity", "missing")
 
 
+def test_a_run_whose_light_is_gone(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "envmap.exr").unlink()
+    for argv in (["eval", str(run)], ["edit", str(run), "-o", str(tmp_path / "new"), "--set", "opacity=1"]):
+        refused(argv, capsys, "envmap.exr", "light: missing")
+    refused(["render", str(run), "-o", str(tmp_path / "x.exr")], capsys, "envmap.exr", "No such file")
+
+
 def test_what_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for command in ("eval", "export"):
         refused([command, str(tmp_path)], capsys, tmp_path, "config.toml")

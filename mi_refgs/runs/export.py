@@ -111,6 +111,10 @@ class TrainedScene:
             ) from error
         light, mesh = folder / LIGHT_MAP, folder / MESH
         around, behind = folder / AROUND_FILE, folder / BACKGROUND_MAP
+        if shading.model.light != "none" and not light.is_file():
+            raise InputError(
+                f"{light}: light: missing; restore the file, or write it again with `refgs export {folder}`"
+            )
         fitted = TrainedScene(
             read_ply(folder / SURFELS),
             EnvironmentLight.from_file(light) if light.is_file() else None,
