@@ -304,9 +304,14 @@ def test_the_roughness_slider_shows_and_saves_the_edited_scene(
 
 
 def test_a_selection_that_is_none_is_one_sentence_on_the_page(tab: Tab) -> None:
-    tab.type("Where", "metallic > ")
-    tab.page.get_by_text("Not done").wait_for(state="attached", timeout=1000 * PATIENCE)
+    """Below the field, where it may come and go while one types; no message covers the picture."""
+    for text, said in (("metallic > ", "a name or a number is missing"), ("x < {", "'{' has no meaning")):
+        tab.type("Where", text)
+        tab.page.get_by_text(said).wait_for(timeout=1000 * PATIENCE)
+    assert tab.page.get_by_text("(still 6,000 of 6,000 surfels)").count() == 1
+    assert tab.page.get_by_text("Not done").count() == 0
     tab.type("Where", "")
+    tab.page.get_by_text("6,000 of 6,000 surfels", exact=True).wait_for(timeout=1000 * PATIENCE)
 
 
 def test_another_variable_is_shown_and_saved(tab: Tab, server: tuple[Server, Path]) -> None:

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
 
+from mi_refgs.errors import InputError
 from mi_refgs.viewer.edits import mean_of, selected, with_material
 from mi_refgs.viewer.fitted import Change, Fitted
 from mi_refgs.viewer.page import Page
 
 STEP = 0.01
+PUNCTUATION = re.compile(r"([\\`*_{}\[\]<>#])")
+"""What has a meaning in Markdown."""
 
 
 def add(page: Page, scene: Fitted) -> None:
     """Add the controls; nothing for a scene without materials."""
     if scene.materials:
         Materials(page, scene)
+
+
+def escaped(text: str) -> str:
+    """Plain text as the page's Markdown."""
+    return PUNCTUATION.sub(r"\\\1", text)
 
 
 class Materials:
@@ -58,8 +67,13 @@ class Materials:
         self.scene.set_changes([*self.done, self._change()])
 
     def select(self) -> None:
-        """Select what the expression says; raises InputError for one that is none or selects nothing."""
-        mask = selected(self.where.value, self.scene.original)
+        """Select what the expression says; what is wrong with it stands below it, as it may be half typed."""
+        try:
+            mask = selected(self.where.value, self.scene.original)
+        except InputError as error:
+            said = str(error).removeprefix("--where: ")
+            self.count.content = f"{escaped(said)} (still {self._counted()})"
+            return
         if self.values:
             self.done.append(self._change())
         self.mask, self.values = mask, {}
