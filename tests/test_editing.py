@@ -15,6 +15,7 @@ from known_scene import CENTRES, RADII, known_mesh, known_surfels
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.cli import main
+from mi_refgs.data.dataset import read_dataset
 from mi_refgs.editing import Change, Selection, apply, assignments, edit, join, select
 from mi_refgs.editing.fields import Fields
 from mi_refgs.editing.rigid import rotated_harmonics
@@ -31,6 +32,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.channels import SH_DC, logit
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.viewer.pose import Pose
 
 SIZE = 48
 METAL_BALL = "x < 0"
@@ -535,6 +537,14 @@ def test_masks_and_views(
     ):
         assert main([*command, "-o", str(tmp_path / "none"), *extra]) == 2
         assert message in capsys.readouterr().err
+    camera = tmp_path / "view_000.json"  # as the page saves it
+    pose = Pose.of_view(read_dataset(data, "test").views[1])
+    camera.write_text(json.dumps(pose.transforms(20, 20, "view_000")))
+    assert main([*command, "-o", str(tmp_path / "saved"), "--view", str(camera), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["selected"] == found["selected"]
+    camera.write_text("{}")
+    assert main([*command, "-o", str(tmp_path / "none"), "--view", str(camera)]) == 2
+    assert "view_000.json: frames: missing" in capsys.readouterr().err
     write_png(tmp_path / "mask.png", mask[:15])
     assert main([*command, "-o", str(tmp_path / "none")]) == 2
     assert "mask.png: mask: 40 × 15 pixels, but the view has 20 × 20" in capsys.readouterr().err

@@ -50,7 +50,11 @@ def add(commands: Any) -> None:
         "--mask", type=Path, metavar="PNG", help="what a picture of a view shows where it is painted white"
     )
     chosen.add_argument(
-        "--view", type=int, default=0, metavar="I", help="the view of --mask (default %(default)s)"
+        "--view",
+        type=view,
+        default=0,
+        metavar="I|CAMERA.json",
+        help="the view of --mask: a number, or what the page of `refgs view` saved (default %(default)s)",
     )
     chosen.add_argument(
         "--split", choices=("test", "train"), default="test", help="whose views these are (default test)"
@@ -101,8 +105,14 @@ def add(commands: Any) -> None:
     parser.add_argument("--preview", action="store_true", help="preview.png: views before and after")
 
 
+def view(text: str) -> int | Path:
+    """The number of a view, or the file of a camera."""
+    return int(text) if re.fullmatch(r"-?\d{1,9}", text, re.ASCII) else Path(text)
+
+
 def run(args: argparse.Namespace) -> Result:
     """Edit."""
+    from mi_refgs.formats.incoming import read_cameras
     from mi_refgs.images import write_png
     from mi_refgs.reconstruction import load
 
@@ -111,6 +121,8 @@ def run(args: argparse.Namespace) -> Result:
     whole = replace(whole, source=whole.source.with_data(args.data))
     join = None if args.join is None else load(args.join, write=False)
     options = {name: getattr(args, name) for name in OPTIONS}
+    if isinstance(args.view, Path):
+        options["view"] = read_cameras(args.view)[0]
     try:
         edited = whole.edit(**options, join=join)
     except InputError as error:
