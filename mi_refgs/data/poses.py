@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER, RIGID_TOLERANCE
@@ -11,6 +14,19 @@ MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
 """OpenGL's camera looks along −z with +x right and +y up; its own inverse."""
 MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 """OpenCV's and COLMAP's looks along +z with +x right and +y down; its own inverse."""
+
+
+def pinhole(width: int, height: int, focal: float) -> dict[str, Any]:
+    """The lens in a transforms file: square pixels, the principal point in the middle; lengths in pixels."""
+    return {
+        "camera_angle_x": 2 * math.atan(0.5 * width / focal),
+        "w": width,
+        "h": height,
+        "fl_x": focal,
+        "fl_y": focal,
+        "cx": width / 2,
+        "cy": height / 2,
+    }
 
 
 def rigid(matrix: np.ndarray, field: str) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.data.pathtrace import MAPS, Tracer, camera_poses, environment_image
-from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, pinhole
 from mi_refgs.data.settings import Settings
 from mi_refgs.errors import InputError
 from mi_refgs.exr import read_exr, read_exr_image, write_exr
@@ -116,14 +116,4 @@ def _frame(split: str, index: int, pose: np.ndarray, maps: bool) -> dict[str, An
 
 def _transforms(settings: Settings, frames: list[dict[str, Any]]) -> dict[str, Any]:
     width, height = settings.resolution
-    focal = settings.focal
-    return {
-        "camera_angle_x": 2 * math.atan(0.5 * width / focal),
-        "w": width,
-        "h": height,
-        "fl_x": focal,
-        "fl_y": focal,
-        "cx": width / 2,
-        "cy": height / 2,
-        "frames": frames,
-    }
+    return {**pinhole(width, height, settings.focal), "frames": frames}

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from mi_refgs.data.poses import MITSUBA_FROM_OPENCV, MITSUBA_FROM_OPENGL
+from mi_refgs.data.poses import MITSUBA_FROM_OPENCV, MITSUBA_FROM_OPENGL, pinhole
 from mi_refgs.data.view import View
 from mi_refgs.splat.camera import Camera
 
@@ -79,21 +80,9 @@ class Pose:
     def transforms(self, width: int, height: int, picture: str) -> dict[str, Any]:
         """The content of a transforms file of one frame, whose picture has this name and size."""
         focal = height / 2 / math.tan(self.fov / 2)
-        return {
-            "camera_angle_x": 2 * math.atan(width / 2 / focal),
-            "w": width,
-            "h": height,
-            "fl_x": focal,
-            "fl_y": focal,
-            "cx": width / 2,
-            "cy": height / 2,
-            "frames": [
-                {
-                    "file_path": f"./{picture}",
-                    "transform_matrix": (self.to_world @ MITSUBA_FROM_OPENGL).tolist(),
-                }
-            ],
-        }
+        matrix = (self.to_world @ MITSUBA_FROM_OPENGL).tolist()
+        frames = [{"file_path": f"./{picture}", "transform_matrix": matrix}]
+        return {**pinhole(width, height, focal), "frames": frames}
 
 
 def up_of(views: list[View]) -> np.ndarray:
@@ -110,12 +99,5 @@ def up_of(views: list[View]) -> np.ndarray:
 
 def page_rotation(pose: Pose) -> np.ndarray:
     """The unit quaternion (4,), w first, of viser's axes, which are OpenCV's."""
-    m = (pose.to_world @ MITSUBA_FROM_OPENCV)[:3, :3]
-    # The largest of the four squares is at least 1/4, so that nothing small is divided by.
-    squares = np.array([1 + m[0, 0] + m[1, 1] + m[2, 2], *(1 + 2 * m[i, i] - np.trace(m) for i in range(3))])
-    first = int(np.argmax(squares))
-    x, y, z = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
-    rows = ((squares[0], x, y, z), (x, squares[1], xy, xz), (y, xy, squares[2], yz), (z, xz, yz, squares[3]))
-    row = np.array(rows[first], dtype=np.float64)
-    return np.asarray(row / np.linalg.norm(row))
+    turn = Rotation.from_matrix((pose.to_world @ MITSUBA_FROM_OPENCV)[:3, :3])
+    return np.roll(turn.as_quat(), 1)
