@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from mi_refgs.evaluation.evaluate import evaluate as evaluate
     from mi_refgs.fitting.progress import Progress as Progress
     from mi_refgs.fitting.train import Trainer as Trainer
+    from mi_refgs.importing import import_splats as import_splats
     from mi_refgs.methods.method import Method as Method
     from mi_refgs.methods.read import load as load_method
     from mi_refgs.occlusion.mesh import Mesh as Mesh
@@ -89,6 +90,7 @@ _PUBLIC = {
     "evaluate": ("evaluation.evaluate", "evaluate"),
     "fit": ("reconstruct", "fit"),
     "from_points": ("surfels.init", "from_points"),
+    "import_splats": ("importing", "import_splats"),
     "load": ("reconstruction", "load"),
     "load_method": ("methods.read", "load"),
     "make_dataset": ("data.make_dataset", "make_dataset"),
@@ -133,6 +135,7 @@ __all__ = [
     "evaluate",
     "fit",
     "from_points",
+    "import_splats",
     "load",
     "load_method",
     "make_dataset",

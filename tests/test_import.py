@@ -142,6 +142,25 @@ def test_the_command_makes_a_run_that_is_shown_the_same(
     assert "holds a run already" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("linear", [False, True])
+def test_python_imports_what_the_command_does(theirs: Path, tmp_path: Path, linear: bool) -> None:
+    """In memory, saved, and by the command: the same picture bit for bit; colours differ by what they are."""
+    import mi_refgs
+
+    made = mi_refgs.import_splats(str(theirs), linear=linear)
+    assert made.folder is None and made.method.variant == "theirs" and len(made.cameras()) == 4
+    picture = made.render(1, size=32)
+    assert picture[..., :3].max() > 0.1
+    np.testing.assert_array_equal(made.save(tmp_path / "saved").render(1, size=32), picture)
+    run = tmp_path / "run"
+    assert main(["import", str(theirs), "-o", str(run), *(["--linear"] if linear else [])]) == 0
+    np.testing.assert_array_equal(mi_refgs.load(run).render(1, size=32), picture)
+    other = mi_refgs.import_splats(theirs, linear=not linear).render(1, size=32)
+    assert np.abs(other - picture).max() > 0.05
+    with pytest.raises(InputError, match="cannot be read"):
+        mi_refgs.import_splats(tmp_path / "no.ply")
+
+
 def test_what_was_imported_is_exported_as_it_was(theirs: Path, tmp_path: Path) -> None:
     """Encoded colours are not fitted anew; Gaussians come back bit for bit."""
     run, again = tmp_path / "run", tmp_path / "again.ply"

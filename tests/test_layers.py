@@ -86,6 +86,7 @@ LAYERS: dict[str, set[str]] = {
     },
     "editing": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
     "reconstruct": {"methods", "fitting", "evaluation", "plugins", "reconstruction", "errors"},
+    "importing": {"formats", "plugins", "reconstruction", "source"},
     "gallery": RENDERER
     | {"methods", "data", "runs", "evaluation", "relighting", "editing", "resources", ""}
     | {"reconstruct", "reconstruction"},
@@ -107,6 +108,7 @@ LAYERS: dict[str, set[str]] = {
         "relighting",
         "reconstruct",
         "reconstruction",
+        "importing",
         "source",
         "editing",
         "messages",
@@ -122,7 +124,7 @@ LAYERS: dict[str, set[str]] = {
     "reference": {"constants"},
     "": RENDERER
     | {"llvm", "plugins", "methods", "data", "runs", "fitting", "evaluation", "relighting"}
-    | {"editing", "reconstruct", "reconstruction"},
+    | {"editing", "reconstruct", "reconstruction", "importing"},
 }
 """What each part of the package may import besides itself; "" is the package's own `__init__`.
 

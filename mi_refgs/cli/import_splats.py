@@ -30,20 +30,17 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Import."""
-    from mi_refgs.formats.incoming import method_of, read_cameras, read_splats
-    from mi_refgs.formats.shots import shots_around
+    from mi_refgs.formats.incoming import read_cameras
+    from mi_refgs.importing import import_splats
     from mi_refgs.runs.run import Run
     from mi_refgs.runs.save import save
 
     Run(args.output).require_none()
-    trained = read_splats(args.file, args.linear)
-    if args.transforms is None:
-        cameras = [shot.camera for shot in shots_around(trained.surfels) if shot.split == "test"]
-    else:
-        cameras = read_cameras(args.transforms)
-    method = method_of(trained, args.file.stem)
-    files = [str(path) for path in save(trained, args.output, method, cameras[0], more=cameras[1:])]
-    surfels = trained.surfels
+    made = import_splats(args.file, linear=args.linear)
+    cameras = made.cameras() if args.transforms is None else read_cameras(args.transforms)
+    written = save(made.trained, args.output, made.method, cameras[0], more=cameras[1:])
+    files = [str(path) for path in written]
+    surfels = made.trained.surfels
     kind, degree = surfels.primitive.name, surfels.sh_degree()
     data = {"files": files, "surfels": surfels.count, "primitive": kind, "degree": degree}
     data["cameras"] = len(cameras)
