@@ -538,6 +538,15 @@ def test_a_senseless_address_is_one_sentence(
     assert "--port: " in capsys.readouterr().err
 
 
+def test_a_run_without_a_fit_says_how_to_fit_it(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Run(tmp_path / "run")
+    run.create(load("ref_gaussian", "quick"), str(data))
+    assert main(["view", str(run.path), "--port", "0"]) == 2
+    assert capsys.readouterr().err.endswith(f"`refgs train DATA -o {run.path} --resume`\n")
+
+
 def test_without_viser_the_remedy_is_named(
     finished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,7 +15,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.picture_store import undecoded
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
-from mi_refgs.runs.export import MODEL, TrainedScene, load_if_newer
+from mi_refgs.runs.export import newest
 from mi_refgs.runs.run import DATASET, Run
 from mi_refgs.viewer import quality
 from mi_refgs.viewer.controls import light, look, materials, overlays, saving, truth
@@ -44,7 +44,7 @@ def page_of_run(
     """
     views = views_of(run, data, tell)
     some = views.test or views.train
-    scene = scene_of(run)
+    scene = newest(run, run.method())
     source = Fitted(scene, None if some is None else some.region)
     page = Page(source, views, run.path.resolve().name, host, port, output or run.path / "views")
     page.side = warm_up(source, page.look, page.start(), tell)
@@ -68,16 +68,6 @@ def page_of_scene(scene: Any, path: Path, host: str, port: int, output: Path | N
     saving.add(page)
     page.listen()
     return page
-
-
-def scene_of(run: Run) -> TrainedScene:
-    """What a run's newest checkpoint holds, else its artefacts; raises InputError if there are neither."""
-    fresh = load_if_newer(run, run.method())
-    if fresh is not None:
-        return fresh
-    if not (run.path / MODEL).is_file():
-        raise InputError(f"{run.path}: checkpoints: none yet; train it with `refgs train DATA -o {run.path}`")
-    return TrainedScene.read(run.path)
 
 
 def views_of(run: Run, data: Path | None, tell: Tell) -> Views:
