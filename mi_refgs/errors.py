@@ -1,4 +1,4 @@
-"""The one exception for input a person can mend, and values in its messages."""
+"""The exceptions for input a person can mend, and values in their messages."""
 
 
 class InputError(ValueError):
@@ -6,6 +6,15 @@ class InputError(ValueError):
 
     The command line prints it as one sentence and exits with code 2.
     """
+
+
+class SceneError(InputError):
+    """A scene lacks what is asked of it: where a run is read, its folder is put in front of the message."""
+
+
+def counted(count: int, noun: str) -> str:
+    """A number of things, such as 1 surfel and 2 surfels."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def shown(value: object, limit: int = 80) -> str:

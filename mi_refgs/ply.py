@@ -49,14 +49,14 @@ class Header:
     comments: tuple[str, ...]
 
 
-def read_header(path: Path, file: BinaryIO) -> Header:
+def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or mesh.ply of a run") -> Header:
     """Read the header; the file then stands at the data.
 
     Raises InputError, naming `path`, for what is no PLY header and for one that promises more rows than the
-    file is long.
+    file is long. `wanted` is what the message of the former says to give.
     """
     if file.readline(MAX_LINE).strip() != b"ply":
-        raise InputError(f"{path}: header: not a PLY file; give the surfels.ply or mesh.ply of a run")
+        raise InputError(f"{path}: header: not a PLY file; give {wanted}")
     order, comments = "", []
     found: list[tuple[str, int, list[tuple[str, str]], list[tuple[str, str]]]] = []
     for _ in range(MAX_HEADER_LINES):

@@ -18,7 +18,7 @@ import numpy as np
 from mi_refgs import editing, formats
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, counted
 from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.evaluation.pictures import planes
 from mi_refgs.methods.method import Method
@@ -53,7 +53,7 @@ class Reconstruction:
     def __repr__(self) -> str:
         light, mesh, around = self.trained.light, self.trained.mesh, self.trained.surroundings
         parts = [
-            f"{self.trained.surfels.count} {self.trained.surfels.primitive.name}s",
+            counted(self.trained.surfels.count, self.trained.surfels.primitive.name),
             f"channels = {', '.join(self.trained.surfels.raw)}",
             f"light = {None if light is None else f'{light.height} × {2 * light.height}'}",
             f"mesh = {None if mesh is None else f'{len(mesh.faces)} triangles'}",

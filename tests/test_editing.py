@@ -197,6 +197,8 @@ def test_a_colour_scales_all_harmonics(scene: TrainedScene) -> None:
         ({"set": ["albedo=1,2"]}, "2 values; give 1 or 3"),
         ({"set": ["roughness"]}, "no assignment; write it like roughness=0.3"),
         ({"set": ["roughness==1"]}, "no assignment"),
+        ({"set": ["roughness=0.2 albedo=1"]}, "several assignments in one; separate them, each in its own"),
+        ({"set": ["roughness=0.2, albedo.r *= 0.5"]}, "several assignments in one"),
         ({"set": ["roughness=x>0"]}, "a comparison is no number"),
         ({"set": ["roughness=0/0"]}, "not a finite number for every surfel"),
         ({"set": ["roughness=shine"]}, "'shine' is no value of these surfels; use one of position.x"),
@@ -226,6 +228,15 @@ def test_what_makes_no_sense_is_one_sentence(
     with pytest.raises(InputError) as caught:
         edit(scene, **given)
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("wrong", [["--where", "x >"], ["--set", "roughness"]])
+def test_a_formula_is_refused_before_the_run_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: list[str]
+) -> None:
+    """The run is not even there."""
+    assert main(["edit", str(tmp_path / "none"), "-o", str(tmp_path / "new"), *wrong]) == 2
+    assert capsys.readouterr().err.startswith(f"refgs: {wrong[0]}: ")
 
 
 def test_arrays_do_as_well_as_lists(scene: TrainedScene) -> None:

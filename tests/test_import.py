@@ -142,6 +142,27 @@ def test_the_command_makes_a_run_that_is_shown_the_same(
     assert "holds a run already" in capsys.readouterr().err
 
 
+def test_one_gaussian_is_said_in_the_singular(
+    tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, run = their_bytes(raw_of(3, 0, rng)), tmp_path / "run"
+    header, end, body = whole.partition(b"end_header\n")
+    path = tmp_path / "one.ply"
+    path.write_bytes(header.replace(b"vertex 40", b"vertex 1") + end + body[: len(body) // COUNT])
+    assert main(["import", str(path), "-o", str(run)]) == 0
+    assert f"{run}: 1 gaussian of degree 0, 4 cameras in scene.xml" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("form", ["gltf-mesh", "mitsuba"])
+def test_what_a_run_lacks_is_said_of_its_folder(
+    theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str
+) -> None:
+    run = tmp_path / "run"
+    assert main(["import", str(theirs), "-o", str(run)]) == 0
+    assert main(["export", str(run), "--to", form, "-o", str(tmp_path / "out")]) == 2
+    assert f"{run}: albedo, metallic, roughness: the run has none; fit one" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("linear", [False, True])
 def test_python_imports_what_the_command_does(theirs: Path, tmp_path: Path, linear: bool) -> None:
     """In memory, saved, and by the command: the same picture bit for bit; colours differ by what they are."""
@@ -247,8 +268,8 @@ def broken(kind: str, whole: bytes) -> bytes:
         ("empty", "there are none"),
         ("degree", "f_rest_*: 44 properties"),
         ("truncated", ""),
-        ("nothing", "not a PLY file"),
-        ("text", "not a PLY file"),
+        ("nothing", "not a PLY file; give the PLY file of 3DGS or 2DGS"),
+        ("text", "not a PLY file; give the PLY file of 3DGS or 2DGS"),
     ],
 )
 def test_other_files_get_one_sentence(

@@ -112,11 +112,16 @@ def view(text: str) -> int | Path:
 
 def run(args: argparse.Namespace) -> Result:
     """Edit."""
+    from mi_refgs.editing import assignments
+    from mi_refgs.editing.expression import parse_truth
     from mi_refgs.formats.incoming import read_cameras
     from mi_refgs.images import write_png
     from mi_refgs.reconstruction import load
 
     _require_free(args.output)
+    assignments(args.set)  # what is no formula is said before the run is read, which takes seconds
+    if args.where is not None:
+        parse_truth(args.where)
     whole = load(args.run_folder, write=False)
     whole = replace(whole, source=whole.source.with_data(args.data))
     join = None if args.join is None else load(args.join, write=False)

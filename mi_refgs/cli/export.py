@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs.cli.command import Result, add_command, add_run, say
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, SceneError
 
 
 def add(commands: Any) -> None:
@@ -89,7 +89,10 @@ def run(args: argparse.Namespace) -> Result:
         training, views = (load_split(folder, method, split, args.data) for split in ("train", "test"))
         fitted, report = prune(fitted, training, views, LIMIT if args.limit is None else args.limit, say)
     if args.to is not None:
-        written = write(fitted, args.to.split(","), target, shots, options)
+        try:
+            written = write(fitted, args.to.split(","), target, shots, options)
+        except SceneError as error:
+            raise InputError(f"{folder.path}: {error}") from error
         files = [str(path) for paths in written.values() for path in paths]
     else:
         make_folder(target)

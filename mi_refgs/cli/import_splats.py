@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs.cli.command import Result, add_command, add_output
+from mi_refgs.errors import counted
 
 
 def add(commands: Any) -> None:
@@ -44,5 +45,7 @@ def run(args: argparse.Namespace) -> Result:
     kind, degree = surfels.primitive.name, surfels.sh_degree()
     data = {"files": files, "surfels": surfels.count, "primitive": kind, "degree": degree}
     data["cameras"] = len(cameras)
-    text = f"{args.output}: {surfels.count} {kind}s of degree {degree}, {len(cameras)} cameras in scene.xml"
-    return Result(data, text)
+    what = (
+        f"{counted(surfels.count, kind)} of degree {degree}, {counted(len(cameras), 'camera')} in scene.xml"
+    )
+    return Result(data, f"{args.output}: {what}")

@@ -22,6 +22,8 @@ from mi_refgs.surfels.channels import SH_DC, logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 
 ASSIGNMENT = re.compile(r"\s*([A-Za-z_][\w.]*)\s*(\*?=)(?!=)(.*)", re.ASCII | re.DOTALL)
+ANOTHER = re.compile(r"[\s,;][A-Za-z_][\w.]*\s*\*?=(?!=)", re.ASCII)
+"""The beginning of a further assignment in the value of one."""
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 SCALES = (1e-6, 1e6)
 """Factors of --scale: beyond, float32 holds no scene."""
@@ -52,6 +54,10 @@ class Assignment:
         found = ASSIGNMENT.fullmatch(text)
         if found is None:
             raise InputError(f"--set: {shown(text)}: no assignment; write it like roughness=0.3")
+        if ANOTHER.search(found[3]):
+            raise InputError(
+                f"--set: {shown(text)}: several assignments in one; separate them, each in its own quotes"
+            )
         return Assignment(found[1], tuple(parse_numbers(found[3])), found[2] == "*=", text.strip())
 
 

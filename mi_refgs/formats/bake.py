@@ -17,7 +17,7 @@ import numpy as np
 import trimesh
 
 from mi_refgs.device import upload
-from mi_refgs.errors import InputError
+from mi_refgs.errors import SceneError
 from mi_refgs.formats.format import Shot, module
 from mi_refgs.formats.surface import surface, texels, unwrap
 from mi_refgs.formats.textured import TexturedMesh, check
@@ -71,7 +71,7 @@ def _bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, size: int) -
         module(package)
     scene = relightable(trained)
     if scene.mesh is None or scene.light is None:
-        raise InputError("mesh: the run has none; fit one with occlusion, as `--for relighting` does")
+        raise SceneError("mesh: the run has none; fit one with occlusion, as `--for relighting` does")
     plain = replace(scene, shading=Shading("pixel", "split_sum", "irradiance", False))
     chosen = np.unique(np.linspace(0, len(shots) - 1, VIEWS).round().astype(int))
     views = [shots[i].camera.resized(VIEW_SIZE) for i in chosen]

@@ -30,6 +30,9 @@ from mi_refgs.surfels.table import Surfels
 LENSES = ("k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye")
 """Keys of lenses that are no pinholes, unless they are 0 or false."""
 
+WANTED = "the PLY file of 3DGS or 2DGS"
+"""What messages say to give."""
+
 
 def read_splats(path: Path, linear: bool = False) -> TrainedScene:
     """The scene in a PLY file: positions, rotations, sizes, opacities and colours of 3D Gaussians or surfels.
@@ -76,7 +79,7 @@ def _require_splats(path: Path) -> None:
     """Raise InputError for PLY files of other things, by their header."""
     try:
         with path.open("rb") as file:
-            header = read_header(path, file)
+            header = read_header(path, file, WANTED)
     except OSError as error:
         raise InputError(f"{path}: file: cannot be read ({error.strerror}); check the path") from error
     tables = {element.name: {name for name, _ in element.fields} for element in header.elements}
@@ -88,7 +91,7 @@ def _require_splats(path: Path) -> None:
         )
     if not {"opacity", "scale_0", "rot_0"} & names:
         what = "a mesh" if tables.get("face") is not None else "points without size or opacity"
-        raise InputError(f"{path}: vertex: {what}, no Gaussians; give the PLY file of 3DGS or 2DGS")
+        raise InputError(f"{path}: vertex: {what}, no Gaussians; give {WANTED}")
     if not any(name.startswith("f_dc_") for name in names):
         raise InputError(f"{path}: f_dc_0: the property is missing; export the file again with its colours")
 

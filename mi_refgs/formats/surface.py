@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 
 from mi_refgs.device import upload
-from mi_refgs.errors import InputError
+from mi_refgs.errors import SceneError
 from mi_refgs.occlusion.mesh import Mesh, clean
 from mi_refgs.occlusion.visibility import Occluder
 
@@ -38,7 +38,7 @@ def surface(mesh: Mesh, faces: int) -> Mesh:
     Raises InputError if there is nothing of it.
     """
     if not len(mesh.faces):
-        raise InputError("mesh: the run has none that textures could be baked to; train it for longer")
+        raise SceneError("mesh: the run has none that textures could be baked to; train it for longer")
     low, size = mesh.vertices.min(axis=0), np.ptp(mesh.vertices, axis=0).max()
     made = trimesh.Trimesh((mesh.vertices - low) / size, mesh.faces, process=False)
     trimesh.smoothing.filter_taubin(made, iterations=SMOOTHING)

@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from mi_refgs.device import upload_tensor
-from mi_refgs.errors import InputError
+from mi_refgs.errors import SceneError
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points
 from mi_refgs.occlusion.visibility import Occluder
@@ -57,7 +57,7 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     missing = [name for name in MATERIALS if not scene.surfels.has(name)]
     if scene.light is None or missing:
         what = ", ".join(missing) or "light"
-        raise InputError(
+        raise SceneError(
             f"{what}: the run has none; fit one with materials and a light, as `--for relighting` does"
         )
     surfels = scene.surfels.detach()
