@@ -530,12 +530,22 @@ def test_a_busy_port_is_one_sentence(finished: Path, capsys: pytest.CaptureFixtu
     assert message.endswith("); give another --port")
 
 
-@pytest.mark.parametrize("more", [["--port", "70000"], ["--host", "no.such.host.invalid"]])
-def test_a_senseless_address_is_one_sentence(
-    finished: Path, more: list[str], capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    "option, value",
+    [
+        ("--port", "70000"),
+        ("--host", "no.such.host.invalid"),
+        ("--host", "300.1.1.1"),
+        ("--host", "192.0.2.1"),  # an address of no machine: RFC 5737
+    ],
+)
+def test_a_senseless_address_is_one_sentence_on_its_option(
+    finished: Path, option: str, value: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["view", str(finished), *more]) == 2
-    assert "--port: " in capsys.readouterr().err
+    assert main(["view", str(finished), option, value]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith(f"refgs: {option}: {value}")
+    assert ("--port" in message) == (option == "--port")
 
 
 def test_a_run_without_a_fit_says_how_to_fit_it(

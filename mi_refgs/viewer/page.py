@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import math
 import socket
@@ -63,12 +64,18 @@ def require_free(host: str, port: int) -> None:
         raise InputError(f"--port: {port} is out of range; give 1 to 65535, or 0 for any that is free")
     try:
         info = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"--host: {host} is no address ({reason}); give another --host") from error
+    try:
         with socket.socket(info[0], socket.SOCK_STREAM) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(info[4])
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"--port: {host}:{port} cannot be used ({reason}); give another --port") from error
+    except OSError as error:
+        option = "host" if error.errno == errno.EADDRNOTAVAIL else "port"
+        raise InputError(
+            f"--{option}: {host}:{port} cannot be used ({error.strerror}); give another --{option}"
+        ) from error
 
 
 class Page:
@@ -212,7 +219,7 @@ class Page:
         self.looked()
 
     def complain(self, message: str) -> None:
-        """Show a sentence about bad input."""
+        """Show a sentence about bad input, or about what failed."""
         self.notify("Not done", message, "red")
 
     def notify(self, title: str, body: str, colour: str | None = None) -> None:
