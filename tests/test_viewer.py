@@ -298,6 +298,48 @@ def test_notes_run_once_the_last_of_a_key_wins_and_bad_input_is_told(running: An
     assert [s.shown for s in seen] == [COARSE, COARSE]  # the first note changed what is seen
 
 
+def test_a_failure_is_told_and_the_others_go_on(running: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a note and of a picture; a picture that fails is tried again only after a change."""
+    loop, source, _, seen = running
+    told: list[str] = []
+    other: list[Shown] = []
+    loop.failed = told.append
+
+    def broken() -> None:
+        raise RuntimeError("out of memory\nand much more")
+
+    loop.ask("a", broken)
+    loop.ask("b", lambda: loop.look(7, POSE, (640, 400)))
+    source.during = broken
+    assert loop.step() == 0
+    assert loop.step() == math.inf
+    assert (len(source.shots), len(told), seen) == (1, 2, [])
+    assert all(message.startswith("out of memory; ") and "\n" not in message for message in told)
+    assert capsys.readouterr().err.count("RuntimeError: out of memory\nand much more") == 2
+    source.during = None
+    loop.enter(8, Visitor(other.append))
+    loop.look(8, POSE, (640, 400))
+    loop.step()
+    assert (seen, [s.shown for s in other]) == ([], [COARSE])
+    loop.look(7, POSE, (640, 400))
+    loop.step()
+    assert [s.shown for s in seen] == [COARSE]
+
+
+def test_a_picture_that_fails_after_a_change_is_drawn_anew(running: Any) -> None:
+    loop, source, _, seen = running
+
+    def moved_and_broken() -> None:
+        source.during = None
+        loop.look(7, POSE, (640, 400))
+        raise RuntimeError("gone")
+
+    loop.look(7, POSE, (640, 400))
+    source.during = moved_and_broken
+    assert loop.step() == loop.step() == 0
+    assert [s.shown for s in seen] == [COARSE]
+
+
 def test_who_sees_least_goes_first_and_who_left_is_forgotten(running: Any) -> None:
     loop, _, clock, seen = running
     other: list[Shown] = []

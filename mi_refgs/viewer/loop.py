@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -70,7 +71,7 @@ class Loop:
     def __init__(self, source: Source, clock: Callable[[], float] = time.monotonic) -> None:
         self.source, self.clock = source, clock
         self.visitors: dict[int, Visitor] = {}
-        self.failed: Callable[[str], None] = lambda message: None  # told of bad input of a note
+        self.failed: Callable[[str], None] = lambda message: None  # told of what fails, in one sentence
         self.pictures = 0  # that were sent
         self.smooth = True  # whether pictures that stay are averaged over samples
         self._notes: dict[Any, Callable[[], None]] = {}
@@ -153,10 +154,7 @@ class Loop:
         with self._wake:
             notes, self._notes = self._notes, {}
         for note in notes.values():
-            try:
-                note()
-            except InputError as error:
-                self.failed(str(error))
+            self._guarded(note)
         now = self.clock()
         waiting = [
             (quality.due(v.shown if self.smooth or v.shown < LARGE else DONE, now - v.changed), v.shown, v)
@@ -168,8 +166,26 @@ class Loop:
         wait, _, visitor = min(waiting, key=lambda entry: entry[:2])  # who sees least goes first
         if wait > 0:
             return wait
-        self._advance(visitor)
+        version = visitor.version
+        if not self._guarded(lambda: self._advance(visitor)):
+            with self._wake:
+                if visitor.version == version:  # else it would fail again at once, without an end
+                    visitor.shown, visitor.sums = DONE, []
         return 0.0
+
+    def _guarded(self, task: Callable[[], None]) -> bool:
+        """Whether a task succeeds. The page is told of a failure in one sentence, and goes on."""
+        try:
+            task()
+        except InputError as error:
+            self.failed(str(error))
+        except Exception as error:
+            traceback.print_exc()
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
+            self.failed(f"{reason}; what was shown stays, and the terminal shows where this failed")
+        else:
+            return True
+        return False
 
     def _advance(self, visitor: Visitor) -> None:
         """Draw a visitor's next sample and send the picture, unless it is old by then."""
