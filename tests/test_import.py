@@ -15,6 +15,7 @@ from mi_refgs.constants import GAUSSIAN_LOW_PASS
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.pictures import planes
+from mi_refgs.exr import read_exr
 from mi_refgs.formats.incoming import read_cameras, read_splats
 from mi_refgs.images import read_png
 from mi_refgs.reference import splat as oracle
@@ -325,3 +326,40 @@ def test_bad_cameras_are_named(change: dict[str, object], message: str, tmp_path
     with pytest.raises(InputError) as caught:
         read_cameras(file)
     assert message in str(caught.value) and str(file) in str(caught.value)
+
+
+def test_a_run_is_rendered_from_the_cameras_of_a_file(
+    theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The picture of that frame's camera, which is no sensor of the run; wrong frames are one sentence."""
+    import mi_refgs
+
+    file, run, out = tmp_path / "camera.json", tmp_path / "run", tmp_path / "out.exr"
+    file.write_text(json.dumps(transforms()))
+    assert main(["import", str(theirs), "-o", str(run)]) == 0
+    command = ["render", str(run), "-o", str(out), "--camera", str(file), "--sensor"]
+    assert main([*command, "1"]) == 0
+    camera = read_cameras(file)[1]
+    goal = mi_refgs.load(run).render(camera)
+    channels = read_exr(out)
+    picture = np.stack([channels[name] for name in "RGBA"], axis=-1)
+    assert picture.shape == goal.shape == (camera.height, camera.width, 4) and goal[..., 3].max() > 0.5
+    np.testing.assert_allclose(picture, goal, atol=2e-3)
+    capsys.readouterr()
+    assert main([*command, "2"]) == 2
+    assert capsys.readouterr().err == (f"refgs: {file}: --sensor: 2: the file has 2 frames; give 0 to 1\n")
+
+
+def test_a_scene_without_sensors_needs_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The scene is any of Mitsuba's: a white sphere in uniform light."""
+    scene, file, out = tmp_path / "scene.xml", tmp_path / "camera.json", tmp_path / "out.png"
+    scene.write_text(
+        '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>'
+        '<shape type="sphere"><bsdf type="diffuse"/></shape></scene>'
+    )
+    file.write_text(json.dumps(transforms()))
+    command = ["render", str(scene), "-o", str(out)]
+    assert main(command) == 2
+    assert "sensor: the scene has none; add one, or give a file with --camera" in capsys.readouterr().err
+    assert main([*command, "--camera", str(file)]) == 0
+    assert read_png(out).shape[:2] == (48, 64)

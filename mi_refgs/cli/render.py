@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs.cli.command import Result, add_command, add_output
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, counted
 
 SUFFIXES = (".exr", ".png")
 
@@ -22,6 +22,12 @@ def add(commands: Any) -> None:
     add_output(parser, "picture: .exr (linear, premultiplied alpha) or .png (sRGB, straight alpha)", "OUT")
     parser.add_argument(
         "--sensor", type=int, default=0, metavar="I", help="which sensor of the scene (default %(default)s)"
+    )
+    parser.add_argument(
+        "--camera",
+        type=Path,
+        metavar="FILE.json",
+        help="cameras of a transforms.json, such as the page of `refgs view` saves; --sensor counts these",
     )
     parser.add_argument(
         "--object", action="store_true", help="the object alone, on transparency, without its surroundings"
@@ -41,7 +47,9 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Render."""
+    from mi_refgs.formats.incoming import read_cameras
     from mi_refgs.render.load_scene import load_scene
+    from mi_refgs.render.scene_xml import sensors_of
 
     if args.output.suffix.lower() not in SUFFIXES:
         raise InputError(
@@ -53,14 +61,19 @@ def run(args: argparse.Namespace) -> Result:
         )
     if args.spp < 0:
         raise InputError(f"--spp: {args.spp} is out of range; give a number from 1")
+    cameras = None if args.camera is None else read_cameras(args.camera)
     scene = load_scene(scene_file(args.scene), args.aov, args.object)
-    sensors = scene.sensors()
+    own = sensors = scene.sensors()
+    whose = f"{args.scene}: --sensor: {args.sensor}: the scene has {counted(len(own), 'sensor')}"
+    if cameras is not None:
+        sensors = sensors_of(cameras)
+        whose = f"{args.camera}: --sensor: {args.sensor}: the file has {counted(len(sensors), 'frame')}"
+    if not sensors:
+        raise InputError(f"{args.scene}: sensor: the scene has none; add one, or give a file with --camera")
     if not 0 <= args.sensor < len(sensors):
-        raise InputError(
-            f"{args.scene}: --sensor: {args.sensor}: the scene has {len(sensors)} sensors; "
-            f"give 0 to {len(sensors) - 1}"
-        )
-    names = write(scene, sensors[args.sensor], args.spp, args.output)
+        raise InputError(f"{whose}; give 0 to {len(sensors) - 1}")
+    spp = args.spp or (own[0].sampler().sample_count() if cameras is not None and own else 0)
+    names = write(scene, sensors[args.sensor], spp, args.output)
     width, height = (int(x) for x in sensors[args.sensor].film().crop_size())
     data = {"output": str(args.output), "width": width, "height": height, "channels": names}
     return Result(data, f"{args.output}: {width} × {height}, {', '.join(names)}")

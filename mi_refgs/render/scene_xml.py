@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import mitsuba as mi
+
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
 from mi_refgs.shade.shading import Shading
@@ -78,6 +80,15 @@ def write_scene_xml(
         add_sensor(scene, one, f"sensor_{index}" if index else "sensor")
 
     write_xml(path, scene)
+
+
+def sensors_of(cameras: Sequence[Camera]) -> list[Any]:
+    """Mitsuba sensors of cameras, as a scene.xml has them; raises InputError as `write_scene_xml` does."""
+    scene = ElementTree.Element("scene", version="3.0.0")
+    put(scene, "default", "spp", "1")
+    for index, camera in enumerate(cameras):
+        add_sensor(scene, camera, f"sensor_{index}")
+    return list(mi.load_string(ElementTree.tostring(scene, encoding="unicode")).sensors())
 
 
 def write_xml(path: str | Path, scene: ElementTree.Element) -> None:
