@@ -13,9 +13,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.files import read_json
 from mi_refgs.fitting.whole import read_views
 from mi_refgs.formats import Shot
-from mi_refgs.formats.shots import shots_around
+from mi_refgs.formats.shots import shots_around, turntable_cameras
 from mi_refgs.methods.method import Method
-from mi_refgs.relighting.relight import turntable_poses
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.save import save
@@ -92,5 +91,4 @@ class Source:
             raise InputError(f"turntable: {count} is out of range; give a number of cameras from 1")
         cameras = [shot.camera for shot in self.shots(trained, "test")]
         region = None if trained.surroundings is None else self.region
-        poses = turntable_poses(trained, [camera.pose() for camera in cameras], count, region)
-        return [cameras[0].moved(pose) for pose in poses]
+        return turntable_cameras(trained, cameras, count, region)

@@ -68,9 +68,9 @@ LAYERS: dict[str, set[str]] = {
     "runs": RENDERER | {"methods"},
     "fitting": RENDERER | {"methods", "data", "capture", "runs", "resources"},
     "evaluation": RENDERER | {"methods", "data", "runs", "fitting", "messages"},
-    "relighting": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
+    "relighting": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", "formats", "source"},
     "formats": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", "plugins"},
-    "source": RENDERER | {"methods", "data", "runs", "fitting", "formats", "relighting"},
+    "source": RENDERER | {"methods", "data", "runs", "fitting", "formats"},
     "reconstruction": RENDERER
     | {
         "methods",

@@ -19,9 +19,12 @@ from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.surface import TrueSurface
 from mi_refgs.exr import read_exr_image, write_exr
+from mi_refgs.formats import shots
+from mi_refgs.formats.shots import turntable_cameras
 from mi_refgs.images import read_png
-from mi_refgs.relighting.light import NewLight, truth_under
-from mi_refgs.relighting.relight import relight, turntable_views
+from mi_refgs.reconstruction import load
+from mi_refgs.relighting.light import NewLight, any_light, truth_under
+from mi_refgs.relighting.relight import relight
 from mi_refgs.relighting.score import common_scale, score, shown
 from mi_refgs.runs.export import TrainedScene, export
 from mi_refgs.runs.run import Run
@@ -232,12 +235,51 @@ def test_a_turntable_goes_around_the_object(folder: Path) -> None:
     assert all(0.05 < frame.mean() < 0.9 and frame[0].max() == 0 for frame in frames)
     assert not (folder / "turn" / "test").exists() and (folder / "turn" / "scene.xml").is_file()
     fitted, views = TrainedScene.read(folder / "run"), read_dataset(folder / "data", "test").views
-    poses = np.array([view.to_world for view in turntable_views(fitted, views, 4)])
+    around = turntable_cameras(fitted, [view.camera() for view in views], 4)
+    assert around[0].width == SIZE and around[0].focal == pytest.approx(views[0].fx)
+    poses = np.array([camera.pose() for camera in around])
     middle = poses[:, :3, 3].mean(axis=0)
     offset = poses[:, :3, 3] - middle
     assert np.ptp(offset[:, 2]) < 1e-9 and np.ptp(np.linalg.norm(offset, axis=1)) < 1e-9
     np.testing.assert_allclose(offset[0, :2], -offset[2, :2], atol=1e-9)
     assert (poses[:, 2, 1] > 0).all()  # upright
+
+
+# ---------------- without a data set ----------------
+
+
+@pytest.mark.parametrize("record", [None, '{"path": "gone"}'])
+@pytest.mark.parametrize("turntable", [0, 2])
+def test_a_run_without_data_is_relit_around_the_object(
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture,
+    record: str | None,
+    turntable: int,
+) -> None:
+    """A saved run that records no data set, and one whose data is gone; alike from Python."""
+    monkeypatch.setattr(shots, "SIZE", SIZE)
+    run = load(folder / "run").save(tmp_path / "run").folder
+    assert run is not None
+    (run / "dataset.json").unlink()
+    if record is not None:
+        (run / "dataset.json").write_text(record)
+    light, out = folder / "dusk.exr", tmp_path / "out"
+    command = ["relight", str(run), "--envmap", str(light), "-o", str(out), "--json"]
+    assert main([*command, "--turntable", str(turntable)]) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert "cameras are around the object" in result["score_reason"] and result["psnr"] is None
+    relit = load(run).relight(light)
+    cameras = relit.turntable(turntable) if turntable else relit.cameras()
+    assert len(result["pictures"]) == len(cameras) and (out / "sheet.png").is_file()
+    for name, camera in zip(result["pictures"], cameras, strict=True):
+        shown = read_exr_image((out / name).with_suffix(".exr"))
+        np.testing.assert_allclose(shown, relit.render(camera), atol=1e-4)
+        assert 0.05 < shown[..., 3].mean() < 0.9
+    if record is not None and not turntable:  # with its data named it has the truth
+        found = relight(Run(run), NewLight(light), tmp_path / "named", data=folder / "data").result
+        assert found["psnr"] > 20
 
 
 # ---------------- the command, and what it refuses ----------------
@@ -287,6 +329,9 @@ def test_what_cannot_be_relit(folder: Path, tmp_path: Path) -> None:
     for rotate, exposure in ((float("nan"), 0.0), (0.0, 50.0)):
         with pytest.raises(InputError, match="--rotate, --exposure"):
             NewLight(folder / "dusk.exr", False, rotate, exposure)
+        for given in (other_sky(), NewLight(folder / "dusk.exr").read()):
+            with pytest.raises(InputError, match=r"light: rotate, exposure: .* out of range"):
+                any_light(given, False, rotate, exposure)
     bare = Run(Path(shutil.copytree(run.path, tmp_path / "bare")))
     fitted = TrainedScene.read(run.path)
     camera = read_dataset(folder / "data", "test").views[0].camera()

@@ -1,15 +1,18 @@
-"""Cameras around surfels, for what has no data set."""
+"""Cameras around surfels: for what has no data set, and of a turntable."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from mi_refgs.constants import GOLDEN_ANGLE
+from mi_refgs.contraction import Region
 from mi_refgs.data.pathtrace import poses_around
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
+from mi_refgs.runs.export import TrainedScene
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 
@@ -45,6 +48,28 @@ def shots_around(surfels: Surfels) -> list[Shot]:
             )
             shots.append(Shot(f"{split}/r_{i:03d}", split, camera))
     return shots
+
+
+def turntable_cameras(
+    scene: TrainedScene, cameras: Sequence[Camera], count: int, region: Region | None = None
+) -> list[Camera]:
+    """Cameras on a circle around the object, z up, like `cameras` in distance and (median) height.
+
+    They have the first one's lens. The object is what lies in the `region`; without one, all of the scene.
+    """
+    if region is not None:
+        centre = np.array(region.centre)
+    else:
+        position = scene.surfels.position().numpy().T if scene.mesh is None else scene.mesh.vertices
+        centre = (position.min(axis=0) + position.max(axis=0)).astype(np.float64) / 2
+    offset = np.array([camera.pose()[:3, 3] for camera in cameras]) - centre
+    distance = float(np.median(np.linalg.norm(offset, axis=1)))
+    height = float(np.median(offset[:, 2] / np.linalg.norm(offset, axis=1)))
+    height = min(max(height, -0.95), 0.95)  # not from a pole, where no side is up
+    angle = 2 * np.pi * np.arange(count) / count
+    ring = math.sqrt(1 - height**2)
+    outward = np.stack([ring * np.cos(angle), ring * np.sin(angle), np.full(count, height)], axis=1)
+    return [cameras[0].moved(pose) for pose in poses_around(outward, centre, distance)]
 
 
 def _quantile(values: np.ndarray, weight: np.ndarray, share: float) -> float:

@@ -38,11 +38,7 @@ class NewLight:
     def __post_init__(self) -> None:
         """Raise InputError if there is no such file, or a number makes no sense."""
         require_file(self.path)
-        if not (np.isfinite(self.rotate) and abs(self.exposure) <= EXPOSURE_MAX):
-            raise InputError(
-                f"{self.path}: --rotate, --exposure: {self.rotate}, {self.exposure} are out of range; give "
-                f"degrees, and stops from {-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
-            )
+        _require_range(f"{self.path}: --rotate, --exposure", self.rotate, self.exposure)
 
     @property
     def suffix(self) -> str:
@@ -55,15 +51,24 @@ class NewLight:
         return world_light(read_radiance(self.path), self.world, self.rotate, self.exposure)
 
 
+def _require_range(field: str, rotate: float, exposure: float) -> None:
+    if not (np.isfinite(rotate) and abs(exposure) <= EXPOSURE_MAX):
+        raise InputError(
+            f"{field}: {rotate}, {exposure} are out of range; give degrees, and stops from "
+            f"{-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
+        )
+
+
 def world_light(
     radiance: np.ndarray, world: bool = False, rotate: float = 0.0, exposure: float = 0.0
 ) -> EnvironmentLight:
     """Lat-long radiance (h, w, 3) as a light of at most HEIGHT rows; the rest as in `NewLight`.
 
-    Raises InputError for an array that is no such map.
+    Raises InputError for an array that is no such map, and for a number that makes no sense.
     """
     import mitsuba as mi
 
+    _require_range("light: rotate, exposure", rotate, exposure)
     radiance = np.ascontiguousarray(radiance, dtype=np.float32)
     if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape) < 2:
         raise InputError(f"light: {radiance.shape} is no lat-long map; give linear radiance (h, w, 3)")

@@ -11,7 +11,6 @@ A folder of it holds
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,15 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.contraction import Region
-from mi_refgs.data.dataset import Dataset, read_dataset
-from mi_refgs.data.pathtrace import poses_around
-from mi_refgs.data.view import View
+from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import pictures
-from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.exr import write_exr
 from mi_refgs.files import cannot_write, write_json
+from mi_refgs.formats.shots import turntable_cameras
 from mi_refgs.images import straight_srgb, write_png
 from mi_refgs.methods.method import Method
 from mi_refgs.progress_bar import with_bar
@@ -38,6 +34,7 @@ from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import TrainedScene, export, up_to_date
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
+from mi_refgs.source import Source
 from mi_refgs.splat import Camera
 
 SHEET, RESULT = "sheet.png", "relight.json"
@@ -46,6 +43,7 @@ SHEET_VIEWS = 4
 SHEET_COLUMNS = 6
 """Frames of a turntable in a row of its sheet."""
 NO_TRUTH = "the data set has no test views under this light; make them with `refgs dataset --relight`"
+NO_DATA = "no data set is there, so cameras are around the object; name its folder with --data"
 
 
 @dataclass(frozen=True)
@@ -72,31 +70,44 @@ def relight(
 
     The scene becomes materials alone (`runs.relightable`): diffuse light is the new light's irradiance, with
     the mesh's shadows and bounces; mirrors are traced. The views are the test views of the run's data set,
-    or of `data`; with `turntable`, so many cameras on a circle around the object instead. If the data set has
-    the truth under this light (`light.truth_under`), the test views are compared with it.
+    or of `data`; with `turntable`, so many cameras on a circle around the object instead. Without a data set
+    both are of cameras around the object (`Source.shots`). If the data set has the truth under this light
+    (`light.truth_under`), the test views are compared with it.
 
-    Raises InputError for a run without light or materials, a light that cannot be read, data that is gone,
-    and a folder that holds a run or cannot be written.
+    Raises InputError for a run without light or materials, a light or a data set that cannot be read, and a
+    folder that holds a run or cannot be written.
     """
     if turntable < 0:
         raise InputError(f"--turntable: {turntable} is out of range; give a number of views from 1")
-    method = run.method()
-    views = load_split(run, method, "test", data)
-    known = None if turntable else truth_under(light, views.path)
+    source = Source.of(run).with_data(data)
+    views = source.views("test") if source.is_there else None
+    known = None if turntable or views is None else truth_under(light, views.path)
     light = light if known is None else known[1]
-    fitted = up_to_date(run, method, views.views[0].camera())
+
+    def cameras_of(trained: TrainedScene) -> list[Camera]:
+        if views is None:
+            return [shot.camera for shot in source.shots(trained, "test")]
+        return [view.camera() for view in views.views]
+
+    fitted = up_to_date(run, source.method, lambda trained: cameras_of(trained)[0])
     try:
         scene = replace(relightable(fitted), light=light.read())
     except InputError as error:
         raise InputError(f"{run.path}: {error}") from error
     name = light.path.parent.name if known is not None else light.path.stem
     out = run.path / "relight" / f"{name}{light.suffix}" if out is None else out
-    region = None if fitted.surroundings is None else views.region
-    shot = turntable_views(scene, views.views, turntable, region) if turntable else views.views
+    cameras = cameras_of(fitted)
+    if turntable:
+        region = source.region if views is None else views.region
+        region = None if fitted.surroundings is None else region
+        cameras = turntable_cameras(scene, cameras, turntable, region)
     kind = "turntable" if turntable else "test"
     _prepare(out, kind)
-    export(scene, out, shot[0].camera())
-    ours = _render(scene, shot, out / kind, samples, progress)
+    export(scene, out, cameras[0])
+    ours = _render(scene, cameras, out / kind, samples, progress)
+    colour = BACKGROUNDS[source.method.data.background]
+    background = np.full(3, colour, np.float32) if views is None else views.background
+    reason = "a turntable has no truth" if turntable else NO_TRUTH
 
     result: dict[str, Any] = {
         "run": str(run.path),
@@ -104,18 +115,18 @@ def relight(
         "light": str(light.path),
         "rotate": light.rotate,
         "exposure": light.exposure,
-        "pictures": [f"{kind}/{i}" for i in _names(kind, len(shot))],
+        "pictures": [f"{kind}/{i}" for i in _names(kind, len(cameras))],
         "samples": samples_per_axis(samples) ** 2,
         "psnr": None,
         "psnr_scaled": None,
-        "score_reason": "a turntable has no truth" if turntable else NO_TRUTH,
+        "score_reason": NO_DATA if views is None else reason,
     }
     truth: list[np.ndarray] = []
-    if known is not None:
-        truth = _truth(method, known[0], light.exposure, views)
-        result |= score([view.name for view in views.views], ours, truth, views.background)
+    if known is not None and views is not None:
+        truth = _truth(source.method, known[0], light.exposure, views)
+        result |= score([view.name for view in views.views], ours, truth, background)
         result["score_reason"] = None
-    _write_sheet(out / SHEET, ours, truth, result.get("scale"), views.background, scene)
+    _write_sheet(out / SHEET, ours, truth, result.get("scale"), background, scene)
     write_json(out / RESULT, result)
     warning = ""
     if fitted.shading.diffuse == "sh":
@@ -125,36 +136,6 @@ def relight(
             "`refgs train --for relighting` fits materials"
         )
     return Relit(result, warning)
-
-
-def turntable_views(
-    scene: TrainedScene, views: Sequence[View], count: int, region: Region | None = None
-) -> list[View]:
-    """Cameras on a circle around the object, as of `turntable_poses`, and with the first view's lens."""
-    poses = turntable_poses(scene, [view.to_world for view in views], count, region)
-    return [views[0].changed(name=f"{i}", to_world=pose) for i, pose in enumerate(poses)]
-
-
-def turntable_poses(
-    scene: TrainedScene, poses: Sequence[np.ndarray], count: int, region: Region | None = None
-) -> np.ndarray:
-    """Poses (count, 4, 4) on a circle around the object, z up, like `poses` in distance and (median) height.
-
-    The object is what lies in the `region`; without one, all of the scene.
-    """
-    if region is not None:
-        centre = np.array(region.centre)
-    else:
-        position = scene.surfels.position().numpy().T if scene.mesh is None else scene.mesh.vertices
-        centre = (position.min(axis=0) + position.max(axis=0)).astype(np.float64) / 2
-    offset = np.array([pose[:3, 3] for pose in poses]) - centre
-    distance = float(np.median(np.linalg.norm(offset, axis=1)))
-    height = float(np.median(offset[:, 2] / np.linalg.norm(offset, axis=1)))
-    height = min(max(height, -0.95), 0.95)  # not from a pole, where no side is up
-    angle = 2 * np.pi * np.arange(count) / count
-    ring = math.sqrt(1 - height**2)
-    outward = np.stack([ring * np.cos(angle), ring * np.sin(angle), np.full(count, height)], axis=1)
-    return poses_around(outward, centre, distance)
 
 
 def _prepare(out: Path, kind: str) -> None:
@@ -180,17 +161,16 @@ def _letter(kind: str) -> str:
 
 
 def _render(
-    scene: TrainedScene, views: Sequence[View], folder: Path, samples: int, progress: bool
+    scene: TrainedScene, cameras: Sequence[Camera], folder: Path, samples: int, progress: bool
 ) -> list[np.ndarray]:
-    """Premultiplied linear RGBA (H, W, 4) of the views, written as a data set has them."""
+    """Premultiplied linear RGBA (H, W, 4) of the cameras, written as a data set has them."""
     renderer: Callable[[Camera], Frame] = scene.renderer(aovs=False, samples=samples)
-    names = _names(folder.name, len(views))
-    jobs = list(zip(names, views, strict=True))
+    names = _names(folder.name, len(cameras))
+    jobs = list(zip(names, cameras, strict=True))
     found = []
-    for name, view in with_bar(jobs, "relight", unit="view", disable=not progress):
-        frame = renderer(view.camera())
-        size = view.height, view.width
-        rgba = pictures.planes([*frame.radiance, frame.alpha], *size)
+    for name, camera in with_bar(jobs, "relight", unit="view", disable=not progress):
+        frame = renderer(camera)
+        rgba = pictures.planes([*frame.radiance, frame.alpha], camera.height, camera.width)
         write_exr((folder / name).with_suffix(".exr"), rgba)
         write_png(folder / name, straight_srgb(rgba))
         found.append(rgba)
