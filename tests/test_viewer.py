@@ -38,6 +38,7 @@ from mi_refgs.viewer.compare import AROUND, GAP, side_by_side
 from mi_refgs.viewer.controls.light import light_of
 from mi_refgs.viewer.controls.saving import write_view
 from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
+from mi_refgs.viewer.drawable import Drawable, Sample, Sampled
 from mi_refgs.viewer.edits import mean_of, selected, with_material
 from mi_refgs.viewer.fitted import Fitted
 from mi_refgs.viewer.live import Training, TrainingPage, read_log
@@ -45,7 +46,6 @@ from mi_refgs.viewer.loop import Loop, Shown, Visitor
 from mi_refgs.viewer.mitsuba_scene import MitsubaScene
 from mi_refgs.viewer.pose import Pose, page_rotation
 from mi_refgs.viewer.quality import COARSE, DONE, LARGE, NOTHING
-from mi_refgs.viewer.source import Sampled, Shot, Source
 
 
 @pytest.fixture(scope="module")
@@ -162,22 +162,22 @@ def test_an_offset_moves_the_sample_that_way() -> None:
 
 
 class Plain:
-    """A source of one grey, which says what it was asked for."""
+    """A scene of one grey, which says what it was asked for."""
 
     variables: tuple[str, ...] = ("picture",)
     backdrops: tuple[str, ...] = ("white",)
     centre, radius, square_pixels = np.zeros(3), 1.0, False
 
     def __init__(self) -> None:
-        self.shots: list[Shot] = []
+        self.samples: list[Sample] = []
         self.grey = 0.25
         self.during: Any = None
 
     def fine(self, *_: Any) -> list[Any]:
         raise NotImplementedError
 
-    def draw(self, shot: Shot) -> Sampled:
-        self.shots.append(shot)
+    def draw(self, sample: Sample) -> Sampled:
+        self.samples.append(sample)
         if self.during is not None:
             self.during()
         one = mi.Float(1)
@@ -196,17 +196,17 @@ class Clock:
 @pytest.fixture
 def running() -> Iterator[tuple[Loop, Plain, Clock, list[Shown]]]:
     """A loop with one visitor, who looks at nothing yet."""
-    source, clock, seen = Plain(), Clock(), []  # type: ignore[var-annotated]
-    loop = Loop(source, clock)
+    drawable, clock, seen = Plain(), Clock(), []  # type: ignore[var-annotated]
+    loop = Loop(drawable, clock)
     loop.enter(7, Visitor(seen.append))
-    yield loop, source, clock, seen
+    yield loop, drawable, clock, seen
 
 
 POSE = Pose(np.eye(4), 0.7, 1.0)
 
 
 def test_the_loop_waits_draws_small_then_large_then_smooth(running: Any) -> None:
-    loop, source, clock, seen = running
+    loop, drawable, clock, seen = running
     assert loop.step() == math.inf
     loop.look(7, POSE, (640, 400))
     assert loop.step() == 0
@@ -221,37 +221,37 @@ def test_the_loop_waits_draws_small_then_large_then_smooth(running: Any) -> None
     assert [s.shown for s in seen] == [COARSE, LARGE, LARGE + 4, DONE]
     small, large = quality.size_of(quality.COARSEST, 1.6), quality.size_of(quality.still_side(640, 400), 1.6)
     assert [s.image.shape[1::-1] for s in seen] == [small, large, large, large]
-    assert [shot.offset for shot in source.shots[2:]] == list(quality.offsets())
-    assert [shot.settled for shot in source.shots] == [False] + [True] * 17
+    assert [sample.offset for sample in drawable.samples[2:]] == list(quality.offsets())
+    assert [sample.settled for sample in drawable.samples] == [False] + [True] * 17
 
 
 def test_what_moves_meanwhile_drops_what_was_under_way(running: Any) -> None:
-    loop, source, clock, seen = running
+    loop, drawable, clock, seen = running
     loop.look(7, POSE, (640, 400))
     loop.step()
     clock.now += 1
-    source.during = lambda: loop.look(7, replace(POSE, fov=0.8), (640, 400))
+    drawable.during = lambda: loop.look(7, replace(POSE, fov=0.8), (640, 400))
     loop.step()  # a large picture, of the view before
-    source.during = None
+    drawable.during = None
     assert [s.shown for s in seen] == [COARSE]
     loop.step()
     assert [s.shown for s in seen] == [COARSE, COARSE]
-    assert source.shots[-1].pose.fov == 0.8
+    assert drawable.samples[-1].pose.fov == 0.8
 
 
 def test_small_pictures_are_shown_while_it_keeps_moving(running: Any) -> None:
     """Each is old by the time that it is drawn."""
-    loop, source, _, seen = running
-    source.during = lambda: loop.look(7, replace(POSE, fov=0.7 + 0.01 * len(source.shots)), (640, 400))
-    source.during()
+    loop, drawable, _, seen = running
+    drawable.during = lambda: loop.look(7, replace(POSE, fov=0.7 + 0.01 * len(drawable.samples)), (640, 400))
+    drawable.during()
     for _ in range(5):
         assert loop.step() == 0
     assert len(seen) == 5
-    assert [shot.pose.fov for shot in source.shots] == [0.7 + 0.01 * i for i in range(5)]
+    assert [sample.pose.fov for sample in drawable.samples] == [0.7 + 0.01 * i for i in range(5)]
 
 
 def test_a_smooth_picture_is_the_mean_of_its_samples_and_starts_anew_after_a_change(running: Any) -> None:
-    loop, source, clock, seen = running
+    loop, drawable, clock, seen = running
 
     def encoded(grey: float) -> int:
         return round(255 * (1.055 * grey ** (1 / 2.4) - 0.055))
@@ -260,7 +260,7 @@ def test_a_smooth_picture_is_the_mean_of_its_samples_and_starts_anew_after_a_cha
     loop.step()
     clock.now += 1
     for grey in (9.0, *[0.1, 0.3] * 8):
-        source.grey = grey
+        drawable.grey = grey
         loop.step()
     assert (seen[-1].shown, seen[-1].image[0, 0, 0]) == (DONE, encoded(0.2))
     loop.change()
@@ -269,7 +269,7 @@ def test_a_smooth_picture_is_the_mean_of_its_samples_and_starts_anew_after_a_cha
         clock.now += 1
     assert LARGE < seen[-1].shown < DONE
     loop.change()
-    source.grey = 0.5
+    drawable.grey = 0.5
     loop.step()
     assert (seen[-1].shown, seen[-1].image[0, 0, 0]) == (COARSE, encoded(0.5))
     clock.now += 1
@@ -300,7 +300,7 @@ def test_notes_run_once_the_last_of_a_key_wins_and_bad_input_is_told(running: An
 
 def test_a_failure_is_told_and_the_others_go_on(running: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """Of a note and of a picture; a picture that fails is tried again only after a change."""
-    loop, source, _, seen = running
+    loop, drawable, _, seen = running
     told: list[str] = []
     other: list[Shown] = []
     loop.failed = told.append
@@ -310,13 +310,13 @@ def test_a_failure_is_told_and_the_others_go_on(running: Any, capsys: pytest.Cap
 
     loop.ask("a", broken)
     loop.ask("b", lambda: loop.look(7, POSE, (640, 400)))
-    source.during = broken
+    drawable.during = broken
     assert loop.step() == 0
     assert loop.step() == math.inf
-    assert (len(source.shots), len(told), seen) == (1, 2, [])
+    assert (len(drawable.samples), len(told), seen) == (1, 2, [])
     assert all(message.startswith("out of memory; ") and "\n" not in message for message in told)
     assert capsys.readouterr().err.count("RuntimeError: out of memory\nand much more") == 2
-    source.during = None
+    drawable.during = None
     loop.enter(8, Visitor(other.append))
     loop.look(8, POSE, (640, 400))
     loop.step()
@@ -327,15 +327,15 @@ def test_a_failure_is_told_and_the_others_go_on(running: Any, capsys: pytest.Cap
 
 
 def test_a_picture_that_fails_after_a_change_is_drawn_anew(running: Any) -> None:
-    loop, source, _, seen = running
+    loop, drawable, _, seen = running
 
     def moved_and_broken() -> None:
-        source.during = None
+        drawable.during = None
         loop.look(7, POSE, (640, 400))
         raise RuntimeError("gone")
 
     loop.look(7, POSE, (640, 400))
-    source.during = moved_and_broken
+    drawable.during = moved_and_broken
     assert loop.step() == loop.step() == 0
     assert [s.shown for s in seen] == [COARSE]
 
@@ -364,16 +364,16 @@ FROM_THE_FRONT = np.array([0.5**0.5, -(0.5**0.5), 0, 0])
 """Towards +y, z up: a page's camera looks along +z, y down, when it is not turned."""
 
 
-def shown(source: Source, look: Look, size: int = 40) -> np.ndarray:
+def shown(drawable: Drawable, look: Look, size: int = 40) -> np.ndarray:
     """A picture of the tiny scene from a side."""
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.0)
-    shot = Shot(pose, size, size, look, settled=True)
-    return to_bytes(shown_planes(source.draw(shot).planes, look), size, size).astype(int)
+    sample = Sample(pose, size, size, look, settled=True)
+    return to_bytes(shown_planes(drawable.draw(sample).planes, look), size, size).astype(int)
 
 
 def test_every_variable_that_a_scene_has_is_drawn(scene: TrainedScene) -> None:
-    source = Fitted(scene)
-    assert source.variables == (
+    drawable = Fitted(scene)
+    assert drawable.variables == (
         "picture",
         "albedo",
         "metallic",
@@ -386,47 +386,47 @@ def test_every_variable_that_a_scene_has_is_drawn(scene: TrainedScene) -> None:
         "specular",
         "indirect",
     )
-    for name in source.variables:
-        picture = shown(source, Look(name, depths=(2.0, 4.0)))
+    for name in drawable.variables:
+        picture = shown(drawable, Look(name, depths=(2.0, 4.0)))
         assert picture.shape == (40, 40, 3), name
         assert name == "indirect" or np.ptp(picture) > 0, name  # the balls have no such channel
 
 
 def test_the_light_turns_by_the_angle_that_is_asked_for(scene: TrainedScene) -> None:
-    source = Fitted(scene)
-    before = shown(source, Look())
-    source.set_turn(90)
+    drawable = Fitted(scene)
+    before = shown(drawable, Look())
+    drawable.set_turn(90)
     # Directions of the world are turned back by the angle before the map is asked.
-    x = source.light.radiance(mi.Vector3f(0, 1, 0)).numpy()  # type: ignore[union-attr]
+    x = drawable.light.radiance(mi.Vector3f(0, 1, 0)).numpy()  # type: ignore[union-attr]
     assert np.allclose(x, scene.light.prefilter().radiance(mi.Vector3f(1, 0, 0)).numpy(), rtol=1e-4)  # type: ignore[union-attr]
-    assert np.abs(shown(source, Look()) - before).max() > 3
-    source.set_turn(0)
-    assert np.array_equal(shown(source, Look()), before)
-    source.set_light(EnvironmentLight.constant(3.0, 8))
-    assert np.abs(shown(source, Look()) - before).max() > 3
-    source.set_light(None)
-    assert np.array_equal(shown(source, Look()), before)
+    assert np.abs(shown(drawable, Look()) - before).max() > 3
+    drawable.set_turn(0)
+    assert np.array_equal(shown(drawable, Look()), before)
+    drawable.set_light(EnvironmentLight.constant(3.0, 8))
+    assert np.abs(shown(drawable, Look()) - before).max() > 3
+    drawable.set_light(None)
+    assert np.array_equal(shown(drawable, Look()), before)
 
 
 def test_materials_alone_are_those_of_relight_and_changes_stay_on_them(scene: TrainedScene) -> None:
-    source = Fitted(scene)
-    before = shown(source, Look())
-    source.set_relit(True)
+    drawable = Fitted(scene)
+    before = shown(drawable, Look())
+    drawable.set_relit(True)
     again = Fitted(relightable(scene))
-    assert np.array_equal(shown(source, Look()), shown(again, Look()))
-    assert not np.array_equal(shown(source, Look()), before)
+    assert np.array_equal(shown(drawable, Look()), shown(again, Look()))
+    assert not np.array_equal(shown(drawable, Look()), before)
 
     def black(given: TrainedScene) -> TrainedScene:
         raw = given.surfels.to_numpy()
         raw["albedo"][:] = -20
         return replace(given, surfels=Surfels.from_numpy(raw))
 
-    source.set_changes([black])
-    assert shown(source, Look("albedo", backdrop="black")).max() == 0
-    source.set_relit(False)
-    assert shown(source, Look("albedo", backdrop="black")).max() == 0
-    source.set_changes([])
-    assert np.array_equal(shown(source, Look()), before)
+    drawable.set_changes([black])
+    assert shown(drawable, Look("albedo", backdrop="black")).max() == 0
+    drawable.set_relit(False)
+    assert shown(drawable, Look("albedo", backdrop="black")).max() == 0
+    drawable.set_changes([])
+    assert np.array_equal(shown(drawable, Look()), before)
 
 
 def test_a_slider_sets_a_material_of_what_is_selected(scene: TrainedScene) -> None:
@@ -436,19 +436,19 @@ def test_a_slider_sets_a_material_of_what_is_selected(scene: TrainedScene) -> No
     assert mean_of(rough, mask, "roughness") == pytest.approx(0.9, abs=1e-5)
     assert mean_of(rough, mask, "metallic") == pytest.approx(0.2, abs=1e-5)
     assert mean_of(rough, ~mask, "roughness") == pytest.approx(CLAY["roughness"], abs=1e-5)
-    source = Fitted(scene)
-    source.set_changes([lambda given: with_material(given, mask, {"roughness": 0.9, "metallic": 0.2})])
-    assert np.array_equal(shown(source, Look()), shown(Fitted(rough), Look()))
-    assert np.abs(shown(source, Look()) - shown(Fitted(scene), Look())).max() > 20
+    drawable = Fitted(scene)
+    drawable.set_changes([lambda given: with_material(given, mask, {"roughness": 0.9, "metallic": 0.2})])
+    assert np.array_equal(shown(drawable, Look()), shown(Fitted(rough), Look()))
+    assert np.abs(shown(drawable, Look()) - shown(Fitted(scene), Look())).max() > 20
 
 
 def test_exposure_and_backdrop_are_what_they_say(scene: TrainedScene) -> None:
-    source = Fitted(scene)
-    corner = [shown(source, Look(backdrop=name))[0, 0].tolist() for name in ("white", "grey", "black")]
+    drawable = Fitted(scene)
+    corner = [shown(drawable, Look(backdrop=name))[0, 0].tolist() for name in ("white", "grey", "black")]
     assert corner == [[255] * 3, [64] * 3, [0] * 3]
-    light = shown(source, Look(backdrop="light"))[0, 0]
+    light = shown(drawable, Look(backdrop="light"))[0, 0]
     assert 0 < light.max()
-    dark, bright = (shown(source, Look(exposure=e, backdrop="black"))[20, 14].max() for e in (-3.0, 0.0))
+    dark, bright = (shown(drawable, Look(exposure=e, backdrop="black"))[20, 14].max() for e in (-3.0, 0.0))
     assert 0 < dark < bright
 
 
@@ -466,25 +466,25 @@ def surrounded(scene: TrainedScene) -> TrainedScene:
 
 
 def test_a_photographed_object_is_shown_in_its_surroundings_or_alone(surrounded: TrainedScene) -> None:
-    source, alone = Fitted(surrounded), Fitted(replace(surrounded, surroundings=None))
-    assert source.backdrops == ("surroundings", "white", "grey", "black", "light")
+    drawable, alone = Fitted(surrounded), Fitted(replace(surrounded, surroundings=None))
+    assert drawable.backdrops == ("surroundings", "white", "grey", "black", "light")
     assert alone.backdrops == ("white", "grey", "black", "light")
-    whole = shown(source, Look(backdrop="surroundings"))
+    whole = shown(drawable, Look(backdrop="surroundings"))
     assert whole[0, 0].tolist() == [124] * 3  # 0.2 as sRGB
     assert np.ptp(whole[:, 24:]) > 20  # the other ball
     for backdrop in alone.backdrops:
-        assert np.array_equal(shown(source, Look(backdrop=backdrop)), shown(alone, Look(backdrop=backdrop)))
+        assert np.array_equal(shown(drawable, Look(backdrop=backdrop)), shown(alone, Look(backdrop=backdrop)))
     for name in ("alpha", "depth"):  # of what is shown
         some = Look(name, backdrop="black", depths=(2.0, 4.0))
-        assert np.array_equal(shown(source, some), shown(alone, some))
-        assert not np.array_equal(shown(source, replace(some, backdrop="surroundings")), shown(alone, some))
+        assert np.array_equal(shown(drawable, some), shown(alone, some))
+        assert not np.array_equal(shown(drawable, replace(some, backdrop="surroundings")), shown(alone, some))
 
 
 def test_what_is_saved_has_surroundings_or_is_transparent(surrounded: TrainedScene, tmp_path: Path) -> None:
-    source, pose = Fitted(surrounded), Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6)
+    drawable, pose = Fitted(surrounded), Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6)
     found = {}
     for backdrop in ("surroundings", "grey"):
-        path = write_view(source, pose, (32, 20), Look(backdrop=backdrop), tmp_path, ".exr")
+        path = write_view(drawable, pose, (32, 20), Look(backdrop=backdrop), tmp_path, ".exr")
         found[backdrop] = read_exr_image(path)
     assert found["surroundings"][..., 3].min() == 1
     assert np.allclose(found["surroundings"][0, 0, :3], 0.2, rtol=1e-3)
@@ -498,24 +498,24 @@ def test_a_scene_file_with_surroundings_is_shown_with_them_or_without(
 ) -> None:
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.0)
     export(surrounded, tmp_path, pose.camera(24, 24))
-    source, own = MitsubaScene(load_scene(tmp_path / "scene.xml"), "scene.xml"), Fitted(surrounded)
-    assert source.backdrops == ("surroundings", "white", "grey", "black")
-    for backdrop in source.backdrops:
+    drawable, own = MitsubaScene(load_scene(tmp_path / "scene.xml"), "scene.xml"), Fitted(surrounded)
+    assert drawable.backdrops == ("surroundings", "white", "grey", "black")
+    for backdrop in drawable.backdrops:
         look = Look(backdrop=backdrop)
-        assert np.abs(shown(source, look) - shown(own, look)).max() <= 2, backdrop
+        assert np.abs(shown(drawable, look) - shown(own, look)).max() <= 2, backdrop
 
 
 def test_a_watched_fit_shows_its_object_alone_too(
     data: Path, method: Path, surrounded: TrainedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trainer = Trainer(load(str(method), "quick", SETTINGS), read_dataset(data, "train"))
-    source = Training(trainer)
-    assert "surroundings" not in source.backdrops
-    before = shown(source, Look())
+    drawable = Training(trainer)
+    assert "surroundings" not in drawable.backdrops
+    before = shown(drawable, Look())
     monkeypatch.setattr(Trainer, "surroundings", surrounded.surroundings)
-    assert source.backdrops == ("surroundings", "white", "grey", "black")
-    assert np.array_equal(shown(source, Look()), before)
-    assert np.abs(shown(source, Look(backdrop="surroundings")) - before).max() > 50
+    assert drawable.backdrops == ("surroundings", "white", "grey", "black")
+    assert np.array_equal(shown(drawable, Look()), before)
+    assert np.abs(shown(drawable, Look(backdrop="surroundings")) - before).max() > 50
 
 
 def test_truth_and_picture_stand_side_by_side_in_the_shape_of_the_window() -> None:
@@ -532,9 +532,9 @@ def test_truth_and_picture_stand_side_by_side_in_the_shape_of_the_window() -> No
 
 def test_views_are_saved_under_the_next_number_with_their_camera(scene: TrainedScene, tmp_path: Path) -> None:
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6)
-    source, window = Fitted(scene), (32, 20)
+    drawable, window = Fitted(scene), (32, 20)
     paths = [
-        write_view(source, pose, window, Look(), tmp_path, suffix) for suffix in (".png", ".exr", ".json")
+        write_view(drawable, pose, window, Look(), tmp_path, suffix) for suffix in (".png", ".exr", ".json")
     ]
     assert [path.name for path in paths] == ["view_000.png", "view_001.exr", "view_002.json"]
     for split in ("train", "test"):
@@ -611,18 +611,18 @@ def test_without_viser_the_remedy_is_named(
 
 
 def test_a_mitsuba_scene_of_a_run_is_drawn_like_the_run(finished: Path) -> None:
-    source = MitsubaScene(load_scene(finished / "scene.xml", []), "scene.xml")
+    drawable = MitsubaScene(load_scene(finished / "scene.xml", []), "scene.xml")
     own = Fitted(TrainedScene.read(finished))
-    assert source.variables == own.variables
-    pose = source.start()
+    assert drawable.variables == own.variables
+    pose = drawable.start()
     for name in ("picture", "normal", "roughness", "depth", "specular"):
         found, wanted = (
-            to_bytes(shown_planes(each.draw(Shot(pose, 24, 24, Look(name))).planes, Look(name)), 24, 24)
-            for each in (source, own)
+            to_bytes(shown_planes(each.draw(Sample(pose, 24, 24, Look(name))).planes, Look(name)), 24, 24)
+            for each in (drawable, own)
         )
         assert np.abs(found.astype(int) - wanted).max() <= 2, name
         assert np.ptp(wanted) > 0, name
-    assert len(source.fine(pose, 12, 10, Look())) == 4
+    assert len(drawable.fine(pose, 12, 10, Look())) == 4
 
 
 def test_the_environment_of_a_path_traced_scene_turns() -> None:
@@ -644,13 +644,13 @@ def test_the_environment_of_a_path_traced_scene_turns() -> None:
             },
         }
     )
-    source = MitsubaScene(loaded, "ball.xml")
-    assert source.lit and source.variables == ("picture",)
-    assert source.radius == pytest.approx(3**0.5, rel=1e-3) and np.abs(source.centre).max() < 1e-3
+    drawable = MitsubaScene(loaded, "ball.xml")
+    assert drawable.lit and drawable.variables == ("picture",)
+    assert drawable.radius == pytest.approx(3**0.5, rel=1e-3) and np.abs(drawable.centre).max() < 1e-3
     bright = []
     for degrees in (0.0, 90.0, 180.0, 360.0):
-        source.set_turn(degrees)
-        planes_found = source.fine(source.start(), 16, 16, Look())
+        drawable.set_turn(degrees)
+        planes_found = drawable.fine(drawable.start(), 16, 16, Look())
         bright.append(np.array(planes_found[0]).reshape(16, 16)[:, :8].sum())
     assert bright[0] == pytest.approx(bright[3], rel=0.05)
     assert max(bright) > 1.5 * min(bright)
@@ -666,16 +666,16 @@ def test_a_fit_draws_only_for_those_who_look_and_a_share_of_its_time(
     trainer = Trainer(load(str(method), "quick", SETTINGS), views)
     clock = Clock()
     page = TrainingPage(trainer, Run(tmp_path), "127.0.0.1", 0, clock)
-    drawn: list[Shot] = []
-    draw = page.page.source.draw
+    drawn: list[Sample] = []
+    draw = page.page.drawable.draw
 
-    def slow(shot: Shot) -> Sampled:
-        drawn.append(shot)
+    def slow(sample: Sample) -> Sampled:
+        drawn.append(sample)
         clock.now += 0.5
-        return draw(shot)
+        return draw(sample)
 
     try:
-        page.page.source.draw = slow  # type: ignore[method-assign]
+        page.page.drawable.draw = slow  # type: ignore[method-assign]
         for _ in range(20):
             clock.now += 0.1
             page.step()

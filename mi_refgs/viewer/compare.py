@@ -13,8 +13,8 @@ from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.pictures import planes
 from mi_refgs.render.display import displayed
 from mi_refgs.viewer.develop import PICTURE, Look, shown_planes, to_bytes
+from mi_refgs.viewer.drawable import Drawable, Sample
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.source import Shot, Source
 
 AROUND = 0.12
 """Display-encoded brightness beside the two pictures."""
@@ -30,10 +30,10 @@ class Compared:
     data: Dataset
     tell: Callable[[float | None], None]  # told the PSNR of each picture that is drawn, None of a variable
 
-    def picture(self, source: Source, look: Look, window: tuple[int, int]) -> np.ndarray:
+    def picture(self, drawable: Drawable, look: Look, window: tuple[int, int]) -> np.ndarray:
         """Both, as large as they fit into a window: 8-bit RGB of the window's shape."""
         view = self.view
-        frame_of = getattr(source, "frame", None)
+        frame_of = getattr(drawable, "frame", None)
         truth = np.clip(view.displayed, 0, 1)
         if look.what == PICTURE and frame_of is not None:
             shown = displayed(frame_of(view.camera()), self.data.background, self.data.linear)
@@ -41,9 +41,11 @@ class Compared:
             self.tell(metrics.psnr(ours, truth))
             drawn = to_8_bits(ours)
         else:
-            shot = Shot(Pose.of_view(view), view.width, view.height, look, settled=True, exact=view.camera())
+            sample = Sample(
+                Pose.of_view(view), view.width, view.height, look, settled=True, exact=view.camera()
+            )
             self.tell(None)
-            drawn = to_bytes(shown_planes(source.draw(shot).planes, look), view.width, view.height)
+            drawn = to_bytes(shown_planes(drawable.draw(sample).planes, look), view.width, view.height)
         return side_by_side([to_8_bits(truth), drawn], window)
 
 

@@ -11,16 +11,16 @@ import mitsuba as mi
 
 from mi_refgs.render.samples import box_mean
 from mi_refgs.viewer.develop import Look
+from mi_refgs.viewer.drawable import Sample, Sampled
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.quality import GRID, MULTIPLE
-from mi_refgs.viewer.source import Sampled, Shot
 
 STRIP = 1 << 20
 """Samples that are drawn together: as many as the largest picture on a page has."""
 
 
 def fine_planes(
-    draw: Callable[[Shot], Sampled], pose: Pose, width: int, height: int, look: Look
+    draw: Callable[[Sample], Sampled], pose: Pose, width: int, height: int, look: Look
 ) -> list[Any]:
     """Means over the samples of all pixels, planes as `draw` gives them.
 
@@ -33,7 +33,7 @@ def fine_planes(
     for top in range(0, height, rows):
         count = min(rows, height - top)
         strip = replace(camera, height=count, cy=camera.cy - top, offset=(0, top))
-        planes = draw(Shot(pose, width, count, look, settled=True, exact=strip.supersampled(GRID))).planes
+        planes = draw(Sample(pose, width, count, look, settled=True, exact=strip.supersampled(GRID))).planes
         means = [box_mean(plane, strip, GRID) + dr.zeros(mi.Float, width * count) for plane in planes]
         dr.eval(means)
         strips.append(means)

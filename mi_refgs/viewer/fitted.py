@@ -24,9 +24,9 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.channels import CHANNELS
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of, planes_of
+from mi_refgs.viewer.drawable import Sample, Sampled
 from mi_refgs.viewer.fine import fine_planes
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.source import Sampled, Shot
 
 OUTLIERS = 2.0
 """Percent of the surfels along each axis and side that do not count as the object."""
@@ -75,12 +75,12 @@ class Fitted:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """See `Source`."""
+        """See `Drawable`."""
         return variables_of(self.scene.surfels, self.scene.shading)
 
     @property
     def backdrops(self) -> tuple[str, ...]:
-        """See `Source`."""
+        """See `Drawable`."""
         return backdrops_of(self.scene.surroundings is not None, self.lit)
 
     @property
@@ -189,13 +189,13 @@ class Fitted:
         there = self._occluder.ambient is not None, self._occluder.around is not None
         return not self._occluder.empty and any(w and not t for w, t in zip(wanted, there, strict=True))
 
-    def draw(self, shot: Shot) -> Sampled:
-        """See `Source`."""
-        camera = shot.camera()
-        frame = self.frame(camera, shot.asked, shot.settled, shot.look.alone)
+    def draw(self, sample: Sample) -> Sampled:
+        """See `Drawable`."""
+        camera = sample.camera()
+        frame = self.frame(camera, sample.asked, sample.settled, sample.look.alone)
         with dr.suspend_grad():
-            return Sampled(planes_of(frame, camera, shot.look, self.light), frame.depth)
+            return Sampled(planes_of(frame, camera, sample.look, self.light), frame.depth)
 
     def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
-        """See `Source`."""
+        """See `Drawable`."""
         return fine_planes(self.draw, pose, width, height, look)

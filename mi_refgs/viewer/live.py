@@ -18,11 +18,11 @@ from mi_refgs.evaluation.progress import Bar
 from mi_refgs.runs.run import LOG, Run
 from mi_refgs.viewer.controls import look, overlays
 from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of, planes_of
+from mi_refgs.viewer.drawable import Sample, Sampled
 from mi_refgs.viewer.fine import fine_planes
 from mi_refgs.viewer.fitted import bounds_of, variables_of
 from mi_refgs.viewer.page import Page, Views, require_free, require_viser
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.source import Sampled, Shot
 
 if TYPE_CHECKING:
     from mi_refgs.fitting.train import Trainer
@@ -38,7 +38,7 @@ CURVES = {"loss": "#4dabf7", "psnr": "#ffa94d"}
 
 
 class Training:
-    """A trainer as a source of pictures."""
+    """A trainer as something to draw."""
 
     square_pixels = False
 
@@ -48,24 +48,24 @@ class Training:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """See `Source`; those that the fit has from its first stage on."""
+        """See `Drawable`; those that the fit has from its first stage on."""
         shading = self.trainer.shading()
         return tuple(name for name in variables_of(self.trainer.surfels, shading) if name != "visibility")
 
     @property
     def backdrops(self) -> tuple[str, ...]:
-        """See `Source`."""
+        """See `Drawable`."""
         return backdrops_of(self.trainer.surroundings is not None, light=False)
 
-    def draw(self, shot: Shot) -> Sampled:
-        """See `Source`."""
-        camera = shot.camera()
-        frame = self.trainer.view(camera, shot.look.what != PICTURE, shot.look.alone)
+    def draw(self, sample: Sample) -> Sampled:
+        """See `Drawable`."""
+        camera = sample.camera()
+        frame = self.trainer.view(camera, sample.look.what != PICTURE, sample.look.alone)
         with dr.suspend_grad():
-            return Sampled(planes_of(frame, camera, shot.look, None), frame.depth)
+            return Sampled(planes_of(frame, camera, sample.look, None), frame.depth)
 
     def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
-        """See `Source`."""
+        """See `Drawable`."""
         return fine_planes(self.draw, pose, width, height, look)
 
 

@@ -21,9 +21,9 @@ from mi_refgs.errors import InputError
 from mi_refgs.viewer import quality
 from mi_refgs.viewer.compare import Compared
 from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
+from mi_refgs.viewer.drawable import Drawable, Sample, Sampled
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.quality import COARSE, DONE, LARGE, NOTHING, SHOWN_AT
-from mi_refgs.viewer.source import Sampled, Shot, Source
 
 FAR = 160.0
 """Depth that pages can show at most, scene units: viser packs it into 24 bits of 1e-5."""
@@ -66,10 +66,10 @@ class Visitor:
 
 
 class Loop:
-    """Draws a source for visitors; `step` and `run` belong to the thread that renders, the rest to any."""
+    """Draws a scene for visitors; `step` and `run` belong to the thread that renders, the rest to any."""
 
-    def __init__(self, source: Source, clock: Callable[[], float] = time.monotonic) -> None:
-        self.source, self.clock = source, clock
+    def __init__(self, drawable: Drawable, clock: Callable[[], float] = time.monotonic) -> None:
+        self.drawable, self.clock = drawable, clock
         self.visitors: dict[int, Visitor] = {}
         self.failed: Callable[[str], None] = lambda message: None  # told of what fails, in one sentence
         self.pictures = 0  # that were sent
@@ -195,22 +195,22 @@ class Loop:
         assert pose is not None
         begin = self.clock()
         if compared is not None:
-            image, depth, reached = compared.picture(self.source, visitor.look, visitor.window), None, DONE
+            image, depth, reached = compared.picture(self.drawable, visitor.look, visitor.window), None, DONE
         else:
             still = quality.still_side(*visitor.window, visitor.largest)
             moving = visitor.fixed or min(visitor.side, still)
             side = moving if shown == NOTHING else still
             reached = shown + 1 if shown >= LARGE else (LARGE if side >= still else COARSE)
-            shot = self._shot(visitor, pose, side, reached)
-            sampled = self.source.draw(shot)
+            sample = self._sample(visitor, pose, side, reached)
+            sampled = self.drawable.draw(sample)
             sums = added(sums, sampled.planes)
             count = max(reached - LARGE, 1)
             image = None
             if reached <= LARGE or reached in SHOWN_AT:
                 share = dr.opaque(type(sums[0]), 1 / count)
                 mean = [plane * share for plane in sums] if count > 1 else sums
-                image = to_bytes(shown_planes(mean, visitor.look), shot.width, shot.height)
-            depth = self._depth(visitor, sampled, shot) if image is not None else None
+                image = to_bytes(shown_planes(mean, visitor.look), sample.width, sample.height)
+            depth = self._depth(visitor, sampled, sample) if image is not None else None
             dr.sync_thread()
         taken = self.clock() - begin
         with self._wake:
@@ -225,22 +225,22 @@ class Loop:
             samples = 1 if compared is not None else max(reached - LARGE, 1)
             visitor.deliver(Shown(image, reached, taken, depth, samples))
 
-    def _shot(self, visitor: Visitor, pose: Pose, side: int, reached: int) -> Shot:
-        width, height = visitor.size(side, self.source.square_pixels)
+    def _sample(self, visitor: Visitor, pose: Pose, side: int, reached: int) -> Sample:
+        width, height = visitor.size(side, self.drawable.square_pixels)
         aspect = visitor.window[0] / max(visitor.window[1], 1)
         index = max(reached - LARGE - 1, 0)
         offset = quality.offsets()[index] if reached > LARGE else (0.0, 0.0)
         pose = replace(pose, aspect=aspect)
         settled = reached >= LARGE
-        return Shot(pose, width, height, visitor.look, offset, index, settled, depth=visitor.depth)
+        return Sample(pose, width, height, visitor.look, offset, index, settled, depth=visitor.depth)
 
-    def _depth(self, visitor: Visitor, sampled: Sampled, shot: Shot) -> np.ndarray | None:
+    def _depth(self, visitor: Visitor, sampled: Sampled, sample: Sample) -> np.ndarray | None:
         if not visitor.depth or sampled.depth is None:
             return None
         depth = dr.select(sampled.depth > 0, sampled.depth, FAR) + dr.zeros(
-            type(sampled.depth), shot.width * shot.height
+            type(sampled.depth), sample.width * sample.height
         )
-        return np.array(depth.numpy(), dtype=np.float32).reshape(shot.height, shot.width)
+        return np.array(depth.numpy(), dtype=np.float32).reshape(sample.height, sample.width)
 
 
 def added(sums: list[Any], planes: list[Any]) -> list[Any]:

@@ -14,10 +14,10 @@ from mi_refgs.plugins.aovs import AOV, suffixes
 from mi_refgs.plugins.surroundings import Around
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of
+from mi_refgs.viewer.drawable import Sample, Sampled
 from mi_refgs.viewer.fitted import variables_of
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.quality import SAMPLES
-from mi_refgs.viewer.source import Sampled, Shot
 
 CLIP = 1e-3, 1e4
 """Near and far plane, in radii of the scene."""
@@ -90,14 +90,16 @@ class MitsubaScene:
         across = math.tan(math.radians(float(np.array(params["x_fov"]).ravel()[0])) / 2)
         return Pose(matrix, 2 * math.atan(across * height / width), width / height)
 
-    def draw(self, shot: Shot) -> Sampled:
-        """See `Source`."""
+    def draw(self, sample: Sample) -> Sampled:
+        """See `Drawable`."""
         return Sampled(
-            self._planes(shot.pose, shot.width, shot.height, shot.look, shot.index, 1, shot.offset)
+            self._planes(
+                sample.pose, sample.width, sample.height, sample.look, sample.index, 1, sample.offset
+            )
         )
 
     def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
-        """See `Source`."""
+        """See `Drawable`."""
         return self._planes(pose, width, height, look, 0, SAMPLES)
 
     def _planes(

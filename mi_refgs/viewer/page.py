@@ -20,9 +20,9 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.viewer import quality
 from mi_refgs.viewer.develop import Look
+from mi_refgs.viewer.drawable import Drawable
 from mi_refgs.viewer.loop import Loop, Shown, Visitor
 from mi_refgs.viewer.pose import Pose, up_of
-from mi_refgs.viewer.source import Source
 
 MOVING_JPEG, STILL_JPEG = 70, 92
 """JPEG qualities of pictures that are soon replaced, and of those that stay until a smooth one, a PNG."""
@@ -83,7 +83,7 @@ class Page:
 
     def __init__(
         self,
-        source: Source,
+        drawable: Drawable,
         views: Views,
         title: str,
         host: str,
@@ -94,11 +94,11 @@ class Page:
         """Listen; raises InputError if that port is taken or viser is not installed."""
         viser = require_viser()
         require_free(host, port)
-        self.source, self.views, self.views_folder = source, views, views_folder
+        self.drawable, self.views, self.views_folder = drawable, views, views_folder
         self.begin = begin
-        self.loop = Loop(source)
+        self.loop = Loop(drawable)
         self.loop.failed = self.complain
-        self.look = Look(backdrop=source.backdrops[0], depths=self._depths())
+        self.look = Look(backdrop=drawable.backdrops[0], depths=self._depths())
         self.fixed: int | None = None
         self.largest = quality.FINEST
         self.depth = False
@@ -130,28 +130,28 @@ class Page:
             return Pose.of_view(self.views.all[0])
         outward = np.array([math.cos(0.6), math.sin(0.6), 0.5])
         outward /= np.linalg.norm(outward)
-        distance = START_DISTANCE * self.source.radius / math.tan(START_FOV / 2) / 2
-        return looking(self.source.centre + distance * outward, self.source.centre, START_FOV)
+        distance = START_DISTANCE * self.drawable.radius / math.tan(START_FOV / 2) / 2
+        return looking(self.drawable.centre + distance * outward, self.drawable.centre, START_FOV)
 
     def _set_start(self) -> None:
         pose, camera = self.start(), self.server.initial_camera
         camera.position = pose.position
-        camera.look_at = pose.look_at(self.source.centre)
+        camera.look_at = pose.look_at(self.drawable.centre)
         camera.up = pose.up if abs(pose.forward @ up_of(self.views.all)) > 0.99 else up_of(self.views.all)
         camera.fov = pose.fov
-        camera.near, camera.far = 1e-3 * self.source.radius, 1e3 * self.source.radius
+        camera.near, camera.far = 1e-3 * self.drawable.radius, 1e3 * self.drawable.radius
 
     def _depths(self) -> tuple[float, float]:
         """Distances that a depth map shows as white and as black: the object's, from the first camera."""
-        distance = float(np.linalg.norm(self.start().position - self.source.centre))
-        return max(distance - self.source.radius, 0.0), distance + self.source.radius
+        distance = float(np.linalg.norm(self.start().position - self.drawable.centre))
+        return max(distance - self.drawable.radius, 0.0), distance + self.drawable.radius
 
     def go(self, client: Any, pose: Pose) -> None:
         """Move a page's camera."""
         with client.atomic():
             client.camera.up_direction = up_of(self.views.all)
             client.camera.position = pose.position
-            client.camera.look_at = pose.look_at(self.source.centre)
+            client.camera.look_at = pose.look_at(self.drawable.centre)
             client.camera.fov = pose.fov
         client.flush()
 

@@ -20,12 +20,12 @@ from mi_refgs.runs.run import DATASET, Run
 from mi_refgs.viewer import quality
 from mi_refgs.viewer.controls import light, look, materials, overlays, saving, truth
 from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
+from mi_refgs.viewer.drawable import Drawable, Sample
 from mi_refgs.viewer.fitted import Fitted
 from mi_refgs.viewer.loop import added
 from mi_refgs.viewer.mitsuba_scene import MitsubaScene
 from mi_refgs.viewer.page import Page, Views
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.source import Shot, Source
 
 USUAL_SHAPES = (1.0, 1.6)
 """Shapes of the pictures that are compiled before a page asks: of small and of large desktop windows, less
@@ -45,12 +45,12 @@ def page_of_run(
     views = views_of(run, data, tell)
     some = views.test or views.train
     scene = newest(run, run.method())
-    source = Fitted(scene, None if some is None else some.region)
-    page = Page(source, views, run.path.resolve().name, host, port, output or run.path / "views")
-    page.side = warm_up(source, page.look, page.start(), tell)
+    drawable = Fitted(scene, None if some is None else some.region)
+    page = Page(drawable, views, run.path.resolve().name, host, port, output or run.path / "views")
+    page.side = warm_up(drawable, page.look, page.start(), tell)
     look.add(page)
-    light.add(page, source)
-    materials.add(page, source)
+    light.add(page, drawable)
+    materials.add(page, drawable)
     overlays.add(page, scene)
     truth.add(page)
     saving.add(page)
@@ -60,11 +60,11 @@ def page_of_run(
 
 def page_of_scene(scene: Any, path: Path, host: str, port: int, output: Path | None, tell: Tell) -> Page:
     """A page of a loaded Mitsuba scene, drawn by its own integrator; raises InputError as `page_of_run`."""
-    source = MitsubaScene(scene, str(path))
-    page = Page(source, Views(), path.name, host, port, output or path.parent / "views", source.start())
-    page.side = warm_up(source, page.look, page.start(), tell)
+    drawable = MitsubaScene(scene, str(path))
+    page = Page(drawable, Views(), path.name, host, port, output or path.parent / "views", drawable.start())
+    page.side = warm_up(drawable, page.look, page.start(), tell)
     look.add(page)
-    light.add(page, source)
+    light.add(page, drawable)
     saving.add(page)
     page.listen()
     return page
@@ -87,18 +87,18 @@ def views_of(run: Run, data: Path | None, tell: Tell) -> Views:
     return found
 
 
-def warm_up(source: Source, look: Look, pose: Pose, tell: Tell) -> int:
+def warm_up(drawable: Drawable, look: Look, pose: Pose, tell: Tell) -> int:
     """Compile the kernels of all sizes that a desktop window needs; returns the rung to begin moving at."""
     tell("preparing: compiling for each size of picture")
     chosen = quality.COARSEST
     for shape, side in itertools.product(USUAL_SHAPES, quality.SIDES):
         if side > quality.FINEST:
             continue
-        shot = Shot(pose, *quality.size_of(side, shape), look, settled=True)
-        sums = added([], source.draw(shot).planes)
+        sample = Sample(pose, *quality.size_of(side, shape), look, settled=True)
+        sums = added([], drawable.draw(sample).planes)
         begin = time.monotonic()
-        sums = added(sums, source.draw(shot).planes)
-        to_bytes(shown_planes(sums, look), shot.width, shot.height)
+        sums = added(sums, drawable.draw(sample).planes)
+        to_bytes(shown_planes(sums, look), sample.width, sample.height)
         if time.monotonic() - begin < quality.SLOW:
             chosen = max(side, chosen)
     dr.sync_thread()

@@ -71,10 +71,10 @@ def _add_swap(page: Page, scene: Fitted, turn: Any) -> None:
     relit = None
     if scene.can_relight:
         relit = gui.add_checkbox(
-            "Materials alone",
+            "Light changes colours",
             False,
-            hint="Shade the diffuse part by the light, too, with traced shadows, as `refgs relight` "
-            "does; without, a diffuse colour that was fitted stays.",
+            hint="Replaces fitted colours by materials, so that all of them follow a new light, with traced "
+            "shadows, as `refgs relight` does.",
         )
     gui.add_html(DROP)
 

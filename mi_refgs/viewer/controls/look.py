@@ -18,13 +18,13 @@ def add(page: Page) -> None:
     with gui.add_folder("View"):
         what = gui.add_dropdown(
             "Show",
-            page.source.variables,
+            page.drawable.variables,
             hint="The picture, or a variable of what is seen: materials, geometry, terms of the radiance.",
         )
         exposure = gui.add_slider("Exposure", -STOPS, STOPS, 0.25, 0.0, hint="Stops.")
         backdrop = gui.add_dropdown(
             "Backdrop",
-            page.source.backdrops,
+            page.drawable.backdrops,
             hint="What is seen behind the object; it is shown alone on all but its surroundings.",
         )
         sizes = {f"{side}²": side for side in quality.SIDES}

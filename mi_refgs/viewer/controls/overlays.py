@@ -91,7 +91,7 @@ def add_cameras(page: Page) -> list[Any]:
                     f"/cameras/{split}/{index}",
                     pose.fov,
                     pose.aspect,
-                    scale=FRUSTUM * page.source.radius,
+                    scale=FRUSTUM * page.drawable.radius,
                     thickness=THICKNESS,
                     thickness_units="screen",
                     color=colour,

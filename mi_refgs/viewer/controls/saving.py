@@ -13,9 +13,9 @@ from mi_refgs.exr import write_exr
 from mi_refgs.files import make_folder, write_json
 from mi_refgs.images import straight_srgb, write_png
 from mi_refgs.viewer.develop import PICTURE, Look, shown_planes
+from mi_refgs.viewer.drawable import Drawable
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.source import Source
 
 NUMBERED = re.compile(r"view_(\d+)\.")
 CAMERA = ".json"
@@ -39,7 +39,9 @@ def add(page: Page) -> None:
         visitor = page.loop.visitors.get(number)
         if visitor is None or visitor.pose is None:
             return
-        path = write_view(page.source, visitor.pose, visitor.window, visitor.look, page.views_folder, suffix)
+        path = write_view(
+            page.drawable, visitor.pose, visitor.window, visitor.look, page.views_folder, suffix
+        )
         saved.content = f"saved {path}"
 
     for suffix, button in buttons.items():
@@ -51,7 +53,7 @@ def add(page: Page) -> None:
 
 
 def write_view(
-    source: Source, pose: Pose, window: tuple[int, int], look: Look, folder: Path, suffix: str
+    drawable: Drawable, pose: Pose, window: tuple[int, int], look: Look, folder: Path, suffix: str
 ) -> Path:
     """Write the next numbered view in a folder, and its camera; returns the path of the picture, or of that.
 
@@ -62,7 +64,7 @@ def write_view(
     stem = f"view_{max(taken, default=-1) + 1:03d}"
     camera = folder / f"{stem}{CAMERA}"
     if suffix != CAMERA:
-        planes = source.fine(pose, *window, look)
+        planes = drawable.fine(pose, *window, look)
         write_picture(folder / f"{stem}{suffix}", planes, window, look)
     write_json(camera, pose.transforms(*window, stem))
     return camera if suffix == CAMERA else folder / f"{stem}{suffix}"

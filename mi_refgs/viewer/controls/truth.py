@@ -71,7 +71,7 @@ class Stepper:
         target, reached = self.at.get(number, (pose, False))
         if number not in self.at:
             return
-        distance = float(abs(pose.position - self.page.source.centre).max())
+        distance = float(abs(pose.position - self.page.drawable.centre).max())
         apart = target.apart(pose, distance)
         if reached and apart > LEFT:
             self.leave(number)

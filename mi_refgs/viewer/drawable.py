@@ -13,7 +13,7 @@ from mi_refgs.viewer.pose import Pose
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class Sample:
     """One sample of every pixel of a picture."""
 
     pose: Pose
@@ -39,13 +39,13 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """What a scene gives for a shot."""
+    """What a scene gives for a sample."""
 
     planes: list[Any]  # see `develop.planes_of`
     depth: Any = None  # mi.Float: along the camera's z axis, 0 where nothing is seen; None where unknown
 
 
-class Source(Protocol):
+class Drawable(Protocol):
     """A scene as a page shows it. All but the constants is called on one thread, that of the loop."""
 
     @property
@@ -63,7 +63,7 @@ class Source(Protocol):
     square_pixels: bool
     """Whether its pixels must be square, whatever sizes that gives."""
 
-    def draw(self, shot: Shot) -> Sampled:
+    def draw(self, sample: Sample) -> Sampled:
         """One sample of every pixel."""
 
     def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
