@@ -188,6 +188,11 @@ def exif_tags(picture: Any) -> tuple[dict[int, Any], dict[int, Any]]:
     return tags, settings
 
 
+def to_8_bits(image: np.ndarray) -> np.ndarray:
+    """Values in [0, 1] (clipped; NaN is 0) as uint8 of the same shape."""
+    return np.asarray(np.round(np.clip(np.nan_to_num(image), 0, 1) * 255), dtype=np.uint8)
+
+
 def write_png(path: str | Path, image: np.ndarray) -> None:
     """Write an (H, W, 3 or 4) image, sRGB-encoded values in [0, 1] (clipped), as 8-bit PNG, atomically.
 
@@ -195,5 +200,5 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
     """
     from PIL import Image
 
-    pixels = np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)
+    pixels = to_8_bits(image)
     replace_file(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG"))

@@ -96,6 +96,13 @@ def known_mesh() -> Mesh:
     return Mesh(vertices.astype(np.float32), faces.astype(np.uint32), 2e-3)
 
 
+def known_scene() -> TrainedScene:
+    """A ball of metal and one of glaze under a sky, whose every material is known."""
+    shading = Shading(diffuse="irradiance", occlusion=True)
+    light = EnvironmentLight.from_radiance(sky(32))
+    return TrainedScene(known_surfels(), light, known_mesh(), shading, 1, 0.0)
+
+
 def write_known_run(data: Path, folder: Path, **shading: Any) -> Run:
     """The run that has found everything: true materials, surface and light; `shading` as in `Shading`."""
     run = Run(folder)

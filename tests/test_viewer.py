@@ -14,8 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import ROOT
-from integrator_scenes import sky
-from known_scene import CLAY, known_mesh, known_surfels
+from known_scene import CLAY, known_scene
 from tiny_scene import SETTINGS
 
 from mi_refgs.cli import main
@@ -31,7 +30,6 @@ from mi_refgs.runs.export import TrainedScene, export
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer import fine, quality
 from mi_refgs.viewer.compare import AROUND, GAP, side_by_side
@@ -52,9 +50,7 @@ from mi_refgs.viewer.quality import COARSE, DONE, LARGE, NOTHING
 def scene() -> TrainedScene:
     """A ball of metal and one of glaze, whose every material is known."""
     mi.set_variant("llvm_ad_rgb")
-    shading = Shading(diffuse="irradiance", occlusion=True)
-    light = EnvironmentLight.from_radiance(sky(32))
-    return TrainedScene(known_surfels(), light, known_mesh(), shading, 1, 0.0)
+    return known_scene()
 
 
 @pytest.mark.parametrize("name", ["../light.exr", f"light.{'x' * 300}", "light.\0"])

@@ -24,8 +24,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import ROOT
-from integrator_scenes import sky
-from known_scene import known_mesh, known_surfels, other_sky
+from known_scene import known_scene, other_sky
 from PIL import Image
 from tiny_scene import train_command, write_data, write_method
 
@@ -38,7 +37,6 @@ from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import TrainedScene, export
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.pose import Pose
@@ -170,9 +168,7 @@ class Tab:
 def scene() -> TrainedScene:
     """A ball of metal and one of glaze under a sky."""
     mi.set_variant("llvm_ad_rgb")
-    shading = Shading(diffuse="irradiance", occlusion=True)
-    light = EnvironmentLight.from_radiance(sky(32))
-    return TrainedScene(known_surfels(), light, known_mesh(), shading, 1, 0.0)
+    return known_scene()
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_refgs.capture.photographs import Photograph
 from mi_refgs.errors import InputError
-from mi_refgs.images import ENDINGS, open_picture, read_mask
+from mi_refgs.images import ENDINGS, open_picture, read_mask, to_8_bits
 
 
 def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:
@@ -53,7 +53,7 @@ def mask_pixels(path: Path, photograph: Photograph) -> np.ndarray:
     """
     from PIL import Image
 
-    mask = Image.fromarray(np.round(255 * read_mask(path)).astype(np.uint8))
+    mask = Image.fromarray(to_8_bits(read_mask(path)))
     displayed = mask.size == photograph.size
     turned = (replace(photograph, orientation=1) if displayed else photograph).turned(mask)
     return np.asarray(turned)[..., None]

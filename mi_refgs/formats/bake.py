@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +18,7 @@ import trimesh
 from mi_refgs.device import upload
 from mi_refgs.errors import SceneError
 from mi_refgs.formats.format import Shot, module
+from mi_refgs.formats.last_made import LastMade
 from mi_refgs.formats.surface import surface, texels, unwrap
 from mi_refgs.formats.textured import TexturedMesh, check
 from mi_refgs.occlusion.mesh import Mesh
@@ -48,8 +48,7 @@ COLUMNS = 8
 """Albedo (3), metallic, roughness, normal (3)."""
 
 
-_BAKED: WeakKeyDictionary[TrainedScene, tuple[Any, TexturedMesh]] = WeakKeyDictionary()
-"""The last result of each scene: several formats ask for the same."""
+_BAKED: LastMade[TexturedMesh] = LastMade()
 
 
 def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int) -> TexturedMesh:
@@ -60,10 +59,8 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
     and missing packages.
     """
     check(faces, texture)
-    asked = faces, texture, tuple(shots)
-    if trained not in _BAKED or _BAKED[trained][0] != asked:
-        _BAKED[trained] = asked, _bake(trained, shots, faces, texture)
-    return _BAKED[trained][1]
+    asked = faces, texture, *shots
+    return _BAKED.get(trained, asked, lambda: _bake(trained, shots, faces, texture))
 
 
 def _bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, size: int) -> TexturedMesh:

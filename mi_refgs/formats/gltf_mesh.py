@@ -30,12 +30,12 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
     from trimesh.visual.texture import TextureVisuals
 
     from mi_refgs.formats.bake import bake
-    from mi_refgs.images import srgb_from_linear
+    from mi_refgs.images import srgb_from_linear, to_8_bits
 
     made = bake(trained, shots, faces, texture)
 
     def picture(values: np.ndarray) -> Any:
-        return Image.fromarray(np.round(255 * values).astype(np.uint8))
+        return Image.fromarray(to_8_bits(values))
 
     # By the specification, roughness is green and metallic is blue.
     surface = np.stack([np.zeros_like(made.roughness), made.roughness, made.metallic], axis=-1)

@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -29,6 +28,7 @@ from scipy.spatial import cKDTree
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
+from mi_refgs.formats.last_made import LastMade
 from mi_refgs.render.display import display_image
 from mi_refgs.render.surroundings import together
 from mi_refgs.runs.export import TrainedScene
@@ -56,8 +56,7 @@ DAMPING = 0.1
 dB from the surfels' without the factor l², 36.8 with it; of a smooth metal one 31.2 and 33.1."""
 
 
-_MADE: WeakKeyDictionary[TrainedScene, tuple[tuple[Any, ...], Surfels]] = WeakKeyDictionary()
-"""What was made last of a scene, and of what: several formats hold the same Gaussians."""
+_MADE: LastMade[Surfels] = LastMade()
 
 
 def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, alone: bool) -> Surfels:
@@ -67,9 +66,7 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, alone: 
     of range, and for a scene without surfels.
     """
     asked = (*shots, degree, alone)
-    if trained not in _MADE or _MADE[trained][0] != asked:
-        _MADE[trained] = asked, _gaussians(trained, shots, degree, alone)
-    return _MADE[trained][1]
+    return _MADE.get(trained, asked, lambda: _gaussians(trained, shots, degree, alone))
 
 
 def _gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, alone: bool) -> Surfels:

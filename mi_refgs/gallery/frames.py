@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.files import write_bytes
+from mi_refgs.images import to_8_bits
 
 QUALITY = 75
 """Of WebP, 0 to 100: fine texture stays, and a sheet is a tenth of its PNG."""
@@ -30,7 +31,7 @@ def write_turntable(path: Path, frames: Sequence[np.ndarray], seconds: float) ->
 def _write(path: Path, frames: Sequence[np.ndarray], **options: Any) -> None:
     from PIL import Image
 
-    first, *others = (Image.fromarray(np.uint8(np.clip(frame, 0, 1) * 255 + 0.5)) for frame in frames)
+    first, *others = (Image.fromarray(to_8_bits(frame)) for frame in frames)
     buffer = io.BytesIO()
     first.save(
         buffer, "WEBP", save_all=bool(others), append_images=others, quality=QUALITY, method=EFFORT, **options

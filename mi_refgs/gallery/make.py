@@ -18,6 +18,7 @@ from mi_refgs.files import is_file, make_folder, read_json, write_bytes, write_j
 from mi_refgs.gallery.exhibits import EXHIBITS, Exhibit
 from mi_refgs.gallery.frames import write_still, write_turntable
 from mi_refgs.gallery.page import DECOMPOSITION, EDITS, RELIT, TURNTABLE, page
+from mi_refgs.images import read_png
 from mi_refgs.reconstruct import fit
 from mi_refgs.reconstruction import Reconstruction
 from mi_refgs.relighting import relight as relighting
@@ -140,7 +141,7 @@ def _pictures(name: str, exhibit: Exhibit, run: Reconstruction, out: Path, size:
     }
     for target, source in sheets.items():
         if not is_file(out / target):
-            write_still(out / target, _read(source))
+            write_still(out / target, read_png(source))
     if not is_file(out / TURNTABLE):
         other = run.relight(resource_dir("scenes") / "lights" / LIGHT)
         frames = [
@@ -160,11 +161,3 @@ def _pictures(name: str, exhibit: Exhibit, run: Reconstruction, out: Path, size:
 def _shown(run: Reconstruction, camera: Any, size: int) -> np.ndarray:
     """A camera's picture (size, size, 3) before white, display-encoded."""
     return shown(run.render(camera, size=size, samples=SAMPLES), np.ones(3))
-
-
-def _read(path: Path) -> np.ndarray:
-    """A sheet (H, W, 3) that a command has written."""
-    from PIL import Image
-
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"), np.float32) / 255

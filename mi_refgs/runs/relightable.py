@@ -43,6 +43,12 @@ AMBIENT_RAYS = 128
 """Rays of each vertex of the mesh."""
 
 
+def lacking(scene: TrainedScene) -> str:
+    """What a scene lacks to be `relightable`: some materials or a light, by name; nothing if it is."""
+    missing = [name for name in MATERIALS if not scene.surfels.has(name)]
+    return ", ".join(missing) or ("light" if scene.light is None else "")
+
+
 def relightable(scene: TrainedScene) -> TrainedScene:
     """The scene with albedo, metallic and roughness alone, shaded by whatever light it is given.
 
@@ -54,12 +60,11 @@ def relightable(scene: TrainedScene) -> TrainedScene:
 
     Raises InputError for a scene without light or one of the materials.
     """
-    missing = [name for name in MATERIALS if not scene.surfels.has(name)]
-    if scene.light is None or missing:
-        what = ", ".join(missing) or "light"
+    if what := lacking(scene):
         raise SceneError(
             f"{what}: the run has none; fit one with materials and a light, as `--for relighting` does"
         )
+    assert scene.light is not None
     surfels = scene.surfels.detach()
     mesh = scene.mesh
     if mesh is not None and scene.surroundings is not None:

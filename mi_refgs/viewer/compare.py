@@ -11,6 +11,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.pictures import planes
+from mi_refgs.images import to_8_bits
 from mi_refgs.render.display import displayed
 from mi_refgs.viewer.develop import PICTURE, Look, shown_planes, to_bytes
 from mi_refgs.viewer.drawable import Drawable, Sample
@@ -47,11 +48,6 @@ class Compared:
             self.tell(None)
             drawn = to_bytes(shown_planes(drawable.draw(sample).planes, look), view.width, view.height)
         return side_by_side([to_8_bits(truth), drawn], window)
-
-
-def to_8_bits(picture: np.ndarray) -> np.ndarray:
-    """8-bit values of a display-encoded picture."""
-    return np.asarray(np.clip(np.nan_to_num(picture), 0, 1) * 255 + 0.5, dtype=np.uint8)
 
 
 def side_by_side(pictures: list[np.ndarray], window: tuple[int, int]) -> np.ndarray:

@@ -15,7 +15,7 @@ from mi_refgs.contraction import Region
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.runs.export import TrainedScene
-from mi_refgs.runs.relightable import relightable
+from mi_refgs.runs.relightable import lacking, relightable
 from mi_refgs.shade.ambient import prepare
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.light import Light, RotatedLight
@@ -40,9 +40,16 @@ def bounds_of(surfels: Surfels, region: Region | None = None) -> tuple[np.ndarra
     if region is not None:
         return np.array(region.centre), region.radius
     position = surfels.to_numpy()["position"].astype(np.float64)
-    if not len(position):
-        return np.zeros(3), 1.0
-    low, high = np.percentile(position, (OUTLIERS, 100 - OUTLIERS), axis=0)
+    return around_box(*box_of(position)) if len(position) else (np.zeros(3), 1.0)
+
+
+def box_of(position: np.ndarray) -> np.ndarray:
+    """Lower and upper corner (2, 3) of the box of most positions (N, 3), N > 0."""
+    return np.percentile(position, (OUTLIERS, 100 - OUTLIERS), axis=0)
+
+
+def around_box(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (3,) and radius of the sphere around a box."""
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
 
@@ -96,9 +103,7 @@ class Fitted:
     @property
     def can_relight(self) -> bool:
         """Whether `runs.relightable` takes it."""
-        return self.original.light is not None and all(
-            self.original.surfels.has(name) for name in ("albedo", "roughness", "metallic")
-        )
+        return not lacking(self.original)
 
     # ---------------- what changes it ----------------
 

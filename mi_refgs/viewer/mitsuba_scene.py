@@ -15,7 +15,7 @@ from mi_refgs.plugins.surroundings import Around
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of
 from mi_refgs.viewer.drawable import Sample, Sampled
-from mi_refgs.viewer.fitted import variables_of
+from mi_refgs.viewer.fitted import around_box, box_of, variables_of
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.quality import SAMPLES
 
@@ -23,8 +23,6 @@ CLIP = 1e-3, 1e4
 """Near and far plane, in radii of the scene."""
 ALONE = Around(None, None, None)
 """What is around an object without its surroundings."""
-PERCENT = 2.0, 98.0
-"""Of surfels along each axis, that count for the size of a scene that has no shapes."""
 
 
 class MitsubaScene:
@@ -59,13 +57,13 @@ class MitsubaScene:
         positions = [np.array(self.params[key]) for key in self.params.keys() if key.endswith(".position")]
         surfels = [p for p in positions if p.ndim == 2 and p.shape[1] == 3 and len(p)]
         if surfels:
-            low, high = np.percentile(np.concatenate(surfels), PERCENT, axis=0)
+            low, high = box_of(np.concatenate(surfels))
         elif self.scene.shapes():
             box = self.scene.bbox()
             low, high = np.array(box.min, np.float64), np.array(box.max, np.float64)
         else:
             raise InputError(f"{path}: shapes: the scene has neither shapes nor surfels; add an object")
-        return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+        return around_box(low, high)
 
     @property
     def lit(self) -> bool:
