@@ -86,41 +86,58 @@ def _padded(width: int) -> int:
 
 
 def columns_of(array: Any, width: int) -> list[Any]:
-    """Columns (mi.Float, width N) of N · width floats without padding, under AD."""
-    packet = math.gcd(width, PACKET)
-    if packet == 1 and width > PACKET:
-        return list(dr.custom(_OddColumns, array, width))
-    # Lane i alone reads row i, so the adjoint need not be atomic.
-    return _split(array, width, packet, dr.ReduceMode.NoConflicts)
+    """Columns (mi.Float, width N) of N · width floats without padding, under AD.
 
-
-def _split(array: Any, width: int, packet: int, mode: Any = dr.ReduceMode.Auto) -> list[Any]:
-    count, packets = dr.width(array) // width, width // packet
-    row = dr.arange(mi.UInt32, count) * packets
-    if packet == 1:
-        return [dr.gather(mi.Float, array, row + i, mode=mode) for i in range(width)]
-    shape = (packet, count)
-    return [x for i in range(packets) for x in dr.gather(mi.ArrayXf, array, row + i, mode=mode, shape=shape)]
-
-
-class _OddColumns(dr.CustomOp):
-    """PackedRows that no packet divides → columns; the adjoint makes padded rows first, in packets.
-
-    To add to memory column by column, 16 cache lines each time, takes four times as long.
+    The adjoint is made in memory of its own and then added to that of `array`. The adjoint of a gather would
+    write into the gradient of `array` itself, where other terms of a loss write too, in another mode: what
+    one of them has written is then lost.
     """
+    return list(dr.custom(_Columns, array, width))
+
+
+class _Columns(dr.CustomOp):
+    """Flat rows → columns."""
 
     def eval(self, array: Any, width: int) -> list[Any]:
         self.width = width
-        return _split(array, width, 1)
+        return self._split(array)
 
     def forward(self) -> None:
-        self.set_grad_out(_split(self.grad_in("array"), self.width, 1))
+        self.set_grad_out(self._split(self.grad_in("array")))
 
     def backward(self) -> None:
-        self.set_grad_in("array", PackedRows.pack(self.grad_out()).unpadded())
+        self.set_grad_in("array", self._join(self.grad_out()))
 
     def name(self) -> str:
         return "columns"
+
+    @property
+    def packet(self) -> int:
+        """Floats that one access moves: the widest packet that divides a row."""
+        return math.gcd(self.width, PACKET)
+
+    def _split(self, array: Any) -> list[Any]:
+        count, packets = dr.width(array) // self.width, self.width // self.packet
+        row = dr.arange(mi.UInt32, count) * packets
+        if self.packet == 1:
+            return [dr.gather(mi.Float, array, row + i) for i in range(self.width)]
+        shape = (self.packet, count)
+        return [x for i in range(packets) for x in dr.gather(mi.ArrayXf, array, row + i, shape=shape)]
+
+    def _join(self, columns: list[Any]) -> Any:
+        if self.width == 1:
+            return columns[0]
+        if self.packet == 1 and self.width > PACKET:
+            # To write column by column, 16 cache lines each time, takes four times as long.
+            return PackedRows.pack(columns).unpadded()
+        count, packets = dr.width(columns), self.width // self.packet
+        flat, row = dr.empty(mi.Float, count * self.width), dr.arange(mi.UInt32, count) * packets
+        for i in range(packets):
+            group = columns[i * self.packet : (i + 1) * self.packet]
+            value = group[0] if self.packet == 1 else mi.ArrayXf(group)
+            # Without the promise of no conflicts every packet would be a kernel of its own.
+            dr.scatter(flat, value, row + i, mode=dr.ReduceMode.NoConflicts)
+        return flat
 
 
 def joined(first: list[Any], second: list[Any]) -> list[Any]:

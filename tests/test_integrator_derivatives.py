@@ -112,14 +112,27 @@ def test_derivatives_of_the_scenes_environment(tmp_path: Path) -> None:
     emitter = {"type": "envmap", "filename": str(tmp_path / "sky.exr")}
     of = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor(), "sky": emitter})
     check_derivatives(of, "sky.data")
-    # Reflections are linear in the scale.
+
+
+@pytest.mark.parametrize("columns", [64, 48], ids=["as it is", "resampled"])
+def test_the_scale_of_an_environment_has_a_derivative(columns: int, tmp_path: Path) -> None:
+    """Reflections are linear in the scale, in both modes."""
+    mi.Bitmap(sky()[:, :columns]).write(str(tmp_path / "sky.exr"))
+    channels = integrator(terms="specular")
+    del channels["light"]
+    emitter = {"type": "envmap", "filename": str(tmp_path / "sky.exr")}
+    of = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor(), "sky": emitter})
     params = mi.traverse(of)
+    expected = image(of)
     scale = mi.Float(1)
     dr.enable_grad(scale)
     params["sky.scale"] = scale
     params.update()
     dr.backward(dr.sum(mi.render(of, params), axis=None))
-    np.testing.assert_allclose(dr.grad(scale)[0], image(scene(terms="specular")).sum(), rtol=1e-4)
+    np.testing.assert_allclose(dr.grad(scale)[0], expected.sum(), rtol=1e-4)
+    dr.set_grad(scale, 1)
+    tangent = dr.forward_to(mi.render(of, params))
+    np.testing.assert_allclose(tangent.numpy(), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_derivatives_of_a_constant_environment() -> None:

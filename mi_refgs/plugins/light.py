@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import upload_tensor
+from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.shade.envmap import (
     DEFAULT_HEIGHT,
@@ -47,9 +47,9 @@ def own_light(emitter: Any) -> tuple[Any, Any]:
 def emitter_light(emitter: Any, filtered: bool = True, levels: Levels = LEVELS) -> Light:
     """The light of an emitter of the scene, under AD; not `filtered` to `levels`, it has `radiance` alone.
 
-    Gradients flow to its `data` and `scale`, or `radiance.value`. A map that must be resampled (see
-    `_map_radiance`) can receive none: asking for it raises InputError, as does any emitter but `envmap` and
-    `constant`.
+    Gradients flow to its `scale` and `data`, or `radiance.value`; to `data` only where its size is one that
+    lights have. Raises InputError if the texels of another size (see `_map_radiance`) should receive some,
+    and for any emitter but `envmap` and `constant`.
     """
     params = mi.traverse(emitter)
     if "data" not in params:
@@ -120,13 +120,15 @@ def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
     width = columns - 2  # Mitsuba keeps one more column on each side, for its interpolation
     texel = dr.arange(mi.UInt32, rows * width * 3)
     source = ((texel // (3 * width)) * columns + (texel // 3) % width + 1) * channels + texel % 3
-    scale = mi.Float(params["scale"])
-    texels = dr.gather(mi.Float, data.array, source) * scale
-    radiance = mi.TensorXf(bounded(texels, texels), (rows, width, 3))
-    if width == 2 * rows and rows % 4 == 0 and MIN_HEIGHT <= rows <= MAX_HEIGHT:
-        return radiance, ""
-    height = min(MAX_HEIGHT, max(MIN_HEIGHT, 4 * (width // 8)))
-    return upload_tensor(resample(radiance.numpy(), height)), f"{rows} x {width}"
+    texels = dr.gather(mi.Float, data.array, source)
+    resampled = not (width == 2 * rows and rows % 4 == 0 and MIN_HEIGHT <= rows <= MAX_HEIGHT)
+    shape = (rows, width, 3)
+    if resampled:
+        height = min(MAX_HEIGHT, max(MIN_HEIGHT, 4 * (width // 8)))
+        known = mi.TensorXf(bounded(texels, texels), shape)
+        texels, shape = upload(resample(known.numpy(), height)), (height, 2 * height, 3)
+    radiance = texels * mi.Float(params["scale"])
+    return mi.TensorXf(bounded(radiance, radiance), shape), f"{rows} x {width}" if resampled else ""
 
 
 def _constant_radiance(params: Any, emitter: Any) -> Any:

@@ -161,11 +161,7 @@ class Surfels:
     # ---------------- raw columns ----------------
 
     def columns(self, name: str) -> list[Any]:
-        """Raw columns of a channel as D `mi.Float` of width N, under AD.
-
-        Gathering from the raw tensor, or from these columns, by another index map in the same derivative pass
-        would let two adjoints write to the same places: make a table of its own for that (`PackedRows`).
-        """
+        """Raw columns of a channel as D `mi.Float` of width N, under AD."""
         tensor = self.raw[name]
         rows, width = (int(size) for size in tensor.shape)
         if rows == 0:

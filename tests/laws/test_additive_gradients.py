@@ -1,0 +1,301 @@
+"""The gradient of a sum of losses is the sum of their gradients, for every order, parameter and mode.
+
+Each scene is a row of SCENES, each loss a row of `Losses.terms`; a new one joins by its row, and a registered
+reflectance model by itself. Losses of the parameters read them as priors do, so that their adjoints write to
+the same leaves as that of the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from integrator_scenes import COUNT, hollow_mesh, integrator, raw_channels, sensor, sky
+from scipy.spatial import cKDTree
+
+from mi_refgs.render.pipeline import render
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.reflectance import MODELS
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.channels import channel
+
+TOLERANCE = 1e-5
+"""Relative to the largest entry of the sum, for each parameter: sums by scatter come in any order."""
+NEIGHBOURS = 4
+AROUND = "surroundings_"
+
+
+# ---------------- what is rendered ----------------
+
+
+def every_channel(model: str, diffuse: str, gaussians: bool) -> dict[str, np.ndarray]:
+    """The geometry, and what a reflectance model needs."""
+    raw, rng = raw_channels(), np.random.default_rng(5)
+    if gaussians:
+        raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1]], axis=1)
+    wanted = MODELS[model].channels(diffuse)
+    for name in wanted:
+        raw.setdefault(name, rng.normal(size=(COUNT, channel(name).widths[0])).astype(np.float32))
+    kept = {"position", "rotation", "scale", "opacity", *wanted}
+    return {name: values for name, values in raw.items() if name in kept}
+
+
+def model_scene(model: str, diffuse: str = "sh", gaussians: bool = False, **changes: Any) -> Any:
+    """A reflectance model with its own light, among Gaussians around it and before a map."""
+    raw = every_channel(model, diffuse, gaussians)
+    if "mesh" in changes and "traced_bounces" not in changes:
+        raw["indirect_sh"] = raw_channels()["indirect_sh"]
+    far = {name: raw[name] for name in ("position", "rotation", "scale", "opacity")}
+    far |= {"position": 1.7 * far["position"], "radiance_sh": raw_channels()["radiance_sh"]}
+    around = {AROUND + name: mi.TensorXf(values) for name, values in far.items()}
+    behind = EnvironmentLight.from_radiance(0.3 + sky(16)).raw
+    chosen = {"reflectance": model, "diffuse": diffuse, "background": behind, **around, **changes}
+    inner = integrator(raw, aovs="a:alpha,d:depth,n:normal,s:diffuse", **chosen)
+    if MODELS[model].light == "none":
+        del inner["light"]
+    return mi.load_dict({"type": "scene", "integrator": inner, "sensor": sensor()})
+
+
+def lit_scene(emitter: dict[str, Any]) -> Any:
+    """Surfels under an emitter of the scene."""
+    inner = integrator(every_channel("split_sum", "sh", False), aovs="s:specular")
+    del inner["light"]
+    return mi.load_dict({"type": "scene", "integrator": inner, "sensor": sensor(), "sky": emitter})
+
+
+def map_of(rows: int, columns: int, folder: Path) -> dict[str, Any]:
+    """An `envmap` with a file of its own."""
+    path = folder / f"{rows}x{columns}.exr"
+    mi.Bitmap(np.resize(sky(rows), (rows, columns, 3))).write(str(path))
+    return {"type": "envmap", "filename": str(path), "scale": 0.7}
+
+
+def textured_scene(method: str) -> Any:
+    """A sphere of `refgs_bsdf`, whose materials are textures, under a constant light."""
+    rng = np.random.default_rng(2)
+
+    def texture(channels: int) -> dict[str, Any]:
+        texels = rng.uniform(0.2, 0.8, (4, 4, channels)).astype(np.float32)
+        return {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
+
+    bsdf = {"type": "refgs_bsdf", "albedo": texture(3), "metallic": texture(1), "roughness": texture(1)}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": method, "max_depth": 3},
+            "sensor": sensor(),
+            "ball": {"type": "sphere", "bsdf": bsdf},
+            "sky": {"type": "constant"},
+        }
+    )
+
+
+def traced(folder: Path, **changes: Any) -> Any:
+    """Deferred shading whose rays meet a mesh with materials."""
+    return model_scene("split_sum", "irradiance", mesh=hollow_mesh(folder), **changes)
+
+
+SCENES: dict[str, Callable[[Path], Any]] = {
+    **{f"model {name}": (lambda _, name=name: model_scene(name)) for name in MODELS},
+    "3D Gaussians": lambda _: model_scene("split_sum", gaussians=True),
+    "at surfels": lambda _: model_scene("split_sum", shade_at="surfel"),
+    "antialiased": lambda _: model_scene("split_sum", antialias=True),
+    "indirect light": lambda folder: model_scene("split_sum", mesh=hollow_mesh(folder)),
+    "traced bounces": lambda folder: traced(folder, traced_bounces=1, ambient_rays=4, visibility_rays=2),
+    "envmap": lambda folder: lit_scene(map_of(16, 32, folder)),
+    "resampled envmap": lambda folder: lit_scene(map_of(16, 24, folder)),
+    "constant": lambda _: lit_scene({"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1, 2]}}),
+    "BSDF, path": lambda _: textured_scene("path"),
+    "BSDF, prb": lambda _: textured_scene("prb"),
+}
+
+
+# ---------------- losses ----------------
+
+
+def is_trained(key: str) -> bool:
+    """Whether a parameter belongs to the surfels, a light or a BSDF."""
+    return key.startswith("integrator.") or key.endswith((".data", "sky.scale", "sky.radiance.value"))
+
+
+class Losses:
+    """A scene and its parameters, and losses of all of them by name, whose weights are drawn once."""
+
+    def __init__(self, scene: Any, without: tuple[str, ...] = ()) -> None:
+        self.scene, self.params = scene, mi.traverse(scene)
+        kept = [key for key in self.params.keys() if is_trained(key) and key not in without]
+        self.base = {key: np.array(dr.ravel(self.params[key])) for key in kept}
+        self.shape = {key: tuple(self.params[key].shape) for key in kept}
+        rng = np.random.default_rng(0)
+        self.direction = {key: rng.normal(size=x.shape).astype(np.float32) for key, x in self.base.items()}
+        self.picked = {key: mi.UInt32(rng.integers(0, x.size, 2 * x.size)) for key, x in self.base.items()}
+        image = mi.render(scene, spp=1)
+        self.weight = mi.TensorXf(rng.normal(size=image.shape).astype(np.float32))
+        _, self.neighbour = cKDTree(raw_channels()["position"]).query(raw_channels()["position"], NEIGHBOURS)
+        self.terms: dict[str, Callable[[], Any]] = {
+            "image": lambda: self.rendered(1, slice(0, 3)),
+            **({"aovs": lambda: self.rendered(4, slice(3, None))} if image.shape[2] > 3 else {}),
+            **({"frame": self.frame} if "integrator.background" in kept else {}),
+            "slice": lambda: self.priors(lambda _, x: x[..., 0] if isinstance(x, mi.TensorXf) else x),
+            "gather": lambda: self.priors(lambda key, x: dr.gather(mi.Float, dr.ravel(x), self.picked[key])),
+            "mean": lambda: self.priors(
+                lambda key, x: self.base[key].size ** 0.5 * (2 + dr.mean(dr.ravel(x)))
+            ),
+            "neighbours": lambda: self.priors(self.differences),
+        }
+
+    def leaves(self) -> dict[str, Any]:
+        """New leaves of the AD graph in place of all parameters."""
+        made = {}
+        for key, values in self.base.items():
+            flat = mi.Float(values)
+            leaf = mi.TensorXf(flat, self.shape[key])
+            if type(self.params[key]) is mi.Color3f:
+                leaf = mi.Color3f(*(mi.Float(float(x)) for x in values))
+            elif type(self.params[key]) is mi.Float:
+                leaf = flat
+            dr.enable_grad(leaf)
+            self.params[key] = made[key] = leaf
+        self.params.update()
+        return made
+
+    # ---------------- by name ----------------
+
+    def rendered(self, spp: int, channels: slice) -> Any:
+        """A weighted sum of some channels of an image with so many samples per pixel."""
+        image = mi.render(self.scene, self.params, spp=spp, seed=1)
+        return dr.sum((image * self.weight)[..., channels], axis=None).array
+
+    def frame(self) -> Any:
+        """A weighted sum over a frame of the renderer below the plugin."""
+        of = self.scene.integrator()
+        camera = Camera.from_sensor(self.scene.sensors()[0])
+        light = of.shading.light_of(of.light)
+        around = of.around.splatted(of.surfels)
+        frame = render(of.surfels, camera, of.shading, light, of.occluder, surroundings=around)
+        weight = self.weight.array
+        values = [*frame.radiance, *frame.background, frame.alpha, frame.depth]
+        rows = dr.arange(mi.UInt32, dr.width(frame.alpha))
+        return sum(dr.sum(x * dr.gather(mi.Float, weight, rows + i)) for i, x in enumerate(values))
+
+    def priors(self, read: Callable[[str, Any], Any]) -> Any:
+        """Sum of squares of what is read of each parameter."""
+        total = mi.Float(0)
+        for key in self.base:
+            value = read(key, self.params[key])
+            total += dr.sum(dr.square(dr.ravel(value)))
+        return total
+
+    def differences(self, key: str, x: Any) -> Any:
+        """Each row minus its neighbours: of surfels the nearest ones, of a map the next rows."""
+        flat, rows = dr.ravel(x), self.shape[key][0]
+        width = dr.width(flat) // rows
+        near = self.neighbour if rows == COUNT else np.arange(rows)[:, None] + np.arange(NEIGHBOURS)
+        other = np.repeat(near % rows, width, axis=0) * width + np.tile(np.arange(width), rows)[:, None]
+        own = dr.arange(mi.UInt32, rows * width)
+        return sum(
+            dr.gather(mi.Float, flat, own) - dr.gather(mi.Float, flat, mi.UInt32(column))
+            for column in other.T.astype(np.uint32)
+        )
+
+    # ---------------- their derivatives ----------------
+
+    def gradient(self, *names: str) -> dict[str, np.ndarray]:
+        """Reverse mode: the gradient of the sum of these losses, made in this order."""
+        leaves = self.leaves()
+        dr.backward(sum((self.terms[name]() for name in names), start=mi.Float(0)))
+        return {key: np.array(dr.ravel(dr.grad(leaf))) for key, leaf in leaves.items()}
+
+    @cached_property
+    def gradients(self) -> dict[str, dict[str, np.ndarray]]:
+        """The gradient of each loss alone."""
+        return {name: self.gradient(name) for name in self.terms}
+
+    def tangent(self, *names: str) -> dict[str, np.ndarray]:
+        """Forward mode: the derivative of the sum of these losses along one direction of all parameters."""
+        leaves = self.leaves()
+        for key, leaf in leaves.items():
+            v = mi.Float(self.direction[key])
+            kind = type(leaf)
+            dr.set_grad(leaf, kind(v, self.shape[key]) if kind is mi.TensorXf else dr.unravel(kind, v))
+        # Mitsuba's integrators want what lies before the parameters to be done with.
+        dr.enqueue(dr.ADMode.Forward, leaves)
+        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+        total = sum((self.terms[name]() for name in names), start=mi.Float(0))
+        return {"all parameters": np.array(dr.forward_to(total))}
+
+
+# ---------------- the law ----------------
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def losses(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Losses:
+    mi.set_variant("llvm_ad_rgb")
+    scene = SCENES[request.param](tmp_path_factory.mktemp("scene"))
+    # Mitsuba's texels of a map that is resampled have no derivative, and say so.
+    return Losses(scene, ("sky.data",) if request.param == "resampled envmap" else ())
+
+
+def check_additive(
+    derivative: Callable[..., dict[str, np.ndarray]],
+    alone: dict[str, dict[str, np.ndarray]],
+    orders: list[tuple[str, ...]],
+) -> None:
+    """The derivative of a sum of losses, in each of the orders, is the sum of their own derivatives."""
+    for order in orders:
+        for key, found in derivative(*order).items():
+            parts = [alone[name][key] for name in order]
+            sizes = [np.abs(part).max() for part in parts]
+            lost = 10 * TOLERANCE * max(sizes)
+            assert all(size == 0 or size > lost for size in sizes), f"{key}: too small to be missed: {sizes}"
+            error = np.abs(found - sum(parts)).max() / max(sizes)
+            assert error <= TOLERANCE, f"{key}: {', then '.join(order)}: off by {error:.1e}"
+
+
+def all_at_once(names: list[str]) -> list[tuple[str, ...]]:
+    """Two orders, in which each of the names comes before each other one."""
+    return [tuple(names), tuple(reversed(names))]
+
+
+@contextmanager
+def running_on(threads: int) -> Iterator[None]:
+    """Kernels run on so many threads meanwhile."""
+    before = dr.thread_count()
+    dr.set_thread_count(threads)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
+
+
+@pytest.mark.parametrize("threads", [2, 1])
+def test_gradients_of_losses_add(losses: Losses, threads: int) -> None:
+    with running_on(threads):
+        check_additive(losses.gradient, losses.gradients, all_at_once([*losses.terms]))
+
+
+def test_tangents_of_losses_add(losses: Losses) -> None:
+    alone = {name: losses.tangent(name) for name in losses.terms}
+    check_additive(losses.tangent, alone, all_at_once([*losses.terms]))
+
+
+def test_gradients_of_every_pair_of_losses_add() -> None:
+    """Two at a time, so that no third loss hides what they do to each other."""
+    losses = Losses(model_scene("split_sum"))
+    with running_on(2):
+        check_additive(losses.gradient, losses.gradients, [*permutations(losses.terms, 2)])
+
+
+def test_every_parameter_has_a_gradient(losses: Losses) -> None:
+    """A gradient of zero could not be lost."""
+    found = [losses.gradients[name] for name in ("image", "aovs") if name in losses.terms]
+    for key in losses.base:
+        assert any(np.abs(gradient[key]).max() > 0 for gradient in found), key
