@@ -77,7 +77,7 @@ def test_derivatives_of_every_channel(key: str) -> None:
     check_derivatives(scene(), f"integrator.{key}")
 
 
-@pytest.mark.parametrize("key", ["position", "albedo", "light"])
+@pytest.mark.parametrize("key", ["position", "opacity", "albedo", "light"])
 def test_derivatives_with_irradiance_and_supersampling(key: str) -> None:
     of = scene(diffuse="irradiance", aovs="nn:normal,d:depth,a:albedo")
     check_derivatives(of, f"integrator.{key}", spp=4)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from integrator_scenes import HEIGHT, WIDTH, raw_channels, sky
+from integrator_scenes import HEIGHT, WIDTH, raw_channels, scene, sensor, sky
+from test_integrator_surroundings import behind, far_channels, open_scene
 from tiny_scene import SETTINGS, SIZE, write_data, write_method
 
 from mi_refgs import methods
@@ -17,9 +19,11 @@ from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.evaluate import evaluate
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.images import srgb_from_linear
+from mi_refgs.plugins.aovs import AOV, aov_values
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import supersampled
+from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
@@ -114,3 +118,64 @@ def test_eval_encodes_the_mean_of_linear_radiance(tmp_path: Path) -> None:
         encoded_first.append(metrics.psnr(np.mean(each, axis=0).transpose(1, 2, 0), view.image))
     assert result["psnr"] == pytest.approx(np.mean(scores), abs=1e-4)
     assert abs(np.mean(encoded_first) - np.mean(scores)) > 1e-3
+
+
+@pytest.mark.parametrize("spp", [4, 9])
+@pytest.mark.parametrize("at, around", [("pixel", False), ("surfel", False), ("pixel", True)])
+def test_aovs_of_several_samples_are_premultiplied_means_divided_once(
+    spp: int, at: str, around: bool
+) -> None:
+    """Against means in float64 of the samples' own AOVs; the plugin and the renderer of a run agree."""
+    kinds = ["albedo", "metallic", "roughness", "normal", "depth", "alpha", "visibility", "diffuse"]
+    options = {"shade_at": at, "aovs": ",".join(f"{kind}:{kind}" for kind in kinds)}
+    raw = raw_channels()
+    raw["scale"] -= 0.7  # of sharp outlines
+    raw["opacity"] += 5
+    of = (open_scene if around else scene)(sensor(film={"pixel_format": "rgba"}), raw=raw, **options)
+    eye, factor = Camera.from_sensor(of.sensors()[0]), round(spp**0.5)
+    fine_eye = eye.supersampled(factor)
+    surfels, light = Surfels.from_numpy(raw), EnvironmentLight.from_radiance(sky())
+    beside = Surroundings(Surfels.from_numpy(far_channels()), behind()) if around else None
+    shading = Shading(at=at)  # type: ignore[arg-type]
+    made = TrainedScene(surfels, light, None, shading, 1, 0.0, surroundings=beside)
+    frame, fine = made.renderer(samples=spp)(eye), made.renderer()(fine_eye)
+
+    image = mi.render(of, spp=spp).numpy().astype(np.float64)
+    widths = [len(AOV(kind, kind).channels()) for kind in kinds]
+    plugin = dict(zip(kinds, np.split(image[..., 4:], np.cumsum(widths)[:-1], axis=-1), strict=True))
+    samples = {kind: planes(wide(aov_values(kind, fine, fine_eye), factor), factor) for kind in kinds}
+    alpha = samples["alpha"]
+    own = alpha if fine.share is None else planes(fine.share, factor)
+    coverage, own_coverage = block_means(alpha, factor), block_means(own, factor)
+    assert (
+        np.mean((own_coverage > 0.01) & (block_means((own < 1e-3) * 1.0, factor) > 0)) > 0.03
+    )  # silhouettes
+
+    def divided(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        total = block_means(weight, factor)
+        return np.where(total > 1e-3, block_means(values * weight, factor) / np.maximum(total, 1e-3), 0)
+
+    expected = {kind: divided(samples[kind], own) for kind in ("albedo", "metallic", "roughness")}
+    expected["depth"] = divided(samples["depth"], alpha)
+    expected["visibility"] = (own_coverage > 1e-3) * 1.0
+    blended = block_means(planes(fine.normal, factor), factor)
+    norm = np.linalg.norm(blended, axis=-1, keepdims=True)
+    expected["normal"] = np.where(coverage > 1e-3, blended / np.maximum(norm, 1e-20), 0)
+    expected |= {kind: block_means(samples[kind], factor) for kind in ("alpha", "diffuse")}
+    clear = np.abs(coverage - 1e-3) > 1e-5  # of rounding at the floor
+    for kind in kinds:
+        np.testing.assert_allclose(plugin[kind] * clear, expected[kind] * clear, atol=2e-4, err_msg=kind)
+        ours = planes(wide(aov_values(kind, frame, eye), 1))
+        np.testing.assert_allclose(ours, plugin[kind], atol=1e-4, err_msg=kind)
+    seen = own_coverage[..., 0] > 0.01
+    np.testing.assert_allclose(np.linalg.norm(plugin["normal"], axis=-1)[seen], 1, atol=1e-5)
+
+    through = planes(fine.radiance, factor)
+    if around:
+        through = through + (1 - alpha) * planes(fine.background, factor)
+    np.testing.assert_allclose(image[..., :3], block_means(through, factor), atol=1e-5)
+
+
+def wide(values: list[object], factor: int) -> mi.ArrayXf:
+    """Planes of full width."""
+    return mi.ArrayXf([value + dr.zeros(mi.Float, WIDTH * HEIGHT * factor**2) for value in values])

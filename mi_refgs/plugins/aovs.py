@@ -14,6 +14,7 @@ import mitsuba as mi
 from mi_refgs.constants import COVERAGE_FLOOR, NORM_FLOOR
 from mi_refgs.errors import InputError
 from mi_refgs.render.pipeline import Frame
+from mi_refgs.render.samples import ray_distance
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.channels import CHANNELS
@@ -68,9 +69,10 @@ def parse_aovs(text: str) -> list[AOV]:
 def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Any]:
     """The channels (mi.Float) of one type, as wide as the frame or 1.
 
-    Materials and the unit normal are those of what is seen, 0 where nothing is. Depth is the distance along
-    the ray from the near plane, as Mitsuba's `depth` is. The three terms are premultiplied by alpha and sum
-    to the image over black.
+    Materials, the unit normal and the visibility are those of what is seen, 0 where nothing is. Depth is the
+    distance along the ray from the near plane, as Mitsuba's `depth` is. The three terms are premultiplied by
+    alpha and sum to the image over black. A supersampled frame was averaged premultiplied
+    and divided by its mean alpha; `camera` is that of its pixels, not of the samples.
     """
     seen = frame.alpha > COVERAGE_FLOOR
     if kind in CHANNELS:
@@ -82,10 +84,11 @@ def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Any]:
         unit = frame.normal * dr.rsqrt(dr.select(valid, length2, 1))
         return [*dr.select(valid, unit, 0)]
     if kind == "depth":
-        distance = (frame.depth - camera.near) * dr.norm(camera.rays())
+        distance = ray_distance(frame.depth, camera) if frame.distance is None else frame.distance
         return [dr.select(seen, distance, 0)]
     if kind == "alpha":
         return [frame.alpha]
     if kind == "visibility":
-        return [dr.select(seen, frame.maps.get("visibility", mi.Float(1)), 0)]
+        of_object = seen if frame.share is None else frame.share > COVERAGE_FLOOR
+        return [dr.select(of_object, frame.maps.get("visibility", mi.Float(1)), 0)]
     return [*getattr(frame.terms, kind)]

@@ -257,11 +257,11 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             made = f"made under {self.variant}, not {mi.variant()}"
             raise InputError(f"refgs: variant: {made}; load the scene again")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        return through_film(sensor, spp, partial(self._channels, scene, derivatives), self.aov_names())
+        view = partial(self._frame, scene, derivatives)
+        return through_film(sensor, spp, view, self._channels, self.aov_names())
 
-    def _channels(self, scene: Any, derivatives: bool, camera: Camera, alpha: bool) -> list[Any]:
+    def _channels(self, frame: Frame, camera: Camera, alpha: bool) -> list[Any]:
         """R, G, B, (A), W and the AOVs, as the film's blocks have them."""
-        frame = self._frame(scene, camera, derivatives)
         rgb = frame.radiance
         if len(self.terms) < len(TERMS):  # of the object alone
             rgb = sum((getattr(frame.terms, name) for name in self.terms), start=mi.Color3f(0))
@@ -271,14 +271,14 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         more = [value for aov in self.aovs for value in aov_values(aov.type, frame, camera)]
         return [*rgb, *([coverage] if alpha else []), mi.Float(1), *more]
 
-    def _frame(self, scene: Any, camera: Camera, derivatives: bool) -> Frame:
+    def _frame(self, scene: Any, derivatives: bool, camera: Camera) -> Frame:
         asked = {aov.type for aov in self.aovs} | {*(self.terms if len(self.terms) < len(TERMS) else ())}
         light = self.filtered.of(self.shading, self.light, self.light_rotation, scene, derivatives)
         if self.occluder is not None and not self.prepared:
             prepare(self.occluder, self.surfels.detach(), light, self.shading.accuracy)
             # No one is told when a light of the scene changes.
             self.prepared = self.light is not None or not self.shading.accuracy.ambient_rays
-        return render(
+        frame = render(
             Surfels(self.surfels.raw, screened=True),
             camera,
             self.shading,
@@ -289,6 +289,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             surroundings=self.around.splatted(self.surfels),
             derivatives=derivatives,
         )
+        return frame.only(asked)
 
     def to_string(self) -> str:
         size = "x".join(str(x) for x in self.light.raw.shape[:2]) if self.light is not None else "the scene's"

@@ -3,9 +3,8 @@
     shade at surfels:  attributes ─ shade ─► radiance channel ─ blend ─► image
     shade at pixels:   attributes ─ blend ─► G-buffer ─ shade ─► image
 
-The same `splat` and the same `shade` serve both. Everything is traced by Dr.Jit; the derivatives that are
-absent on purpose are those of `splat.blend`, the visibility, the side to which a normal is turned, and the
-camera.
+The same `splat` and the same `shade` serve both. Everything is traced by Dr.Jit; derivatives are left out of
+visibility, the side to which a normal is turned, the camera, and those that `splat.blend` lists.
 """
 
 from __future__ import annotations
@@ -50,7 +49,18 @@ class Frame:
     maps: dict[str, Any] = field(default_factory=dict)  # by channel (such as albedo), visibility, where known
     background: Any = None  # mi.Color3f: linear, seen through 1 - alpha; only with surroundings
     share: Any = None  # opacity of the object alone, where it is known and not alpha
+    distance: Any = None  # along the ray from the near plane, mean of several samples; None of one
     own_normal: bool = False  # `normal` is of the object alone, and premultiplied by `share`
+
+    def only(self, asked: Collection[str]) -> Frame:
+        """The same frame without depth, normal, terms and maps that are not asked for by name."""
+        return replace(
+            self,
+            depth=self.depth if "depth" in asked else None,
+            normal=self.normal if "normal" in asked else None,
+            terms=self.terms if {*TERMS}.intersection(asked) else None,
+            maps={name: value for name, value in self.maps.items() if name in asked},
+        )
 
 
 def render(
@@ -92,7 +102,7 @@ def render(
     scene = _Scene(surfels, camera, shading, light, occluder, seen, attributes, shift, around, asked, alone)
     frame, buffer = _shade_at_surfels(scene) if shading.at == "surfel" else _shade_at_pixels(scene)
     if not derivatives:
-        frame = _only(frame, asked, buffer.places)
+        frame = _in_raster_order(frame.only(asked), buffer.places)
     return boundary(frame, "shade backward")
 
 
@@ -114,15 +124,7 @@ def _asked(surfels: Surfels, aovs: bool | Collection[str]) -> frozenset[str]:
     return frozenset(aovs)
 
 
-def _only(frame: Frame, asked: frozenset[str], places: Places | None) -> Frame:
-    """A frame with nothing that is not asked for, in raster order."""
-    frame = replace(
-        frame,
-        depth=frame.depth if "depth" in asked else None,
-        normal=frame.normal if "normal" in asked else None,
-        terms=frame.terms if asked & {*TERMS} else None,
-        maps={name: value for name, value in frame.maps.items() if name in asked},
-    )
+def _in_raster_order(frame: Frame, places: Places | None) -> Frame:
     if places is None:
         return frame
     dr.eval(frame.alpha, frame.depth, frame.normal, frame.radiance, frame.terms, frame.maps, frame.share)
