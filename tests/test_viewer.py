@@ -24,6 +24,7 @@ from mi_refgs.evaluation.pictures import planes
 from mi_refgs.exr import read_exr_image
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.read import load
+from mi_refgs.render import passes
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import TrainedScene, export
@@ -31,7 +32,7 @@ from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer import fine, quality
+from mi_refgs.viewer import quality
 from mi_refgs.viewer.compare import AROUND, GAP, side_by_side
 from mi_refgs.viewer.controls.light import light_of
 from mi_refgs.viewer.controls.saving import write_view
@@ -542,14 +543,15 @@ def test_views_are_saved_under_the_next_number_with_their_camera(scene: TrainedS
     assert view.alpha is not None and np.abs(view.alpha - wanted).max() < 0.51 / 255
 
 
-@pytest.mark.parametrize("strip", [fine.STRIP, 2000])
+@pytest.mark.parametrize("samples", [passes.PASS_SAMPLES, 2000])
 def test_a_saved_picture_is_that_of_sixteen_samples(
-    scene: TrainedScene, strip: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: TrainedScene, samples: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whole, and in strips of four rows."""
-    monkeypatch.setattr(fine, "STRIP", strip)
+    """Whole, and in passes of two rows."""
+    monkeypatch.setattr(passes, "PASS_SAMPLES", samples)
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6)
     path = write_view(Fitted(scene), pose, (32, 20), Look(), tmp_path, ".exr")
+    monkeypatch.setattr(passes, "PASS_SAMPLES", 1 << 20)
     frame = scene.renderer(aovs=False, samples=16)(pose.camera(32, 20))
     assert np.abs(read_exr_image(path) - planes([*frame.radiance, frame.alpha], 20, 32)).max() < 1e-5
 

@@ -1,19 +1,21 @@
-"""Channels of a picture are sampled, filtered and developed by a sensor's film.
+"""Channels of an image are sampled, filtered and developed by a sensor's film.
 
 No Mitsuba class is defined here, so that this module need not be reloaded when the variant changes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
+from mi_refgs.render.passes import DERIVATIVE_SAMPLES, Band, bands
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.render.samples import supersampled
+from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.splat.camera import Camera
 
 Channels = Callable[[Frame, Camera, bool], list[Any]]
@@ -21,24 +23,137 @@ Channels = Callable[[Frame, Camera, bool], list[Any]]
 alpha: R, G, B, (A), the weight and the AOVs, as the film's blocks have them."""
 
 
-def through_film(
-    sensor: Any, spp: int, view: Callable[[Camera], Frame], channels: Channels, aovs: list[str]
-) -> Any:
-    """The image (h, w, c) of a `view`, sampled, filtered and developed for a sensor; under AD.
+@dataclass(frozen=True)
+class Picture:
+    """The image of a `view` through a sensor's film, and its derivatives in both modes, in passes.
 
     A sample count n (`spp`, or 0 for that of the sampler) gives k × k regular samples per pixel, k = ⌈√n⌉,
     averaged as by `render.samples`. `aovs` names the channels beyond the weight. Raises InputError for a film
     of another kind.
     """
-    film = sensor.film()
-    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        raise InputError("refgs: film: refgs renders RGB radiance only; use an `hdrfilm`")
-    camera = Camera.from_sensor(sensor)
-    frame = supersampled(view, camera, max(1, int(spp) or int(sensor.sampler().sample_count())))
-    made = channels(frame, camera, mi.has_flag(film.flags(), mi.FilmFlags.Alpha))
-    pixels = dr.zeros(mi.Float, camera.width * camera.height)
-    values = dr.ravel(mi.ArrayXf([channel + pixels for channel in made]))
-    tensor = mi.TensorXf(values, (camera.height, camera.width, len(made)))
-    film.prepare(aovs)
-    film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
-    return film.develop()
+
+    sensor: Any
+    spp: int
+    view: Callable[[Camera], Frame]
+    channels: Channels
+    aovs: list[str]
+    neighbours: int  # see `Shading`
+
+    def __post_init__(self) -> None:
+        if mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
+            raise InputError("refgs: film: refgs renders RGB radiance only; use an `hdrfilm`")
+
+    @property
+    def film(self) -> Any:
+        """The sensor's film."""
+        return self.sensor.film()
+
+    def image(self) -> Any:
+        """The image (h, w, c), without derivatives."""
+        parts = []
+        for band in self._bands(None):
+            parts.append(self._values(band))
+            if band.rows < self._size[0]:
+                dr.eval(parts[-1])
+        return self._developed(dr.concat(parts) if len(parts) > 1 else parts[0])
+
+    def adjoints(self, δ_image: Any) -> Iterator[tuple[Any, Any]]:
+        """Values of one pass after the other, attached to the parameters, and their adjoints.
+
+        They add up to the adjoint of the image. Hold no reference to the values when asking for the next.
+        """
+        found = self._bands(DERIVATIVE_SAMPLES)
+        if len(found) == 1:
+            yield self._developed(self._values(found[0])), δ_image
+            return
+        δ_values = self._through_film(lambda image, values: _pulled(image, values, δ_image))
+        at = 0
+        for band in found:
+            δ = self._rows(δ_values, at, band.rows)
+            at += band.rows
+            yield self._values(band), δ
+
+    def tangent(self) -> Any:
+        """Tangent of the image for the tangents of the parameters."""
+        found = self._bands(DERIVATIVE_SAMPLES)
+        if len(found) == 1:
+            image = self._developed(self._values(found[0]))
+            dr.forward_to(image)
+            return dr.grad(image)
+        parts = []
+        for band in found:
+            values = self._values(band)
+            dr.forward_to(values, flags=dr.ADFlag.ClearEdges)
+            parts.append(dr.grad(values))
+            dr.eval(parts[-1])
+            del values
+        tangent = dr.concat(parts)
+        return self._through_film(lambda image, values: _pushed(image, values, tangent))
+
+    # ---------------- passes ----------------
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        width, height = (int(x) for x in self.film.crop_size())
+        return height, width
+
+    @property
+    def _samples(self) -> int:
+        return max(1, int(self.spp) or int(self.sensor.sampler().sample_count()))
+
+    def _bands(self, most: int | None) -> list[Band]:
+        camera = Camera.from_sensor(self.sensor)
+        return bands(camera, samples_per_axis(self._samples), self.neighbours, most)
+
+    def _values(self, band: Band) -> Any:
+        """Channels of the pixels of a band (mi.Float), pixel by pixel; under AD."""
+        camera = band.camera
+        frame = supersampled(self.view, camera, self._samples)
+        made = self.channels(frame, camera, mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha))
+        pixels = dr.zeros(mi.Float, camera.width * camera.height)
+        return dr.ravel(mi.ArrayXf([band.kept(channel + pixels) for channel in made]))
+
+    def _rows(self, values: Any, first: int, rows: int) -> Any:
+        """The values of some rows."""
+        length = dr.width(values) // self._size[0]
+        index = dr.arange(mi.UInt32, rows * length) + dr.opaque(mi.UInt32, first * length)
+        return dr.gather(mi.Float, values, index)
+
+    # ---------------- the film ----------------
+
+    def _developed(self, values: Any) -> Any:
+        """What the film makes of the channels of all pixels; under AD."""
+        height, width = self._size
+        tensor = mi.TensorXf(values, (height, width, dr.width(values) // (height * width)))
+        self.film.prepare(self.aovs)
+        self.film.put_block(mi.ImageBlock(tensor, self.film.crop_offset()))
+        return self.film.develop()
+
+    def _through_film(self, derivative: Callable[[Any, Any], Any]) -> Any:
+        """A derivative of the developed image by the channels: the film is linear, so any values will do."""
+        shown = self.film.develop(True)
+        height, width = self._size
+        alpha = mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha)
+        count = (4 if alpha else 3) + 1 + len(self.aovs)
+        index = dr.arange(mi.UInt32, height * width * count) % count
+        values = dr.select(index == (4 if alpha else 3), mi.Float(1), 0)  # the weight, which it divides by
+        dr.enable_grad(values)
+        found = dr.detach(derivative(self._developed(values), values))
+        dr.eval(found)
+        self.film.prepare(self.aovs)  # what it has shown before
+        self.film.put_block(mi.ImageBlock(shown, self.film.crop_offset()))
+        return found
+
+
+def _pulled(image: Any, values: Any, δ_image: Any) -> Any:
+    dr.set_grad(image, δ_image)
+    dr.enqueue(dr.ADMode.Backward, image)
+    dr.traverse(dr.ADMode.Backward)
+    return dr.grad(values)
+
+
+def _pushed(image: Any, values: Any, tangent: Any) -> Any:
+    dr.set_grad(values, tangent)
+    dr.enqueue(dr.ADMode.Forward, values)
+    dr.traverse(dr.ADMode.Forward)
+    return dr.grad(image)

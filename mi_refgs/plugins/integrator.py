@@ -14,7 +14,7 @@ import mitsuba as mi
 from mi_refgs.errors import InputError
 from mi_refgs.plugins import require_supported_variant
 from mi_refgs.plugins.aovs import aov_values
-from mi_refgs.plugins.film import through_film
+from mi_refgs.plugins.film import Picture
 from mi_refgs.plugins.light import FilteredOnce
 from mi_refgs.plugins.properties import (
     read_aovs,
@@ -226,7 +226,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     ) -> Any:
         """The image (h, w, c) of a sensor; see the class for its channels."""
         self.unusable.look(self.around.values(self.surfels, self.light))
-        image = self._image(scene, sensor, spp, derivatives=False)
+        image = self._picture(scene, sensor, spp, derivatives=False).image()
         if evaluate:
             dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -234,31 +234,30 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
         """Tangent of the image for the tangents of the parameters."""
         with dr.resume_grad():
-            image = self._image(scene, sensor, spp)
-            dr.forward_to(image)
-            return dr.grad(image)
+            return self._picture(scene, sensor, spp).tangent()
 
     def render_backward(
         self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
     ) -> None:
         """Accumulate the adjoints of the parameters for the adjoint of the image."""
         with dr.resume_grad():
-            image = self._image(scene, sensor, spp)
-            dr.set_grad(image, grad_in)
-            dr.enqueue(dr.ADMode.Backward, image)
-            dr.traverse(dr.ADMode.Backward)
+            for image, δ in self._picture(scene, sensor, spp).adjoints(grad_in):
+                dr.set_grad(image, δ)
+                dr.enqueue(dr.ADMode.Backward, image)
+                dr.traverse(dr.ADMode.Backward)
+                del image, δ  # or the memory of a pass would be held through the next
 
     def sample(self, *args: Any, **kwargs: Any) -> Any:
         raise InputError("refgs: sample: renders whole images only; do not nest it, use its own `aovs`")
 
-    def _image(self, scene: Any, sensor: Any, spp: int, derivatives: bool = True) -> Any:
-        """Render under whatever AD scope is active, through the sensor's film."""
+    def _picture(self, scene: Any, sensor: Any, spp: int, derivatives: bool = True) -> Picture:
+        """The image through the sensor's film."""
         if mi.variant() != self.variant:
             made = f"made under {self.variant}, not {mi.variant()}"
             raise InputError(f"refgs: variant: {made}; load the scene again")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         view = partial(self._frame, scene, derivatives)
-        return through_film(sensor, spp, view, self._channels, self.aov_names())
+        return Picture(sensor, spp, view, self._channels, self.aov_names(), self.shading.neighbours)
 
     def _channels(self, frame: Frame, camera: Camera, alpha: bool) -> list[Any]:
         """R, G, B, (A), W and the AOVs, as the film's blocks have them."""

@@ -272,7 +272,7 @@ def _shade_at_pixels(scene: _Scene) -> tuple[Frame, GBuffer]:
     values = {name: buffer.divided(name) for name in slots if name != "normal"}
     normal = buffer.slots["normal"]
     pixel = None if buffer.places is None else buffer.places.raster
-    ray = camera.rays(pixel)
+    ray, index = camera.rays(pixel), camera.image_index(pixel)
     alpha = buffer.slots.get(OBJECT, buffer.alpha)
     attributes = {name: values[name] for name in scene.named}
     if shading.accuracy.antialias:
@@ -281,7 +281,7 @@ def _shade_at_pixels(scene: _Scene) -> tuple[Frame, GBuffer]:
     maps = {name: values[name] for name in scene.surfels.raw if name in values}
     if shading.occlusion:
         covered = dr.detach(alpha) > COVERAGE_FLOOR
-        meets = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered, pixel)
+        meets = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered, index)
         points = shading.model.trace(points, meets, shading)
         maps["visibility"] = points.visibility
     shaded = shade(points, scene.light, shading)

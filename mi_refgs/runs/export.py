@@ -29,8 +29,9 @@ from mi_refgs.files import read_json
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, render
-from mi_refgs.render.samples import supersampled
+from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.checkpoint import PARAMS, tensors
@@ -162,8 +163,11 @@ class TrainedScene:
                     derivatives=False,
                 )
 
+            def averaged(view: Camera) -> Frame:
+                return supersampled(once, view, samples, details=bool(aovs))
+
             with dr.suspend_grad():
-                return supersampled(once, camera, samples, details=bool(aovs))
+                return in_passes(averaged, camera, samples_per_axis(samples), self.shading.neighbours)
 
         return draw
 

@@ -104,6 +104,11 @@ class Shading:
         """Whether the model can trace visibility in this order."""
         return self.model.visibility == "own" or (self.model.visibility == "mirror" and self.at == "pixel")
 
+    @property
+    def neighbours(self) -> int:
+        """Pixels along each axis that a pixel's colour depends on."""
+        return int(self.accuracy.antialias)
+
     def light_of(self, environment: EnvironmentLight | None) -> Light | None:
         """The light as the model looks it up, under AD; None if there is none, or it asks for none."""
         if environment is None or self.model.light == "none":

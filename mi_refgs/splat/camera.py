@@ -36,6 +36,7 @@ class Camera:
     near: mi.Float  # scene units along the camera's z axis
     focal: float  # |fx| as a host number, which chooses the size of tiles
     offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film, whose tiles it keeps
+    first_row: Any = 0  # mi.UInt32, of a band of a larger image, whose random numbers it keeps
 
     @property
     def tile(self) -> tuple[int, int]:
@@ -208,6 +209,23 @@ class Camera:
         }
         return replace(self, width=size[0], height=size[1], focal=self.focal * x, offset=(0, 0), **scaled)
 
+    def band(self, first: int, height: int) -> Camera:
+        """The same view of so many rows of pixels from row `first`, which may lie outside the image.
+
+        Its kernels do not depend on `first`, if that is a multiple of PACKET_EDGE.
+        """
+        x, y = self.offset
+        row = self.first_row + dr.opaque(mi.UInt32, first % 2**32)
+        cy = self.cy - dr.opaque(mi.Float, first)
+        return replace(self, height=height, cy=cy, offset=(x, y + first), first_row=row)
+
+    def image_index(self, raster: Any = None) -> Any:
+        """Index in the whole image of pixels (None: of all) by that in a band; the same without a band."""
+        if isinstance(self.first_row, int):
+            return raster
+        index = dr.arange(mi.UInt32, self.width * self.height) if raster is None else raster
+        return index + self.first_row * self.width
+
     def supersampled(self, factor: int) -> Camera:
         """The same view with factor² pixels for each pixel."""
         if factor == 1:
@@ -222,4 +240,5 @@ class Camera:
             cy=self.cy * factor,
             focal=self.focal * factor,
             offset=(self.offset[0] * factor, self.offset[1] * factor),
+            first_row=self.first_row * factor,
         )

@@ -66,7 +66,7 @@ class Training:
 
     def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
         """See `Drawable`."""
-        return fine_planes(self.draw, pose, width, height, look)
+        return fine_planes(self.draw, pose, width, height, look, self.trainer.shading().neighbours)
 
 
 class Live(Bar):

@@ -1,0 +1,116 @@
+"""Images rendered in passes, bands of rows one after the other, so that memory does not grow with samples.
+
+A band keeps its place in the tiles of the whole image: its tiles have the same lists, and its pixels the same
+values. Bands are equally high, and their places are opaque, so that one set of kernels serves all of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.constants import PACKET_EDGE
+from mi_refgs.splat.camera import Camera
+
+PASS_SAMPLES = 1 << 22
+"""Samples of a pass: pixels times samples per pixel. A pass costs up to 0.3 kB of memory per sample; smaller
+passes project the surfels more often."""
+DERIVATIVE_SAMPLES = 1 << 20
+"""Samples of a pass with derivatives, which costs up to 3 kB per sample."""
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Band:
+    """Rows of an image that are rendered together."""
+
+    camera: Camera  # of the rows, and of `margin` neighbours on both sides
+    above: int  # rendered rows before the first row of the band
+    rows: int
+
+    def kept(self, value: Any) -> Any:
+        """Values of the band's own pixels, of an array of values of all pixels of `camera`, or of one."""
+        width = self.camera.width
+        if dr.width(value) == 1 or self.rows == self.camera.height:
+            return value
+        index = dr.arange(mi.UInt32, self.rows * width) + dr.opaque(mi.UInt32, self.above * width)
+        return dr.gather(type(value), value, index)
+
+
+def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = None) -> list[Band]:
+    """The bands of a camera's image for passes of at most so many samples, factor² per pixel.
+
+    `margin`: rows of neighbours that the values of a pixel depend on. Without one, the last band may reach
+    below the image, as high as the others. `most` is PASS_SAMPLES by default; a band has PACKET_EDGE rows of
+    samples at least.
+    """
+    most = PASS_SAMPLES if most is None else most
+    if camera.width * camera.height * factor**2 <= most:
+        return [Band(camera, 0, camera.height)]
+    step = PACKET_EDGE // math.gcd(PACKET_EDGE, factor)  # tiles of all bands begin at their first row
+    highest = max(most // (camera.width * factor**2) // step * step, step)
+    count = -(-camera.height // highest)
+    high = -(-camera.height // (count * step)) * step
+    found = []
+    for top in range(0, camera.height, high):
+        first, last = top - margin, top + high + margin
+        if margin:
+            first, last = max(first, 0), min(last, camera.height)
+        part = camera.band(first, last - first)
+        found.append(Band(part, top - first, min(high, camera.height - top)))
+    return found
+
+
+def in_passes(draw: Callable[[Camera], Result], camera: Camera, factor: int = 1, margin: int = 0) -> Result:
+    """What `draw` gives for a camera, drawn in the `bands` of its image; without derivatives.
+
+    `draw` returns arrays of one value per pixel or one in all, in lists, dictionaries and dataclasses. It
+    takes factor² samples per pixel.
+    """
+    found = bands(camera, factor, margin)
+    if len(found) == 1:
+        return draw(camera)
+    parts = []
+    for band in found:
+        arrays: list[Any] = []
+
+        def kept(value: Any, band: Band = band, arrays: list[Any] = arrays) -> Any:
+            arrays.append(band.kept(value))
+            return arrays[-1]
+
+        parts.append(_mapped(kept, draw(band.camera)))
+        dr.eval(arrays)  # or memory would hold the samples of all bands
+
+    def stacked(*values: Any) -> Any:
+        if all(dr.width(value) == 1 for value in values):
+            return values[0]
+        wide = [x + dr.zeros(type(x), b.rows * camera.width) for x, b in zip(values, found, strict=True)]
+        return dr.concat(wide)
+
+    return _mapped(stacked, *parts)
+
+
+def _mapped(function: Callable[..., Any], *trees: Any) -> Any:
+    """Trees of arrays (None and flags stay) as one of what a function makes of each of their leaves."""
+    first = trees[0]
+    if first is None or isinstance(first, bool):
+        return first
+    if isinstance(first, dict):
+        return {name: _mapped(function, *(tree[name] for tree in trees)) for name in first}
+    if isinstance(first, list):
+        return [_mapped(function, *parts) for parts in zip(*trees, strict=True)]
+    if dataclasses.is_dataclass(first) and not isinstance(first, type):
+        names = [field.name for field in dataclasses.fields(first)]
+        return replace(
+            first, **{name: _mapped(function, *(getattr(tree, name) for tree in trees)) for name in names}
+        )
+    if dr.depth_v(first) > 1:
+        return type(first)(*(_mapped(function, *parts) for parts in zip(*trees, strict=True)))
+    return function(*trees)
