@@ -6,15 +6,14 @@ may stand before or after `mi.set_variant`; it should stand before `import mitsu
 choose the LLVM. The names of `__all__` are what a user of Python needs; each module of theirs is imported
 when its first name is asked for, so that `import mi_refgs` stays quick.
 
-Raises:
-    ImportError: when neither a usable LLVM nor a CUDA device is there; the message says what to install.
+Without a usable LLVM the import warns (RuntimeWarning) and says what to install, unless there is a CUDA
+device. `mi.set_variant` to an LLVM variant then raises ImportError; if one is set already, the import does.
 """
 
 from __future__ import annotations
 
 import importlib
-import sys
-from pathlib import Path
+import warnings
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs import llvm
@@ -177,13 +176,9 @@ import mitsuba as mi  # noqa: E402
 
 from mi_refgs import plugins  # noqa: E402
 
-# The command must be able to start without LLVM, because `refgs doctor` says what is missing.
-_is_command = Path((getattr(sys, "argv", None) or [""])[0]).stem == "refgs" or (
-    sys.orig_argv[1:3] == ["-m", "mi_refgs"]
-)
-
-if _llvm_problem and not _is_command and not dr.has_backend(dr.JitBackend.CUDA):
-    raise ImportError(str(_llvm_problem))
+# A warning, not an error: `refgs doctor` must start, and it too begins with this import.
+if _llvm_problem and not dr.has_backend(dr.JitBackend.CUDA):
+    warnings.warn(str(_llvm_problem), RuntimeWarning, stacklevel=2)
 
 
 def _on_variant(old: str | None, new: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,12 @@ from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.formats import FORMATS, Format, Option, register, write
-from mi_refgs.formats.shots import shots_around
+from mi_refgs.formats.shots import shots_around, turntable_cameras
+from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
 from mi_refgs.source import Source
+from mi_refgs.surfels.table import Surfels
 
 
 @pytest.fixture
@@ -162,6 +165,28 @@ def test_a_run_without_data_has_cameras_around_its_surfels(
     (run / "model.json").unlink()
     assert main(["export", str(run)]) == 2
     assert "checkpoints: none yet" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+def test_a_stray_does_not_move_a_turntable(finished: Path, mesh: bool) -> None:
+    """One surfel, or one vertex, far out: the cameras look at what they looked at without it."""
+    import mitsuba as mi
+
+    trained = TrainedScene.read(finished)
+    position = trained.surfels.to_numpy()["position"]
+    if mesh:
+        trained = replace(trained, mesh=Mesh(position, np.zeros((0, 3), np.uint32), 0.1))
+    cameras = [shot.camera for shot in shots_around(trained.surfels)]
+    before = turntable_cameras(trained, cameras, 3)
+    far = position.copy()
+    far[0, 0] = 300
+    if mesh:
+        moved = replace(trained, mesh=Mesh(far, np.zeros((0, 3), np.uint32), 0.1))
+    else:
+        raw = trained.surfels.raw | {"position": mi.TensorXf(far)}
+        moved = replace(trained, surfels=Surfels(raw))
+    for camera, other in zip(before, turntable_cameras(moved, cameras, 3), strict=True):
+        np.testing.assert_allclose(other.pose()[:3, 3], camera.pose()[:3, 3], atol=0.1)
 
 
 def test_nothing_to_look_at_is_said(finished: Path) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
+from mi_refgs import llvm
 from mi_refgs.errors import InputError
 from mi_refgs.messages import say as say
 from mi_refgs.messages import warn as warn
@@ -140,7 +141,8 @@ def prepare(args: argparse.Namespace) -> None:
     try:
         mi.set_variant(variant)
     except ImportError as error:
-        raise UnusableError(f"{error} (`refgs doctor` says more)") from error
+        problem = llvm.problem() if variant.startswith("llvm") else None
+        raise UnusableError(f"{problem or error} (`refgs doctor` says more)") from error
     mi.set_log_level(mi.LogLevel.Warn)
 
 

@@ -2,7 +2,7 @@
 
 Letters: I rendered image, T target, A accumulated alpha, L linear radiance, N blended normal Σ w n (not
 unit). Every loss is a mi.Float of width 1, zero for a perfect image, and has finite gradients for finite
-input. Targets, weights and masks have no derivative. SSIM is in `fit.ssim`.
+input. Targets, weights and masks have no derivative. SSIM is in `fitting.ssim`.
 """
 
 from __future__ import annotations

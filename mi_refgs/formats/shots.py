@@ -26,12 +26,9 @@ INSIDE = 0.98
 
 def shots_around(surfels: Surfels) -> list[Shot]:
     """Cameras on a sphere that look at the surfels' middle from 10° below to 70° above its equator, z up."""
-    raw = surfels.to_numpy()
-    if not len(raw["position"]):
-        raise InputError("surfels: there are none; cameras have nothing to look at")
-    weight = 1 / (1 + np.exp(-raw["opacity"][:, 0].astype(np.float64)))
-    middle = np.array([_quantile(axis, weight, 0.5) for axis in raw["position"].T.astype(np.float64)])
-    reach = _quantile(np.linalg.norm(raw["position"] - middle, axis=1), weight, INSIDE)
+    position, weight = _weighted(surfels)
+    middle = np.array([_quantile(axis, weight, 0.5) for axis in position.T])
+    reach = _quantile(np.linalg.norm(position - middle, axis=1), weight, INSIDE)
     radius = max(reach, 1e-6) * 1.1
     distance = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
     focal = SIZE / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
@@ -55,13 +52,13 @@ def turntable_cameras(
 ) -> list[Camera]:
     """Cameras on a circle around the object, z up, like `cameras` in distance and (median) height.
 
-    They have the first one's lens. The object is what lies in the `region`; without one, all of the scene.
+    They have the first one's lens. The object is what lies in the `region`; without one, all of the scene but
+    strays: the box of INSIDE of the surfels by opacity, or of the mesh's vertices.
     """
     if region is not None:
         centre = np.array(region.centre)
     else:
-        position = scene.surfels.position().numpy().T if scene.mesh is None else scene.mesh.vertices
-        centre = (position.min(axis=0) + position.max(axis=0)).astype(np.float64) / 2
+        centre = _middle(scene)
     offset = np.array([camera.pose()[:3, 3] for camera in cameras]) - centre
     distance = float(np.median(np.linalg.norm(offset, axis=1)))
     height = float(np.median(offset[:, 2] / np.linalg.norm(offset, axis=1)))
@@ -70,6 +67,24 @@ def turntable_cameras(
     ring = math.sqrt(1 - height**2)
     outward = np.stack([ring * np.cos(angle), ring * np.sin(angle), np.full(count, height)], axis=1)
     return [cameras[0].moved(pose) for pose in poses_around(outward, centre, distance)]
+
+
+def _middle(scene: TrainedScene) -> np.ndarray:
+    """The middle (3,) of the box that holds all of a scene but strays."""
+    if scene.mesh is None:
+        position, weight = _weighted(scene.surfels)
+    else:
+        position, weight = scene.mesh.vertices.astype(np.float64), np.ones(len(scene.mesh.vertices))
+    low, high = ([_quantile(axis, weight, share) for axis in position.T] for share in (1 - INSIDE, INSIDE))
+    return (np.array(low) + np.array(high)) / 2
+
+
+def _weighted(surfels: Surfels) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 3) and opacities (N,), float64; raises InputError where there are none."""
+    raw = surfels.to_numpy()
+    if not len(raw["position"]):
+        raise InputError("surfels: there are none; cameras have nothing to look at")
+    return raw["position"].astype(np.float64), 1 / (1 + np.exp(-raw["opacity"][:, 0].astype(np.float64)))
 
 
 def _quantile(values: np.ndarray, weight: np.ndarray, share: float) -> float:

@@ -72,7 +72,7 @@ def relight(
     the mesh's shadows and bounces; mirrors are traced. The views are the test views of the run's data set,
     or of `data`; with `turntable`, so many cameras on a circle around the object instead. Without a data set
     both are of cameras around the object (`Source.shots`). If the data set has the truth under this light
-    (`light.truth_under`), the test views are compared with it.
+    (`truth_under`), the test views are compared with it.
 
     Raises InputError for a run without light or materials, a light or a data set that cannot be read, and a
     folder that holds a run or cannot be written.

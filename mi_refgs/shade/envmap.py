@@ -1,8 +1,8 @@
 """The environment light: learnable lat-long radiance, its prefiltered levels, and lookups for shading.
 
 Directions follow Mitsuba's `envmap`: up is +y, φ = atan2(x, -z) runs along a row, θ from +y down the rows;
-column centres at half-integers, the first and the last row at the poles (see `lobe`). Images go in and out
-unturned.
+column centres at half-integers, the first and the last row at the poles (see `lobe_matrices`). Images go in and
+out unturned.
 
 Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that
 an optimiser's step bounds the change of radiance; an exponential would let one step multiply a highlight.

@@ -18,7 +18,7 @@ import numpy as np
 from mi_refgs.device import upload
 
 BLOCK = 4
-"""RowLayout that need as many frequencies as each other: `mixing` makes them in one lane."""
+"""Rows that need as many frequencies as each other: `mixing` computes them in one lane."""
 
 COEFFICIENT = 8
 """Floats a coefficient, and TEXEL floats a texel: powers of two, as packets are."""

@@ -1,4 +1,4 @@
-"""The GGX prefilter in Dr.Jit: three gather-only kernels each way, for the matrices that `lobe` builds.
+"""The GGX prefilter in Dr.Jit: three gather-only kernels each way, for the matrices of `lobe_matrices`.
 
     radiance ─ analyse ─► Fourier rows ─ mix rows ─► Fourier rows of every level ─ synthesise ─► levels
     δradiance ◄ synthesise ─ Fourier rows ◄ mix rows (transposed) ─ Fourier rows ◄ analyse ─ δlevels
