@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import check_size, replace_file, require_file
+from mi_refgs.files import check_size, replace_file, require_file, strip_rows
 
 EXR_MAGIC = b"\x76\x2f\x31\x01"
 """First bytes of every EXR file."""
@@ -42,25 +42,71 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     return _read_exr(Path(path))[0]
 
 
-def read_exr_image(path: str | Path) -> np.ndarray:
-    """EXR file as float32 (H, W, C): R, G, B, A; R, G, B; X, Y, Z; Y, A; or a single channel.
+def read_exr_image(path: str | Path, vectors: bool = False) -> np.ndarray:
+    """EXR file as float32 (H, W, C): R, G, B, A; R, G, B; Y, A; or a single channel.
 
-    Raises InputError as `read_exr` does, if the file has none of these sets of channels, and for colours in
-    other primaries than those of linear sRGB.
+    `vectors`: X, Y, Z, too, which are no colours. Raises InputError as `read_exr` does, if the file has none
+    of these sets of channels, and for colours in other primaries than those of linear sRGB.
     """
     channels, header = _read_exr(Path(path))
+    names = _chosen(Path(path), channels.keys(), header, vectors)
+    return np.stack([channels[name] for name in names], axis=-1)
+
+
+def _chosen(path: Path, channels: Collection[str], header: Mapping[str, Any], vectors: bool) -> list[str]:
+    """The channels of an image by their names, in order; raises InputError as `read_exr_image` does."""
     primaries = header.get("chromaticities", SRGB_CHROMATICITIES)
     if "R" in channels and not np.allclose(primaries, SRGB_CHROMATICITIES, atol=CHROMATICITY_TOLERANCE):
         raise InputError(f"{path}: chromaticities: not those of sRGB; convert the image to linear sRGB")
-    for names in ("RGBA", "RGB", "XYZ", "YA"):
-        if set(names) <= channels.keys():
-            return np.stack([channels[name] for name in names], axis=-1)
+    for names in ("RGBA", "RGB", *(("XYZ",) if vectors else ()), "YA"):
+        if set(names) <= set(channels):
+            return list(names)
     if len(channels) == 1:
-        return next(iter(channels.values()))[..., None]
-    found = ", ".join(sorted(channels))
+        return list(channels)
+    found, wanted = ", ".join(sorted(channels)), "X, Y, Z, " if vectors else ""
     raise InputError(
-        f"{path}: channels: found {found}; export R, G, B (and A), X, Y, Z, or one channel (and A)"
+        f"{path}: channels: found {found}; export R, G, B (and A), {wanted}or one channel (and A)"
     )
+
+
+def exr_strips(path: Path) -> tuple[tuple[int, int], Iterator[np.ndarray]]:
+    """Height and width of an EXR file, and its rows from the top in linear float32 (n, W, 3).
+
+    One channel, with or without alpha, is grey. Raises InputError as `read_exr_image` does, but leaves NaN
+    and infinite values to the caller; the strips raise it where they are broken.
+    """
+    import OpenEXR
+
+    width, height = exr_size(path)
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            header, found = dict(file.header()), file.header()["channels"]
+    except Exception as error:  # the binding raises RuntimeError, TypeError or its own types
+        raise _unreadable(path, error) from error
+    names = _chosen(path, [channel.name for channel in found], header, False)
+    return (height, width), _strips(path, names[:3] if len(names) > 2 else names[:1], width, height)
+
+
+def _strips(path: Path, names: list[str], width: int, height: int) -> Iterator[np.ndarray]:
+    """Rows of three channels, or of one as three."""
+    import Imath
+    import OpenEXR
+
+    kind, step = Imath.PixelType(Imath.PixelType.FLOAT), strip_rows(width)
+    try:
+        file = OpenEXR.InputFile(str(path))  # `OpenEXR.File` reads all rows
+        first = file.header()["dataWindow"].min.y
+        for top in range(0, height, step):
+            count = min(step, height - top)
+            rows = file.channels(names, kind, first + top, first + top + count - 1)
+            planes = [np.frombuffer(row, np.float32).reshape(count, width) for row in rows]
+            yield np.stack(planes * (3 // len(planes)), axis=-1)
+    except Exception as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path}: pixels: not a readable EXR file ({error}); export it again")
 
 
 def exr_size(path: Path) -> tuple[int, int]:
@@ -109,7 +155,7 @@ def _read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             channels = {name: np.array(c.pixels, dtype=np.float32) for name, c in file.channels().items()}
             header = dict(file.header())
     except Exception as error:  # the binding raises RuntimeError, TypeError or its own types
-        raise InputError(f"{path}: pixels: not a readable EXR file ({error}); export it again") from error
+        raise _unreadable(path, error) from error
     for name, pixels in channels.items():
         bad = np.argwhere(~np.isfinite(pixels))
         if len(bad):

@@ -20,6 +20,12 @@ ANY_FILE = 2**24
 """Bytes of pixels that any file may promise."""
 MAX_EXPANSION = 1100
 """Bytes of pixels that a byte of a larger file may promise: DEFLATE cannot expand by more than 1,032."""
+MAX_PIXELS = 2**28
+"""Pixels of an image file at most: twice those of a 16K panorama, and more than any camera has."""
+STRIP_PIXELS = 2**22
+"""Pixels of a large image that are floating-point numbers at a time: 50 MB of three channels."""
+STRIP_ROWS = 256
+"""Rows of such a strip at most: those of the largest block in which EXR files are compressed (DWAB)."""
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
@@ -120,9 +126,22 @@ def require_file(path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:
-    """Raise InputError for a size that no file of this length can hold, before memory is asked for."""
+    """Raise InputError for a size beyond MAX_PIXELS, and for one that no file of this length can hold.
+
+    Readers call it with what the header says, before they ask for memory.
+    """
+    if width * height > MAX_PIXELS:
+        raise InputError(
+            f"{path}: size: {width} × {height} pixels are more than {MAX_PIXELS // 10**6} million; save a "
+            "smaller copy"
+        )
     promised = width * height * bytes_per_pixel
     if promised > max(ANY_FILE, MAX_EXPANSION * path.stat().st_size):
         raise InputError(
             f"{path}: size: {width} × {height} pixels are more than the file can hold; export it again"
         )
+
+
+def strip_rows(width: int) -> int:
+    """Rows of an image of this width that are read at a time."""
+    return max(1, min(STRIP_ROWS, STRIP_PIXELS // width))

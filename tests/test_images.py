@@ -27,7 +27,9 @@ def test_srgb_curve() -> None:
 def test_exr_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
     image = rng.normal(size=(5, 7, 3)).astype(np.float32)
     write_exr(tmp_path / "a.exr", image, names="XYZ")
-    np.testing.assert_array_equal(read_exr_image(tmp_path / "a.exr"), image)
+    np.testing.assert_array_equal(read_exr_image(tmp_path / "a.exr", vectors=True), image)
+    with pytest.raises(InputError, match=r"a\.exr: channels: found X, Y, Z; export R, G, B"):
+        read_exr_image(tmp_path / "a.exr")
     write_exr(tmp_path / "a.exr", image[..., 0], half=True)
     np.testing.assert_allclose(read_exr(tmp_path / "a.exr")["Y"], image[..., 0], rtol=1e-3)
     write_exr(tmp_path / "b.exr", image[..., :2], names="UV")

@@ -110,7 +110,7 @@ class FrameReader:
         file = self._path(index, frame, key)
         if file is None:
             return None
-        pixels = read_exr_image(file)
+        pixels = read_exr_image(file, vectors=True)
         if pixels.shape != expected:
             raise InputError(
                 f"{file}: frames[{index}].{key}: has shape {pixels.shape} but the picture needs {expected}; "

@@ -14,7 +14,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.exr import mitsuba_exr
 from mi_refgs.files import require_file
-from mi_refgs.shade.envmap import read_radiance
+from mi_refgs.shade.light_file import read_radiance
 
 Z_UP = (1, 0, 0), 90.0
 """Axis and angle in degrees that turn the y of a lat-long map to z: for scenes without an `envmap`."""
@@ -86,7 +86,7 @@ def under_light(scene: Any, light: Path) -> Any:
         params = mi.traverse(environment)
         if "data" in params and "to_world" in params:
             turned = mi.ScalarTransform4f(np.array(params["to_world"].matrix, np.float64).reshape(4, 4))
-    radiance = np.ascontiguousarray(read_radiance(light), dtype=np.float32)
+    radiance = read_radiance(light)
     lamps = [
         emitter
         for emitter in scene.emitters()

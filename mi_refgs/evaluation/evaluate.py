@@ -16,7 +16,6 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation import decomposition, metrics, pictures
 from mi_refgs.evaluation.speed import machine, milliseconds
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
-from mi_refgs.exr import read_exr_image
 from mi_refgs.files import read_json
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
 from mi_refgs.fitting.whole import of_run, read_views
@@ -26,6 +25,7 @@ from mi_refgs.progress_bar import with_bar
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import TrainedScene, up_to_date
 from mi_refgs.runs.run import DATASET, Run
+from mi_refgs.shade.light_file import read_radiance
 
 FOLDER = "eval"
 SHEET = "contact_sheet.png"
@@ -213,7 +213,7 @@ def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[st
     light = np.array(tensor, dtype=np.float32).reshape(tensor.shape)
     if data.environment is None:
         return nothing | {"env_reason": "the data set has no environment.exr"}, pictures.lights(light)
-    truth = read_exr_image(data.environment)[..., :3]
+    truth = read_radiance(data.environment, len(light))
     return metrics.environment(light, truth) | {"env_reason": None}, pictures.lights(light, truth)
 
 

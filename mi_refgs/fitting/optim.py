@@ -4,9 +4,9 @@ Letters: θ parameter, g gradient, m v first and second moment, t step count of 
     m ← β₁ m + (1 - β₁) g,   v ← β₂ v + (1 - β₂) g²,   θ ← θ - η √(1 - β₂ᵗ) / (1 - β₁ᵗ) · m / (√v + ε)
 [Kingma and Ba 2015, §2, the efficient order].
 
-Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing (`fitting.skips`). And |g| is
-cut to OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor,
-whichever is more, and to RAW_LIMIT, whose square float32 holds. A step is at most (1 - β₁) / √(1 - β₂) = 3.2
+Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing (`fitting.skips`). And |g|
+is cut to OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor, whichever is
+more, and to RAW_LIMIT, whose square float32 holds. A step is at most (1 - β₁) / √(1 - β₂) = 3.2
 η long however large g is, so the cut shortens the one in hand by less than 5 %. What it bounds is the memory
 of v: after one gradient of 10¹⁰, an entry of usual gradients 10⁻⁷ would not move for 2 ln(10¹⁷ √(1 - β₂)) /
 (1 - β₂) = 71,000 steps; cut, it moves 3.3 times slower, or ten times if it happens in the first hundred

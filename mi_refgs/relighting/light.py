@@ -13,15 +13,18 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from mi_refgs.data.pathtrace import environment_image
+from mi_refgs.data.pathtrace import ENVIRONMENT_OVERSAMPLING, environment_image
 from mi_refgs.data.scene_file import Z_UP
 from mi_refgs.data.settings import RELIGHT, recorded_lights
 from mi_refgs.errors import InputError
 from mi_refgs.files import require_file
-from mi_refgs.shade.envmap import EnvironmentLight, read_radiance
+from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light_file import read_radiance
 
 HEIGHT = 256
 """Rows of a light, at most: a texel is 0.7°, an eighth of the lobe of roughness 0.1."""
+READ_ROWS = ENVIRONMENT_OVERSAMPLING * HEIGHT
+"""Rows to which a larger map is averaged first: turned, it is sampled at as many."""
 EXPOSURE_MAX = 10.0
 """Stops; a light keeps no radiance below 1e-4, so that a much darker one would be grey."""
 
@@ -48,7 +51,7 @@ class NewLight:
 
     def read(self) -> EnvironmentLight:
         """The light, of at most HEIGHT rows; raises InputError for a file that is no lat-long image."""
-        return world_light(read_radiance(self.path), self.world, self.rotate, self.exposure)
+        return world_light(read_radiance(self.path, READ_ROWS), self.world, self.rotate, self.exposure)
 
 
 def _require_range(field: str, rotate: float, exposure: float) -> None:

@@ -1,7 +1,7 @@
 """The environment light: learnable lat-long radiance, its prefiltered levels, and lookups for shading.
 
 Directions follow Mitsuba's `envmap`: up is +y, φ = atan2(x, -z) runs along a row, θ from +y down the rows;
-column centres at half-integers, the first and the last row at the poles (see `lobe_matrices`). Images go in and
+column centres at half-integers, the first and the last row at the poles (`lobe_matrices`). Images go in and
 out unturned.
 
 Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that
@@ -25,10 +25,9 @@ import numpy as np
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
-from mi_refgs.exr import EXR_MAGIC, read_exr_image, write_exr
-from mi_refgs.hdr import read_hdr
-from mi_refgs.images import linear_from_srgb, read_png
+from mi_refgs.exr import write_exr
 from mi_refgs.shade import lobe_matrices
+from mi_refgs.shade.light_file import read_radiance
 from mi_refgs.shade.lobe_matrices import LEVELS, Levels
 from mi_refgs.shade.positive import bounded, nearest_raw, softplus
 from mi_refgs.shade.prefilter import Operator, prefilter
@@ -40,6 +39,9 @@ mirror."""
 
 MIN_HEIGHT = 8
 """Fewest rows for which the prefilter's symmetries hold."""
+
+FINEST = 1024
+"""Most rows of a light that is read from a file without saying how many: 0.2° per texel."""
 
 RADIANCE_FLOOR = 1e-4
 """Darkest radiance that an import keeps: softplus has no finite raw value for 0."""
@@ -199,10 +201,10 @@ class EnvironmentLight:
     def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:
         """Read a lat-long image (EXR, HDR) and resample it to `height` rows, keeping its energy.
 
-        Without `height`: the image's own rows, to the next lower multiple of 4. Raises InputError when it is
-        no such image.
+        Without `height`: the image's own rows, to the next lower multiple of 4, and FINEST at most. Raises
+        InputError as `read_radiance` does.
         """
-        image = read_radiance(path)
+        image = read_radiance(path, height or FINEST)
         rows = height if height is not None else max(MIN_HEIGHT, image.shape[0] // 4 * 4)
         return cls.from_radiance(lobe_matrices.resample(image, rows))
 
@@ -240,35 +242,3 @@ class EnvironmentLight:
         with suppress(OSError):  # a folder that cannot be made cannot be written to either
             path.parent.mkdir(parents=True, exist_ok=True)
         write_exr(path, self.radiance().numpy())
-
-
-def read_radiance(path: str | os.PathLike[str]) -> np.ndarray:
-    """Linear radiance (H, W, 3), at least 0, of a lat-long EXR, HDR, PNG or JPEG file.
-
-    Raises InputError when it is no such image.
-    """
-    image = _read_image(Path(path))
-    if image.ndim != 3 or min(image.shape[:2]) < 2:
-        raise InputError(
-            f"{path}: environment: {image.shape} is no lat-long image; give one of at least 2 × 2 texels"
-        )
-    if not np.isfinite(image).all():
-        raise InputError(f"{path}: environment: holds NaN or infinity; replace those texels")
-    return np.maximum(image, 0)
-
-
-def _read_image(path: Path) -> np.ndarray:
-    """Linear radiance (H, W, 3) of an EXR, Radiance (.hdr), PNG or JPEG file, by its first bytes."""
-    try:
-        with path.open("rb") as file:
-            first = file.read(4)
-    except OSError as error:
-        raise InputError(
-            f"{path}: environment: cannot be read ({error.strerror}); give an EXR or HDR file"
-        ) from error
-    if first[:2] == b"#?":
-        return read_hdr(path)
-    if first != EXR_MAGIC:
-        return linear_from_srgb(read_png(path)[..., :3])
-    image = read_exr_image(path)
-    return image[..., :3] if image.shape[-1] > 1 else np.repeat(image, 3, axis=-1)

@@ -15,6 +15,7 @@ function.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -113,6 +114,29 @@ def column_resampling(w_in: int, w_out: int) -> np.ndarray:
     Δ = np.abs(column_angles(w_out)[:, None] - column_angles(w_in)[None])
     hat = np.maximum(0, 1 - np.minimum(Δ, 2 * np.pi - Δ) / step)
     return hat / hat.sum(1, keepdims=True)
+
+
+def hat_rows(count: int, fewer: int, periodic: bool = False) -> Any:
+    """`row_resampling(count, fewer)`, or of columns if `periodic`, sparse (fewer, count) float32."""
+    from scipy.sparse import csr_matrix
+
+    last = 0 if periodic else 1  # rows stand on both ends of their interval, columns do not
+    ratio = (count - last) / (fewer - last)
+    offset = 0.5 * (ratio - 1) if periodic else 0.0
+    centre = ratio * np.arange(fewer) + offset  # in steps of the finer grid
+    index = np.round(centre).astype(int)[:, None] + np.arange(-int(ratio) - 1, int(ratio) + 2)
+    weight = np.maximum(0, 1 - np.abs(centre[:, None] - index) / ratio)
+    if periodic:
+        index %= count
+    else:
+        weight[(index < 0) | (index >= count)] = 0
+        index = np.clip(index, 0, count - 1)
+        weight *= row_areas(count)[index]
+    weight /= weight.sum(axis=1, keepdims=True)
+    row = np.repeat(np.arange(fewer), index.shape[1])
+    matrix = csr_matrix((weight.ravel().astype(np.float32), (row, index.ravel())), shape=(fewer, count))
+    matrix.eliminate_zeros()
+    return matrix
 
 
 def resample(radiance: np.ndarray, height: int) -> np.ndarray:
