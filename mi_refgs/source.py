@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -78,9 +79,23 @@ class Source:
         if not self.is_there:
             return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
         with undecoded():
-            return [
-                Shot(view.name, split, view.camera()) for split in splits for view in self.views(split).views
-            ]
+            return [shot for split in splits for shot in self._shots_of(split)]
+
+    def _shots_of(self, split: str) -> list[Shot]:
+        """Those of one split, with the files of the pictures as they are on disk."""
+        assert self.data is not None
+        views = originals = read_views(self.method, self.data, split, truth=False).views
+        if (self.method.data.downscale or 1) > 1:
+            whole = replace(self.method, data=replace(self.method.data, downscale=1))
+            originals = read_views(whole, self.data, split, truth=False).views
+        shots = []
+        for view, original in zip(views, originals, strict=True):
+            file = original.file
+            if file is not None:
+                mask = None if file.mask is None else Path(os.path.relpath(file.mask, self.data))
+                file = replace(file, path=Path(os.path.relpath(file.path, self.data)), mask=mask)
+            shots.append(Shot(view.name, split, view.camera(), file))
+        return shots
 
     def turntable(self, trained: TrainedScene, count: int) -> list[Camera]:
         """Cameras on a circle around the object, z up, like the test views in lens, distance and height.

@@ -216,6 +216,24 @@ def test_llff(factor: int, tmp_path: Path) -> None:
     assert fitting_downscale(data, "png", 2000) == (2, 96, 72)
 
 
+def test_llff_masks(tmp_path: Path) -> None:
+    """Of the whole pictures, so that smaller copies are left alone; all pictures have one, or none."""
+    data = llff(tmp_path)
+    for folder in ("images_2", "masks"):
+        (data / folder).mkdir()
+    mask = np.zeros((72, 96, 3))
+    mask[36:] = 1
+    for path in (data / "images").iterdir():
+        write_png(data / "images_2" / path.name, box_downscale(read_png(path), 2))
+        write_png(data / "masks" / path.name, mask)
+    view = read_dataset(data, "train", downscale=2, background="black").views[0]
+    assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
+    assert not view.image[:18].any() and view.image[18:].any()
+    (data / "masks/c.png").unlink()
+    with pytest.raises(InputError, match=r"masks/c\.png\.png: mask: missing"):
+        read_dataset(data, "train")
+
+
 def saved(folder: Path, array: Any) -> None:
     np.save(folder / "poses_bounds.npy", array, allow_pickle=True)
 

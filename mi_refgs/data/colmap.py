@@ -14,18 +14,17 @@ import numpy as np
 
 from mi_refgs.data.colmap_model import Camera, Image, Points, read_cameras, read_images, read_points
 from mi_refgs.data.picture_files import Mask, PictureFile, make_view
-from mi_refgs.data.picture_folders import PictureFolders
+from mi_refgs.data.picture_folders import PictureFolders, mask_file, mask_folder
 from mi_refgs.data.poses import from_world_to_camera
 from mi_refgs.data.readers import PointCloud, ReadOptions, Recording, held_out
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.files import inside, is_file
+from mi_refgs.files import is_file
 from mi_refgs.images import image_size, linear_from_srgb
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 """Where a reconstruction may lie, in the order in which they are tried."""
 ENDINGS = ("bin", "txt")
-MASKS = "masks"
 TEST_LIST = "test.txt"
 MIN_VIEWS, MAX_ERROR = 3, 2.0
 """A point that two pictures show lies anywhere along a line for a single wrong match; errors beyond 2 pixels
@@ -69,7 +68,7 @@ class Reconstruction:
         self.images = read_images(self.source)
         self.point_file = model / f"points3D.{ending}"
         self.pictures = PictureFolders.of(folder, flat=True)
-        self.masks = folder / MASKS if (folder / MASKS).is_dir() else None
+        self.masks = mask_folder(folder)
         found = {image.name: self._find(image.name) for image in self.images}
         self.found = {name: file for name, file in found.items() if file is not None}
 
@@ -141,16 +140,7 @@ class Reconstruction:
         return self.pictures.find(name, self.options.downscale, whole=self.masks is not None)
 
     def _mask(self, name: str) -> Mask | None:
-        """The mask of a picture; raises InputError if others have one."""
-        if self.masks is None:
-            return None
-        for candidate in (f"{name}.png", name, str(Path(name).with_suffix(".png"))):
-            file = inside(self.masks, candidate)
-            if file is not None and is_file(file):
-                return Mask(file)
-        raise InputError(
-            f"{self.masks / (name + '.png')}: mask: missing; add it, or remove the folder of masks"
-        )
+        return None if self.masks is None else Mask(mask_file(self.masks, name))
 
 
 def _model(folder: Path) -> tuple[Path, str] | None:

@@ -8,16 +8,32 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.data.colmap import TEST_LIST
+from mi_refgs.data.lens import Lens
 from mi_refgs.files import write_bytes
 
 OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0])
 """OpenCV's camera has +x right and +y down, Mitsuba's +x left and +y up."""
 
 
-def write_cameras(folder: Path, pinholes: Iterable[tuple[float, ...]]) -> None:
-    """Pinholes (width, height, fx, fy, cx, cy), pixels, numbered from 1."""
-    rows = [f"{i} PINHOLE {' '.join(map(repr, numbers))}" for i, numbers in enumerate(pinholes, 1)]
-    _write(folder / "cameras.txt", "CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY", rows)
+def write_cameras(folder: Path, cameras: Iterable[tuple[tuple[float, ...], Lens | None]]) -> None:
+    """Cameras, each (width, height, fx, fy, cx, cy), pixels, and its lens, or None; numbered from 1."""
+    rows = []
+    for i, (numbers, lens) in enumerate(cameras, 1):
+        model, coefficients = _lens(lens)
+        rows.append(f"{i} {model} {' '.join(map(repr, (*numbers, *coefficients)))}")
+    _write(folder / "cameras.txt", "CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY, and coefficients", rows)
+
+
+def _lens(lens: Lens | None) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's model of a lens, and its coefficients."""
+    if lens is None:
+        return "PINHOLE", ()
+    if lens.fisheye:
+        return "OPENCV_FISHEYE", lens.radial
+    k1, k2, k3 = (*lens.radial, 0.0, 0.0)[:3]
+    if not k3:
+        return "OPENCV", (k1, k2, *lens.tangential)
+    return "FULL_OPENCV", (k1, k2, *lens.tangential, k3, 0.0, 0.0, 0.0)
 
 
 def write_images(

@@ -1,4 +1,4 @@
-"""LLFF's layout: `poses_bounds.npy` beside `images`, and smaller copies in `images_2` and the like.
+"""LLFF's layout: `poses_bounds.npy` beside `images`, smaller copies in `images_2` and the like, and `masks`.
 
 A row a picture, in the order of their names: a 3 × 5 matrix by rows, then the nearest and the farthest depth.
 The matrix holds the camera's axes in the world (down, right, backwards), its position, and height, width and
@@ -13,13 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
-from mi_refgs.data.picture_files import PictureFile, make_view
-from mi_refgs.data.picture_folders import PictureFolders
+from mi_refgs.data.picture_files import Mask, PictureFile, make_view
+from mi_refgs.data.picture_folders import PictureFolders, mask_file, mask_folder
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.readers import ReadOptions, Recording, held_out
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.images import image_size
 
 POSES = "poses_bounds.npy"
 COLUMNS = 17
@@ -37,7 +36,8 @@ class LlffReader:
 
     def size(self, folder: Path, images: str) -> tuple[int, int]:
         """Width and height of the first training picture as it lies in its file."""
-        return image_size(_placed(folder, "train", ReadOptions(images=images))[0][2])
+        picture = _placed(folder, "train", ReadOptions(images=images))[0][2]
+        return picture.width, picture.height
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
         """The views of one split."""
@@ -45,8 +45,8 @@ class LlffReader:
         return Recording(views, source=folder / POSES)
 
 
-def _placed(folder: Path, split: str, options: ReadOptions) -> list[tuple[str, np.ndarray, Path, int]]:
-    """Name, row, file and what is left of the downscale, of each picture of a split."""
+def _placed(folder: Path, split: str, options: ReadOptions) -> list[tuple[str, np.ndarray, PictureFile]]:
+    """Name, row and picture of each picture of a split."""
     if options.images != "png":
         raise InputError(f"{folder}: images: LLFF has no EXR pictures; read it as 'png'")
     rows, pictures = read_poses(folder / POSES), PictureFolders.of(folder)
@@ -56,10 +56,12 @@ def _placed(folder: Path, split: str, options: ReadOptions) -> list[tuple[str, n
             f"{folder / POSES}: {len(rows)} cameras, but {pictures.folders[1].name} has {len(names)} "
             "pictures; restore the pictures"
         )
-    placed = []
+    placed, masks = [], mask_folder(folder)
     for name, row in held_out(list(zip(names, rows, strict=True)), split):
-        file, left = pictures.find(name, options.downscale) or (pictures.folders[1] / name, options.downscale)
-        placed.append((name, row, file, left))
+        found = pictures.find(name, options.downscale, whole=masks is not None)
+        file, left = found or (pictures.folders[1] / name, options.downscale)
+        mask = None if masks is None else Mask(mask_file(masks, name))
+        placed.append((name, row, PictureFile.find(file, left, mask)))
     if not placed:
         raise InputError(f"{folder / POSES}: zero {split} views; add pictures")
     return placed
@@ -85,7 +87,7 @@ def read_poses(path: Path) -> np.ndarray:
     return rows
 
 
-def _view(source: Path, options: ReadOptions, name: str, row: np.ndarray, file: Path, downscale: int) -> View:
+def _view(source: Path, options: ReadOptions, name: str, row: np.ndarray, picture: PictureFile) -> View:
     matrix, field = row[:15].reshape(3, 5), f"{source}: {name}"
     down, right, backwards, position, (height, width, focal) = matrix.T
     if min(height, width, focal) <= 0:
@@ -93,7 +95,6 @@ def _view(source: Path, options: ReadOptions, name: str, row: np.ndarray, file: 
     pose = np.eye(4)
     pose[:3] = np.stack([right, -down, backwards, position], axis=-1)
     to_world = rigid(pose, field) @ MITSUBA_FROM_OPENGL
-    picture = PictureFile.find(file, downscale)
     fx, fy = focal * picture.width / width, focal * picture.height / height
     intrinsics = (fx, fy, picture.width / 2, picture.height / 2)
     return make_view(name, picture, options, intrinsics, None, to_world, field)[0]

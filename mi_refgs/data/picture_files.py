@@ -44,6 +44,18 @@ class Mask:
 
 
 @dataclass(frozen=True)
+class FileCamera:
+    """An image file as it is on disk, and the lens through which it was taken."""
+
+    path: Path
+    width: int  # pixels
+    height: int
+    intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels of the file
+    lens: Lens | None = None  # None: a pinhole
+    mask: Path | None = None  # the file of its mask, as `read_mask` takes it
+
+
+@dataclass(frozen=True)
 class PictureFile:
     """A picture in a file, and what is done to it."""
 
@@ -180,6 +192,8 @@ def make_view(
     for focal in intrinsics[:2]:
         if not 1 / MAX_NUMBER <= focal <= MAX_NUMBER:
             raise InputError(f"{where}: focal length: {focal:.3g} pixels is out of range; correct it")
+    mask = None if picture.mask is None or picture.mask.below is not None else picture.mask.path
+    file = FileCamera(picture.path, picture.width, picture.height, intrinsics, lens, mask)
     width, height = picture.size
     fx, fy, cx, cy = (value / picture.downscale for value in intrinsics)
     straight = None
@@ -194,7 +208,5 @@ def make_view(
     alpha = pixels if pixels.cut_out else None
     exposure = log_exposure(picture.path)
     linear = options.images == "exr"
-    view = View(
-        name, width, height, fx, fy, cx, cy, to_world, pixels, alpha, None, None, linear, exposure=exposure
-    )
-    return view, straight
+    view = View(name, width, height, fx, fy, cx, cy, to_world, pixels, alpha, None, None, linear)
+    return view.changed(exposure=exposure, file=file), straight

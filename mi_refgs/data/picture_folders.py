@@ -1,4 +1,4 @@
-"""Folders of pictures as COLMAP and LLFF have them: `images`, and smaller copies in `images_2` …"""
+"""Folders of pictures as COLMAP and LLFF have them: `images`, smaller copies in `images_2` …, and `masks`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from mi_refgs.images import ENDINGS
 COPIES = (8, 4, 2)
 """Factors by which copies are smaller than the pictures in `images`."""
 IMAGES = "images"
+MASKS = "masks"
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,23 @@ class PictureFolders:
             if there := next((f for f in (file, *others) if is_file(f)), None):
                 return there, downscale // factor
         return None
+
+
+def mask_folder(root: Path) -> Path | None:
+    """The folder of masks of a data set; None without one."""
+    return root / MASKS if (root / MASKS).is_dir() else None
+
+
+def mask_file(folder: Path, name: str) -> Path:
+    """The mask of a picture by its name: `a.jpg.png`, `a.jpg` or `a.png` of `a.jpg`.
+
+    Raises InputError if there is none: others have one.
+    """
+    for candidate in (f"{name}.png", name, str(Path(name).with_suffix(".png"))):
+        file = inside(folder, candidate)
+        if file is not None and is_file(file):
+            return file
+    raise InputError(f"{folder / (name + '.png')}: mask: missing; add it, or remove the folder of masks")
 
 
 def _is_picture(path: Path) -> bool:

@@ -12,6 +12,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.images import box_downscale, linear_from_srgb, srgb_from_linear
 
 if TYPE_CHECKING:
+    from mi_refgs.data.picture_files import FileCamera
     from mi_refgs.splat.camera import Camera
 
 ALPHA_FLOOR = 1e-3
@@ -50,6 +51,7 @@ class View:
     pixel for which the others stand; all 0 where it is 0."""
     exposure: float | None = None  # log(time · ISO / f-number²), where EXIF data say so
     near: float = 0.0  # depth of the near plane, scene units; `read_dataset` derives it from all cameras
+    file: FileCamera | None = None  # that the picture was read from
 
     def camera(self) -> Camera:
         """The splatter's camera; in Mitsuba's frame both of its focal lengths are negative."""

@@ -51,7 +51,7 @@ def write_colmap(folder: Path, data: Path, cameras: Cameras, tracer: Tracer) -> 
     shown = np.stack([read_png(images / picture)[..., :3] for picture in pictures])
     points, colours, tracks, places = _points(shown, poses, tracer, focal, settings.seed)
 
-    write_cameras(sparse, [(width, height, focal, focal, width / 2, height / 2)])
+    write_cameras(sparse, [((width, height, focal, focal, width / 2, height / 2), None)])
     seen: list[list[str]] = [[] for _ in pictures]
     rows = []
     for i, (point, colour) in enumerate(zip(points, colours, strict=True)):

@@ -1,25 +1,28 @@
 """`cameras`: the cameras of a run as transforms.json (instant-ngp, nerfstudio) and as COLMAP's text files.
 
-    transforms.json          intrinsics and OpenGL pose of each frame; train_filenames, test_filenames
+    transforms.json          intrinsics, lens and OpenGL pose of each frame; train_filenames, test_filenames
     sparse/0/cameras.txt …   the same in COLMAP's convention, without points; test.txt lists the test views
 
-Pictures are named as in the data set, relative to it: put the files into it, or it beside them.
+Names, sizes and lenses are those of the data set's image files on disk, whatever the fit made of them. Paths
+are relative to the data set, in COLMAP's files to its folder `images` where all images are there.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mi_refgs.files import make_folder, write_json
 from mi_refgs.formats.format import Format, Shot
 
 if TYPE_CHECKING:
+    from mi_refgs.data.lens import Lens
     from mi_refgs.runs.export import TrainedScene
 
-PICTURES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".tif", ".tiff")
-"""Endings of pictures; a name without one gets the first."""
+IMAGE_FOLDER = re.compile(r"images(_\d+)?")
+"""Folders to which COLMAP's names are relative."""
 
 
 def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Path]:
@@ -29,38 +32,65 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
 
     sparse = target / "sparse" / "0"
     make_folder(sparse)
-    names = [_file_name(shot.name) for shot in shots]
+    names = [_file_name(shot) for shot in shots]
     poses = [shot.camera.pose() for shot in shots]
+    cameras = [(_pinhole(shot), shot.file.lens if shot.file else None) for shot in shots]
     frames = []
-    for name, shot, pose in zip(names, shots, poses, strict=True):
-        numbers = dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), _pinhole(shot), strict=True))
+    for name, shot, pose, (numbers, lens) in zip(names, shots, poses, cameras, strict=True):
+        frame = {"file_path": name, **dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), numbers, strict=True))}
+        if shot.file is not None and shot.file.mask is not None:
+            frame["mask_path"] = shot.file.mask.as_posix()
         opengl = (pose @ MITSUBA_FROM_OPENGL).tolist()
-        frames.append({"file_path": name, **numbers, "transform_matrix": opengl})
+        frames.append({**frame, **_coefficients(lens), "transform_matrix": opengl})
     splits = {
         f"{split}_filenames": [name for name, shot in zip(names, shots, strict=True) if shot.split == split]
         for split in ("train", "test")
     }
-    write_json(target / "transforms.json", {"camera_model": "PINHOLE", **splits, "frames": frames})
-    pinholes = {_pinhole(shot): None for shot in shots}
-    numbered = {pinhole: i for i, pinhole in enumerate(pinholes, 1)}
-    write_cameras(sparse, pinholes)
-    write_images(sparse, names, poses, [numbered[_pinhole(shot)] for shot in shots], [""] * len(shots))
+    model = {"camera_model": frames[0]["camera_model"]}
+    write_json(target / "transforms.json", {**model, **splits, "frames": frames})
+    numbered = {camera: i for i, camera in enumerate(dict.fromkeys(cameras), 1)}
+    write_cameras(sparse, numbered)
+    files = _below_images(names)
+    write_images(sparse, files, poses, [numbered[camera] for camera in cameras], [""] * len(shots))
     write_points(sparse, [])
-    write_test_list(sparse, splits["test_filenames"])
-    files = ("cameras.txt", "images.txt", "points3D.txt", "test.txt")
-    return [target / "transforms.json", *(sparse / file for file in files)]
+    write_test_list(sparse, [f for f, shot in zip(files, shots, strict=True) if shot.split == "test"])
+    written = ("cameras.txt", "images.txt", "points3D.txt", "test.txt")
+    return [target / "transforms.json", *(sparse / file for file in written)]
+
+
+def _file_name(shot: Shot) -> str:
+    from mi_refgs.images import ENDINGS
+
+    if shot.file is not None:
+        return shot.file.path.as_posix()
+    return shot.name if Path(shot.name).suffix.lower() in ENDINGS else f"{shot.name}{ENDINGS[0]}"
 
 
 def _pinhole(shot: Shot) -> tuple[float, ...]:
     """Width, height, fx, fy, cx, cy in pixels, focal lengths positive."""
+    if shot.file is not None:
+        return shot.file.width, shot.file.height, *(float(x) for x in shot.file.intrinsics)
     camera = shot.camera
     numbers = (-camera.fx[0], -camera.fy[0], camera.cx[0], camera.cy[0])
     return camera.width, camera.height, *(float(x) for x in numbers)
 
 
-def _file_name(name: str) -> str:
-    path = Path(name)
-    return name if path.suffix.lower() in PICTURES else f"{name}{PICTURES[0]}"
+def _coefficients(lens: Lens | None) -> dict[str, Any]:
+    """The lens of a frame as nerfstudio names it."""
+    if lens is None:
+        return {"camera_model": "PINHOLE"}
+    found = {f"k{i}": k for i, k in enumerate(lens.radial, 1)}
+    if lens.fisheye:
+        return {"camera_model": "OPENCV_FISHEYE", **found}
+    return {"camera_model": "OPENCV", **found, "p1": lens.tangential[0], "p2": lens.tangential[1]}
+
+
+def _below_images(names: Sequence[str]) -> list[str]:
+    """The names without the folder of images that all are in, if they are."""
+    first = names[0].partition("/")[0]
+    if IMAGE_FOLDER.fullmatch(first) and all(name.startswith(f"{first}/") for name in names):
+        return [name.partition("/")[2] for name in names]
+    return list(names)
 
 
 CAMERAS = Format("cameras", "transforms.json and COLMAP's text files of the cameras", "", write)

@@ -16,6 +16,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.files import make_folder
 
 if TYPE_CHECKING:
+    from mi_refgs.data.picture_files import FileCamera
     from mi_refgs.runs.export import TrainedScene
     from mi_refgs.splat.camera import Camera
 
@@ -27,6 +28,7 @@ class Shot:
     name: str  # of its picture, without ending, such as "train/r_003"
     split: str  # "train" or "test"
     camera: Camera
+    file: FileCamera | None = None  # of its picture, where there is a data set; the path is relative to that
 
 
 @dataclass(frozen=True)
