@@ -21,6 +21,8 @@ AROUND = 0.12
 """Display-encoded brightness beside the two pictures."""
 GAP = 8
 """Pixels between the two."""
+LONGEST = 8.0
+"""Aspect ratio of the canvas, at most: of a window of one row of pixels it would not fit into memory."""
 
 
 @dataclass(eq=False)
@@ -54,7 +56,7 @@ def side_by_side(pictures: list[np.ndarray], window: tuple[int, int]) -> np.ndar
     """Pictures (H, W, 3) uint8 of one size in a row, on a canvas of the window's shape."""
     height, width = pictures[0].shape[:2]
     row = len(pictures) * width + (len(pictures) - 1) * GAP
-    aspect = max(window[0], 1) / max(window[1], 1)
+    aspect = min(max(window[0] / window[1], 1 / LONGEST), LONGEST)
     canvas_width = max(row, round(height * aspect))
     canvas_height = max(height, round(canvas_width / aspect))
     canvas = np.full((canvas_height, canvas_width, 3), round(255 * AROUND), np.uint8)

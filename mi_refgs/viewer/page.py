@@ -93,6 +93,8 @@ class Page:
     ) -> None:
         """Listen; raises InputError if that port is taken or viser is not installed."""
         viser = require_viser()
+        from mi_refgs.viewer.guard import Guard, guard_controls, guarded  # needs what viser installs
+
         require_free(host, port)
         self.drawable, self.views, self.views_folder = drawable, views, views_folder
         self.begin = begin
@@ -109,12 +111,15 @@ class Page:
         self._told = 0.0
         # A picture for a page that is closed meanwhile is nothing to tell of.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
-        with contextlib.redirect_stdout(io.StringIO()):  # viser greets
+        self.guard = Guard(host)
+        with guarded(self.guard), contextlib.redirect_stdout(io.StringIO()):  # viser greets
             self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        guard_controls(self.guard, self.server)
+        self.guard.refused = self.complain
         if port and self.server.get_port() != port:
             self.server.stop()
             raise InputError(f"--port: {host}:{port} is in use; give another --port")
-        self.url = f"http://{host}:{self.server.get_port()}"
+        self.url = self.guard.url(self.server.get_port())
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         self.server.gui.main_panel.dock_right()
         self.server.scene.set_up_direction(tuple(up_of(views.all)))
@@ -179,8 +184,6 @@ class Page:
 
     def _looks(self, number: int, camera: Any) -> None:
         window = (camera.image_width, camera.image_height)
-        if min(window) < 1:
-            return
         near = self.views.all[0].near if self.views.all else 0.0
         pose = Pose.of_page(camera.wxyz, camera.position, camera.fov, window[0] / window[1], near)
         self.moved(number, pose)

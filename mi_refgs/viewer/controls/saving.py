@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +12,15 @@ import drjit as dr
 import numpy as np
 
 from mi_refgs.exr import write_exr
-from mi_refgs.files import make_folder, write_json
+from mi_refgs.files import cannot_write, make_folder
 from mi_refgs.images import straight_srgb, write_png
 from mi_refgs.viewer.develop import PICTURE, Look, shown_planes
 from mi_refgs.viewer.drawable import Drawable
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.pose import Pose
 
-NUMBERED = re.compile(r"view_(\d+)\.")
+NUMBERED = re.compile(r"view_\d{3,6}", re.ASCII)
+"""Names of views. The number after a longer one may be too long for the name of a file."""
 CAMERA = ".json"
 
 
@@ -49,7 +52,7 @@ def add(page: Page) -> None:
         @button.on_click
         def _(event: Any, suffix: str = suffix) -> None:
             number = event.client.client_id
-            page.loop.ask(("save", suffix), lambda: save(suffix, number), changes=False)
+            page.loop.ask(("save", suffix, number), lambda: save(suffix, number), changes=False)
 
 
 def write_view(
@@ -60,14 +63,38 @@ def write_view(
     Raises InputError if it cannot be written.
     """
     make_folder(folder)
-    taken = [int(found[1]) for path in folder.iterdir() if (found := NUMBERED.match(path.name))]
-    stem = f"view_{max(taken, default=-1) + 1:03d}"
-    camera = folder / f"{stem}{CAMERA}"
+    camera = write_camera(folder, lambda stem: json.dumps(pose.transforms(*window, stem), indent=1) + "\n")
+    picture = camera.with_suffix(suffix)
     if suffix != CAMERA:
-        planes = drawable.fine(pose, *window, look)
-        write_picture(folder / f"{stem}{suffix}", planes, window, look)
-    write_json(camera, pose.transforms(*window, stem))
-    return camera if suffix == CAMERA else folder / f"{stem}{suffix}"
+        try:
+            write_picture(picture, drawable.fine(pose, *window, look), window, look)
+        except BaseException:
+            camera.unlink(missing_ok=True)
+            raise
+    return picture
+
+
+def write_camera(folder: Path, content: Callable[[str], str]) -> Path:
+    """Write the file that takes the next number, and its text for that name; other files stay as they are.
+
+    Whoever creates the file first has the number, so two viewers may save into one folder. Raises InputError
+    if it cannot be written.
+    """
+    stems = {path.name.partition(".")[0] for path in folder.iterdir()}
+    number = max((int(stem[5:]) for stem in stems if NUMBERED.fullmatch(stem)), default=-1)
+    while True:
+        number += 1
+        path = folder / f"view_{number:03d}{CAMERA}"
+        if path.stem in stems:
+            continue
+        try:
+            with path.open("x", encoding="utf-8") as file:
+                file.write(content(path.stem))
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise cannot_write(path, error) from error
+        return path
 
 
 def write_picture(path: Path, planes: list[Any], window: tuple[int, int], look: Look) -> None:
