@@ -86,7 +86,7 @@ class Viewer:
         )
         assert self.process.stderr is not None
         for line in self.process.stderr:
-            if found := re.search(r"http://[\d.]+:\d+", line):
+            if found := re.search(r"http://\S+", line):
                 self.url = found[0]
                 break
         else:

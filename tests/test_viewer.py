@@ -525,6 +525,8 @@ def test_truth_and_picture_stand_side_by_side_in_the_shape_of_the_window() -> No
         assert (row == 10).sum() == (row == 20).sum() == 40
         assert np.flatnonzero(row == 20)[0] - np.flatnonzero(row == 10)[-1] == GAP + 1
         assert canvas[0, 0, 0] == round(255 * AROUND) or height == 30
+    for window in ((16384, 1), (1, 16384)):  # its shape would take gigabytes
+        assert side_by_side([left, right], window).nbytes < 1e6
 
 
 def test_views_are_saved_under_the_next_number_with_their_camera(scene: TrainedScene, tmp_path: Path) -> None:
@@ -541,6 +543,47 @@ def test_views_are_saved_under_the_next_number_with_their_camera(scene: TrainedS
     wanted = planes(scene.renderer(aovs=False, samples=16)(view.camera()).alpha, 20, 32)
     assert wanted.max() > 0.9
     assert view.alpha is not None and np.abs(view.alpha - wanted).max() < 0.51 / 255
+
+
+def test_a_saved_view_overwrites_no_file_and_takes_a_short_number(
+    scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files of others in the folder, and a file that another viewer makes at the same moment."""
+    others = [
+        f"view_{'9' * 200}.png",
+        "view_0٣.png",
+        "view_007.exr",
+        "view_008",
+        "view_009.json",
+        "notes.txt",
+    ]
+    for name in others:
+        (tmp_path / name).write_text(name)
+    pose, drawable = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6), Fitted(scene)
+    (tmp_path / "view_010.json").symlink_to(tmp_path / "nowhere")
+    listed, late = Path.iterdir, tmp_path / "view_011.json"
+
+    def listed_before_another_came(folder: Path) -> Iterator[Path]:
+        found = list(listed(folder))
+        late.write_text(late.name)
+        return iter(found)
+
+    monkeypatch.setattr(Path, "iterdir", listed_before_another_came)
+    saved = write_view(drawable, pose, (32, 20), Look(), tmp_path, ".png")
+    monkeypatch.undo()
+    assert saved.name == "view_012.png" and saved.with_suffix(".json").is_file()
+    for name in (*others, late.name):
+        assert (tmp_path / name).read_text() == name
+    assert not (tmp_path / "nowhere").exists()
+
+    def full(*_: Any) -> list[Any]:
+        raise MemoryError
+
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.setattr(drawable, "fine", full)
+    with pytest.raises(MemoryError):
+        write_view(drawable, pose, (32, 20), Look(), tmp_path, ".png")
+    assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize("samples", [passes.PASS_SAMPLES, 2000])

@@ -78,7 +78,7 @@ class Server:
         assert self.process.stderr is not None
         for line in self.process.stderr:
             self.said.append(line)
-            if found := re.search(r"http://[\d.]+:\d+", line):
+            if found := re.search(r"http://\S+", line):
                 self.url = found[0]
                 self._known.set()
         self._known.set()

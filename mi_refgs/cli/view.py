@@ -27,7 +27,8 @@ def add(commands: Any) -> None:
         "--host",
         default=HOST,
         metavar="H",
-        help="address to listen at; 0.0.0.0 lets other machines in (default %(default)s: this machine only)",
+        help="address to listen at; with 0.0.0.0 other machines can open the printed address, too "
+        "(default %(default)s: this machine only)",
     )
     parser.add_argument(
         "--data", type=Path, metavar="DATA", help="another data set than the one it was fitted to"
