@@ -45,6 +45,8 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 WINDOW = {"width": 760, "height": 420}
 """Small: browser and viewer draw on the same processor. The picture is as wide as it is high."""
+SMALL = "200²"
+"""Pixels at rest."""
 PATIENCE = 45.0
 """Seconds that a page may take to show something, on a busy machine."""
 
@@ -55,7 +57,7 @@ pytestmark = pytest.mark.skipif(
 
 
 class Server:
-    """`refgs …` in a process of its own, and the address that it prints."""
+    """`refgs …` in a process of its own."""
 
     def __init__(self, *arguments: str | Path) -> None:
         self.process = subprocess.Popen(
@@ -67,19 +69,23 @@ class Server:
             text=True,
         )
         self.said: list[str] = []
-        self.url = ""
+        self._url = ""
         self._known = threading.Event()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        assert self._known.wait(PATIENCE), "".join(self.said)
-        assert self.url, "".join(self.said)
+
+    @property
+    def url(self) -> str:
+        """The address, as soon as it is printed."""
+        assert self._known.wait(PATIENCE) and self._url, "".join(self.said)
+        return self._url
 
     def _read(self) -> None:
         assert self.process.stderr is not None
         for line in self.process.stderr:
             self.said.append(line)
             if found := re.search(r"http://\S+", line):
-                self.url = found[0]
+                self._url = found[0]
                 self._known.set()
         self._known.set()
 
@@ -123,7 +129,7 @@ class Tab:
         """The canvas as soon as it is so."""
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
-            self.page.wait_for_timeout(200)
+            self.page.wait_for_timeout(50)
             if done(picture := self.canvas()):
                 return picture
         raise AssertionError(f"not within {PATIENCE} s: {what}")
@@ -132,10 +138,10 @@ class Tab:
         """The canvas once the picture is smooth and stays."""
         self.page.get_by_text(re.compile(r"× \d+, 16 a pixel")).wait_for(timeout=1000 * PATIENCE)
         before, same = self.canvas(), 0
-        for _ in range(60):
-            self.page.wait_for_timeout(300)
+        for _ in range(200):
+            self.page.wait_for_timeout(100)
             same = same + 1 if np.array_equal(now := self.canvas(), before) else 0
-            if same == 2:  # a busy browser takes its time to decode a picture
+            if same == 3:  # a busy browser takes its time to decode a picture
                 return now
             before = now
         raise AssertionError("the canvas does not come to rest")
@@ -202,13 +208,20 @@ def server(known_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     assert "pictures shown" in running.stop()
 
 
-@pytest.fixture
-def tab(chromium: Any, server: tuple[Server, Path]) -> Iterator[Tab]:
-    """A new page of it; afterwards the browser's console must hold no error."""
+@pytest.fixture(scope="module")
+def opened(server: tuple[Server, Path], chromium: Any) -> Iterator[Tab]:
+    """A page of it with small pictures, which 16 samples of take less time."""
     page = chromium.new_page(viewport=WINDOW)
-    opened = Tab(page, server[0].url)
-    yield opened
+    tab = Tab(page, server[0].url)
+    tab.choose("Still", SMALL)
+    yield tab
     page.close()
+
+
+@pytest.fixture
+def tab(opened: Tab) -> Iterator[Tab]:
+    """The page; each test leaves its controls as they were, and the browser's console without an error."""
+    yield opened
     assert opened.errors == []
 
 
