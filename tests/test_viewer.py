@@ -576,6 +576,10 @@ def test_a_saved_view_overwrites_no_file_and_takes_a_short_number(
         assert (tmp_path / name).read_text() == name
     assert not (tmp_path / "nowhere").exists()
 
+    for name in ("view_999999.png", "view_1000000.png"):
+        (tmp_path / name).touch()
+    assert write_view(drawable, pose, (32, 20), Look(), tmp_path, ".json").name == "view_1000001.json"
+
     def full(*_: Any) -> list[Any]:
         raise MemoryError
 

@@ -7,7 +7,6 @@ import itertools
 import math
 import re
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -255,14 +254,13 @@ def test_no_control_takes_a_value_that_the_page_does_not_offer(client: Client) -
     assert {type(control).__name__ for control in everyone} == set(VALUES)
     for control, value in itertools.product(everyone, HOSTILE):
         client.update(control, value)
-    for control in everyone:  # properties, not values
-        client.send(
-            type="GuiUpdateMessage", uuid=control._impl.uuid, updates={"visible": False, "value": True}
-        )
+    callbacks = [list(control._impl.update_cb) for control in everyone]
+    for control in everyone:  # a property that is not its value
+        updates = {"update_cb": [], "value": control.value}
+        client.send(type="GuiUpdateMessage", uuid=control._impl.uuid, updates=updates)
     client.settled()
-    assert [
-        getattr(control, "label", "") for control in everyone if not in_range(control) or not control.visible
-    ] == []
+    assert [getattr(control, "label", "") for control in everyone if not in_range(control)] == []
+    assert [control._impl.update_cb for control in everyone] == callbacks
 
 
 def test_what_the_page_offers_is_taken(client: Client) -> None:
@@ -450,11 +448,7 @@ def test_a_viser_without_known_controls_is_stopped(monkeypatch: pytest.MonkeyPat
     assert server.stopped
 
 
-def test_websockets_without_the_places_of_the_guard_is_refused(
-    fitted: Fitted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    threads = threading.active_count()
+def test_websockets_without_the_places_of_the_guard_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(websockets_server, "serve", lambda handler, host, port, process_request=None: None)
-    with pytest.raises(InputError, match="pip install viser=="):
-        Page(fitted, Views(), "a page", "127.0.0.1", 0, tmp_path)
-    assert threading.active_count() == threads
+    with pytest.raises(InputError, match="pip install viser=="), guard_module.guarded(Guard("127.0.0.1")):
+        pass
