@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import typing
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import refine
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.presets import scaled
+from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.surfels.table import Surfels
 
 
@@ -55,6 +57,32 @@ def test_a_preset_scales_every_number_of_iterations(tmp_path: Path) -> None:
     assert method.refine.propagate is not None
     assert (method.refine.propagate.hold, method.loss.smooth_until) == (100, 1500)
     assert [method.data.block_at(i) for i in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]
+
+
+def test_only_declared_fields_are_scaled() -> None:
+    """A field that is called like one that counts iterations stays what it is; nothing is lost below it."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Other:
+        until: int = 8
+        hold: int = dataclasses.field(default=8, metadata=ITERATIONS)
+        after: dict[str, Window] = dataclasses.field(default_factory=lambda: {"a": Window(0, 8, 2)})
+
+    assert scaled(Other(), 0.5) == Other(8, 4, {"a": Window(0, 4, 1)})
+    assert scaled(Other(hold=0), 0.5).hold == 0 and scaled(Other(hold=1), 0.1).hold == 1
+
+
+def test_every_number_of_iterations_is_declared() -> None:
+    """The intervals of checkpoints, previews and logs are of the run, not of its schedule."""
+    names = {"until", "hold", "after", "trial", "iterations"}
+    waiting: list[Any] = [methods.Method]
+    for kind in waiting:
+        hints = typing.get_type_hints(kind) if dataclasses.is_dataclass(kind) and kind is not Window else {}
+        for field in dataclasses.fields(kind) if hints else ():
+            counts = field.name in names or field.name.endswith(("_start", "_rise", "_until"))
+            assert (field.metadata == ITERATIONS) == counts, f"{kind.__name__}.{field.name}"
+        waiting += [part for hint in hints.values() for part in (hint, *typing.get_args(hint))]
+        waiting += [] if hints else typing.get_args(kind)
 
 
 def test_stages_and_windows_meet_without_gap_or_overlap() -> None:

@@ -337,3 +337,22 @@ def test_lamps_grow_by_shares() -> None:
     optimiser.step(0)
     moved = params["x"].numpy() - start
     np.testing.assert_allclose(moved, 0.1 * np.maximum(start, 1), rtol=1e-3)
+
+
+def test_every_tensor_has_its_bit_however_many_there_are() -> None:
+    """The first and the last of 40 tensors are told apart from the others, by row and where rows are wide."""
+    sizes = {f"t{i}": (4, 2) for i in range(38)} | {"wide": (2, 100), "last": (4, 2)}
+    params = {name: tensor(np.zeros(size)) for name, size in sizes.items()}
+    optimiser = Adam(params, {name: Group(1.0) for name in sizes})
+    spoilt = {"t0": (1, 0), "t33": (2, 1), "wide": (1, 70), "last": (3, 1)}
+    for name, size in sizes.items():
+        gradient = np.ones(size, np.float32)
+        if name in spoilt:
+            gradient[spoilt[name]] = np.nan
+        give(optimiser, name, gradient)
+    optimiser.step(0)
+    found = optimiser.report()
+    assert found.count == 1
+    expected = {name: [0 if name == "wide" else row] for name, (row, _) in spoilt.items()}
+    assert {name: rows.tolist() for name, rows in found.rows.items()} == expected
+    assert np.all(params["t1"].numpy() == 0)

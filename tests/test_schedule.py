@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from mi_refgs import fitting
 from mi_refgs.fitting.schedule import Schedule
 from mi_refgs.methods.method import LightOptions, Method, Stage, SurfelOptions
 from mi_refgs.methods.window import Window
@@ -23,12 +27,27 @@ def test_views_come_once_an_epoch_in_an_order_of_its_own() -> None:
     assert len({tuple(epoch) for epoch in epochs}) == 5
 
 
-def test_draws_follow_seed_and_iteration() -> None:
-    draws = [schedule(seed).rng(i).random() for seed in (0, 1) for i in (0, 1, 2)]
+def test_draws_follow_seed_iteration_and_operation() -> None:
+    """Two operations of one iteration share no random numbers, nor does one with the next iteration."""
+    keys = [(seed, i, name) for seed in (0, 1) for i in (0, 1, 2) for name in ("densify", "relocate", "r")]
+    draws = [schedule(seed).rng(i, name).random() for seed, i, name in keys]
     assert len(set(draws)) == len(draws)
-    assert draws == [schedule(seed).rng(i).random() for seed in (0, 1) for i in (0, 1, 2)]
+    assert draws == [schedule(seed).rng(i, name).random() for seed, i, name in keys]
     orders = [[schedule(seed).view(i + 1) for i in range(7)] for seed in range(4)]
     assert len(set(map(tuple, orders))) > 1
+
+
+def test_every_operation_of_an_iteration_draws_on_its_own() -> None:
+    """Read off the package: `rng` is called with another name in each place."""
+    package = Path(fitting.__file__).parent
+    calls = [
+        call.args[1]
+        for path in package.glob("*.py")
+        for call in ast.walk(ast.parse(path.read_text()))
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and call.func.attr == "rng"
+    ]
+    names = [name.value for name in calls if isinstance(name, ast.Constant)]
+    assert len(names) == len(calls) == len(set(names)) >= 6
 
 
 @pytest.mark.parametrize(

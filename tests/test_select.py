@@ -293,6 +293,8 @@ def test_branching_resamples_the_light(variant: str, views: Dataset) -> None:
         ("light = { height = 8 }", "light = { height = 10 }", ["light.height", "10"]),
         ("degree = { radiance_sh = 1 } } }", "degrees = { radiance_sh = 1 } } }", ["degrees"]),
         ("after = 5", "after = 9", ["interreflection", "tried later"]),
+        ("after = 5\n", 'after = 5\nneeds = ["specular"]\n', ["specular", "tried later"]),
+        ("after = 5\n", 'after = 8\nneeds = ["interreflection"]\n', ["specular", "tried later"]),
     ],
 )
 def test_a_selection_that_cannot_be_made_is_refused_at_once(

@@ -22,7 +22,7 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
     """
     state = trainer.state()
     old, count = part(state, PARAMS), trainer.surfels.count
-    rng = trainer.schedule.rng(trainer.iteration)
+    rng = trainer.schedule.rng(trainer.iteration, "branch")
     wanted: dict[str, np.ndarray] = {}
     for name in method.surfels.names:
         width = method.surfels.columns(name)

@@ -63,7 +63,7 @@ class AdaptiveControl:
             self._densify(iteration)
         if options.relocate is not None and options.relocate.when.due(iteration):
             fit.check()
-            draws = fit.schedule.rng(iteration)
+            draws = fit.schedule.rng(iteration, "relocate")
             for table in self.tables:
                 table.adopt(relocate(table.surfels, options.relocate, table.max_count, draws))
             fit.occluder.around = None
@@ -76,7 +76,9 @@ class AdaptiveControl:
         elif options.propagate is not None and options.propagate.when.due(iteration):
             colour = ("radiance_sh",) if options.propagate.noise else ()
             self.table.replace(
-                refine.propagate_normals(fit.surfels, options.propagate, fit.schedule.rng(iteration)),
+                refine.propagate_normals(
+                    fit.surfels, options.propagate, fit.schedule.rng(iteration, "propagate")
+                ),
                 cleared=("opacity", *fit.surfels.primitive.sizes, *colour),
             )
             fit.optimiser.set_factor("opacity", 0.0)
@@ -87,7 +89,7 @@ class AdaptiveControl:
     def _densify(self, iteration: int) -> None:
         fit = self.trainer
         fit.check()
-        options, draws = fit.method.refine, fit.schedule.rng(iteration)
+        options, draws = fit.method.refine, fit.schedule.rng(iteration, "densify")
         since_reset = options.reset.since(iteration) if options.reset is not None else None
         wait = refine.prune_wait(options, fit.method.rates.of("opacity"))
         prune_transparent = since_reset is None or since_reset >= wait
@@ -142,7 +144,7 @@ class AdaptiveControl:
         """Channels and the light back to their initial values, without history."""
         fit = self.trainer
         starts = {name: fit.method.surfels.start(name) for name in names if name != LIGHT}
-        edited = refine.restart(fit.surfels, starts, fit.schedule.rng(iteration))
+        edited = refine.restart(fit.surfels, starts, fit.schedule.rng(iteration, "restart"))
         self.table.replace(edited, cleared=tuple(starts))
         if LIGHT in names and fit.method.light is not None:
             fit.params[LIGHT] = first_light(fit.method.light).raw

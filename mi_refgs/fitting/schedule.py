@@ -23,9 +23,9 @@ class Schedule:
     method: Method
     views: int
 
-    def rng(self, iteration: int) -> np.random.Generator:
-        """Random numbers of an iteration; 0 is the initialisation."""
-        return np.random.default_rng([self.method.seed, iteration])
+    def rng(self, iteration: int, operation: str) -> np.random.Generator:
+        """Random numbers of one operation of an iteration, such as "densify"; 0 is the initialisation."""
+        return np.random.default_rng([self.method.seed, iteration, *operation.encode()])
 
     def view(self, iteration: int) -> int:
         """Index of the picture: sampling without replacement, a fresh permutation every epoch."""

@@ -94,7 +94,7 @@ def select_terms(trainer: Trainer, tell: Callable[[str], None] = lambda _: None)
 def _open(trainer: Trainer, select: Selection) -> list[str]:
     """Terms that are not decided yet, in the order in which they are tried."""
     decided = {row["term"] for row in trainer.decisions}
-    return sorted((name for name in select.term if name not in decided), key=lambda n: select.term[n].after)
+    return [name for name in select.order if name not in decided]
 
 
 def _due(trainer: Trainer, select: Selection) -> str | None:

@@ -22,6 +22,9 @@ from mi_refgs.fitting.rates import Group
 WIDE_ROW = 64
 """Columns beyond which rows are not told apart: harmonics have 48, a row of the light hundreds."""
 
+WORD = 32
+"""Tensors whose bits fit one integer of the marks."""
+
 MEMORY = 4096
 """Steps that `report` may come late."""
 
@@ -43,8 +46,8 @@ class Skips:
 
     def __init__(self, params: Mapping[str, Any], groups: Mapping[str, Group]) -> None:
         self._params, self._groups = params, groups
-        # By number of rows, (rows,): bit i where a gradient of the i-th group was not finite.
-        self._marks: dict[int, Any] = {}
+        # By number of rows and word w, (rows,): bit b where a gradient of group WORD w + b was not finite.
+        self._marks: dict[tuple[int, int], Any] = {}
         self._calls, self._iteration = 0, 0  # number and iteration of the last step
         self._reported = 0  # number of the last step that was reported
         # At the number of a step modulo MEMORY: that number, if the step was skipped.
@@ -68,14 +71,14 @@ class Skips:
         skipped = skipped[skipped > self._reported]
         rows = {}
         for i, name in enumerate(self._groups if len(skipped) else ()):
-            marks = self._marks.get(self._marked(name))
-            rows[name] = np.flatnonzero(marks.numpy() >> i & 1) if marks is not None else np.zeros(0, int)
+            marks = self._marks.get((self._marked(name), i // WORD))
+            found = np.zeros(0, np.uint32) if marks is None else marks.numpy()
+            rows[name] = np.flatnonzero(found >> np.uint32(i % WORD) & 1)
         last = self._iteration - (self._calls - int(skipped.max(initial=0)))
-        found = Skipped(len(skipped), last, {name: at for name, at in rows.items() if len(at)})
         self._reported = self._calls
         if len(skipped):
             self._marks.clear()
-        return found
+        return Skipped(len(skipped), last, {name: at for name, at in rows.items() if len(at)})
 
     def forget_rows(self) -> None:
         """Forget which rows had such gradients: rows have moved."""
@@ -87,28 +90,29 @@ class Skips:
         return rows if width <= WIDE_ROW else 1
 
     def _not_finite(self, gradients: Mapping[str, Any]) -> list[Any]:
-        """Where something is not finite (mi.Bool), by rows or by entries; rows get bit i for the i-th group.
+        """Where something is not finite (mi.Bool), by rows or by entries; rows get the bit of each group.
 
         One look at a row serves all of its tensors. Only head columns are looked at: the others are of
         spherical harmonics, whose gradient is that of a head column times a bounded function.
         """
         by_entry: list[Any] = []
-        by_row: dict[int, Any] = {}
+        by_row: dict[tuple[int, int], Any] = {}
         for i, name in enumerate(self._groups):
             if name not in gradients:
                 continue
-            g, rows, bit = gradients[name], self._marked(name), mi.UInt32(1 << i)
-            self._marks.setdefault(rows, dr.opaque(mi.UInt32, 0, rows))
+            g, rows, bit = gradients[name], self._marked(name), mi.UInt32(1 << i % WORD)
+            key = rows, i // WORD
+            self._marks.setdefault(key, dr.opaque(mi.UInt32, 0, rows))
             if rows == 1:
                 bad = ~dr.isfinite(g)
-                dr.scatter_reduce(dr.ReduceOp.Or, self._marks[1], bit, 0, bad, dr.ReduceMode.Direct)
+                dr.scatter_reduce(dr.ReduceOp.Or, self._marks[key], bit, 0, bad, dr.ReduceMode.Direct)
                 by_entry.append(bad)
                 continue
             width = dr.width(g) // rows
             first = dr.arange(mi.UInt32, rows) * width
             columns = [dr.gather(mi.Float, g, first + c) for c in range(self._groups[name].head or width)]
             found = dr.select(reduce(operator.and_, map(dr.isfinite, columns)), mi.UInt32(0), bit)
-            by_row[rows] = by_row.get(rows, mi.UInt32(0)) | found
-        for rows, found in by_row.items():
-            self._marks[rows] |= found
+            by_row[key] = by_row.get(key, mi.UInt32(0)) | found
+        for key, found in by_row.items():
+            self._marks[key] |= found
         return by_entry + [found != 0 for found in by_row.values()]

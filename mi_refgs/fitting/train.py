@@ -78,7 +78,7 @@ class Trainer:
         if state is not None:
             self.restore(state)
             return
-        self.params |= initial_parameters(method, data, self.schedule.rng(0), self.open)
+        self.params |= initial_parameters(method, data, self.schedule.rng(0, "start"), self.open)
         self.params |= self.exposure.start()
         self.optimiser = Adam(self.params, self._groups())
         self.optimiser.set_factor(GAIN, 0.0)  # until it is decided

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from mi_refgs.methods.surroundings import BACKGROUND, SurroundingsOptions
 from mi_refgs.methods.weights import LossWeights
-from mi_refgs.methods.window import Window
+from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.primitives import primitive_named
 from mi_refgs.shade.accuracy import DIRECTIONS, MAX_LEVELS
 from mi_refgs.surfels.channels import MAX_SH_DEGREE, channel
@@ -85,7 +85,7 @@ class LightOptions:
 class Stage:
     """One stretch of the schedule with its own way to shade, up to and including iteration `until`."""
 
-    until: int
+    until: int = field(metadata=ITERATIONS)
     at: Literal["surfel", "pixel"] = "pixel"
     reflectance: str = "split_sum"  # a model of `shade.reflectance`
     diffuse: Literal["sh", "irradiance"] = "sh"
@@ -114,7 +114,7 @@ class Propagation:
     roughness: float | None = None  # … and at most this rough; absent: however rough
     noise: float = 0.0  # half the width of the noise on the constant colour of the others, in coefficients
     noise_metallic: float = 0.05  # which are at most this metallic
-    hold: int = 200  # iterations without opacity learning afterwards
+    hold: int = field(default=200, metadata=ITERATIONS)  # iterations without opacity learning afterwards
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class ExposureOptions:
     """A gain a channel of each training view, on the linear radiance; decided once (`fitting.exposure`)."""
 
     gains: Literal["judged", "on", "off"] = "judged"  # judged: if they pay
-    after: int = 1_200  # iterations, then it is decided
+    after: int = field(default=1_200, metadata=ITERATIONS)  # iterations, then it is decided
     worth: float = 0.5  # dB that the training views must gain, on pixels that the gains were not fitted to
     rate: float = 3e-3  # of log gains, a step; a tenth at the end
 
@@ -190,7 +190,7 @@ class CoarsePictures:
     """Pictures of fewer pixels for the iterations up to `until`; of several such tables the one that ends
     first counts."""
 
-    until: int  # iterations
+    until: int = field(metadata=ITERATIONS)  # iterations
     block: int = 2  # pixels along a side of the squares that are averaged into one
 
 
@@ -213,8 +213,8 @@ class DataOptions:
 class Term:
     """Something that a method can do without, as changes of its file, and when a fit tries it."""
 
-    after: int  # iterations before it is tried
-    trial: int  # iterations with it, and without it, that are compared
+    after: int = field(metadata=ITERATIONS)  # iterations before it is tried
+    trial: int = field(metadata=ITERATIONS)  # iterations with it, and without it, that are compared
     change: dict[str, Any] = field(default_factory=dict)  # tables merged over the method's
     drop: tuple[str, ...] = ()  # keys that it removes before, where they are there
     needs: tuple[str, ...] = ()  # terms that must be in use
@@ -235,12 +235,17 @@ class Selection:
     gain_per_ms: float = 0.003  # dB for each millisecond of a step
     gain_per_mb: float = 0.001  # dB for each MB of parameters and their moments
 
+    @property
+    def order(self) -> list[str]:
+        """The terms in the order in which they are tried: as they fall due, then as the file has them."""
+        return sorted(self.term, key=lambda name: self.term[name].after)
+
 
 @dataclass(frozen=True)
 class Method:
     """Everything that describes a fit; the resolved copy is saved with the run."""
 
-    iterations: int
+    iterations: int = field(metadata=ITERATIONS)
     stage: dict[str, Stage]
     about: About = About()
     surfels: SurfelOptions = SurfelOptions()

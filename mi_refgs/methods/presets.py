@@ -6,11 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from mi_refgs.methods.window import Window
-
-# Fields that count iterations, and so scale with the preset, as windows do.
-_SCALED = {"iterations", "until", "normal_start", "normal_rise", "half_metal_start", "half_metal_rise"}
-_SCALED |= {"smooth_until", "hold", "after", "trial"}
+from mi_refgs.methods.window import ITERATIONS, Window
 
 
 @dataclass(frozen=True)
@@ -34,17 +30,21 @@ PRESETS = {
 }
 
 
-def scaled(value: Any, factor: float, key: str = "") -> Any:
-    """Scale every field that counts iterations: windows exactly, others to a whole number of at least 1."""
+def scaled(value: Any, factor: float) -> Any:
+    """Scale windows exactly, and fields whose metadata is ITERATIONS to whole numbers of at least 1."""
     if isinstance(value, dict):
         return {name: scaled(inner, factor) for name, inner in value.items()}
     if isinstance(value, tuple):
         return tuple(scaled(inner, factor) for inner in value)
     if isinstance(value, Window):
         return Window(factor * value.start, factor * value.until, factor * value.every)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: scaled(getattr(value, f.name), factor, f.name) for f in dataclasses.fields(value)}
-        return dataclasses.replace(value, **fields)
-    if key in _SCALED:
-        return max(round(value * factor), 1) if value > 0 else value
-    return value
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return value
+    fields = {}
+    for field in dataclasses.fields(value):
+        inner = getattr(value, field.name)
+        if field.metadata != ITERATIONS:
+            fields[field.name] = scaled(inner, factor)
+        elif inner > 0:
+            fields[field.name] = max(round(inner * factor), 1)
+    return dataclasses.replace(value, **fields)

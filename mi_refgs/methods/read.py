@@ -80,7 +80,7 @@ def _needed(select: Selection, name: str) -> list[str]:
     """The terms that one needs, and those that they need, in the order in which they are tried."""
     found: list[str] = []
     for needed in select.term[name].needs:
-        if select.term[needed].after > select.term[name].after or needed == name:
+        if needed not in select.order[: select.order.index(name)]:
             raise InputError(f"select.term.{name}: needs: '{needed}' is tried later; try it before")
         found += [other for other in (*_needed(select, needed), needed) if other not in found]
     return found

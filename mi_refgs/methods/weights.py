@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from mi_refgs.methods.window import ITERATIONS
 
 
 @dataclass(frozen=True)
@@ -15,14 +17,14 @@ class LossWeights:
 
     ssim: float = 0.2
     normal: float = 0.05
-    normal_start: int = 0  # iterations before L_n counts
-    normal_rise: int = 0  # iterations in which its weight then rises linearly from 0
+    normal_start: int = field(default=0, metadata=ITERATIONS)  # iterations before L_n counts
+    normal_rise: int = field(default=0, metadata=ITERATIONS)  # then its weight rises linearly from 0
     smooth: float = 0.0
-    smooth_until: int = 18_000
+    smooth_until: int = field(default=18_000, metadata=ITERATIONS)
     alpha: float = 0.0
     half_metal: float = 0.0  # metals or dielectrics, not half of each
-    half_metal_start: int = 0  # iterations before that counts: pictures decide which it is
-    half_metal_rise: int = 0  # iterations in which this weight then rises linearly from 0
+    half_metal_start: int = field(default=0, metadata=ITERATIONS)  # before, pictures decide
+    half_metal_rise: int = field(default=0, metadata=ITERATIONS)  # then this weight rises linearly
     materials: float = 0.0  # neighbours of like colour share roughness and metallic
     light_colour: float = 0.0  # colour belongs to the albedo rather than to the light
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+ITERATIONS = {"unit": "iterations"}
+"""Metadata of a dataclass' field that counts iterations, which a preset scales as it does windows."""
 TIE = 1e-6
 """Intervals by which a scaled window may miss a multiple of its interval for the rounding of floats."""
 
