@@ -1,10 +1,14 @@
-"""NumPy arrays to the device, and functions that are traced once."""
+"""What computes: the machine; NumPy arrays to the device; functions that are traced once."""
 
 from __future__ import annotations
 
 import functools
 import gc
+import os
+import platform
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -15,6 +19,33 @@ LOOK_AHEAD = 64
 """Elements by which kernels read beyond the last one of an array, at most: a packet of the widest machine."""
 DTYPES = {"Float": np.float32, "UInt32": np.uint32, "Int32": np.int32, "Bool": np.bool_}
 """NumPy's types of the elements of Mitsuba's flat arrays."""
+
+
+def machine() -> dict[str, Any]:
+    """What times are measured on: processor, threads and versions."""
+    try:
+        found = re.search(
+            r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE
+        )
+    except OSError:
+        found = None
+    return {
+        "cpu": found.group(1) if found else platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": int(dr.thread_count()),
+        "system": f"{platform.system()} {platform.machine()}",
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "mitsuba_variant": mi.variant(),
+    }
+
+
+def simd_width() -> int:
+    """Floats of a vector of the kernels, read off one, since Dr.Jit does not tell it; 1 for other devices."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.eval(dr.minimum(dr.arange(mi.Float, LOOK_AHEAD), dr.opaque(mi.Float, 2)))
+        code = "".join(kernel["ir"].getvalue() for kernel in dr.kernel_history() if "ir" in kernel)
+    return max(map(int, re.findall(r"<(\d+) x float>", code)), default=1)
 
 
 def upload(values: np.ndarray, kind: Any = None) -> Any:

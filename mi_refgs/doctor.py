@@ -26,17 +26,13 @@ EXTRAS = {
 }
 """Distribution that each optional extra of pyproject.toml brings, of those that a command asks for."""
 
-# A process of its own, because an LLVM that cannot compile this kernel aborts instead of raising. The width
-# of the vectors is read off the kernel, since Dr.Jit does not tell it.
+# A process of its own, because an LLVM that cannot compile this kernel aborts instead of raising.
 _PROBE = """
-import re, mi_refgs, drjit as dr, mitsuba as mi
+import mi_refgs, drjit as dr, mitsuba as mi
+from mi_refgs.device import simd_width
 mi.set_variant("llvm_ad_rgb")
-dr.set_flag(dr.JitFlag.KernelHistory, True)
-x = dr.minimum(dr.arange(mi.Float, 64), dr.opaque(mi.Float, 2))
-dr.eval(x)
-assert x[63] == 2
-code = "".join(kernel["ir"].getvalue() for kernel in dr.kernel_history() if "ir" in kernel)
-print(max(map(int, re.findall(r"<(\\d+) x float>", code)), default=1))
+assert dr.minimum(dr.arange(mi.Float, 64), dr.opaque(mi.Float, 2))[63] == 2
+print(simd_width())
 """
 
 
@@ -55,6 +51,7 @@ class Report:
     threads: int
     simd_width: int | None
     kernel_cache: str
+    speeds: list[str]
     extras: dict[str, str | None]
     problems: tuple[llvm.Problem, ...]
 
@@ -79,6 +76,7 @@ class Report:
             "threads": str(self.threads),
             "SIMD width": f"{self.simd_width} floats" if self.simd_width else "unknown",
             "kernel cache": self.kernel_cache,
+            "speeds": "; ".join(self.speeds) or "none measured yet",
         }
         for name, version in self.extras.items():
             found[name] = version or f'not installed (optional: pip install "mi_refgs[{name}]")'
@@ -93,6 +91,8 @@ class Report:
 def examine() -> Report:
     """Look at the installation; runs one small kernel in a process of its own (about half a second)."""
     import drjit as dr
+
+    from mi_refgs.fitting import cost_model
 
     problems: list[llvm.Problem] = []
     cuda = bool(dr.has_backend(dr.JitBackend.CUDA))
@@ -118,6 +118,7 @@ def examine() -> Report:
         threads=int(dr.thread_count()),
         simd_width=width,
         kernel_cache=os.environ.get("DRJIT_CACHE_DIR", str(Path.home() / ".drjit")),
+        speeds=cost_model.summary(),
         extras={name: _version(distribution) for name, distribution in EXTRAS.items()},
         problems=tuple(problems),
     )

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import json
 import os
 import re
+import threading
+import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from mi_refgs.errors import InputError
 
@@ -26,6 +29,10 @@ STRIP_PIXELS = 2**22
 """Pixels of a large image that are floating-point numbers at a time: 50 MB of three channels."""
 STRIP_ROWS = 256
 """Rows of such a strip at most: those of the largest block in which EXR files are compressed (DWAB)."""
+POLL = 0.1
+"""Seconds between two tries to take a lock."""
+_OWN = threading.local()
+"""`held`: the locks of this thread."""
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
@@ -76,6 +83,62 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 def write_json(path: str | Path, content: Any, indent: int = 1) -> None:
     """Write a JSON file, whole or not at all; raises InputError as `replace_file` does."""
     write_bytes(path, f"{json.dumps(content, indent=indent)}\n".encode())
+
+
+class BusyError(InputError):
+    """Another process, or another thread of this one, holds a lock."""
+
+
+@contextlib.contextmanager
+def locked(path: Path, busy: str, wait: float = 0.0) -> Iterator[None]:
+    """Hold the lock of the file at `path`, which the system releases however this process ends.
+
+    A thread that holds it may take it again. The file is removed afterwards; one that a killed process leaves
+    locks nothing. Where the file system has no locks, nothing is held.
+
+    Raises BusyError with the sentence `busy` if it is held elsewhere for `wait` seconds, and InputError as
+    `make_folder` does.
+    """
+    key = path.parent.resolve() / path.name
+    held: set[Path] = _OWN.__dict__.setdefault("held", set())
+    if key in held:
+        yield
+        return
+    make_folder(path.parent)
+    until = time.monotonic() + wait
+    while (file := _lock_of(path)) is None:
+        if time.monotonic() >= until:
+            raise BusyError(busy)
+        time.sleep(POLL)
+    held.add(key)
+    try:
+        yield
+    finally:
+        held.remove(key)
+        with contextlib.suppress(OSError):  # while it is still held: nobody else can have this file's lock
+            path.unlink()
+        file.close()
+
+
+def _lock_of(path: Path) -> IO[str] | None:
+    """The file with its lock taken; None if it is held elsewhere."""
+    while True:
+        try:
+            file = path.open("a")
+        except OSError as error:
+            raise cannot_write(path, error) from error
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                return file
+        except BlockingIOError:
+            file.close()
+            return None
+        except FileNotFoundError:  # removed by its holder since it was opened
+            pass
+        except OSError:  # no locks on this file system
+            return file
+        file.close()
 
 
 def remove_temporaries(folder: Path) -> None:

@@ -8,6 +8,7 @@ import weakref
 from dataclasses import replace
 from pathlib import Path
 
+from mi_refgs.capture.triangulate import with_points
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.progress import Bar, Previews
 from mi_refgs.fitting import job
@@ -37,8 +38,8 @@ def fit(
 
     output: the run folder, which is kept. Without one a temporary folder is used, which is removed when no
     `Reconstruction` of it is left; `save` keeps what was found. resume: go on with the run in `output`, if
-    there is one. progress: True shows messages and a bar on standard error, False nothing but Python's
-    warnings; a `Progress` listens to each step.
+    there is one; other arguments are those that it was started with, or absent. progress: True shows messages
+    and a bar on standard error, False nothing but Python's warnings; a `Progress` listens to each step.
 
     Raises InputError for bad input, and KeyboardInterrupt with a message that says where the checkpoints are.
     """
@@ -61,6 +62,7 @@ def fit(
             resume=resume,
             minutes=minutes,
             progress=listener,
+            find_points=with_points,
         )
     except KeyboardInterrupt:
         if keeper is not None:

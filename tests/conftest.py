@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from tiny_scene import train_command, write_data, write_method
 
 from mi_refgs.cli import main
 from mi_refgs.exr import MITSUBA_EXR_THREADS
+from mi_refgs.fitting.cost_model import FOLDER_VARIABLE
 
 # The same examples in every run. Kernels are compiled in the first, so there is no deadline; failures are not
 # simplified, since examples are mostly seeds.
@@ -33,6 +36,10 @@ settings.register_profile(
 )
 settings.register_profile("thorough", settings.get_profile("mi_refgs"), max_examples=400, derandomize=False)
 settings.load_profile("mi_refgs")
+
+CACHE = tempfile.TemporaryDirectory(prefix="refgs_cache_")
+os.environ[FOLDER_VARIABLE] = CACHE.name
+"""What tests measure of this machine goes there, in processes of their own too, and never to the user's."""
 
 THREADS = max(dr.thread_count(), MITSUBA_EXR_THREADS)
 """Tests let Mitsuba read EXR files, on machines of one core too."""

@@ -17,8 +17,7 @@ from tiny_scene import SIZE, train_command
 
 from mi_refgs.cli import demo, main
 from mi_refgs.exr import read_exr
-from mi_refgs.fitting import plan
-from mi_refgs.fitting import speed as speeds
+from mi_refgs.fitting import cost_model, plan
 from mi_refgs.fitting.job import load_method
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.fitting.whole import sized
@@ -118,10 +117,10 @@ def test_large_pictures_are_read_smaller_unless_told_otherwise(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The size is chosen once: config.toml records it, and evaluation reads the same."""
-    slow = speeds.Speed({"initial": [1.0, 4.0], "deferred": [1.0, 4.0]}, 0.0, 0.0)  # 10 ms a pixel
-    for name, value in {"speed_of": lambda *_: slow, "WORTH": 0, "LEAST": 10}.items():
+    slow = cost_model.Speed({"initial": [1.0, 4.0], "deferred": [1.0, 4.0]}, 0.0, 0.0)  # 10 ms a pixel
+    for name, value in {"speed_of": lambda *_: slow, "WORTH": 0, "LEAST": 10, "WHOLE": 0}.items():
         monkeypatch.setattr(plan, name, value)
-    monkeypatch.setattr(speeds, "SIZES", (10, 20))
+    monkeypatch.setattr(cost_model, "SIZES", (10, 20))
     minutes = (
         (plan.START + 5) / plan.SAFETY / 60
     )  # two iterations take 8 s, or 2 s on a quarter of the pixels

@@ -21,6 +21,7 @@ from mi_refgs.compare import execute, jobs, paper_table, plots, results
 from mi_refgs.compare.jobs import Job
 from mi_refgs.compare.paper import Figures, Place, place_of
 from mi_refgs.compare.table import Row, Scene, Statistic, Table
+from mi_refgs.compare.text import heading
 from mi_refgs.errors import InputError
 from mi_refgs.exr import write_exr
 from mi_refgs.images import read_png
@@ -299,6 +300,40 @@ def test_pictures_are_looked_for_as_the_methods_read_them(
     assert len(plan("data.images='exr'")) == 1
     with pytest.raises(InputError, match="png"):
         plan()
+
+
+def test_images_of_different_sizes_are_not_set_side_by_side(
+    compared: tuple[Path, int],
+    ball: Path,
+    variants: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Before anything is fitted: two methods, or one and what the folder holds; and where runs are there."""
+    smaller = tmp_path / "smaller.toml"
+    smaller.write_text(f'extends = "{variants[0]}"\n[data]\ndownscale = 2\n')
+    copy = Path(shutil.copytree(compared[0], tmp_path / "copy"))
+    for path in copy.rglob("job.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"folder": str(path.parent)}))
+    for folder, chosen in ((tmp_path / "new", (variants[0], smaller)), (copy, (smaller,))):
+        assert main(command(ball, folder, *chosen)) == 2
+        said = capsys.readouterr().err.strip()
+        assert len(said.splitlines()) == 1 and "20 × 20" in said and "10 × 10" in said and "smaller" in said
+        assert not (folder / "runs/ball/smaller").exists()
+    metrics = copy / "runs/ball/other/seed1/metrics.json"
+    metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"image_size": [10, 10]}))
+    assert main(["compare", "-o", str(copy)]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "20 × 20" in said and "10 × 10" in said and "runs/ball/other/seed1" in said
+
+
+def test_the_size_of_images_stands_above_the_scores(compared: tuple[Path, int]) -> None:
+    [scene] = results.table(compared[0]).scenes
+    assert scene.downscale == 1 and heading(scene) == "ball (2 test views of 20 × 20 pixels)"
+    scene.downscale = 2
+    assert heading(scene) == "ball (2 test views of 20 × 20 pixels, downscaled by 2)"
+    for name in ("table.md", "index.html"):
+        assert "ball (2 test views of 20 × 20 pixels)" in (compared[0] / name).read_text()
 
 
 def test_other_settings_are_refused(

@@ -231,10 +231,10 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
     scene.write_text(SCENE)
     tiny = {**OPTIONS, "views": 1, "test_views": 1, "size": 4, "environment_height": 0}
     out = make_dataset(scene, tmp_path / "out", **{**tiny, "views": 2})
-    with pytest.raises(InputError, match=r"dataset.json: views: .*overwrite"):
+    with pytest.raises(InputError, match=r"dataset.json: --views: .*overwrite"):
         make_dataset(scene, out, **tiny)
     scene.write_text(SCENE.replace("0.7", "0.6"))
-    with pytest.raises(InputError, match="scene_sha256"):
+    with pytest.raises(InputError, match=r"dataset.json: SCENE: "):
         make_dataset(scene, out, **{**tiny, "views": 2})
     make_dataset(scene, out, **tiny, overwrite=True)
     assert not (out / "train/r_001.png").exists() and len(read_dataset(out, "train").views) == 1
@@ -410,7 +410,7 @@ def test_a_light_is_turned_as_the_scenes_own(made: Path, tmp_path: Path) -> None
 def test_lights_that_cannot_be_used(relit: Path, made: Path, tmp_path: Path) -> None:
     scene = made.parent / "ball.xml"
     (tmp_path / "warm.exr").write_bytes((made.parent / "cold sky.exr").read_bytes())
-    with pytest.raises(InputError, match=r"dataset.json: relight warm: .*overwrite"):
+    with pytest.raises(InputError, match=r"dataset.json: --relight warm: .*overwrite"):
         make_dataset(scene, relit, **OPTIONS, relight=[tmp_path / "warm.exr"])
     with pytest.raises(InputError, match="two have one name"):
         make_dataset(scene, relit, **OPTIONS, relight=[tmp_path / "warm.exr", made.parent / "warm.exr"])

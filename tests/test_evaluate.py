@@ -32,7 +32,7 @@ KEYS = (
     "surface_distance surface_accuracy surface_completeness surface_reason concave_share concave_reason "
     "psnr_concave normal_mae_deg_concave albedo_psnr_concave surface_distance_concave "
     "env_scale env_mae env_psnr env_correlation env_reason "
-    "train_seconds iterations surfels ms_per_frame variant preset dataset machine"
+    "train_seconds iterations surfels ms_per_frame variant preset dataset machine image_size downscale"
 ).split()
 
 
@@ -94,7 +94,7 @@ def test_mitsuba_renders_the_exported_scene_as_the_trainer_does(run: Run, folder
     )
     planes = [*frame.radiance, frame.alpha]
     expected = np.stack([np.array(plane).reshape(SIZE, SIZE) for plane in planes], axis=-1)
-    assert frame.alpha[SIZE * SIZE // 2 + SIZE // 2] > 0.5
+    assert frame.alpha[SIZE * SIZE // 2 + SIZE // 2] > 0.3
     np.testing.assert_allclose(image, expected, atol=1e-5)
 
 

@@ -73,7 +73,7 @@ def test_bad_input_is_one_sentence(made: Path, capsys: pytest.CaptureFixture[str
     assert main(["gallery", "-o", str(made / "other"), "--scenes", "nothing"]) == 2
     assert "use some of mirror_ring" in capsys.readouterr().err
     assert main([*command(made / "out", made / "work"), "--size", "25"]) == 2
-    assert "another gallery" in capsys.readouterr().err
+    assert "--size: the gallery was made with" in capsys.readouterr().err
 
 
 def test_turntable_turns_and_keeps_colours(tmp_path: Path) -> None:

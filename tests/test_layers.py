@@ -66,7 +66,7 @@ LAYERS: dict[str, set[str]] = {
     "data": RENDERER,
     "capture": {"data"} | BOTTOM,
     "runs": RENDERER | {"methods"},
-    "fitting": RENDERER | {"methods", "data", "capture", "runs", "resources"},
+    "fitting": RENDERER | {"methods", "data", "runs", "resources", ""},
     "evaluation": RENDERER | {"methods", "data", "runs", "fitting", "messages"},
     "relighting": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", "formats", "source"},
     "formats": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", "plugins"},
@@ -85,7 +85,7 @@ LAYERS: dict[str, set[str]] = {
         "editing",
     },
     "editing": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
-    "reconstruct": {"methods", "fitting", "evaluation", "plugins", "reconstruction", "errors"},
+    "reconstruct": {"methods", "capture", "fitting", "evaluation", "plugins", "reconstruction", "errors"},
     "importing": {"formats", "plugins", "reconstruction", "source"},
     "gallery": RENDERER
     | {"methods", "data", "runs", "evaluation", "relighting", "editing", "resources", ""}
@@ -93,8 +93,8 @@ LAYERS: dict[str, set[str]] = {
     "profiling": RENDERER | {"methods", "data", "fitting"},
     "viewer": RENDERER
     | {"methods", "data", "runs", "fitting", "evaluation", "relighting", "plugins", "editing"},
-    "compare": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", ""},
-    "doctor": {"llvm", "errors", ""},
+    "compare": RENDERER | {"methods", "data", "capture", "runs", "fitting", "evaluation", ""},
+    "doctor": {"llvm", "errors", "fitting.cost_model", ""},
     "cli": RENDERER
     | {
         "methods",

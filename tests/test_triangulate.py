@@ -81,7 +81,7 @@ def test_a_fit_starts_from_them(
         return points
 
     monkeypatch.setattr(triangulate, "triangulated", found)
-    trainer = begin(method, data, Run(tmp_path / "run"), said.append)
+    trainer = begin(method, data, Run(tmp_path / "run"), said.append, triangulate.with_points)
     assert f"{len(points.position)} points to start from" in said[0]
     assert trainer.data.points is not None
     np.testing.assert_array_equal(trainer.data.points.position, points.position)

@@ -48,13 +48,13 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--variants", nargs="+", metavar="V", help="methods: names or .toml files, by spaces or commas"
     )
-    parser.add_argument("--seeds", nargs="+", default=["0"], metavar="K", help="as in 0,1 (default 0)")
+    parser.add_argument("--seeds", nargs="+", metavar="K", help="as in 0,1 (default 0)")
     parser.add_argument(
         "--preset", metavar="P", help=f"quick, standard or paper: how long (default {DEFAULT_PRESET})"
     )
     add_settings(parser)
     parser.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="jobs at once, which share the cores (default 1)"
+        "--workers", type=int, metavar="N", help="jobs at once, which share the cores (default 1)"
     )
     parser.add_argument(
         "--cluster",
@@ -75,24 +75,25 @@ def run(args: argparse.Namespace) -> Result:
     if args.output is None:
         raise InputError("-o: none given; name the folder of the comparison")
     if args.data:
-        planned = _plan(args, execute.threads_each(args.workers, args.threads))
+        workers = 1 if args.workers is None else args.workers
+        planned = _plan(args, workers, execute.threads_each(workers, args.threads))
         wanted = [job for job in planned if not jobs.finished(job)]
-        say(f"{args.output}: {len(wanted)} of {len(planned)} jobs to do, {args.workers} at once")
+        say(f"{args.output}: {len(wanted)} of {len(planned)} jobs to do, {workers} at once")
         try:
             if args.cluster is None:
-                execute.execute_all(wanted, args.workers, Report(len(wanted)))
+                execute.execute_all(wanted, workers, Report(len(wanted)))
             else:
-                cluster.run_on_cluster(wanted, args.cluster or None, args.workers, Report(len(wanted)))
+                cluster.run_on_cluster(wanted, args.cluster or None, workers, Report(len(wanted)))
         except KeyboardInterrupt as error:
             raise type(error)(f"interrupted; the same command goes on, from {args.output}") from None
-    elif args.variants or args.set or args.preset:
-        raise InputError("DATA: none given; name the data sets that the methods are to be fitted to")
+    else:
+        _require_unused(args, "DATA: none given; name the data sets that the methods are to be fitted to")
     table = results.write(args.output)
     text = results.text(args.output, table)
     return Result(dataclasses.asdict(table), text, 0 if table.complete else EXIT_INCOMPLETE)
 
 
-def _plan(args: argparse.Namespace, threads: int | None) -> list[Job]:
+def _plan(args: argparse.Namespace, workers: int, threads: int | None) -> list[Job]:
     from mi_refgs.compare import jobs, results
     from mi_refgs.methods import names
 
@@ -100,14 +101,14 @@ def _plan(args: argparse.Namespace, threads: int | None) -> list[Job]:
     if not variants:
         raise InputError(f"--variants: none given; name some of {', '.join(names())}")
     try:
-        seeds = [int(seed) for seed in _separated(args.seeds)]
+        seeds = [int(seed) for seed in _separated(args.seeds or ["0"])]
     except ValueError as error:
         raise InputError(f"--seeds: {' '.join(args.seeds)}: not whole numbers; write them as 0,1") from error
     preset = args.preset or DEFAULT_PRESET
     planned = jobs.plan(
         args.output, args.data, variants, seeds, preset, args.set, args.mitsuba_variant, threads
     )
-    results.begin(args.output, planned, args.workers, sys.argv[1:])
+    results.begin(args.output, planned, workers, sys.argv[1:])
     return planned
 
 
@@ -116,11 +117,19 @@ def _paper_table(args: argparse.Namespace) -> Result:
     from mi_refgs.compare.paper import Figures
 
     figures = Figures.read()
-    if args.data or args.variants:
-        raise InputError("--paper-table: prints what -o holds and fits nothing; drop DATA and --variants")
+    if args.data:
+        raise InputError("--paper-table: prints what -o holds and fits nothing; drop DATA")
+    _require_unused(args, "--paper-table: prints what -o holds and fits nothing; drop the option")
     ours = None if args.output is None else results.table(args.output)
     found = paper_table.compared(args.paper_table, ours, figures)
     return Result(dataclasses.asdict(found), paper_table.text(found, figures))
+
+
+def _require_unused(args: argparse.Namespace, reason: str) -> None:
+    """Raise InputError for an option that only a fit honours."""
+    for name in ("variants", "seeds", "preset", "set", "workers", "cluster", "threads"):
+        if getattr(args, name) not in (None, []):
+            raise InputError(f"--{name}: {reason}")
 
 
 def _separated(values: list[str]) -> list[str]:

@@ -43,9 +43,7 @@ def run(args: argparse.Namespace) -> Result:
         environment_height=64,
     )
     say(f"2 of 3: fitting into {output}")
-    started = (output / "config.toml").is_file()
-    settings = [] if started else args.set
-    found = fit(data, preset=args.preset, settings=settings, output=output, resume=True)
+    found = fit(data, preset=args.preset, settings=args.set, output=output, resume=True)
     say("3 of 3: evaluating")
     result = read_metrics(Run(output))
     if (

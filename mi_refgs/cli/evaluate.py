@@ -8,6 +8,8 @@ from typing import Any
 from mi_refgs.cli.command import Result, add_command, add_run, add_test_views
 
 ROWS = (
+    ("image_size", "image size", "{0[0]} × {0[1]} pixels"),
+    ("downscale", "downscaled by", "{}"),
     ("psnr", "PSNR", "{:.2f} dB"),
     ("psnr_gain", "PSNR, exposure fitted", "{:.2f} dB"),
     ("ssim", "SSIM", "{:.4f}"),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.files import read_json
 from mi_refgs.fitting.whole import read_views, sized
-from mi_refgs.methods.method import About, DataOptions, Method
+from mi_refgs.methods.difference import differences
+from mi_refgs.methods.method import DataOptions, Method
 from mi_refgs.methods.read import load
 from mi_refgs.runs.run import Run
 
@@ -112,20 +114,42 @@ def plan(
         for variant in variants
     ]
     require_settings(folder, preset, settings)
-    _require_test_views(jobs)
+    _require_test_views(folder, jobs)
     for job in jobs:
         require_same(job)
     return jobs
 
 
-def _require_test_views(jobs: Iterable[Job]) -> None:
-    """Raise InputError for a data set whose test views cannot be read as its jobs will read them."""
-    read: set[tuple[str, DataOptions]] = set()
+def _require_test_views(folder: Path, jobs: Iterable[Job]) -> None:
+    """Raise InputError for test views that cannot be read as the jobs will read them, or that these and the
+    runs in the folder read in different sizes."""
+    read: dict[tuple[str, DataOptions], list[int]] = {}
+    sizes: dict[str, dict[str, list[int]]] = {}
+    for job in jobs_in(folder):
+        with contextlib.suppress(InputError):  # a row that says why
+            if finished(job) and (metrics := read_metrics(job.run)) is not None:
+                sizes.setdefault(job.data, {})[job.title] = metrics["image_size"]
     for job in jobs:
         method = job.method()
-        if (job.data, method.data) not in read:
-            read_views(method, Path(job.data), "test", truth=False)
-            read.add((job.data, method.data))
+        if (key := (job.data, method.data)) not in read:
+            view = read_views(method, Path(job.data), "test", truth=False).views[0]
+            read[key] = [view.width, view.height]
+        sizes.setdefault(job.data, {})[job.title] = read[key]
+    for path, found in sizes.items():
+        require_one_size(path, found, "give all methods one data.downscale, as --set data.downscale=1 does")
+
+
+def require_one_size(where: str, sizes: Mapping[str, list[int]], remedy: str) -> None:
+    """Raise InputError if runs, by their names, were or will be measured on images of different sizes.
+
+    Their scores do not compare: the PSNR of one fit differs by decibels between sizes.
+    """
+    named: dict[tuple[int, ...], str] = {}
+    for name, size in sizes.items():
+        named.setdefault(tuple(size), name)
+    if len(named) > 1:
+        each = ", ".join(f"{name} with {size[0]} × {size[1]} pixels" for size, name in named.items())
+        raise InputError(f"{where}: image sizes: {each}: scores of different sizes do not compare; {remedy}")
 
 
 def require_settings(folder: Path, preset: str, settings: Sequence[str]) -> None:
@@ -147,17 +171,18 @@ def require_same(job: Job) -> None:
         job.method()
         return
     made = job.run.method()
-    # Neither what it is called nor where its file lies changes a run; the terms are what the run has chosen.
-    before, now = (
-        _flat(dataclasses.replace(method, about=About(), file=""))
-        for method in (made, job.method(made.terms))
-    )
-    differing = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
-    if differing:
-        key = differing[0]
+    # The terms are what the run has chosen.
+    for key, (before, now) in differences(made, job.method(made.terms)).items():
         raise InputError(
-            f"{job.folder}/config.toml: {key}: the run was made with {before.get(key)}, and now it would be "
-            f"{now.get(key)}; choose another -o, or remove that run"
+            f"{job.folder}/config.toml: {key}: the run was made with {before}, and now --variants, "
+            f"--preset or --set would make it {now}; choose another -o, or remove that run"
+        )
+    if (job_file := Path(job.folder) / JOB).is_file() and (
+        was := Job.read(job_file.parent).mitsuba_variant
+    ) != job.mitsuba_variant:
+        raise InputError(
+            f"{job_file}: --mitsuba-variant: the run was made with {was}, not {job.mitsuba_variant}; repeat "
+            "that, or choose another -o"
         )
     try:
         data = job.run.dataset()
@@ -167,7 +192,7 @@ def require_same(job: Job) -> None:
         ) from error
     if data.resolve() != Path(job.data).resolve():
         raise InputError(
-            f"{job.folder}/dataset.json: path: the run was fitted to {data}, not to {job.data}; choose "
+            f"{job.folder}/dataset.json: DATA: the run was fitted to {data}, not to {job.data}; choose "
             "another -o, or remove that run"
         )
 
@@ -202,18 +227,6 @@ def _unique(names: Iterable[str], option: str, remedy: str) -> None:
         if name in seen:
             raise InputError(f"{option}: '{name}' stands there twice; {remedy}")
         seen.add(name)
-
-
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    """Dotted keys → leaves of nested dataclasses and dictionaries."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    if not isinstance(value, dict):
-        return {prefix: value}
-    flat: dict[str, Any] = {}
-    for name, inner in value.items():
-        flat |= _flat(inner, f"{prefix}.{name}" if prefix else name)
-    return flat
 
 
 def _words(value: Any) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.compare.jobs import FAILED, Job, finished
+from mi_refgs.compare.jobs import FAILED, Job, finished, require_one_size
 from mi_refgs.compare.paper import Figures, Place, place_of
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
@@ -93,6 +93,7 @@ class Scene:
     path: str
     rows: list[Row] = field(default_factory=list)
     image_size: list[int] = field(default_factory=list)
+    downscale: int | None = None  # of the files' pixels; None: not recorded
     test_views: int = 0
     place: Place | None = None  # in the paper
     note: str = ""  # what to keep in mind when comparing with the paper
@@ -116,12 +117,16 @@ class Table:
 
 
 def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
-    """The table of the jobs of a comparison in `folder`; a run that cannot be read is a failed one."""
+    """The table of the jobs of a comparison in `folder`; a run that cannot be read is a failed one.
+
+    Raises InputError for runs on one data set that were measured on images of different sizes.
+    """
     figures = Figures.read()
     table = Table(about=about)
     scenes: dict[str, Scene] = {}
     rows: dict[tuple[str, str], Row] = {}
     metrics: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    sizes: dict[str, dict[str, list[int]]] = {}
     for job in jobs:
         key = job.data, Path(job.variant).stem
         scene = scenes.setdefault(job.data, Scene(Path(job.data).name, job.data))
@@ -143,12 +148,16 @@ def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
             row.seeds.append(job.seed)
             row.runs.append(str(Path(job.folder).relative_to(folder.resolve())))
             scene.image_size, scene.test_views = found["image_size"], found["test_views"]
+            scene.downscale = found.get("downscale")
+            sizes.setdefault(job.data, {})[row.runs[-1]] = scene.image_size
             if found["machine"] not in table.machines:
                 table.machines.append(found["machine"])
         elif (failure := Path(job.folder) / FAILED).is_file():
             row.failed[job.seed] = str(read_json(failure).get("reason"))
         else:
             row.unfinished.append(job.seed)
+    for found in sizes.values():
+        require_one_size(str(folder), found, "remove the runs of one size, and fit them again in the other")
     for (path, _), row in rows.items():
         _fill(row, metrics[path, row.variant])
         _compare_with_paper(row, scenes[path], figures)

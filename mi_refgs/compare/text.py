@@ -26,7 +26,8 @@ def heading(scene: Scene) -> str:
     if not scene.image_size:
         return scene.name
     width, height = scene.image_size
-    return f"{scene.name} ({scene.test_views} test views of {width} × {height} pixels)"
+    scale = f", downscaled by {scene.downscale}" if scene.downscale not in (None, 1) else ""
+    return f"{scene.name} ({scene.test_views} test views of {width} × {height} pixels{scale})"
 
 
 def remarks(scene: Scene) -> list[str]:

@@ -8,15 +8,12 @@ Exit codes: 0 done, 2 failed (failed.json says why), 143 told to stop.
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import os
 import signal
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +21,7 @@ from mi_refgs.compare.jobs import FAILED, Job
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.interrupt import TerminatedError
+from mi_refgs.runs.run import Run
 
 DONE, FAILURE, STOPPED = 0, 2, 143
 """Exit codes."""
@@ -40,7 +38,7 @@ def main(folder: Path) -> int:
     """Do the job of a run folder and return the exit code."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        with _alone_in(folder):
+        with Run(folder).alone(PATIENCE):
             (folder / FAILED).unlink(missing_ok=True)
             fit_and_measure(Job.read(folder))
     except KeyboardInterrupt:
@@ -66,12 +64,14 @@ def fit_and_measure(job: Job) -> None:
     mi.set_variant(job.mitsuba_variant)
     mi.set_log_level(mi.LogLevel.Warn)
 
+    from mi_refgs.capture.triangulate import with_points
     from mi_refgs.evaluation.evaluate import evaluate
     from mi_refgs.fitting.whole import begin, finish, read_views
 
     run, data = job.run, Path(job.data)
     method = run.method() if run.exists() else job.method()
-    trainer = begin(method, read_views(method, data, "train", truth=False), run)
+    views = read_views(method, data, "train", truth=False)
+    trainer = begin(method, views, run, find_points=with_points)
     if trainer.iteration:
         print(f"refgs: resumed at iteration {trainer.iteration} of {method.iterations}", file=sys.stderr)
     trainer.train(Curve(job, method, trainer.iteration))
@@ -109,22 +109,6 @@ class Curve:
         ]
         line = {"iteration": trainer.iteration, "seconds": round(trainer.seconds, 3)}
         self.run.log(line | {"psnr": round(sum(values) / len(values), 4)}, CURVE)
-
-
-@contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock; raises InputError if another process keeps it."""
-    with (folder / ".lock").open("w") as file:
-        until = time.monotonic() + PATIENCE
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except OSError:
-                if time.monotonic() > until:
-                    raise InputError(f"{folder}: another process works in it; wait until it ends") from None
-                time.sleep(0.2)
-        yield
 
 
 def _end_with_parent() -> None:

@@ -96,14 +96,15 @@ def prepare_folder(out: Path, settings: Settings, overwrite: bool, relight: Sequ
     lights = _lights(found)
     same = found is not None and {name: found.get(name) for name in wanted} == wanted
     stale = [] if same else [f for pattern in VIEW_FILES for f in sorted(out.glob(pattern))]
-    changed = [k for k in wanted if k not in found or found[k] != wanted[k]] if found else []
+    differing = [k for k in wanted if k not in found or found[k] != wanted[k]] if found else []
+    changed = [*dict.fromkeys(_option(name) for name in differing)]
     if len({light.name for light in relight}) < len(relight):
         names = ", ".join(str(light.path) for light in relight)
         raise InputError(f"{names}: --relight: two have one name; rename one of the files")
     for light in relight if same else ():
         if lights.get(light.name, light.sha256) != light.sha256:
             stale += [f for pattern in OWN_FILES for f in sorted((out / RELIGHT / light.name).glob(pattern))]
-            changed.append(f"{RELIGHT} {light.name}")
+            changed.append(f"--{RELIGHT} {light.name}")
     if stale and not overwrite:
         raise InputError(
             f"{record if found else out}: {', '.join(changed) or 'output'}: the folder holds another "
@@ -118,6 +119,12 @@ def prepare_folder(out: Path, settings: Settings, overwrite: bool, relight: Sequ
     except OSError as error:
         raise InputError(f"{out}: output: cannot be written ({error}); choose a writable folder") from error
     write_json(record, wanted | {RELIGHT: lights})
+
+
+def _option(field: str) -> str:
+    """The argument of `refgs dataset` that a field of the settings comes from."""
+    names = {"scene": "SCENE", "scene_sha256": "SCENE", "height": "--size", "light_sha256": "--light"}
+    return names.get(field) or f"--{'object' if field == 'objects' else field.replace('_', '-')}"
 
 
 def _as_json(values: dict[str, Any]) -> dict[str, Any]:

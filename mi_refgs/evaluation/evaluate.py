@@ -12,9 +12,10 @@ import numpy as np
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import region_pixels
 from mi_refgs.data.view import View
+from mi_refgs.device import machine
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import decomposition, metrics, pictures
-from mi_refgs.evaluation.speed import machine, milliseconds
+from mi_refgs.evaluation.speed import milliseconds
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.files import read_json
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
@@ -78,10 +79,11 @@ def evaluate(
     them; keys that end in `_concave` count pixels where the true surface is (`evaluation.surface`).
     `psnr_gain` is that after `data.exposure.fitted_gain`, a gain a channel of every view: what pictures of
     different exposure are judged by, for every method alike. `exposure` is what the fit decided about its own
-    gains. `ms_per_frame` is the median over single synchronised frames of the displayed picture alone, light
-    filtered beforehand. `pruned` is null for a whole scene. All that is rendered has `samples` a pixel, box
-    filtered (`render.samples`); `antialias` asks for widened roughness (`render.antialias`) where the run was
-    fitted without.
+    gains. `image_size` is that of the test views as they are read, each pixel the mean of `downscale`² pixels
+    of the file; scores of different sizes do not compare. `ms_per_frame` is the median over single
+    synchronised frames of the displayed image alone, light filtered beforehand. `pruned` is null for a whole
+    scene. All that is rendered has `samples` a pixel, box filtered (`render.samples`); `antialias` asks for
+    widened roughness (`render.antialias`) where the run was fitted without.
 
     Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, and for data
     that is gone.
@@ -179,6 +181,7 @@ def evaluate(
         "dataset": str(views.path),
         "test_views": len(per_view),
         "image_size": [views.views[0].width, views.views[0].height],
+        "downscale": method.data.downscale or 1,
         "machine": machine(),
         "views": [
             {key: value for key, value in scores.items() if not key.endswith("_reason")}

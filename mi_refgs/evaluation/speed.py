@@ -1,17 +1,11 @@
-"""How long a frame takes, and on what."""
+"""How long a frame takes."""
 
 from __future__ import annotations
 
-import os
-import platform
-import re
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
@@ -23,25 +17,6 @@ WARM_UP_FRAMES = 2
 """Frames before the timing: the first compiles or loads the kernels, the second fills the memory pools."""
 TIMED_FRAMES = 20
 """Frames whose median is reported; the views repeat if there are fewer."""
-
-
-def machine() -> dict[str, Any]:
-    """What the numbers were measured on."""
-    try:
-        found = re.search(
-            r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE
-        )
-    except OSError:
-        found = None
-    return {
-        "cpu": found.group(1) if found else platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "threads": int(dr.thread_count()),
-        "system": f"{platform.system()} {platform.machine()}",
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
-        "mitsuba_variant": mi.variant(),
-    }
 
 
 def milliseconds(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from mi_refgs import methods
@@ -15,7 +16,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting.plan import planned
 from mi_refgs.fitting.progress import Progress
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.fitting.whole import begin, finish, read_views
+from mi_refgs.fitting.whole import FindPoints, begin, finish, read_views
 from mi_refgs.methods.method import Method
 from mi_refgs.resources import resource_dir
 from mi_refgs.runs.run import Run
@@ -39,40 +40,59 @@ def fit(
     resume: bool = False,
     minutes: float | None = None,
     progress: Progress | None = None,
+    find_points: FindPoints | None = None,
 ) -> Trainer:
     """Fit, from the start or from the newest checkpoint, and write the artefacts; a finished run is loaded.
 
     method: a name, the path of a .toml, or None: the full method, and for pictures without alpha the one that
     fits their surroundings too. A `Method` is fitted as it is. preset: how long, "standard" if it is None.
-    minutes: time that a new fit may take. resume: go on if the folder holds a run.
+    minutes: time that a new fit may take. resume: go on if the folder holds a run. Its method, preset,
+    settings and size of images stay: what is given has to be the same. find_points: as in `begin`.
 
-    Raises InputError for bad input, and KeyboardInterrupt or TerminatedError with a message that says how to
-    go on.
+    Raises InputError for bad input, BusyError for a run that another process trains, and KeyboardInterrupt or
+    TerminatedError with a message that says how to go on.
     """
     progress = progress or Progress()
     folder = Run(output)
     resumed = resume and folder.exists()
     if isinstance(method, Method) and (preset or settings):
         raise InputError("method: preset, settings: a Method has its own; change it, or name one")
+    if minutes is not None and not 0 < minutes < math.inf:
+        raise InputError(f"--minutes: {minutes} is no time; give more than 0")
     if resumed:
         chosen = folder.method()
-        _require_same(folder, chosen, data, method, preset, settings, progress)
+        _require_same(folder, chosen, data, method, preset, settings, minutes)
     else:
         folder.require_none()
-        if minutes is not None and not 0 < minutes < math.inf:
-            raise InputError(f"--minutes: {minutes} is no time; give more than 0")
         if not isinstance(method, Method):
             method = method or default_method(data, preset, settings, progress)
             method = load_method(method, preset, settings)
+        if minutes is not None and method.data.downscale is not None:
+            raise InputError(
+                f"--minutes: data.downscale={method.data.downscale} decides the size of images; drop either"
+            )
         wanted = None if minutes is None else 60 * minutes
         chosen, progress.expected = planned(method, data, wanted, progress.say)
         if progress.expected is not None:
             progress.say(progress.expected.sentence(chosen.iterations))
     views = read_views(chosen, data, "train", truth=False)
     _warn_of_data(chosen, views, progress)
-    trainer = begin(chosen, views, folder, progress.say)
+    with folder.alone():
+        if not resumed:
+            folder.require_none()
+        return _fit(chosen, views, folder, progress, find_points)
+
+
+def _fit(
+    method: Method, views: Dataset, folder: Run, progress: Progress, find_points: FindPoints | None
+) -> Trainer:
+    """Train to the last iteration and write the artefacts, with the run to itself."""
+    data, output, resumed = views.path, folder.path, folder.exists()
     if resumed:
-        progress.say(f"{output}: resumed at iteration {trainer.iteration} of {chosen.iterations}")
+        _say_if_moved(folder, data, progress)
+    trainer = begin(method, views, folder, progress.say, find_points)
+    if resumed:
+        progress.say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
 
     def step(trainer: Trainer) -> None:
         while trainer.notices:
@@ -125,31 +145,55 @@ def default_method(
 
 def _require_same(
     folder: Run,
-    method: Method,
+    made: Method,
     data: Path,
     wanted: str | Method | None,
     preset: str | None,
     settings: Settings,
-    progress: Progress,
+    minutes: float | None,
 ) -> None:
-    """Raise InputError if a run that is resumed was started with something else."""
-    if changes := methods.assignments(settings):
+    """Raise InputError if what is given for a run that is resumed would have made another method of it."""
+    changes, file = methods.assignments(settings), made.file
+    if isinstance(wanted, Method):
+        if wanted.select is not None and wanted.terms != made.terms:
+            wanted = methods.load(wanted.file, wanted.preset, wanted.assignments, made.terms)
+        _require(folder, "method", made, wanted)
+    elif wanted is not None:
+        file = wanted
+        now = methods.load(file, made.preset or DEFAULT_PRESET, made.assignments, made.terms)
+        _require(folder, "--variant (--for)", made, now)
+    if preset is not None and preset != made.preset:
         raise InputError(
-            f"--set: {changes[0]}: a resumed run keeps its method; drop --set or choose another -o"
+            f"{folder.path / 'config.toml'}: --preset: the run was started with '{made.preset}', not "
+            f"'{preset}'; drop --preset or choose another -o"
         )
-    named = wanted.variant if isinstance(wanted, Method) else wanted and Path(wanted).stem
-    for option, name, found in (("--variant", named, method.variant), ("--preset", preset, method.preset)):
-        if name and name != found:
-            raise InputError(
-                f"{folder.path / 'config.toml'}: {option}: the run was started with '{found}', "
-                f"not '{preset if option == '--preset' else wanted}'; drop {option} or choose another -o"
-            )
+    if changes and tuple(changes) != made.assignments:
+        _require(folder, "--set", made, methods.load(file, made.preset, changes, made.terms))
+    if minutes is not None:
+        free = replace(made, data=replace(made.data, downscale=None))
+        _require(folder, "--minutes", made, planned(free, data, 60 * minutes)[0])
+
+
+def _require(folder: Run, option: str, made: Method, now: Method) -> None:
+    """Raise InputError if the method of a run is another one than an option asks for."""
+    if now.data.downscale is None:  # decided when the run was started
+        now = replace(now, data=replace(now.data, downscale=made.data.downscale))
+    for key, (before, after) in methods.differences(made, now).items():
+        raise InputError(
+            f"{folder.path / 'config.toml'}: {option}: {key}: the run was started with {before}, and "
+            f"would now have {after}; drop {option} or choose another -o"
+        )
+
+
+def _say_if_moved(folder: Run, data: Path, progress: Progress) -> None:
+    """Warn of another data set, and record it: commands that follow read that of the last fit."""
     try:
-        before = folder.dataset()
+        before = folder.dataset().resolve()
     except (OSError, ValueError, KeyError, TypeError):
         before = data.resolve()
-    if before.resolve() != data.resolve():
+    if before != data.resolve():
         progress.warn(f"{folder.path}: was fitted to {before} before, now to {data}")
+        folder.write_dataset(str(data.resolve()), folder.region())
 
 
 def _warn_of_data(method: Method, views: Dataset, progress: Progress) -> None:

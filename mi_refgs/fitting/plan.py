@@ -10,13 +10,16 @@ import drjit as dr
 
 from mi_refgs.data.picture_store import BUDGET as PICTURE_BYTES
 from mi_refgs.data.picture_store import undecoded
-from mi_refgs.fitting.speed import Speed, speed_of
+from mi_refgs.fitting.cost_model import Speed
+from mi_refgs.fitting.speed import speed_of
 from mi_refgs.fitting.targets import BUDGET as TARGET_BYTES
 from mi_refgs.fitting.targets import PIXEL_BYTES
 from mi_refgs.fitting.whole import read_views, sized
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.presets import PRESETS
 
+WHOLE = 256 * 256
+"""Pixels of an image up to which it is read whole, unless the method says otherwise."""
 LEAST = 96
 """Pixels of the shorter side that no data set is read smaller than: what is left shows no surface."""
 SAFETY = 0.8
@@ -59,10 +62,12 @@ def minutes(seconds: float) -> str:
 def planned(
     method: Method, path: Path, limit: float | None = None, tell: Callable[[str], None] = lambda _: None
 ) -> tuple[Method, Estimate | None]:
-    """The method with the size of pictures decided, and what its fit will need; None if that is next to none.
+    """The method with the size of images decided, and what its fit will need; None if that is next to none.
 
-    The largest pictures whose fit takes at most `limit` seconds, or what the preset promises; a size that the
-    method says stays. `tell` is called with what was chosen. Raises InputError as `read_dataset` does.
+    The largest images whose fit takes at most `limit` seconds, or what the preset promises. Images of at most
+    WHOLE pixels are not downscaled, nor is a size changed that the method gives. On a busy machine the same
+    is decided: a step takes as long as `cost_model` has it. `tell` is called with what was chosen. Raises
+    InputError as `read_dataset` does.
     """
     promise = PRESETS[method.preset].minutes if method.preset in PRESETS else None
     limit = 60 * promise if limit is None and promise is not None else limit
@@ -71,32 +76,38 @@ def planned(
         data = read_views(whole, path, "train", truth=False)
     first = data.views[0]
     width, height = first.width, first.height
+    given = method.data.downscale is not None
+    if not given and limit is None:
+        method = sized(method, path, tell)
+    factor = method.data.downscale or 1
+    method = replace(method, data=replace(method.data, downscale=factor))
     if method.iterations * width * height < WORTH:
-        return (whole if method.data.downscale is None else method), None
+        return method, None
     cut_out = data.cut_out
     speed = speed_of(method, cut_out)
 
     def at(factor: int) -> Estimate:
         return estimate(method, speed, len(data.views), (width, height), factor, cut_out)
 
-    if method.data.downscale is None and limit is None:
-        method = sized(method, path, tell)
-    if method.data.downscale is not None:
-        return method, at(method.data.downscale)
-    assert limit is not None
-    factor = 1
-    while at(factor).seconds > SAFETY * limit and min(width, height) // (factor + 1) >= LEAST:
+    if given or limit is None:
+        return method, at(factor)
+    while (
+        width * height > WHOLE
+        and at(factor).seconds > SAFETY * limit
+        and min(width, height) // (factor + 1) >= LEAST
+    ):
         factor += 1
     chosen = at(factor)
     if factor > 1:
         tell(
-            f"{path}: pictures of {width} × {height} pixels are read as {chosen.width} × {chosen.height}, so "
+            f"{path}: images of {width} × {height} pixels are read as {chosen.width} × {chosen.height}, so "
             f"that the fit takes {minutes(limit)} at most; --set data.downscale=1 reads them whole "
             f"({minutes(at(1).seconds)}), --minutes M gives it other time"
         )
     if chosen.seconds > limit:
         tell(
-            f"{path}: no size of pictures is fitted in {minutes(limit)}: this takes {minutes(chosen.seconds)}"
+            f"{path}: the fit takes {minutes(chosen.seconds)}, more than {minutes(limit)}; "
+            f"--set data.downscale={factor + 1} reads smaller images"
         )
     return replace(method, data=replace(method.data, downscale=factor)), chosen
 

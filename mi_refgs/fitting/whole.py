@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.capture.triangulate import with_points
 from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
+from mi_refgs.data.readers import PointCloud
 from mi_refgs.data.survey import require_several_sides
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.exposure import EXPOSURE_FILE
@@ -32,7 +33,7 @@ def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: No
     """
     if method.data.downscale is not None:
         return method
-    budget = PRESETS[method.preset].pixels
+    budget = PRESETS[method.preset].pixels if method.preset in PRESETS else sys.maxsize
     factor, width, height = fitting_downscale(path, method.data.images, budget)
     if factor > 1:
         tell(
@@ -59,12 +60,24 @@ def read_views(method: Method, path: Path, split: str, truth: bool = True) -> Da
     )
 
 
-def begin(method: Method, views: Dataset, run: Run, tell: Callable[[str], None] = lambda _: None) -> Trainer:
+Tell = Callable[[str], None]
+"""Is called with sentences for the user."""
+FindPoints = Callable[[Dataset, Path, Tell], PointCloud | None]
+"""Finds points for a fit to start from, and keeps them in the folder: `capture.triangulate.with_points`."""
+
+
+def begin(
+    method: Method,
+    views: Dataset,
+    run: Run,
+    tell: Tell = lambda _: None,
+    find_points: FindPoints | None = None,
+) -> Trainer:
     """A trainer that writes into `run`: from its newest checkpoint if the folder holds a run, else anew.
 
-    A new fit of pictures without alpha looks for points to start from where the data set has none. `tell` is
-    called with what is found, and what is decided about the terms of a method that selects them. A run that
-    is resumed keeps its region of interest. Raises InputError for cameras that all stand in one place,
+    A new fit starts from what `find_points` finds, by default the points of the data set. `tell` is called
+    with what is found, and what is decided about the terms of a method that selects them. A run that is
+    resumed keeps its region of interest. Raises InputError for cameras that all stand in one place,
     checkpoints that are all damaged, a scene that no checkpoint is of, and a folder that cannot be written.
     """
     resumed = run.exists()
@@ -81,7 +94,8 @@ def begin(method: Method, views: Dataset, run: Run, tell: Callable[[str], None] 
         require_several_sides(views)
         for note in views.notes:
             tell(f"{views.path}: {note}")
-        views = replace(views, points=with_points(views, run.path, tell))
+        if find_points is not None:
+            views = replace(views, points=find_points(views, run.path, tell))
     trainer = Trainer(method, views, run, state)
     trainer.exposure.tell = tell
     if resumed:

@@ -68,10 +68,13 @@ def make_gallery(
     found: dict[str, Any] = {}
     if is_file(out / RECORD):
         before = read_json(out / RECORD)
-        if before.get("settings") != settings:
-            raise InputError(
-                f"{out / RECORD}: settings: another gallery's; choose another -o, or its settings"
-            )
+        made = before.get("settings")
+        for option, value in settings.items():
+            if (was := made.get(option) if isinstance(made, dict) else None) != value:
+                raise InputError(
+                    f"{out / RECORD}: --{option}: the gallery was made with {was}, not {value}; repeat "
+                    "that, or choose another -o"
+                )
         found = dict(before["scenes"])
     for number, name in enumerate(names):
         tell(f"{number + 1} of {len(names)}: {name}")
@@ -109,7 +112,7 @@ def _fitted(
         data,
         method,
         preset=settings["preset"],
-        settings=() if folder.exists() else settings["set"],  # a run that is resumed keeps its own
+        settings=settings["set"],
         output=folder.path,
         resume=True,
         progress=progress,

@@ -25,7 +25,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import read_json
+from mi_refgs.files import BusyError, read_json
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
@@ -175,9 +175,14 @@ class TrainedScene:
 def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Camera] = ()) -> list[Path]:
     """Write the artefacts into `folder`, each whole or not at all; returns their paths.
 
-    `camera` becomes the sensor of scene.xml, and `more` the next ones. Raises InputError if a file cannot be
-    written or a value is not finite.
+    `camera` becomes the sensor of scene.xml, `more` the next ones. Raises BusyError for a run that another
+    process trains, and InputError if a file cannot be written or a value is not finite.
     """
+    with Run(folder).alone():
+        return _export(fitted, folder, camera, more)
+
+
+def _export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Camera]) -> list[Path]:
     light = LIGHT_MAP if fitted.light is not None else None
     mesh = MESH if fitted.mesh is not None else None
     around = AROUND_FILE if fitted.surroundings is not None else None
@@ -256,12 +261,15 @@ def _no_artefacts(run: Run) -> InputError:
 def up_to_date(run: Run, method: Method, camera: Camera | Callable[[TrainedScene], Camera]) -> TrainedScene:
     """The artefacts of a run, written first if there are none or the newest checkpoint is newer.
 
-    `camera` is that of scene.xml, or chooses one for what is written. Raises InputError if there is nothing
-    to write them from.
+    Of a run that another process trains, the newest checkpoint, and nothing is written. `camera` is that of
+    scene.xml, or chooses one for what is written. Raises InputError if there is nothing to write them from.
     """
     fresh = load_if_newer(run, method)
     if fresh is not None:
-        export(fresh, run.path, camera(fresh) if callable(camera) else camera)
+        try:
+            export(fresh, run.path, camera(fresh) if callable(camera) else camera)
+        except BusyError:
+            return fresh
     elif not (run.path / MODEL).is_file():
         raise _no_artefacts(run)
     return TrainedScene.read(run.path)

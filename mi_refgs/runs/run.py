@@ -11,6 +11,7 @@ import json
 import math
 import sys
 import tempfile
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,15 @@ import numpy as np
 
 from mi_refgs.contraction import Region
 from mi_refgs.errors import InputError
-from mi_refgs.files import cannot_write, read_json, remove_temporaries, write_bytes, write_json
+from mi_refgs.files import cannot_write, locked, read_json, remove_temporaries, write_bytes, write_json
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
 from mi_refgs.runs import checkpoint
 
 DATASET = "dataset.json"
 """What the run is fitted to: the data set's folder and its region of interest."""
+LOCK = ".lock"
+"""A file that is there, and locked, while a process changes the run."""
 LOG = "metrics.jsonl"
 """The log of training; another log of a run is another .jsonl."""
 CHECKPOINTS_KEPT = 2
@@ -48,6 +51,18 @@ class Run:
             raise InputError(
                 f"{self.path}: holds a run already; add --resume to go on with it, or choose another -o"
             )
+
+    def alone(self, wait: float = 0.0) -> AbstractContextManager[None]:
+        """Hold the run for changes; within it, raises BusyError if another process does for `wait` seconds.
+
+        Whoever trains holds it, and whoever writes artefacts; a killed process holds nothing.
+        """
+        return locked(
+            self.path / LOCK,
+            f"{self.path}: run folder: another process trains this run or writes it; wait until it ends, or "
+            "choose another folder",
+            wait,
+        )
 
     def create(self, method: Method, dataset: str, region: Region | None = None) -> None:
         """Start a run on the data set in folder `dataset`, with this region of interest if there is one.

@@ -45,10 +45,11 @@ def save(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise cannot_write(folder, error) from error
-    written = export(trained, folder, camera, more)
-    if data is not None:
-        run.write_dataset(str(data.resolve()), region)
-    for name, content in (records or {}).items():
-        run.write_json(name, content)
-    run.write_method(method)
+    with run.alone():
+        written = export(trained, folder, camera, more)
+        if data is not None:
+            run.write_dataset(str(data.resolve()), region)
+        for name, content in (records or {}).items():
+            run.write_json(name, content)
+        run.write_method(method)
     return written
