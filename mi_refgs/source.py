@@ -9,7 +9,6 @@ from typing import Any
 
 from mi_refgs.contraction import Region
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.picture_store import undecoded
 from mi_refgs.errors import InputError
 from mi_refgs.files import read_json
 from mi_refgs.fitting.whole import read_views
@@ -63,12 +62,12 @@ class Source:
         """Whether the folder of the data set is."""
         return self.data is not None and self.data.is_dir()
 
-    def views(self, split: str) -> Dataset:
+    def views(self, split: str, decode: bool = True) -> Dataset:
         """A split of the data set; raises InputError where that is unknown, gone or unreadable."""
         if self.data is None or not self.is_there:
             gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
             raise InputError(f"views: {split}: {gone}; use cameras(), or bring the data set back")
-        found = read_views(self.method, self.data, split)
+        found = read_views(self.method, self.data, split, decode=decode)
         return found if self.region is None else replace(found, region=self.region)
 
     def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
@@ -78,16 +77,15 @@ class Source:
         """
         if not self.is_there:
             return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
-        with undecoded():
-            return [shot for split in splits for shot in self._shots_of(split)]
+        return [shot for split in splits for shot in self._shots_of(split)]
 
     def _shots_of(self, split: str) -> list[Shot]:
         """Those of one split, with the files of the pictures as they are on disk."""
         assert self.data is not None
-        views = originals = read_views(self.method, self.data, split, truth=False).views
+        views = originals = read_views(self.method, self.data, split, truth=False, decode=False).views
         if (self.method.data.downscale or 1) > 1:
             whole = replace(self.method, data=replace(self.method.data, downscale=1))
-            originals = read_views(whole, self.data, split, truth=False).views
+            originals = read_views(whole, self.data, split, truth=False, decode=False).views
         shots = []
         for view, original in zip(views, originals, strict=True):
             file = original.file

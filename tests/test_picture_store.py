@@ -7,6 +7,7 @@ import gc
 import json
 import subprocess
 import sys
+import threading
 import weakref
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from mi_refgs.data.picture_files import Mask, PictureFile
 from mi_refgs.data.picture_store import Picture, PictureStore
 from mi_refgs.errors import InputError
 from mi_refgs.exr import write_exr
+from mi_refgs.fitting.objective import Target
 from mi_refgs.fitting.targets import PIXEL_BYTES, Targets
 from mi_refgs.images import write_png
 from mi_refgs.methods.method import CoarsePictures, DataOptions
@@ -135,6 +137,7 @@ mi.set_variant("llvm_ad_rgb")
 from pathlib import Path
 from mi_refgs.data import picture_store
 from mi_refgs.data.dataset import read_dataset
+from mi_refgs.fitting.objective import Target
 from mi_refgs.fitting.targets import Targets
 from mi_refgs.methods.method import DataOptions
 picture_store.STORE.budget = int(sys.argv[2])
@@ -198,3 +201,70 @@ def test_a_view_says_whether_it_has_alpha_without_decoding(
     assert view.cut_out and view.alpha is not None
     other = dataclasses.replace(view, image=view.image * 0.5, alpha=None)
     assert not other.cut_out and np.array_equal(other.image, view.image * 0.5)
+
+
+def test_a_loaded_view_decodes_once(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading a data set for its cameras decodes nothing, whatever the budget; a target decodes once."""
+    photographs(tmp_path / "data", rng)
+    decoded, real = [], PictureFile.decode
+
+    def decode(file: PictureFile) -> np.ndarray:
+        decoded.append(file.path.stem)
+        return real(file)
+
+    monkeypatch.setattr(PictureFile, "decode", decode)
+    view = read_dataset(tmp_path / "data", "train", truth=False, decode=False).views[3]
+    assert not decoded
+    monkeypatch.setattr(view.__dict__["image"], "store", PictureStore(0))
+    loaded = view.load()
+    assert decoded == ["003"] and loaded.load() is loaded
+    assert np.array_equal(loaded.image, view.image) and loaded.alpha is None
+    decoded.clear()
+    Target.of(view, np.ones(3))
+    assert decoded == ["003"]
+    hidden = view.changed(alpha=np.zeros((HEIGHT, WIDTH), np.float32)).load()
+    assert hidden.alpha is not None and not hidden.alpha.any()
+
+
+def test_threads_share_a_store(tmp_path: Path, rng: np.random.Generator) -> None:
+    """What is kept is counted, however they meet."""
+    for i in range(6):
+        write_png(tmp_path / f"{i}.png", rng.random((20, 20, 4)))
+    size = 20 * 20 * 4
+    store = PictureStore(2 * size)
+    pictures = [Picture(PictureFile.find(tmp_path / f"{i}.png", 1), 0.0, store) for i in range(6)]
+
+    def look(first: int) -> None:
+        for i in range(40):
+            assert pictures[(first + i) % 6].planes()[0].shape == (20, 20, 3)
+
+    threads = [threading.Thread(target=look, args=(i,)) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert store.bytes == sum(kept.nbytes for kept in store._kept.values()) <= 2 * size
+
+
+def test_two_threads_that_decode_one_picture_count_it_once(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second of them meets what the first has kept meanwhile."""
+    write_png(tmp_path / "a.png", rng.random((20, 20, 4)))
+    store = PictureStore()
+    picture = Picture(PictureFile.find(tmp_path / "a.png", 1), 0.0, store, decode=False)
+    real, meet = PictureFile.decode, threading.Barrier(2)
+
+    def decode(file: PictureFile) -> np.ndarray:
+        meet.wait(20)
+        return real(file)
+
+    monkeypatch.setattr(PictureFile, "decode", decode)
+    threads = [threading.Thread(target=picture.planes) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert store.bytes == 20 * 20 * 4

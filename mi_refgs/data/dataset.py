@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.data.picture_store import undecoded
 from mi_refgs.data.readers import PointCloud, ReadOptions, reader_of
 from mi_refgs.data.region import Region, read_region, region_of
 from mi_refgs.data.view import View
@@ -66,14 +65,17 @@ def read_dataset(
     background: str = "white",
     images: str = "png",
     truth: bool = True,
+    decode: bool = True,
 ) -> Dataset:
     """Read one split ("train" or "test") of the data set in folder `path`.
 
     `downscale` averages blocks of so many pixels squared, colour premultiplied by alpha; without it pictures
     are read whole. Pixels at the right and the bottom that fill no block are left out. Where the data set
     names no test views, every eighth picture, in the order of their paths, is one and no training view.
-    `truth` reads normals, depth and materials where there are any. The region of interest is what region.json
-    says; without it, and without alpha, what the training cameras look at, for every split.
+    `truth` reads normals, depth and materials where there are any. `decode` reads images at once, while memory
+    is granted (`picture_store`), so that a broken file is told here; without it `View.load` reads them. The
+    region of interest is what region.json says; without it, and without alpha, what the training cameras look
+    at, for every split.
 
     Raises InputError for anything missing, unreadable or inconsistent: file, field and remedy are named.
     """
@@ -85,7 +87,7 @@ def read_dataset(
     downscale = 1 if downscale is None else downscale
     if downscale < 1:
         raise InputError(f"{path}: downscale: {downscale} is out of range; give a whole number from 1")
-    options = ReadOptions(downscale, BACKGROUNDS[background], images, truth)
+    options = ReadOptions(downscale, BACKGROUNDS[background], images, truth, decode)
     found = reader_of(path).read(path, split, options)
     views = found.views
     sizes = {(view.width, view.height): view.name for view in views}
@@ -100,7 +102,7 @@ def read_dataset(
     colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
     region = read_region(path)
     if region is None and not all(view.cut_out for view in views):
-        with contextlib.suppress(InputError), undecoded():  # views that share no point have none
+        with contextlib.suppress(InputError):  # views that share no point have none
             # Every split has that of the training cameras: a fit and its evaluation mean the same sphere.
             training = views if split == "train" else _training_views(path, options)
             region = region_of(training)
@@ -121,7 +123,7 @@ def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, 
 
 
 def _training_views(path: Path, options: ReadOptions) -> tuple[View, ...]:
-    return reader_of(path).read(path, "train", replace(options, truth=False)).views
+    return reader_of(path).read(path, "train", replace(options, truth=False, decode=False)).views
 
 
 def _extent(views: tuple[View, ...]) -> float:

@@ -51,6 +51,7 @@ def fitted_gain(
     count as they are seen. Pixels where an 8-bit picture is clipped do not count, nor those not in `where`
     (H, W, bool). A channel without light has gain 1.
     """
+    view = view.load()
     covered = alpha if view.alpha is None else np.minimum(alpha, view.alpha)
     rendered = np.maximum(radiance, 0) / np.maximum(alpha, 1e-6)[..., None]
     colour = view.colour(background)

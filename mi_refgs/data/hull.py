@@ -171,6 +171,7 @@ def median_colours(
             seen = seen & (np.sum(normals * (view.to_world[:3, 3] - points), axis=1) > 0)
         at = np.rint([row[seen], column[seen]]).astype(int)
         row_index, column_index = np.clip(at, 0, np.array([[view.height], [view.width]]) - 1)
+        view = view.load()
         colour = view.colour(background)[row_index, column_index]
         opaque = (
             np.full(len(colour), True) if view.alpha is None else view.alpha[row_index, column_index] > 0.5

@@ -204,7 +204,7 @@ def make_view(
             raise InputError(f"{where}: k1 … p2: {error}") from None
         fx, fy = fx * straight.zoom, fy * straight.zoom
         picture = replace(picture, straight=straight)
-    pixels: Any = Picture(picture, options.background)
+    pixels: Any = Picture(picture, options.background, decode=options.decode)
     alpha = pixels if pixels.cut_out else None
     exposure = log_exposure(picture.path)
     linear = options.images == "exr"

@@ -6,10 +6,9 @@ float32 where pixels were averaged or resampled, so a picture is the same howeve
 
 from __future__ import annotations
 
-import contextlib
+import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,24 +21,31 @@ BUDGET = 2**30
 
 
 class PictureStore:
-    """Decoded pictures; those that were asked for last are kept, and none longer than its `Picture`."""
+    """Decoded pictures; those that were asked for last are kept, and none longer than its `Picture`.
+
+    Threads may share it: the same picture is then decoded twice at worst.
+    """
 
     def __init__(self, budget: int = BUDGET) -> None:
         self.budget = budget
         self.bytes = 0
         self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._lock = threading.RLock()  # a picture may be collected, and so dropped, within it
 
     def pixels(self, picture: Picture) -> np.ndarray:
         """The pixels of a picture, decoded if they are not kept; errors as `PictureFile.decode`."""
         key = id(picture)
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key]
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
         decoded = picture.file.decode()
-        self._kept[key] = decoded
-        self.bytes += decoded.nbytes
-        while self.bytes > self.budget and self._kept:
-            self.drop(next(iter(self._kept)))
+        with self._lock:
+            self.drop(key)  # what another thread has decoded meanwhile
+            self._kept[key] = decoded
+            self.bytes += decoded.nbytes
+            while self.bytes > self.budget and self._kept:
+                self.drop(next(iter(self._kept)))
         return decoded
 
     def has_room(self, size: int) -> bool:
@@ -48,35 +54,28 @@ class PictureStore:
 
     def drop(self, key: int) -> None:
         """Keep the picture of this `id` no longer."""
-        dropped = self._kept.pop(key, None)
-        self.bytes -= 0 if dropped is None else dropped.nbytes
+        with self._lock:
+            dropped = self._kept.pop(key, None)
+            self.bytes -= 0 if dropped is None else dropped.nbytes
 
 
 STORE = PictureStore()
 """The pictures of this process."""
 
 
-@contextlib.contextmanager
-def undecoded() -> Iterator[None]:
-    """Within it, data sets are read without decoding pictures."""
-    budget, STORE.budget = STORE.budget, 0
-    try:
-        yield
-    finally:
-        STORE.budget = budget
-
-
 class Picture:
     """The pixels of a view, in a file."""
 
-    def __init__(self, file: PictureFile, background: float, store: PictureStore = STORE) -> None:
+    def __init__(
+        self, file: PictureFile, background: float, store: PictureStore = STORE, decode: bool = True
+    ) -> None:
         """Decode the file while there is room, so that what is wrong with it is said when it is read.
 
-        Raises InputError as `PictureFile.decode` does.
+        `decode`: false for a look at cameras alone. Raises InputError as `PictureFile.decode` does.
         """
         self.file, self.background, self.store = file, background, store
         weakref.finalize(self, store.drop, id(self)).atexit = False
-        whole = store.pixels(self) if store.has_room(file.largest) else None
+        whole = store.pixels(self) if decode and store.has_room(file.largest) else None
         self.cut_out = file.cut_out() if whole is None else whole.shape[-1] == 4
 
     def planes(self) -> tuple[np.ndarray, np.ndarray | None]:

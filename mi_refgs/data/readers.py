@@ -30,6 +30,7 @@ class ReadOptions:
     background: float = 1.0  # 0 … 1, in the space of the pictures, behind their alpha
     images: str = "png"  # "png": as displayed, or "exr": linear radiance
     truth: bool = True  # with normals, depth and materials where there are any
+    decode: bool = True  # pictures at once, while there is room; else when they are asked for
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,6 +53,19 @@ class View:
     near: float = 0.0  # depth of the near plane, scene units; `read_dataset` derives it from all cameras
     file: FileCamera | None = None  # that the picture was read from
 
+    def load(self) -> View:
+        """The same view with its picture in memory: `image` and `alpha` are arrays, decoded at once.
+
+        Raises InputError for a file that cannot be read. Of a view of a file that is not loaded, these two
+        attributes decode it each time, and raise likewise.
+        """
+        given = self.__dict__["image"]
+        if isinstance(given, np.ndarray):
+            return self
+        image, alpha = given.planes()
+        own = self.__dict__["alpha"]
+        return self.changed(image=image, alpha=alpha if own is given else own)
+
     def camera(self) -> Camera:
         """The splatter's camera; in Mitsuba's frame both of its focal lengths are negative."""
         from mi_refgs.splat.camera import Camera
@@ -102,7 +115,8 @@ class View:
                 f"{self.name}: data.coarse: {self.width} × {self.height} pixels are less than a block of "
                 f"{block}²; give a smaller one"
             )
-        image, alpha = self.image, self.alpha
+        loaded = self.load()
+        image, alpha = loaded.image, loaded.alpha
         alpha = None if alpha is None else box_downscale(alpha[..., None], block)[..., 0]
         return replace(
             self,
@@ -121,8 +135,9 @@ class View:
 
     def colour(self, background: np.ndarray) -> np.ndarray:
         """Linear colour (H, W, 3) of the object alone, not premultiplied; `background` (3,) as in `image`."""
-        alpha = np.float32(1) if self.alpha is None else self.alpha[..., None]
-        colour = np.clip((self.image - (1 - alpha) * background) / np.maximum(alpha, ALPHA_FLOOR), 0, None)
+        loaded = self.load()
+        alpha = np.float32(1) if loaded.alpha is None else loaded.alpha[..., None]
+        colour = np.clip((loaded.image - (1 - alpha) * background) / np.maximum(alpha, ALPHA_FLOOR), 0, None)
         return colour if self.linear else linear_from_srgb(np.clip(colour, 0, 1))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

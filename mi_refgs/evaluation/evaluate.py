@@ -39,7 +39,9 @@ NORMAL_KEYS = ("normal_mae_deg", "normal_mae_deg_full")
 LIGHT_KEYS = ("env_scale", "env_mae", "env_psnr", "env_correlation")
 
 
-def load_split(run: Run, method: Method, split: str, path: Path | None = None) -> Dataset:
+def load_split(
+    run: Run, method: Method, split: str, path: Path | None = None, decode: bool = True
+) -> Dataset:
     """A split of the data set that a run was fitted to, or of the one at `path`, read as the method says.
 
     Its region of interest is the run's. Raises InputError as `read_dataset` and `Run.region` do, and if the
@@ -59,7 +61,7 @@ def load_split(run: Run, method: Method, split: str, path: Path | None = None) -
             raise InputError(
                 f"{run.path / 'dataset.json'}: path: {path} is gone; name the data set's folder with --data"
             )
-    return of_run(run, read_views(method, path, split))
+    return of_run(run, read_views(method, path, split, decode=decode))
 
 
 def evaluate(

@@ -10,7 +10,6 @@ from pathlib import Path
 from mi_refgs import methods
 from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.picture_store import undecoded
 from mi_refgs.data.survey import few_views
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.plan import planned
@@ -132,8 +131,7 @@ def default_method(
     """The method for pictures without alpha, where the data set has such; None for the full one."""
     # What `settings` say of a method may be of the other one.
     of_data = [text for text in methods.assignments(settings) if text.startswith("data.")]
-    with undecoded():
-        views = read_views(load_method(None, preset, of_data), data, "train", truth=False)
+    views = read_views(load_method(None, preset, of_data), data, "train", truth=False, decode=False)
     if views.cut_out or views.region is None:
         return None
     method = methods.for_purpose(OPEN_PURPOSE)

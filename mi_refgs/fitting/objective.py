@@ -40,7 +40,8 @@ class Target:
     @staticmethod
     def of(view: View, background: np.ndarray) -> Target:
         """Upload a view; `background` (3,) in the space of its picture."""
-        colour, opacity = view.image, view.alpha
+        loaded = view.load()
+        colour, opacity = loaded.image, loaded.alpha
         planes = [upload(colour[..., i]) for i in range(3)]
         image = [srgb_from_linear(plane) for plane in planes] if view.linear else planes
         alpha = None if opacity is None else upload(opacity)

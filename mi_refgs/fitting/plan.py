@@ -9,7 +9,6 @@ from pathlib import Path
 import drjit as dr
 
 from mi_refgs.data.picture_store import BUDGET as PICTURE_BYTES
-from mi_refgs.data.picture_store import undecoded
 from mi_refgs.fitting.cost_model import Speed
 from mi_refgs.fitting.speed import speed_of
 from mi_refgs.fitting.targets import BUDGET as TARGET_BYTES
@@ -72,8 +71,7 @@ def planned(
     promise = PRESETS[method.preset].minutes if method.preset in PRESETS else None
     limit = 60 * promise if limit is None and promise is not None else limit
     whole = replace(method, data=replace(method.data, downscale=1))
-    with undecoded():
-        data = read_views(whole, path, "train", truth=False)
+    data = read_views(whole, path, "train", truth=False, decode=False)
     first = data.views[0]
     width, height = first.width, first.height
     given = method.data.downscale is not None

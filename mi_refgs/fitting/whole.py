@@ -44,8 +44,8 @@ def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: No
     return replace(method, data=replace(method.data, downscale=factor))
 
 
-def read_views(method: Method, path: Path, split: str, truth: bool = True) -> Dataset:
-    """A split of the data set at `path` as the method asks for its pictures; `truth` as in `read_dataset`.
+def read_views(method: Method, path: Path, split: str, truth: bool = True, decode: bool = True) -> Dataset:
+    """A split of the data set at `path` as the method asks for its pictures; the others as in `read_dataset`.
 
     Raises InputError as `read_dataset` does.
     """
@@ -57,6 +57,7 @@ def read_views(method: Method, path: Path, split: str, truth: bool = True) -> Da
         background=options.background,
         images=options.images,
         truth=truth,
+        decode=decode,
     )
 
 

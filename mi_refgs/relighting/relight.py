@@ -196,7 +196,7 @@ def _truth(method: Method, folder: Path, exposure: float, views: Dataset) -> lis
             ],
             axis=-1,
         )
-        for view in found
+        for view in (view.load() for view in found)
     ]
 
 

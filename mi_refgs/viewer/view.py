@@ -12,7 +12,6 @@ from typing import Any
 import drjit as dr
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.picture_store import undecoded
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.runs.export import newest
@@ -77,8 +76,7 @@ def views_of(run: Run, data: Path | None, tell: Tell) -> Views:
         return found
     for split in ("train", "test"):
         try:
-            with undecoded():
-                some: Dataset = load_split(run, method, split, data)
+            some: Dataset = load_split(run, method, split, data, decode=False)
             found = dataclasses.replace(found, **{split: some})
         except InputError as error:
             if data is not None:
