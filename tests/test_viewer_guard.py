@@ -123,7 +123,7 @@ def test_a_request_needs_host_origin_and_token_of_the_page(
     page = request.getfixturevalue(served)
     port, token = port_and_token(page)
 
-    def answer(host: str, origin: str | None, path: str, *more: str) -> int:
+    def answer(host: Any, origin: Any, path: Any, *more: str) -> int:
         host = host.format(port=port)
         origins = () if origin is None else (f"Origin: {origin.format(host=host.lower())}",)
         path = path.format(token=token, cut=token[:-1])

@@ -72,7 +72,7 @@ def read_dataset(
     `downscale` averages blocks of so many pixels squared, colour premultiplied by alpha; without it pictures
     are read whole. Pixels at the right and the bottom that fill no block are left out. Where the data set
     names no test views, every eighth picture, in the order of their paths, is one and no training view.
-    `truth` reads normals, depth and materials where there are any. `decode` reads images at once, while memory
+    `truth` reads normals, depth and materials where there are any. `decode` reads images now, while memory
     is granted (`picture_store`), so that a broken file is told here; without it `View.load` reads them. The
     region of interest is what region.json says; without it, and without alpha, what the training cameras look
     at, for every split.

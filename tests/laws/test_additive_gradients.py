@@ -103,8 +103,13 @@ def traced(folder: Path, **changes: Any) -> Any:
     return model_scene("split_sum", "irradiance", mesh=hollow_mesh(folder), **changes)
 
 
+def of_model(name: str) -> Callable[[Path], Any]:
+    """What makes the scene of a model."""
+    return lambda _: model_scene(name)
+
+
 SCENES: dict[str, Callable[[Path], Any]] = {
-    **{f"model {name}": (lambda _, name=name: model_scene(name)) for name in MODELS},
+    **{f"model {name}": of_model(name) for name in MODELS},
     "3D Gaussians": lambda _: model_scene("split_sum", gaussians=True),
     "at surfels": lambda _: model_scene("split_sum", shade_at="surfel"),
     "antialiased": lambda _: model_scene("split_sum", antialias=True),
