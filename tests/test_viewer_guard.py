@@ -134,9 +134,9 @@ def test_a_request_needs_host_origin_and_token_of_the_page(
         assert answer(*parts) == answered, parts
     for part, values in enumerate((FOREIGN_HOSTS, FOREIGN_ORIGINS, FOREIGN_PATHS)):
         for value in values:
-            one_foreign = [value if index == part else given[0] for index, given in enumerate(own)]
+            one_foreign: list[Any] = [value if index == part else given[0] for index, given in enumerate(own)]
             assert answer(*one_foreign) == 403, one_foreign
-    first = [values[0] for values in own]
+    first: list[Any] = [values[0] for values in own]
     assert answer(ADDRESS, *first[1:]) == (403 if served == "page" else answered)
     assert answer(*first, "Host: evil.example") == answer(*first, "Origin: http://evil.example") == 403
     assert status(port, f"/{token}", *upgrade) == 403  # without any host
