@@ -39,6 +39,11 @@ class Region:
         x, y, z, radius = map(float, numbers)
         return Region((x, y, z), radius)
 
+    def moved(self, offset: np.ndarray) -> Region:
+        """The region with its centre moved by an offset (3,)."""
+        x, y, z = (float(c) for c in np.array(self.centre) + offset)
+        return Region((x, y, z), self.radius)
+
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Which of the points (N, 3) lie inside: (N,) bool."""
         return np.linalg.norm(points - np.array(self.centre), axis=-1) <= self.radius

@@ -10,12 +10,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import test_colmap
 import trimesh
 from integrator_scenes import COUNT, image, raw_channels, scene, sensor, sky
 from tiny_scene import write_data
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.region import Region, write_region
+from mi_refgs.data.survey import require_several_sides, survey
+from mi_refgs.errors import InputError
 from mi_refgs.fitting.initial import initial_surfels
 from mi_refgs.fitting.optim import Adam
 from mi_refgs.fitting.rates import Group
@@ -180,3 +184,93 @@ def test_far_from_the_origin_the_camera_is_as_exact_as_the_surfels(shift: float)
     assert keep.mean() > 0.95 and np.abs(expected.alpha).max() > 0.5
     assert np.abs(maps.alpha.numpy().reshape(SIZE, SIZE) - expected.alpha)[keep].max() < 2e-5
     assert np.abs(maps.depth.numpy().reshape(SIZE, SIZE) - expected.depth)[keep].max() < 1e-4
+
+
+# ---------------- data sets ----------------
+
+UTM = np.array([5e5, 4e6 + 4, 120.0])
+PLACES = {"small": (1e-5, 0 * UTM), "large": (1e5, 0 * UTM), "far": (1.0, UTM), "small and far": (1e-3, UTM)}
+"""Another unit of length, and what is added to positions."""
+
+
+def put(data: Path, scale: float, offset: np.ndarray) -> Path:
+    """The cameras, and the region, of a data set in another place and unit."""
+    for path in data.glob("transforms*.json"):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, 3] = scale * matrix[:3, 3] + offset
+            frame["transform_matrix"] = matrix.tolist()
+        path.write_text(json.dumps(content))
+    write_region(data, Region(tuple(offset.tolist()), 0.5 * scale))
+    return data
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_data_set_in_any_place_and_unit_is_the_same(place: str, tmp_path: Path) -> None:
+    """Read, surveyed, and begun to be fitted; both splits are relative to one point."""
+    scale, offset = PLACES[place]
+    plain = write_data(tmp_path / "plain", truth=False)
+    data = put(write_data(tmp_path / "data", truth=False), scale, offset)
+    for folder in (plain, data):  # a lone test view, whose own mean has another round number
+        content = json.loads((folder / "transforms_test.json").read_text())
+        (folder / "transforms_test.json").write_text(json.dumps(content | {"frames": content["frames"][:1]}))
+    before, after = (read_dataset(folder, "train") for folder in (plain, data))
+    test = read_dataset(data, "test")
+    assert after.offset == test.offset and after.region == test.region
+    assert any(after.offset) == any(offset) == any("relative to (500000, 4" in note for note in after.notes)
+    assert after.scene_extent == pytest.approx(scale * before.scene_extent, rel=1e-4)
+    rest = (offset - after.offset) / scale  # of the scene's middle
+    for dataset, folder in ((after, plain), (test, plain)):
+        for view, other in zip(dataset.views, read_dataset(folder, dataset.split).views, strict=True):
+            expected = other.to_world[:3, 3] + rest
+            np.testing.assert_allclose(view.to_world[:3, 3] / scale, expected, rtol=1e-4, atol=1e-5)
+            assert np.abs(view.to_world[:3, 3]).max() < 100 * after.scene_extent
+    assert after.region is not None
+    np.testing.assert_allclose(np.array(after.region.centre) / scale, rest, atol=1e-5)
+    require_several_sides(after)
+    assert not any("one place" in note for note in survey(data).missing)
+
+
+@pytest.mark.parametrize("offset", [0 * UTM, UTM])
+@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e5])
+def test_cameras_in_one_place_are_refused_in_any_unit(
+    scale: float, offset: np.ndarray, tmp_path: Path
+) -> None:
+    data = write_data(tmp_path / "data", truth=False)
+    for path in data.glob("transforms*.json"):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            frame["transform_matrix"] = content["frames"][0]["transform_matrix"]
+        path.write_text(json.dumps(content))
+    put(data, scale, offset)
+    with pytest.raises(InputError, match="stand in one place"):
+        require_several_sides(read_dataset(data, "train"))
+
+
+def test_a_far_reconstruction_keeps_its_points(tmp_path: Path) -> None:
+    """They move with the cameras, before anything is float32."""
+    shots = test_colmap.SHOTS
+    near = read_dataset(test_colmap.write(tmp_path / "near", "txt"), "train")
+    data = test_colmap.write(tmp_path / "far", "txt")
+    model = data / "sparse/0"
+    lines = (model / "images.txt").read_text().splitlines()
+    for i, shot in enumerate(shots):
+        words = lines[1 + 2 * i].split()
+        words[5:8] = [repr(float(x)) for x in shot.translation - shot.rotation @ UTM]
+        lines[1 + 2 * i] = " ".join(words)
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    lines = (model / "points3D.txt").read_text().splitlines()
+    for i, line in enumerate(lines[2:], 2):
+        words = line.split()
+        words[1:4] = [repr(float(x) + float(d)) for x, d in zip(words[1:4], UTM, strict=True)]
+        lines[i] = " ".join(words)
+    (model / "points3D.txt").write_text("\n".join(lines) + "\n")
+    moved = read_dataset(data, "train")
+    assert moved.points is not None and near.points is not None
+    rest = UTM - moved.offset
+    np.testing.assert_allclose(moved.points.position, near.points.position + rest, atol=1e-6)
+    for view, other in zip(moved.views, near.views, strict=True):
+        np.testing.assert_allclose(view.to_world[:3, 3], other.to_world[:3, 3] + rest, atol=1e-6)
+    assert moved.region is not None and near.region is not None
+    np.testing.assert_allclose(moved.region.centre, near.region.centre + rest, atol=1e-4)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,11 @@ EXTENT_MARGIN = 1.1
 NEAR_EXTENTS = 2e-3
 """Depth of the near plane in scene extents, about 0.01 in the units of Blender's data sets: what is nearer
 stands in front of the lens."""
+FAR = 1e3
+"""Distance of the training cameras' mean from the world's origin, in scene extents, from which positions are
+moved: from there float32 resolves less than a ten-thousandth of the extent."""
+DISTINCT = 1e-11
+"""Scene extent as part of that distance below which cameras stand in one place, and nothing is moved."""
 MAX_SIZES = 4
 """Sizes of pictures in a data set, such as upright and lying: a fit compiles every kernel for each."""
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
@@ -42,6 +47,8 @@ class Dataset:
     points: PointCloud | None = None  # on what is seen, where the data set has some
     region: Region | None = None  # of interest, of all splits; absent where alpha says what is the object's
     notes: tuple[str, ...] = ()  # as in Recording
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What was subtracted from all positions of the files, scene units; as `FAR` says."""
 
     @property
     def cut_out(self) -> bool:
@@ -75,7 +82,8 @@ def read_dataset(
     `truth` reads normals, depth and materials where there are any. `decode` reads images now, while memory
     is granted (`picture_store`), so that a broken file is told here; without it `View.load` reads them. The
     region of interest is what region.json says; without it, and without alpha, what the training cameras look
-    at, for every split.
+    at, for every split. Positions far from the world's origin, as in UTM coordinates, come relative to
+    `Dataset.offset`, the same in all splits.
 
     Raises InputError for anything missing, unreadable or inconsistent: file, field and remedy are named.
     """
@@ -97,17 +105,40 @@ def read_dataset(
             f"{found.source or path}: pictures: {len(sizes)} different sizes, such as {shown}; "
             f"bring all pictures to one size, or to {MAX_SIZES} at most"
         )
-    near = NEAR_EXTENTS * _extent(views)
-    views = tuple(view.changed(near=near) for view in views)
+
+    # What depends on the cameras depends on the training cameras, for every split: a fit and its evaluation
+    # mean the same sphere, and the same place.
+    @cache
+    def training() -> tuple[View, ...]:
+        return views if split == "train" else _training_views(path, options)
+
+    offset = _offset(training()) if split == "train" or _may_be_far(views) else np.zeros(3)
+    near = NEAR_EXTENTS * _extent(views, offset)
     colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
     region = read_region(path)
+    region = None if region is None else region.moved(-offset)
     if region is None and not all(view.cut_out for view in views):
         with contextlib.suppress(InputError):  # views that share no point have none
-            # Every split has that of the training cameras: a fit and its evaluation mean the same sphere.
-            training = views if split == "train" else _training_views(path, options)
-            region = region_of(training)
+            region = region_of([_moved(view, offset) for view in training()])
+    views = tuple(_moved(view, offset).changed(near=near) for view in views)
+    points, notes = found.points, found.notes
+    if offset.any():
+        points = None if points is None else replace(points, position=points.position - offset)
+        x, y, z = (f"{value:.12g}" for value in offset)
+        notes = (*notes, f"cameras stand far from the origin: positions are relative to ({x}, {y}, {z})")
     linear = images == "exr"
-    return Dataset(path, split, views, colour, linear, found.environment, found.points, region, found.notes)
+    return Dataset(
+        path,
+        split,
+        views,
+        colour,
+        linear,
+        found.environment,
+        points,
+        region,
+        notes,
+        (float(offset[0]), float(offset[1]), float(offset[2])),
+    )
 
 
 def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, int, int]:
@@ -126,7 +157,33 @@ def _training_views(path: Path, options: ReadOptions) -> tuple[View, ...]:
     return reader_of(path).read(path, "train", replace(options, truth=False, decode=False)).views
 
 
-def _extent(views: tuple[View, ...]) -> float:
-    origins = np.array([view.to_world[:3, 3] for view in views])
+def _extent(views: tuple[View, ...], offset: np.ndarray | float = 0.0) -> float:
+    origins = np.array([view.to_world[:3, 3] for view in views]) - offset
     middle = origins.mean(axis=0) if len(np.unique(origins, axis=0)) > 1 else 0
     return EXTENT_MARGIN * float(np.linalg.norm(origins - middle, axis=1).max()) or 1.0
+
+
+def _may_be_far(views: tuple[View, ...]) -> bool:
+    """Whether it takes the training cameras to say if views stand far away: unless they are plainly near."""
+    middle = np.mean([view.to_world[:3, 3] for view in views], axis=0)
+    return len(views) == 1 or float(np.linalg.norm(middle)) > 0.01 * FAR * _extent(views)
+
+
+def _offset(views: tuple[View, ...]) -> np.ndarray:
+    """What to subtract from all positions, (3,) float64: the mean of cameras that stand FAR away, in round
+    numbers; else 0."""
+    middle = np.mean([view.to_world[:3, 3] for view in views], axis=0)
+    distance, extent = float(np.linalg.norm(middle)), _extent(views)
+    if not FAR * extent < distance < extent / DISTINCT:
+        return np.zeros(3)
+    step = 10.0 ** np.ceil(np.log10(extent))
+    return np.asarray(np.round(middle / step) * step)
+
+
+def _moved(view: View, offset: np.ndarray) -> View:
+    """The view with positions relative to an offset (3,)."""
+    if not offset.any():
+        return view
+    to_world = view.to_world.copy()
+    to_world[:3, 3] -= offset
+    return view.changed(to_world=to_world)

@@ -19,8 +19,8 @@ SMALL_SIDE = 48
 FEW_VIEWS = 20
 """Training views below which surfels overfit; published scenes have 100 and more."""
 SAME_PLACE = 1e-4
-"""Distance of all cameras from their mean, as part of their distance from the origin or the length of an
-axis, below which they stand in one place."""
+"""Distance of all cameras from their mean, as part of their distance from the origin or from the points,
+below which they stand in one place."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,12 @@ def few_views(count: int) -> str | None:
 def require_several_sides(data: Dataset) -> None:
     """Raise InputError for views that stand in one place: they show no shape."""
     origins = np.array([view.to_world[:3, 3] for view in data.views])
-    spread = np.linalg.norm(origins - origins.mean(axis=0), axis=1).max()
-    if spread <= SAME_PLACE * max(1.0, float(np.abs(origins).max())):
+    middle = origins.mean(axis=0)
+    spread = np.linalg.norm(origins - middle, axis=1).max()
+    scale = float(np.abs(origins).max())
+    if data.points is not None:
+        scale = max(scale, float(np.median(np.linalg.norm(data.points.position - middle, axis=1))))
+    if spread <= SAME_PLACE * scale:
         kind = (
             "a lone training view shows"
             if len(origins) == 1

@@ -112,7 +112,7 @@ def evaluate(
     rows: list[dict[str, np.ndarray]] = []
     kept: list[Any] = []
     per_view: list[dict[str, Any]] = []
-    surface, errors = TrueSurface.read(views.path), decomposition.Decomposition()
+    surface, errors = TrueSurface.read(views.path, views.offset), decomposition.Decomposition()
     materials = decomposition.material_maps(fitted, samples)
     for index, truth in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         frame = view(truth.camera())

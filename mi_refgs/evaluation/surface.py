@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,12 +50,16 @@ class TrueSurface:
     occluder: Occluder
 
     @staticmethod
-    def read(folder: Path) -> TrueSurface | None:
-        """That of a data set; None where there is none. Raises InputError for a file that cannot be read."""
+    def read(folder: Path, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> TrueSurface | None:
+        """That of a data set, relative to `Dataset.offset`; None where there is none.
+
+        Raises InputError for a file that cannot be read.
+        """
         path = folder / SURFACE
         if not path.is_file():
             return None
         mesh = read_mesh(path)
+        mesh = replace(mesh, vertices=(mesh.vertices - np.array(offset)).astype(np.float32))
         return TrueSurface(mesh, Occluder(mesh)) if len(mesh.faces) else None
 
     def concave(self, view: View) -> np.ndarray | None:
