@@ -116,7 +116,8 @@ def locked(path: Path, busy: str, wait: float = 0.0) -> Iterator[None]:
     finally:
         held.remove(key)
         with contextlib.suppress(OSError):  # while it is still held: nobody else can have this file's lock
-            path.unlink()
+            if not path.stat().st_size:  # a file with content is not ours
+                path.unlink()
         file.close()
 
 

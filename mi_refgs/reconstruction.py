@@ -202,21 +202,21 @@ class Reconstruction:
     def save(self, folder: str | Path) -> Reconstruction:
         """Write a run folder without checkpoints, which every command that takes a run reads; returns that.
 
-        `load` of it renders the same pictures, bit for bit. Raises InputError for a folder that holds a run
-        or cannot be written.
+        `load` of it renders the same pictures, bit for bit. Raises InputError for a folder that holds a run,
+        has a foreign file in the way or cannot be written.
         """
         self.source.save(self.trained, Path(folder), self.cameras()[0])
         return load(folder)
 
-    def export(self, form: str, path: str | Path, **options: Any) -> list[Path]:
+    def export(self, form: str, path: str | Path, *, overwrite: bool = False, **options: Any) -> list[Path]:
         """Write a file or folder of another program, such as "3dgs-ply" or "cameras"; returns the files.
 
-        `mi_refgs.formats.FORMATS` lists the formats and their options, as `refgs export --help` does. Raises
-        InputError for an unknown format or option, a reconstruction that the format cannot hold, a package
-        that must be installed, and a path that cannot be written.
+        `mi_refgs.formats.FORMATS` lists the formats and their options, as `refgs export --help` does. In a
+        folder, only `overwrite` replaces foreign files. Raises InputError for an unknown format or option, a
+        scene that the format cannot hold, a package that is missing, and a path that cannot be written.
         """
         shots = self.source.shots(self.trained, "test", "train")
-        return formats.write(self.trained, [form], Path(path), shots, options)[form]
+        return formats.write(self.trained, [form], Path(path), shots, options, self.folder, overwrite)[form]
 
     # ---------------- changes ----------------
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.cli import main
+from mi_refgs.ownership import RECORD
 from mi_refgs.runs import checkpoint
 from mi_refgs.runs.run import Run
 
@@ -186,7 +187,7 @@ def test_resume_clears_what_a_killed_process_left(finished: Path, data: Path, tm
     copy.write_bytes(b"mine")
     run.checkpoints()[-1].unlink()
     assert main(["train", str(data), "-o", str(run.path), "--resume"]) == 0
-    assert [path.name for path in run.path.rglob(".*")] == [".notes"] and copy.exists()
+    assert {path.name for path in run.path.rglob(".*")} == {RECORD, ".notes"} and copy.exists()
     lines = log.read_bytes().splitlines()
     assert lines[:1] == whole.splitlines()[:1] and len(lines) == 3
 

@@ -24,6 +24,7 @@ from mi_refgs.fitting.whole import sized
 from mi_refgs.images import read_png, srgb_from_linear, write_png
 from mi_refgs.methods.presets import PRESETS
 from mi_refgs.methods.read import load_resolved
+from mi_refgs.ownership import RECORD
 
 COMMANDS = (
     "doctor",
@@ -98,7 +99,7 @@ def test_train_writes_a_run_folder(finished: Path) -> None:
     lines = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [2, 4, 6]
     left_over = [path.name for path in finished.rglob("*") if path.name.startswith(".")]
-    assert not left_over
+    assert left_over == [RECORD]
 
 
 def test_train_tells_what_is_unusual(

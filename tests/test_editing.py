@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.editing import Change, Selection, apply, assignments, edit, join, select
 from mi_refgs.editing.fields import Fields
+from mi_refgs.editing.joining import joined_shading
 from mi_refgs.editing.rigid import rotated_harmonics
 from mi_refgs.errors import InputError
 from mi_refgs.images import write_png
@@ -25,8 +27,9 @@ from mi_refgs.reconstruction import load
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import TrainedScene
-from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.sh import eval_sh
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
@@ -442,6 +445,36 @@ def test_two_halves_joined_are_the_whole() -> None:
     assert told == ["the light is that of RUN"] and joined.surfels.count == 2 * HALF
     np.testing.assert_allclose(picture(joined), picture(whole), atol=2e-3)
     assert np.abs(picture(joined) - picture(first)).max() > 0.2
+
+
+@pytest.mark.parametrize("option", fields(Accuracy), ids=lambda option: option.name)
+def test_shading_options_of_joined_runs_are_those_of_the_first(option: Any) -> None:
+    """Whichever of the two traces rays; the options of rays are of the one that traces."""
+    model = next(model for model in MODELS.values() if option.name in model.honours)
+    of_rays = option.name in NEED_OCCLUSION
+    other = not option.default if isinstance(option.default, bool) else option.default + 1
+    other = option.default - 1 if option.name == "light_levels" else other
+
+    def shading(occlusion: bool, value: Any) -> Shading:
+        value = option.default if of_rays and not occlusion else value
+        accuracy = Accuracy(**{option.name: value})
+        return Shading(model.orders[0], model.name, "irradiance", occlusion, accuracy)
+
+    traces = [True, False] if model.visibility != "none" else [False]
+    for pair, values in product(product(traces, traces), ((option.default, other), (other, option.default))):
+        first, second = (shading(*each) for each in zip(pair, values, strict=True))
+        joined = joined_shading(first, second)
+        assert joined.occlusion == any(pair)
+        owner = second if of_rays and pair == (False, True) else first
+        assert getattr(joined.accuracy, option.name) == getattr(owner.accuracy, option.name)
+
+
+def test_a_joined_run_that_traces_keeps_the_options_of_the_first(scene: TrainedScene) -> None:
+    first = replace(scene, mesh=None, shading=replace(scene.shading, occlusion=False))
+    assert scene.shading.occlusion
+    accuracy = Accuracy(multiscatter=True, light_levels=4)
+    joined, _ = join(replace(first, shading=replace(first.shading, accuracy=accuracy)), scene)
+    assert joined.shading == replace(scene.shading, accuracy=accuracy)
 
 
 def test_harmonics_that_one_run_lacks_change_neither(scene: TrainedScene) -> None:

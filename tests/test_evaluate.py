@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
+import unicodedata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mitsuba as mi
@@ -14,9 +17,10 @@ import pytest
 from tiny_scene import SETTINGS, SIZE, write_data, write_method
 
 from mi_refgs import methods
+from mi_refgs.compare import plots
 from mi_refgs.data import dataset
 from mi_refgs.evaluation import metrics, pictures
-from mi_refgs.evaluation.evaluate import evaluate
+from mi_refgs.evaluation.evaluate import evaluate, render_names
 from mi_refgs.evaluation.speed import TIMED_FRAMES, WARM_UP_FRAMES
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.images import read_png
@@ -180,3 +184,54 @@ def test_a_sheet_holds_rows_of_different_length() -> None:
     sheet = pictures.sheet([{"a": black, "b": white}, {"a": black}], {"light": np.zeros((8, 16, 3))})
     assert sheet.ndim == 3 and sheet.shape[2] == 3
     assert (sheet[:, :, 0] == 0).sum() >= 2 * (13 * 10) * (13 * 30)
+
+
+def test_views_of_any_name_have_an_image_each() -> None:
+    """Also where file systems ignore case or compose accents; plain names stay as they are."""
+    names = [
+        "test/r_0",
+        "左",
+        "右",
+        "e\u0301",
+        "é",
+        "A",
+        "a",
+        "a",
+        "",
+        "!",
+        "x" * 300,
+        "x" * 301,
+        "b c",
+        "b/c",
+    ]
+    found = render_names([SimpleNamespace(name=name) for name in names])  # type: ignore[misc]
+    assert len({unicodedata.normalize("NFC", name).casefold() for name in found}) == len(names)
+    assert found[:3] == ["eval/test_r_0.png", "eval/左.png", "eval/右.png"]
+    assert all(len(name.encode()) < 255 and re.fullmatch(r"eval/[^./]+\.png", name) for name in found)
+    again = render_names([SimpleNamespace(name=name) for name in names[5:]])  # type: ignore[misc]
+    assert again == found[5:]
+
+
+def test_comparisons_read_the_image_of_each_view(
+    run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of views whose names have no ASCII letter."""
+    data = shutil.copytree(folder / "ball", tmp_path / "ball")
+    record = json.loads((data / "transforms_test.json").read_text())
+    for frame, name in zip(record["frames"], ("左", "右"), strict=True):
+        (data / f"{frame['file_path']}.png").rename(data / "test" / f"{name}.png")
+        frame |= {"file_path": f"./test/{name}"}
+    (data / "transforms_test.json").write_text(json.dumps(record))
+    result = evaluate(run, data)
+    images = {*(run.path / "eval").iterdir()}
+    assert len(images) == len(result["views"]) == 2
+    read: list[Path] = []
+
+    def noted(path: Path) -> np.ndarray:
+        read.append(path)
+        return read_png(path)
+
+    monkeypatch.setattr(plots, "read_png", noted)
+    scene: Any = SimpleNamespace(rows=[SimpleNamespace(runs=["run"], variant="tiny")], path=str(data))
+    assert plots.write_crops(tmp_path, scene, tmp_path / "crops.png") is not None
+    assert {*read} == images

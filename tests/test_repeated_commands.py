@@ -34,7 +34,7 @@ from mi_refgs.fitting.progress import Progress
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.gallery.make import RECORD
 from mi_refgs.resources import resource_dir
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import LOCK, Run
 
 
 @dataclass(frozen=True)
@@ -440,7 +440,7 @@ def live(finished: Path, tmp_path: Path) -> Iterator[tuple[Path, subprocess.Pope
     run = Path(shutil.copytree(finished, tmp_path / "run"))
     model = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(model | {"iteration": 3}))
-    argv = [sys.executable, "-c", HOLD, str(run / ".lock")]
+    argv = [sys.executable, "-c", HOLD, str(run / LOCK)]
     with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None and process.stdout.readline() == "held\n"
         yield run, process
@@ -474,7 +474,7 @@ def test_a_second_process_is_refused_until_the_first_ends(
     assert json.loads((run / "model.json").read_text())["iteration"] == 3  # nothing is written
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert main(argv) == 0 and not (run / ".lock").exists()
+    assert main(argv) == 0 and not (run / LOCK).exists()
 
 
 def test_a_folder_that_is_being_trained_in_is_not_saved_to(
@@ -506,7 +506,7 @@ def test_a_fit_holds_its_run(places: dict[str, str], tmp_path: Path) -> None:
 
     method = methods.load(places["method"], "quick", SETTINGS)
     reconstruct.fit(places["data"], method, output=run.path, progress=Watch())
-    assert seen == ["busy"] * 6 and not (run.path / ".lock").exists()
+    assert seen == ["busy"] * 6 and not (run.path / LOCK).exists()
     attempt()
     assert seen[-1] == "free"
     with run.alone(), run.alone():

@@ -20,6 +20,7 @@ from mi_refgs.exr import read_exr
 from mi_refgs.formats import Shot, write
 from mi_refgs.formats.shots import shots_around
 from mi_refgs.formats.splats import THIN, gaussians
+from mi_refgs.ownership import RECORD
 from mi_refgs.render.display import display_image
 from mi_refgs.render.pipeline import render
 from mi_refgs.render.surroundings import Surroundings
@@ -289,9 +290,11 @@ def test_views_of_an_exr_file_are_counted(
     assert main(["export", str(finished), "--to", "exr", "-o", str(tmp_path / "a.exr"), "--view", "9"]) == 2
     assert "--view: 9 is out of range; there are 5, give 0 to 4" in capsys.readouterr().err
     assert (
-        main(["export", str(finished), "--to", "exr,3dgs-ply,gltf-splats", "-o", str(tmp_path / "all")]) == 0
+        main(["export", str(finished), "--to", "exr, 3dgs-ply, gltf-splats,", "-o", str(tmp_path / "all")])
+        == 0
     )
     assert {path.name for path in (tmp_path / "all").iterdir()} == {
+        RECORD,
         "exr.exr",
         "3dgs-ply.ply",
         "gltf-splats.glb",

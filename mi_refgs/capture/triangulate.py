@@ -22,6 +22,7 @@ from mi_refgs.data.readers import PointCloud
 from mi_refgs.data.view import View
 from mi_refgs.files import write_bytes
 from mi_refgs.images import linear_from_srgb, write_png
+from mi_refgs.ownership import RUN, OutputFolder
 
 POINTS_FILE = "points.npz"
 """File in a run's folder: position (P, 3), colour (P, 3) linear, and key, a hash of their source."""
@@ -71,8 +72,7 @@ def with_points(data: Dataset, folder: Path, tell: Callable[[str], None]) -> Poi
     )
     content = io.BytesIO()
     np.savez_compressed(content, key=key, position=points.position, colour=np.asarray(points.colour))
-    folder.mkdir(parents=True, exist_ok=True)
-    write_bytes(kept, content.getvalue())
+    write_bytes(OutputFolder(folder, RUN).own(POINTS_FILE), content.getvalue())
     return points
 
 

@@ -32,6 +32,11 @@ def run(args: argparse.Namespace) -> Result:
     from mi_refgs.runs.run import Run
 
     data, output = args.output / "data", args.output / args.preset
+    folder = Run(output)
+    if folder.exists():
+        folder.method()
+    else:
+        folder.require_none()
     say(f"1 of 3: tracing {VIEWS + TEST_VIEWS} views of {SCENE} into {data}")
     make_dataset(
         resource_dir("scenes") / SCENE,
@@ -45,7 +50,7 @@ def run(args: argparse.Namespace) -> Result:
     say(f"2 of 3: fitting into {output}")
     found = fit(data, preset=args.preset, settings=args.set, output=output, resume=True)
     say("3 of 3: evaluating")
-    result = read_metrics(Run(output))
+    result = read_metrics(folder)
     if (
         result is None
         or result.get("iterations") != found.trained.iteration

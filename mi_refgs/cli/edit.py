@@ -117,6 +117,7 @@ def run(args: argparse.Namespace) -> Result:
     from mi_refgs.formats.incoming import read_cameras
     from mi_refgs.images import write_png
     from mi_refgs.reconstruction import load
+    from mi_refgs.runs.run import Run
 
     _require_free(args.output)
     assignments(args.set)  # what is no formula is said before the run is read, which takes seconds
@@ -139,7 +140,7 @@ def run(args: argparse.Namespace) -> Result:
     sheet = _preview(whole, edited) if args.preview else None
     edited.save(args.output)
     if sheet is not None:
-        write_png(args.output / PREVIEW, sheet)
+        write_png(Run(args.output).output.own(PREVIEW), sheet)
     text = f"{args.output}: {entry['selected']} of {entry['of']} surfels; it has {entry['surfels']}"
     return Result({"output": str(args.output), **entry}, text)
 

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mi_refgs.cli.command import Result, add_command, add_run, say
 from mi_refgs.errors import InputError, SceneError
+
+if TYPE_CHECKING:
+    from mi_refgs.ownership import OutputFolder
+    from mi_refgs.runs.run import Run
 
 
 def add(commands: Any) -> None:
@@ -40,6 +44,11 @@ def add(commands: Any) -> None:
         "--data", type=Path, metavar="DATA", help="data set of the cameras, if not that of the fit"
     )
     parser.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace files in the folder -o that are not this export of RUN, but never those of a run",
+    )
+    parser.add_argument(
         "--prune",
         action="store_true",
         help="leave out what the training views do not need; exporting again without it writes everything",
@@ -55,9 +64,8 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> Result:
     """Export."""
     from mi_refgs.evaluation.evaluate import load_split
-    from mi_refgs.files import make_folder
     from mi_refgs.formats import FORMATS, options_of, write
-    from mi_refgs.runs.export import TrainedScene, export, newest
+    from mi_refgs.runs.export import ARTEFACTS, TrainedScene, export, newest
     from mi_refgs.runs.run import Run
     from mi_refgs.source import Source
 
@@ -77,6 +85,9 @@ def run(args: argparse.Namespace) -> Result:
         say(f"note: {source.data} is gone; cameras are around the object, or give its folder with --data")
     shots = source.shots(fitted, "test", "train")
     target = args.output or folder.path
+    output = _output(folder, target, args.overwrite)
+    if args.to is None:
+        output.require_free(ARTEFACTS)
     report: dict[str, Any] = {}
     if args.prune:
         from mi_refgs.evaluation.prune import LIMIT, prune
@@ -90,17 +101,30 @@ def run(args: argparse.Namespace) -> Result:
         fitted, report = prune(fitted, training, views, LIMIT if args.limit is None else args.limit, say)
     if args.to is not None:
         try:
-            written = write(fitted, args.to.split(","), target, shots, options)
+            names = [name.strip() for name in args.to.split(",") if name.strip()]
+            written = write(fitted, names, target, shots, options, folder.path, args.overwrite)
         except SceneError as error:
             raise InputError(f"{folder.path}: {error}") from error
         files = [str(path) for paths in written.values() for path in paths]
     else:
-        make_folder(target)
-        files = [str(path) for path in export(fitted, target, shots[0].camera)]
+        files = [str(path) for path in export(fitted, target, shots[0].camera, output=output)]
     data = {"files": files, "iteration": fitted.iteration, "surfels": fitted.surfels.count}
     if not args.prune:
         return Result(data, "\n".join(files))
     return Result(data | {"pruned": report}, "\n".join([*files, table(report)]))
+
+
+def _output(run: Run, target: Path, overwrite: bool) -> OutputFolder:
+    """The folder of the artefacts of a run; raises InputError for the folder of another run."""
+    from mi_refgs.ownership import OutputFolder
+    from mi_refgs.runs.run import Run
+
+    if target.resolve() == run.path.resolve():
+        return run.output
+    if Run(target).exists():
+        raise InputError(f"{target}: output: holds a run, which is never overwritten; choose another -o")
+    remedy = "choose another -o, or replace it with --overwrite"
+    return OutputFolder(target, f"export of {run.path.resolve()}", remedy=remedy, overwrite=overwrite)
 
 
 def table(report: dict[str, Any]) -> str:

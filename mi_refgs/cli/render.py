@@ -48,6 +48,7 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> Result:
     """Render."""
     from mi_refgs.formats.incoming import read_cameras
+    from mi_refgs.ownership import require_no_run
     from mi_refgs.render.load_scene import load_scene
     from mi_refgs.render.scene_xml import sensors_of
 
@@ -59,6 +60,7 @@ def run(args: argparse.Namespace) -> Result:
         raise InputError(
             f"{args.output}: output: its folder does not exist; create it or choose a writable folder"
         )
+    require_no_run(args.output)
     if args.spp < 0:
         raise InputError(f"--spp: {args.spp} is out of range; give a number from 1")
     cameras = None if args.camera is None else read_cameras(args.camera)

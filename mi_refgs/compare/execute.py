@@ -77,7 +77,7 @@ def _process(job: Job, stop: threading.Event | None) -> int:
     package = str(Path(__file__).resolve().parents[2])
     paths = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
     try:
-        log = (Path(job.folder) / LOG).open("ab")
+        log = job.run.output.own(LOG).open("ab")
     except OSError as error:
         raise cannot_write(Path(job.folder) / LOG, error) from error
     with log:

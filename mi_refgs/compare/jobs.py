@@ -56,12 +56,6 @@ class Job:
 
     def write(self) -> None:
         """Write the job into its run folder; raises InputError if that is impossible."""
-        try:
-            Path(self.folder).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"{self.folder}: output: cannot be created ({error.strerror}); choose a writable folder"
-            ) from error
         self.run.write_json(JOB, dataclasses.asdict(self))
 
     @staticmethod
@@ -166,9 +160,10 @@ def require_settings(folder: Path, preset: str, settings: Sequence[str]) -> None
 
 
 def require_same(job: Job) -> None:
-    """Raise InputError if the job's folder holds a run of another method or other data."""
+    """Raise InputError if the job's folder holds a run of another method or other data, or foreign files."""
     if not job.run.exists():
         job.method()
+        job.run.output.require_free()
         return
     made = job.run.method()
     # The terms are what the run has chosen.

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from html import escape
-from pathlib import Path
 
 from mi_refgs.compare.plots import Region, write_crops, write_curves
 from mi_refgs.compare.table import Row, Scene, Table
 from mi_refgs.compare.text import NOTHING, cell, columns_of, header, heading, paper_cells, remarks
 from mi_refgs.errors import InputError
-from mi_refgs.files import cannot_write, write_bytes
+from mi_refgs.files import write_bytes
+from mi_refgs.ownership import OutputFolder
 
 PAGE, PICTURES = "index.html", "pictures"
 STYLE = """
@@ -31,14 +31,10 @@ pre { padding: .6rem; overflow-x: auto; }
 """
 
 
-def write_page(folder: Path, table: Table) -> None:
+def write_page(output: OutputFolder, table: Table) -> None:
     """Write index.html and its pictures; raises InputError if a file cannot be written."""
-    try:
-        (folder / PICTURES).mkdir(exist_ok=True)
-    except OSError as error:
-        raise cannot_write(folder / PICTURES, error) from error
     names = _names(scene.name for scene in table.scenes)
-    parts = [_scene(folder, scene, name) for scene, name in zip(table.scenes, names, strict=True)]
+    parts = [_scene(output, scene, name) for scene, name in zip(table.scenes, names, strict=True)]
     title = f"Comparison: {', '.join(scene.name for scene in table.scenes)}"
     content = f"""<!DOCTYPE html>
 <html lang="en">
@@ -58,12 +54,13 @@ were timed {_crowd(table)}.</p>
 </body>
 </html>
 """
-    write_bytes(folder / PAGE, content.encode())
+    write_bytes(output.own(PAGE), content.encode())
 
 
-def _scene(folder: Path, scene: Scene, name: str) -> str:
+def _scene(output: OutputFolder, scene: Scene, name: str) -> str:
     curves, crops = f"{PICTURES}/{name}_psnr.png", f"{PICTURES}/{name}_crops.png"
-    figures = ""
+    figures, folder = "", output.path
+    output.claim(curves, crops)
     if write_curves(folder, scene, folder / curves):
         figures += _figure(
             curves,

@@ -14,7 +14,7 @@ import numpy as np
 from mi_refgs.compare.table import Row, Scene
 from mi_refgs.compare.worker import CURVE
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.evaluate import render_name
+from mi_refgs.evaluation.evaluate import render_names
 from mi_refgs.evaluation.pictures import sheet
 from mi_refgs.files import write_bytes
 from mi_refgs.fitting.whole import read_views
@@ -108,12 +108,13 @@ def write_crops(folder: Path, scene: Scene, path: Path) -> Region | None:
         return None
     views = read_views(Run(folder / rows[0].runs[0]).method(), Path(scene.path), "test", truth=False).views
     chosen = np.unique(np.linspace(0, len(views) - 1, CROP_VIEWS).round().astype(int))
+    names = render_names(views)
     best: tuple[float, int, int, int, list[np.ndarray]] | None = None
     side = max(min(views[0].width, views[0].height) // CROP_SHARE, CROP_MIN)
     side = min(side, views[0].width, views[0].height)
     for index in chosen:
         truth = views[index].displayed
-        pictures = _renders(folder, rows, render_name(views[index]))
+        pictures = _renders(folder, rows, names[index])
         if pictures is None or any(picture.shape != truth.shape for picture in pictures):
             continue
         score, y, x = most_different(truth, pictures, side)

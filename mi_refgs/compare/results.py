@@ -11,12 +11,19 @@ from pathlib import Path
 from mi_refgs import __version__
 from mi_refgs.compare import jobs
 from mi_refgs.compare.jobs import SETTINGS, Job
-from mi_refgs.compare.page import PAGE, write_page
+from mi_refgs.compare.page import PAGE, PICTURES, write_page
 from mi_refgs.compare.table import Table, rows_or_error, table_of
 from mi_refgs.compare.text import markdown
-from mi_refgs.files import cannot_write, read_json, write_bytes, write_json
+from mi_refgs.files import read_json, write_bytes, write_json
+from mi_refgs.ownership import OutputFolder
 
 TABLE, TABLE_TEXT = "table.json", "table.md"
+
+
+def output(folder: Path) -> OutputFolder:
+    """The files of a comparison beside its runs."""
+    files = (SETTINGS, TABLE, TABLE_TEXT, PAGE, f"{PICTURES}/*_psnr.png", f"{PICTURES}/*_crops.png")
+    return OutputFolder(folder, "compare", files, marker=SETTINGS)
 
 
 def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequence[str]) -> None:
@@ -24,6 +31,7 @@ def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequenc
 
     The table has a row for each of them from now on.
     """
+    output(folder).require_free()
     for job in planned:
         job.write()
     before = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
@@ -37,7 +45,7 @@ def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequenc
         "command": shlex.join(["refgs", *arguments]),
         "version": __version__,
     }
-    write_json(folder / SETTINGS, about, indent=2)
+    write_json(output(folder).own(SETTINGS), about, indent=2)
 
 
 def table(folder: Path) -> Table:
@@ -58,14 +66,12 @@ def write(folder: Path) -> Table:
 
     Raises InputError if there are none, and if a file cannot be written.
     """
-    found = rows_or_error(table(folder))
-    try:
-        content = json.dumps(dataclasses.asdict(found), indent=1, ensure_ascii=False)
-        write_bytes(folder / TABLE, f"{content}\n".encode())
-        write_bytes(folder / TABLE_TEXT, markdown(found).encode())
-    except OSError as error:
-        raise cannot_write(folder, error) from error
-    write_page(folder, found)
+    found, files = rows_or_error(table(folder)), output(folder)
+    files.require_free()
+    content = json.dumps(dataclasses.asdict(found), indent=1, ensure_ascii=False)
+    write_bytes(files.own(TABLE), f"{content}\n".encode())
+    write_bytes(files.own(TABLE_TEXT), markdown(found).encode())
+    write_page(files, found)
     return found
 
 

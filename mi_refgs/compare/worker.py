@@ -39,8 +39,9 @@ def main(folder: Path) -> int:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         with Run(folder).alone(PATIENCE):
-            (folder / FAILED).unlink(missing_ok=True)
-            fit_and_measure(Job.read(folder))
+            job = Job.read(folder)
+            job.run.output.remove([FAILED])
+            fit_and_measure(job)
     except KeyboardInterrupt:
         return STOPPED
     except InputError as error:

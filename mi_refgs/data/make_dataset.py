@@ -35,11 +35,11 @@ import numpy as np
 
 from mi_refgs.data.open_scene import check_cameras, named_shapes, region_around
 from mi_refgs.data.pathtrace import bounding_sphere, reach
-from mi_refgs.data.region import write_region
+from mi_refgs.data.region import REGION_FILE, write_region
 from mi_refgs.data.scene_file import LightFile, load_scene, scene_hash, under_light
 from mi_refgs.data.settings import RELIGHT, SURFACE, Settings, prepare_folder
 from mi_refgs.data.surface import surface_mesh
-from mi_refgs.data.write_colmap import write_colmap
+from mi_refgs.data.write_colmap import colmap_output, write_colmap
 from mi_refgs.data.write_views import Cameras, write_views
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
@@ -133,17 +133,20 @@ def make_dataset(
     if about:
         poses = np.stack([pose for split in ("train", "test") for pose, _ in cameras.of(split)])
         check_cameras(loaded, about, region, poses, scene)
-    prepare_folder(out, settings, overwrite, others)
+    points = None if colmap is None else colmap_output(Path(colmap), out, cameras)
+    output = prepare_folder(out, settings, overwrite, others)
     if about:
+        output.claim(REGION_FILE)
         write_region(out, region)
+    output.claim(SURFACE)
     if not (out / SURFACE).exists():
         voxel = 2 * radius / SURFACE_VOXELS
         write_mesh(out / SURFACE, Mesh(vertices.astype(np.float32), faces.astype(np.uint32), voxel))
     tracer = cameras.tracer(lit)
-    write_views(out, ("train", "test"), cameras, tracer, True, progress)
-    if colmap is not None:
-        write_colmap(Path(colmap), out, cameras, tracer)
+    write_views(output, "", ("train", "test"), cameras, tracer, True, progress)
+    if points is not None:
+        write_colmap(points, out, cameras, tracer)
     for other, scene_there in zip(others, relit, strict=True):
-        folder = out / RELIGHT / other.name
-        write_views(folder, ("test",), cameras, cameras.tracer(scene_there), False, progress)
+        part = f"{RELIGHT}/{other.name}/"
+        write_views(output, part, ("test",), cameras, cameras.tracer(scene_there), False, progress)
     return out

@@ -15,9 +15,10 @@ import numpy as np
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.data.scene_file import LightFile
 from mi_refgs.errors import InputError
-from mi_refgs.files import read_json, write_json
+from mi_refgs.files import make_folder, read_json, write_json
+from mi_refgs.ownership import OutputFolder
 
-SURFACE = "surface.ply"
+RECORD, SURFACE = "dataset.json", "surface.ply"
 RELIGHT = "relight"
 """Folder of the test views under further lights."""
 OWN_FILES = (
@@ -82,9 +83,11 @@ class Settings:
         need(0 < near <= far < np.inf or near == far == 0, "distance", "give two lengths, 0 < NEAR <= FAR")
 
 
-def prepare_folder(out: Path, settings: Settings, overwrite: bool, relight: Sequence[LightFile] = ()) -> None:
+def prepare_folder(
+    out: Path, settings: Settings, overwrite: bool, relight: Sequence[LightFile] = ()
+) -> OutputFolder:
     """Make the folders and record the settings; stop at a folder that holds anything else, or empty it."""
-    record = out / "dataset.json"
+    record = out / RECORD
     # Settings that an older version lacked have their defaults.
     known = _as_json({f.name: f.default for f in fields(Settings) if f.default is not MISSING})
     wanted = _as_json(asdict(settings))
@@ -92,7 +95,8 @@ def prepare_folder(out: Path, settings: Settings, overwrite: bool, relight: Sequ
     if record.is_file():
         with contextlib.suppress(InputError):
             content = read_json(record)
-            found = known | content if isinstance(content, dict) else None
+            found = known | content if "scene_sha256" in content else None  # a run has a dataset.json, too
+    output = OutputFolder(out, "dataset", (RECORD, *VIEW_FILES), RECORD if found else "", overwrite=overwrite)
     lights = _lights(found)
     same = found is not None and {name: found.get(name) for name in wanted} == wanted
     stale = [] if same else [f for pattern in VIEW_FILES for f in sorted(out.glob(pattern))]
@@ -111,14 +115,13 @@ def prepare_folder(out: Path, settings: Settings, overwrite: bool, relight: Sequ
             "data set; give another folder, the same settings, or --overwrite"
         )
     lights = (lights if same else {}) | {light.name: light.sha256 for light in relight}
-    try:
-        for folder in (out / "train", out / "test", *(out / RELIGHT / name / "test" for name in lights)):
-            folder.mkdir(parents=True, exist_ok=True)
-        for file in stale:
-            file.unlink()
-    except OSError as error:
-        raise InputError(f"{out}: output: cannot be written ({error}); choose a writable folder") from error
-    write_json(record, wanted | {RELIGHT: lights})
+    if not same:
+        output.require_free()
+    output.remove(file.relative_to(out).as_posix() for file in stale)
+    for folder in (out / "train", out / "test", *(out / RELIGHT / name / "test" for name in lights)):
+        make_folder(folder)
+    write_json(output.own(RECORD), wanted | {RELIGHT: lights})
+    return output
 
 
 def _option(field: str) -> str:

@@ -8,6 +8,7 @@ whose colour is the same in the views that see them, as structure from motion fi
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,9 @@ from mi_refgs.data.pathtrace import Tracer
 from mi_refgs.data.readers import HOLDOUT
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.data.write_views import Cameras
-from mi_refgs.files import cannot_write, replace_file
+from mi_refgs.files import replace_file
 from mi_refgs.images import read_png
+from mi_refgs.ownership import OutputFolder
 
 CANDIDATES = 40_000
 """Places on surfaces that are drawn; those of one colour become points."""
@@ -31,19 +33,20 @@ SAME_PLACE = 1e-3
 """Difference of depths, as part of them, within which a view sees a place and nothing before it."""
 
 
-def write_colmap(folder: Path, data: Path, cameras: Cameras, tracer: Tracer) -> None:
-    """Write the finished data set in `data` as COLMAP into `folder`; files there are replaced.
+def colmap_output(folder: Path, data: Path, cameras: Cameras) -> OutputFolder:
+    """Claim the COLMAP files of the data set in `data`; raises InputError where a foreign one is there."""
+    output = OutputFolder(folder, f"colmap of {data.resolve()}")
+    sparse = (f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D", "test"))
+    output.claim(*sparse, REGION_FILE, *(f"images/{file}" for file in _pictures(_order(cameras)[0])))
+    return output
 
-    Raises InputError if a file cannot be written.
-    """
+
+def write_colmap(output: OutputFolder, data: Path, cameras: Cameras, tracer: Tracer) -> None:
+    """Write the finished data set in `data` as COLMAP; raises InputError if a file cannot be written."""
+    folder = output.path
     names, poses, tests = _order(cameras)
     sparse, images = folder / "sparse" / "0", folder / "images"
-    try:
-        images.mkdir(parents=True, exist_ok=True)
-        sparse.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
-    pictures = [f"{i:04d}.png" for i in range(len(names))]
+    pictures = _pictures(names)
     for name, picture in zip(names, pictures, strict=True):
         _copy(data / f"{name}.png", images / picture)
     settings = cameras.settings
@@ -66,6 +69,10 @@ def write_colmap(folder: Path, data: Path, cameras: Cameras, tracer: Tracer) -> 
     write_test_list(sparse, [pictures[i] for i in tests])
     if (data / REGION_FILE).is_file():
         _copy(data / REGION_FILE, folder / REGION_FILE)
+
+
+def _pictures(names: Sequence[str]) -> list[str]:
+    return [f"{i:04d}.png" for i in range(len(names))]
 
 
 def _order(cameras: Cameras) -> tuple[list[str], np.ndarray, list[int]]:

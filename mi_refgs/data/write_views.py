@@ -17,6 +17,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.exr import read_exr, read_exr_image, write_exr
 from mi_refgs.files import write_json
 from mi_refgs.images import read_png, srgb_from_linear, straight_srgb, write_png
+from mi_refgs.ownership import OutputFolder
 from mi_refgs.progress_bar import with_bar
 
 
@@ -63,9 +64,23 @@ class Cameras:
 
 
 def write_views(
-    out: Path, splits: Sequence[str], cameras: Cameras, tracer: Tracer, maps: bool, progress: bool
+    output: OutputFolder,
+    part: str,
+    splits: Sequence[str],
+    cameras: Cameras,
+    tracer: Tracer,
+    maps: bool,
+    progress: bool,
 ) -> None:
-    """The light, the views and then the transforms of some splits under one light; `maps`: with those."""
+    """The light, the views and then the transforms of some splits under one light; `maps`: with those.
+
+    `part` is what the paths of the files begin with, "" or "relight/NAME/".
+    """
+    out = output.path / part
+    endings = (".png", ".exr", *(f"_{name}.exr" for name in MAPS if maps))
+    views = [f"{split}/r_{i:03d}" for split in splits for i, _ in enumerate(cameras.of(split))]
+    files = ["environment.exr", *(f"transforms_{split}.json" for split in splits)]
+    output.claim(*(f"{part}{file}" for file in (*files, *(view + end for view in views for end in endings))))
     light, height = out / "environment.exr", cameras.settings.environment_height
     known = tracer.scene.environment() is not None and not cameras.objects  # a room is lit by more than it
     if height and known and not light.exists():

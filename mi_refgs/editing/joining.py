@@ -9,6 +9,8 @@ import numpy as np
 from mi_refgs.editing import follow
 from mi_refgs.errors import InputError
 from mi_refgs.runs.export import TrainedScene
+from mi_refgs.shade.accuracy import NEED_OCCLUSION
+from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.channels import CHANNELS
 from mi_refgs.surfels.table import Surfels
 
@@ -16,9 +18,10 @@ from mi_refgs.surfels.table import Surfels
 def join(first: TrainedScene, second: TrainedScene) -> tuple[TrainedScene, list[str]]:
     """Both scenes, the surfels of `first` before those of `second`; and what a person should be told.
 
-    Light, surroundings and options of accuracy are those of the first, the light that of the second where the
-    first has none. Harmonics that one of them lacks, such as what it reflects of itself, are zero there,
-    which changes none of its pictures. The meshes of both are traced: each shades and mirrors the other.
+    Light, surroundings and shading options are those of the first; of the second are the light where the
+    first has none, and the options that only rays of a mesh need where the first traces none. Harmonics that
+    one of them lacks, such as what it reflects of itself, are zero there, which changes none of its pictures.
+    The meshes of both are traced: each shades and mirrors the other.
 
     Raises InputError for scenes of different primitives, reflectance or diffuse terms: one would look wrong.
     """
@@ -36,15 +39,22 @@ def join(first: TrainedScene, second: TrainedScene) -> tuple[TrainedScene, list[
     raw = {
         name: np.concatenate(_columns(name, tables)) for name in CHANNELS if any(name in t for t in tables)
     }
-    traced = next((scene.shading for scene in (first, second) if scene.shading.occlusion), first.shading)
     joined = replace(
         first,
         surfels=Surfels.from_numpy(raw),
         light=first.light or second.light,
         mesh=follow.together(first.mesh, follow.without_surroundings(second)),
-        shading=traced,
+        shading=joined_shading(first.shading, second.shading),
     )
     return joined, _notes(first, second, joined)
+
+
+def joined_shading(first: Shading, second: Shading) -> Shading:
+    """The options of the first; rays are traced if one of the two traces them, as that one does."""
+    if first.occlusion or not second.occlusion:
+        return first
+    rays = {name: getattr(second.accuracy, name) for name in NEED_OCCLUSION}
+    return replace(first, occlusion=True, accuracy=replace(first.accuracy, **rays))
 
 
 def _columns(name: str, tables: list[dict[str, np.ndarray]]) -> list[np.ndarray]:

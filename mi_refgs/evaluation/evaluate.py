@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import re
+import unicodedata
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +36,9 @@ FOLDER = "eval"
 SHEET = "contact_sheet.png"
 DECOMPOSITION = "decomposition.png"
 METRICS = "metrics.json"
+LONGEST_STEM, HASH_DIGITS = 60, 12
+"""Characters of the view's name in an image's file name, of which file systems allow 255 bytes, and digits of
+the hash that separates equal ones."""
 SHEET_VIEWS = 4
 """Rows of either sheet, spread evenly over the test views."""
 REGION_KEYS = ("psnr_region", "ssim_region", "region_share")
@@ -87,11 +94,13 @@ def evaluate(
     scene. All that is rendered has `samples` a pixel, box filtered (`render.samples`); `antialias` asks for
     widened roughness (`render.antialias`) where the run was fitted without.
 
-    Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, and for data
-    that is gone.
+    Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, for data
+    that is gone, and for a foreign file in the run that has the name of a result.
     """
     method = run.method()
     views = load_split(run, method, "test", data)
+    renders = render_names(views.views)
+    run.output.require_free([*renders, SHEET, DECOMPOSITION, METRICS])
     fitted = up_to_date(run, method, views.views[0].camera())
     if antialias:
         accuracy = dataclasses.replace(fitted.shading.accuracy, antialias=True)
@@ -100,13 +109,7 @@ def evaluate(
     view = fitted.renderer(samples=samples)
     alone = None if fitted.surroundings is None else dataclasses.replace(fitted, surroundings=None)
     object_view = None if alone is None else alone.renderer(samples=samples)
-    folder = run.path / FOLDER
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: output: cannot be created ({error.strerror}); make the run folder writable"
-        ) from error
+    run.output.claim(*renders, SHEET, DECOMPOSITION, METRICS)
 
     shown = set(np.linspace(0, len(views.views) - 1, SHEET_VIEWS).round().astype(int).tolist())
     rows: list[dict[str, np.ndarray]] = []
@@ -142,7 +145,7 @@ def evaluate(
         maps = materials(truth.camera(), shot)
         concave = None if surface is None else surface.concave(truth)
         errors.add(shot, maps, truth, concave)
-        write_png(run.path / render_name(truth), shot.image)
+        write_png(run.path / renders[index], shot.image)
         if index in shown:
             found = pictures.panels(shot, truth)
             if object_view is not None:
@@ -204,9 +207,25 @@ def _exposure(run: Run) -> dict[str, Any] | None:
     return {name: value for name, value in read_json(run.path / EXPOSURE_FILE).items() if name != "gain"}
 
 
-def render_name(view: View) -> str:
-    """Path, below the run folder, of the picture that `evaluate` writes of a test view."""
-    return f"{FOLDER}/{re.sub(r'[^0-9A-Za-z]+', '_', view.name).strip('_')}.png"
+def render_names(views: Sequence[View]) -> list[str]:
+    """Path, below the run folder, of the image that `evaluate` writes of each test view; no two are the same.
+
+    Views whose names differ only in what file names lose, such as case or punctuation, get a hash of the
+    name.
+    """
+    stems = [
+        re.sub(r"[^\w]+", "_", unicodedata.normalize("NFC", view.name)).strip("_")[:LONGEST_STEM]
+        for view in views
+    ]
+    alike = Counter(stem.casefold() for stem in stems)
+    found: list[str] = []
+    for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
+        if not stem or alike[stem.casefold()] > 1:
+            same = sum(other.name == view.name for other in views[:index])
+            digest = hashlib.sha256(f"{same}/{view.name}".encode()).hexdigest()[:HASH_DIGITS]
+            stem = f"{stem}_{digest}".lstrip("_")
+        found.append(f"{FOLDER}/{stem}.png")
+    return found
 
 
 def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:

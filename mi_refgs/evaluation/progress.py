@@ -35,7 +35,7 @@ class Previews(Progress):
             radiance = trainer.light.radiance()
             light = pictures.lights(np.array(radiance, dtype=np.float32).reshape(radiance.shape))
         image = pictures.sheet([pictures.panels(shot, view)], light)
-        write_png(trainer.run.path / "previews" / f"{trainer.iteration:07d}.png", image)
+        write_png(trainer.run.output.own(f"previews/{trainer.iteration:07d}.png"), image)
 
 
 class Bar(Previews):

@@ -7,13 +7,17 @@ inside their functions.
 from __future__ import annotations
 
 import importlib
+import os
+import tempfile
+import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import make_folder
+from mi_refgs.files import cannot_write, make_folder
+from mi_refgs.ownership import OutputFolder, require_no_run
 
 if TYPE_CHECKING:
     from mi_refgs.data.picture_files import FileCamera
@@ -119,11 +123,15 @@ def write(
     output: Path,
     shots: Sequence[Shot],
     options: Mapping[str, Any] | None = None,
+    source: Path | None = None,
+    overwrite: bool = False,
 ) -> dict[str, list[Path]]:
     """Write a scene in some formats: one at `output`, several in that folder; returns the files by format.
 
-    `options` are keywords of the formats, each for those that declare it. Raises InputError for an unknown
-    format, an option that none of them has, a scene that one cannot hold, and what cannot be written.
+    `options` are keywords of the formats, each for those that declare it. The file that `output` names is
+    replaced. In a folder, only files that the same format wrote of the same `source`, a run folder, are
+    replaced, unless `overwrite` permits all. Raises InputError for an unknown format, an option that
+    none of them has, a scene that one cannot hold, what cannot be written, and a foreign file in the way.
     """
     chosen, given = [format_of(name) for name in names], dict(options or {})
     if not chosen:
@@ -134,8 +142,42 @@ def write(
             flag = f"--{name.replace('_', '-')}"
             raise InputError(f"{flag}: means nothing to {', '.join(names)} ({able or 'no format'} has it)")
     found = {}
+    remedy = "choose another output, or replace it with --overwrite (overwrite=True in Python)"
     for made in chosen:
         target = place(made, Path(output), len(chosen) > 1)
+        owner = f"{made.name} of {source.resolve() if source else uuid.uuid4().hex}"
         own = {option.name: given.get(option.name, option.default) for option in made.options}
+        if not made.suffix:
+            folder = OutputFolder(target, owner, remedy=remedy, overwrite=overwrite)
+            found[made.name] = _write_folder(made, folder, trained, shots, own)
+            continue
+        if target == Path(output):
+            require_no_run(target)
+        else:
+            OutputFolder(target.parent, owner, remedy=remedy, overwrite=overwrite).claim(target.name)
         found[made.name] = made.write(trained, target, shots, **own)
     return found
+
+
+def _write_folder(
+    made: Format,
+    output: OutputFolder,
+    trained: TrainedScene,
+    shots: Sequence[Shot],
+    options: Mapping[str, Any],
+) -> list[Path]:
+    """Write a format beside `output`, then move its files there; none if a foreign one is in the way.
+
+    Formats need not say beforehand which files they write. Raises InputError as `OutputFolder.claim` does.
+    """
+    try:
+        with tempfile.TemporaryDirectory(prefix=".refgs_", dir=output.path) as name:
+            stage = Path(name)
+            listed = [path.relative_to(stage) for path in made.write(trained, stage, shots, **options)]
+            files = [path.relative_to(stage) for path in stage.rglob("*") if path.is_file()]
+            output.claim(*(path.as_posix() for path in files))
+            for path in files:
+                os.replace(stage / path, output.path / path)
+    except OSError as error:
+        raise cannot_write(output.path, error) from error
+    return [output.path / path for path in listed]

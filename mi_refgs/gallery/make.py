@@ -14,11 +14,12 @@ from mi_refgs.editing import Options
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.evaluation.pictures import sheet
-from mi_refgs.files import is_file, make_folder, read_json, write_bytes, write_json
+from mi_refgs.files import is_file, read_json, write_bytes, write_json
 from mi_refgs.gallery.exhibits import EXHIBITS, Exhibit
 from mi_refgs.gallery.frames import write_still, write_turntable
 from mi_refgs.gallery.page import DECOMPOSITION, EDITS, RELIT, TURNTABLE, page
 from mi_refgs.images import read_png
+from mi_refgs.ownership import OutputFolder
 from mi_refgs.reconstruct import fit
 from mi_refgs.reconstruction import Reconstruction
 from mi_refgs.relighting import relight as relighting
@@ -76,9 +77,11 @@ def make_gallery(
                     "that, or choose another -o"
                 )
         found = dict(before["scenes"])
+    pictures = (DECOMPOSITION, RELIT, TURNTABLE, EDITS)
+    output = OutputFolder(out, "gallery", (RECORD, PAGE, *(f"*/{file}" for file in pictures)), marker=RECORD)
+    output.claim(RECORD, PAGE, *(f"{name}/{file}" for name in names for file in pictures))
     for number, name in enumerate(names):
         tell(f"{number + 1} of {len(names)}: {name}")
-        make_folder(out / name)
         run, scores = _fitted(name, work / name, settings, progress)
         found[name] = scores
         _pictures(name, EXHIBITS[name], run, out / name, size)

@@ -49,6 +49,12 @@ class NewLight:
         turned = f"_r{self.rotate:g}" if self.rotate % 360 else ""
         return turned + (f"_e{self.exposure:+g}" if self.exposure else "")
 
+    @property
+    def identity(self) -> str:
+        """What the radiance depends on: a hash of the file, its orientation and its exposure."""
+        digest = hashlib.sha256(self.path.read_bytes()).hexdigest()
+        return f"{digest} world={self.world} rotate={self.rotate % 360!r} exposure={self.exposure!r}"
+
     def read(self) -> EnvironmentLight:
         """The light, of at most HEIGHT rows; raises InputError for a file that is no lat-long image."""
         return world_light(read_radiance(self.path, READ_ROWS), self.world, self.rotate, self.exposure)

@@ -11,6 +11,7 @@ A folder of it holds
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,16 +23,17 @@ from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import pictures
 from mi_refgs.exr import write_exr
-from mi_refgs.files import cannot_write, write_json
+from mi_refgs.files import write_json
 from mi_refgs.formats.shots import turntable_cameras
 from mi_refgs.images import straight_srgb, write_png
 from mi_refgs.methods.method import Method
+from mi_refgs.ownership import OutputFolder
 from mi_refgs.progress_bar import with_bar
 from mi_refgs.relighting.light import NewLight, truth_under
 from mi_refgs.relighting.score import score, shown
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import samples_per_axis
-from mi_refgs.runs.export import TrainedScene, export, up_to_date
+from mi_refgs.runs.export import ARTEFACTS, TrainedScene, export, up_to_date
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.source import Source
@@ -66,7 +68,8 @@ def relight(
 ) -> Relit:
     """Render the scene of a run under another light into a folder.
 
-    `out` is RUN/relight/NAME by default, with the rotation and the exposure in its name if they are set.
+    `out` is RUN/relight/NAME by default, with the rotation and the exposure in its name if they are set, and
+    with a number if another map of this name is there.
 
     The scene becomes materials alone (`runs.relightable`): diffuse light is the new light's irradiance, with
     the mesh's shadows and bounces; mirrors are traced. The views are the test views of the run's data set,
@@ -75,12 +78,14 @@ def relight(
     (`truth_under`), the test views are compared with it.
 
     Raises InputError for a run without light or materials, a light or a data set that cannot be read, and a
-    folder that holds a run or cannot be written.
+    folder that cannot be written or holds a run, the pictures of another light, or foreign files of these
+    names.
     """
     if turntable < 0:
         raise InputError(f"--turntable: {turntable} is out of range; give a number of views from 1")
     source = Source.of(run).with_data(data)
     views = source.views("test") if source.is_there else None
+    asked = light
     known = None if turntable or views is None else truth_under(light, views.path)
     light = light if known is None else known[1]
 
@@ -95,15 +100,16 @@ def relight(
     except InputError as error:
         raise InputError(f"{run.path}: {error}") from error
     name = light.path.parent.name if known is not None else light.path.stem
-    out = run.path / "relight" / f"{name}{light.suffix}" if out is None else out
+    output = _own_folder(run, f"{name}{light.suffix}", asked) if out is None else _output(run, out, asked)
+    out = output.path
     cameras = cameras_of(fitted)
     if turntable:
         region = source.region if views is None else views.region
         region = None if fitted.surroundings is None else region
         cameras = turntable_cameras(scene, cameras, turntable, region)
     kind = "turntable" if turntable else "test"
-    _prepare(out, kind)
-    export(scene, out, cameras[0])
+    _prepare(output, kind, len(cameras))
+    export(scene, out, cameras[0], output=output)
     ours = _render(scene, cameras, out / kind, samples, progress)
     colour = BACKGROUNDS[source.method.data.background]
     background = np.full(3, colour, np.float32) if views is None else views.background
@@ -138,17 +144,33 @@ def relight(
     return Relit(result, warning)
 
 
-def _prepare(out: Path, kind: str) -> None:
+def _output(run: Run, out: Path, light: NewLight) -> OutputFolder:
+    """The folder `out` for the pictures of a run under a light."""
+    here = out.resolve().is_relative_to(run.path.resolve())  # the run and its folder may then move together
+    of = "" if here else f" of {run.path.resolve()}"
+    return OutputFolder(out, f"relight {light.identity}{of}", remedy="choose another -o")
+
+
+def _own_folder(run: Run, name: str, light: NewLight) -> OutputFolder:
+    """RUN/relight/NAME, or the first of NAME_2, NAME_3, … that holds nothing of another light."""
+    numbered = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
+    outputs = (_output(run, run.path / "relight" / folder, light) for folder in numbered)
+    return next(o for o in outputs if o.owner in o.owners().values() or not o.path.exists())
+
+
+def _prepare(output: OutputFolder, kind: str, count: int) -> None:
+    """Remove the pictures of the last call for the same light, and claim the names of those to come."""
+    out = output.path
     if (out / "config.toml").exists() or any(out.glob("transforms*.json")):
         raise InputError(
             f"{out}: output: holds a run or a data set, whose files would be replaced; choose another -o"
         )
-    try:
-        (out / kind).mkdir(parents=True, exist_ok=True)
-        for stale in (out / kind).glob(f"{_letter(kind)}_*.*"):  # of more views, or another data set
-            stale.unlink()
-    except OSError as error:
-        raise cannot_write(out, error) from error
+    images = [f"{kind}/{name}" for name in _names(kind, count)]
+    names = [*images, *(f"{Path(name).with_suffix('.exr')}" for name in images), RESULT, SHEET]
+    output.require_free([*names, *ARTEFACTS])
+    stale = output.owned(f"{kind}/{_letter(kind)}_*.*")  # of more views, or another data set
+    output.remove(path.relative_to(out).as_posix() for path in stale)
+    output.claim(*names)
 
 
 def _names(kind: str, count: int) -> list[str]:

@@ -25,10 +25,11 @@ import drjit as dr
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import BusyError, read_json
+from mi_refgs.files import BusyError, read_json, write_json
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.ownership import OutputFolder
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
@@ -46,6 +47,7 @@ from mi_refgs.surfels.table import Surfels
 
 SURFELS, LIGHT_MAP, MESH, SCENE, MODEL = "surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "model.json"
 AROUND_FILE, BACKGROUND_MAP = "surroundings.ply", "background.exr"
+ARTEFACTS = (SURFELS, LIGHT_MAP, MESH, AROUND_FILE, BACKGROUND_MAP, SCENE, MODEL)
 
 
 @dataclass(frozen=True)
@@ -172,23 +174,35 @@ class TrainedScene:
         return draw
 
 
-def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Camera] = ()) -> list[Path]:
+def export(
+    fitted: TrainedScene,
+    folder: Path,
+    camera: Camera,
+    more: Sequence[Camera] = (),
+    output: OutputFolder | None = None,
+) -> list[Path]:
     """Write the artefacts into `folder`, each whole or not at all; returns their paths.
 
-    `camera` becomes the sensor of scene.xml, `more` the next ones. Raises BusyError for a run that another
-    process trains, and InputError if a file cannot be written or a value is not finite.
+    `camera` becomes the sensor of scene.xml, and `more` the next ones. `output` says whose artefacts they
+    are, by default those of a run in `folder`. Raises BusyError for a run that another process trains;
+    InputError, with nothing changed, where a file of another owner has the name of an artefact; and if a
+    file cannot be written or a value is not finite.
     """
     with Run(folder).alone():
-        return _export(fitted, folder, camera, more)
+        return _export(fitted, folder, camera, more, output or Run(folder).output)
 
 
-def _export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Camera]) -> list[Path]:
+def _export(
+    fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Camera], output: OutputFolder
+) -> list[Path]:
     light = LIGHT_MAP if fitted.light is not None else None
     mesh = MESH if fitted.mesh is not None else None
     around = AROUND_FILE if fitted.surroundings is not None else None
     behind = BACKGROUND_MAP if fitted.surroundings and fitted.surroundings.background else None
-    for stale in {LIGHT_MAP, MESH, AROUND_FILE, BACKGROUND_MAP} - {light, mesh, around, behind}:
-        (folder / stale).unlink(missing_ok=True)
+    written = [name for name in (SURFELS, light, mesh, around, behind, SCENE, MODEL) if name is not None]
+    output.require_free(ARTEFACTS)
+    output.remove({*ARTEFACTS} - {*written})
+    output.claim(*written)
     write_ply(folder / SURFELS, fitted.surfels)
     if fitted.light is not None:
         fitted.light.write(folder / LIGHT_MAP)
@@ -219,9 +233,8 @@ def _export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[C
     }
     if fitted.pruned is not None:
         note["pruned"] = dataclasses.asdict(fitted.pruned)
-    Run(folder).write_json(MODEL, note | {"shading": dataclasses.asdict(fitted.shading)})
-    written = (SURFELS, light, mesh, around, behind, SCENE, MODEL)
-    return [folder / name for name in written if name is not None]
+    write_json(folder / MODEL, note | {"shading": dataclasses.asdict(fitted.shading)}, indent=2)
+    return [folder / name for name in written]
 
 
 def load_if_newer(run: Run, method: Method) -> TrainedScene | None:

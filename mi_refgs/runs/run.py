@@ -23,14 +23,32 @@ from mi_refgs.errors import InputError
 from mi_refgs.files import cannot_write, locked, read_json, remove_temporaries, write_bytes, write_json
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
+from mi_refgs.ownership import RUN, OutputFolder
 from mi_refgs.runs import checkpoint
 
 DATASET = "dataset.json"
 """What the run is fitted to: the data set's folder and its region of interest."""
-LOCK = ".lock"
+LOCK = ".refgs.lock"
 """A file that is there, and locked, while a process changes the run."""
 LOG = "metrics.jsonl"
 """The log of training; another log of a run is another .jsonl."""
+CONFIG = "config.toml"
+RUN_FILES = (
+    *(CONFIG, DATASET, LOG, "curve.jsonl", "checkpoints/*.npz", "previews/*.png", "points.npz"),
+    *(
+        "surfels.ply",
+        "envmap.exr",
+        "mesh.ply",
+        "surroundings.ply",
+        "background.exr",
+        "scene.xml",
+        "model.json",
+    ),
+    *("exposure.json", "decisions.json", "edit.json", "preview.png"),
+    *("metrics.json", "contact_sheet.png", "decomposition.png", "eval/*.png"),
+    *("job.json", "failed.json", "job.log"),
+)
+"""Patterns of all files that commands write into a run folder, relative to it."""
 CHECKPOINTS_KEPT = 2
 """One could be enough, since a checkpoint appears only when complete; two survive a disk that lies."""
 
@@ -40,17 +58,19 @@ class Run:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
+        self.output = OutputFolder(self.path, RUN, RUN_FILES, marker=CONFIG)
 
     def exists(self) -> bool:
         """Whether the folder holds a run."""
         return (self.path / "config.toml").is_file()
 
     def require_none(self) -> None:
-        """Raise InputError if the folder holds a run already."""
-        if (self.path / "config.toml").exists():
+        """Raise InputError if the folder holds a run already, or a foreign file where a run has its own."""
+        if (self.path / CONFIG).exists():
             raise InputError(
                 f"{self.path}: holds a run already; add --resume to go on with it, or choose another -o"
             )
+        self.output.require_free()
 
     def alone(self, wait: float = 0.0) -> AbstractContextManager[None]:
         """Hold the run for changes; within it, raises BusyError if another process does for `wait` seconds.
@@ -67,7 +87,7 @@ class Run:
     def create(self, method: Method, dataset: str, region: Region | None = None) -> None:
         """Start a run on the data set in folder `dataset`, with this region of interest if there is one.
 
-        Raises InputError if the folder holds one already or cannot be written.
+        Raises InputError if the folder holds one already, has a foreign file in the way or cannot be written.
         """
         self.require_none()
         self._make_folders()
@@ -79,11 +99,11 @@ class Run:
         record: dict[str, Any] = {"path": dataset}
         if region is not None:
             record["region"] = asdict(region)
-        write_bytes(self.path / DATASET, json.dumps(record).encode())
+        write_bytes(self.output.own(DATASET), json.dumps(record).encode())
 
     def write_method(self, method: Method) -> None:
         """Write the resolved method."""
-        write_bytes(self.path / "config.toml", dump(method).encode())
+        write_bytes(self.output.own(CONFIG), dump(method).encode())
 
     def method(self) -> Method:
         """The resolved method; raises InputError if this is no run folder."""
@@ -116,8 +136,9 @@ class Run:
     def save_checkpoint(self, iteration: int, state: dict[str, np.ndarray]) -> None:
         """Save a state, then drop all but the newest CHECKPOINTS_KEPT; raises InputError if it cannot be
         written."""
-        write_bytes(self.path / "checkpoints" / f"{iteration:07d}.npz", checkpoint.encode(state))
-        for old in self.checkpoints()[:-CHECKPOINTS_KEPT]:
+        write_bytes(self.output.own(f"checkpoints/{iteration:07d}.npz"), checkpoint.encode(state))
+        own = self.output.owned("checkpoints/*.npz")
+        for old in [path for path in self.checkpoints() if path in own][:-CHECKPOINTS_KEPT]:
             old.unlink(missing_ok=True)
 
     def load_checkpoint(self) -> dict[str, np.ndarray] | None:
@@ -149,10 +170,11 @@ class Run:
         self._make_folders()
         for folder in (self.path, self.path / "checkpoints", self.path / "previews"):
             remove_temporaries(folder)
+        own = self.output.owned("checkpoints/*.npz")
         for path in self.checkpoints():
-            if int(path.stem) > iteration:
+            if int(path.stem) > iteration and path in own:
                 path.unlink()
-        for log in {self.path / LOG, *self.path.glob("*.jsonl")}:
+        for log in {self.output.own(LOG), *self.output.owned("*.jsonl")}:
             text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
             kept = [line for line in text.splitlines() if _logged(line) <= iteration]
             write_bytes(log, "".join(f"{line}\n" for line in kept).encode())
@@ -164,7 +186,7 @@ class Run:
 
         Raises InputError if it cannot be written.
         """
-        path = self.path / name
+        path = self.output.own(name)
         line = {
             name: None if isinstance(value, float) and not math.isfinite(value) else value
             for name, value in line.items()
@@ -176,8 +198,8 @@ class Run:
             raise cannot_write(path, error) from error
 
     def write_json(self, name: str, content: Any) -> None:
-        """Write a JSON file of the run."""
-        write_json(self.path / name, content, indent=2)
+        """Write a JSON file of the run; raises InputError for a foreign file of this name."""
+        write_json(self.output.own(name), content, indent=2)
 
     def _make_folders(self) -> None:
         try:

@@ -11,7 +11,7 @@ from typing import Any
 
 from mi_refgs.contraction import Region
 from mi_refgs.errors import InputError
-from mi_refgs.files import cannot_write
+from mi_refgs.files import make_folder
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.export import TrainedScene, export
 from mi_refgs.runs.run import Run
@@ -33,19 +33,17 @@ def save(
 
     `camera` and `more` become the sensors of scene.xml; `data` is the data set of its test views, and
     `region` that of interest; `records` are JSON files by name. config.toml is written last: where it is, the
-    folder is complete. Raises InputError for a folder that holds a run or cannot be written, and for a value
-    that is not finite.
+    folder is complete. Raises InputError for a folder that holds a run, has a foreign file in the way or
+    cannot be written, and for a value that is not finite.
     """
     run = Run(folder)
     if run.exists():
         raise InputError(
             f"{folder}: holds a run already, which nothing is written into; choose another folder"
         )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
+    make_folder(folder)
     with run.alone():
+        run.output.require_free()
         written = export(trained, folder, camera, more)
         if data is not None:
             run.write_dataset(str(data.resolve()), region)
