@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from mi_refgs import doctor, llvm
+from mi_refgs.fitting import cost_model
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +85,15 @@ def test_the_command_reports_what_keeps_the_package_from_being_imported() -> Non
     assert done.returncode == 1
     assert "PROBLEM: DRJIT_LIBLLVM_PATH=/none/libLLVM.so does not exist" in done.stdout
     assert f"unset {llvm.ENVIRONMENT_VARIABLE}" in done.stdout
+
+
+def test_measured_speeds_are_shown_with_how_to_measure_anew(
+    report: doctor.Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(cost_model.FOLDER_VARIABLE, str(tmp_path))
+    assert "none measured yet" in dataclasses.replace(report, speeds=cost_model.summary()).to_text()
+    for threads in (1, 2):
+        cost_model.kept({"threads": threads}, lambda: cost_model.Speed({"all": [1.0, 2.0]}, 0.0, 0.0))
+    text = dataclasses.replace(report, speeds=cost_model.summary()).to_text()
+    assert "1 measured with 1 threads" in text and "1 measured with 2 threads" in text
+    assert f"in {tmp_path}, which may be removed to measure them anew" in text
