@@ -75,16 +75,27 @@ def exr_strips(path: Path) -> tuple[tuple[int, int], Iterator[np.ndarray]]:
     One channel, with or without alpha, is grey. Raises InputError as `read_exr_image` does, but leaves NaN
     and infinite values to the caller; the strips raise it where they are broken.
     """
+    width, height = exr_size(path)
+    names = _header(path)
+    return (height, width), _strips(path, names[:3] if len(names) > 2 else names[:1], width, height)
+
+
+def exr_has_alpha(path: Path) -> bool:
+    """Whether `read_exr_image` gives alpha beside a colour, by the header; raises InputError as that does."""
+    exr_size(path)
+    return len(_header(path)) == 4
+
+
+def _header(path: Path) -> list[str]:
+    """The channels that `read_exr_image` takes."""
     import OpenEXR
 
-    width, height = exr_size(path)
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             header, found = dict(file.header()), file.header()["channels"]
     except Exception as error:  # the binding raises RuntimeError, TypeError or its own types
         raise _unreadable(path, error) from error
-    names = _chosen(path, [channel.name for channel in found], header, False)
-    return (height, width), _strips(path, names[:3] if len(names) > 2 else names[:1], width, height)
+    return _chosen(path, [channel.name for channel in found], header, False)
 
 
 def _strips(path: Path, names: list[str], width: int, height: int) -> Iterator[np.ndarray]:

@@ -152,6 +152,13 @@ def has_alpha(path: str | Path) -> bool:
         return _transparent(picture)
 
 
+def is_opaque(path: Path) -> bool:
+    """Whether no pixel of a PNG or JPEG file is transparent; raises InputError as `read_png` does."""
+    with open_picture(path) as picture:
+        whole = picture if picture.mode in ("RGBA", "LA") else picture.convert("RGBA")
+        return bool(whole.getchannel("A").getextrema()[0] == 255)
+
+
 def _transparent(picture: Any) -> bool:
     return picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
 

@@ -90,7 +90,7 @@ class Source:
         for view, original in zip(views, originals, strict=True):
             file = original.file
             if file is not None:
-                mask = None if file.mask is None else Path(os.path.relpath(file.mask, self.data))
+                mask = file.mask and replace(file.mask, path=Path(os.path.relpath(file.mask.path, self.data)))
                 file = replace(file, path=Path(os.path.relpath(file.path, self.data)), mask=mask)
             shots.append(Shot(view.name, split, view.camera(), file))
         return shots

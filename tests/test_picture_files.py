@@ -8,9 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from tiny_scene import write_data
 
+from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.picture_files import BAND, Mask, PictureFile
+from mi_refgs.data.survey import survey
 from mi_refgs.errors import InputError
+from mi_refgs.exr import read_exr_image, write_exr
 from mi_refgs.images import box_downscale, read_bytes, read_grey, read_png, write_png
 
 
@@ -117,3 +121,40 @@ def test_pictures_are_used_as_they_lie(tmp_path: Path) -> None:
     turned = jpeg(tmp_path / "b.jpg", pixels, exif=exif)
     assert PictureFile.find(turned, 1).size == (40, 24)
     np.testing.assert_array_equal(read(turned, 2)[0], read(plain, 2)[0])
+
+
+def filled(data: Path, but: str = "") -> Path:
+    """A data set whose images keep alpha but have no transparent pixel; `but` for one."""
+    for kind, read_file, write_file in ((".png", read_png, write_png), (".exr", read_exr_image, write_exr)):
+        for path in [p for p in data.glob(f"t*/r_?{kind}") if p.stem != but]:
+            image = np.array(read_file(path))
+            image[..., 3] = 1
+            write_file(path, image)
+    return data
+
+
+@pytest.mark.parametrize("images", ["png", "exr"])
+def test_alpha_that_leaves_nothing_out_is_none(images: str, tmp_path: Path) -> None:
+    """Photographs saved as RGBA are photographs, in both splits, and that is said; a mask stays a mask."""
+    data = write_data(tmp_path / "ball", truth=False)
+    for path in data.glob("*/*.png"):
+        write_exr(path.with_suffix(".exr"), read_png(path))
+    assert all(read_dataset(data, split, images=images).cut_out for split in ("train", "test"))
+    filled(data)
+    for split in ("train", "test"):
+        found = read_dataset(data, split, images=images)
+        assert not found.cut_out and all(view.alpha is None for view in found.views)
+        assert found.region is not None and "no pixel is transparent" in found.notes[-1]
+    assert survey(data).alpha == "none"
+    if images == "png":
+        for path in data.glob("*/r_?.png"):
+            write_png(path, read_png(path)[..., :3])
+            write_png(path.with_name(f"{path.stem}_alpha.png"), np.ones((20, 20, 3)))
+        assert read_dataset(data, "train").cut_out
+
+
+def test_one_image_that_is_full_is_still_masked(tmp_path: Path) -> None:
+    """What alpha means is a matter of the data set: others leave something out."""
+    data = filled(write_data(tmp_path / "ball", truth=False), but="r_2")
+    for split in ("train", "test"):
+        assert read_dataset(data, split).cut_out

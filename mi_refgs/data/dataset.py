@@ -17,6 +17,8 @@ from mi_refgs.data.readers import PointCloud, ReadOptions, reader_of
 from mi_refgs.data.region import Region, read_region, region_of
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
+from mi_refgs.exr import read_exr_image
+from mi_refgs.images import is_opaque
 
 EXTENT_MARGIN = 1.1
 """Scene extent over the largest distance of a training camera to their mean (3DGS)."""
@@ -28,6 +30,8 @@ FAR = 1e3
 moved: from there float32 resolves less than a ten-thousandth of the extent."""
 DISTINCT = 1e-11
 """Scene extent as part of that distance below which cameras stand in one place, and nothing is moved."""
+OPAQUE = 8
+"""Images whose alpha is looked at: an object that leaves no pixel free in any of them is not cut out."""
 MAX_SIZES = 4
 """Sizes of pictures in a data set, such as upright and lying: a fit compiles every kernel for each."""
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
@@ -52,7 +56,7 @@ class Dataset:
 
     @property
     def cut_out(self) -> bool:
-        """Whether all pictures have alpha; decodes nothing."""
+        """Whether all pictures have alpha that leaves something out; decodes nothing."""
         return all(view.cut_out for view in self.views)
 
     @cached_property
@@ -112,6 +116,10 @@ def read_dataset(
     def training() -> tuple[View, ...]:
         return views if split == "train" else _training_views(path, options)
 
+    notes = found.notes
+    if _opaque(views) and (split == "train" or _opaque(training())):
+        views = tuple(view.changed(alpha=None) if _own_alpha(view) else view for view in views)
+        notes = (*notes, "images have alpha, but no pixel is transparent: they count as images without")
     offset = _offset(training()) if split == "train" or _may_be_far(views) else np.zeros(3)
     near = NEAR_EXTENTS * _extent(views, offset)
     colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
@@ -121,7 +129,7 @@ def read_dataset(
         with contextlib.suppress(InputError):  # views that share no point have none
             region = region_of([_moved(view, offset) for view in training()])
     views = tuple(_moved(view, offset).changed(near=near) for view in views)
-    points, notes = found.points, found.notes
+    points = found.points
     if offset.any():
         points = None if points is None else replace(points, position=points.position - offset)
         x, y, z = (f"{value:.12g}" for value in offset)
@@ -155,6 +163,26 @@ def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, 
 
 def _training_views(path: Path, options: ReadOptions) -> tuple[View, ...]:
     return reader_of(path).read(path, "train", replace(options, truth=False, decode=False)).views
+
+
+def _own_alpha(view: View) -> bool:
+    """Whether a view has alpha, and not that of a mask."""
+    return view.cut_out and (view.file is None or view.file.mask is None)
+
+
+def _opaque(views: tuple[View, ...]) -> bool:
+    """Whether alpha says nothing: no pixel is transparent in OPAQUE images that have alpha, evenly chosen."""
+    own = [view for view in views if _own_alpha(view)]
+    chosen = np.unique(np.linspace(0, len(own) - 1, OPAQUE).astype(int)) if own else ()
+    return bool(own) and all(_is_opaque(own[i]) for i in chosen)
+
+
+def _is_opaque(view: View) -> bool:
+    if view.file is None:
+        return view.alpha is not None and bool(view.alpha.min() >= 1)
+    if view.file.path.suffix.lower() == ".exr":
+        return bool(read_exr_image(view.file.path)[..., 3].min() >= 1)
+    return is_opaque(view.file.path)
 
 
 def _extent(views: tuple[View, ...], offset: np.ndarray | float = 0.0) -> float:

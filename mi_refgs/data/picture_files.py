@@ -20,7 +20,7 @@ from mi_refgs.data.picture_store import Picture
 from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.exr import read_exr_image
+from mi_refgs.exr import exr_has_alpha, read_exr_image
 from mi_refgs.images import box_downscale, has_alpha, image_size, read_bytes, read_grey, read_mask
 
 BAND = 256
@@ -52,7 +52,7 @@ class FileCamera:
     height: int
     intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels of the file
     lens: Lens | None = None  # None: a pinhole
-    mask: Path | None = None  # the file of its mask, as `read_mask` takes it
+    mask: Mask | None = None
 
 
 @dataclass(frozen=True)
@@ -105,9 +105,9 @@ class PictureFile:
         return not changed and self.path.suffix.lower() != ".exr"
 
     def cut_out(self) -> bool:
-        """Whether there is alpha: by the file's header, of an EXR file by its channels."""
+        """Whether there is alpha, by the file's header."""
         if self.path.suffix.lower() == ".exr":
-            return self.mask is not None or self.decode().shape[-1] == 4
+            return self.mask is not None or exr_has_alpha(self.path)
         return self.mask is not None or has_alpha(self.path)
 
     def decode(self) -> np.ndarray:
@@ -192,8 +192,7 @@ def make_view(
     for focal in intrinsics[:2]:
         if not 1 / MAX_NUMBER <= focal <= MAX_NUMBER:
             raise InputError(f"{where}: focal length: {focal:.3g} pixels is out of range; correct it")
-    mask = None if picture.mask is None or picture.mask.below is not None else picture.mask.path
-    file = FileCamera(picture.path, picture.width, picture.height, intrinsics, lens, mask)
+    file = FileCamera(picture.path, picture.width, picture.height, intrinsics, lens, picture.mask)
     width, height = picture.size
     fx, fy, cx, cy = (value / picture.downscale for value in intrinsics)
     straight = None

@@ -38,8 +38,9 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
     frames = []
     for name, shot, pose, (numbers, lens) in zip(names, shots, poses, cameras, strict=True):
         frame = {"file_path": name, **dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), numbers, strict=True))}
-        if shot.file is not None and shot.file.mask is not None:
-            frame["mask_path"] = shot.file.mask.as_posix()
+        mask = None if shot.file is None else shot.file.mask
+        if mask is not None and mask.below is None:
+            frame["mask_path"] = mask.path.as_posix()
         opengl = (pose @ MITSUBA_FROM_OPENGL).tolist()
         frames.append({**frame, **_coefficients(lens), "transform_matrix": opengl})
     splits = {
