@@ -252,8 +252,12 @@ def test_a_white_metal_loses_nothing(rng: np.random.Generator) -> None:
 def test_multiple_scattering_comes_closer_to_a_walk_in_the_microsurface(
     roughness: float, rng: np.random.Generator
 ) -> None:
-    """Coloured metals in the furnace, against Heitz's random walk, whose first bounce is the table."""
+    """Coloured metals in the furnace, against Heitz's random walk, whose first bounce is the table.
+
+    The formula gives too little, never too much: the bounces absorb by the mean of Schlick's term.
+    """
     f0 = np.array([0.95, 0.7, 0.3, 0.04])
+    left = np.array([0.07, 0.25, 0.56, 0.9])  # largest part of the energy that is still missing, by f0
     for cosine in (0.2, 0.6, 0.95):
         walk, noise = exact.microsurface_walk(cosine, roughness, f0, rng, 40000)
         white, _ = exact.microsurface_walk(cosine, roughness, np.ones(1), rng, 2000)
@@ -263,9 +267,9 @@ def test_multiple_scattering_comes_closer_to_a_walk_in_the_microsurface(
             single = value * float(a[0]) + float(b[0])
             further = multiple_scattering(mi.Color3f(value), mi.Color3f(single), a + b).numpy()[0, 0]
             missing = walk[channel] - single
-            assert abs(missing - further) < 0.8 * missing + 3 * noise[channel], (cosine, value)
-            if value > 0.9:
-                assert abs(missing - further) < 0.2 * missing + 3 * noise[channel], (cosine, value)
+            error = missing - further
+            assert -3 * noise[channel] < error < left[channel] * missing + 3 * noise[channel], (cosine, value)
+            assert error < (0.07 if value > 0.5 else 0.025), (cosine, value)  # of the light that falls in
 
 
 def test_the_walks_first_bounce_is_the_brute_force_integral(rng: np.random.Generator) -> None:

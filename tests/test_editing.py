@@ -165,7 +165,7 @@ def test_new_values_are_exact_and_others_stay_bit_for_bit(scene: TrainedScene) -
     np.testing.assert_allclose(now["albedo.g"][chosen], 0.6, rtol=1e-6)
     np.testing.assert_allclose(now["albedo.b"][chosen], 0.5 * fields["albedo.b"][chosen], rtol=1e-5)
     np.testing.assert_allclose(now["opacity"], fields["opacity"], rtol=1e-6)
-    assert edited.scene.mesh is scene.mesh or edited.scene.mesh is not None
+    assert edited.scene.mesh is scene.mesh
 
 
 def test_products_and_single_columns(scene: TrainedScene) -> None:

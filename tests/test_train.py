@@ -279,11 +279,14 @@ def test_a_second_signal_is_not_held(
 
 
 def test_a_signal_that_was_ignored_stays_ignored() -> None:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as of a job that a script put in the background
+    """As of a job that a script put in the background."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with held_interrupts() as release:
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
             os.kill(os.getpid(), signal.SIGINT)
             release()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
 

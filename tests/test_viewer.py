@@ -524,7 +524,7 @@ def test_truth_and_picture_stand_side_by_side_in_the_shape_of_the_window() -> No
         row = canvas[height // 2, :, 0]
         assert (row == 10).sum() == (row == 20).sum() == 40
         assert np.flatnonzero(row == 20)[0] - np.flatnonzero(row == 10)[-1] == GAP + 1
-        assert canvas[0, 0, 0] == round(255 * AROUND) or height == 30
+        assert canvas[0, 0, 0] == round(255 * AROUND)
     for window in ((16384, 1), (1, 16384)):  # its shape would take gigabytes
         assert side_by_side([left, right], window).nbytes < 1e6
 

@@ -171,7 +171,7 @@ class Guard:
         own = [f"{scheme}://{hosts[0]}".lower() for scheme in ("http", "https")]
         if any(origin.lower() not in own for origin in origins):
             return "Pages of other sites may not use this server."
-        if not hmac.compare_digest(_parts(request.path)[0].encode(), self.token.encode()):
+        if not hmac.compare_digest(_parts(request.path)[0].encode(errors="replace"), self.token.encode()):
             return "The token is missing: open the address that the terminal shows."
         return None
 
