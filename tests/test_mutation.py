@@ -10,8 +10,8 @@ from benchmark_runs import ROOT
 from benchmarks.mutation.planting import catalogue, mutated
 
 MISTAKES = catalogue()
-WITHOUT_MISTAKES = {"cli", "compare", "gallery", "reference"}
-"""Packages that show what others compute, and the float64 reference that the others are tested against."""
+WITHOUT_MISTAKES = {"gallery", "reference"}
+"""Pictures of the documentation, and the float64 reference that the others are tested against."""
 
 
 def test_a_mistake_changes_what_its_file_does() -> None:
@@ -40,4 +40,4 @@ def test_names_are_unique() -> None:
 def test_every_package_has_mistakes() -> None:
     """A new package gets some, or is listed as one that computes nothing of its own."""
     packages = {path.parent.name for path in (ROOT / "mi_refgs").glob("*/__init__.py")}
-    assert packages - {mistake.file.split("/")[1] for mistake in MISTAKES} == WITHOUT_MISTAKES
+    assert packages - {mistake.file.split("/")[1] for mistake in MISTAKES} <= WITHOUT_MISTAKES
