@@ -45,6 +45,32 @@ THREADS = max(dr.thread_count(), MITSUBA_EXR_THREADS)
 """Tests let Mitsuba read EXR files, on machines of one core too."""
 
 
+LONGEST = (
+    "test_tutorials.py",
+    "test_variants.py",
+    "test_viewer_page.py",
+    "test_splitsum_benchmark.py",
+    "test_train.py",
+    "test_compare.py",
+    "test_profile.py",
+    "test_packaging.py",
+    "test_splatting_benchmark.py",
+    "test_visibility_benchmark.py",
+    "test_docs.py",
+    "test_config.py",
+    "test_survival.py",
+    "test_render_laws.py",
+    "test_gallery.py",
+)
+"""Files that take longest, in this order: run first, so that no process ends long before the other."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files; the others keep their order."""
+    rank = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
+
+
 def pytest_collection_finish() -> None:
     """Modules and tests stay till the end: the collection after each test need not look at them again."""
     gc.collect()

@@ -38,12 +38,24 @@ PAUSE = 0.25
 """Seconds that a planted sleep takes: far more than any stage of the tiny scene, on a busy machine too."""
 
 
-@pytest.fixture
-def trainer(data: Path, method: Path) -> Trainer:
+def new_trainer(data: Path, method: Path) -> Trainer:
     """Stages up to iterations 30 and 60."""
     until = ["iterations=60", "stage.initial.until=30", "stage.deferred.until=60"]
     resolved = methods.load(str(method), "quick", [*SETTINGS, *until])
     return Trainer(resolved, data_module.read_dataset(data, "train"))
+
+
+@pytest.fixture
+def trainer(data: Path, method: Path) -> Trainer:
+    """A trainer before its first step."""
+    return new_trainer(data, method)
+
+
+@pytest.fixture(scope="module")
+def used_trainer(data: Path, method: Path) -> Trainer:
+    """One for tests of where time goes, whatever steps went before."""
+    mi.set_variant("llvm_ad_rgb")
+    return new_trainer(data, method)
 
 
 # ---------- Phases ----------
@@ -108,12 +120,12 @@ class SleepyClock(phases.PhaseClock):
     ],
 )
 def test_time_is_booked_where_it_is_spent(
-    place: str, side: str, phase: str, at: str, trainer: Trainer, monkeypatch: pytest.MonkeyPatch
+    place: str, side: str, phase: str, at: str, used_trainer: Trainer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(phases, "WARM_UP", 1)
     monkeypatch.setattr(phases, "PhaseClock", lambda: SleepyClock(place, side))
-    trainer.iteration = {"initial": 5, "deferred": 35}[at]
-    found = phases.phase_times(trainer.step, 3)
+    used_trainer.iteration = {"initial": 5, "deferred": 35}[at]
+    found = phases.phase_times(used_trainer.step, 3)
     assert found[phase] > 1e3 * PAUSE
     assert max(ms for other, ms in found.items() if other != phase) < 1e3 * PAUSE
 

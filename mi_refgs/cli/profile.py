@@ -57,6 +57,7 @@ def run(args: argparse.Namespace) -> Result:
     """Measure, and advise. Nothing is written."""
     from mi_refgs.profiling.advice import advice
     from mi_refgs.profiling.profile import profile
+    from mi_refgs.runs.export import MODEL
     from mi_refgs.runs.run import Run
 
     if not 1 <= args.steps <= MOST_STEPS:
@@ -64,11 +65,15 @@ def run(args: argparse.Namespace) -> Result:
     for size in args.size or ():
         if not 1 <= size <= MOST_PIXELS:
             raise InputError(f"--size: {size} is out of range; give 1 to {MOST_PIXELS}")
+    folder = Run(args.path)
+    trained = folder.exists() and not folder.checkpoints() and (args.path / MODEL).is_file()
+    # What is refused is refused before the images, which take longest.
+    made = None if trained else _trainer(args)
     frames = _frames(args)
     data: dict[str, Any] = {"frames": [asdict(frame) for frame in frames], "threads": _threads()}
-    if frames and not Run(args.path).checkpoints():
+    if made is None:
         return Result(data, frames_text(frames))
-    trainer, stages = _trainer(args)
+    trainer, stages = made
     found = profile(trainer, stages, args.steps)
     said = advice(found, trainer.method)
     data |= asdict(found) | {"advice": said}
