@@ -46,7 +46,8 @@ class Run:
     def time(self, setup: Exact, calls: Calls) -> None:
         """Book the times of calls."""
         megapixels = self.settings.timing_size**2 / 1e6
-        for (method, setting), ms in timing.milliseconds(calls, self.settings.timing_seconds).items():
+        limits = self.settings.timing_seconds, self.settings.timing_rounds
+        for (method, setting), ms in timing.milliseconds(calls, *limits).items():
             found = self.times.setdefault((setup.name, setup.light.name, method), {})
             found[setting] = ms / megapixels
 

@@ -56,6 +56,7 @@ class Settings:
     full_depth_spp: int = 256
     surfels: int = 6000  # on the sphere of the surfels' budget
     timing_seconds: float = 0.25  # spent on each time, at least
+    timing_rounds: int = 25  # of each time, at most
 
 
 PAGE = Settings()
@@ -65,7 +66,7 @@ SMALL = Settings(
     roughness=(0.1, 0.3, 0.8),
     metallic=(0.5,),
     size=32,
-    timing_size=128,
+    timing_size=32,
     truth_height=64,
     heights=(16, 32, 64),
     height=32,
@@ -78,6 +79,7 @@ SMALL = Settings(
     full_depth_spp=16,
     surfels=2000,
     timing_seconds=0.05,
+    timing_rounds=1,
 )
 FULL = replace(
     PAGE,

@@ -95,9 +95,9 @@ def _times(setup: Setup) -> dict[str, dict[str, float]]:
     """Milliseconds of each rule that is timed, by name: shading alone, and the product's frame."""
     setup.material(TIMED_ROUGHNESS)
     timed = [rule for rule in rules(setup.settings) if rule.rays in (0, 1, *setup.settings.rays)]
-    seconds = setup.settings.timing_seconds
+    limits = setup.settings.timing_seconds, setup.settings.timing_rounds
     shading, frame = (
-        timing.milliseconds({rule.name: make(rule) for rule in timed}, seconds)
+        timing.milliseconds({rule.name: make(rule) for rule in timed}, *limits)
         for make in (setup.shading_call, setup.frame_call)
     )
     return {rule.name: {"ms": shading[rule.name], "frame_ms": frame[rule.name]} for rule in timed}

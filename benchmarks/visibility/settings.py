@@ -35,6 +35,7 @@ class Settings:
     dominant: tuple[bool, ...] = (False, True)  # for traced light: off, and on
     detail: int = 1  # 0: coarse meshes
     timing_seconds: float = 0.2  # spent on each time, at least
+    timing_rounds: int = 25  # of each time, at most
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -58,6 +59,7 @@ SMALL = Settings(
     dominant=(False,),
     detail=0,
     timing_seconds=0.02,
+    timing_rounds=1,
 )
 
 
