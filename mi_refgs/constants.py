@@ -67,6 +67,10 @@ GAUSSIAN_SLOPE_MARGIN = 0.15
 linearised there, and not at its centre: the affine approximation of what lies far beside the view would cover
 all of it. [3DGS, released code: 1.3 tan(fov/2)]"""
 
+PRUNE_LIMIT = 50.0
+"""PSNR in dB of a pruned image against the whole one, at least: a root mean square error of 0.8 of a step of
+an 8-bit image. The default of `refgs export --limit`."""
+
 TILE_SIZES = ((512.0, (4, 4)), (1024.0, (8, 4)), (math.inf, (8, 8)))
 """Focal lengths in pixels, and width and height in pixels of the tiles of cameras below them. The pixels of a
 tile share a list of surfels and its order: large tiles give one order to more of the picture, and evaluate

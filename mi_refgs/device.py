@@ -1,4 +1,4 @@
-"""What computes: the machine; NumPy arrays to the device; functions that are traced once."""
+"""The machine, the variant that kernels need, NumPy arrays to the device, and functions that are traced once."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from mi_refgs.errors import InputError
 
 LOOK_AHEAD = 64
 """Elements by which kernels read beyond the last one of an array, at most: a packet of the widest machine."""
@@ -48,6 +50,21 @@ def simd_width() -> int:
     return max(map(int, re.findall(r"<(\d+) x float>", code)), default=1)
 
 
+def is_supported(variant: str | None) -> bool:
+    """Whether the renderer can run under this variant: it needs arrays with derivatives and RGB colour."""
+    return variant is not None and variant.endswith("_ad_rgb")
+
+
+def require_supported_variant(what: str) -> None:
+    """Raise InputError, naming `what` and the remedy, under a variant that the renderer cannot use."""
+    variant = mi.variant()
+    if not is_supported(variant):
+        raise InputError(
+            f"{what}: variant: '{variant}' is not supported; "
+            "call mi.set_variant('llvm_ad_rgb') or mi.set_variant('cuda_ad_rgb') first"
+        )
+
+
 def upload(values: np.ndarray, kind: Any = None) -> Any:
     """A flat mi.Float (or another `kind` of DTYPES) with the values, in memory that Dr.Jit has allocated.
 
@@ -55,8 +72,9 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
     end: the process ends where the next page of memory is nobody's. Also, that memory may be aligned to
     packets or not: each array has two kernels, and which one a training step needs, and compiles, changes
     from view to view. Dr.Jit copies arrays of vectors, such as `mi.Point3f(table.T)`, by elements: they need
-    none of this.
+    none of this. Raises InputError under a variant that the renderer cannot use.
     """
+    require_supported_variant("mi_refgs")
     kind = mi.Float if kind is None else kind
     dtype = {getattr(mi, name): dtype for name, dtype in DTYPES.items()}[kind]
     count = np.size(values)
@@ -73,6 +91,7 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
 
 def upload_tensor(values: np.ndarray, kind: Any = None) -> Any:
     """The same as an mi.TensorXf (or another `kind` of tensor) of their shape."""
+    require_supported_variant("mi_refgs")
     kind = mi.TensorXf if kind is None else kind
     return kind(upload(values, dr.array_t(kind)), shape=values.shape)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mi_refgs.device import require_supported_variant
 from mi_refgs.formats.incoming import method_of, read_splats
-from mi_refgs.plugins import require_supported_variant
 from mi_refgs.reconstruction import Reconstruction
 from mi_refgs.source import Source
 

@@ -9,12 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from mi_refgs.capture.triangulate import with_points
+from mi_refgs.device import require_supported_variant
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.progress import Bar, Previews
 from mi_refgs.fitting import job
 from mi_refgs.fitting.progress import Progress
 from mi_refgs.methods.method import Method
-from mi_refgs.plugins import require_supported_variant
 from mi_refgs.reconstruction import Reconstruction, load
 
 

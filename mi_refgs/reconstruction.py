@@ -18,11 +18,11 @@ import numpy as np
 from mi_refgs import editing, formats
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
+from mi_refgs.device import require_supported_variant
 from mi_refgs.errors import InputError, counted
 from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.evaluation.pictures import planes
 from mi_refgs.methods.method import Method
-from mi_refgs.plugins import require_supported_variant
 from mi_refgs.plugins.aovs import aov_values, suffixes
 from mi_refgs.relighting.light import AnyLight, any_light
 from mi_refgs.render.load_scene import load_scene

@@ -211,6 +211,26 @@ def test_render_writes_exr_with_aovs_and_png(
     assert seen.any() and np.abs(pixels[..., 1] - shown)[seen].max() < 0.51 / 255
 
 
+def test_aovs_come_after_those_of_the_scene(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What the scene has already is not repeated; a name of two types is refused."""
+    scene, out = finished / "with_aovs.xml", str(tmp_path / "view.exr")
+    text = (finished / "scene.xml").read_text()
+    own = '<string name="aovs" value=" nn : normal,depth:depth"/></integrator>'
+    scene.write_text(text.replace("</integrator>", own))
+
+    def layers(*aovs: str) -> list[str]:
+        assert main(["render", str(scene), "-o", out, "--json", *(["--aov", *aovs] if aovs else [])]) == 0
+        names = json.loads(capsys.readouterr().out)["channels"]
+        return list(dict.fromkeys(name.partition(".")[0] for name in names if "." in name))
+
+    assert layers() == ["nn", "depth"]
+    assert layers("albedo", "depth", "nn:normal", "albedo") == ["nn", "depth", "albedo"]
+    refused(["render", str(scene), "-o", out, "--aov", "nn:depth"], capsys, "aovs", "'nn' occurs twice")
+    scene.unlink()
+
+
 def test_dataset_traces_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = tmp_path / "scene.xml"
     scene.write_text(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
@@ -10,8 +11,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import run_python
+from integrator_scenes import raw_channels
 
+import mi_refgs
 from mi_refgs.device import upload, upload_tensor
+from mi_refgs.errors import InputError
 
 
 @pytest.mark.parametrize("offset", range(5))
@@ -48,6 +52,44 @@ def test_other_shapes_types_and_nothing() -> None:
     assert isinstance(tensor, mi.TensorXu)
     np.testing.assert_array_equal(tensor.numpy(), table)
     assert isinstance(upload_tensor(table), mi.TensorXf)
+
+
+UNUSABLE: dict[str, Callable[[], object]] = {
+    "an array": lambda: upload(np.zeros(3)),
+    "a tensor": lambda: upload_tensor(np.zeros((3, 2))),
+    "surfels": lambda: mi_refgs.Surfels.from_numpy(raw_channels()),
+    "a light": lambda: mi_refgs.EnvironmentLight.constant(),
+    "a mesh": lambda: mi_refgs.Occluder(tetrahedron()),
+    "points": lambda: mi_refgs.from_points(np.zeros((3, 3)), np.zeros((3, 3)), rng=np.random.default_rng()),
+    "a PLY file": lambda: mi_refgs.import_splats("some.ply"),
+    "a run": lambda: mi_refgs.load("some"),
+    "a fit": lambda: mi_refgs.fit("some", "some"),
+    "a plugin": lambda: mi.load_dict({"type": "refgs", "filename": "some.ply"}),
+}
+"""What a variant without arrays or derivatives cannot make."""
+
+
+def tetrahedron() -> mi_refgs.Mesh:
+    faces = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]], np.uint32)
+    return mi_refgs.Mesh(np.vstack([np.zeros(3), np.eye(3)]).astype(np.float32), faces, 0.1)
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral"])
+@pytest.mark.parametrize("what", UNUSABLE)
+def test_a_variant_that_cannot_render_is_one_sentence(what: str, variant: str) -> None:
+    mi.set_variant(variant)
+    with pytest.raises(Exception, match=f"variant: '{variant}' is not supported; call mi.set_variant"):
+        UNUSABLE[what]()
+
+
+def test_what_was_made_under_another_variant_is_not_rendered() -> None:
+    surfels = mi_refgs.Surfels.from_numpy(raw_channels())
+    camera, shading = mi_refgs.Camera.look_at([3, 0, 0], size=8), mi_refgs.Shading("surfel", "radiance")
+    made = mi_refgs.TrainedScene(surfels, None, None, shading, 1, 1.0)
+    mi.set_variant("scalar_rgb")
+    for draw in (lambda: mi_refgs.render_frame(surfels, camera, shading), lambda: made.renderer()(camera)):
+        with pytest.raises(InputError, match="variant: 'scalar_rgb' is not supported"):
+            draw()
 
 
 GUARDED = """

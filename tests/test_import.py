@@ -363,3 +363,20 @@ def test_a_scene_without_sensors_needs_cameras(tmp_path: Path, capsys: pytest.Ca
     assert "sensor: the scene has none; add one, or give a file with --camera" in capsys.readouterr().err
     assert main([*command, "--camera", str(file)]) == 0
     assert read_png(out).shape[:2] == (48, 64)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e5])
+def test_cameras_of_a_file_see_scenes_of_every_size(scale: float, tmp_path: Path) -> None:
+    """A black ball in white light, whose camera has no near plane: it is not cut off."""
+    scene, file, out = tmp_path / "scene.xml", tmp_path / "camera.json", tmp_path / "out.exr"
+    scene.write_text(
+        '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>'
+        f'<shape type="sphere"><float name="radius" value="{scale}"/>'
+        '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf></shape></scene>'
+    )
+    pose = np.array(mi.ScalarTransform4f().look_at([4 * scale, 0, 0], [0, 0, 0], [0, 0, 1]).matrix)
+    frame = {"transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist()}
+    file.write_text(json.dumps({"w": 16, "h": 12, "camera_angle_x": 0.8, "frames": [frame]}))
+    assert main(["render", str(scene), "-o", str(out), "--camera", str(file)]) == 0
+    seen = read_exr(out)["R"]
+    assert seen[5:7, 7:9].max() == 0 and seen[0, 0] == pytest.approx(1)

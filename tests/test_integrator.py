@@ -196,6 +196,8 @@ def test_wrong_shapes_are_refused(key: str, shape: tuple[int, ...], words: str) 
         ({"shade_at": "voxel"}, "shade_at: 'voxel' is unknown"),
         ({"reflectance": "phong"}, "reflectance: 'phong'"),
         ({"terms": "diffuse,caustic"}, "terms: 'caustic'"),
+        ({"terms": ""}, "terms: '' names none; use some of diffuse, specular, indirect"),
+        ({"terms": " ,"}, "terms: ' ,' names none"),
         ({"aovs": "normal"}, "<name>:<type>"),
         ({"aovs": "a:colour"}, "unknown type 'colour'"),
         ({"aovs": "a:depth,a:normal"}, "occurs twice"),

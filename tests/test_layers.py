@@ -55,7 +55,7 @@ LAYERS: dict[str, set[str]] = {
     "ply": {"errors"},
     "progress_bar": set(),
     "rows": set(),
-    "device": set(),
+    "device": {"errors"},
     "timing": set(),
     "primitives": BOTTOM,
     "surfels": {"rows", "primitives"} | BOTTOM,
@@ -87,8 +87,8 @@ LAYERS: dict[str, set[str]] = {
         "editing",
     },
     "editing": RENDERER | {"methods", "data", "runs", "fitting", "evaluation"},
-    "reconstruct": {"methods", "capture", "fitting", "evaluation", "plugins", "reconstruction", "errors"},
-    "importing": {"formats", "plugins", "reconstruction", "source"},
+    "reconstruct": {"methods", "capture", "fitting", "evaluation", "reconstruction", "device", "errors"},
+    "importing": {"formats", "reconstruction", "source", "device"},
     "gallery": RENDERER
     | {"methods", "data", "runs", "evaluation", "relighting", "editing", "resources", ""}
     | {"reconstruct", "reconstruction"},

@@ -15,9 +15,10 @@ import pytest
 from tiny_scene import write_data
 
 from mi_refgs.cli import main
+from mi_refgs.constants import PRUNE_LIMIT
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.prune import LIMIT, contributions, prune
+from mi_refgs.evaluation.prune import contributions, prune
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.ownership import RECORD
 from mi_refgs.runs.export import Pruned, TrainedScene
@@ -112,8 +113,10 @@ def test_exactly_what_was_planted_goes(train: Dataset, folder: Path, rng: np.ran
     assert report["after"]["channels"] == widths
     assert report["before"]["ply_bytes"] > 3 * report["after"]["ply_bytes"]
     for split, count in (("train", 3), ("test", 2)):
-        assert report[split]["views"] == count and report[split]["mean"] >= report[split]["worst"] >= LIMIT
-    assert pruned.pruned == Pruned(whole.surfels.count, LIMIT, report["train"]["worst"])
+        assert (
+            report[split]["views"] == count and report[split]["mean"] >= report[split]["worst"] >= PRUNE_LIMIT
+        )
+    assert pruned.pruned == Pruned(whole.surfels.count, PRUNE_LIMIT, report["train"]["worst"])
     assert json.loads(json.dumps(report, allow_nan=False)) == report
 
 

@@ -12,7 +12,7 @@ from helpers import run_python
 
 STAND_IN = """
 import mitsuba as mi
-from mi_refgs.plugins import require_supported_variant
+from mi_refgs.device import require_supported_variant
 
 class RefGSIntegrator(mi.SamplingIntegrator):
     def __init__(self, props):
@@ -59,7 +59,8 @@ for variant in ["llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral", "llvm_ad_rgb"]:
 def test_each_supported_variant_gets_its_own_class(tmp_path: Path) -> None:
     """The base class differs from variant to variant; here a second one counts as supported."""
     code = """
-plugins.is_supported = lambda variant: "_ad_" in variant
+from mi_refgs import device
+device.is_supported = plugins.is_supported = lambda variant: "_ad_" in variant
 for variant in ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"]:
     mi.set_variant(variant)
     print(make(), isinstance(mi.load_dict({"type": "refgs"}), mi.SamplingIntegrator))

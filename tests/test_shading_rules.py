@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.methods.read import load
 from mi_refgs.render.pipeline import render
 from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.points import ShadingPoints, Terms
+from mi_refgs.shade.reflectance import Reflectance, SurfelView, register, unregister
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import CHANNELS, Surfels
@@ -151,3 +155,44 @@ def test_a_stage_says_how_many_directions(tmp_path: Path) -> None:
     path.write_text(f"{text}at = 'surfel'\ndiffuse = 'irradiance'\ndirections = 8")
     with pytest.raises(InputError, match="directions: needs reflectance = monte_carlo"):
         load(str(path))
+
+
+class Complete(Reflectance):
+    """A model with all that is needed."""
+
+    name = "complete"
+
+    def channels(self, diffuse: str) -> tuple[str, ...]:
+        return ("albedo",)
+
+    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+        return {"albedo": surfels.albedo()}
+
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+        return Terms(points.albedo)
+
+
+INCOMPLETE: dict[str, tuple[dict[str, Any], str]] = {
+    "no channels": ({"channels": Reflectance.channels}, "channels is missing; write that method"),
+    "no attributes": ({"attributes": Reflectance.attributes}, "attributes is missing"),
+    "no shade": ({"shade": Reflectance.shade}, "shade is missing"),
+    "rays of its own, and none": ({"visibility": "own"}, "trace is missing"),
+    "no such rays": ({"visibility": "many"}, "visibility: 'many' is not allowed; use none or mirror or own"),
+    "no such lookup": ({"light": "sharp"}, "light: 'sharp' is not allowed"),
+    "no order": ({"orders": ()}, "orders: () is not allowed; use pixel or surfel"),
+    "a name in place of orders": ({"orders": "pixel"}, "orders: 'pixel' is not allowed"),
+    "no such option": ({"accuracy": ("speed",)}, "accuracy: ('speed',) is not allowed; use dominant"),
+    "no name": ({"name": ""}, "no name"),
+    "another's name": ({"name": "split_sum"}, "another model's"),
+}
+
+
+@pytest.mark.parametrize("case", INCOMPLETE)
+def test_an_incomplete_model_is_refused_when_it_is_registered(case: str) -> None:
+    changes, words = INCOMPLETE[case]
+    with pytest.raises(InputError, match=f"^reflectance: .*{re.escape(words)}"):
+        register(type("Incomplete", (Complete,), changes)())
+    with pytest.raises(InputError, match="no model; give an object of a subclass of Reflectance"):
+        register(Complete)  # type: ignore[arg-type]
+    register(Complete())
+    unregister("complete")

@@ -130,6 +130,15 @@ def test_nothing_in_view_is_black() -> None:
         assert not np.array(frame.radiance).any()
 
 
+@pytest.mark.parametrize("name", ["project", "list_by_tile"])
+def test_nothing_in_view_is_looked_for_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    behind = replace(camera_at(30.0), origin=mi.Point3f(-9, -15, -30))
+    made, calls = getattr(splat, name), []
+    monkeypatch.setattr(splat, name, lambda *given: calls.append(name) or made(*given))
+    frame = render(things(), behind, Shading(reflectance="radiance"), aovs=["depth"], derivatives=False)
+    assert calls == [name] and not np.array(frame.depth).any()
+
+
 @pytest.mark.parametrize("at", ["surfel", "pixel"])
 @pytest.mark.parametrize("name", ["", *sorted(ALL)])
 def test_a_frame_has_what_is_asked_for(at: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:

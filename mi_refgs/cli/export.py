@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs.cli.command import Result, add_command, add_run, say
+from mi_refgs.constants import PRUNE_LIMIT
 from mi_refgs.errors import InputError, SceneError
 
 if TYPE_CHECKING:
@@ -57,7 +58,8 @@ def add(commands: Any) -> None:
         "--limit",
         type=float,
         metavar="DB",
-        help="with --prune: PSNR of every pruned picture against the whole one, at least (default 50)",
+        help="with --prune: PSNR of every pruned picture against the whole one, at least "
+        f"(default {PRUNE_LIMIT:g})",
     )
 
 
@@ -90,7 +92,7 @@ def run(args: argparse.Namespace) -> Result:
         output.require_free(ARTEFACTS)
     report: dict[str, Any] = {}
     if args.prune:
-        from mi_refgs.evaluation.prune import LIMIT, prune
+        from mi_refgs.evaluation.prune import prune
 
         if state is None and target.resolve() == folder.path.resolve():
             raise InputError(
@@ -98,7 +100,9 @@ def run(args: argparse.Namespace) -> Result:
                 "pruned one to another folder with -o"
             )
         training, views = (load_split(folder, method, split, args.data) for split in ("train", "test"))
-        fitted, report = prune(fitted, training, views, LIMIT if args.limit is None else args.limit, say)
+        fitted, report = prune(
+            fitted, training, views, PRUNE_LIMIT if args.limit is None else args.limit, say
+        )
     if args.to is not None:
         try:
             names = [name.strip() for name in args.to.split(",") if name.strip()]

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.constants import PRUNE_LIMIT
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.device import upload
 from mi_refgs.errors import InputError
@@ -28,9 +29,6 @@ from mi_refgs.surfels.channels import channel, sh_columns
 from mi_refgs.surfels.ply import encode_ply
 from mi_refgs.surfels.table import Surfels
 
-LIMIT = 50.0
-"""PSNR in dB of a pruned picture against the whole one, at least: a root mean square error of 0.8 of a step
-of an 8-bit picture."""
 ROWS_STEP = 1 / 1000
 """Share of the rows to which the number of those that go is searched."""
 
@@ -64,7 +62,7 @@ def prune(
     whole: TrainedScene,
     train: Dataset,
     test: Dataset | None = None,
-    limit: float = LIMIT,
+    limit: float = PRUNE_LIMIT,
     tell: Tell = lambda _: None,
 ) -> tuple[TrainedScene, dict[str, Any]]:
     """The scene without what its pictures do not need, and a report that JSON can hold.

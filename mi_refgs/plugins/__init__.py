@@ -26,32 +26,13 @@ from typing import Any
 
 import mitsuba as mi
 
-from mi_refgs.errors import InputError
+from mi_refgs.device import is_supported, require_supported_variant
 
 PLUGINS = {
     "refgs": ("register_integrator", "mi_refgs.plugins.integrator"),
     "refgs_bsdf": ("register_bsdf", "mi_refgs.plugins.bsdf"),
 }
 """For each plugin name, the Mitsuba function that registers it and the module that defines it."""
-
-
-def is_supported(variant: str | None) -> bool:
-    """Whether the plugins can run under this variant: they need arrays with derivatives and RGB colour."""
-    return variant is not None and variant.endswith("_ad_rgb")
-
-
-def require_supported_variant(plugin: str) -> None:
-    """Refuse to make `plugin` under a variant that it cannot run under.
-
-    Raises:
-        InputError: naming the variant and what to call instead.
-    """
-    variant = mi.variant()
-    if not is_supported(variant):
-        raise InputError(
-            f"{plugin}: variant: '{variant}' is not supported; "
-            "call mi.set_variant('llvm_ad_rgb') or mi.set_variant('cuda_ad_rgb') first"
-        )
 
 
 def load() -> None:

@@ -11,8 +11,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.device import require_supported_variant
 from mi_refgs.errors import InputError
-from mi_refgs.plugins import require_supported_variant
 from mi_refgs.plugins.aovs import aov_values
 from mi_refgs.plugins.film import Picture
 from mi_refgs.plugins.light import FilteredOnce

@@ -169,4 +169,6 @@ def read_terms(props: Any) -> list[str]:
     for name in names:
         if name not in TERMS or names.count(name) > 1:
             raise InputError(f"refgs: terms: '{name}' is unknown or repeated; use some of {', '.join(TERMS)}")
+    if not names:
+        raise InputError(f"refgs: terms: {shown(text)} names none; use some of {', '.join(TERMS)}")
     return names

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 
 from mi_refgs.constants import COVERAGE_FLOOR
-from mi_refgs.splat import Camera, splat, splat_shown
+from mi_refgs.splat import Blended, Camera, Shown, splat, splat_shown
 from mi_refgs.splat.lanes import Places
 from mi_refgs.surfels.table import Surfels
 
@@ -44,8 +44,11 @@ class GBuffer:
         the rows that have them. For a picture `alone` there is no derivative, and `depth` only on demand.
         """
         features = [part for value in slots.values() for part in parts(value)]
-        shown = splat_shown(surfels, features, camera, depth) if alone else None
-        blended = splat(surfels, features, camera, shift) if shown is None else shown
+        blended: Blended | Shown
+        if alone:
+            blended = splat_shown(surfels, features, camera, depth)
+        else:
+            blended = splat(surfels, features, camera, shift)
         rest, maps = list(blended.features), {}
         for name, value in slots.items():
             width = len(parts(value))
@@ -53,7 +56,7 @@ class GBuffer:
         inverse = inverse_alpha(blended.alpha)
         own = inverse_alpha(maps[share]) if share else inverse
         mean_depth = None if blended.depth is None else blended.depth * inverse
-        return GBuffer(blended.alpha, mean_depth, maps, own, None if shown is None else shown.places)
+        return GBuffer(blended.alpha, mean_depth, maps, own, getattr(blended, "places", None))
 
     def divided(self, name: str) -> Any:
         """A slot divided by alpha, or by the share: the mean over what is seen, 0 where nothing is."""

@@ -13,10 +13,11 @@ from mi_refgs.exr import mitsuba_exr
 
 
 def load_scene(path: Path, aovs: Sequence[str] = (), alone: bool = False) -> Any:
-    """Load a scene, its `refgs` integrator with these AOVs besides its own: types, or `name:type`.
+    """Load a scene, its `refgs` integrator with these AOVs after its own: types, or `name:type`.
 
-    `alone`: without the surroundings and the background of that. Raises InputError for what Mitsuba cannot
-    load, and for AOVs or `alone` without a `refgs` integrator.
+    A pair that the integrator has already is not repeated. `alone`: without the surroundings and the
+    background of that. Raises InputError for what Mitsuba cannot load, for a name of two types, and for AOVs
+    or `alone` without a `refgs` integrator.
     """
     before = mi.file_resolver()
     beside = mi.FileResolver(before)
@@ -32,7 +33,8 @@ def load_scene(path: Path, aovs: Sequence[str] = (), alone: bool = False) -> Any
                 option = "--aov" if aovs else "--object"
                 raise InputError(f"{path}: {option}: the scene has no `refgs` integrator; drop {option}")
             if aovs:
-                integrators[0]["aovs"] = ",".join(aov if ":" in aov else f"{aov}:{aov}" for aov in aovs)
+                own = str(integrators[0].get("aovs", "")).split(",")
+                integrators[0]["aovs"] = ",".join(_pairs([*filter(str.strip, own), *aovs]))
             for name in ("surroundings", "background") if alone else ():
                 if name in integrators[0]:
                     del integrators[0][name]
@@ -43,6 +45,12 @@ def load_scene(path: Path, aovs: Sequence[str] = (), alone: bool = False) -> Any
     finally:
         mi.set_file_resolver(before)
     return loaded[0] if isinstance(loaded, list) else loaded
+
+
+def _pairs(aovs: Sequence[str]) -> list[str]:
+    """`name:type` pairs in order, each once; a type alone is its own name."""
+    parts = [[part.strip() for part in aov.split(":")] for aov in aovs]
+    return list(dict.fromkeys(":".join(part * 2 if len(part) == 1 else part) for part in parts))
 
 
 def reason(error: BaseException) -> str:

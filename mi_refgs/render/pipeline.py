@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR, FACING_TOLERANCE
+from mi_refgs.device import require_supported_variant
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.primitives import primitive_of, widths_of
 from mi_refgs.render.antialias import widened
@@ -86,8 +87,9 @@ def render(
     Without `derivatives`, the frame has radiance, alpha and what `aovs` asks for, and nothing else is made;
     pictures differ from those with them by rounding.
     `shading.accuracy.traced_bounces` needs an occluder whose `set_materials` has seen these surfels.
-    Raises InputError for what `shading.check` refuses.
+    Raises InputError for what `shading.check` refuses, and under a variant that has no such arrays.
     """
+    require_supported_variant("mi_refgs.render_frame")
     primitive_of(widths_of(surfels.raw))
     shading.check(surfels.raw, light is not None, occluder is not None)
     if surfels.count == 0:

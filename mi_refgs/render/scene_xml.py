@@ -10,14 +10,16 @@ from xml.etree import ElementTree
 
 import mitsuba as mi
 
+from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.files import write_bytes
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 
-# Mitsuba wants a near plane, and a far plane, which the splatter has no use for, behind it: in near planes.
+# Mitsuba requires a near plane above 0 and a far plane behind it. The far plane lies beyond every scene:
+# cameras of a file have no near plane to derive it from, and other integrators show nothing behind it.
 NEAR_CLIP_MIN = 1e-12
-CLIP_RANGE = 1e6
+FAR_CLIP = RAW_LIMIT
 
 
 def write_scene_xml(
@@ -129,7 +131,7 @@ def add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
     put(sensor, "string", "fov_axis", "x")
     put(sensor, "float", "fov", repr(math.degrees(2 * math.atan(width / (2 * focal)))))
     put(sensor, "float", "near_clip", repr(max(near, NEAR_CLIP_MIN)))
-    put(sensor, "float", "far_clip", repr(max(CLIP_RANGE * near, 1.0)))
+    put(sensor, "float", "far_clip", repr(FAR_CLIP))
     put(sensor, "float", "principal_point_offset_x", repr(0.5 - cx * per_pixel[0] / width))
     put(sensor, "float", "principal_point_offset_y", repr(0.5 - cy * per_pixel[1] / height))
     transform = ElementTree.SubElement(sensor, "transform", name="to_world")

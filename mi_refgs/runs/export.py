@@ -24,6 +24,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_refgs.device import require_supported_variant
 from mi_refgs.errors import InputError
 from mi_refgs.files import BusyError, read_json, write_json
 from mi_refgs.methods.method import Method
@@ -146,6 +147,7 @@ class TrainedScene:
 
     def drawn(self) -> Callable[..., Frame]:
         """`renderer`, but what it is called with is a camera, the `aovs` and, if not 1, the `samples`."""
+        require_supported_variant("TrainedScene.renderer")
         with dr.suspend_grad():
             light = self.shading.light_of(self.light)
         occluder = Occluder(self.mesh)

@@ -50,9 +50,9 @@ def splat(surfels: Surfels, features: list[Any], camera: Camera, shift: Any = No
     return boundary(blend(footprints, features, lists, camera), "splat backward")
 
 
-def splat_shown(surfels: Surfels, features: list[Any], camera: Camera, depth: bool) -> Shown | None:
-    """The maps of `splat` for a picture alone, as `blend_shown` gives them; None where nothing is seen."""
+def splat_shown(surfels: Surfels, features: list[Any], camera: Camera, depth: bool) -> Shown:
+    """The maps of `splat` for a picture alone, as `blend_shown` gives them."""
     if surfels.count == 0:
-        return None
+        return Shown.nothing(len(features), camera, depth)
     footprints = project(surfels, camera)
     return blend_shown(footprints, features, list_by_tile(footprints, camera), camera, depth)

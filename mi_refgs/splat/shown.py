@@ -28,16 +28,22 @@ class Shown:
     features: list[Any]  # K maps Σ w f
     depth: Any  # Σ w z; None where it was not asked for
     alpha: Any  # Σ w
-    places: Places
+    places: Places | None  # None where nothing is seen: zeros in raster order
+
+    @staticmethod
+    def nothing(features: int, camera: Camera, depth: bool) -> Shown:
+        """The maps of a view that shows no surfel."""
+        blank = [dr.zeros(mi.Float, camera.width * camera.height) for _ in range(features + 1)]
+        return Shown(blank[1:], dr.zeros(mi.Float, dr.width(blank[0])) if depth else None, blank[0], None)
 
 
 @phase("splat forward")
 def blend_shown(
     footprints: Footprints, features: list[Any], lists: TileLists, camera: Camera, depth: bool
-) -> Shown | None:
-    """Composite per-surfel features (K × mi.Float (N,)) as `blend` does; None where there are no pairs."""
+) -> Shown:
+    """Composite per-surfel features (K × mi.Float (N,)) as `blend` does."""
     if not lists.pairs:
-        return None
+        return Shown.nothing(len(features), camera, depth)
     grid = Grid(lists, camera)
     chosen, primitive = grid.filled(), footprints.primitive
     lanes = Lanes.of(grid, chosen)

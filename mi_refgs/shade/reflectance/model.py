@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, shown
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.points import ShadingPoints, Terms
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.shade.visibility import mirror_visibility
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from mi_refgs.shade.shading import Shading
 
 Order = Literal["pixel", "surfel"]
+Lookup = Literal["none", "radiance", "filtered"]
+Rays = Literal["none", "mirror", "own"]
 
 
 @dataclass(frozen=True)
@@ -57,9 +60,9 @@ class Reflectance:
     name: str = ""
     orders: tuple[Order, ...] = ("pixel", "surfel")  # where it may be shaded, the usual one first
     linear: bool = False  # both orders give the same picture, so that surfels are shaded, which blends less
-    light: Literal["none", "radiance", "filtered"] = "filtered"  # lookups: none, `radiance` alone, all
+    light: Lookup = "filtered"  # lookups: none, `radiance` alone, all
     encoded: bool = False  # its radiance_sh are colours as a display shows them, and blended as such
-    visibility: Literal["none", "mirror", "own"] = "none"  # rays: none, of pixels in mirrors, by `trace`
+    visibility: Rays = "none"  # rays: none, of pixels in mirrors, by `trace`
     accuracy: tuple[str, ...] = ()  # options of `Accuracy` that it honours
 
     @property
@@ -101,10 +104,32 @@ MODELS: dict[str, Reflectance] = {}
 def register(model: Reflectance) -> Reflectance:
     """Make a model known to method files, the plugin and `Shading`; returns it.
 
-    Raises InputError without a name, or if another model has it.
+    Raises InputError without a name, if another model has it, and for a model that cannot render: a method is
+    missing, or an attribute has a value that does not exist.
     """
+    if not isinstance(model, Reflectance):
+        raise InputError(
+            f"reflectance: {shown(model)} is no model; give an object of a subclass of Reflectance"
+        )
     if not model.name or model.name in MODELS:
         raise InputError(f"reflectance: '{model.name}': no name, or another model's; rename the model")
+    traced = ("trace",) if model.visibility == "own" else ()
+    for name in ("channels", "attributes", "shade", *traced):
+        if getattr(type(model), name) is getattr(Reflectance, name):
+            raise InputError(f"reflectance: {model.name}: {name} is missing; write that method")
+    for name, allowed in (
+        ("orders", get_args(Order)),
+        ("light", get_args(Lookup)),
+        ("visibility", get_args(Rays)),
+        ("accuracy", [option.name for option in fields(Accuracy)]),
+    ):
+        value = getattr(model, name)
+        values = value if name in ("orders", "accuracy") else (value,)
+        if not {*values} <= {*allowed} or (name == "orders" and not values):
+            choices = " or ".join(allowed)
+            raise InputError(
+                f"reflectance: {model.name}: {name}: {shown(value)} is not allowed; use {choices}"
+            )
     MODELS[model.name] = model
     return model
 
