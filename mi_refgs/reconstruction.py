@@ -25,6 +25,7 @@ from mi_refgs.evaluation.pictures import planes
 from mi_refgs.methods.method import Method
 from mi_refgs.plugins.aovs import aov_values, suffixes
 from mi_refgs.relighting.light import AnyLight, any_light
+from mi_refgs.render.display import composited
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.export import SCENE, TrainedScene, export, newest, up_to_date
@@ -132,10 +133,7 @@ class Reconstruction:
         """
         seen = self.camera(camera, size)
         frame = self._frame(seen, samples, alone, aovs=False)
-        alpha, radiance = frame.alpha, list(frame.radiance)
-        if frame.background is not None:
-            radiance = [a + (1 - alpha) * b for a, b in zip(radiance, frame.background, strict=True)]
-            alpha = mi.Float(1)
+        radiance, alpha = composited(frame)
         return planes([*radiance, alpha], seen.height, seen.width)
 
     def aovs(

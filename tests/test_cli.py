@@ -13,6 +13,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import ROOT
 from tiny_scene import SIZE, train_command
 
 from mi_refgs.cli import demo, main
@@ -231,6 +232,19 @@ def test_aovs_come_after_those_of_the_scene(
     scene.unlink()
 
 
+def test_render_shows_the_newest_checkpoint(finished: Path, run: Path, tmp_path: Path) -> None:
+    """As `load` and `refgs view` do: of artefacts that are older, nothing is shown."""
+    note = json.loads((run / "model.json").read_text())
+    (run / "model.json").write_text(json.dumps(note | {"iteration": 0}))
+    shutil.copyfile(ROOT / "scenes" / "lights" / "sky.exr", run / "envmap.exr")
+    images = []
+    for folder in (finished, run):
+        assert main(["render", str(folder), "-o", str(tmp_path / "out.exr")]) == 0
+        images.append(read_exr(tmp_path / "out.exr")["R"])
+    np.testing.assert_allclose(images[0], images[1], atol=1e-5)
+    assert json.loads((run / "model.json").read_text()) == note
+
+
 def test_dataset_traces_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = tmp_path / "scene.xml"
     scene.write_text(
@@ -373,7 +387,7 @@ def test_a_run_whose_light_is_gone(run: Path, tmp_path: Path, capsys: pytest.Cap
     (run / "envmap.exr").unlink()
     for argv in (["eval", str(run)], ["edit", str(run), "-o", str(tmp_path / "new"), "--set", "opacity=1"]):
         refused(argv, capsys, "envmap.exr", "light: missing")
-    refused(["render", str(run), "-o", str(tmp_path / "x.exr")], capsys, "envmap.exr", "No such file")
+    refused(["render", str(run), "-o", str(tmp_path / "x.exr")], capsys, "envmap.exr", "light: missing")
 
 
 def test_what_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

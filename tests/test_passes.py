@@ -72,6 +72,25 @@ def test_a_frame_in_passes_is_the_whole_frame(
         np.testing.assert_allclose(parts[key], value, atol=2e-5, err_msg=key)
 
 
+@pytest.mark.parametrize("samples", [1, 4])
+@pytest.mark.parametrize("name", SHADINGS)
+def test_a_crop_window_is_part_of_the_whole(name: str, samples: int, tmp_path: Path) -> None:
+    """With the random numbers of the whole, and the neighbours beside the window."""
+    shading = SHADINGS[name]
+    mesh = read_mesh(Path(hollow_mesh(tmp_path))) if shading.occlusion else None
+    light, surfels = EnvironmentLight.from_radiance(sky()), Surfels.from_numpy(raw_channels())
+    view = TrainedScene(surfels, light, mesh, shading, 1, 0.0).renderer(samples=samples)
+    crop = {"crop_offset_x": 5, "crop_offset_y": 2, "crop_width": 7, "crop_height": 6}
+    whole, part = (
+        dict(leaves(view(Camera.from_sensor(mi.load_dict(sensor(film=film)))))) for film in ({}, crop)
+    )
+    for key, value in whole.items():
+        if value.shape[-1] == HEIGHT * WIDTH:
+            value = value.reshape(*value.shape[:-1], HEIGHT, WIDTH)[..., 2:8, 5:12]
+            value = value.reshape(*value.shape[:-2], -1)
+        np.testing.assert_allclose(part[key], value, atol=2e-5, err_msg=key)
+
+
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(passes, "PASS_SAMPLES", FEW)
     monkeypatch.setattr(film, "DERIVATIVE_SAMPLES", FEW)
@@ -175,7 +194,7 @@ def test_bands_cover_every_row_once(monkeypatch: pytest.MonkeyPatch) -> None:
         assert sum(band.rows for band in found) == 103 and len(found) > 1
         top = 0
         for band in found:
-            assert band.camera.offset[1] == top - band.above and band.above in (0, margin)
+            assert band.camera.offset[1] == top - band.first[1] and band.first in ((0, 0), (0, margin))
             assert band.camera.width * (band.camera.height - 2 * margin) * factor**2 <= 30 * 24 * factor**2
             top += band.rows
         heights = {band.camera.height for band in found}

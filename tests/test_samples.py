@@ -160,7 +160,7 @@ def test_aovs_of_several_samples_are_premultiplied_means_divided_once(
     expected["visibility"] = (own_coverage > 1e-3) * 1.0
     blended = block_means(planes(fine.normal, factor), factor)
     norm = np.linalg.norm(blended, axis=-1, keepdims=True)
-    expected["normal"] = np.where(coverage > 1e-3, blended / np.maximum(norm, 1e-20), 0)
+    expected["normal"] = np.where(own_coverage > 1e-3, blended / np.maximum(norm, 1e-20), 0)
     expected |= {kind: block_means(samples[kind], factor) for kind in ("alpha", "diffuse")}
     clear = np.abs(coverage - 1e-3) > 1e-5  # of rounding at the floor
     for kind in kinds:

@@ -134,7 +134,12 @@ def test_nothing_in_view_is_black() -> None:
 def test_nothing_in_view_is_looked_for_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     behind = replace(camera_at(30.0), origin=mi.Point3f(-9, -15, -30))
     made, calls = getattr(splat, name), []
-    monkeypatch.setattr(splat, name, lambda *given: calls.append(name) or made(*given))
+
+    def counted(*given: Any) -> Any:
+        calls.append(name)
+        return made(*given)
+
+    monkeypatch.setattr(splat, name, counted)
     frame = render(things(), behind, Shading(reflectance="radiance"), aovs=["depth"], derivatives=False)
     assert calls == [name] and not np.array(frame.depth).any()
 

@@ -82,11 +82,16 @@ def run(args: argparse.Namespace) -> Result:
 
 
 def scene_file(path: Path) -> Path:
-    """The XML of a scene or of a run folder, whose artefacts are written first where they are missing."""
+    """The XML of a scene, or of a run folder, whose artefacts are written first if a checkpoint is newer."""
     if not path.is_dir():
         if not path.is_file():
             raise InputError(f"{path}: scene: no such file; give a Mitsuba XML or a run folder")
         return path
+    from mi_refgs.reconstruction import load
+    from mi_refgs.runs.run import Run
+
+    if Run(path).checkpoints():
+        load(path)
     scene = path / "scene.xml"
     if not scene.is_file():
         raise InputError(f"{scene}: scene: missing; write it with `refgs export {path}`")

@@ -99,8 +99,9 @@ def _require_splats(path: Path) -> None:
 def read_cameras(path: Path) -> list[Camera]:
     """The pinholes of a transforms.json, without their pictures.
 
-    Keys: fl_x or camera_angle_x, fl_y, cx, cy, w and h of the file or of a frame, and transform_matrix
-    (camera to world, OpenGL's axes). Raises InputError for a file that lacks one or has another lens.
+    Keys: fl_x or camera_angle_x, fl_y, cx, cy, w, h and near (depth of the near plane, 0 by default) of the
+    file or of a frame, and transform_matrix (camera to world, OpenGL's axes). Raises InputError for a file
+    that lacks one or has another lens.
     """
     content = read_json(path)
     frames = content.get("frames")
@@ -139,4 +140,6 @@ def _camera(path: Path, content: dict[str, Any], index: int, frame: Any) -> Came
         raise InputError(f"{where}.transform_matrix: no 4 × 4 matrix of numbers; export the file again")
     pose = rigid(matrix, f"{where}.transform_matrix") @ MITSUBA_FROM_OPENGL
     cx, cy = number("cx", width / 2), number("cy", height / 2)
-    return Camera.from_pose(round(width), round(height), -fx, -fy, cx, cy, pose)
+    return Camera.from_pose(
+        round(width), round(height), -fx, -fy, cx, cy, pose, max(number("near", 0.0), 0.0)
+    )

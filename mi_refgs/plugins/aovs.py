@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR, NORM_FLOOR
 from mi_refgs.errors import InputError
+from mi_refgs.render.gbuffer import inverse_alpha
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import ray_distance
 from mi_refgs.shade.points import TERMS
@@ -74,21 +75,56 @@ def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Any]:
     alpha and sum to the image over black. A supersampled frame was averaged premultiplied
     and divided by its mean alpha; `camera` is that of its pixels, not of the samples.
     """
-    seen = frame.alpha > COVERAGE_FLOOR
+    return _finished(kind, *_weighted(kind, frame, camera))
+
+
+def aov_planes(kind: str, frame: Frame, camera: Camera) -> list[Any]:
+    """Premultiplied channels (mi.Float) of one type and their weight, which are averaged over samples.
+
+    `values_of_planes` of the means gives what `aov_values` gives for a supersampled frame.
+    """
+    values, weight = _weighted(kind, frame, camera)
+    return [*(values if kind in PREMULTIPLIED else (value * weight for value in values)), weight]
+
+
+def values_of_planes(kind: str, planes: list[Any]) -> list[Any]:
+    """The channels (mi.Float) of one type from means of `aov_planes`."""
+    *values, weight = planes
+    if kind not in PREMULTIPLIED:
+        inverse = inverse_alpha(weight)
+        values = [value * inverse for value in values]
+    return _finished(kind, values, weight)
+
+
+PREMULTIPLIED = (*TERMS, "alpha", "normal")
+"""Types that a frame has premultiplied. All others are divided by alpha, or by the opacity of the object."""
+
+
+def _weighted(kind: str, frame: Frame, camera: Camera) -> tuple[list[Any], Any]:
+    """The channels of one type as the frame has them, and the opacity of what they are of."""
+    of_object = frame.alpha if frame.share is None else frame.share
     if kind in CHANNELS:
         value = frame.maps[kind]
-        return [*value] if len(CHANNELS[kind].aov) > 1 else [value]
+        return [*value] if len(CHANNELS[kind].aov) > 1 else [value], of_object
     if kind == "normal":
-        length2 = dr.squared_norm(frame.normal)
-        valid = seen & (length2 > NORM_FLOOR)
-        unit = frame.normal * dr.rsqrt(dr.select(valid, length2, 1))
-        return [*dr.select(valid, unit, 0)]
+        return [*frame.normal], of_object if frame.own_normal else frame.alpha
     if kind == "depth":
-        distance = ray_distance(frame.depth, camera) if frame.distance is None else frame.distance
-        return [dr.select(seen, distance, 0)]
+        return [ray_distance(frame.depth, camera) if frame.distance is None else frame.distance], frame.alpha
     if kind == "alpha":
-        return [frame.alpha]
+        return [frame.alpha], frame.alpha
     if kind == "visibility":
-        of_object = seen if frame.share is None else frame.share > COVERAGE_FLOOR
-        return [dr.select(of_object, frame.maps.get("visibility", mi.Float(1)), 0)]
-    return [*getattr(frame.terms, kind)]
+        return [frame.maps.get("visibility", mi.Float(1))], of_object
+    return [*getattr(frame.terms, kind)], of_object
+
+
+def _finished(kind: str, values: list[Any], weight: Any) -> list[Any]:
+    """The channels as an image has them: unit normals, and 0 where nothing is seen."""
+    if kind in TERMS or kind == "alpha":
+        return values
+    valid = weight > COVERAGE_FLOOR
+    if kind == "normal":
+        normal = mi.Vector3f(*values)
+        length2 = dr.squared_norm(normal)
+        valid &= length2 > NORM_FLOOR
+        values = [*(normal * dr.rsqrt(dr.select(valid, length2, 1)))]
+    return [dr.select(valid, value, 0) for value in values]

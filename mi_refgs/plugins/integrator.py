@@ -5,6 +5,8 @@ Imported or reloaded for each variant: see `mi_refgs.plugins`.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,16 +18,11 @@ from mi_refgs.errors import InputError
 from mi_refgs.plugins.aovs import aov_values
 from mi_refgs.plugins.film import Picture
 from mi_refgs.plugins.light import FilteredOnce
-from mi_refgs.plugins.properties import (
-    read_aovs,
-    read_light,
-    read_shading,
-    read_surfels,
-    read_terms,
-)
+from mi_refgs.plugins.properties import read_aovs, read_light, read_shading, read_surfels, read_terms
 from mi_refgs.plugins.surroundings import Around
 from mi_refgs.plugins.unusable import UnusableValues
 from mi_refgs.primitives import primitive_of, widths_of
+from mi_refgs.render.display import composited
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.shade.ambient import prepare
 from mi_refgs.shade.points import TERMS
@@ -256,22 +253,20 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             made = f"made under {self.variant}, not {mi.variant()}"
             raise InputError(f"refgs: variant: {made}; load the scene again")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        view = partial(self._frame, scene, derivatives)
+        view = partial(self.frame, scene, derivatives, {aov.type for aov in self.aovs}, self.around)
         return Picture(sensor, spp, view, self._channels, self.aov_names(), self.shading.neighbours)
 
     def _channels(self, frame: Frame, camera: Camera, alpha: bool) -> list[Any]:
         """R, G, B, (A), W and the AOVs, as the film's blocks have them."""
-        rgb = frame.radiance
-        if len(self.terms) < len(TERMS):  # of the object alone
-            rgb = sum((getattr(frame.terms, name) for name in self.terms), start=mi.Color3f(0))
-        behind, coverage = self.around.behind(frame), frame.alpha
-        if behind is not None:
-            rgb, coverage = rgb + (1 - frame.alpha) * behind, mi.Float(1)
+        rgb, coverage = composited(frame)
         more = [value for aov in self.aovs for value in aov_values(aov.type, frame, camera)]
         return [*rgb, *([coverage] if alpha else []), mi.Float(1), *more]
 
-    def _frame(self, scene: Any, derivatives: bool, camera: Camera) -> Frame:
-        asked = {aov.type for aov in self.aovs} | {*(self.terms if len(self.terms) < len(TERMS) else ())}
+    def frame(
+        self, scene: Any, derivatives: bool, aovs: Collection[str], around: Around, camera: Camera
+    ) -> Frame:
+        """One sample per pixel of an image with these types of AOVs, `around` the object being that."""
+        asked = {*aovs} | {*(self.terms if len(self.terms) < len(TERMS) else ())}
         light = self.filtered.of(self.shading, self.light, self.light_rotation, scene, derivatives)
         if self.occluder is not None and not self.prepared:
             prepare(self.occluder, self.surfels.detach(), light, self.shading.accuracy)
@@ -285,10 +280,13 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             self.occluder,
             aovs=asked,
             normals=False,
-            surroundings=self.around.splatted(self.surfels),
+            surroundings=around.splatted(self.surfels),
             derivatives=derivatives,
         )
-        return frame.only(asked)
+        if len(self.terms) < len(TERMS):  # of the object alone
+            radiance = sum((getattr(frame.terms, name) for name in self.terms), start=mi.Color3f(0))
+            frame = replace(frame, radiance=radiance)
+        return replace(frame.only(aovs), background=around.behind(frame))
 
     def to_string(self) -> str:
         size = "x".join(str(x) for x in self.light.raw.shape[:2]) if self.light is not None else "the scene's"

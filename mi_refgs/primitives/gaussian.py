@@ -163,11 +163,14 @@ class Gaussian(Primitive):
 
 
 def _near_picture(slope: Any, camera: Any) -> Any:
-    """Slopes brought to within GAUSSIAN_SLOPE_MARGIN of the picture, with no gradient across the border."""
+    """Slopes brought to within GAUSSIAN_SLOPE_MARGIN of the picture, with no gradient across the border.
+
+    A crop window has the borders of its film, or Gaussians would change with the window.
+    """
     limited = []
-    for x, focal, middle, size in (
-        (slope.x, camera.fx, camera.cx, camera.width),
-        (slope.y, camera.fy, camera.cy, camera.height),
+    width, height = camera.film or (camera.width, camera.height)
+    for x, focal, middle, size in zip(
+        slope, (camera.fx, camera.fy), camera.centre, (width, height), strict=True
     ):
         ends = [
             (share * size - middle) / focal for share in (-GAUSSIAN_SLOPE_MARGIN, 1 + GAUSSIAN_SLOPE_MARGIN)

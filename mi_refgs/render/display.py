@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mi_refgs.images import SRGB_LINEAR_LIMIT
@@ -40,6 +41,13 @@ def display_image(radiance: Iterable[Any], alpha: Any, background: Iterable[Any]
         alpha * srgb_from_linear(plane * inverse) + (1 - alpha) * behind
         for plane, behind in zip(radiance, background, strict=True)
     ]
+
+
+def composited(frame: Frame) -> tuple[Any, Any]:
+    """Radiance (mi.Color3f) over the background of a frame and alpha, 1 over one: the pixels of an image."""
+    if frame.background is None:
+        return frame.radiance, frame.alpha
+    return frame.radiance + (1 - frame.alpha) * frame.background, mi.Float(1)
 
 
 def displayed(

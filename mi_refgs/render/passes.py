@@ -31,40 +31,49 @@ Result = TypeVar("Result")
 class Band:
     """Rows of an image that are rendered together."""
 
-    camera: Camera  # of the rows, and of `margin` neighbours on both sides
-    above: int  # rendered rows before the first row of the band
-    rows: int
+    camera: Camera  # of the rows, and of `margin` neighbours on all sides that lie on the film
+    first: tuple[int, int]  # column and row of the band's first pixel in what `camera` sees
+    size: tuple[int, int]  # columns and rows of the band
+
+    @property
+    def rows(self) -> int:
+        """Rows of the band."""
+        return self.size[1]
 
     def kept(self, value: Any) -> Any:
         """Values of the band's own pixels, of an array of values of all pixels of `camera`, or of one."""
-        width = self.camera.width
-        if dr.width(value) == 1 or self.rows == self.camera.height:
+        if dr.width(value) == 1 or self.size == (self.camera.width, self.camera.height):
             return value
-        index = dr.arange(mi.UInt32, self.rows * width) + dr.opaque(mi.UInt32, self.above * width)
-        return dr.gather(type(value), value, index)
+        index, columns = dr.arange(mi.UInt32, self.size[0] * self.size[1]), self.size[0]
+        first = dr.opaque(mi.UInt32, self.first[1] * self.camera.width + self.first[0])
+        return dr.gather(type(value), value, index // columns * self.camera.width + index % columns + first)
 
 
 def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = None) -> list[Band]:
     """The bands of a camera's image for passes of at most so many samples, factor² per pixel.
 
-    `margin`: rows of neighbours that the values of a pixel depend on. Without one, the last band may reach
+    `margin`: pixels of neighbours that the values of a pixel depend on. Without one, the last band may reach
     below the image, as high as the others. `most` is PASS_SAMPLES by default; a band has PACKET_EDGE rows of
     samples at least.
     """
     most = PASS_SAMPLES if most is None else most
-    if camera.width * camera.height * factor**2 <= most:
-        return [Band(camera, 0, camera.height)]
-    step = PACKET_EDGE // math.gcd(PACKET_EDGE, factor)  # tiles of all bands begin at their first row
-    highest = max(most // (camera.width * factor**2) // step * step, step)
-    count = -(-camera.height // highest)
-    high = -(-camera.height // (count * step)) * step
+    width, height = camera.width, camera.height
+    film, offset = camera.film or (width, height), camera.offset if camera.film else (0, 0)
+    left, right = min(margin, offset[0]), min(margin, film[0] - offset[0] - width)
+    high = height
+    if width * height * factor**2 > most:
+        step = PACKET_EDGE // math.gcd(PACKET_EDGE, factor)  # tiles of all bands begin at their first row
+        highest = max(most // (width * factor**2) // step * step, step)
+        count = -(-height // highest)
+        high = -(-height // (count * step)) * step
     found = []
-    for top in range(0, camera.height, high):
+    for top in range(0, height, high):
         first, last = top - margin, top + high + margin
         if margin:
-            first, last = max(first, 0), min(last, camera.height)
-        part = camera.band(first, last - first)
-        found.append(Band(part, top - first, min(high, camera.height - top)))
+            first, last = max(first, -offset[1]), min(last, film[1] - offset[1])
+        whole = (left, first, right, last) == (0, 0, 0, height)
+        part = camera if whole else camera.window(-left, first, left + width + right, last - first)
+        found.append(Band(part, (left, top - first), (width, min(high, height - top))))
     return found
 
 
@@ -75,7 +84,7 @@ def in_passes(draw: Callable[[Camera], Result], camera: Camera, factor: int = 1,
     takes factor² samples per pixel.
     """
     found = bands(camera, factor, margin)
-    if len(found) == 1:
+    if found[0].camera is camera:
         return draw(camera)
     parts = []
     for band in found:

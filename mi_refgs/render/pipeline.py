@@ -83,11 +83,9 @@ def render(
     degree of the radiance channel, for coarse-to-fine schedules. `aovs` asks for materials, "visibility",
     "normal", "depth" and the terms of the radiance, by name or (True) all, even where the picture does not
     need them per pixel; without `normals`, they are absent where it does not. `shift`: see `splat.project`;
-    with `surroundings` it is of their rows too, after the object's.
-    Without `derivatives`, the frame has radiance, alpha and what `aovs` asks for, and nothing else is made;
-    pictures differ from those with them by rounding.
-    `shading.accuracy.traced_bounces` needs an occluder whose `set_materials` has seen these surfels.
-    Raises InputError for what `shading.check` refuses, and under a variant that has no such arrays.
+    with `surroundings` it is of their rows too, after the object's. Without `derivatives`, the frame has
+    radiance, alpha and what `aovs` asks for alone; images differ by rounding. `traced_bounces` needs an
+    occluder whose `set_materials` has seen these surfels. Raises InputError as `shading.check` does.
     """
     require_supported_variant("mi_refgs.render_frame")
     primitive_of(widths_of(surfels.raw))

@@ -214,7 +214,9 @@ def _export(
         write_ply(folder / AROUND_FILE, fitted.surroundings.surfels)
         if fitted.surroundings.background is not None:
             fitted.surroundings.background.write(folder / BACKGROUND_MAP)
-    # Transparent: pictures with alpha are composited after the sRGB encoding, which no scene can say.
+    # Transparent without surroundings: pictures with alpha are composited after the sRGB encoding, which no
+    # scene can say. Behind surroundings without a map it is black, as `render` has it.
+    black = (0.0, 0.0, 0.0) if around is not None and behind is None else None
     write_scene_xml(
         folder / SCENE,
         ply=SURFELS,
@@ -224,7 +226,7 @@ def _export(
         camera=camera,
         more=more,
         surroundings=around,
-        background=behind,
+        background=behind or black,
         remark="" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels",
     )
     # Written last: where it is, the other files are complete.

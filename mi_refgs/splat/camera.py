@@ -36,12 +36,20 @@ class Camera:
     near: mi.Float  # scene units along the camera's z axis
     focal: float  # |fx| as a host number, which chooses the size of tiles
     offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film, whose tiles it keeps
-    first_row: Any = 0  # mi.UInt32, of a band of a larger image, whose random numbers it keeps
+    film: tuple[int, int] | None = None  # pixels, size of the film of a window; None: this is all of it
 
     @property
     def tile(self) -> tuple[int, int]:
         """Width and height of a tile, pixels."""
         return tile_size(self.focal)
+
+    @property
+    def centre(self) -> tuple[Any, Any]:
+        """The principal point on the film (mi.Float each), pixels."""
+        if self.film is None:
+            return self.cx, self.cy
+        x, y = (dr.opaque(mi.Float, offset) for offset in self.offset)
+        return self.cx + x, self.cy + y
 
     @property
     def tile_offset(self) -> tuple[int, int]:
@@ -158,8 +166,9 @@ class Camera:
             matrix,
             near=float(params["near_clip"]),
         )
-        x, y = (int(offset) for offset in sensor.film().crop_offset())
-        return replace(camera, offset=(x, y))
+        film, (x, y) = sensor.film(), (int(offset) for offset in sensor.film().crop_offset())
+        size = int(film.size()[0]), int(film.size()[1])
+        return replace(camera, offset=(x, y), film=None if size == (width, height) else size)
 
     def towards(self, point: Any) -> Any:
         """Vector (mi.Vector3f, world) from the camera to a world point, to float32 of the vector itself."""
@@ -207,24 +216,28 @@ class Camera:
             name: dr.opaque(mi.Float, float(getattr(self, name)[0]) * ratio)
             for name, ratio in (("fx", x), ("cx", x), ("fy", y), ("cy", y))
         }
-        return replace(self, width=size[0], height=size[1], focal=self.focal * x, offset=(0, 0), **scaled)
+        return replace(
+            self, width=size[0], height=size[1], focal=self.focal * x, offset=(0, 0), film=None, **scaled
+        )
 
-    def band(self, first: int, height: int) -> Camera:
-        """The same view of so many rows of pixels from row `first`, which may lie outside the image.
+    def window(self, x: int, y: int, width: int, height: int) -> Camera:
+        """The same view of so many pixels from pixel (x, y), which may lie outside the image.
 
-        Its kernels do not depend on `first`, if that is a multiple of PACKET_EDGE.
+        Tiles, random numbers and borders are those of the whole image. Kernels do not depend on x and y, if
+        these are multiples of PACKET_EDGE.
         """
-        x, y = self.offset
-        row = self.first_row + dr.opaque(mi.UInt32, first % 2**32)
-        cy = self.cy - dr.opaque(mi.Float, first)
-        return replace(self, height=height, cy=cy, offset=(x, y + first), first_row=row)
+        cx, cy = self.cx - dr.opaque(mi.Float, x), self.cy - dr.opaque(mi.Float, y)
+        offset = self.offset[0] + x, self.offset[1] + y
+        film = self.film or (self.width, self.height)
+        return replace(self, width=width, height=height, cx=cx, cy=cy, offset=offset, film=film)
 
     def image_index(self, raster: Any = None) -> Any:
-        """Index in the whole image of pixels (None: of all) by that in a band; the same without a band."""
-        if isinstance(self.first_row, int):
+        """Index on the film of pixels (None: of all) by that in a window; the same without a window."""
+        if self.film is None:
             return raster
         index = dr.arange(mi.UInt32, self.width * self.height) if raster is None else raster
-        return index + self.first_row * self.width
+        first = dr.opaque(mi.UInt32, (self.offset[1] * self.film[0] + self.offset[0]) % 2**32)
+        return index // self.width * self.film[0] + index % self.width + first
 
     def supersampled(self, factor: int) -> Camera:
         """The same view with factor² pixels for each pixel."""
@@ -240,5 +253,5 @@ class Camera:
             cy=self.cy * factor,
             focal=self.focal * factor,
             offset=(self.offset[0] * factor, self.offset[1] * factor),
-            first_row=self.first_row * factor,
+            film=None if self.film is None else (self.film[0] * factor, self.film[1] * factor),
         )

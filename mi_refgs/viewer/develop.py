@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.plugins.aovs import aov_values, suffixes
-from mi_refgs.render.display import ALPHA_EMPTY, display_image, srgb_from_linear
+from mi_refgs.plugins.aovs import aov_planes, suffixes, values_of_planes
+from mi_refgs.render.display import display_image, srgb_from_linear
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light import Light
 from mi_refgs.shade.points import TERMS
@@ -49,18 +49,25 @@ class Look:
 def planes_of(frame: Frame, camera: Camera, look: Look, light: Light | None) -> list[Any]:
     """What is averaged over samples: the planes of the picture or variable, premultiplied, and alpha.
 
-    Behind a picture with surroundings or the light, three planes of that follow.
+    For a picture with surroundings or the light behind it, three planes of that follow, times 1 - alpha.
     """
     if look.what == PICTURE:
         behind = frame.background
         if behind is None and look.backdrop == LIGHT_BEHIND and light is not None:
             behind = light.radiance(dr.normalize(camera.rays()))
-        return [*frame.radiance, frame.alpha, *(() if behind is None else behind)]
-    coverage = frame.alpha if frame.share is None else frame.share
-    values = aov_values(look.what, frame, camera)
-    if look.what in (*TERMS, "alpha"):
-        return [*values, coverage]
-    return [*(value * coverage for value in values), coverage]
+        through = () if behind is None else (1 - frame.alpha) * mi.Color3f(behind)
+        return [*frame.radiance, frame.alpha, *through]
+    return aov_planes(look.what, frame, camera)
+
+
+def seen_of(planes: list[Any], look: Look) -> list[Any]:
+    """Channels of an image from the mean of `planes_of`: linear RGBA, or those of the variable's AOV."""
+    if look.what != PICTURE:
+        return values_of_planes(look.what, planes)
+    radiance, alpha, behind = planes[:3], planes[3], planes[4:]
+    if not behind:
+        return [*radiance, alpha]
+    return [*(plane + value for plane, value in zip(radiance, behind, strict=True)), mi.Float(1)]
 
 
 def shown_planes(planes: list[Any], look: Look) -> list[Any]:
@@ -68,21 +75,17 @@ def shown_planes(planes: list[Any], look: Look) -> list[Any]:
     backdrop = BACKDROPS.get(look.backdrop, 1.0)
     if look.what == PICTURE:
         gain = dr.opaque(mi.Float, 2.0**look.exposure)
-        radiance, alpha, behind = [plane * gain for plane in planes[:3]], planes[3], planes[4:]
-        if not behind:
+        *seen, alpha = seen_of(planes, look)
+        radiance = [plane * gain for plane in seen]
+        if len(planes) == 4:
             return display_image(radiance, alpha, [backdrop] * 3)
-        return [
-            srgb_from_linear(plane + (1 - alpha) * value * gain)
-            for plane, value in zip(radiance, behind, strict=True)
-        ]
-    *values, alpha = planes
+        return [srgb_from_linear(plane) for plane in radiance]
+    values, alpha = seen_of(planes, look), planes[-1]
     if look.what in TERMS:
         gain = dr.opaque(mi.Float, 2.0**look.exposure)
         return [srgb_from_linear(value * gain) for value in values]
     if look.what == "alpha":
         return values * 3
-    inverse = dr.select(alpha > ALPHA_EMPTY, dr.rcp(dr.maximum(alpha, ALPHA_EMPTY)), 0)
-    values = [value * inverse for value in values]
     kind = suffixes()[look.what]
     if kind == "XYZ":
         values = [0.5 + 0.5 * value for value in values]

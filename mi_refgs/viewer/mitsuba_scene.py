@@ -10,11 +10,12 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.plugins.aovs import AOV, suffixes
+from mi_refgs.plugins.aovs import suffixes
 from mi_refgs.plugins.surroundings import Around
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of
+from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of, planes_of
 from mi_refgs.viewer.drawable import Sample, Sampled
+from mi_refgs.viewer.fine import fine_planes
 from mi_refgs.viewer.fitted import around_box, box_of, variables_of
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.quality import SAMPLES
@@ -86,10 +87,17 @@ class MitsubaScene:
         matrix[:3, :3] /= np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
         width, height = (int(x) for x in sensor.film().crop_size())
         across = math.tan(math.radians(float(np.array(params["x_fov"]).ravel()[0])) / 2)
-        return Pose(matrix, 2 * math.atan(across * height / width), width / height)
+        near = float(params["near_clip"]) if self._surfels else 0.0
+        return Pose(matrix, 2 * math.atan(across * height / width), width / height, near)
 
     def draw(self, sample: Sample) -> Sampled:
         """See `Drawable`."""
+        if self._surfels:
+            camera, integrator = sample.camera(), self.scene.integrator()
+            around = ALONE if sample.look.alone else self._around
+            with dr.suspend_grad():
+                frame = integrator.frame(self.scene, False, sample.asked, around, camera)
+                return Sampled(planes_of(frame, camera, sample.look, None), frame.depth)
         return Sampled(
             self._planes(
                 sample.pose, sample.width, sample.height, sample.look, sample.index, 1, sample.offset
@@ -98,6 +106,9 @@ class MitsubaScene:
 
     def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
         """See `Drawable`."""
+        if self._surfels:
+            neighbours = self.scene.integrator().shading.neighbours
+            return fine_planes(self.draw, pose, width, height, look, neighbours)
         return self._planes(pose, width, height, look, 0, SAMPLES)
 
     def _planes(
@@ -131,10 +142,6 @@ class MitsubaScene:
                 "sampler": {"type": "independent", "sample_count": spp},
             }
         )
-        if self._surfels:  # only what is shown
-            integrator = self.scene.integrator()
-            integrator.aovs = [] if look.what == PICTURE else [AOV(look.what, look.what)]
-            integrator.around = ALONE if look.alone else self._around
         image = mi.render(self.scene, sensor=sensor, spp=spp, seed=seed)
         names = [channel.name for channel in sensor.film().bitmap().struct_()]
         index = dr.arange(mi.UInt32, width * height) * len(names)

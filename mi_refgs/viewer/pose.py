@@ -82,7 +82,8 @@ class Pose:
         focal = height / 2 / math.tan(self.fov / 2)
         matrix = (self.to_world @ MITSUBA_FROM_OPENGL).tolist()
         frames = [{"file_path": f"./{picture}", "transform_matrix": matrix}]
-        return {**pinhole(width, height, focal), "frames": frames}
+        near = {"near": self.near} if self.near else {}
+        return {**pinhole(width, height, focal), **near, "frames": frames}
 
 
 def up_of(views: list[View]) -> np.ndarray:

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from mi_refgs.exr import write_exr
 from mi_refgs.files import cannot_write, make_folder
 from mi_refgs.images import straight_srgb, write_png
-from mi_refgs.viewer.develop import PICTURE, Look, shown_planes
+from mi_refgs.shade.points import TERMS
+from mi_refgs.viewer.develop import PICTURE, Look, seen_of, shown_planes
 from mi_refgs.viewer.drawable import Drawable
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.pose import Pose
@@ -101,9 +101,13 @@ def write_picture(path: Path, planes: list[Any], window: tuple[int, int], look: 
     """Write planes of `develop.planes_of` as PNG, as they are shown, or as EXR, linear."""
     straight = look.what == PICTURE and len(planes) == 4  # nothing of its own behind it
     if path.suffix == ".exr":
-        if look.what == PICTURE and not straight:
-            radiance = [a + (1 - planes[3]) * b for a, b in zip(planes[:3], planes[4:], strict=True)]
-            planes = [*radiance, dr.ones(type(planes[3]))]
+        values, coverage = seen_of(planes, look), planes[-1]
+        if look.what == PICTURE:
+            planes = values
+        elif look.what in (*TERMS, "alpha"):
+            planes = [*values, coverage]
+        else:
+            planes = [*(value * coverage for value in values), coverage]
         names = {2: "YA", 4: "RGBA"}[len(planes)]
         write_exr(path, stacked(planes, window), names)
     elif straight:
