@@ -10,6 +10,7 @@ from typing import BinaryIO
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.memory import PER_PLY_BYTE, require
 
 MAX_HEADER_LINES = 1000
 """A header of surfels has 124 lines at most; more than this without its end is no PLY header."""
@@ -115,6 +116,8 @@ def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
         raise InputError(
             f"{path}: {vertex.lists[0][0]}: not a number property; export the vertices without lists"
         )
+    size = vertex.count * (8 if header.order == "a" else 1) * max(vertex.row_bytes(False), 1)
+    require(PER_PLY_BYTE * size, f"{path}: vertex: {vertex.count:,} rows", "keep fewer of them")
     if header.order == "a":
         values = _read_ascii(path, file, vertex.count, len(vertex.fields))
         dtype = np.dtype([(name, "f8") for name, _ in vertex.fields])

@@ -11,7 +11,7 @@ import pytest
 from test_train import METHOD
 from tiny_scene import write_data
 
-from mi_refgs import methods
+from mi_refgs import memory, methods
 from mi_refgs.cli import main
 from mi_refgs.data.picture_files import PictureFile
 from mi_refgs.fitting import cost_model, plan
@@ -45,10 +45,10 @@ def test_an_estimate_is_the_sum_of_the_stages(method: Method) -> None:
     coarse = DataOptions(coarse=(CoarsePictures(6, 2), CoarsePictures(12, 2)))
     partly = plan.estimate(dataclasses.replace(method, data=coarse), SPEED, 7, (20, 20), 1)
     assert partly.seconds == pytest.approx(others + 7 * 400 * plan.DECODING + 8 * 1 + 4 * 2 + 18 * 10)
-    assert whole.bytes - found.bytes == pytest.approx(300 * (plan.PER_PIXEL + 7 * (12 + 19)))
+    assert whole.bytes - found.bytes == pytest.approx(300 * (memory.PER_PIXEL + 7 * (12 + 19)))
     around = dataclasses.replace(method, surroundings=SurroundingsOptions(max_count=50))
     more = plan.estimate(around, SPEED, 7, (20, 20), 1).bytes - whole.bytes
-    assert more == pytest.approx(50 * plan.PER_SURFEL)
+    assert more == pytest.approx(50 * memory.PER_SURFEL)
     scene = plan.estimate(method, SPEED, 7, (20, 20), 1, cut_out=False)
     assert whole.seconds - scene.seconds == pytest.approx((plan.GROWTH - plan.OPEN_GROWTH) * at_400)
     tiny = plan.estimate(method, SPEED, 7, (1, 1), 1)

@@ -8,11 +8,9 @@ from pathlib import Path
 
 import drjit as dr
 
-from mi_refgs.data.picture_store import BUDGET as PICTURE_BYTES
 from mi_refgs.fitting.cost_model import Speed
 from mi_refgs.fitting.speed import speed_of
-from mi_refgs.fitting.targets import BUDGET as TARGET_BYTES
-from mi_refgs.fitting.targets import PIXEL_BYTES
+from mi_refgs.fitting.targets import bytes_of
 from mi_refgs.fitting.whole import read_views, sized
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.presets import PRESETS
@@ -32,8 +30,6 @@ DECODING = 1.5e-8
 """Seconds for a pixel of a file, once for each picture: JPEG 8e-9, PNG 2e-8."""
 WORTH = 1e7
 """Iterations × pixels from which a fit takes minutes, and an estimate is worth its own seconds."""
-BASE, PER_PIXEL, PER_SURFEL = 0.5e9, 3e3, 2.5e3
-"""Bytes of a process with its kernels; of a pixel of a step; of a surfel with moments and gradients."""
 
 
 @dataclass(frozen=True)
@@ -127,11 +123,7 @@ def estimate(
     files = views * size[0] * size[1] * DECODING
     steps *= GROWTH if cut_out else OPEN_GROWTH
     seconds = START + files + steps + meshes * (speed.mesh + views * speed.mesh_view)
-    surfels = method.surfels.max_count
-    surfels += method.surroundings.max_count if method.surroundings is not None else 0
-    pictures = min(views * pixels * 12, PICTURE_BYTES) + min(views * pixels * PIXEL_BYTES, TARGET_BYTES)
-    needed = BASE + pictures + PER_PIXEL * pixels + PER_SURFEL * surfels
-    return Estimate(seconds, needed, width, height)
+    return Estimate(seconds, bytes_of(method, views, pixels), width, height)
 
 
 def _blocks(method: Method, begin: int, end: int) -> list[tuple[int, int]]:

@@ -5,13 +5,31 @@ from __future__ import annotations
 from collections import OrderedDict
 
 from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.picture_store import BUDGET as PICTURE_BYTES
 from mi_refgs.fitting.objective import Target
-from mi_refgs.methods.method import DataOptions
+from mi_refgs.memory import of_fit, require
+from mi_refgs.methods.method import DataOptions, Method
 
 BUDGET = 2**30
 """Bytes of targets that stay on the device: a thousand pictures of 200², or ten of 2000²."""
 PIXEL_BYTES = 4 * 4 + 3
 """Bytes of a pixel of a target: three colours and alpha as float32, and where each colour is clipped."""
+
+
+def bytes_of(method: Method, views: int, pixels: int) -> float:
+    """Memory of a fit to so many images of so many pixels each."""
+    surfels = method.surfels.max_count
+    surfels += method.surroundings.max_count if method.surroundings is not None else 0
+    images = min(views * pixels * 12, PICTURE_BYTES) + min(views * pixels * PIXEL_BYTES, BUDGET)
+    return of_fit(pixels, surfels, images)
+
+
+def require_memory(method: Method, data: Dataset) -> None:
+    """Raise InputError if the fit would not fit into memory."""
+    pixels = max((view.width * view.height for view in data.views), default=0)
+    what = f"fit: images of {pixels:,} pixels, {method.surfels.max_count:,} surfels at most"
+    remedy = "read them smaller with --set data.downscale=N, or lower surfels.max_count"
+    require(bytes_of(method, len(data.views), pixels), what, remedy)
 
 
 class Targets:

@@ -27,7 +27,7 @@ from mi_refgs.fitting.rates import Group
 from mi_refgs.fitting.schedule import Schedule
 from mi_refgs.fitting.state import decisions_of, occluder_of, packed, require_fit
 from mi_refgs.fitting.surface import supply, surface_of
-from mi_refgs.fitting.targets import Targets
+from mi_refgs.fitting.targets import Targets, require_memory
 from mi_refgs.images import psnr_of
 from mi_refgs.methods.method import GAIN, Method, Stage
 from mi_refgs.occlusion.mesh import Mesh
@@ -98,6 +98,7 @@ class Trainer:
         self.method, self.data = method, data
         self.extent, self.open = data.scene_extent, is_open(method, data)
         self.schedule = Schedule(method, len(data.views))
+        require_memory(method, data)
         self.targets = Targets(data, method.data)
 
     def _groups(self) -> dict[str, Group]:

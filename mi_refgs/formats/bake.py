@@ -21,6 +21,7 @@ from mi_refgs.formats.format import Shot, module
 from mi_refgs.formats.last_made import LastMade
 from mi_refgs.formats.surface import surface, texels, unwrap
 from mi_refgs.formats.textured import TexturedMesh, check
+from mi_refgs.memory import BASE, PER_SHOWN_SURFEL, PER_TEXEL, require
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import NORMAL_AGREEMENT, VertexSurfels
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
@@ -59,6 +60,11 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
     and missing packages.
     """
     check(faces, texture)
+    require(
+        BASE + PER_TEXEL * texture**2 + PER_SHOWN_SURFEL * trained.count,
+        f"--texture: {texture} × {texture} texels",
+        "bake a smaller texture",
+    )
     asked = faces, texture, *shots
     return _BAKED.get(trained, asked, lambda: _bake(trained, shots, faces, texture))
 

@@ -13,7 +13,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
-from mi_refgs.render.passes import DERIVATIVE_SAMPLES, Band, bands
+from mi_refgs.memory import DERIVATIVE_SAMPLES, require_image
+from mi_refgs.render.passes import Band, bands
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.splat.camera import Camera
@@ -29,7 +30,7 @@ class Picture:
 
     A sample count n (`spp`, or 0 for that of the sampler) gives k × k regular samples per pixel, k = ⌈√n⌉,
     averaged as by `render.samples`. `aovs` names the channels beyond the weight. Raises InputError for a film
-    of another kind.
+    of another kind, and where an image of `surfels` does not fit into memory.
     """
 
     sensor: Any
@@ -38,6 +39,7 @@ class Picture:
     channels: Channels
     aovs: list[str]
     neighbours: int  # see `Shading`
+    surfels: int
 
     def __post_init__(self) -> None:
         if mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
@@ -55,7 +57,9 @@ class Picture:
             parts.append(self._values(band))
             if band.rows < self._size[0]:
                 dr.eval(parts[-1])
-        return self._developed(dr.concat(parts) if len(parts) > 1 else parts[0])
+        values = dr.concat(parts) if len(parts) > 1 else parts[0]
+        parts.clear()
+        return self._developed(values)
 
     def adjoints(self, δ_image: Any) -> Iterator[tuple[Any, Any]]:
         """Values of one pass after the other, attached to the parameters, and their adjoints.
@@ -102,7 +106,9 @@ class Picture:
         return max(1, int(self.spp) or int(self.sensor.sampler().sample_count()))
 
     def _bands(self, most: int | None) -> list[Band]:
-        camera = Camera.from_sensor(self.sensor)
+        camera, channels = Camera.from_sensor(self.sensor), 5 + len(self.aovs)
+        size = camera.width, camera.height
+        require_image(size, self._samples, self.surfels, channels, most is not None)
         return bands(camera, samples_per_axis(self._samples), self.neighbours, most)
 
     def _values(self, band: Band) -> Any:

@@ -254,7 +254,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             raise InputError(f"refgs: variant: {made}; load the scene again")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         view = partial(self.frame, scene, derivatives, {aov.type for aov in self.aovs}, self.around)
-        return Picture(sensor, spp, view, self._channels, self.aov_names(), self.shading.neighbours)
+        neighbours, count = self.shading.neighbours, self.around.count(self.surfels)
+        return Picture(sensor, spp, view, self._channels, self.aov_names(), neighbours, count)
 
     def _channels(self, frame: Frame, camera: Camera, alpha: bool) -> list[Any]:
         """R, G, B, (A), W and the AOVs, as the film's blocks have them."""

@@ -57,6 +57,10 @@ class Around:
         found = {AROUND + name: tensor for name, tensor in around.items()}
         return {**surfels.raw, **found, **{name: value.raw for name, value in maps.items()}}
 
+    def count(self, surfels: Surfels) -> int:
+        """Surfels of the object and of these."""
+        return surfels.count + (0 if self.surfels is None else self.surfels.count)
+
     def splatted(self, surfels: Surfels) -> Surroundings | None:
         """What is splatted with the object's surfels, and the map behind; None without both."""
         if self.surfels is None and self.map is None:

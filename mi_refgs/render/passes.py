@@ -16,13 +16,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import PACKET_EDGE
+from mi_refgs.memory import PASS_SAMPLES, require_image
 from mi_refgs.splat.camera import Camera
-
-PASS_SAMPLES = 1 << 22
-"""Samples of a pass: pixels times samples per pixel. A pass costs up to 0.3 kB of memory per sample; smaller
-passes project the surfels more often."""
-DERIVATIVE_SAMPLES = 1 << 20
-"""Samples of a pass with derivatives, which costs up to 3 kB per sample."""
 
 Result = TypeVar("Result")
 
@@ -77,12 +72,19 @@ def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = N
     return found
 
 
-def in_passes(draw: Callable[[Camera], Result], camera: Camera, factor: int = 1, margin: int = 0) -> Result:
+MAPS = 24
+"""Channels of a frame with all its maps, about."""
+
+
+def in_passes(
+    draw: Callable[[Camera], Result], camera: Camera, factor: int = 1, margin: int = 0, surfels: int = 0
+) -> Result:
     """What `draw` gives for a camera, drawn in the `bands` of its image; without derivatives.
 
     `draw` returns arrays of one value per pixel or one in all, in lists, dictionaries and dataclasses. It
-    takes factor² samples per pixel.
+    takes factor² samples per pixel. Raises InputError where an image of `surfels` does not fit into memory.
     """
+    require_image((camera.width, camera.height), factor**2, surfels, MAPS)
     found = bands(camera, factor, margin)
     if found[0].camera is camera:
         return draw(camera)

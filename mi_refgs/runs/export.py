@@ -96,6 +96,11 @@ class TrainedScene:
             surroundings=surroundings_of(params),
         )
 
+    @property
+    def count(self) -> int:
+        """Surfels of the object and of what is around it."""
+        return self.surfels.count + (0 if self.surroundings is None else self.surroundings.surfels.count)
+
     @staticmethod
     def read(folder: Path) -> TrainedScene:
         """Read the artefacts in a run folder; raises InputError for a file that cannot be used."""
@@ -170,8 +175,9 @@ class TrainedScene:
             def averaged(view: Camera) -> Frame:
                 return supersampled(once, view, samples, details=bool(aovs))
 
+            factor, count = samples_per_axis(samples), self.count
             with dr.suspend_grad():
-                return in_passes(averaged, camera, samples_per_axis(samples), self.shading.neighbours)
+                return in_passes(averaged, camera, factor, self.shading.neighbours, count)
 
         return draw
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.samples import box_mean
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.viewer.develop import Look
 from mi_refgs.viewer.drawable import Sample, Sampled
@@ -18,12 +19,18 @@ from mi_refgs.viewer.quality import GRID
 
 
 def fine_planes(
-    draw: Callable[[Sample], Sampled], pose: Pose, width: int, height: int, look: Look, neighbours: int
+    draw: Callable[[Sample], Sampled],
+    pose: Pose,
+    width: int,
+    height: int,
+    look: Look,
+    shading: Shading,
+    surfels: int,
 ) -> list[Any]:
     """Means over the samples of all pixels, planes as `draw` gives them.
 
     The samples of a page are those of the large picture, moved: their surfels are low-pass filtered for its
-    pixels. Here they are for their own, as in `render.samples`. `neighbours`: see `Shading`.
+    pixels. Here they are for their own, as in `render.samples`.
     """
 
     def means(camera: Camera) -> list[Any]:
@@ -32,4 +39,4 @@ def fine_planes(
         pixels = dr.zeros(mi.Float, camera.width * camera.height)
         return [box_mean(plane, camera, GRID) + pixels for plane in drawn.planes]
 
-    return in_passes(means, pose.camera(width, height), GRID, neighbours)
+    return in_passes(means, pose.camera(width, height), GRID, shading.neighbours, surfels)

@@ -203,4 +203,5 @@ class Fitted:
 
     def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
         """See `Drawable`."""
-        return fine_planes(self.draw, pose, width, height, look, self.scene.shading.neighbours)
+        scene = self.scene
+        return fine_planes(self.draw, pose, width, height, look, scene.shading, scene.count)

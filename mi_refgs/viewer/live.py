@@ -66,7 +66,8 @@ class Training:
 
     def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
         """See `Drawable`."""
-        return fine_planes(self.draw, pose, width, height, look, self.trainer.shading().neighbours)
+        trainer = self.trainer
+        return fine_planes(self.draw, pose, width, height, look, trainer.shading(), trainer.surfels.count)
 
 
 class Live(Bar):

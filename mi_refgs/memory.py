@@ -1,0 +1,138 @@
+"""Memory: what a computation will need, what there is, and the refusal of what would not fit.
+
+Numbers are upper bounds of the resident memory of the process, measured by `python -m benchmarks.memory`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+from mi_refgs.errors import InputError
+
+BASE = 0.4e9
+"""Bytes of a process with its kernels."""
+PASS_SAMPLES = 1 << 22
+"""Samples of a pass: pixels times samples per pixel. Smaller passes project the surfels more often."""
+DERIVATIVE_SAMPLES = 1 << 21
+"""Samples of a pass with derivatives, which needs more memory for each."""
+PER_SAMPLE, PER_DERIVATIVE_SAMPLE = 200, 350
+"""Bytes per sample of a pass."""
+PER_VALUE = 28
+"""Bytes per value of a finished image: of its passes, of the film, and of what the caller gets."""
+PER_SHOWN_SURFEL, PER_DERIVATIVE_SURFEL = 700, 1400
+"""Bytes per surfel of an image: raw channels, projected rows, tile lists with their sort, and gradients."""
+PER_PIXEL, PER_SURFEL = 3e3, 2.5e3
+"""Bytes per pixel of a training step; per surfel with moments and gradients."""
+PER_TEXEL = 400
+"""Bytes per texel of a texture while it is baked."""
+PER_PATH = 100
+"""Bytes per path of Mitsuba's path tracer."""
+PER_PLY_BYTE = 4
+"""Bytes per byte of the vertices of a PLY file, as they are read, checked and made arrays."""
+
+CGROUPS = Path("/sys/fs/cgroup")
+PROC = Path("/proc")
+
+
+def of_image(pixels: int, samples: int, surfels: int, channels: int, derivatives: bool = False) -> float:
+    """Bytes to render an image of so many channels and samples per pixel."""
+    needed = BASE + PER_VALUE * channels * pixels
+    if derivatives:
+        each = PER_DERIVATIVE_SAMPLE * min(pixels * samples, DERIVATIVE_SAMPLES)
+        return needed + each + PER_DERIVATIVE_SURFEL * surfels
+    return needed + PER_SAMPLE * min(pixels * samples, PASS_SAMPLES) + PER_SHOWN_SURFEL * surfels
+
+
+def require_image(
+    size: tuple[int, int], samples: int, surfels: int, channels: int, derivatives: bool = False
+) -> None:
+    """Raise InputError if an image of this width and height would not fit into memory."""
+    width, height = size
+    require(
+        of_image(width * height, samples, surfels, channels, derivatives),
+        f"image: {width} × {height} pixels of {surfels:,} surfels",
+        "ask for fewer pixels or AOVs",
+    )
+
+
+def of_fit(pixels: int, surfels: int, pictures: float) -> float:
+    """Bytes of a fit: per pixel of a step, per surfel at most, and of the images that are kept."""
+    return BASE + pictures + PER_PIXEL * pixels + PER_SURFEL * surfels
+
+
+def require(needed: float, what: str, remedy: str) -> None:
+    """Raise InputError if a process that needs so many bytes in all would not fit into memory.
+
+    `what` names the computation and its size, `remedy` what to do; the sentence is made of both. Memory that
+    the process has already counts as there to use.
+    """
+    there = available() + resident()
+    if needed > there:
+        raise InputError(
+            f"{what}: needs {needed / 1e9:.2g} GB of memory, {there / 1e9:.2g} GB are available; {remedy}"
+        )
+
+
+def available() -> float:
+    """Bytes that this process may still take: what the machine and its control groups have left."""
+    return min(_machine(), *_groups(), math.inf)
+
+
+def resident() -> float:
+    """Bytes that this process has; 0 where the system does not say."""
+    try:
+        pages = int((PROC / "self/statm").read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def _machine() -> float:
+    try:
+        for line in (PROC / "meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return 1024 * float(line.split()[1])
+    except (OSError, ValueError, IndexError):
+        pass
+    try:  # of other systems all that is built in
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return math.inf
+
+
+def _groups() -> list[float]:
+    """What the control groups (version 2, else 1) around this process leave, page cache not counted."""
+    found = []
+    try:
+        lines = (PROC / "self/cgroup").read_text().splitlines()
+    except OSError:
+        return []
+    for line in lines:
+        _, controllers, place = line.split(":", 2)
+        if controllers == "":
+            names, root = ("memory.max", "memory.current"), CGROUPS
+        elif "memory" in controllers.split(","):
+            names, root = ("memory.limit_in_bytes", "memory.usage_in_bytes"), CGROUPS / "memory"
+        else:
+            continue
+        inside = root / place.strip("/")
+        for folder in (inside, *inside.parents):
+            if root not in (folder, *folder.parents):
+                break
+            found.append(_left(folder, *names))
+    return found
+
+
+def _left(group: Path, limit: str, usage: str) -> float:
+    try:
+        text = (group / limit).read_text().strip()
+        if text == "max":
+            return math.inf
+        used = float((group / usage).read_text())
+        stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        cache = sum(float(stat.get(name, 0)) for name in ("active_file", "inactive_file"))
+        return max(float(text) - used + cache, 0)
+    except (OSError, ValueError):
+        return math.inf
