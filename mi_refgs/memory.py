@@ -17,11 +17,11 @@ PASS_SAMPLES = 1 << 22
 """Samples of a pass: pixels times samples per pixel. Smaller passes project the surfels more often."""
 DERIVATIVE_SAMPLES = 1 << 21
 """Samples of a pass with derivatives, which needs more memory for each."""
-PER_SAMPLE, PER_DERIVATIVE_SAMPLE = 200, 350
-"""Bytes per sample of a pass."""
-PER_VALUE = 28
-"""Bytes per value of a finished image: of its passes, of the film, and of what the caller gets."""
-PER_SHOWN_SURFEL, PER_DERIVATIVE_SURFEL = 700, 1400
+PER_SAMPLE, PER_DERIVATIVE_SAMPLE, PER_CHANNEL = 60, 260, 5
+"""Bytes per sample of a pass, and of each of its channels."""
+PER_VALUE, PER_STACKED_VALUE = 10, 28
+"""Bytes per pixel and channel of a finished image, of one pass and of several that are stacked."""
+PER_SHOWN_SURFEL, PER_DERIVATIVE_SURFEL = 700, 1000
 """Bytes per surfel of an image: raw channels, projected rows, tile lists with their sort, and gradients."""
 PER_PIXEL, PER_SURFEL = 3e3, 2.5e3
 """Bytes per pixel of a training step; per surfel with moments and gradients."""
@@ -38,11 +38,13 @@ PROC = Path("/proc")
 
 def of_image(pixels: int, samples: int, surfels: int, channels: int, derivatives: bool = False) -> float:
     """Bytes to render an image of so many channels and samples per pixel."""
-    needed = BASE + PER_VALUE * channels * pixels
+    most, each, per_surfel = PASS_SAMPLES, PER_SAMPLE, PER_SHOWN_SURFEL
     if derivatives:
-        each = PER_DERIVATIVE_SAMPLE * min(pixels * samples, DERIVATIVE_SAMPLES)
-        return needed + each + PER_DERIVATIVE_SURFEL * surfels
-    return needed + PER_SAMPLE * min(pixels * samples, PASS_SAMPLES) + PER_SHOWN_SURFEL * surfels
+        most, each, per_surfel = DERIVATIVE_SAMPLES, PER_DERIVATIVE_SAMPLE, PER_DERIVATIVE_SURFEL
+    together = min(pixels * samples, most)
+    per_value = PER_VALUE if together == pixels * samples else PER_STACKED_VALUE
+    image = per_value * channels * pixels
+    return BASE + image + (each + PER_CHANNEL * channels) * together + per_surfel * surfels
 
 
 def require_image(

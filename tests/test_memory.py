@@ -74,19 +74,18 @@ def test_a_command_without_memory_is_refused_in_one_sentence(
 
 
 def test_images_are_refused_and_rendered_again_where_they_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the plugin too, with derivatives sooner; the sentence says size, need, what there is and a remedy."""
+    """By the plugin too, with derivatives sooner, in one sentence with the numbers and a remedy."""
     of = scene(sensor(film={"width": 600, "height": 500}))
-    there = memory.BASE + 0.5 * memory.PER_DERIVATIVE_SAMPLE * 300_000 + memory.PER_VALUE * 4 * 300_000
     monkeypatch.setattr(memory, "resident", lambda: 0.1e9)
     monkeypatch.setattr(memory, "available", lambda: 0.2e9)
-    sentence = "image: 600 × 500 pixels of 24 surfels: needs 0.5 GB of memory, 0.3 GB are available; ask for"
-    refused(sentence, lambda: mi.render(of).numpy())
-    monkeypatch.setattr(memory, "available", lambda: there)
+    sentence = "image: 600 × 500 pixels of 24 surfels: needs 0.44 GB of memory, 0.3 GB are available; ask for"
+    refused(sentence, lambda: mi.render(of, spp=1).numpy())
+    there = 0.5 * sum(memory.of_image(300_000, 1, 24, 5, derivatives) for derivatives in (False, True))
+    monkeypatch.setattr(memory, "available", lambda: there - 0.1e9)
     params = mi.traverse(of)
     dr.enable_grad(params["integrator.albedo"])
-    image = mi.render(of, params)
+    image = mi.render(of, params, spp=1)
     assert image.shape == (500, 600, 3)
-    monkeypatch.setattr(memory, "available", lambda: there - 0.1e9)
     refused("image: 600 × 500 pixels", lambda: dr.backward(dr.sum(image, axis=None)))
 
 

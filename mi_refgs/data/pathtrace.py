@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.data.materials import materials_at
-from mi_refgs.memory import BASE, PER_PATH, PER_VALUE, require
+from mi_refgs.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
 from mi_refgs.shade import lobe_matrices
 
 SAMPLES_PER_LAUNCH = 1 << 24
@@ -140,7 +140,7 @@ class Tracer:
         pixels = self.width * self.height
         paths = min(pixels * spp, SAMPLES_PER_LAUNCH)
         what = f"image: {self.width} × {self.height} pixels"
-        require(BASE + PER_PATH * paths + 8 * PER_VALUE * pixels, what, "make smaller ones")
+        require(BASE + PER_PATH * paths + 8 * PER_STACKED_VALUE * pixels, what, "make smaller ones")
         self.passes = -(-self.width * self.height * spp // SAMPLES_PER_LAUNCH)
         # The sampler's own grid of strata: it would round up by itself, but warn each time.
         strata = math.isqrt(-(-spp // self.passes))

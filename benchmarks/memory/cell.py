@@ -1,0 +1,78 @@
+"""One image or gradient in a process of its own, whose peak memory is printed.
+
+Discs that cover a sphere twice, however many there are; deferred split-sum shading with spherical harmonics.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from typing import Any
+
+import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
+
+import drjit as dr  # isort: skip
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.shade.envmap import EnvironmentLight
+
+AOVS = "n:normal,d:depth,al:albedo,r:roughness,m:metallic,di:diffuse,sp:specular"
+CHANNELS = {"image": 5, "AOVs": 5 + 3 + 1 + 3 + 1 + 1 + 3 + 3, "gradient": 5}
+"""Channels of R, G, B, alpha, the weight and the AOVs."""
+KINDS = tuple(CHANNELS)
+
+
+def scene(kind: str, size: int, surfels: int) -> Any:
+    """A Mitsuba scene of a sphere of discs, seen by a camera of size² pixels."""
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(surfels, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    raw = {
+        "position": normal,
+        "rotation": np.stack([-normal[:, 1], normal[:, 0], 0 * normal[:, 0], 1 + normal[:, 2]], 1),
+        "scale": np.log(rng.uniform(0.5, 1.5, (surfels, 2)) * 2.5 / np.sqrt(surfels)),
+        "opacity": rng.uniform(0, 4, (surfels, 1)),
+        "radiance_sh": 0.1 * rng.normal(size=(surfels, 12)),
+        "albedo": rng.normal(size=(surfels, 3)),
+        "metallic": rng.normal(size=(surfels, 1)),
+        "roughness": rng.normal(size=(surfels, 1)),
+    }
+    tensors = {name: mi.TensorXf(values.astype(np.float32)) for name, values in raw.items()}
+    light = EnvironmentLight.from_radiance(np.ones((64, 128, 3), np.float32)).raw
+    aovs = {"aovs": AOVS} if kind == "AOVs" else {}
+    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba"}
+    camera = {
+        "type": "perspective",
+        "fov": 40,
+        "to_world": mi.ScalarTransform4f().look_at([0, -3, 0.5], [0, 0, 0], [0, 0, 1]),
+        "film": film | {"rfilter": {"type": "box"}},
+    }
+    integrator = {"type": "refgs", **tensors, "light": light, **aovs}
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": camera})
+
+
+def main(kind: str, size: int, samples: int, surfels: int) -> None:
+    """Render, and differentiate for a gradient by all channels; print the peak and the seconds as JSON."""
+    mi.set_variant("llvm_ad_rgb")
+    of = scene(kind, size, surfels)
+    start = time.perf_counter()
+    if kind == "gradient":
+        params = mi.traverse(of)
+        leaves = [params[key] for key in params.keys() if key.startswith("integrator.")]
+        dr.enable_grad(leaves)
+        params.update()
+        dr.backward(dr.mean(mi.render(of, params, spp=samples), axis=None))
+        dr.eval([dr.grad(leaf) for leaf in leaves])
+    else:
+        mi.render(of, spp=samples).numpy()
+    dr.sync_thread()
+    seconds = time.perf_counter() - start
+    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    print(json.dumps({"measured": peak, "seconds": seconds}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], *map(int, sys.argv[2:]))
