@@ -185,3 +185,17 @@ def test_gradients_reach_what_a_parameter_is_made_from() -> None:
         losses.append(float(loss.array[0]))
     assert losses[-1] < losses[0]
     assert not dr.grad_enabled(mi.render(of))
+    assert not dr.grad_enabled(mi.render(of))
+
+
+def test_a_parameter_that_changes_nothing_has_tangent_zero() -> None:
+    """Forward mode, as reverse mode gives gradient zero."""
+    of = scene(reflectance="radiance")
+    params = mi.traverse(of)
+    leaf = mi.TensorXf(params["integrator.albedo"])
+    dr.enable_grad(leaf)
+    params["integrator.albedo"] = leaf
+    params.update()
+    picture = mi.render(of, params)
+    dr.set_grad(leaf, dr.ones(mi.TensorXf, leaf.shape))
+    assert not np.any(dr.forward_to(picture).numpy())

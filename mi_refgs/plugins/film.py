@@ -78,17 +78,15 @@ class Picture:
             yield self._values(band), δ
 
     def tangent(self) -> Any:
-        """Tangent of the image for the tangents of the parameters."""
+        """Tangent of the image for the tangents of the parameters; zero where none of these changes it."""
         found = self._bands(DERIVATIVE_SAMPLES)
         if len(found) == 1:
             image = self._developed(self._values(found[0]))
-            dr.forward_to(image)
-            return dr.grad(image)
+            return dr.forward_to(image, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         parts = []
         for band in found:
             values = self._values(band)
-            dr.forward_to(values, flags=dr.ADFlag.ClearEdges)
-            parts.append(dr.grad(values))
+            parts.append(dr.forward_to(values, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad))
             dr.eval(parts[-1])
             del values
         tangent = dr.concat(parts)

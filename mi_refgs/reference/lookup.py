@@ -20,6 +20,7 @@ class Light:
     levels: list[Array]  # (h, 2h, 3) each
     roughness: tuple[float, ...]
     table: Array  # (n, n, 2): [roughness, n·v]
+    turn: Array | None = None  # (3, 3): from world directions to the map's
 
     def flat(self) -> Array:
         """All texels (T, 3), level after level."""
@@ -41,31 +42,46 @@ def shade(
     indirect: Array | None,
     diffuse: str,
     taps: list[tuple[Array, Array, Array]],
-) -> Array:
-    """Radiance (n, 3) of points; `materials` (n, 5) are albedo, metallic, roughness. As `shade.split_sum`."""
+    dominant: bool = False,
+    multiscatter: bool = False,
+) -> list[Array]:
+    """Terms (n, 3) of points: diffuse, specular, indirect; `materials` (n, 5) are albedo, metallic, roughness.
+
+    As `shade.split_sum`.
+    """
     n, v = unit(normal), unit(view)
     albedo, metallic, roughness = materials[:, :3], materials[:, 3:4], materials[:, 4]
     n_v = np.sum(n * v, 1)
     f0 = DIELECTRIC_F0 * (1 - metallic) + albedo * metallic
     a, b = table(light.table, n_v, roughness)
     reflectance = f0 * a[:, None] + b[:, None]
-    free = np.ones(len(n)) if visibility is None else visibility
-    factor = reflectance * free[:, None]
-    texel, share = specular(light, 2 * n_v[:, None] * n - v, roughness)
+    free = (np.ones(len(n)) if visibility is None else visibility)[:, None]
+    direction = 2 * n_v[:, None] * n - v
+    if dominant:  # [Lagarde and de Rousiers 2014, §4.9.3]
+        smooth = 1 - roughness[:, None] ** 2
+        direction = unit(n + smooth * (np.sqrt(smooth) + 1 - smooth) * (direction - n))
+    texel, share = specular(light, direction, roughness)
     flat = light.flat()
-    taps.append((texel, share, factor))
-    out = factor * np.einsum("nk,nkc->nc", share, flat[texel])
+    taps.append((texel, share, reflectance * free))
+    reflected = reflectance * np.einsum("nk,nkc->nc", share, flat[texel])
+    texel, share = bilinear(light, n, np.full(len(n), len(light.levels) - 1))
+    arriving = np.einsum("nk,nkc->nc", share, flat[texel])
+    if multiscatter:  # [Fdez-Agüera 2019]
+        lost = (f0 + (1 - f0) / 21) * (1 - a - b)[:, None]
+        further = reflectance * lost / (1 - lost)
+        taps.append((texel, share, further * free))
+        reflected, reflectance = reflected + further * arriving, reflectance + further
     if diffuse == "sh":
         assert own is not None
-        out = out + (1 - metallic) * own
+        scattered = (1 - metallic) * own
     else:
-        texel, share = bilinear(light, n, np.full(len(n), len(light.levels) - 1))
         factor = positive(1 - reflectance) * (1 - metallic) * albedo
         taps.append((texel, share, factor))
-        out = out + factor * np.einsum("nk,nkc->nc", share, flat[texel])
+        scattered = factor * arriving
+    blocked = np.zeros_like(scattered)
     if visibility is not None and indirect is not None:
-        out = out + (1 - free)[:, None] * indirect * reflectance
-    return out
+        blocked = (1 - free) * indirect * reflectance
+    return [scattered, free * reflected, blocked]
 
 
 def table(table: Array, n_v: Array, roughness: Array) -> tuple[Array, Array]:
@@ -98,7 +114,7 @@ def bilinear(light: Light, direction: Array, level: Array) -> tuple[Array, Array
     firsts = np.concatenate([[0], np.cumsum(2 * heights**2)[:-1]])
     h = heights[level]
     w, first = 2 * h, firsts[level]
-    x, y, z = direction.T
+    x, y, z = direction.T if light.turn is None else light.turn @ direction.T
     pole = (x.real == 0) & (z.real == 0)
     sin = np.where(pole, 0, np.sqrt(np.where(pole, 1, x * x + z * z)))
     turn = atan2(np.where(pole, 0, x), np.where(pole, -1, -z)) / (2 * math.pi)

@@ -10,19 +10,20 @@ Letters: N surfels, P pixels, K features, D raw columns. Maps are (P, …).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mi_refgs import constants as c
 from mi_refgs.reference.blend import STEP, Blend
 from mi_refgs.reference.footprint import Rules
-from mi_refgs.reference.lookup import Light, harmonics, positive, shade, unit
+from mi_refgs.reference.lookup import Light, harmonics, positive, unit
+from mi_refgs.reference.models import MATERIALS, MODELS, Options, Points
 from mi_refgs.reference.pinhole import QUATERNION_FLOOR, PinholeCamera, rotation_axes, sigmoid
 from mi_refgs.reference.primitives import primitive_of
 
 Array = np.ndarray
-MAPS = ("radiance", "alpha", "depth", "normal", "albedo", "metallic", "roughness")
+TERMS = ("diffuse", "specular", "indirect")
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,9 @@ class Scene:
     light: Light | None = None
     visibility: Callable[[Array, Array], Array] | None = None  # unit normals, unit rays (P, 3) → 0 … 1 (P,)
     rules: Rules = field(default_factory=Rules)
+    options: Options = field(default_factory=Options)  # but its `diffuse`, which is the one above
+    variance: Array | None = None  # (P,): added to roughness⁴, to 1 at most, before pixels are shaded
+    terms: bool = False  # also the terms of the radiance, premultiplied; these give the light no gradient
 
 
 @dataclass
@@ -116,7 +120,7 @@ def sample_depth(scene: Scene) -> Array:
 
 
 class Features:
-    """Features (N, K) of raw columns (N, D): normal, materials, SH colours; or normal and radiance."""
+    """Features (N, K) of raw columns (N, D), by `layout`: normal, then what is blended besides."""
 
     def __init__(self, scene: Scene, raw: dict[str, Array]) -> None:
         self.scene, self.normal = scene, primitive_of(raw).normal(raw)
@@ -124,11 +128,25 @@ class Features:
         self.columns = np.concatenate([raw[name] for name in self.names], axis=1)
         self.widths = [raw[name].shape[1] for name in self.names]
         self.has_indirect = scene.visibility is not None and "indirect_sh" in raw
+        self.options = replace(scene.options, diffuse=scene.diffuse)
         self.radiance = slice(3, 6)  # of a surfel that is shaded itself
+        self.materials = {name: raw[name].shape[1] for name in MATERIALS if name in raw}
+        if scene.at == "surfel":
+            self.layout = {"normal": 3, "radiance": 3, **self.materials}
+            self.layout |= dict.fromkeys(TERMS, 3) if scene.terms else {}
+        else:
+            self.layout = {"normal": 3, **self.materials}
+            own = scene.reflectance != "split_sum" or scene.diffuse == "sh"
+            self.layout |= ({"radiance": 3} if own else {}) | ({"indirect": 3} if self.has_indirect else {})
 
     def split(self, columns: Array) -> dict[str, Array]:
         """Columns by channel."""
         return dict(zip(self.names, np.split(columns, np.cumsum(self.widths)[:-1], axis=1), strict=True))
+
+    def blended(self, sums: Array) -> dict[str, Array]:
+        """Columns of blended features by name."""
+        ends = np.cumsum([*self.layout.values()])[:-1]
+        return dict(zip(self.layout, np.split(sums, ends, axis=1), strict=True))
 
     def __call__(self, columns: Array, taps: list[tuple[Array, Array, Array]]) -> Array:
         raw, scene = self.split(columns), self.scene
@@ -136,22 +154,22 @@ class Features:
         normal = np.choose(self.normal[:, None], rotation_axes(raw["rotation"]))
         away = np.sum(normal * direction, 1, keepdims=True).real > c.FACING_TOLERANCE
         normal = np.where(away, -normal, normal)
-        materials = [sigmoid(raw[n]) for n in ("albedo", "metallic", "roughness") if n in raw]
-        colour = positive(harmonics(raw["radiance_sh"], direction) + 0.5)
-        if scene.at == "surfel":
-            if scene.reflectance == "split_sum":
-                assert scene.light is not None
-                m = np.concatenate(materials, axis=1)
-                own = colour if scene.diffuse == "sh" else None
-                colour = shade(scene.light, normal, -direction, m, own, None, None, scene.diffuse, taps)
-            return np.concatenate([normal, colour, *materials], axis=1)
-        parts = [normal, *materials]
-        if scene.diffuse == "sh":
-            parts.append(colour)
+        values = {name: sigmoid(raw[name]) for name in self.materials}
+        if "radiance_sh" in raw:
+            values["radiance"] = positive(harmonics(raw["radiance_sh"], direction) + 0.5)
         if self.has_indirect:
             n_v = -np.sum(normal * direction, 1, keepdims=True)
-            parts.append(positive(harmonics(raw["indirect_sh"], 2 * n_v * normal + direction)))
-        return np.concatenate(parts, axis=1)
+            values["indirect"] = positive(harmonics(raw["indirect_sh"], 2 * n_v * normal + direction))
+        if scene.at == "surfel":
+            if scene.reflectance == "monte_carlo" and "indirect_sh" in raw:
+                values["incident"] = raw["indirect_sh"]
+            if scene.reflectance == "gaussian_shader":
+                normal = unit(normal + np.where(away, -1, 1) * raw["normal_offset"])
+            points = Points(normal, -direction, values)
+            terms = MODELS[scene.reflectance](points, scene.light, self.options, taps)
+            values |= dict(zip(TERMS, terms, strict=True)) | {"radiance": sum(terms[1:], terms[0])}
+        values["normal"] = normal
+        return np.concatenate([values[name] for name in self.layout], axis=1)
 
 
 class Resolve:
@@ -167,25 +185,35 @@ class Resolve:
             self.visibility = scene.visibility(unit(sums[:, :3]), self.ray)
 
     def __call__(self, sums: Array, taps: list[tuple[Array, Array, Array]]) -> Array:
-        alpha = sums[:, -1:]
+        scene, alpha = self.scene, sums[:, -1:]
         seen = alpha.real > c.COVERAGE_FLOOR
         inverse = np.where(seen, 1 / np.where(seen, alpha, 1), 0)
-        normal, depth = sums[:, :3], sums[:, -2:-1] * inverse
-        if self.scene.at == "surfel":
-            return np.concatenate([sums[:, 3:6], alpha, depth, normal, sums[:, 6:-2] * inverse], axis=1)
-        assert self.scene.light is not None
-        materials, rest = sums[:, 3:8] * inverse, sums[:, 8:-2] * inverse
-        own = rest[:, :3] if self.scene.diffuse == "sh" else None
-        indirect = rest[:, -3:] if self.features.has_indirect else None
-        found: list[tuple[Array, Array, Array]] = []
-        colour = shade(
-            self.scene.light, normal, -self.ray, materials, own, self.visibility, indirect,
-            self.scene.diffuse, found,
-        )  # fmt: skip
-        taps += [(texel, share, factor * alpha) for texel, share, factor in found]
-        return np.concatenate([colour * alpha, alpha, depth, normal, materials], axis=1)
+        blended = self.features.blended(sums[:, :-2])
+        values = {name: x * inverse for name, x in blended.items() if name != "normal"}
+        maps = {"alpha": alpha, "depth": sums[:, -2:-1] * inverse, "normal": blended["normal"], **values}
+        if scene.at == "surfel":
+            maps |= {name: blended[name] for name in ("radiance", *TERMS) if name in blended}
+        else:
+            if scene.variance is not None:
+                widened = values["roughness"] ** 4 + scene.variance[:, None]
+                values["roughness"] = np.where(
+                    scene.variance[:, None] > 0, np.where(widened.real > 1, 1, widened) ** 0.25,
+                    values["roughness"],
+                )  # fmt: skip
+            found: list[tuple[Array, Array, Array]] = []
+            points = Points(blended["normal"], -self.ray, values, self.visibility)
+            terms = MODELS[scene.reflectance](points, scene.light, self.features.options, found)
+            taps += [(texel, share, factor * alpha) for texel, share, factor in found]
+            maps |= {name: term * alpha for name, term in zip(TERMS, terms, strict=True)}
+            maps["radiance"] = sum(terms[1:], terms[0]) * alpha
+        return np.concatenate([maps[name] for name in self.maps()], axis=1)
+
+    def maps(self) -> dict[str, int]:
+        """Columns of each map."""
+        widths = {"radiance": 3, "alpha": 1, "depth": 1, "normal": 3, **self.features.materials}
+        return widths | (dict.fromkeys(TERMS, 3) if self.scene.terms else {})
 
     def named(self, values: Array) -> dict[str, Array]:
         """Columns by map."""
-        parts = np.split(values, [3, 4, 5, 8, 11, 12], axis=1)
-        return {n: p for n, p in zip(MAPS, parts, strict=True) if p.shape[1]}
+        widths = self.maps()
+        return dict(zip(widths, np.split(values, np.cumsum([*widths.values()])[:-1], axis=1), strict=True))

@@ -1,0 +1,153 @@
+"""The options of a rendered image, as data: their values, and which of these do not go together.
+
+A new reflectance model, primitive, method or option of accuracy is read from its registry. A new value of
+another option is one more entry below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+from covering import Case, Rule
+
+from mi_refgs.methods.read import load, names
+from mi_refgs.primitives import PRIMITIVES
+from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
+from mi_refgs.shade.reflectance import MODELS
+from mi_refgs.shade.shading import DIFFUSE
+
+WIDTH, HEIGHT = 16, 12
+CROPS = {"none": (0, 0, WIDTH, HEIGHT), "inner": (3, 2, 8, 6), "corner": (8, 6, 8, 6)}
+"""Offset and size, pixels. 2 × 2 samples of half the size share the kernels of the whole."""
+OCCLUSION: dict[str, dict[str, Any]] = {
+    "none": {},
+    "mesh": {},
+    "visibility rays": {"visibility_rays": 4},
+    "traced bounces": {"traced_bounces": 2},
+    "ambient rays": {"ambient_rays": 8},
+}
+"""Options of accuracy that need a mesh; every one but "none" has it."""
+ACCURACY: dict[str, Any] = {
+    "none": None, "dominant": True, "multiscatter": True, "antialias": True, "light_levels": 3, "directions": 7
+}  # fmt: skip
+"""The others, one at a time."""
+
+
+def shadings() -> list[str]:
+    """Every shading that a method of `variants/` has, and every registered model: model, order, diffuse.
+
+    Diffuse terms count as one where the model's channels do not differ.
+    """
+    stages = [stage for method in names() for stage in load(method).stage.values()]
+    found = [(stage.reflectance, stage.at, stage.diffuse) for stage in stages]
+    used = {reflectance for reflectance, _, _ in found}
+    found += [(name, model.orders[0], DIFFUSE[0]) for name, model in MODELS.items() if name not in used]
+    every: dict[str, None] = {}
+    for name, at, diffuse in found:
+        model = MODELS[name]
+        split = model.channels(DIFFUSE[0]) != model.channels(DIFFUSE[1])
+        order = "surfel" if model.linear else at
+        every[f"{name}/{order}/{diffuse if split else DIFFUSE[0]}"] = None
+    return [*every]
+
+
+DIMENSIONS: dict[str, list[Any]] = {
+    "shading": shadings(),
+    "primitive": [*PRIMITIVES],
+    "input": ["tensors", "ply", "xml", "run"],
+    "accuracy": [*ACCURACY],
+    "occlusion": [*OCCLUSION],
+    "emitter": ["tensor", "nested", "scene"],
+    "map": ["8 rows", "12 rows", "9 x 14", "constant"],
+    "rotated": [False, True],
+    "background": ["none", "constant", "map"],
+    "surroundings": [False, True],
+    "colour": ["rgb", "luminance", "xyz"],
+    "alpha": [False, True],
+    "component_format": ["float32", "float16", "uint32"],
+    "rfilter": ["box", "tent", "gaussian", "lanczos"],
+    "crop": [*CROPS],
+    "samples": [1, 4, 5, 9],
+    "aovs": ["none", "some", "all"],
+    "terms": ["all", "specular"],
+    "threads": [1, 2],
+    "derivative": ["none", "forward", "reverse", "reverse with a prior"],
+}
+
+
+def _model(shading: str) -> Any:
+    return MODELS[shading.partition("/")[0]]
+
+
+def _traceable(shading: str) -> bool:
+    return _model(shading).visibility == "own" or (
+        _model(shading).visibility == "mirror" and "/pixel" in shading
+    )
+
+
+RULES = [
+    # What is refused.
+    Rule(
+        ("shading", "occlusion"),
+        lambda shading, occlusion: occlusion != "none" and not _traceable(shading),
+        "shading: occlusion: needs shade_at = pixel and reflectance = split_sum",
+    ),
+    Rule(
+        ("shading", "occlusion"),
+        lambda shading, occlusion: (
+            _traceable(shading) and bool({*OCCLUSION[occlusion]} - {*_model(shading).honours})
+            and not (occlusion == "ambient rays" and "/irradiance" not in shading)
+        ),
+        "shading: (visibility_rays|traced_bounces|ambient_rays): needs reflectance = split_sum",
+    ),
+    Rule(
+        ("shading", "occlusion"),
+        lambda shading, occlusion: (
+            _traceable(shading) and occlusion == "ambient rays" and "/irradiance" not in shading
+        ),
+        "shading: ambient_rays: need diffuse = irradiance",
+    ),
+    Rule(
+        ("shading", "accuracy"),
+        lambda shading, accuracy: accuracy == "antialias" and "/pixel" not in shading,
+        "shading: antialias: needs shade_at = pixel",
+    ),
+    Rule(
+        ("shading", "accuracy"),
+        lambda shading, accuracy: (
+            accuracy not in ("none", *_model(shading).honours)
+            and not (accuracy == "antialias" and "/pixel" not in shading)
+        ),
+        "shading: [a-z_]+: needs reflectance = ",
+    ),
+    Rule(("emitter", "map"), lambda emitter, map_: emitter == "tensor" and map_ == "9 x 14", "EnvironmentLight: raw: shape"),
+    # What no input can say: an emitter's rotation, tensors in a file, options that runs do not have.
+    Rule(("emitter", "rotated"), lambda emitter, rotated: emitter == "tensor" and rotated),
+    Rule(("map", "rotated"), lambda map_, rotated: map_ == "constant" and rotated),
+    Rule(("input", "emitter"), lambda input_, emitter: input_ == "xml" and emitter == "tensor"),
+    Rule(("input", "emitter"), lambda input_, emitter: input_ == "run" and emitter != "tensor"),
+    Rule(("input", "map"), lambda input_, map_: input_ == "run" and map_ == "9 x 14"),
+    Rule(("input", "terms"), lambda input_, terms: input_ == "run" and terms != "all"),
+    Rule(("input", "background"), lambda input_, background: input_ == "run" and background == "constant"),
+    Rule(
+        ("input", "background", "surroundings"),
+        lambda input_, background, around: input_ == "run" and background == "map" and not around,
+    ),
+]  # fmt: skip
+
+
+FORMATS = {"rgb": "rgba", "luminance": "luminance_alpha", "xyz": "xyza"}
+"""The pixel format with alpha of each one without."""
+
+
+def spec(case: Case) -> str:
+    """A case in one line."""
+    return ", ".join(f"{name}={value}" for name, value in case.items())
+
+
+def unlisted_accuracy() -> set[str]:
+    """Options of accuracy that no dimension has."""
+    traced = {name for options in OCCLUSION.values() for name in options}
+    assert traced == {*NEED_OCCLUSION}
+    return {option.name for option in fields(Accuracy)} - traced - {*ACCURACY}
