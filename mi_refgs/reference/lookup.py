@@ -45,9 +45,9 @@ def shade(
     dominant: bool = False,
     multiscatter: bool = False,
 ) -> list[Array]:
-    """Terms (n, 3) of points: diffuse, specular, indirect; `materials` (n, 5) are albedo, metallic, roughness.
+    """Terms (n, 3) of points: diffuse, specular, indirect. As `shade.split_sum`.
 
-    As `shade.split_sum`.
+    materials: (n, 5) albedo, metallic, roughness.
     """
     n, v = unit(normal), unit(view)
     albedo, metallic, roughness = materials[:, :3], materials[:, 3:4], materials[:, 4]

@@ -29,8 +29,13 @@ OCCLUSION: dict[str, dict[str, Any]] = {
 }
 """Options of accuracy that need a mesh; every one but "none" has it."""
 ACCURACY: dict[str, Any] = {
-    "none": None, "dominant": True, "multiscatter": True, "antialias": True, "light_levels": 3, "directions": 7
-}  # fmt: skip
+    "none": None,
+    "dominant": True,
+    "multiscatter": True,
+    "antialias": True,
+    "light_levels": 3,
+    "directions": 7,
+}
 """The others, one at a time."""
 
 
@@ -121,7 +126,11 @@ RULES = [
         ),
         "shading: [a-z_]+: needs reflectance = ",
     ),
-    Rule(("emitter", "map"), lambda emitter, map_: emitter == "tensor" and map_ == "9 x 14", "EnvironmentLight: raw: shape"),
+    Rule(
+        ("emitter", "map"),
+        lambda emitter, map_: emitter == "tensor" and map_ == "9 x 14",
+        "EnvironmentLight: raw: shape",
+    ),
     # What no input can say: an emitter's rotation, tensors in a file, options that runs do not have.
     Rule(("emitter", "rotated"), lambda emitter, rotated: emitter == "tensor" and rotated),
     Rule(("map", "rotated"), lambda map_, rotated: map_ == "constant" and rotated),

@@ -68,7 +68,7 @@ def camera_of(case: Case) -> tuple[PinholeCamera, tuple[int, int], int]:
 
 @dataclass
 class Oracle:
-    """Images of a case for any values near the first ones; what has no derivative stays as it is for those."""
+    """Images of a case for values near the first ones; what has no derivative stays as it is for those."""
 
     case: Case
     first: Values
@@ -185,7 +185,7 @@ class Oracle:
         case = self.case
         rgb, alpha = maps["radiance"], maps["alpha"]
         if case["terms"] != "all":
-            rgb = sum(maps[name] for name in case["terms"].split(","))
+            rgb = maps[case["terms"]]
         coverage = self._blocks(alpha)
         if case["background"] != "none":
             behind = maps["background"] if case["background"] == "map" else np.array(BACKDROP)
@@ -295,5 +295,7 @@ def _facing(raw: dict[str, Array], camera: PinholeCamera) -> Array:
 def _free(position: Array, normal: Array, count: int) -> Array:
     """Whether light arrives at surfels from their directions, (N, count)."""
     start = position + OFFSET_VOXELS * mesh().voxel * normal
-    free = [~_blocked(np.tile(o, (count, 1)), hemisphere(count, n)) for o, n in zip(start, normal, strict=True)]
+    free = [
+        ~_blocked(np.tile(o, (count, 1)), hemisphere(count, n)) for o, n in zip(start, normal, strict=True)
+    ]
     return np.stack(free)

@@ -83,7 +83,7 @@ def mesh() -> Mesh:
 def radiance(case: Case) -> np.ndarray:
     """The light's map (h, w, 3) before `scale` and rotation."""
     if case["map"] == "constant":
-        return np.tile(np.float32(CONSTANT), (8, 16, 1))
+        return np.tile(np.array(CONSTANT, np.float32), (8, 16, 1))
     if case["map"] == "9 x 14":
         smooth = sky(56)
         return np.ascontiguousarray(smooth[::6][:9, ::8])
@@ -265,5 +265,3 @@ def _xml(value: dict[str, Any], name: str) -> ElementTree.Element:
             tag = {bool: "boolean", int: "integer", float: "float", str: "string"}[type(inner)]
             put(element, tag, key, str(inner).lower() if tag == "boolean" else str(inner))
     return element
-
-

@@ -39,7 +39,8 @@ KEPT = 0.75
 """Share of the pixels outside the reference's declared discontinuities, at least."""
 GROUPS = {
     "position": "shape", "rotation": "shape", "scale": "shape", "opacity": "shape",
-    "background": "background", "brightness": "the light's scale", "light": "light", "data": "light", "radiance": "light",
+    "background": "background", "light": "light", "data": "light", "radiance": "light",
+    "brightness": "the light's scale",
 }  # fmt: skip
 
 
@@ -70,9 +71,7 @@ def group(name: str) -> str:
     return GROUPS.get(name, "materials")
 
 
-def test_images_and_derivatives_of_all_pairs_of_options(
-    case: Case, tmp_path: Path, threads: Any
-) -> None:
+def test_images_and_derivatives_of_all_pairs_of_options(case: Case, tmp_path: Path, threads: Any) -> None:
     try:
         threads(case["threads"])
         check(case, tmp_path)
@@ -219,5 +218,3 @@ def test_what_does_not_go_together_is_refused_in_a_sentence(tmp_path: Path) -> N
                 build(case, values(case), tmp_path)
             sentence = reason(info.value)
             assert re.search(rule.refusal, sentence) and "\n" not in sentence, (spec(case), sentence)
-
-
