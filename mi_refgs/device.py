@@ -1,4 +1,4 @@
-"""The machine, the variant that kernels need, NumPy arrays to the device, and functions that are traced once."""
+"""The machine, the variant that kernels need, NumPy arrays on the device, functions that are traced once."""
 
 from __future__ import annotations
 

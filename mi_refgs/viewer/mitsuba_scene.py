@@ -107,8 +107,9 @@ class MitsubaScene:
     def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
         """See `Drawable`."""
         if self._surfels:
-            neighbours = self.scene.integrator().shading.neighbours
-            return fine_planes(self.draw, pose, width, height, look, neighbours)
+            of = self.scene.integrator()
+            count = of.around.count(of.surfels)
+            return fine_planes(self.draw, pose, width, height, look, of.shading, count)
         return self._planes(pose, width, height, look, 0, SAMPLES)
 
     def _planes(
