@@ -13,7 +13,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.exr import exr_size
-from mi_refgs.files import check_size, replace_file, require_file
+from mi_refgs.files import check_size, is_file, replace_file, require_file
 
 SRGB_LINEAR_LIMIT = 0.0031308
 """Linear value below which the sRGB curve is a straight line (IEC 61966-2-1)."""
@@ -69,6 +69,23 @@ def box_downscale(image: np.ndarray, factor: int) -> np.ndarray:
 def psnr_of(error: float) -> float:
     """PSNR in dB of a mean squared error of values up to 1; at most PSNR_MAX, NaN of NaN."""
     return PSNR_MAX if error <= 0 else min(-10 * float(np.log10(error)), PSNR_MAX)
+
+
+def with_ending(stem: Path, endings: tuple[str, ...] = ENDINGS) -> Path | None:
+    """The file whose name is that of `stem` and an ending, in letters of any case; None without one.
+
+    Of several the first in the order of `endings`.
+    """
+    for ending in endings:
+        for suffix in (ending, ending.upper()):
+            if is_file(file := stem.with_name(stem.name + suffix)):
+                return file
+    try:
+        others = sorted(path for path in stem.parent.iterdir() if path.name.startswith(f"{stem.name}."))
+    except OSError:
+        return None
+    by_ending = {path.name[len(stem.name) :].lower(): path for path in others if is_file(path)}
+    return next((by_ending[ending] for ending in endings if ending in by_ending), None)
 
 
 def image_size(path: str | Path) -> tuple[int, int]:

@@ -18,7 +18,8 @@ from mi_refgs.cli import main
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.pictures import planes
 from mi_refgs.exr import read_exr_image
-from mi_refgs.formats import Shot, write
+from mi_refgs.formats import Shot, gltf_mesh, write
+from mi_refgs.formats import usd as usd_format
 from mi_refgs.formats.bake import bake
 from mi_refgs.formats.principled import base_colour, diffuse_share
 from mi_refgs.formats.shots import shots_around
@@ -30,6 +31,7 @@ from mi_refgs.runs.export import TrainedScene
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.channels import logit
 from mi_refgs.surfels.table import Surfels
 
@@ -324,6 +326,39 @@ def test_usd_says_what_the_mesh_and_its_light_are(exported: Exported, tmp_path: 
         assert exported.trained.light is not None
         with_light = exported.trained.light.unfiltered().radiance(mi.Vector3f(*map(float, axis)))
         np.testing.assert_allclose(panorama[row, column], np.array(with_light).ravel(), atol=0.2)
+
+
+def off_centre() -> Camera:
+    """A camera whose principal point is far from the middle, and whose pixels are not square."""
+    pose = shots_around(trained_scene().surfels)[2].camera.pose()
+    return Camera.from_pose(64, 48, -70.0, -55.0, 40.5, 17.0, pose)
+
+
+def test_a_usd_camera_keeps_the_principal_point() -> None:
+    """Points land where our camera sees them, by USD's own frustum."""
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import Gf, UsdGeom
+
+    camera = off_centre()
+    stage = usd.Stage.CreateInMemory()
+    prim = UsdGeom.Camera.Define(stage, "/camera")
+    usd_format._add_camera(prim, camera, Gf)
+    frustum = prim.GetCamera(0).frustum
+    matrix = np.array(frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix())
+    points = MIDDLES[:, None] + np.array([[0.0, 0, 0], [0.2, 0, 0], [0, 0.2, 0], [0, 0, 0.2]])
+    for point in points.reshape(-1, 3):
+        clip = np.append(point, 1) @ matrix
+        x, y = (clip[:2] / clip[3] + 1) / 2
+        local = np.array(camera.to_camera(mi.Point3f(*point))).ravel()
+        ours = local[0] / local[2] * -70 + 40.5, local[1] / local[2] * -55 + 17
+        np.testing.assert_allclose((64 * x, 48 * (1 - y)), ours, atol=1e-3)
+
+
+def test_a_gltf_camera_that_loses_its_principal_point_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    for camera, said in ((off_centre(), True), (shots_around(trained_scene().surfels)[0].camera, False)):
+        gltf_mesh._add_camera({"nodes": [], "scenes": [{"nodes": []}]}, camera)
+        text = "8.5 pixels to the right and -7.0 below" in capsys.readouterr().err
+        assert text is said
 
 
 def test_usd_passes_its_own_validators(exported: Exported) -> None:

@@ -73,7 +73,7 @@ LAYERS: dict[str, set[str]] = {
     "fitting": RENDERER | {"methods", "data", "runs", "resources", ""},
     "evaluation": RENDERER | {"methods", "data", "runs", "fitting", "messages"},
     "relighting": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", "formats", "source"},
-    "formats": RENDERER | {"methods", "data", "runs", "fitting", "evaluation", "plugins"},
+    "formats": RENDERER | {"messages", "methods", "data", "runs", "fitting", "evaluation", "plugins"},
     "source": RENDERER | {"methods", "data", "runs", "fitting", "formats"},
     "reconstruction": RENDERER
     | {

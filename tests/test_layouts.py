@@ -122,6 +122,21 @@ def test_splits_that_a_file_names(tmp_path: Path) -> None:
         read_dataset(data, "test")
 
 
+@pytest.mark.parametrize("name", ["a.PNG", "a.Png", "a.JPG", "a.jpeg", "a.b.JPEG", "a"])
+@pytest.mark.parametrize("written", [True, False])
+def test_a_file_path_finds_its_file_by_any_ending(name: str, written: bool, tmp_path: Path) -> None:
+    """With the file's ending, in other letters or of another kind, or without; a dot may be in the name."""
+    data = nerfstudio(tmp_path)
+    stem = name.rpartition(".")[0] or name
+    (data / "images/b.png").rename(data / "images" / (name if name != stem else f"{stem}.jpg"))
+    named = f"images/{stem}.png" if written else f"images/{stem}"
+    mended(data, lambda content: content["frames"][1].update(file_path=named))
+    (data / "images/a.png").unlink(missing_ok=True)
+    mended(data, lambda content: content.update(frames=[content["frames"][2], content["frames"][1]]))
+    [view] = read_dataset(data, "test" if named < "images/c.png" else "train").views
+    check(view, SHOTS[1])
+
+
 # ---------------- Shiny Blender ----------------
 
 

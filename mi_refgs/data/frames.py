@@ -19,7 +19,7 @@ from mi_refgs.data.view import View
 from mi_refgs.errors import InputError, shown
 from mi_refgs.exr import read_exr_image
 from mi_refgs.files import inside, is_file
-from mi_refgs.images import ENDINGS, has_alpha, image_size
+from mi_refgs.images import ENDINGS, has_alpha, image_size, with_ending
 
 SUFFIXES = (*ENDINGS, ".exr")
 """File name endings that `file_path` may carry or leave out, in the order in which they are tried."""
@@ -74,9 +74,11 @@ class FrameReader:
         if named is None:
             raise InputError(f"{self.transforms}: frames[{index}].file_path: missing; name the picture")
         if self.options.images == "exr":
-            return self._path(index, frame, "exr_path") or named.with_name(f"{_stem(named.name)}.exr")
-        candidates = [named.with_name(_stem(named.name) + suffix) for suffix in ENDINGS]
-        file = next((c for c in (named, *candidates) if is_file(c)), candidates[0])
+            stem = named.with_name(_stem(named.name))
+            there = self._path(index, frame, "exr_path") or with_ending(stem, (".exr",))
+            return there or stem.with_name(f"{stem.name}.exr")
+        stem = named.with_name(_stem(named.name))
+        file = named if is_file(named) else with_ending(stem) or stem.with_name(stem.name + ENDINGS[0])
         if file.suffix.lower() == ".exr":
             raise InputError(f"{file}: images: the picture is an EXR file; read this data set as 'exr'")
         return file

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mi_refgs.errors import InputError, shown
 from mi_refgs.files import inside, is_file
-from mi_refgs.images import ENDINGS
+from mi_refgs.images import ENDINGS, with_ending
 
 COPIES = (8, 4, 2)
 """Factors by which copies are smaller than the pictures in `images`."""
@@ -58,8 +58,7 @@ class PictureFolders:
                 raise InputError(
                     f"{self.root}: {shown(name)} names no file in {folder.name}; move the picture there"
                 )
-            others = (file.with_suffix(ending) for s in ENDINGS for ending in (s, s.upper()))
-            if there := next((f for f in (file, *others) if is_file(f)), None):
+            if there := file if is_file(file) else with_ending(file.with_suffix("")):
                 return there, downscale // factor
         return None
 

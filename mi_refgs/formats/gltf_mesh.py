@@ -1,6 +1,7 @@
 """`gltf-mesh`: glTF 2.0 in one file, a mesh with metallic-roughness textures, and a camera.
 
-glTF is in metres with +y up, our world has +z up: (x, y, z) becomes (x, z, −y). It has no environment light.
+glTF is in metres with +y up, our world has +z up: (x, y, z) becomes (x, z, −y). It has no environment
+light, and no principal point of a camera.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 """glTF's world from ours."""
+CENTRED = 0.5
+"""Pixels by which a principal point may lie beside the middle without a word."""
 
 
 def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int, texture: int) -> list[Path]:
@@ -67,6 +70,14 @@ def _add_camera(tree: dict[str, Any], camera: Camera) -> None:
     """The camera as a node; glTF's looks along its −z, ours along +z with +x to the left."""
     import numpy as np
 
+    from mi_refgs.messages import warn
+
+    right, down = float(camera.cx[0]) - camera.width / 2, float(camera.cy[0]) - camera.height / 2
+    if max(abs(right), abs(down)) > CENTRED:
+        warn(
+            f"gltf-mesh: a glTF camera has its principal point in the middle; this one's lies {right:.1f} "
+            f"pixels to the right and {down:.1f} below, by which its image is shifted"
+        )
     width, height = camera.width / abs(float(camera.fx[0])), camera.height / abs(float(camera.fy[0]))
     lens = {"aspectRatio": width / height, "yfov": 2 * float(np.arctan(height / 2)), "znear": 1e-3}
     tree["cameras"] = [{"type": "perspective", "perspective": lens}]

@@ -111,6 +111,10 @@ def _add_camera(prim: Any, camera: Camera, gf: Any) -> None:
     prim.CreateHorizontalApertureAttr(APERTURE)
     prim.CreateFocalLengthAttr(APERTURE * fx / camera.width)
     prim.CreateVerticalApertureAttr(APERTURE * fx / camera.width * camera.height / fy)
+    # From the principal point to the middle of the film, to the right and up.
+    right, down = camera.width / 2 - float(camera.cx[0]), camera.height / 2 - float(camera.cy[0])
+    prim.CreateHorizontalApertureOffsetAttr(APERTURE * right / camera.width)
+    prim.CreateVerticalApertureOffsetAttr(-APERTURE * fx / camera.width * down / fy)
     prim.CreateClippingRangeAttr(gf.Vec2f(1e-3, 1e6))
     # USD's matrices multiply rows.
     pose = (camera.pose() @ np.diag([-1.0, 1.0, -1.0, 1.0])).T
