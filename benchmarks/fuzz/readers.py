@@ -351,6 +351,11 @@ def _file(name: str, kind: str, samples: Any, read: Callable[[Path], Any], file:
     return Reader(name, kind, samples, _read_file(read, file), **more)
 
 
+def _read_log(path: Path) -> None:
+    (path.parent / "config.toml").touch()  # the log is that of a run
+    Run(path.parent).rewind(5)
+
+
 READERS = {
     reader.name: reader
     for reader in (
@@ -372,7 +377,7 @@ READERS = {
         _file("model", "json", _models, _read_model, "model.json"),
         _file("run-data", "json", _data_places, _read_data_place, "dataset.json", inside=False),
         _file("dataset", "json", _settings, _read_settings, "dataset.json"),
-        _file("log", "json", _logs, lambda path: Run(path.parent).rewind(5), "metrics.jsonl"),
+        _file("log", "json", _logs, _read_log, "metrics.jsonl"),
         # A scene may name files anywhere, as every scene of Mitsuba's.
         _file("scene", "xml", _scenes, _read_scene, "x.xml", inside=False),
     )

@@ -191,7 +191,7 @@ def test_a_log_of_anything(tmp_path: Path) -> None:
         "[" * 10**5,
         "{}",
     ]
-    (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
+    Run(tmp_path).output.own("metrics.jsonl").write_text("\n".join(lines))
     Run(tmp_path).rewind(5)
     assert (tmp_path / "metrics.jsonl").read_text() == lines[0] + "\n"
 
