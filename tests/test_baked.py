@@ -349,7 +349,7 @@ def test_a_usd_camera_keeps_the_principal_point() -> None:
     for point in points.reshape(-1, 3):
         clip = np.append(point, 1) @ matrix
         x, y = (clip[:2] / clip[3] + 1) / 2
-        local = np.array(camera.to_camera(mi.Point3f(*point))).ravel()
+        local = np.array(camera.to_camera(mi.Point3f(*map(float, point)))).ravel()
         ours = local[0] / local[2] * -70 + 40.5, local[1] / local[2] * -55 + 17
         np.testing.assert_allclose((64 * x, 48 * (1 - y)), ours, atol=1e-3)
 
