@@ -68,10 +68,9 @@ def normal(raw: dict[str, Array]) -> Array:
 def _limits(camera: PinholeCamera) -> list[tuple[float, float]]:
     """Slopes p_x / p_z and p_y / p_z of the neighbourhood of the picture."""
     limits = []
-    for (focal, middle), size in zip(intrinsics(camera), (camera.width, camera.height), strict=True):
-        ends = [
-            ((i + side * c.GAUSSIAN_SLOPE_MARGIN) * size - middle) / focal for i, side in ((0, -1), (1, 1))
-        ]
+    for (focal, middle), (first, last) in zip(intrinsics(camera), camera.borders, strict=True):
+        margin = c.GAUSSIAN_SLOPE_MARGIN * (last - first)
+        ends = [(first - margin - middle) / focal, (last + margin - middle) / focal]
         limits.append((min(ends), max(ends)))
     return limits
 

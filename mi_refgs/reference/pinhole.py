@@ -23,6 +23,13 @@ class PinholeCamera:
     cy: float
     to_world: np.ndarray  # (4, 4)
     near: float = 0.01
+    film: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """First and last pixel border of the film along x and y, of a crop window; None: those of the image."""
+
+    @property
+    def borders(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """`film`, or the borders of the image."""
+        return self.film or ((0, self.width), (0, self.height))
 
 
 def rotation_matrix(q: np.ndarray) -> np.ndarray:

@@ -63,7 +63,8 @@ def camera_of(case: Case) -> tuple[PinholeCamera, tuple[int, int], int]:
     centre = (WIDTH / 2 - x) * k, (HEIGHT / 2 - y) * k
     tile = c.tile_size(abs(focal))
     corner = x * k % tile[0], y * k % tile[1]
-    return PinholeCamera(width * k, height * k, focal, focal, *centre, pose, NEAR), corner, k
+    film = (-x * k, (WIDTH - x) * k), (-y * k, (HEIGHT - y) * k)
+    return PinholeCamera(width * k, height * k, focal, focal, *centre, pose, NEAR, film), corner, k
 
 
 @dataclass
@@ -75,7 +76,11 @@ class Oracle:
     _kept: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.camera, self.corner, self.per_axis = camera_of(self.case)
+        shown, self.window = self.case, (slice(None), slice(None))
+        if self.case["accuracy"] == "antialias":  # roughness depends on pixels beside the crop window
+            x, y, width, height = CROPS[self.case["crop"]]
+            shown, self.window = self.case | {"crop": "none"}, (slice(y, y + height), slice(x, x + width))
+        self.camera, self.corner, self.per_axis = camera_of(shown)
         self.pixels = np.arange(self.camera.width * self.camera.height)
         self.band = np.zeros(len(self.pixels), bool)
         self.exact = self.case["occlusion"] not in TRACED
@@ -84,11 +89,11 @@ class Oracle:
         """(H, W, channels), as `mi.render` gives it."""
         values = {name: np.asarray(x, np.float64) for name, x in values.items()}
         maps = self._reference(values) if self.exact else self._rendered(values)
-        return self._developed(maps, values)
+        return self._developed(maps, values)[self.window]
 
     def undecided(self) -> Array:
         """Pixels (H, W) of which a sample is near a discontinuity; after the first `image`."""
-        return self._blocks(self.band.astype(float)[:, None])[..., 0] > 0
+        return self._blocks(self.band.astype(float)[:, None])[self.window][..., 0] > 0
 
     # ---------------- maps of the samples ----------------
 
@@ -159,7 +164,8 @@ class Oracle:
         view = Camera.from_pose(
             camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.to_world, NEAR
         )
-        view = replace(view, offset=self.corner)
+        (left, right), (top, bottom) = (map(int, ends) for ends in camera.borders)
+        view = replace(view, offset=(-left, -top), film=(right - left, bottom - top))
         frame = render(surfels, view, chosen, light, occluder, aovs=True, surroundings=open_)
         assert frame.terms is not None
         found = {
@@ -190,6 +196,8 @@ class Oracle:
         if case["background"] != "none":
             behind = maps["background"] if case["background"] == "map" else np.array(BACKDROP)
             rgb, coverage = rgb + (1 - alpha) * behind, np.ones_like(coverage)
+        elif case["input"] == "run" and case["surroundings"]:  # opaque over black
+            coverage = np.ones_like(coverage)
         colour = self._blocks(rgb)
         if case["colour"] != "rgb":
             colour = colour @ (XYZ if case["colour"] == "xyz" else XYZ[1:2]).T
