@@ -19,6 +19,8 @@ from mi_refgs.errors import InputError
 
 LOOK_AHEAD = 64
 """Elements by which kernels read beyond the last one of an array, at most: a packet of the widest machine."""
+ALIGNMENT = 64
+"""Bytes of the widest packet."""
 DTYPES = {"Float": np.float32, "UInt32": np.uint32, "Int32": np.int32, "Bool": np.bool_}
 """NumPy's types of the elements of Mitsuba's flat arrays."""
 
@@ -65,6 +67,20 @@ def require_supported_variant(what: str) -> None:
         )
 
 
+def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
+    """A flat copy in memory aligned to packets, LOOK_AHEAD zeros after its end.
+
+    Dr.Jit compiles one kernel for aligned and another for unaligned memory. NumPy's is either by chance, so
+    that kernels on disk would serve only some of the later processes.
+    """
+    size, count = np.dtype(dtype).itemsize, np.size(values)
+    whole: np.ndarray = np.zeros((count + LOOK_AHEAD) * size + ALIGNMENT, np.uint8)
+    start = -whole.ctypes.data % ALIGNMENT
+    padded: np.ndarray = whole[start : start + (count + LOOK_AHEAD) * size].view(dtype)
+    padded[:count] = np.ravel(values)
+    return padded
+
+
 def upload(values: np.ndarray, kind: Any = None) -> Any:
     """A flat mi.Float (or another `kind` of DTYPES) with the values, in memory that Dr.Jit has allocated.
 
@@ -78,8 +94,7 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
     kind = mi.Float if kind is None else kind
     dtype = {getattr(mi, name): dtype for name, dtype in DTYPES.items()}[kind]
     count = np.size(values)
-    padded: np.ndarray = np.zeros(count + LOOK_AHEAD, dtype)
-    padded[:count] = np.ravel(values)
+    padded = aligned(values, dtype)
     own = dr.empty(kind, count)
     if count:
         index = dr.arange(mi.UInt32, count)

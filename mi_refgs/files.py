@@ -104,6 +104,7 @@ def locked(path: Path, busy: str, wait: float = 0.0) -> Iterator[None]:
     if key in held:
         yield
         return
+    new = not path.parent.exists()
     make_folder(path.parent)
     until = time.monotonic() + wait
     while (file := _lock_of(path)) is None:
@@ -118,6 +119,8 @@ def locked(path: Path, busy: str, wait: float = 0.0) -> Iterator[None]:
         with contextlib.suppress(OSError):  # while it is still held: nobody else can have this file's lock
             if not path.stat().st_size:  # a file with content is not ours
                 path.unlink()
+            if new:
+                path.parent.rmdir()  # where nothing was written; fails otherwise
         file.close()
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from mi_refgs.device import upload_tensor
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.shade.envmap import EnvironmentLight
 
@@ -70,7 +71,7 @@ def sensor(**changes: Any) -> dict:
 def integrator(raw: dict[str, np.ndarray] | None = None, **changes: object) -> dict:
     raw = raw_channels() if raw is None else raw
     light = EnvironmentLight.from_radiance(sky()).raw
-    channels = {name: mi.TensorXf(values) for name, values in raw.items()}
+    channels = {name: upload_tensor(values) for name, values in raw.items()}
     return {"type": "refgs", **channels, "light": light} | changes
 
 

@@ -25,6 +25,25 @@ KNOWN = {
 }
 
 
+def test_a_lookup_needs_one_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever NumPy has put the table: kernels on disk serve every later process."""
+    table = brdf.table()
+    memory = np.empty(table.size + 64, np.float32)
+    first = -memory.ctypes.data % 64 // 4
+    kernels = []
+    for offset in (0, 1):
+        moved = memory[first + offset : first + offset + table.size].reshape(table.shape)
+        moved[:] = table
+        monkeypatch.setattr(brdf, "table", lambda moved=moved: moved)
+        brdf.device_table.cache_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            dr.eval(brdf.split_sum(dr.opaque(mi.Float, 0.3, 8), dr.opaque(mi.Float, 0.4, 8)))
+            kernels.append([kernel["ir"].getvalue() for kernel in dr.kernel_history() if "ir" in kernel])
+    brdf.device_table.cache_clear()
+    assert kernels[0] == kernels[1] != []
+
+
 def lookup(n_dot_v: float, roughness: float) -> tuple[float, float]:
     a, b = brdf.split_sum(mi.Float(n_dot_v), mi.Float(roughness))
     return a[0], b[0]

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.device import aligned
 from mi_refgs.errors import InputError
 from mi_refgs.files import replace_file
 
@@ -101,7 +102,7 @@ def device_table(variant: str) -> Any:
     """The table as evaluated mi.Float of the variant that is set; made on the first call, kept for others."""
     # Gathers alone read it, by elements: NumPy's memory will do. The first one may be in a loop that is being
     # recorded, where `upload` could not run its kernel.
-    return mi.Float(table().ravel())
+    return mi.Float(aligned(table()))
 
 
 def split_sum(n_dot_v: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Float]:

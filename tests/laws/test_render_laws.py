@@ -17,6 +17,7 @@ from integrator_scenes import plane_mesh, sky
 from law_scenes import COUNT, FOCAL, HEIGHT, LIGHT_ROWS, SCENES, SEEDS, WIDTH, Scene, random_scene, rotated
 from scipy.spatial.transform import Rotation
 
+from mi_refgs.device import upload_tensor
 from mi_refgs.shade.envmap import EnvironmentLight
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -40,7 +41,7 @@ def camera(scene: Scene) -> dict[str, Any]:
 
 
 def loaded(scene: Scene, light: Any, **changes: Any) -> mi.Scene:
-    channels = {name: mi.TensorXf(values) for name, values in scene.raw.items()}
+    channels = {name: upload_tensor(values) for name, values in scene.raw.items()}
     integrator = {"type": "refgs", **channels, "light": light} | changes
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(scene)})
 
@@ -78,7 +79,7 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(setting: str, scene: Scen
     tangents = {key: rng.normal(size=value.shape).astype(np.float32) for key, value in values.items()}
 
     def rendered() -> tuple[dict[str, Any], Any]:
-        leaves = {key: mi.TensorXf(value) for key, value in values.items()}
+        leaves = {key: upload_tensor(value) for key, value in values.items()}
         dr.enable_grad(list(leaves.values()))
         for key, leaf in leaves.items():
             params[key] = leaf
@@ -87,7 +88,7 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(setting: str, scene: Scen
 
     leaves, image = rendered()
     δ = rng.normal(size=image.shape).astype(np.float32)
-    dr.backward(dr.sum(image * mi.TensorXf(δ), axis=None))
+    dr.backward(dr.sum(image * upload_tensor(δ), axis=None))
     reverse = {
         k: float(np.sum(dr.grad(leaf).numpy().astype(float) * tangents[k])) for k, leaf in leaves.items()
     }
@@ -95,7 +96,7 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(setting: str, scene: Scen
     for keys in [*([key] for key in values), list(values)]:
         leaves, image = rendered()
         for key in keys:
-            dr.set_grad(leaves[key], mi.TensorXf(tangents[key]))
+            dr.set_grad(leaves[key], upload_tensor(tangents[key]))
         forward = dr.forward_to(image).numpy().astype(float)
         error = abs(np.sum(forward * δ) - sum(reverse[key] for key in keys))
         assert error <= ADJOINT * np.linalg.norm(δ) * np.linalg.norm(forward), keys
