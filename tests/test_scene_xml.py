@@ -72,8 +72,8 @@ def test_every_option_of_accuracy_goes_round(option: str, tmp_path: Path) -> Non
     """Through scene.xml and through model.json; and the pictures are the same."""
     shading = shading_with(option)
     made = fitted(tmp_path, shading)
-    scene, seen, expected = shown(tmp_path, made, view())
-    assert scene.integrator().shading == shading and TrainedScene.read(tmp_path).shading == shading
+    scene, seen, expected = shown(tmp_path / "run", made, view())
+    assert scene.integrator().shading == shading and TrainedScene.read(tmp_path / "run").shading == shading
     np.testing.assert_allclose(seen, expected, atol=1e-5)
     plain = replace(made, shading=replace(shading, accuracy=Accuracy())).renderer()(view())
     assert np.abs(plain.radiance.numpy().T.reshape(HEIGHT, WIDTH, 3) - seen[..., :3]).max() > 1e-3

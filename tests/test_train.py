@@ -325,7 +325,7 @@ def test_a_full_disk_leaves_what_was_saved(
 
 def test_a_log_that_cannot_be_written_is_one_sentence(method: Method, tmp_path: Path) -> None:
     run = run_folder(tmp_path / "run", method)
-    (run.path / "metrics.jsonl").mkdir()
+    run.output.own("metrics.jsonl").mkdir()
     with pytest.raises(InputError, match=r"metrics\.jsonl: output: cannot be written \(.*\); choose"):
         Trainer(method, ball(), run).train()
 
