@@ -203,7 +203,13 @@ def test_every_package_is_listed() -> None:
     )
 
 
-IMPORT_NAMES = {"scikit_image": "skimage", "pillow": "pil", "mitsuba": "drjit", "dask": "distributed"}
+IMPORT_NAMES = {
+    "scikit_image": "skimage",
+    "pillow": "pil",
+    "mitsuba": "drjit",
+    "dask": "distributed",
+    "openexr": "imath",
+}
 """What a distribution brings under another name than its own, in lower case."""
 
 
