@@ -16,6 +16,8 @@ from mi_refgs.errors import InputError
 
 # Voxels per edge of the visual hull's grid: at 200² a voxel of the cube the views span is two pixels wide.
 HULL_RESOLUTION = 96
+# Of smaller images: as many as their longer edge has pixels, but not fewer than this.
+HULL_LEAST = 32
 # Mask level that bounds the hull, and the level below which a voxel of the blurred masks is given up.
 HULL_LEVEL = 0.5
 HULL_CARVED = 0.05
@@ -115,13 +117,17 @@ class Hull:
         return self.origin + points * self.voxel
 
 
-def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int = HULL_RESOLUTION) -> Hull:
+def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | None = None) -> Hull:
     """The set of points inside every mask (alpha > 0.5, blurred by half a voxel).
 
+    `resolution` is the number of voxels per edge; by default HULL_RESOLUTION, fewer for small images.
     Where a view does not see a point it says nothing, but a quarter of the views must see it. Raises
     InputError if nothing is inside every mask.
     """
     low, high = np.asarray(bounds, dtype=np.float64)
+    if resolution is None:
+        edge = max((max(view.width, view.height) for view in views), default=HULL_LEAST)
+        resolution = min(max(edge, HULL_LEAST), HULL_RESOLUTION)
     voxel = (high - low) / resolution
     centres = np.stack(np.meshgrid(*[np.arange(resolution)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = np.ones(resolution**3, dtype=np.float32)
