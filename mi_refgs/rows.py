@@ -137,6 +137,7 @@ class _Columns(dr.CustomOp):
             value = group[0] if self.packet == 1 else mi.ArrayXf(group)
             # Without the promise of no conflicts every packet would be a kernel of its own.
             dr.scatter(flat, value, row + i, mode=dr.ReduceMode.NoConflicts)
+        dr.eval(flat)  # it may become the gradient itself, which others write into
         return flat
 
 

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from integrator_scenes import COUNT, hollow_mesh, integrator, raw_channels, sensor, sky
+from integrator_scenes import hollow_mesh, integrator, raw_channels, sensor, sky
 from scipy.spatial import cKDTree
 
 from mi_refgs.render.pipeline import render
@@ -29,6 +29,10 @@ from mi_refgs.surfels.channels import channel
 
 TOLERANCE = 1e-5
 """Relative to the largest entry of the sum, for each parameter: sums by scatter come in any order."""
+COUNT = 400
+"""Surfels: enough that two threads share the work on them. What 24 lose, one thread puts right."""
+RENDERED = 100
+"""Weight of the images, whose gradients are small beside those of priors."""
 NEIGHBOURS = 4
 AROUND = "surroundings_"
 
@@ -38,7 +42,7 @@ AROUND = "surroundings_"
 
 def every_channel(model: str, diffuse: str, gaussians: bool) -> dict[str, np.ndarray]:
     """The geometry, and what a reflectance model needs."""
-    raw, rng = raw_channels(), np.random.default_rng(5)
+    raw, rng = raw_channels(COUNT), np.random.default_rng(5)
     if gaussians:
         raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1]], axis=1)
     wanted = MODELS[model].channels(diffuse)
@@ -49,19 +53,25 @@ def every_channel(model: str, diffuse: str, gaussians: bool) -> dict[str, np.nda
 
 
 def model_scene(model: str, diffuse: str = "sh", gaussians: bool = False, **changes: Any) -> Any:
-    """A reflectance model with its own light, among Gaussians around it and before a map."""
+    """A reflectance model with its own light."""
     raw = every_channel(model, diffuse, gaussians)
     if "mesh" in changes and "traced_bounces" not in changes:
-        raw["indirect_sh"] = raw_channels()["indirect_sh"]
-    far = {name: raw[name] for name in ("position", "rotation", "scale", "opacity")}
-    far |= {"position": 1.7 * far["position"], "radiance_sh": raw_channels()["radiance_sh"]}
-    around = {AROUND + name: mi.TensorXf(values) for name, values in far.items()}
-    behind = EnvironmentLight.from_radiance(0.3 + sky(16)).raw
-    chosen = {"reflectance": model, "diffuse": diffuse, "background": behind, **around, **changes}
+        raw["indirect_sh"] = raw_channels(COUNT)["indirect_sh"]
+    chosen = {"reflectance": model, "diffuse": diffuse, **changes}
     inner = integrator(raw, aovs="a:alpha,d:depth,n:normal,s:diffuse", **chosen)
     if MODELS[model].light == "none":
         del inner["light"]
     return mi.load_dict({"type": "scene", "integrator": inner, "sensor": sensor()})
+
+
+def open_scene(**changes: Any) -> Any:
+    """Surfels among others around them, before a map."""
+    far = every_channel("radiance", "sh", False)
+    far["position"] = 1.7 * far["position"]
+    around = {AROUND + name: mi.TensorXf(values) for name, values in far.items()}
+    return model_scene(
+        "split_sum", background=EnvironmentLight.from_radiance(0.3 + sky(16)).raw, **around, **changes
+    )
 
 
 def lit_scene(emitter: dict[str, Any]) -> Any:
@@ -112,6 +122,8 @@ SCENES: dict[str, Callable[[Path], Any]] = {
     **{f"model {name}": of_model(name) for name in MODELS},
     "3D Gaussians": lambda _: model_scene("split_sum", gaussians=True),
     "at surfels": lambda _: model_scene("split_sum", shade_at="surfel"),
+    "surroundings": lambda _: open_scene(),
+    "surroundings at surfels": lambda _: open_scene(shade_at="surfel"),
     "antialiased": lambda _: model_scene("split_sum", antialias=True),
     "indirect light": lambda folder: model_scene("split_sum", mesh=hollow_mesh(folder)),
     "traced bounces": lambda folder: traced(folder, traced_bounces=1, ambient_rays=4, visibility_rays=2),
@@ -139,16 +151,18 @@ class Losses:
         kept = [key for key in self.params.keys() if is_trained(key) and key not in without]
         self.base = {key: np.array(dr.ravel(self.params[key])) for key in kept}
         self.shape = {key: tuple(self.params[key].shape) for key in kept}
+        self.keys = kept
         rng = np.random.default_rng(0)
         self.direction = {key: rng.normal(size=x.shape).astype(np.float32) for key, x in self.base.items()}
         self.picked = {key: mi.UInt32(rng.integers(0, x.size, 2 * x.size)) for key, x in self.base.items()}
         image = mi.render(scene, spp=1)
-        self.weight = mi.TensorXf(rng.normal(size=image.shape).astype(np.float32))
-        _, self.neighbour = cKDTree(raw_channels()["position"]).query(raw_channels()["position"], NEIGHBOURS)
+        self.weight = mi.TensorXf(RENDERED * rng.normal(size=image.shape).astype(np.float32))
+        position = raw_channels(COUNT)["position"]
+        _, self.neighbour = cKDTree(position).query(position, NEIGHBOURS)
         self.terms: dict[str, Callable[[], Any]] = {
             "image": lambda: self.rendered(1, slice(0, 3)),
             **({"aovs": lambda: self.rendered(4, slice(3, None))} if image.shape[2] > 3 else {}),
-            **({"frame": self.frame} if "integrator.background" in kept else {}),
+            **({"frame": self.frame} if "integrator.light" in kept else {}),
             "slice": lambda: self.priors(lambda _, x: x[..., 0] if isinstance(x, mi.TensorXf) else x),
             "gather": lambda: self.priors(lambda key, x: dr.gather(mi.Float, dr.ravel(x), self.picked[key])),
             "mean": lambda: self.priors(
@@ -158,7 +172,7 @@ class Losses:
         }
 
     def leaves(self) -> dict[str, Any]:
-        """New leaves of the AD graph in place of all parameters."""
+        """New leaves of the AD graph in place of the parameters `keys`, and new constants of the others."""
         made = {}
         for key, values in self.base.items():
             flat = mi.Float(values)
@@ -167,8 +181,10 @@ class Losses:
                 leaf = mi.Color3f(*(mi.Float(float(x)) for x in values))
             elif type(self.params[key]) is mi.Float:
                 leaf = flat
-            dr.enable_grad(leaf)
-            self.params[key] = made[key] = leaf
+            if key in self.keys:
+                dr.enable_grad(leaf)
+                made[key] = leaf
+            self.params[key] = leaf
         self.params.update()
         return made
 
@@ -187,14 +203,14 @@ class Losses:
         around = of.around.splatted(of.surfels)
         frame = render(of.surfels, camera, of.shading, light, of.occluder, surroundings=around)
         weight = self.weight.array
-        values = [*frame.radiance, *frame.background, frame.alpha, frame.depth]
+        values = [*frame.radiance, frame.alpha, frame.depth]
         rows = dr.arange(mi.UInt32, dr.width(frame.alpha))
         return sum(dr.sum(x * dr.gather(mi.Float, weight, rows + i)) for i, x in enumerate(values))
 
     def priors(self, read: Callable[[str, Any], Any]) -> Any:
         """Sum of squares of what is read of each parameter."""
         total = mi.Float(0)
-        for key in self.base:
+        for key in self.keys:
             value = read(key, self.params[key])
             total += dr.sum(dr.square(dr.ravel(value)))
         return total
@@ -259,10 +275,10 @@ def check_additive(
         for key, found in derivative(*order).items():
             parts = [alone[name][key] for name in order]
             sizes = [np.abs(part).max() for part in parts]
-            lost = 10 * TOLERANCE * max(sizes)
-            assert all(size == 0 or size > lost for size in sizes), f"{key}: too small to be missed: {sizes}"
-            error = np.abs(found - sum(parts)).max() / max(sizes)
-            assert error <= TOLERANCE, f"{key}: {', then '.join(order)}: off by {error:.1e}"
+            error, least = np.abs(found - sum(parts)).max(), min(size for size in sizes if size)
+            # What one loss has lost must show even where another has a thousand times its gradient.
+            wrong = error > TOLERANCE * max(sizes) or error > 0.1 * least
+            assert not wrong, f"{key}: {', then '.join(order)}: off by {error:.1e}, gradients {sizes}"
 
 
 def all_at_once(names: list[str]) -> list[tuple[str, ...]]:
@@ -293,10 +309,13 @@ def test_tangents_of_losses_add(losses: Losses) -> None:
 
 
 def test_gradients_of_every_pair_of_losses_add() -> None:
-    """Two at a time, so that no third loss hides what they do to each other."""
+    """Two losses of one parameter at a time, so that nothing else evaluates what they write."""
     losses = Losses(model_scene("split_sum"))
     with running_on(2):
-        check_additive(losses.gradient, losses.gradients, [*permutations(losses.terms, 2)])
+        for key in losses.base:
+            losses.keys = [key]
+            alone = {name: losses.gradient(name) for name in losses.terms}
+            check_additive(losses.gradient, alone, [*permutations(losses.terms, 2)])
 
 
 def test_every_parameter_has_a_gradient(losses: Losses) -> None:
