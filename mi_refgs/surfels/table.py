@@ -28,6 +28,8 @@ from mi_refgs.surfels.channels import CHANNELS, channel
 
 # Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is worthless.
 QUATERNION_FLOOR = 1e-12
+# Beyond it the reciprocal is a subnormal number, which processors may flush to zero.
+QUATERNION_LARGE = 1e37
 # e^±40 = 4e-18 … 2e17 scene units: float32 holds them and their squares. `primitives` bound the size of
 # a surfel relative to its depth, which is what pictures depend on.
 LOG_SCALE_LIMIT = 40.0
@@ -197,7 +199,7 @@ class Surfels:
         largest = dr.detach(dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), dr.maximum(dr.abs(z), dr.abs(w))))
         valid = largest >= QUATERNION_FLOOR
         # Dividing by the largest component first keeps |q|² in range; normalising undoes it.
-        shrink = dr.rcp(dr.select(valid, largest, 1.0))
+        shrink = dr.rcp(dr.select(valid, dr.minimum(largest, QUATERNION_LARGE), 1.0))
         x, y, z = (dr.select(valid, part * shrink, 0.0) for part in (x, y, z))
         w = dr.select(valid, w * shrink, 1.0)
         inverse_norm = dr.rsqrt(x * x + y * y + z * z + w * w)
