@@ -53,7 +53,7 @@ if [ "$(uname)" = "Linux" ]; then
 fi
 "$python" -c 'import ensurepip, venv' 2> /dev/null || missing+=(python3-venv)
 if [ "$mode" = test ] && ! command -v chromium chromium-browser google-chrome > /dev/null; then
-    missing+=(chromium)  # tests/test_viewer.py opens pages in it
+    missing+=(chromium)  # tests/viewer/test_viewer.py opens pages in it
 fi
 if [ ${#missing[@]} -gt 0 ]; then
     install_packages "${missing[@]}"

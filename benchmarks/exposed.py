@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.files import read_json, write_json
-from mi_refgs.images import linear_from_srgb, read_png, srgb_from_linear, write_png
+from mi_refgs.io.files import read_json, write_json
+from mi_refgs.io.images import linear_from_srgb, read_png, srgb_from_linear, write_png
 
 
 def put_on(data: Path, copy: Path, low: float, high: float, seed: int) -> dict[str, list[float]]:

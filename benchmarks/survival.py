@@ -70,7 +70,7 @@ def write_data(folder: Path) -> Path:
     """The pictures as a data set on disk."""
     from benchmarks.step import sphere_data
     from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
-    from mi_refgs.images import write_png
+    from mi_refgs.io.images import write_png
 
     folder.mkdir(parents=True)
     views = sphere_data(SIZE, VIEWS, np.random.default_rng(0)).views
@@ -92,7 +92,7 @@ def kill(times: int, seed: int, folder: Path) -> dict[str, Any]:
 
     Every second kill waits, after its random moment, for the next checkpoint that is being written.
     """
-    from mi_refgs.files import TEMPORARY
+    from mi_refgs.io.files import TEMPORARY
     from mi_refgs.runs import checkpoint
     from mi_refgs.runs.run import Run
 

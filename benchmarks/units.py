@@ -68,8 +68,8 @@ def fit(folder: Path, seed: int) -> dict[str, float]:
 
 def measure(size: int, views: int, seeds: int) -> list[dict[str, Any]]:
     """One row for each fit."""
-    from mi_refgs.data.make_dataset import make_dataset
-    from mi_refgs.resources import resource_dir
+    from mi_refgs.io.resources import resource_dir
+    from mi_refgs.synthesis.make_dataset import make_dataset
 
     jobs = [(unit, factor, seed) for seed in range(seeds) for unit, factor in UNITS.items()]
     rows = []

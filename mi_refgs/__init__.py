@@ -21,7 +21,6 @@ from mi_refgs import llvm
 if TYPE_CHECKING:
     from mi_refgs.data.dataset import Dataset as Dataset
     from mi_refgs.data.dataset import read_dataset as read_dataset
-    from mi_refgs.data.make_dataset import make_dataset as make_dataset
     from mi_refgs.data.readers import register as register_reader
     from mi_refgs.data.view import View as View
     from mi_refgs.editing.options import Options as EditOptions
@@ -29,19 +28,17 @@ if TYPE_CHECKING:
     from mi_refgs.evaluation.evaluate import evaluate as evaluate
     from mi_refgs.fitting.progress import Progress as Progress
     from mi_refgs.fitting.train import Trainer as Trainer
-    from mi_refgs.importing import import_splats as import_splats
     from mi_refgs.methods.method import Method as Method
     from mi_refgs.methods.read import load as load_method
     from mi_refgs.occlusion.mesh import Mesh as Mesh
     from mi_refgs.occlusion.mesh import read_mesh as read_mesh
     from mi_refgs.occlusion.mesh import write_mesh as write_mesh
     from mi_refgs.occlusion.visibility import Occluder as Occluder
-    from mi_refgs.primitives import Primitive as Primitive
-    from mi_refgs.primitives import register as register_primitive
-    from mi_refgs.reconstruct import fit as fit
-    from mi_refgs.reconstruction import Reconstruction as Reconstruction
-    from mi_refgs.reconstruction import load as load
-    from mi_refgs.relighting.light import NewLight as NewLight
+    from mi_refgs.reconstruction.fit import fit as fit
+    from mi_refgs.reconstruction.importing import import_splats as import_splats
+    from mi_refgs.reconstruction.new_light import NewLight as NewLight
+    from mi_refgs.reconstruction.reconstruction import Reconstruction as Reconstruction
+    from mi_refgs.reconstruction.reconstruction import load as load
     from mi_refgs.relighting.relight import relight as relight
     from mi_refgs.render.pipeline import Frame as Frame
     from mi_refgs.render.pipeline import render as render_frame
@@ -49,36 +46,39 @@ if TYPE_CHECKING:
     from mi_refgs.runs.relightable import relightable as relightable
     from mi_refgs.runs.run import Run as Run
     from mi_refgs.shade.accuracy import Accuracy as Accuracy
-    from mi_refgs.shade.envmap import EnvironmentLight as EnvironmentLight
+    from mi_refgs.shade.light.envmap import EnvironmentLight as EnvironmentLight
     from mi_refgs.shade.reflectance import Reflectance as Reflectance
     from mi_refgs.shade.reflectance import register as register_reflectance
     from mi_refgs.shade.shading import Shading as Shading
     from mi_refgs.splat.camera import Camera as Camera
-    from mi_refgs.surfels.channels import Channel as Channel
-    from mi_refgs.surfels.channels import register as register_channel
+    from mi_refgs.surfels.attributes import Channel as Channel
+    from mi_refgs.surfels.attributes import register as register_channel
     from mi_refgs.surfels.init import from_points as from_points
     from mi_refgs.surfels.ply import read_ply as read_ply
     from mi_refgs.surfels.ply import write_ply as write_ply
+    from mi_refgs.surfels.primitives import Primitive as Primitive
+    from mi_refgs.surfels.primitives import register as register_primitive
     from mi_refgs.surfels.table import Surfels as Surfels
+    from mi_refgs.synthesis.make_dataset import make_dataset as make_dataset
 
 __version__ = "0.1.0"
 
 _PUBLIC = {
     "Accuracy": ("shade.accuracy", "Accuracy"),
     "Camera": ("splat.camera", "Camera"),
-    "Channel": ("surfels.channels", "Channel"),
+    "Channel": ("surfels.attributes", "Channel"),
     "Dataset": ("data.dataset", "Dataset"),
     "EditOptions": ("editing.options", "Options"),
-    "EnvironmentLight": ("shade.envmap", "EnvironmentLight"),
+    "EnvironmentLight": ("shade.light.envmap", "EnvironmentLight"),
     "Frame": ("render.pipeline", "Frame"),
     "InputError": ("errors", "InputError"),
     "Mesh": ("occlusion.mesh", "Mesh"),
     "Method": ("methods.method", "Method"),
-    "NewLight": ("relighting.light", "NewLight"),
+    "NewLight": ("reconstruction.new_light", "NewLight"),
     "Occluder": ("occlusion.visibility", "Occluder"),
-    "Primitive": ("primitives", "Primitive"),
+    "Primitive": ("surfels.primitives", "Primitive"),
     "Progress": ("fitting.progress", "Progress"),
-    "Reconstruction": ("reconstruction", "Reconstruction"),
+    "Reconstruction": ("reconstruction.reconstruction", "Reconstruction"),
     "Reflectance": ("shade.reflectance", "Reflectance"),
     "Run": ("runs.run", "Run"),
     "Shading": ("shade.shading", "Shading"),
@@ -87,17 +87,17 @@ _PUBLIC = {
     "Trainer": ("fitting.train", "Trainer"),
     "View": ("data.view", "View"),
     "evaluate": ("evaluation.evaluate", "evaluate"),
-    "fit": ("reconstruct", "fit"),
+    "fit": ("reconstruction.fit", "fit"),
     "from_points": ("surfels.init", "from_points"),
-    "import_splats": ("importing", "import_splats"),
-    "load": ("reconstruction", "load"),
+    "import_splats": ("reconstruction.importing", "import_splats"),
+    "load": ("reconstruction.reconstruction", "load"),
     "load_method": ("methods.read", "load"),
-    "make_dataset": ("data.make_dataset", "make_dataset"),
+    "make_dataset": ("synthesis.make_dataset", "make_dataset"),
     "read_dataset": ("data.dataset", "read_dataset"),
     "read_mesh": ("occlusion.mesh", "read_mesh"),
     "read_ply": ("surfels.ply", "read_ply"),
-    "register_channel": ("surfels.channels", "register"),
-    "register_primitive": ("primitives", "register"),
+    "register_channel": ("surfels.attributes", "register"),
+    "register_primitive": ("surfels.primitives", "register"),
     "register_reader": ("data.readers", "register"),
     "register_reflectance": ("shade.reflectance", "register"),
     "relight": ("relighting.relight", "relight"),

@@ -29,7 +29,7 @@ EXTRAS = {
 # A process of its own, because an LLVM that cannot compile this kernel aborts instead of raising.
 _PROBE = """
 import mi_refgs, drjit as dr, mitsuba as mi
-from mi_refgs.device import simd_width
+from mi_refgs.kernels.device import simd_width
 mi.set_variant("llvm_ad_rgb")
 assert dr.minimum(dr.arange(mi.Float, 64), dr.opaque(mi.Float, 2))[63] == 2
 print(simd_width())

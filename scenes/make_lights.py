@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.exr import write_exr
-from mi_refgs.images import box_downscale
+from mi_refgs.io.exr import write_exr
+from mi_refgs.io.images import box_downscale
 
 HEIGHT = 128  # rows; twice as many columns
 OVERSAMPLING = 4  # samples a texel and axis

@@ -17,11 +17,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, settings
-from tiny_scene import train_command, write_data, write_method
 
 from mi_refgs.cli import main
-from mi_refgs.exr import MITSUBA_EXR_THREADS
 from mi_refgs.fitting.cost_model import FOLDER_VARIABLE
+from mi_refgs.io.exr import MITSUBA_EXR_THREADS
+from tests.scenes.tiny import train_command, write_data, write_method
 
 # The same examples in every run. Kernels are compiled in the first, so there is no deadline; failures are not
 # simplified, since examples are mostly seeds.

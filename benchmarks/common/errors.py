@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.common.montecarlo import Estimate
 from mi_refgs.evaluation import metrics
-from mi_refgs.images import srgb_from_linear
+from mi_refgs.io.images import srgb_from_linear
 
 DARK = 0.01
 """Share of the mean radiance below which a relative error counts as one of this radiance."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.files import replace_file
+from mi_refgs.io.files import replace_file
 
 COLOURS = {
     "path": "#444444",

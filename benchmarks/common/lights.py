@@ -14,8 +14,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.shade import lobe_matrices
-from mi_refgs.shade.envmap import RADIANCE_FLOOR, EnvironmentLight
+from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.envmap import RADIANCE_FLOOR, EnvironmentLight
 
 ROOT = Path(__file__).parents[2]
 STUDIO = ROOT / "scenes" / "lights" / "studio.exr"

@@ -16,7 +16,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.files import replace_file
+from mi_refgs.io.files import replace_file
 
 
 def machine() -> dict[str, Any]:

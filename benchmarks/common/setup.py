@@ -13,7 +13,7 @@ from benchmarks.common import montecarlo as mc
 from benchmarks.common.lights import Light
 from benchmarks.common.view import Look, Points, first_hits, make_sensor, surface
 from mi_refgs.shade.points import ShadingPoints
-from mi_refgs.surfels.channels import logit
+from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
 

@@ -16,7 +16,7 @@ from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.llff import read_poses
 from mi_refgs.data.point_file import read_points
-from mi_refgs.images import read_tiff, write_png
+from mi_refgs.io.images import read_tiff, write_png
 
 VIEWS = 3
 SIZE = (8, 6)

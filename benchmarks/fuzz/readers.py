@@ -22,21 +22,21 @@ import trimesh
 from benchmarks.fuzz import layouts
 from mi_refgs import methods
 from mi_refgs.data.dataset import read_dataset
-from mi_refgs.data.settings import Settings, prepare_folder
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
-from mi_refgs.exr import read_exr_image, write_exr
-from mi_refgs.images import read_png, write_png
+from mi_refgs.io.exr import read_exr_image, write_exr
+from mi_refgs.io.images import read_png, write_png
+from mi_refgs.io.resources import resource_dir
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.resources import resource_dir
 from mi_refgs.runs import checkpoint
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
-from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.surfels.attributes import CHANNELS
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.synthesis.settings import Settings, prepare_folder
 
 SEED = 0
 """Seed of the numbers in the files to start from."""

@@ -38,8 +38,8 @@ def measured(run: Path, node: Path, views: list[int], names: list[str]) -> dict[
     """What each program makes of the files of a run."""
     from mi_refgs.formats import write
     from mi_refgs.formats.splats import gaussians
+    from mi_refgs.reconstruction.provenance import Source
     from mi_refgs.render.display import display_image
-    from mi_refgs.source import Source
 
     made = mi_refgs.load(run)
     trained = made.trained

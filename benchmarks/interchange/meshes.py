@@ -26,13 +26,13 @@ from benchmarks.interchange.programs import validated
 from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.evaluation.metrics import psnr
 from mi_refgs.evaluation.pictures import planes
-from mi_refgs.exr import read_exr_image
 from mi_refgs.formats import write
+from mi_refgs.io.exr import read_exr_image
+from mi_refgs.reconstruction.provenance import Source
 from mi_refgs.relighting.score import shown
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
-from mi_refgs.source import Source
 
 OURS_SAMPLES = 4
 

@@ -19,7 +19,7 @@ from PIL import Image
 
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.formats.gltf_splats import NAME
-from mi_refgs.images import srgb_from_linear
+from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import read_ply
 

@@ -1,1 +1,1 @@
-"""Peak memory of images and their gradients, measured beside what `mi_refgs.memory` says beforehand."""
+"""Peak memory of images and their gradients, compared with the prediction of `mi_refgs.kernels.memory`."""

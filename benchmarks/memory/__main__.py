@@ -19,7 +19,7 @@ from typing import Any
 from benchmarks.common.command import make_parser, write_reports
 from benchmarks.common.report import machine, table
 from benchmarks.memory import cell
-from mi_refgs import memory
+from mi_refgs.kernels import memory
 
 SIZES, SAMPLES, SURFELS = (256, 512, 1024, 2048), (1, 4, 16, 64), (10_000, 100_000, 1_000_000)
 LIMIT = 12e9
@@ -42,7 +42,7 @@ def cells(every: bool) -> list[tuple[str, int, int, int]]:
 
 
 def predicted(kind: str, size: int, samples: int, surfels: int) -> float:
-    """Bytes that the cell needs by `mi_refgs.memory`."""
+    """Bytes that the cell needs by `mi_refgs.kernels.memory`."""
     return memory.of_image(size**2, samples, surfels, cell.CHANNELS[kind], kind == "gradient")
 
 

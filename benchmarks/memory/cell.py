@@ -17,7 +17,7 @@ import drjit as dr  # isort: skip
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 
 AOVS = "n:normal,d:depth,al:albedo,r:roughness,m:metallic,di:diffuse,sp:specular"
 CHANNELS = {"image": 5, "AOVs": 5 + 3 + 1 + 3 + 1 + 1 + 3 + 3, "gradient": 5}

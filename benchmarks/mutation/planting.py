@@ -26,11 +26,14 @@ class Mistake:
 
 
 def catalogue() -> list[Mistake]:
-    """The mistakes of catalogue.toml."""
-    files = tomllib.loads(Path(__file__).with_name("catalogue.toml").read_text(encoding="utf-8"))
+    """The mutants of mutants/*.toml: a file per folder of the package.
+
+    Under the name of each source file: name = [text that occurs there once, replacement, the failing test].
+    """
     return [
         Mistake(name, f"mi_refgs/{file}", before, after, f"tests/{test}")
-        for file, mistakes in files.items()
+        for room in sorted(Path(__file__).with_name("mutants").glob("*.toml"))
+        for file, mistakes in tomllib.loads(room.read_text(encoding="utf-8")).items()
         for name, (before, after, test) in mistakes.items()
     ]
 

@@ -9,13 +9,13 @@ import drjit as dr
 import numpy as np
 
 from benchmarks.splatting.workload import Workload
-from mi_refgs.device import upload
 from mi_refgs.fitting.train import Trainer
+from mi_refgs.kernels.device import upload
+from mi_refgs.kernels.timing import listening, phase
 from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.profiling.phases import phase_times
 from mi_refgs.splat import Blended, Camera, list_by_tile, project, splat
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.timing import listening, phase
 
 
 class Ours:

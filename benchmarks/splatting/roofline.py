@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 
 from benchmarks.common.timing import once
-from mi_refgs.primitives.surfel import Surfel
 from mi_refgs.profiling.counts import Counts
+from mi_refgs.surfels.primitives.surfel import Surfel
 
 FLOPS = {"forward": 60, "both": 260}
 CHAINS = 16

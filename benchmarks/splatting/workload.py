@@ -10,12 +10,12 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.primitives.surfel import Surfel
 from mi_refgs.reference.camera import look_at
 from mi_refgs.reference.splat import PinholeCamera
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.channels import logit
+from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.init import quaternions
+from mi_refgs.surfels.primitives.surfel import Surfel
 from mi_refgs.surfels.table import Surfels
 
 OPACITY = 0.8

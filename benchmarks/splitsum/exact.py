@@ -17,7 +17,7 @@ from benchmarks.common.setup import ALBEDO, Setup, path_tracer, shading_points
 from benchmarks.common.view import Points
 from benchmarks.splitsum.settings import SHAPES, Settings, shape
 from mi_refgs.shade.accuracy import Accuracy
-from mi_refgs.shade.lobe_matrices import LEVELS, Levels
+from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels
 from mi_refgs.shade.split_sum import shade
 
 SHIPPED = "shipped"

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.step import make_trainer, sphere_data
-from mi_refgs.device import upload_tensor
 from mi_refgs.fitting.targets import Targets
+from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import LIGHT
 
 SURFELS, SIZE, VIEWS, STEPS = 300, 32, 3, 24

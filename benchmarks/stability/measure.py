@@ -12,15 +12,16 @@ import numpy as np
 
 from benchmarks.stability import textbook
 from benchmarks.stability.case import Array, Case
-from mi_refgs.device import upload, upload_tensor
+from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import occlusion as trace
 from mi_refgs.reference import picture as oracle
 from mi_refgs.reference import surfel
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.pipeline import render
-from mi_refgs.shade import brdf, lobe_matrices
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade import brdf
+from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera, list_by_tile, project
 from mi_refgs.surfels.table import Surfels

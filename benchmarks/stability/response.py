@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.stability.case import Array
-from mi_refgs.device import upload
 from mi_refgs.fitting import losses
+from mi_refgs.kernels.device import upload
 from mi_refgs.reference import losses as oracle
 from mi_refgs.render import display
 

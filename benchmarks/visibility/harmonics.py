@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.view import Points
 from mi_refgs.shade.sh import clamp_positive, eval_sh, sh_basis
-from mi_refgs.surfels.channels import MAX_SH_DEGREE
+from mi_refgs.surfels.attributes import MAX_SH_DEGREE
 
 DEGREE = MAX_SH_DEGREE
 """Of the product's indirect channel, unless told otherwise."""

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.progress_bar import progress_bar, with_bar
+from mi_refgs.progress import progress_bar, with_bar
 
 SEED = 0
 """Seed of all random numbers; with it, a second run gives the same result."""

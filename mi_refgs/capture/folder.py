@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import (
+from mi_refgs.io.files import (
     TEMPORARY,
     cannot_write,
     inside,

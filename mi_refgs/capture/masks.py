@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_refgs.capture.photographs import Photograph
 from mi_refgs.errors import InputError
-from mi_refgs.images import ENDINGS, open_picture, read_mask, to_8_bits
+from mi_refgs.io.images import ENDINGS, open_picture, read_mask, to_8_bits
 
 
 def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:

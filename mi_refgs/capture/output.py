@@ -21,7 +21,7 @@ from mi_refgs.capture.photographs import Photograph
 from mi_refgs.data.colmap_model import MODELS, Camera
 from mi_refgs.data.lens import Undistortion, undistortion
 from mi_refgs.errors import InputError
-from mi_refgs.files import replace_file
+from mi_refgs.io.files import replace_file
 
 QUALITY = 95
 """Quality of JPEG files; with a lower one, a fit learns the edges of their blocks."""

@@ -14,8 +14,8 @@ import numpy as np
 
 from mi_refgs.data.dataset import MAX_SIZES
 from mi_refgs.errors import InputError
-from mi_refgs.files import replace_file
-from mi_refgs.images import ENDINGS, exif_tags, open_picture
+from mi_refgs.io.files import replace_file
+from mi_refgs.io.images import ENDINGS, exif_tags, open_picture
 
 OTHER_ENDINGS = (
     ".heic",

@@ -12,11 +12,11 @@ import numpy as np
 from mi_refgs.capture.failure import some
 from mi_refgs.capture.solved import Solved
 from mi_refgs.data.region import Region
-from mi_refgs.files import replace_file
+from mi_refgs.io.files import replace_file
 
 if TYPE_CHECKING:
     from mi_refgs.capture.output import Straight
-    from mi_refgs.capture.whole import Job
+    from mi_refgs.capture.pipeline import Job
 
 SHOWN_RADII = 6.0
 """Half the width of the plot in radii of the region, unless the cameras need more: far points would hide the

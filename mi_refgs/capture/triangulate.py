@@ -20,9 +20,9 @@ from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
 from mi_refgs.data.poses import MITSUBA_FROM_OPENCV
 from mi_refgs.data.readers import PointCloud
 from mi_refgs.data.view import View
-from mi_refgs.files import write_bytes
-from mi_refgs.images import linear_from_srgb, write_png
-from mi_refgs.ownership import RUN, OutputFolder
+from mi_refgs.io.files import write_bytes
+from mi_refgs.io.images import linear_from_srgb, write_png
+from mi_refgs.io.ownership import RUN, OutputFolder
 
 POINTS_FILE = "points.npz"
 """File in a run's folder: position (P, 3), colour (P, 3) linear, and key, a hash of their source."""

@@ -41,7 +41,7 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Place the photographs."""
-    from mi_refgs.capture.whole import capture
+    from mi_refgs.capture.pipeline import capture
     from mi_refgs.data.region import Region
 
     region = None

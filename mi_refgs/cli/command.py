@@ -12,8 +12,8 @@ from typing import Any, NoReturn
 
 from mi_refgs import llvm
 from mi_refgs.errors import InputError
-from mi_refgs.messages import say as say
-from mi_refgs.messages import warn as warn
+from mi_refgs.progress import say as say
+from mi_refgs.progress import warn as warn
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 

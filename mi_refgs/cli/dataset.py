@@ -105,7 +105,7 @@ def _size(text: str) -> int | tuple[int, int]:
 
 def run(args: argparse.Namespace) -> Result:
     """Trace the views."""
-    from mi_refgs.data.make_dataset import make_dataset
+    from mi_refgs.synthesis.make_dataset import make_dataset
 
     folder = make_dataset(
         args.scene,

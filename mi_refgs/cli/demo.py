@@ -7,7 +7,7 @@ from typing import Any
 
 from mi_refgs.cli.command import Result, add_command, add_output, add_settings, say
 from mi_refgs.cli.evaluate import table
-from mi_refgs.resources import resource_dir
+from mi_refgs.io.resources import resource_dir
 
 SCENE = "glossy_demo.xml"
 VIEWS, TEST_VIEWS, SIZE, SAMPLES = 60, 8, 112, 64
@@ -26,10 +26,10 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Trace, fit, evaluate; what is finished already is not done again."""
-    from mi_refgs.data.make_dataset import make_dataset
     from mi_refgs.evaluation.evaluate import SHEET, read_metrics
-    from mi_refgs.reconstruct import fit
+    from mi_refgs.reconstruction.fit import fit
     from mi_refgs.runs.run import Run
+    from mi_refgs.synthesis.make_dataset import make_dataset
 
     data, output = args.output / "data", args.output / args.preset
     folder = Run(output)

@@ -115,8 +115,8 @@ def run(args: argparse.Namespace) -> Result:
     from mi_refgs.editing import assignments
     from mi_refgs.editing.expression import parse_truth
     from mi_refgs.formats.incoming import read_cameras
-    from mi_refgs.images import write_png
-    from mi_refgs.reconstruction import load
+    from mi_refgs.io.images import write_png
+    from mi_refgs.reconstruction.reconstruction import load
     from mi_refgs.runs.run import Run
 
     _require_free(args.output)
@@ -158,7 +158,7 @@ def _preview(before: Any, after: Any) -> Any:
 
 def _require_free(out: Path) -> None:
     """Raise InputError unless a folder can be made there: nothing stands there, or an empty one."""
-    from mi_refgs.files import cannot_write
+    from mi_refgs.io.files import cannot_write
 
     try:
         taken = os.path.lexists(out) and not (out.is_dir() and not any(out.iterdir()))

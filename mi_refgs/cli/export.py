@@ -11,7 +11,7 @@ from mi_refgs.constants import PRUNE_LIMIT
 from mi_refgs.errors import InputError, SceneError
 
 if TYPE_CHECKING:
-    from mi_refgs.ownership import OutputFolder
+    from mi_refgs.io.ownership import OutputFolder
     from mi_refgs.runs.run import Run
 
 
@@ -67,9 +67,9 @@ def run(args: argparse.Namespace) -> Result:
     """Export."""
     from mi_refgs.evaluation.evaluate import load_split
     from mi_refgs.formats import FORMATS, options_of, write
+    from mi_refgs.reconstruction.provenance import Source
     from mi_refgs.runs.export import ARTEFACTS, TrainedScene, export, newest
     from mi_refgs.runs.run import Run
-    from mi_refgs.source import Source
 
     if args.limit is not None and not args.prune:
         raise InputError("--limit: limits what --prune drops; add --prune, or leave it out")
@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> Result:
 
 def _output(run: Run, target: Path, overwrite: bool) -> OutputFolder:
     """The folder of the artefacts of a run; raises InputError for the folder of another run."""
-    from mi_refgs.ownership import OutputFolder
+    from mi_refgs.io.ownership import OutputFolder
     from mi_refgs.runs.run import Run
 
     if target.resolve() == run.path.resolve():

@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> Result:
 def _frames(args: argparse.Namespace) -> list[FrameProfile]:
     """Pictures of a run at each size; none of a data set, or of a run that has found nothing yet."""
     from mi_refgs.profiling.frame import SIZES, aovs_of, profile_frame
-    from mi_refgs.reconstruction import load
+    from mi_refgs.reconstruction.reconstruction import load
     from mi_refgs.runs.export import MODEL
     from mi_refgs.runs.run import Run
 
@@ -105,8 +105,8 @@ def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
     """The trainer of a run or of a fresh fit, and the stages of the schedule to look at."""
     from mi_refgs.evaluation.evaluate import load_split
     from mi_refgs.fitting.job import load_method
+    from mi_refgs.fitting.runner import read_views, sized
     from mi_refgs.fitting.train import Trainer
-    from mi_refgs.fitting.whole import read_views, sized
     from mi_refgs.runs.run import Run
 
     if not args.path.is_dir():

@@ -49,7 +49,7 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Relight."""
-    from mi_refgs.relighting.light import NewLight
+    from mi_refgs.reconstruction.new_light import NewLight
     from mi_refgs.relighting.relight import SHEET, relight
     from mi_refgs.runs.run import Run
 

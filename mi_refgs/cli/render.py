@@ -48,7 +48,7 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> Result:
     """Render."""
     from mi_refgs.formats.incoming import read_cameras
-    from mi_refgs.ownership import require_no_run
+    from mi_refgs.io.ownership import require_no_run
     from mi_refgs.render.load_scene import load_scene
     from mi_refgs.render.scene_xml import sensors_of
 
@@ -87,7 +87,7 @@ def scene_file(path: Path) -> Path:
         if not path.is_file():
             raise InputError(f"{path}: scene: no such file; give a Mitsuba XML or a run folder")
         return path
-    from mi_refgs.reconstruction import load
+    from mi_refgs.reconstruction.reconstruction import load
     from mi_refgs.runs.run import Run
 
     if Run(path).checkpoints():
@@ -103,9 +103,9 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
     import mitsuba as mi
     import numpy as np
 
-    from mi_refgs.exr import mitsuba_exr
-    from mi_refgs.files import replace_file
-    from mi_refgs.images import srgb_from_linear, straight_srgb, write_png
+    from mi_refgs.io.exr import mitsuba_exr
+    from mi_refgs.io.files import replace_file
+    from mi_refgs.io.images import srgb_from_linear, straight_srgb, write_png
     from mi_refgs.render.load_scene import reason
 
     try:

@@ -52,7 +52,7 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> Result:
     """Fit, from the start or from the newest checkpoint."""
     from mi_refgs.evaluation.progress import Bar
-    from mi_refgs.reconstruct import fit
+    from mi_refgs.reconstruction.fit import fit
 
     progress, begin = Bar() if args.view is None else _watched(args.view), time.monotonic()
     fit(

@@ -14,7 +14,7 @@ from pathlib import Path
 from mi_refgs.compare.jobs import FAILED, Job
 from mi_refgs.compare.worker import DONE, FAILURE, GRACE
 from mi_refgs.errors import InputError
-from mi_refgs.files import cannot_write, read_json
+from mi_refgs.io.files import cannot_write, read_json
 from mi_refgs.runs.interrupt import held_interrupts
 
 LOG = "job.log"

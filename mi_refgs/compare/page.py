@@ -10,8 +10,8 @@ from mi_refgs.compare.plots import Region, write_crops, write_curves
 from mi_refgs.compare.table import Row, Scene, Table
 from mi_refgs.compare.text import NOTHING, cell, columns_of, header, heading, paper_cells, remarks
 from mi_refgs.errors import InputError
-from mi_refgs.files import write_bytes
-from mi_refgs.ownership import OutputFolder
+from mi_refgs.io.files import write_bytes
+from mi_refgs.io.ownership import OutputFolder
 
 PAGE, PICTURES = "index.html", "pictures"
 STYLE = """

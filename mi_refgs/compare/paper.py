@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.files import read_json
+from mi_refgs.io.files import read_json
 
 FILE = Path(__file__).with_name("paper.json")
 OTHER_WORDS = {"blender", "synthetic", "ref", "scene", "data", "dataset"}

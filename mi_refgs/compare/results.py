@@ -14,8 +14,8 @@ from mi_refgs.compare.jobs import SETTINGS, Job
 from mi_refgs.compare.page import PAGE, PICTURES, write_page
 from mi_refgs.compare.table import Table, rows_or_error, table_of
 from mi_refgs.compare.text import markdown
-from mi_refgs.files import read_json, write_bytes, write_json
-from mi_refgs.ownership import OutputFolder
+from mi_refgs.io.files import read_json, write_bytes, write_json
+from mi_refgs.io.ownership import OutputFolder
 
 TABLE, TABLE_TEXT = "table.json", "table.md"
 

@@ -12,7 +12,7 @@ from mi_refgs.compare.jobs import FAILED, Job, finished, require_one_size
 from mi_refgs.compare.paper import Figures, Place, place_of
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
-from mi_refgs.files import read_json
+from mi_refgs.io.files import read_json
 
 
 @dataclass(frozen=True)

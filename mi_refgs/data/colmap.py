@@ -19,8 +19,8 @@ from mi_refgs.data.poses import from_world_to_camera
 from mi_refgs.data.readers import PointCloud, ReadOptions, Recording, held_out
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.files import is_file
-from mi_refgs.images import image_size, linear_from_srgb
+from mi_refgs.io.files import is_file
+from mi_refgs.io.images import image_size, linear_from_srgb
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 """Where a reconstruction may lie, in the order in which they are tried."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from mi_refgs.data.colmap import TEST_LIST
 from mi_refgs.data.lens import Lens
-from mi_refgs.files import write_bytes
+from mi_refgs.io.files import write_bytes
 
 OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0])
 """OpenCV's camera has +x right and +y down, Mitsuba's +x left and +y up."""

@@ -17,8 +17,8 @@ from mi_refgs.data.readers import PointCloud, ReadOptions, reader_of
 from mi_refgs.data.region import Region, read_region, region_of
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.exr import read_exr_image
-from mi_refgs.images import is_opaque
+from mi_refgs.io.exr import read_exr_image
+from mi_refgs.io.images import is_opaque
 
 EXTENT_MARGIN = 1.1
 """Scene extent over the largest distance of a training camera to their mean (3DGS)."""

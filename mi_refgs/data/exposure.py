@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.data.view import View
-from mi_refgs.images import SRGB_LINEAR_LIMIT, exif_tags, linear_from_srgb, open_picture
+from mi_refgs.io.images import SRGB_LINEAR_LIMIT, exif_tags, linear_from_srgb, open_picture
 
 EXPOSURE_TIME, F_NUMBER, ISO = 33434, 33437, 34855
 """Tags of EXIF 2.3 in the table of the camera's settings: seconds, the f-number, and the sensitivity."""

@@ -17,9 +17,9 @@ from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.truth_maps import ALPHA, beside, block_mean, shiny_maps, unit
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError, shown
-from mi_refgs.exr import read_exr_image
-from mi_refgs.files import inside, is_file
-from mi_refgs.images import ENDINGS, has_alpha, image_size, with_ending
+from mi_refgs.io.exr import read_exr_image
+from mi_refgs.io.files import inside, is_file
+from mi_refgs.io.images import ENDINGS, has_alpha, image_size, with_ending
 
 SUFFIXES = (*ENDINGS, ".exr")
 """File name endings that `file_path` may carry or leave out, in the order in which they are tried."""

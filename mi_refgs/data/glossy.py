@@ -21,7 +21,7 @@ from mi_refgs.data.readers import ReadOptions, Recording, held_out
 from mi_refgs.data.truth_maps import block_mean
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.images import image_size, read_grey
+from mi_refgs.io.images import image_size, read_grey
 
 CAMERA = re.compile(r"(\d{1,6})-camera\.pkl")
 DEEPEST = 15.0

@@ -20,8 +20,8 @@ from mi_refgs.data.picture_store import Picture
 from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.exr import exr_has_alpha, read_exr_image
-from mi_refgs.images import box_downscale, has_alpha, image_size, read_bytes, read_grey, read_mask
+from mi_refgs.io.exr import exr_has_alpha, read_exr_image
+from mi_refgs.io.images import box_downscale, has_alpha, image_size, read_bytes, read_grey, read_mask
 
 BAND = 256
 """Rows of a file that are floating-point numbers at a time: a large picture would need half a gigabyte."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mi_refgs.errors import InputError, shown
-from mi_refgs.files import inside, is_file
-from mi_refgs.images import ENDINGS, with_ending
+from mi_refgs.io.files import inside, is_file
+from mi_refgs.io.images import ENDINGS, with_ending
 
 COPIES = (8, 4, 2)
 """Factors by which copies are smaller than the pictures in `images`."""

@@ -9,9 +9,9 @@ import numpy as np
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.readers import PointCloud
 from mi_refgs.errors import InputError
-from mi_refgs.files import require_file
-from mi_refgs.images import linear_from_srgb
-from mi_refgs.ply import read_vertices
+from mi_refgs.io.files import require_file
+from mi_refgs.io.images import linear_from_srgb
+from mi_refgs.io.ply import read_vertices
 
 
 def read_points(path: Path) -> PointCloud | None:

@@ -1,17 +1,24 @@
-"""The region of interest of a data set: from what its cameras look at, or from its folder."""
+"""The region of interest: a sphere, the contraction of all of space around it, and how cameras suggest it.
+
+The contraction maps all of space into a ball of twice the sphere's radius: a grid or a random draw in
+contracted space covers near and far at once. World positions in scene units. [Mip-NeRF 360, Barron et al.
+2022, eq. 10]
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from mi_refgs.contraction import Region as Region
+from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.hull import view_focus
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.files import read_json, write_json
+from mi_refgs.io.files import read_json, write_json
 
 REGION_FILE = "region.json"
 """Beside the pictures of a data set: {"centre": [x, y, z], "radius": r} in scene units."""
@@ -21,6 +28,54 @@ CAMERA_SHARE = 0.8
 """Its largest radius as part of the nearest camera's distance: a camera stands outside of the region."""
 SMALLEST = 1e-6
 """Its smallest radius as part of the largest coordinate of a camera: float32 resolves no smaller lengths."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A sphere."""
+
+    centre: tuple[float, float, float]  # world
+    radius: float  # scene units, positive
+
+    @staticmethod
+    def of(content: Any, source: Path | str) -> Region:
+        """The region {"centre": [x, y, z], "radius": r} of a JSON file or an option, `source`.
+
+        Raises InputError for anything else, and for numbers that no scene has.
+        """
+        centre = content.get("centre") if isinstance(content, dict) else None
+        numbers = [*centre, content.get("radius")] if isinstance(centre, list) else []
+        usable = all(type(number) in (int, float) and abs(number) <= MAX_NUMBER for number in numbers)
+        if len(numbers) != 4 or not usable or not numbers[3] >= 1 / MAX_NUMBER:
+            raise InputError(
+                f"{source}: centre, radius: not three numbers and a positive one; correct or remove them"
+            )
+        x, y, z, radius = map(float, numbers)
+        return Region((x, y, z), radius)
+
+    def moved(self, offset: np.ndarray) -> Region:
+        """The region with its centre moved by an offset (3,)."""
+        x, y, z = (float(c) for c in np.array(self.centre) + offset)
+        return Region((x, y, z), self.radius)
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Which of the points (N, 3) lie inside: (N,) bool."""
+        return np.linalg.norm(points - np.array(self.centre), axis=-1) <= self.radius
+
+    def contract(self, points: np.ndarray) -> np.ndarray:
+        """World points (N, 3) in the ball of radius 2: offset / radius inside, (2 − 1/|o|) o/|o| beyond."""
+        offset = (np.asarray(points, dtype=np.float64) - np.array(self.centre)) / self.radius
+        length = np.linalg.norm(offset, axis=-1, keepdims=True)
+        safe = np.maximum(length, 1.0)
+        return np.where(length > 1, (2 - 1 / safe) * offset / safe, offset)
+
+    def expand(self, contracted: np.ndarray) -> np.ndarray:
+        """The inverse of `contract` for points (N, 3) of length below 2."""
+        contracted = np.asarray(contracted, dtype=np.float64)
+        length = np.linalg.norm(contracted, axis=-1, keepdims=True)
+        safe = np.maximum(length, 1.0)
+        offset = np.where(length > 1, contracted / (safe * (2 - safe)), contracted)
+        return np.array(self.centre) + self.radius * offset
 
 
 def region_of(views: Sequence[View]) -> Region:

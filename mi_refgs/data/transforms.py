@@ -22,7 +22,7 @@ from mi_refgs.data.frames import FrameReader
 from mi_refgs.data.point_file import read_points
 from mi_refgs.data.readers import PointCloud, ReadOptions, Recording, held_out
 from mi_refgs.errors import InputError, shown
-from mi_refgs.files import inside, read_json
+from mi_refgs.io.files import inside, read_json
 
 
 class TransformsReader:

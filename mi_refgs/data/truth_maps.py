@@ -8,8 +8,8 @@ import numpy as np
 
 from mi_refgs.data.lens import Undistortion
 from mi_refgs.errors import InputError
-from mi_refgs.files import is_file
-from mi_refgs.images import box_downscale, read_png, read_tiff
+from mi_refgs.io.files import is_file
+from mi_refgs.io.images import box_downscale, read_png, read_tiff
 
 NORMALS, DISPARITY, ALPHA = "_normal.png", "_disp.tiff", "_alpha.png"
 """What follows a picture's name, without its ending, in the names of its maps."""

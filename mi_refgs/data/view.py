@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.images import box_downscale, linear_from_srgb, srgb_from_linear
+from mi_refgs.io.images import box_downscale, linear_from_srgb, srgb_from_linear
 
 if TYPE_CHECKING:
     from mi_refgs.data.picture_files import FileCamera

@@ -18,7 +18,7 @@ from mi_refgs.editing.selection import finite
 from mi_refgs.errors import InputError, shown
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.export import TrainedScene
-from mi_refgs.surfels.channels import SH_DC, logit, sigmoid
+from mi_refgs.surfels.attributes import SH_DC, logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 
 ASSIGNMENT = re.compile(r"\s*([A-Za-z_][\w.]*)\s*(\*?=)(?!=)(.*)", re.ASCII | re.DOTALL)

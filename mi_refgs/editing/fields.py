@@ -10,7 +10,7 @@ from mi_refgs.errors import InputError, shown
 from mi_refgs.evaluation.pictures import LUMINANCE
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import outward
-from mi_refgs.surfels.channels import CHANNELS, SH_DC, channel, sigmoid
+from mi_refgs.surfels.attributes import CHANNELS, SH_DC, channel, sigmoid
 
 COLOUR = "colour"
 """The part of radiance_sh that is the same from everywhere, ½ + c Y_0: linear radiance."""

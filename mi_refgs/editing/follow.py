@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from mi_refgs.editing.rigid import Placement
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.export import TrainedScene
-from mi_refgs.surfels.channels import sigmoid
+from mi_refgs.surfels.attributes import sigmoid
 
 NEIGHBOURS = 8
 """Surfels around the middle of a triangle that decide about it: as many as give a vertex its materials."""

@@ -11,7 +11,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.shade.accuracy import NEED_OCCLUSION
 from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.attributes import CHANNELS
 from mi_refgs.surfels.table import Surfels
 
 

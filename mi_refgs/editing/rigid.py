@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mi_refgs.primitives import primitive_of, widths_of
 from mi_refgs.shade.sh import sh_rotation
-from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.primitives import primitive_of, widths_of
 from mi_refgs.surfels.table import QUATERNION_FLOOR
 
 

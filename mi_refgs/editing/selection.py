@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
-from mi_refgs.device import upload
 from mi_refgs.editing.expression import parse_truth
 from mi_refgs.editing.fields import Fields
 from mi_refgs.errors import InputError
-from mi_refgs.images import box_downscale, read_mask
+from mi_refgs.io.images import box_downscale, read_mask
+from mi_refgs.kernels.device import upload
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.render.surroundings import together
 from mi_refgs.runs.export import TrainedScene

@@ -16,21 +16,21 @@ import numpy as np
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import region_pixels
 from mi_refgs.data.view import View
-from mi_refgs.device import machine
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import decomposition, metrics, pictures
 from mi_refgs.evaluation.speed import milliseconds
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
-from mi_refgs.files import read_json
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
-from mi_refgs.fitting.whole import of_run, read_views
-from mi_refgs.images import write_png
+from mi_refgs.fitting.runner import of_run, read_views
+from mi_refgs.io.files import read_json
+from mi_refgs.io.images import write_png
+from mi_refgs.kernels.device import machine
 from mi_refgs.methods.method import Method
-from mi_refgs.progress_bar import with_bar
+from mi_refgs.progress import with_bar
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import TrainedScene, up_to_date
 from mi_refgs.runs.run import DATASET, Run
-from mi_refgs.shade.light_file import read_radiance
+from mi_refgs.shade.light.light_file import read_radiance
 
 FOLDER = "eval"
 SHEET = "contact_sheet.png"

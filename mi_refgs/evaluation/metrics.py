@@ -14,8 +14,8 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.ssim import WINDOW_RADIUS, WINDOW_SIGMA
-from mi_refgs.images import psnr_of, srgb_from_linear
-from mi_refgs.shade import lobe_matrices
+from mi_refgs.io.images import psnr_of, srgb_from_linear
+from mi_refgs.shade.light import lobe_matrices
 
 # A pixel is foreground where the true alpha is above this.
 FOREGROUND_ALPHA = 0.5

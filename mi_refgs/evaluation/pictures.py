@@ -15,10 +15,10 @@ import numpy as np
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.evaluation.metrics import environment
-from mi_refgs.images import srgb_from_linear
+from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.attributes import CHANNELS
 
 LIGHT_KEY = 0.36
 """Average luminance of a shown light before the tone curve x / (1 + x), which displays it as 0.55."""

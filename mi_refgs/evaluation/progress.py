@@ -10,9 +10,8 @@ import numpy as np
 from mi_refgs.evaluation import pictures
 from mi_refgs.fitting.progress import Progress
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.images import write_png
-from mi_refgs.messages import say, warn
-from mi_refgs.progress_bar import progress_bar
+from mi_refgs.io.images import write_png
+from mi_refgs.progress import progress_bar, say, warn
 
 PSNR_MEMORY = 0.9
 """Share of the old value in the running PSNR of the bar: one view's is up to 5 dB off the mean."""

@@ -16,16 +16,16 @@ import numpy as np
 
 from mi_refgs.constants import PRUNE_LIMIT
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.metrics import psnr
 from mi_refgs.evaluation.speed import milliseconds
-from mi_refgs.images import PSNR_MAX
+from mi_refgs.io.images import PSNR_MAX
+from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import displayed
 from mi_refgs.runs.export import Pruned, TrainedScene
 from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.splat import Camera, splat
-from mi_refgs.surfels.channels import channel, sh_columns
+from mi_refgs.surfels.attributes import channel, sh_columns
 from mi_refgs.surfels.ply import encode_ply
 from mi_refgs.surfels.table import Surfels
 

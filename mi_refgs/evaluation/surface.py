@@ -13,13 +13,13 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from mi_refgs.data.settings import SURFACE
 from mi_refgs.data.view import View
-from mi_refgs.device import upload
+from mi_refgs.kernels.device import upload
 from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
 from mi_refgs.shade.ambient import ambient_direction
 from mi_refgs.shade.ggx_sampling import lobe_turn
+from mi_refgs.synthesis.settings import SURFACE
 
 OPEN_RAYS = 64
 """Rays of the hemisphere of each point: the share of free ones is known to 1/64 and better."""

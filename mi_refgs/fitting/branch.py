@@ -9,9 +9,9 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.methods.surroundings import AROUND, BACKGROUND
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
-from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.lobe_matrices import resample
-from mi_refgs.surfels.channels import channel
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.lobe_matrices import resample
+from mi_refgs.surfels.attributes import channel
 
 
 def branched(trainer: Trainer, method: Method) -> Trainer:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import locked, read_json, write_json
+from mi_refgs.io.files import locked, read_json, write_json
 
 SIZES = 96, 224
 """Pixels along a side of the images that speeds are measured on: a step at the second takes twice as long."""

@@ -13,7 +13,7 @@ import numpy as np
 from mi_refgs.data.region import Region
 from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.methods.method import Method
-from mi_refgs.surfels.channels import channel
+from mi_refgs.surfels.attributes import channel
 from mi_refgs.surfels.table import Surfels
 
 MARGIN = 0.02

@@ -15,7 +15,7 @@ from mi_refgs.fitting.skips import Skipped
 from mi_refgs.methods.method import LIGHT
 from mi_refgs.methods.surroundings import BACKGROUND
 from mi_refgs.runs.parameters import channels_of
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 
 if TYPE_CHECKING:

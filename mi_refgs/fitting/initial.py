@@ -12,8 +12,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting.scatter import at_points, inside_points, outside_points
 from mi_refgs.methods.method import LIGHT, LightOptions, Method
 from mi_refgs.methods.surroundings import AROUND, BACKGROUND
-from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.lobe_matrices import map_directions
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels import init
 from mi_refgs.surfels.order import morton_order
 from mi_refgs.surfels.table import Surfels

@@ -14,10 +14,10 @@ from mi_refgs.data.survey import few_views
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.plan import planned
 from mi_refgs.fitting.progress import Progress
+from mi_refgs.fitting.runner import FindPoints, begin, finish, read_views
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.fitting.whole import FindPoints, begin, finish, read_views
+from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.method import Method
-from mi_refgs.resources import resource_dir
 from mi_refgs.runs.run import Run
 
 DEFAULT_METHOD = "ref_gaussian.toml"

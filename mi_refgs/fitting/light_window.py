@@ -13,9 +13,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refgs.device import upload
-from mi_refgs.shade.envmap import EnvironmentLight, PrefilteredLight
-from mi_refgs.shade.light import Light
+from mi_refgs.kernels.device import upload
+from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
+from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.shading import Shading
 
 GATHERED = "light_gradient"

@@ -16,7 +16,7 @@ import mitsuba as mi
 from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.fitting.ssim import ssim
 from mi_refgs.render.stencil import neighbours
-from mi_refgs.shade.light import Light
+from mi_refgs.shade.light.light import Light
 
 # An 8-bit target value of 255 stands for everything from here up: the sensor clipped.
 SATURATED = 254.5 / 255.0

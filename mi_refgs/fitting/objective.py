@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset, View
-from mi_refgs.device import upload
 from mi_refgs.fitting import losses
+from mi_refgs.kernels.device import upload
 from mi_refgs.methods.weights import LossWeights
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.display import displayed, srgb_from_linear

@@ -24,12 +24,12 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.constants import RAW_LIMIT
-from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.rates import Group
 from mi_refgs.fitting.skips import Skipped, Skips
+from mi_refgs.kernels.device import upload
+from mi_refgs.kernels.timing import phase
 from mi_refgs.surfels.table import gather_rows
-from mi_refgs.timing import phase
 
 # Adam's decay rates and the ε that 3DGS uses: tiny, as per-surfel gradients of a pixel mean are about 1e-7.
 BETA_1 = 0.9

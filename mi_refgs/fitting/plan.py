@@ -9,9 +9,9 @@ from pathlib import Path
 import drjit as dr
 
 from mi_refgs.fitting.cost_model import Speed
+from mi_refgs.fitting.runner import read_views, sized
 from mi_refgs.fitting.speed import speed_of
 from mi_refgs.fitting.targets import bytes_of
-from mi_refgs.fitting.whole import read_views, sized
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.presets import PRESETS
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import upload
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.device import upload
 from mi_refgs.methods.method import Propagation, Refine
-from mi_refgs.primitives import Primitive, primitive_of, widths_of
-from mi_refgs.surfels.channels import channel, logit, sigmoid
+from mi_refgs.surfels.attributes import channel, logit, sigmoid
 from mi_refgs.surfels.order import morton_order
+from mi_refgs.surfels.primitives import Primitive, primitive_of, widths_of
 from mi_refgs.surfels.table import Surfels
 
 SPLIT_SHRINK = 1.6

@@ -15,8 +15,8 @@ import numpy as np
 
 from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.methods.method import Relocation
-from mi_refgs.primitives import primitive_of, widths_of
-from mi_refgs.surfels.channels import logit, sigmoid
+from mi_refgs.surfels.attributes import logit, sigmoid
+from mi_refgs.surfels.primitives import primitive_of, widths_of
 from mi_refgs.surfels.table import Surfels
 
 MOST_COPIES = 51

@@ -9,7 +9,7 @@ import numpy as np
 from mi_refgs.fitting.rates import Group
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.methods.surroundings import AROUND, BACKGROUND
-from mi_refgs.surfels.channels import channel
+from mi_refgs.surfels.attributes import channel
 
 POSITION_STEPS = 0.6
 """Share of the iterations after which positions learn at their final rate: 30,000 of 50,000 in the released

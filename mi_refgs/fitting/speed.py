@@ -21,16 +21,16 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs import __version__
-from mi_refgs.contraction import Region
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.pathtrace import poses_around
+from mi_refgs.data.region import Region
 from mi_refgs.data.view import View
-from mi_refgs.device import machine, simd_width
 from mi_refgs.fitting import cost_model
 from mi_refgs.fitting.cost_model import Speed
 from mi_refgs.fitting.train import Trainer
+from mi_refgs.kernels.device import machine, simd_width
 from mi_refgs.methods.build import plain
 from mi_refgs.methods.method import Method, Refine
+from mi_refgs.synthesis.pathtrace import poses_around
 
 VIEWS = 6
 COVERED = 0.35

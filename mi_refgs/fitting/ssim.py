@@ -16,8 +16,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.device import replayed
-from mi_refgs.timing import phase
+from mi_refgs.kernels.device import replayed
+from mi_refgs.kernels.timing import phase
 
 # Half width of the 11-pixel window, in pixels. [Wang et al. 2004, §III.B]
 WINDOW_RADIUS = 5

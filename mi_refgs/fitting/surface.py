@@ -7,13 +7,13 @@ from itertools import tee
 
 import numpy as np
 
-from mi_refgs.contraction import Region
+from mi_refgs.data.region import Region
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.shade.ambient import prepare
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels

@@ -8,9 +8,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.refine import TableEdit
+from mi_refgs.kernels.device import upload
 from mi_refgs.runs.parameters import channels_of
 from mi_refgs.surfels.table import Surfels
 

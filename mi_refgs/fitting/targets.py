@@ -7,7 +7,7 @@ from collections import OrderedDict
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.picture_store import BUDGET as PICTURE_BYTES
 from mi_refgs.fitting.objective import Target
-from mi_refgs.memory import of_fit, require
+from mi_refgs.kernels.memory import of_fit, require
 from mi_refgs.methods.method import DataOptions, Method
 
 BUDGET = 2**30

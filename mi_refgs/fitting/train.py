@@ -28,7 +28,8 @@ from mi_refgs.fitting.schedule import Schedule
 from mi_refgs.fitting.state import decisions_of, occluder_of, packed, require_fit
 from mi_refgs.fitting.surface import supply, surface_of
 from mi_refgs.fitting.targets import Targets, require_memory
-from mi_refgs.images import psnr_of
+from mi_refgs.io.images import psnr_of
+from mi_refgs.kernels.timing import phase
 from mi_refgs.methods.method import GAIN, Method, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
@@ -39,11 +40,10 @@ from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, part, tensors
 from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
 from mi_refgs.runs.run import Run
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.timing import phase
 
 
 class Trainer:

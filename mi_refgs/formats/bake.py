@@ -15,13 +15,13 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mi_refgs.device import upload
 from mi_refgs.errors import SceneError
 from mi_refgs.formats.format import Shot, module
 from mi_refgs.formats.last_made import LastMade
 from mi_refgs.formats.surface import surface, texels, unwrap
 from mi_refgs.formats.textured import TexturedMesh, check
-from mi_refgs.memory import BASE, PER_SHOWN_SURFEL, PER_TEXEL, require
+from mi_refgs.kernels.device import upload
+from mi_refgs.kernels.memory import BASE, PER_SHOWN_SURFEL, PER_TEXEL, require
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import NORMAL_AGREEMENT, VertexSurfels
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mi_refgs.files import make_folder, write_json
 from mi_refgs.formats.format import Format, Shot
+from mi_refgs.io.files import make_folder, write_json
 
 if TYPE_CHECKING:
     from mi_refgs.data.lens import Lens
@@ -60,7 +60,7 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
 
 
 def _file_name(shot: Shot) -> str:
-    from mi_refgs.images import ENDINGS
+    from mi_refgs.io.images import ENDINGS
 
     if shot.file is not None:
         return shot.file.path.as_posix()

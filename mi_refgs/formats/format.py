@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import cannot_write, make_folder
-from mi_refgs.ownership import OutputFolder, require_no_run
+from mi_refgs.io.files import cannot_write, make_folder
+from mi_refgs.io.ownership import OutputFolder, require_no_run
 
 if TYPE_CHECKING:
     from mi_refgs.data.picture_files import FileCamera

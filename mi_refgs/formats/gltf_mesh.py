@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mi_refgs.files import write_bytes
 from mi_refgs.formats.format import Format, Shot
 from mi_refgs.formats.textured import OPTIONS
+from mi_refgs.io.files import write_bytes
 
 if TYPE_CHECKING:
     from mi_refgs.runs.export import TrainedScene
@@ -33,7 +33,7 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
     from trimesh.visual.texture import TextureVisuals
 
     from mi_refgs.formats.bake import bake
-    from mi_refgs.images import srgb_from_linear, to_8_bits
+    from mi_refgs.io.images import srgb_from_linear, to_8_bits
 
     made = bake(trained, shots, faces, texture)
 
@@ -70,7 +70,7 @@ def _add_camera(tree: dict[str, Any], camera: Camera) -> None:
     """The camera as a node; glTF's looks along its −z, ours along +z with +x to the left."""
     import numpy as np
 
-    from mi_refgs.messages import warn
+    from mi_refgs.progress import warn
 
     right, down = float(camera.cx[0]) - camera.width / 2, float(camera.cy[0]) - camera.height / 2
     if max(abs(right), abs(down)) > CENTRED:

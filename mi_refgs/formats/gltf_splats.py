@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mi_refgs.files import write_bytes
 from mi_refgs.formats.format import Format, Shot
 from mi_refgs.formats.gaussian_ply import ALONE, DEGREE
+from mi_refgs.io.files import write_bytes
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,8 +45,8 @@ def _encoded(raw: dict[str, np.ndarray]) -> bytes:
     """The bytes of the file."""
     import numpy as np
 
-    from mi_refgs.images import linear_from_srgb
-    from mi_refgs.surfels.channels import SH_DC, sigmoid
+    from mi_refgs.io.images import linear_from_srgb
+    from mi_refgs.surfels.attributes import SH_DC, sigmoid
 
     harmonics, opacity = raw["radiance_sh"], sigmoid(raw["opacity"])
     colour = linear_from_srgb(np.clip(0.5 + SH_DC * harmonics[:, :3], 0, 1))

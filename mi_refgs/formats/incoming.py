@@ -17,13 +17,13 @@ import numpy as np
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.errors import InputError, shown
-from mi_refgs.files import read_json
+from mi_refgs.io.files import read_json
+from mi_refgs.io.ply import read_header
 from mi_refgs.methods.method import DataOptions, Method, Stage, SurfelOptions
-from mi_refgs.ply import read_header
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.attributes import CHANNELS
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
 

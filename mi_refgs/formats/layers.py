@@ -32,9 +32,9 @@ def write(
     import numpy as np
 
     from mi_refgs.evaluation.pictures import planes
-    from mi_refgs.exr import write_exr_layers
+    from mi_refgs.io.exr import write_exr_layers
     from mi_refgs.plugins.aovs import aov_values, suffixes
-    from mi_refgs.surfels.channels import CHANNELS
+    from mi_refgs.surfels.attributes import CHANNELS
 
     if not 0 <= view < len(shots):
         raise InputError(

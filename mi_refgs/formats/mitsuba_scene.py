@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
-from mi_refgs.files import make_folder, write_bytes
 from mi_refgs.formats.format import Format, Shot
 from mi_refgs.formats.textured import OPTIONS
+from mi_refgs.io.files import make_folder, write_bytes
 
 if TYPE_CHECKING:
     from mi_refgs.formats.textured import TexturedMesh
@@ -36,7 +36,7 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
     """Write the folder `target`; see `Format.write`. The sensors are those of the test views."""
     from mi_refgs.formats.bake import bake
     from mi_refgs.formats.principled import base_colour
-    from mi_refgs.images import srgb_from_linear, write_png
+    from mi_refgs.io.images import srgb_from_linear, write_png
     from mi_refgs.render.scene_xml import add_sensor, put, write_xml
 
     made = bake(trained, shots, faces, texture)

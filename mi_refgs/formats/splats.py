@@ -25,16 +25,16 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mi_refgs.device import upload
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
 from mi_refgs.formats.last_made import LastMade
+from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import display_image
 from mi_refgs.render.surroundings import together
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.shade.sh import sh_basis
 from mi_refgs.splat import Camera, splat
-from mi_refgs.surfels.channels import MAX_SH_DEGREE
+from mi_refgs.surfels.attributes import MAX_SH_DEGREE
 from mi_refgs.surfels.table import Surfels
 
 THIN = 0.01

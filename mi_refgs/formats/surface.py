@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mi_refgs.device import upload
 from mi_refgs.errors import SceneError
+from mi_refgs.kernels.device import upload
 from mi_refgs.occlusion.mesh import Mesh, clean
 from mi_refgs.occlusion.visibility import Occluder
 

@@ -11,7 +11,7 @@ from mi_refgs.formats.format import Option
 if TYPE_CHECKING:
     import numpy as np
 
-    from mi_refgs.shade.envmap import EnvironmentLight
+    from mi_refgs.shade.light.envmap import EnvironmentLight
 
 OPTIONS = (
     Option("faces", 50_000, "triangles of an exported mesh, at most"),

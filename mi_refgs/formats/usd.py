@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import replace_file
 from mi_refgs.formats.format import Format, Shot, module
 from mi_refgs.formats.textured import OPTIONS
+from mi_refgs.io.files import replace_file
 
 if TYPE_CHECKING:
     from mi_refgs.formats.textured import TexturedMesh
@@ -31,7 +31,7 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
     """Write the file `target`; see `Format.write`. The camera is that of the first shot."""
     usd_utils = module("pxr.UsdUtils")
     from mi_refgs.formats.bake import bake
-    from mi_refgs.images import srgb_from_linear, write_png
+    from mi_refgs.io.images import srgb_from_linear, write_png
 
     made = bake(trained, shots, faces, texture)
     with tempfile.TemporaryDirectory(prefix="refgs_usd_") as name:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.files import write_bytes
-from mi_refgs.images import to_8_bits
+from mi_refgs.io.files import write_bytes
+from mi_refgs.io.images import to_8_bits
 
 QUALITY = 75
 """Of WebP, 0 to 100: fine texture stays, and a sheet is a tenth of its PNG."""

@@ -9,24 +9,24 @@ from typing import Any
 import numpy as np
 
 from mi_refgs import methods
-from mi_refgs.data.make_dataset import make_dataset
 from mi_refgs.editing import Options
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.evaluation.pictures import sheet
-from mi_refgs.files import is_file, read_json, write_bytes, write_json
 from mi_refgs.gallery.exhibits import EXHIBITS, Exhibit
 from mi_refgs.gallery.frames import write_still, write_turntable
 from mi_refgs.gallery.page import DECOMPOSITION, EDITS, RELIT, TURNTABLE, page
-from mi_refgs.images import read_png
-from mi_refgs.ownership import OutputFolder
-from mi_refgs.reconstruct import fit
-from mi_refgs.reconstruction import Reconstruction
+from mi_refgs.io.files import is_file, read_json, write_bytes, write_json
+from mi_refgs.io.images import read_png
+from mi_refgs.io.ownership import OutputFolder
+from mi_refgs.io.resources import resource_dir
+from mi_refgs.reconstruction.fit import fit
+from mi_refgs.reconstruction.new_light import NewLight
+from mi_refgs.reconstruction.reconstruction import Reconstruction
 from mi_refgs.relighting import relight as relighting
-from mi_refgs.relighting.light import NewLight
 from mi_refgs.relighting.score import shown
-from mi_refgs.resources import resource_dir
 from mi_refgs.runs.run import Run
+from mi_refgs.synthesis.make_dataset import make_dataset
 
 RECORD, PAGE = "gallery.json", "README.md"
 PURPOSE = "relighting"

@@ -12,9 +12,9 @@ from typing import Any, Literal
 from mi_refgs.methods.surroundings import BACKGROUND, SurroundingsOptions
 from mi_refgs.methods.weights import LossWeights
 from mi_refgs.methods.window import ITERATIONS, Window
-from mi_refgs.primitives import primitive_named
 from mi_refgs.shade.accuracy import DIRECTIONS, MAX_LEVELS
-from mi_refgs.surfels.channels import MAX_SH_DEGREE, channel
+from mi_refgs.surfels.attributes import MAX_SH_DEGREE, channel
+from mi_refgs.surfels.primitives import primitive_named
 
 LIGHT = "light"
 """Name of the environment among the parameters of a fit, beside the channels of the surfels."""

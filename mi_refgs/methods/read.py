@@ -15,15 +15,15 @@ import tomli_w
 
 from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError, shown
-from mi_refgs.files import is_file
+from mi_refgs.io.files import is_file
+from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.build import build, plain
 from mi_refgs.methods.method import LIGHT, Method, Selection, Term
 from mi_refgs.methods.presets import PRESETS, scaled
 from mi_refgs.render.samples import samples_per_axis
-from mi_refgs.resources import resource_dir
-from mi_refgs.shade.envmap import MIN_HEIGHT, is_height
+from mi_refgs.shade.light.envmap import MIN_HEIGHT, is_height
 from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.attributes import CHANNELS
 
 MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mi_refgs.primitives import primitive_named
-from mi_refgs.shade.envmap import MIN_HEIGHT, is_height
-from mi_refgs.surfels.channels import MAX_SH_DEGREE
+from mi_refgs.shade.light.envmap import MIN_HEIGHT, is_height
+from mi_refgs.surfels.attributes import MAX_SH_DEGREE
+from mi_refgs.surfels.primitives import primitive_named
 
 BACKGROUND, AROUND = "background", "surroundings/"
 """Name of what lies behind everything among the parameters of a fit, and what the names of the surroundings'

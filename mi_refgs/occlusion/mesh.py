@@ -12,9 +12,9 @@ import trimesh
 from skimage import measure
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import is_file, write_bytes
+from mi_refgs.io.files import is_file, write_bytes
+from mi_refgs.io.ply import Header, read_header
 from mi_refgs.occlusion.tsdf import TSDF
-from mi_refgs.ply import Header, read_header
 
 COMPONENT_KEEP = 0.1
 """Area, relative to the largest connected component, from which a component is an object and not a floater.

@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import upload, upload_tensor
+from mi_refgs.kernels.device import upload, upload_tensor
 
 
 def _is_3_9() -> bool:

@@ -16,8 +16,8 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from mi_refgs.device import upload
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.device import upload
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.surfels.table import Surfels
 

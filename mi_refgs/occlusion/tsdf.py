@@ -25,7 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.contraction import Region
+from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.splat.camera import Camera
 

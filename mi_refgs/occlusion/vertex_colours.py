@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import upload
+from mi_refgs.kernels.device import upload
 from mi_refgs.occlusion.mesh import Mesh
 
 

@@ -26,7 +26,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from mi_refgs.device import is_supported, require_supported_variant
+from mi_refgs.kernels.device import is_supported, require_supported_variant
 
 PLUGINS = {
     "refgs": ("register_integrator", "mi_refgs.plugins.integrator"),

@@ -18,7 +18,7 @@ from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import ray_distance
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.attributes import CHANNELS
 
 # Suffixes as Mitsuba's own `aov` integrator gives them; `Bitmap.split` makes a greyscale layer of a lone Y.
 _SUFFIXES = {

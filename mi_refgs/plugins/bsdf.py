@@ -13,8 +13,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.device import require_supported_variant
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.shade.brdf import device_table, split_sum
 from mi_refgs.shade.split_sum import DIELECTRIC_F0
 

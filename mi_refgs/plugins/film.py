@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
-from mi_refgs.memory import DERIVATIVE_SAMPLES, require_image
+from mi_refgs.kernels.memory import DERIVATIVE_SAMPLES, require_image
 from mi_refgs.render.passes import Band, bands
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import samples_per_axis, supersampled

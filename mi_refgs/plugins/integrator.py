@@ -13,21 +13,21 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.device import require_supported_variant
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.plugins.aovs import aov_values
 from mi_refgs.plugins.film import Picture
 from mi_refgs.plugins.light import FilteredOnce
 from mi_refgs.plugins.properties import read_aovs, read_light, read_shading, read_surfels, read_terms
 from mi_refgs.plugins.surroundings import Around
 from mi_refgs.plugins.unusable import UnusableValues
-from mi_refgs.primitives import primitive_of, widths_of
 from mi_refgs.render.display import composited
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.shade.ambient import prepare
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.primitives import primitive_of, widths_of
 from mi_refgs.surfels.table import Surfels
 
 
@@ -50,7 +50,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - |emitter|
        - An ``envmap`` or ``constant`` emitter, copied into the integrator's own light. Without one, the
          scene's own environment emitter of these types lights the surfels. In Python also the raw tensor of
-         a ``mi_refgs.shade.envmap.EnvironmentLight``.
+         a ``mi_refgs.shade.light.envmap.EnvironmentLight``.
 
      * - mesh
        - |string|

@@ -11,19 +11,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import upload
 from mi_refgs.errors import InputError
-from mi_refgs.shade.envmap import (
+from mi_refgs.kernels.device import upload
+from mi_refgs.shade.light.envmap import (
     DEFAULT_HEIGHT,
     MIN_HEIGHT,
     EnvironmentLight,
     PrefilteredLight,
     UnfilteredLight,
 )
-from mi_refgs.shade.light import ConstantLight, Light, RotatedLight
-from mi_refgs.shade.lobe_matrices import LEVELS, Levels, resample
-from mi_refgs.shade.positive import bounded
-from mi_refgs.shade.prefilter import prefilter
+from mi_refgs.shade.light.light import ConstantLight, Light, RotatedLight
+from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels, resample
+from mi_refgs.shade.light.positive import bounded
+from mi_refgs.shade.light.prefilter import prefilter
 from mi_refgs.shade.shading import Shading
 
 MAX_HEIGHT = 512

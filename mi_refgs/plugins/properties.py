@@ -18,11 +18,11 @@ from mi_refgs.plugins.aovs import AOV, parse_aovs
 from mi_refgs.plugins.light import own_light
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.accuracy import Accuracy
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import DIFFUSE, Shading
-from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.attributes import CHANNELS
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
 

@@ -13,7 +13,7 @@ from mi_refgs.plugins.properties import AROUND, read_background, read_surroundin
 from mi_refgs.plugins.unusable import Values
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.surroundings import Surroundings, nothing_around
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 
 

@@ -10,7 +10,7 @@ import time
 import warnings
 
 from mi_refgs.constants import RAW_LIMIT
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 
 CHECK_SECONDS = 1.0

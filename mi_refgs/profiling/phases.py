@@ -1,7 +1,7 @@
 """Where the time of a training step goes: wall time by phase, between barriers.
 
-The clock listens to the hooks of `mi_refgs.timing`. The backward pass is one call of Dr.Jit: identities at
-the boundaries between phases tell the clock which one the pass has come to.
+The clock listens to the hooks of `mi_refgs.kernels.timing`. The backward pass is one call of Dr.Jit:
+identities at the boundaries between phases tell the clock which one the pass has come to.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refgs.timing import listening
+from mi_refgs.kernels.timing import listening
 
 PHASES = (
     "prefilter forward",

@@ -20,7 +20,7 @@ from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.profiling.phases import phase_times
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import list_by_tile, project
-from mi_refgs.surfels.channels import sigmoid
+from mi_refgs.surfels.attributes import sigmoid
 
 WARM_UP = 4
 """Steps before the first that counts: they compile kernels."""

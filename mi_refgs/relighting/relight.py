@@ -22,21 +22,21 @@ import numpy as np
 from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import pictures
-from mi_refgs.exr import write_exr
-from mi_refgs.files import write_json
 from mi_refgs.formats.shots import turntable_cameras
-from mi_refgs.images import straight_srgb, write_png
+from mi_refgs.io.exr import write_exr
+from mi_refgs.io.files import write_json
+from mi_refgs.io.images import straight_srgb, write_png
+from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.methods.method import Method
-from mi_refgs.ownership import OutputFolder
-from mi_refgs.progress_bar import with_bar
-from mi_refgs.relighting.light import NewLight, truth_under
+from mi_refgs.progress import with_bar
+from mi_refgs.reconstruction.new_light import NewLight, truth_under
+from mi_refgs.reconstruction.provenance import Source
 from mi_refgs.relighting.score import score, shown
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import ARTEFACTS, TrainedScene, export, up_to_date
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
-from mi_refgs.source import Source
 from mi_refgs.splat import Camera
 
 SHEET, RESULT = "sheet.png", "relight.json"

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from mi_refgs.evaluation import metrics
-from mi_refgs.images import srgb_from_linear
+from mi_refgs.io.images import srgb_from_linear
 
 SCALE_REACH = 2.0
 """Stops around the ratio of the means in which the scale is looked for."""

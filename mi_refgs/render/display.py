@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.images import SRGB_LINEAR_LIMIT
+from mi_refgs.io.images import SRGB_LINEAR_LIMIT
 from mi_refgs.render.pipeline import Frame
 
 # Alpha below which a pixel is empty: radiance / A has no meaning and the background alone is seen.

@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
-from mi_refgs.exr import mitsuba_exr
+from mi_refgs.io.exr import mitsuba_exr
 
 
 def load_scene(path: Path, aovs: Sequence[str] = (), alone: bool = False) -> Any:

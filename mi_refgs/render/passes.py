@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import PACKET_EDGE
-from mi_refgs.memory import PASS_SAMPLES, require_image
+from mi_refgs.kernels.memory import PASS_SAMPLES, require_image
 from mi_refgs.splat.camera import Camera
 
 Result = TypeVar("Result")

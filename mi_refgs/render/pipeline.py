@@ -17,21 +17,21 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR, FACING_TOLERANCE
-from mi_refgs.device import require_supported_variant
+from mi_refgs.kernels.device import require_supported_variant
+from mi_refgs.kernels.timing import boundary
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.primitives import primitive_of, widths_of
 from mi_refgs.render.antialias import widened
 from mi_refgs.render.gbuffer import GBuffer, inverse_alpha
 from mi_refgs.render.surroundings import AROUND, OBJECT, Surroundings, joined_slots, together
-from mi_refgs.shade.light import Light
+from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import TERMS, ShadingPoints, Terms, safe_normalize
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera, splat
 from mi_refgs.splat.lanes import Places
-from mi_refgs.surfels.channels import channel
+from mi_refgs.surfels.attributes import channel
+from mi_refgs.surfels.primitives import primitive_of, widths_of
 from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
-from mi_refgs.timing import boundary
 
 
 @dataclass(frozen=True)

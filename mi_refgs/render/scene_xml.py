@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
-from mi_refgs.files import write_bytes
+from mi_refgs.io.files import write_bytes
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 

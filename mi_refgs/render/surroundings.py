@@ -15,9 +15,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.rows import joined
 from mi_refgs.render.gbuffer import of_parts, parts
-from mi_refgs.rows import joined
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.surroundings import AROUND
 from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
 from mi_refgs.surfels.table import Surfels

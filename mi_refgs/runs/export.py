@@ -24,13 +24,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refgs.device import require_supported_variant
 from mi_refgs.errors import InputError
-from mi_refgs.files import BusyError, read_json, write_json
+from mi_refgs.io.files import BusyError, read_json, write_json
+from mi_refgs.io.ownership import OutputFolder
+from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.ownership import OutputFolder
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
@@ -40,7 +40,7 @@ from mi_refgs.runs.checkpoint import PARAMS, tensors
 from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.ambient import prepare
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import read_ply, write_ply

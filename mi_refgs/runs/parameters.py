@@ -8,7 +8,7 @@ from typing import Any
 from mi_refgs.methods.method import APART, LIGHT
 from mi_refgs.methods.surroundings import AROUND, BACKGROUND
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 
 

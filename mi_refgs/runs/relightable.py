@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from mi_refgs.device import upload_tensor
 from mi_refgs.errors import SceneError
+from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points
 from mi_refgs.occlusion.visibility import Occluder
@@ -20,12 +20,12 @@ from mi_refgs.runs.export import TrainedScene
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ambient import ambient
 from mi_refgs.shade.brdf import split_sum
-from mi_refgs.shade.light import Light
+from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.reflectance.split_sum import MATERIALS
 from mi_refgs.shade.sh import sh_basis
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.split_sum import DIELECTRIC_F0
-from mi_refgs.surfels.channels import logit
+from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
 
 COSINE_LOBE = (1.0, 2 / 3, 1 / 4, 0.0)

@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.contraction import Region
+from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
-from mi_refgs.files import cannot_write, locked, read_json, remove_temporaries, write_bytes, write_json
+from mi_refgs.io.files import cannot_write, locked, read_json, remove_temporaries, write_bytes, write_json
+from mi_refgs.io.ownership import RUN, OutputFolder
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
-from mi_refgs.ownership import RUN, OutputFolder
 from mi_refgs.runs import checkpoint
 
 DATASET = "dataset.json"

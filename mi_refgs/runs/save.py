@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.contraction import Region
+from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
-from mi_refgs.files import make_folder
+from mi_refgs.io.files import make_folder
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.export import TrainedScene, export
 from mi_refgs.runs.run import Run

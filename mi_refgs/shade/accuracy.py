@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from mi_refgs.errors import InputError, shown
-from mi_refgs.shade.lobe_matrices import LEVEL_ROUGHNESS
+from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 
 MAX_RAYS = 4096
 """Rays of the lobe, or bounces, beyond which nothing changes but the time: the length of a kernel follows."""

@@ -28,7 +28,7 @@ from mi_refgs.occlusion.vertex_colours import VertexColours
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ggx_sampling import lobe_point, lobe_turn
-from mi_refgs.shade.light import Light
+from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import safe_normalize
 from mi_refgs.shade.traced_light import MeshRadiance
 from mi_refgs.surfels.table import Surfels

@@ -16,9 +16,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import aligned
 from mi_refgs.errors import InputError
-from mi_refgs.files import replace_file
+from mi_refgs.io.files import replace_file
+from mi_refgs.kernels.device import aligned
 
 RESOLUTION = 256
 """Texels along N·V and along roughness, values at texel centres: bilinear lookups are then within 3e-4."""

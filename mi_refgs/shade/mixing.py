@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.device import upload
-from mi_refgs.shade.fourier import BLOCK, COEFFICIENT, read, to_device, write
+from mi_refgs.kernels.device import upload
+from mi_refgs.shade.light.fourier import BLOCK, COEFFICIENT, read, to_device, write
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.surfels.channels import MAX_SH_DEGREE
+from mi_refgs.surfels.attributes import MAX_SH_DEGREE
 
 ROTATION_DIRECTIONS = 64
 """Directions, evenly spread, at which a rotated function is equated with itself: four times the coefficients

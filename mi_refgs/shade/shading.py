@@ -7,14 +7,14 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args, get_type_hints
 
 from mi_refgs.errors import InputError, shown
+from mi_refgs.kernels.timing import phase
 from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
-from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.light import Light
-from mi_refgs.shade.lobe_matrices import Levels
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.light.lobe_matrices import Levels
 from mi_refgs.shade.points import ShadingPoints, Terms
 from mi_refgs.shade.reflectance import MODELS, Reflectance
 from mi_refgs.shade.split_sum import Diffuse
-from mi_refgs.timing import phase
 
 
 @dataclass(frozen=True)

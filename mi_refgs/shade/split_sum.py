@@ -16,7 +16,7 @@ import mitsuba as mi
 from mi_refgs.errors import InputError
 from mi_refgs.shade.accuracy import PLAIN, Accuracy
 from mi_refgs.shade.brdf import split_sum
-from mi_refgs.shade.light import Light
+from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import ShadingPoints, Terms, reflect, safe_normalize
 
 Diffuse = Literal["sh", "irradiance"]

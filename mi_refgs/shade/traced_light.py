@@ -12,7 +12,7 @@ from mi_refgs.constants import FACING_TOLERANCE
 from mi_refgs.occlusion.surface_materials import Surface, SurfaceSample
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.accuracy import Accuracy
-from mi_refgs.shade.light import Light
+from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.shade.split_sum import Diffuse, lookup_direction, shade

@@ -7,13 +7,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.primitives import Footprints
+from mi_refgs.kernels.timing import boundary, phase
 from mi_refgs.splat.blend import Blended, blend
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.shown import Shown, blend_shown
 from mi_refgs.splat.tiles import TileLists, list_by_tile
+from mi_refgs.surfels.primitives import Footprints
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.timing import boundary, phase
 
 __all__ = [
     "Blended",

@@ -28,12 +28,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.primitives import Footprints, Primitive
-from mi_refgs.rows import PackedRows
+from mi_refgs.kernels.rows import PackedRows
+from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.lanes import Grid, Lanes, advance, any_of, walk
 from mi_refgs.splat.tiles import TileLists
-from mi_refgs.timing import phase
+from mi_refgs.surfels.primitives import Footprints, Primitive
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.primitives import Footprints
-from mi_refgs.rows import PackedRows
+from mi_refgs.kernels.rows import PackedRows
+from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.lanes import BLOCKS, PACKET_LANES, Grid, Lanes, Places, advance, walk
 from mi_refgs.splat.tiles import TileLists
-from mi_refgs.timing import phase
+from mi_refgs.surfels.primitives import Footprints
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.primitives import Footprints
-from mi_refgs.rows import PackedRows
+from mi_refgs.kernels.rows import PackedRows
+from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera
-from mi_refgs.timing import phase
+from mi_refgs.surfels.primitives import Footprints
 
 MAX_PAIR_BITS = 27
 """Log₂ of the most pairs that are sorted: they take 40 bytes each, 5 GB in all."""

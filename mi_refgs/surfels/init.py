@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.errors import InputError
-from mi_refgs.primitives import primitive_named
-from mi_refgs.surfels.channels import CHANNELS, MAX_SH_DEGREE, SH_DC, channel
+from mi_refgs.surfels.attributes import CHANNELS, MAX_SH_DEGREE, SH_DC, channel
+from mi_refgs.surfels.primitives import primitive_named
 from mi_refgs.surfels.table import Surfels
 
 # Least distance to the neighbours, as part of the points' extent: keeps the log scale of doubled points

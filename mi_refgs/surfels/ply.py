@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.files import write_bytes
-from mi_refgs.ply import read_vertices
-from mi_refgs.primitives import nearest_primitive, widths_of
-from mi_refgs.surfels.channels import CHANNELS, MAX_SH_DEGREE, sh_columns
+from mi_refgs.io.files import write_bytes
+from mi_refgs.io.ply import read_vertices
+from mi_refgs.surfels.attributes import CHANNELS, MAX_SH_DEGREE, sh_columns
+from mi_refgs.surfels.primitives import nearest_primitive, widths_of
 from mi_refgs.surfels.table import Surfels
 
 # ---------------- reading ----------------

@@ -20,11 +20,11 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.constants import RAW_LIMIT
-from mi_refgs.device import upload_tensor
 from mi_refgs.errors import InputError
-from mi_refgs.primitives import Primitive, primitive_of, widths_of
-from mi_refgs.rows import columns_of
-from mi_refgs.surfels.channels import CHANNELS, channel
+from mi_refgs.kernels.device import upload_tensor
+from mi_refgs.kernels.rows import columns_of
+from mi_refgs.surfels.attributes import CHANNELS, channel
+from mi_refgs.surfels.primitives import Primitive, primitive_of, widths_of
 
 # Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is worthless.
 QUATERNION_FLOOR = 1e-12

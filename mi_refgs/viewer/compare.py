@@ -11,7 +11,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.pictures import planes
-from mi_refgs.images import to_8_bits
+from mi_refgs.io.images import to_8_bits
 from mi_refgs.render.display import displayed
 from mi_refgs.viewer.develop import PICTURE, Look, shown_planes, to_bytes
 from mi_refgs.viewer.drawable import Drawable, Sample

@@ -12,7 +12,7 @@ import numpy as np
 from mi_refgs.plugins.aovs import aov_planes, suffixes, values_of_planes
 from mi_refgs.render.display import display_image, srgb_from_linear
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.shade.light import Light
+from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from mi_refgs.editing import Change, Selection, apply, assignments, select
 from mi_refgs.runs.export import TrainedScene
-from mi_refgs.surfels.channels import sigmoid
+from mi_refgs.surfels.attributes import sigmoid
 
 
 def selected(where: str, scene: TrainedScene) -> np.ndarray:

@@ -11,17 +11,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.contraction import Region
+from mi_refgs.data.region import Region
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import lacking, relightable
 from mi_refgs.shade.ambient import prepare
-from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.light import Light, RotatedLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.attributes import CHANNELS
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of, planes_of
 from mi_refgs.viewer.drawable import Sample, Sampled

@@ -16,14 +16,14 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.errors import InputError, shown
 from mi_refgs.evaluation.evaluate import load_split
-from mi_refgs.exr import read_exr, write_exr
-from mi_refgs.files import read_json
-from mi_refgs.images import image_size, read_png
+from mi_refgs.io.exr import read_exr, write_exr
+from mi_refgs.io.files import read_json
+from mi_refgs.io.images import image_size, read_png
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.plugins.properties import read_background, read_light, read_shading, read_surfels
 from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.ply import read_ply
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmark_runs import ROOT  # first: it lets `benchmarks` be found
 
 from benchmarks.stability import measure as module
 from benchmarks.stability import response
@@ -16,8 +15,9 @@ from benchmarks.stability.__main__ import main
 from benchmarks.stability.case import Case, plain
 from benchmarks.stability.cases import catalogue
 from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, Row, measure
-from mi_refgs.primitives.surfel import FootprintAdjoint
 from mi_refgs.reference import picture as oracle
+from mi_refgs.surfels.primitives.surfel import FootprintAdjoint
+from tests.benchmarks.benchmark_runs import ROOT  # first: it lets `benchmarks` be found
 
 assert ROOT
 CASES = [case for case in catalogue() if case.quick]

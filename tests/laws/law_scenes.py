@@ -10,16 +10,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from hypothesis import strategies as st
-from integrator_scenes import sky
 from scipy.spatial.transform import Rotation
 
-from mi_refgs.device import upload
+from mi_refgs.kernels.device import upload
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Frame, render
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
+from tests.scenes.integrator import sky
 
 COUNT, WIDTH, HEIGHT, FOCAL = 40, 24, 16, 26.0
 LIGHT_ROWS = 16

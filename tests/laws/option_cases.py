@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-from covering import Case, Rule
-
 from mi_refgs.methods.read import load, names
-from mi_refgs.primitives import PRIMITIVES
 from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import DIFFUSE
+from mi_refgs.surfels.primitives import PRIMITIVES
+from tests.laws.covering import Case, Rule
 
 WIDTH, HEIGHT = 16, 12
 CROPS = {"none": (0, 0, WIDTH, HEIGHT), "inner": (3, 2, 8, 6), "corner": (8, 6, 8, 6)}

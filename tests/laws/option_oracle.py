@@ -9,20 +9,6 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from covering import Case
-from option_cases import CROPS, HEIGHT, WIDTH
-from option_scenes import (
-    AROUND,
-    BACKDROP,
-    FOV,
-    NEAR,
-    Values,
-    aov_types,
-    mesh,
-    rotation,
-    shading,
-    surfels_of,
-)
 
 from mi_refgs import constants as c
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
@@ -37,11 +23,26 @@ from mi_refgs.reference.primitives import primitive_of
 from mi_refgs.render.pipeline import render
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.render.surroundings import Surroundings, nothing_around
-from mi_refgs.shade import brdf, lobe_matrices
+from mi_refgs.shade import brdf
 from mi_refgs.shade.ambient import prepare
-from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.light import ConstantLight, RotatedLight
+from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.light import ConstantLight, RotatedLight
 from mi_refgs.splat.camera import Camera
+from tests.laws.covering import Case
+from tests.laws.option_cases import CROPS, HEIGHT, WIDTH
+from tests.laws.option_scenes import (
+    AROUND,
+    BACKDROP,
+    FOV,
+    NEAR,
+    Values,
+    aov_types,
+    mesh,
+    rotation,
+    shading,
+    surfels_of,
+)
 
 Array = np.ndarray
 XYZ = np.array(

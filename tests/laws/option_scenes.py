@@ -11,12 +11,9 @@ from xml.etree import ElementTree
 import mitsuba as mi
 import numpy as np
 import trimesh
-from covering import Case
-from integrator_scenes import raw_channels, sky
-from option_cases import ACCURACY, CROPS, FORMATS, HEIGHT, OCCLUSION, WIDTH
 from scipy.spatial.transform import Rotation
 
-from mi_refgs.exr import mitsuba_exr, write_exr
+from mi_refgs.io.exr import mitsuba_exr, write_exr
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.plugins.aovs import suffixes
 from mi_refgs.render.load_scene import load_scene
@@ -24,13 +21,16 @@ from mi_refgs.render.scene_xml import put
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import SCENE, TrainedScene, export
 from mi_refgs.shade.accuracy import Accuracy
-from mi_refgs.shade.envmap import EnvironmentLight
-from mi_refgs.shade.lobe_matrices import resample
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.lobe_matrices import resample
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.channels import CHANNELS
+from mi_refgs.surfels.attributes import CHANNELS
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
+from tests.laws.covering import Case
+from tests.laws.option_cases import ACCURACY, CROPS, FORMATS, HEIGHT, OCCLUSION, WIDTH
+from tests.scenes.integrator import raw_channels, sky
 
 Values = dict[str, np.ndarray]
 AROUND = "surroundings_"

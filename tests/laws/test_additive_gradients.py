@@ -18,14 +18,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from integrator_scenes import hollow_mesh, integrator, raw_channels, sensor, sky
 from scipy.spatial import cKDTree
 
 from mi_refgs.render.pipeline import render
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.channels import channel
+from mi_refgs.surfels.attributes import channel
+from tests.scenes.integrator import hollow_mesh, integrator, raw_channels, sensor, sky
 
 TOLERANCE = 1e-5
 """Relative to the largest entry of the sum, for each parameter: sums by scatter come in any order."""

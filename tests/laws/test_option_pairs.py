@@ -16,15 +16,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from covering import Case, combinations_of, completed, covering_array
-from option_cases import DIMENSIONS, RULES, spec, unlisted_accuracy
-from option_oracle import Oracle
-from option_scenes import AROUND, Built, Values, build, values
 
 from mi_refgs.plugins.aovs import suffixes
 from mi_refgs.reference.models import MODELS as REFERENCE_MODELS
 from mi_refgs.render.load_scene import reason
 from mi_refgs.shade.reflectance import MODELS
+from tests.laws.covering import Case, combinations_of, completed, covering_array
+from tests.laws.option_cases import DIMENSIONS, RULES, spec, unlisted_accuracy
+from tests.laws.option_oracle import Oracle
+from tests.laws.option_scenes import AROUND, Built, Values, build, values
 
 SEED = 3
 IMAGE = 3e-4

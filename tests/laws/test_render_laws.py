@@ -13,12 +13,23 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from integrator_scenes import plane_mesh, sky
-from law_scenes import COUNT, FOCAL, HEIGHT, LIGHT_ROWS, SCENES, SEEDS, WIDTH, Scene, random_scene, rotated
 from scipy.spatial.transform import Rotation
 
-from mi_refgs.device import upload_tensor
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.kernels.device import upload_tensor
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from tests.laws.law_scenes import (
+    COUNT,
+    FOCAL,
+    HEIGHT,
+    LIGHT_ROWS,
+    SCENES,
+    SEEDS,
+    WIDTH,
+    Scene,
+    random_scene,
+    rotated,
+)
+from tests.scenes.integrator import plane_mesh, sky
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "deferred, with a mesh": {"aovs": "n:normal,d:depth,a:alpha,r:roughness"},

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from law_scenes import (
+from scipy.spatial.transform import Rotation
+
+from mi_refgs import constants
+from mi_refgs.constants import ALPHA_MIN
+from mi_refgs.kernels.device import upload
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import splat
+from mi_refgs.surfels.table import Surfels
+from tests.laws.law_scenes import (
     COUNT,
     DISCS,
     SCENES,
@@ -21,14 +29,6 @@ from law_scenes import (
     gradients,
     random_scene,
 )
-from scipy.spatial.transform import Rotation
-
-from mi_refgs import constants
-from mi_refgs.constants import ALPHA_MIN
-from mi_refgs.device import upload
-from mi_refgs.shade.shading import Shading
-from mi_refgs.splat import splat
-from mi_refgs.surfels.table import Surfels
 
 EXACT = 2e-6
 """Between pictures of the same float32 arithmetic, but for fused operations and the order of equal sums."""

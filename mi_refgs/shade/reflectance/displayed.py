@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from mi_refgs.images import SRGB_ENCODED_LIMIT
+from mi_refgs.io.images import SRGB_ENCODED_LIMIT
 from mi_refgs.shade.points import ShadingPoints, Terms
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
 from mi_refgs.surfels.table import Surfels

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mi_refgs.errors import InputError
-from mi_refgs.relighting.light import NewLight
-from mi_refgs.shade.envmap import EnvironmentLight
+from mi_refgs.reconstruction.new_light import NewLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.viewer.fitted import Fitted
 from mi_refgs.viewer.page import Page
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.exr import write_exr
-from mi_refgs.files import cannot_write, make_folder
-from mi_refgs.images import straight_srgb, write_png
+from mi_refgs.io.exr import write_exr
+from mi_refgs.io.files import cannot_write, make_folder
+from mi_refgs.io.images import straight_srgb, write_png
 from mi_refgs.shade.points import TERMS
 from mi_refgs.viewer.develop import PICTURE, Look, seen_of, shown_planes
 from mi_refgs.viewer.drawable import Drawable

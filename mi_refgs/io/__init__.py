@@ -1,0 +1,1 @@
+"""Files: images, EXR, HDR, PLY, JSON, and which files are ours."""

@@ -1,0 +1,76 @@
+"""Radiance pictures (.hdr) as NumPy arrays."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.io.files import check_size, require_file, strip_rows
+
+MAX_HDR_HEADER = 2**16
+"""Bytes in which the size of a Radiance picture must stand."""
+
+
+SCALES = np.append(0, np.ldexp(1.0, np.arange(1, 256) - 136)).astype(np.float32)
+"""What a number of red, green or blue stands for, by the byte of its exponent."""
+
+
+def hdr_strips(path: Path) -> tuple[tuple[int, int], Iterator[np.ndarray]]:
+    """Height and width of a Radiance picture (.hdr), and its rows from the top in linear float32 (n, W, 3).
+
+    Written here because Mitsuba's reader writes beyond its memory where a run is longer than its row. Layout:
+    Ward, "Real Pixels", 1991. Raises InputError if the file is missing or no such picture; the strips raise
+    it where they are broken.
+    """
+    require_file(path)
+    with path.open("rb") as file:
+        header = file.read(MAX_HDR_HEADER)
+    size = re.search(rb"\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", header)
+    if not header.startswith(b"#?") or b"32-bit_rle_xyze" in header or size is None:
+        raise InputError(f"{path}: header: no Radiance picture of rows from the top; save it as EXR")
+    height, width = int(size.group(1)), int(size.group(2))
+    check_size(path, width, height, 4)
+    return (height, width), _strips(path, height, width, size.end())
+
+
+def _strips(path: Path, height: int, width: int, position: int) -> Iterator[np.ndarray]:
+    """The rows from a place in the file on, run lengths or none."""
+    marker, data = bytes((2, 2, width >> 8 & 255, width & 255)), path.read_bytes()
+    step = strip_rows(max(width, 1))
+    for top in range(0, height, step):
+        rgbe = np.empty((min(step, height - top), width, 4), np.uint8)
+        try:
+            for row in rgbe:
+                if data[position : position + 4] != marker or not 8 <= width < 32768:
+                    row[:] = np.frombuffer(data, np.uint8, 4 * width, position).reshape(width, 4)
+                    position += 4 * width
+                    continue
+                position += 4
+                for channel in range(4):
+                    values, position = _runs(data, position, width)
+                    row[:, channel] = np.frombuffer(values, np.uint8)
+        except (IndexError, ValueError) as error:
+            raise InputError(f"{path}: pixels: truncated or broken; export it again") from error
+        yield rgbe[..., :3] * SCALES[rgbe[..., 3:]]
+
+
+def _runs(data: bytes, position: int, width: int) -> tuple[bytes, int]:
+    """One channel of a row of a Radiance picture, and where the next begins; ValueError if it is too long."""
+    values = bytearray()
+    while len(values) < width:
+        count = data[position]
+        if count > 128:
+            values += data[position + 1 : position + 2] * (count - 128)
+            position += 2
+        else:
+            values += data[position + 1 : position + 1 + count]
+            position += 1 + count
+        if not count:
+            raise ValueError("an empty run")
+    if len(values) > width:
+        raise ValueError("a run longer than its row")
+    return bytes(values), position

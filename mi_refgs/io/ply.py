@@ -1,0 +1,139 @@
+"""The header and the vertices of a PLY file, checked against its length before memory is asked for."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.kernels.memory import PER_PLY_BYTE, require
+
+MAX_HEADER_LINES = 1000
+"""A header of surfels has 124 lines at most; more than this without its end is no PLY header."""
+MAX_LINE = 4096
+"""Bytes of a line of the header."""
+TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
+    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
+}
+"""NumPy's names of the types, without the byte order."""
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "a"}
+
+
+@dataclass(frozen=True)
+class Element:
+    """One table of the file."""
+
+    name: str
+    count: int  # rows
+    fields: tuple[tuple[str, str], ...]  # name and TYPES code of the properties that are numbers
+    lists: tuple[tuple[str, str], ...]  # name and code of the length of those that are lists
+
+    def row_bytes(self, text: bool) -> int:
+        """Bytes that a row takes at least: every list empty; as text, a digit and a space a property."""
+        if text:
+            return 2 * (len(self.fields) + len(self.lists))
+        return sum(int(code[1]) for _, code in (*self.fields, *self.lists))
+
+
+@dataclass(frozen=True)
+class Header:
+    """The lines before the data."""
+
+    order: str  # "<", ">", or "a" for text
+    elements: tuple[Element, ...]
+    comments: tuple[str, ...]
+
+
+def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or mesh.ply of a run") -> Header:
+    """Read the header; the file then stands at the data.
+
+    Raises InputError, naming `path`, for what is no PLY header and for one that promises more rows than the
+    file is long. `wanted` is what the message of the former says to give.
+    """
+    if file.readline(MAX_LINE).strip() != b"ply":
+        raise InputError(f"{path}: header: not a PLY file; give {wanted}")
+    order, comments = "", []
+    found: list[tuple[str, int, list[tuple[str, str]], list[tuple[str, str]]]] = []
+    for _ in range(MAX_HEADER_LINES):
+        line = file.readline(MAX_LINE)
+        words = line.decode("ascii", errors="replace").split()
+        if not line.endswith(b"\n") and words != ["end_header"]:
+            raise InputError(f"{path}: header: no end_header; the file is truncated, export it again")
+        match words:
+            case ["format", name, *_]:
+                order = ORDERS.get(name, "")
+            case ["comment" | "obj_info", *rest]:
+                comments.append(" ".join(rest))
+            case ["element", name, count] if count.isdigit() and len(count) < 19:
+                found.append((name, int(count), [], []))
+            case ["property", kind, name] if found and kind in TYPES:
+                found[-1][2].append((name, TYPES[kind]))
+            case ["property", "list", length, kind, name] if found and {length, kind} <= TYPES.keys():
+                found[-1][3].append((name, TYPES[length]))
+            case ["end_header"]:
+                break
+            case _:
+                text = " ".join(words)[:40]
+                raise InputError(f"{path}: header: '{text}' is no line of a PLY header; export it again")
+    else:
+        raise InputError(f"{path}: header: no end_header in {MAX_HEADER_LINES} lines; export it again")
+    elements = tuple(Element(name, count, (*fields,), (*lists,)) for name, count, fields, lists in found)
+    if not order or not elements:
+        raise InputError(f"{path}: header: no format or no element; export it again")
+    left = os.fstat(file.fileno()).st_size - file.tell()
+    for element in elements:
+        names = [name for name, _ in (*element.fields, *element.lists)]
+        if not names or len({*names}) < len(names):
+            what = (
+                f"a property of {element.name} occurs twice" if names else f"{element.name} has no property"
+            )
+            raise InputError(f"{path}: header: {what}; export it again")
+        left -= element.count * element.row_bytes(order == "a")
+        if left < (-1 if order == "a" else 0):  # text may end without a line break
+            raise InputError(
+                f"{path}: {element.name}: {element.count} rows are more than the file holds; the file is "
+                "truncated, copy or export it again"
+            )
+    return Header(order, elements, (*comments,))
+
+
+def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
+    """The `vertex` element as a structured array.
+
+    Raises InputError as `read_header` does, and for vertices that do not come first or have lists.
+    """
+    header = read_header(path, file)
+    vertex = header.elements[0]
+    if vertex.name != "vertex":
+        raise InputError(f"{path}: {vertex.name}: the vertices must come first; export it as a surfel PLY")
+    if vertex.lists:
+        raise InputError(
+            f"{path}: {vertex.lists[0][0]}: not a number property; export the vertices without lists"
+        )
+    size = vertex.count * (8 if header.order == "a" else 1) * max(vertex.row_bytes(False), 1)
+    require(PER_PLY_BYTE * size, f"{path}: vertex: {vertex.count:,} rows", "keep fewer of them")
+    if header.order == "a":
+        values = _read_ascii(path, file, vertex.count, len(vertex.fields))
+        dtype = np.dtype([(name, "f8") for name, _ in vertex.fields])
+        return np.ascontiguousarray(values).view(dtype).reshape(vertex.count)
+    dtype = np.dtype([(name, header.order + code) for name, code in vertex.fields])
+    return np.frombuffer(file.read(vertex.count * dtype.itemsize), dtype=dtype)
+
+
+def _read_ascii(path: Path, file: BinaryIO, count: int, width: int) -> np.ndarray:
+    values = np.empty((count, width))
+    for row in range(count):
+        words = file.readline().split()
+        try:
+            values[row] = [float(word) for word in words]
+        except ValueError as error:
+            raise InputError(
+                f"{path}: vertex: row {row} is broken or missing; copy or export the file again"
+            ) from error
+    return values

@@ -1,0 +1,28 @@
+"""Where the files that come with the package lie: `variants/*.toml` and `scenes/*.xml`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mi_refgs.errors import InputError
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def resource_dir(name: str) -> Path:
+    """Folder of the resource `name` ("variants" or "scenes"), in an installed wheel as in a checkout.
+
+    A wheel carries these folders inside the package; in a checkout they stand at the top level, beside it.
+
+    Raises:
+        InputError: when neither place has the folder.
+    """
+    for folder, is_ours in (
+        (_PACKAGE / name, True),
+        (_PACKAGE.parent / name, (_PACKAGE.parent / "pyproject.toml").is_file()),
+    ):
+        if is_ours and folder.is_dir():
+            return folder
+    raise InputError(
+        f"{_PACKAGE}: {name}: the folder is missing from this installation; install mi_refgs again"
+    )

@@ -1,0 +1,1 @@
+"""What kernels share: table rows, device arrays, timing, memory."""

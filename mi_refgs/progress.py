@@ -1,0 +1,40 @@
+"""Messages and progress bars on standard error: results alone go to standard output."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
+
+TERMINAL_INTERVAL, LOG_INTERVAL = 0.5, 30.0
+"""Seconds between refreshes of a bar, in a terminal and in a file."""
+
+
+def say(message: str) -> None:
+    """Print a message to the user."""
+    print(f"refgs: {message}", file=sys.stderr)
+
+
+def warn(message: str) -> None:
+    """Print a warning to the user, above a progress bar if one is displayed."""
+    from tqdm import tqdm
+
+    tqdm.write(f"refgs: warning: {message}", file=sys.stderr)
+
+
+def progress_bar(total: int, what: str, **options: Any) -> Any:
+    """Return a bar of `total` steps, to be updated and closed; `options` are tqdm's."""
+    from tqdm import tqdm
+
+    interval = TERMINAL_INTERVAL if sys.stderr.isatty() else LOG_INTERVAL
+    return tqdm(total=total, desc=what, file=sys.stderr, dynamic_ncols=True, mininterval=interval, **options)
+
+
+def with_bar(items: Sequence[Item], what: str, **options: Any) -> Iterator[Item]:
+    """Yield the items under a bar that counts them."""
+    with progress_bar(len(items), what, **options) as bar:
+        for item in items:
+            yield item
+            bar.update()

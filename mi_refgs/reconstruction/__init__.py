@@ -1,0 +1,1 @@
+"""Reconstructions in Python: fit, load, import."""

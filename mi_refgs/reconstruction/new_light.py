@@ -1,0 +1,135 @@
+"""The light that a scene is relit by, and where a data set has the truth under it.
+
+A panorama is stored with its zenith in the first row, Mitsuba's y axis; in the world of a scene z is up. Maps
+that this package writes (environment.exr, envmap.exr) are in world directions already.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.io.files import require_file
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.light_file import read_radiance
+from mi_refgs.synthesis.pathtrace import ENVIRONMENT_OVERSAMPLING, environment_image
+from mi_refgs.synthesis.scene_file import Z_UP
+from mi_refgs.synthesis.settings import RELIGHT, recorded_lights
+
+HEIGHT = 256
+"""Rows of a light, at most: a texel is 0.7°, an eighth of the lobe of roughness 0.1."""
+READ_ROWS = ENVIRONMENT_OVERSAMPLING * HEIGHT
+"""Rows to which a larger map is averaged first: turned, it is sampled at as many."""
+EXPOSURE_MAX = 10.0
+"""Stops; a light keeps no radiance below 1e-4, so that a much darker one would be grey."""
+
+
+@dataclass(frozen=True)
+class NewLight:
+    """A lat-long map as a light of the world."""
+
+    path: Path
+    world: bool = False  # whether the map is in world directions already, else its first row is +z
+    rotate: float = 0.0  # degrees about +z, counter-clockwise seen from above
+    exposure: float = 0.0  # stops: radiance times 2^exposure
+
+    def __post_init__(self) -> None:
+        """Raise InputError if there is no such file, or a number makes no sense."""
+        require_file(self.path)
+        _require_range(f"{self.path}: --rotate, --exposure", self.rotate, self.exposure)
+
+    @property
+    def suffix(self) -> str:
+        """What tells pictures under this light from those under the map as it is: "_r90_e-1", or nothing."""
+        turned = f"_r{self.rotate:g}" if self.rotate % 360 else ""
+        return turned + (f"_e{self.exposure:+g}" if self.exposure else "")
+
+    @property
+    def identity(self) -> str:
+        """What the radiance depends on: a hash of the file, its orientation and its exposure."""
+        digest = hashlib.sha256(self.path.read_bytes()).hexdigest()
+        return f"{digest} world={self.world} rotate={self.rotate % 360!r} exposure={self.exposure!r}"
+
+    def read(self) -> EnvironmentLight:
+        """The light, of at most HEIGHT rows; raises InputError for a file that is no lat-long image."""
+        return world_light(read_radiance(self.path, READ_ROWS), self.world, self.rotate, self.exposure)
+
+
+def _require_range(field: str, rotate: float, exposure: float) -> None:
+    if not (np.isfinite(rotate) and abs(exposure) <= EXPOSURE_MAX):
+        raise InputError(
+            f"{field}: {rotate}, {exposure} are out of range; give degrees, and stops from "
+            f"{-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
+        )
+
+
+def world_light(
+    radiance: np.ndarray, world: bool = False, rotate: float = 0.0, exposure: float = 0.0
+) -> EnvironmentLight:
+    """Lat-long radiance (h, w, 3) as a light of at most HEIGHT rows; the rest as in `NewLight`.
+
+    Raises InputError for an array that is no such map, and for a number that makes no sense.
+    """
+    import mitsuba as mi
+
+    _require_range("light: rotate, exposure", rotate, exposure)
+    radiance = np.ascontiguousarray(radiance, dtype=np.float32)
+    if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape) < 2:
+        raise InputError(f"light: {radiance.shape} is no lat-long map; give linear radiance (h, w, 3)")
+    turned: Any = mi.ScalarTransform4f()
+    if rotate % 360:
+        turned = turned.rotate([0, 0, 1], rotate)
+    if not world:
+        turned = turned.rotate(*Z_UP)
+    emitter = {"type": "envmap", "bitmap": mi.Bitmap(radiance), "to_world": turned}
+    height = min(HEIGHT, max(len(radiance) // 4 * 4, 8))
+    image = environment_image(mi.load_dict({"type": "scene", "light": emitter}), height)
+    return EnvironmentLight.from_radiance(image * np.float32(2.0**exposure))
+
+
+AnyLight: TypeAlias = NewLight | EnvironmentLight | str | Path | np.ndarray
+"""A light, its file, or its radiance (h, w, 3)."""
+
+
+def any_light(light: AnyLight, world: bool, rotate: float, exposure: float) -> EnvironmentLight:
+    """A light of whatever stands for one: its file, its radiance (h, w, 3); the rest as in `NewLight`.
+
+    An `EnvironmentLight` is in world directions already. Raises InputError for what is no light.
+    """
+    if isinstance(light, NewLight):
+        if world or rotate or exposure:
+            raise InputError("light: a NewLight has its own world, rotate and exposure; set them there")
+        return light.read()
+    if isinstance(light, EnvironmentLight):
+        return world_light(light.radiance().numpy(), True, rotate, exposure)
+    if isinstance(light, np.ndarray):
+        return world_light(light, world, rotate, exposure)
+    return NewLight(Path(light), world, rotate, exposure).read()
+
+
+def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:
+    """The data set with test views under this light, and the light as they were traced; None without one.
+
+    It is the map that `refgs dataset --relight` was given, by the content of the file, or an environment.exr
+    of the data set itself. A light that is turned has no truth. Raises InputError for such an environment.exr
+    that is not said to be in world directions.
+    """
+    content = light.path.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    lights = recorded_lights(data / "dataset.json")
+    for folder in (data, *sorted((data / RELIGHT).glob("*"))):
+        map_ = folder / "environment.exr"
+        if not (map_.is_file() and (folder / "transforms_test.json").is_file()):
+            continue
+        recorded = lights.get(folder.name) if folder != data else None  # `data` may have a light's name
+        own = map_.read_bytes() == content
+        if own and not light.world:
+            raise InputError(f"{light.path}: --envmap: this map is in world directions; add --world")
+        if (own if light.world else recorded == digest) and not light.rotate % 360:
+            return folder, NewLight(map_, True, 0.0, light.exposure)
+    return None

@@ -1,0 +1,107 @@
+"""What a reconstruction was made from, and the cameras that follow from it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.region import Region
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.runner import read_views
+from mi_refgs.formats import Shot
+from mi_refgs.formats.shots import shots_around, turntable_cameras
+from mi_refgs.io.files import read_json
+from mi_refgs.methods.method import Method
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.run import Run
+from mi_refgs.runs.save import save
+from mi_refgs.splat import Camera
+
+EDITS = "edit.json"
+
+
+@dataclass(frozen=True)
+class Source:
+    """A method and, where it is known, the data set that it was fitted to, with its region of interest."""
+
+    method: Method
+    data: Path | None = None
+    region: Region | None = None  # in pictures without alpha
+    edits: tuple[dict[str, Any], ...] = ()  # what was done since, in order: `editing.Edited.record`
+
+    @staticmethod
+    def of(run: Run) -> Source:
+        """That of a run folder; raises InputError if it is none, or records a region that cannot be used."""
+        method = run.method()
+        try:
+            data: Path | None = run.dataset()
+        except (OSError, ValueError, KeyError, TypeError):
+            data = None
+        record = run.path / EDITS
+        edits = read_json(record).get("edits", []) if record.is_file() else []
+        return Source(method, data, run.region(), tuple(edits))
+
+    def save(self, trained: TrainedScene, folder: Path, camera: Camera) -> None:
+        """Write a run folder of a scene (`runs.save`); raises InputError as that does."""
+        records = {EDITS: {"edits": self.edits}} if self.edits else None
+        save(trained, folder, self.method, camera, data=self.data, region=self.region, records=records)
+
+    def with_data(self, folder: Path | None) -> Source:
+        """The same with another data set, or this for None; raises InputError for what is no folder."""
+        if folder is None:
+            return self
+        if not folder.is_dir():
+            raise InputError(f"{folder}: --data: no such folder; give that of a data set")
+        return replace(self, data=folder)
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the folder of the data set is."""
+        return self.data is not None and self.data.is_dir()
+
+    def views(self, split: str, decode: bool = True) -> Dataset:
+        """A split of the data set; raises InputError where that is unknown, gone or unreadable."""
+        if self.data is None or not self.is_there:
+            gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
+            raise InputError(f"views: {split}: {gone}; use cameras(), or bring the data set back")
+        found = read_views(self.method, self.data, split, decode=decode)
+        return found if self.region is None else replace(found, region=self.region)
+
+    def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
+        """The cameras of some splits by name; without a data set those around the surfels.
+
+        Decodes no picture. Raises InputError for a data set that is there and cannot be read.
+        """
+        if not self.is_there:
+            return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
+        return [shot for split in splits for shot in self._shots_of(split)]
+
+    def _shots_of(self, split: str) -> list[Shot]:
+        """Those of one split, with the files of the pictures as they are on disk."""
+        assert self.data is not None
+        views = originals = read_views(self.method, self.data, split, truth=False, decode=False).views
+        if (self.method.data.downscale or 1) > 1:
+            whole = replace(self.method, data=replace(self.method.data, downscale=1))
+            originals = read_views(whole, self.data, split, truth=False, decode=False).views
+        shots = []
+        for view, original in zip(views, originals, strict=True):
+            file = original.file
+            if file is not None:
+                mask = file.mask and replace(file.mask, path=Path(os.path.relpath(file.mask.path, self.data)))
+                file = replace(file, path=Path(os.path.relpath(file.path, self.data)), mask=mask)
+            shots.append(Shot(view.name, split, view.camera(), file))
+        return shots
+
+    def turntable(self, trained: TrainedScene, count: int) -> list[Camera]:
+        """Cameras on a circle around the object, z up, like the test views in lens, distance and height.
+
+        Raises InputError as `shots` does, and for a number below 1.
+        """
+        if count < 1:
+            raise InputError(f"turntable: {count} is out of range; give a number of cameras from 1")
+        cameras = [shot.camera for shot in self.shots(trained, "test")]
+        region = None if trained.surroundings is None else self.region
+        return turntable_cameras(trained, cameras, count, region)

@@ -1,0 +1,298 @@
+"""What a fit has found, as one object: look at it, relight it, change it, take it elsewhere.
+
+A `Reconstruction` never changes; what changes it returns another one, which `save` writes into a run folder.
+Pictures are NumPy arrays (H, W, channels) of float32, linear radiance, their first row at the top.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeAlias, Unpack
+
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs import editing, formats
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.view import View
+from mi_refgs.errors import InputError, counted
+from mi_refgs.evaluation import evaluate as evaluation
+from mi_refgs.evaluation.pictures import planes
+from mi_refgs.kernels.device import require_supported_variant
+from mi_refgs.methods.method import Method
+from mi_refgs.plugins.aovs import aov_values, suffixes
+from mi_refgs.reconstruction.new_light import AnyLight, any_light
+from mi_refgs.reconstruction.provenance import Source
+from mi_refgs.render.display import composited
+from mi_refgs.render.load_scene import load_scene
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.runs.export import SCENE, TrainedScene, export, newest, up_to_date
+from mi_refgs.runs.relightable import relightable
+from mi_refgs.runs.run import Run
+from mi_refgs.splat import Camera
+
+CameraLike: TypeAlias = "Camera | View | int | Any"
+"""A `Camera`, a data set's `View`, the index of one of `Reconstruction.cameras`, or a Mitsuba sensor."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """Surfels with materials, a light and a mesh: what a fit has found, or what became of it.
+
+    Made by `mi_refgs.fit` and `mi_refgs.load`.
+    """
+
+    trained: TrainedScene
+    source: Source
+    folder: Path | None = None  # the run folder that holds exactly this; None: only in memory
+    _keeper: Any = field(default=None, repr=False)  # of a temporary folder, removed with the last user
+    _renderers: dict[Any, Callable[[Camera], Frame]] = field(default_factory=dict, init=False, repr=False)
+
+    def __repr__(self) -> str:
+        light, mesh, around = self.trained.light, self.trained.mesh, self.trained.surroundings
+        parts = [
+            counted(self.trained.surfels.count, self.trained.surfels.primitive.name),
+            f"channels = {', '.join(self.trained.surfels.raw)}",
+            f"light = {None if light is None else f'{light.height} × {2 * light.height}'}",
+            f"mesh = {None if mesh is None else f'{len(mesh.faces)} triangles'}",
+            *([] if around is None else [f"surroundings = {around.surfels.count}"]),
+            f"method = {self.method.variant}, {self.trained.iteration} iterations",
+            f"folder = {self.folder}",
+        ]
+        return "Reconstruction[\n  " + ",\n  ".join(parts) + "\n]"
+
+    # ---------------- cameras ----------------
+
+    @property
+    def method(self) -> Method:
+        """What was fitted, and how."""
+        return self.source.method
+
+    def views(self, split: str = "test") -> Dataset:
+        """The "test" or "train" views of the data set: each of `.views` has `.image` (H, W, 3).
+
+        Raises InputError where the data set is unknown, gone or unreadable.
+        """
+        return self.source.views(split)
+
+    def cameras(self, split: str = "test") -> list[Camera]:
+        """Cameras of the data set's "test" or "train" views; where it is not there, cameras all around.
+
+        Raises InputError for a data set that is there and cannot be read.
+        """
+        return [shot.camera for shot in self.source.shots(self.trained, split)]
+
+    def turntable(self, count: int) -> list[Camera]:
+        """Cameras on a circle around the object, z up, like the test views in lens, distance and height."""
+        return self.source.turntable(self.trained, count)
+
+    def camera(
+        self, camera: CameraLike = 0, size: int | tuple[int, int] | None = None, split: str = "test"
+    ) -> Camera:
+        """A camera of whatever stands for one, with other pixels if `size` says so (`Camera.resized`).
+
+        An index counts `cameras(split)`. Raises InputError for an index that is out of range and for what
+        is no camera.
+        """
+        if isinstance(camera, int | np.integer):
+            known = self.cameras(split)
+            if not -len(known) <= camera < len(known):
+                raise InputError(f"camera: {camera}: {split} has {len(known)}; give 0 to {len(known) - 1}")
+            found = known[camera]
+        elif isinstance(camera, View):
+            found = camera.camera()
+        elif isinstance(camera, mi.Sensor):
+            found = Camera.from_sensor(camera)
+        elif isinstance(camera, Camera):
+            found = camera
+        else:
+            raise InputError(
+                f"camera: {type(camera).__name__}: no camera; give a Camera, a View, a Mitsuba sensor or the "
+                "index of a test view"
+            )
+        return found if size is None else found.resized(size)
+
+    # ---------------- pictures ----------------
+
+    def render(
+        self,
+        camera: CameraLike = 0,
+        *,
+        size: int | tuple[int, int] | None = None,
+        samples: int = 1,
+        alone: bool = False,
+    ) -> np.ndarray:
+        """The picture (H, W, 4) of a camera: linear RGB, premultiplied by alpha, and alpha.
+
+        samples: of a pixel, 4 are 2 × 2 and box filtered, 1 is its centre, as in training. alone: the object
+        without its surroundings. What has surroundings has alpha 1 otherwise. Raises InputError as `camera`
+        does.
+        """
+        seen = self.camera(camera, size)
+        frame = self._frame(seen, samples, alone, aovs=False)
+        radiance, alpha = composited(frame)
+        return planes([*radiance, alpha], seen.height, seen.width)
+
+    def aovs(
+        self,
+        camera: CameraLike = 0,
+        names: Sequence[str] = ("albedo", "roughness", "metallic", "normal", "depth"),
+        *,
+        size: int | tuple[int, int] | None = None,
+        samples: int = 1,
+        alone: bool = False,
+    ) -> dict[str, np.ndarray]:
+        """Maps (H, W, 3) or (H, W, 1) of a camera by name, as the `refgs` integrator's AOVs are.
+
+        albedo, roughness, metallic (0 … 1) and unit normals (world, towards the camera) are those of what is
+        seen; depth is the distance along the ray from the near plane, scene units; diffuse, specular and
+        indirect are premultiplied and sum to the picture over black. Raises InputError for a name that is
+        none, or that the surfels have no channel for.
+        """
+        kinds = suffixes()
+        for name in names:
+            if name not in kinds:
+                raise InputError(f"aovs: {name}: unknown; use some of {', '.join(kinds)}")
+        seen = self.camera(camera, size)
+        frame = self._frame(seen, samples, alone, aovs=True)
+        found = {}
+        for name in names:
+            try:
+                values = aov_values(name, frame, seen)
+            except KeyError:
+                raise InputError(f"aovs: {name}: the surfels have no such channel; leave it out") from None
+            found[name] = planes(values, seen.height, seen.width)
+        return found
+
+    def _frame(self, camera: Camera, samples: int, alone: bool, aovs: bool) -> Frame:
+        """A frame of a renderer that is made once."""
+        key = mi.variant(), samples, alone, aovs
+        if key not in self._renderers:
+            scene = replace(self.trained, surroundings=None) if alone else self.trained
+            self._renderers[key] = scene.renderer(aovs=aovs, samples=samples)
+        return self._renderers[key](camera)
+
+    # ---------------- other programs ----------------
+
+    def scene(
+        self,
+        cameras: CameraLike | Sequence[CameraLike] = 0,
+        *,
+        aovs: Sequence[str] = (),
+        alone: bool = False,
+    ) -> Any:
+        """A `mi.Scene` whose integrator has this reconstruction, and a sensor for each of the cameras.
+
+        `mi.traverse` of it shows the raw channels (N, D) of the surfels, such as "refgs.roughness", and the
+        raw map of the light, "refgs.light": `mi.render(scene, params)` differentiates all of them. It is what
+        `mi.load_file` makes of the scene.xml of a run. aovs: types, or name:type, appended to the picture.
+        Raises InputError for what no Mitsuba sensor shows, and for AOVs that are none.
+        """
+        several = [*cameras] if isinstance(cameras, list | tuple) else [cameras]
+        first, *more = (self.camera(one) for one in several)
+        with tempfile.TemporaryDirectory(prefix="refgs_") as folder:
+            export(self.trained, Path(folder), first, more)
+            return load_scene(Path(folder) / SCENE, aovs, alone)
+
+    def save(self, folder: str | Path) -> Reconstruction:
+        """Write a run folder without checkpoints, which every command that takes a run reads; returns that.
+
+        `load` of it renders the same pictures, bit for bit. Raises InputError for a folder that holds a run,
+        has a foreign file in the way or cannot be written.
+        """
+        self.source.save(self.trained, Path(folder), self.cameras()[0])
+        return load(folder)
+
+    def export(self, form: str, path: str | Path, *, overwrite: bool = False, **options: Any) -> list[Path]:
+        """Write a file or folder of another program, such as "3dgs-ply" or "cameras"; returns the files.
+
+        `mi_refgs.formats.FORMATS` lists the formats and their options, as `refgs export --help` does. In a
+        folder, only `overwrite` replaces foreign files. Raises InputError for an unknown format or option, a
+        scene that the format cannot hold, a package that is missing, and a path that cannot be written.
+        """
+        shots = self.source.shots(self.trained, "test", "train")
+        return formats.write(self.trained, [form], Path(path), shots, options, self.folder, overwrite)[form]
+
+    # ---------------- changes ----------------
+
+    def relight(
+        self,
+        light: AnyLight,
+        *,
+        world: bool = False,
+        rotate: float = 0.0,
+        exposure: float = 0.0,
+    ) -> Reconstruction:
+        """The same under another light: materials alone, shaded by it, with shadows and bounces of the mesh.
+
+        light: a lat-long map (EXR, HDR), linear radiance (h, w, 3) of one, or an `EnvironmentLight`. Its
+        first row is straight up, along +z, unless it is in `world` directions already, as an
+        `EnvironmentLight`, environment.exr and envmap.exr are. rotate: degrees about +z, counter-clockwise
+        seen from above. exposure: stops. Raises InputError for a reconstruction without light or materials
+        (`runs.relightable`) and a light that cannot be used.
+        """
+        scene = replace(relightable(self.trained), light=any_light(light, world, rotate, exposure))
+        return self.changed(scene)
+
+    def edit(
+        self,
+        *,
+        view: CameraLike = 0,
+        split: str = "test",
+        join: Reconstruction | str | Path | None = None,
+        **options: Unpack[editing.Options],
+    ) -> Reconstruction:
+        """The same with some surfels changed, as by `refgs edit`; `source.edits[-1]` then says how many.
+
+        options: `EditOptions`, such as where="metallic > 0.5", set={"roughness": 0.3}; a `mask` is of a
+        `view`. join: what is added under the light of this; selected and changed is then that. Raises
+        InputError for what makes no sense.
+        """
+        of = self if join is None else join if isinstance(join, Reconstruction) else load(join)
+        camera = None if options.get("mask") is None else of.camera(view, split=split)
+        into = None if join is None else self.trained
+        edited = editing.edit(of.trained, camera=camera, into=into, **options)
+        record = {"run" if join is None else "join": of.folder and str(of.folder), **edited.record}
+        source = replace(self.source, edits=(*self.source.edits, record))
+        return replace(self.changed(edited.scene), source=source)
+
+    def changed(self, trained: TrainedScene) -> Reconstruction:
+        """Another scene of the same method and data, in memory."""
+        return replace(self, trained=trained, folder=None)
+
+    def evaluate(
+        self,
+        data: str | Path | None = None,
+        *,
+        samples: int = 1,
+        antialias: bool = False,
+        progress: bool = False,
+    ) -> dict[str, Any]:
+        """Measure the run on its test views, or on those of `data`: what `refgs eval` writes and prints.
+
+        Raises InputError where it is only in memory, and as `evaluation.evaluate.evaluate` does.
+        """
+        if self.folder is None:
+            raise InputError("evaluate: folder: only in memory; measure what save(folder) returns")
+        place = None if data is None else Path(data)
+        return evaluation.evaluate(Run(self.folder), place, progress, samples, antialias)
+
+
+def load(run: str | Path, *, write: bool = True) -> Reconstruction:
+    """Read a run folder: the artefacts, first written unless `write` is off where a checkpoint is newer.
+
+    Raises InputError for a folder that is no run, holds neither artefacts nor a checkpoint, or has a file
+    that cannot be used; and where no Mitsuba variant is set that the renderer can use.
+    """
+    require_supported_variant("mi_refgs.load")
+    folder = Run(run)
+    source = Source.of(folder)
+
+    def first(fresh: TrainedScene) -> Camera:
+        return source.shots(fresh, "test")[0].camera
+
+    trained = up_to_date(folder, source.method, first) if write else newest(folder, source.method)
+    return Reconstruction(trained, source, folder.path)

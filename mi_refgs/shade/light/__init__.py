@@ -1,0 +1,1 @@
+"""Environment light: map, activation, prefilter, files."""

@@ -1,0 +1,244 @@
+"""The environment light: learnable lat-long radiance, its prefiltered levels, and lookups for shading.
+
+Directions follow Mitsuba's `envmap`: up is +y, φ = atan2(x, -z) runs along a row, θ from +y down the rows;
+column centres at half-integers, the first and the last row at the poles (`lobe_matrices`). Images go in and
+out unturned.
+
+Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that
+an optimiser's step bounds the change of radiance; an exponential would let one step multiply a highlight.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.constants import RAW_LIMIT
+from mi_refgs.errors import InputError
+from mi_refgs.io.exr import write_exr
+from mi_refgs.kernels.device import upload_tensor
+from mi_refgs.kernels.timing import boundary, phase
+from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.light_file import read_radiance
+from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels
+from mi_refgs.shade.light.positive import bounded, nearest_raw, softplus
+from mi_refgs.shade.light.prefilter import Operator, prefilter
+
+DEFAULT_HEIGHT = 64
+"""Rows of a light that is fitted: 2.8° a texel, about what an image of a few hundred pixels resolves in a
+mirror."""
+
+MIN_HEIGHT = 8
+"""Fewest rows for which the prefilter's symmetries hold."""
+
+FINEST = 1024
+"""Most rows of a light that is read from a file without saying how many: 0.2° per texel."""
+
+RADIANCE_FLOOR = 1e-4
+"""Darkest radiance that an import keeps: softplus has no finite raw value for 0."""
+
+POLE_SINE = 1e-4
+"""Within 0.006° of a pole the azimuth is fixed, so that its derivative stays below 1e4."""
+
+
+def is_height(rows: int) -> bool:
+    """Whether a learnable light may have so many rows."""
+    return rows % 4 == 0 and rows >= MIN_HEIGHT
+
+
+@dataclass(frozen=True)
+class PrefilteredLight:
+    """Levels of an environment (`EnvironmentLight.prefilter`): a `light.Light`, traced and differentiable."""
+
+    operator: Operator
+    levels: Any  # flat RGBA texels, level after level
+
+    def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
+        """Radiance (bilinear) that arrives from unit world directions; derivative in light and direction."""
+        return self._bilinear(*_azimuth_polar(direction), mi.UInt32(0))
+
+    def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
+        """∫ L cosθ dω / π over the hemisphere of unit world normals: constant light 1 gives 1.
+
+        At roughness 1 the lobe D is constant and only the cosine is left, so this is the last level.
+        """
+        return self._bilinear(*_azimuth_polar(normal), mi.UInt32(len(self.operator.roughness)))
+
+    def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
+        """Radiance averaged over the GGX lobe around unit world directions.
+
+        Linear between levels in 1/roughness, where the mixture keeps both the lobe's energy (6 %) and its
+        peak, and in roughness⁴ below the first level, where a lobe narrower than a texel only begins to
+        spread. Derivative in light, direction and roughness. [split sum, Karis 2013]
+        """
+        place = _level(roughness, self.operator.roughness)
+        lower = dr.minimum(mi.UInt32(dr.detach(place)), len(self.operator.roughness) - 1)
+        at = _azimuth_polar(direction)
+        return dr.lerp(self._bilinear(*at, lower), self._bilinear(*at, lower + 1), place - mi.Float(lower))
+
+    def _bilinear(self, u: Any, v: Any, level: Any) -> Any:
+        """Colour at the fractions u of a turn and v of a meridian."""
+        info = self.operator.info
+        first, h, w = (dr.gather(mi.UInt32, info, 4 * level + k) for k in range(3))
+
+        def texel(index: Any) -> Any:
+            return dr.gather(mi.Vector4f, self.levels, first + index)
+
+        colour = _interpolated(texel, u, v, h, w)
+        return mi.Color3f(colour.x, colour.y, colour.z)
+
+
+@dataclass(frozen=True)
+class UnfilteredLight:
+    """The map alone (`EnvironmentLight.unfiltered`), for models that look up nothing but radiance."""
+
+    height: int
+    texels: Any  # flat RGB texels, under AD
+
+    def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
+        """Radiance in unit directions, as `PrefilteredLight.radiance` gives it."""
+        h = dr.opaque(mi.UInt32, self.height)
+
+        def texel(index: Any) -> Any:
+            return dr.gather(mi.Color3f, self.texels, index)
+
+        return _interpolated(texel, *_azimuth_polar(direction), h, 2 * h)
+
+    def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
+        """Raises InputError: that needs a filter."""
+        raise InputError("light: irradiance: the light is not filtered; use EnvironmentLight.prefilter()")
+
+    def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
+        """Raises InputError: that needs a filter."""
+        raise InputError("light: specular: the light is not filtered; use EnvironmentLight.prefilter()")
+
+
+def _interpolated(texel: Callable[[Any], Any], u: Any, v: Any, h: Any, w: Any) -> Any:
+    """Bilinear value of a map of h rows and w columns at the fractions u of a turn and v of a meridian."""
+    x, y = dr.fma(u, mi.Float(w), -0.5), v * mi.Float(h - 1)
+    left = mi.Int32(dr.floor(dr.detach(x)))
+    # Bounded as integers: a NaN becomes some integer, and a bound in floats lets it pass.
+    row = dr.minimum(mi.UInt32(dr.detach(y)), h - 2)
+    s, t = x - mi.Float(left), y - mi.Float(row)
+    column = mi.UInt32(dr.select(left < 0, mi.Int32(w) - 1, dr.minimum(left, mi.Int32(w) - 1)))
+    right = dr.select(column + 1 < w, column + 1, 0)
+    above = row * w
+    upper = dr.lerp(texel(above + column), texel(above + right), s)
+    below = dr.lerp(texel(above + w + column), texel(above + w + right), s)
+    return dr.lerp(upper, below, t)
+
+
+def _azimuth_polar(direction: Any) -> tuple[Any, Any]:
+    """Fractions u of a turn and v of a meridian of unit directions, with finite derivatives at the poles."""
+    x, y, z = direction.x, direction.y, direction.z
+    sin2 = x * x + z * z
+    off_pole = sin2 > POLE_SINE**2
+    # The pole itself has no azimuth, in Mitsuba neither; it looks along +z here.
+    φ = dr.atan2(dr.select(off_pole, x, 0), -dr.select(off_pole, z, 1))
+    u = φ * (0.5 / dr.pi)
+    u = dr.select(u < 0, u + 1, u)
+    # At the pole itself sqrt has no derivative, and the sign of y alone tells the two poles apart.
+    sin = dr.select(off_pole, dr.sqrt(dr.select(off_pole, sin2, 1)), 0)
+    return u, dr.atan2(sin, dr.select(off_pole, y, dr.select(y < 0, -1, 1))) * (1 / dr.pi)
+
+
+def _level(roughness: Any, levels: tuple[float, ...]) -> Any:
+    """Fractional level 0 … L of a roughness, clamped to [0, 1], for the roughness of the L levels."""
+    first = levels[0]
+    r = dr.clip(roughness, 0, 1)
+    sharp = dr.minimum(r, first) * (1 / first)
+    level = dr.square(dr.square(sharp))
+    inverse = dr.rcp(dr.maximum(r, first))
+    for a, b in pairwise(levels):
+        level += dr.clip((inverse - 1 / a) * (1 / (1 / b - 1 / a)), 0, 1)
+    return level
+
+
+@dataclass(frozen=True)
+class EnvironmentLight:
+    """A learnable lat-long light: `raw` is a tensor (h, 2h, 3), h a multiple of 4, radiance = softplus(raw).
+
+    Raises InputError for another shape.
+    """
+
+    raw: Any
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.raw.shape)
+        h = shape[0] if shape else 0
+        if shape != (h, 2 * h, 3) or not is_height(h):
+            raise InputError(
+                f"EnvironmentLight: raw: shape {shape}; need (h, 2h, 3), h ≥ {MIN_HEIGHT} a multiple of 4: "
+                "EnvironmentLight.from_file resamples"
+            )
+
+    @classmethod
+    def constant(cls, radiance: float = 0.5, height: int = DEFAULT_HEIGHT) -> EnvironmentLight:
+        """The same positive radiance from everywhere."""
+        return cls.from_radiance(np.full((height, 2 * height, 3), radiance))
+
+    @classmethod
+    def from_radiance(cls, radiance: np.ndarray) -> EnvironmentLight:
+        """Take linear radiance (h, 2h, 3), in Mitsuba's orientation; values below 1e-4 become 1e-4.
+
+        Raises InputError for NaN, infinity or another shape.
+        """
+        radiance = np.asarray(radiance, np.float64)
+        if not np.isfinite(radiance).all():
+            raise InputError("EnvironmentLight: radiance: holds NaN or infinity; replace those texels")
+        return cls(upload_tensor(nearest_raw(np.maximum(radiance, RADIANCE_FLOOR))))
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:
+        """Read a lat-long image (EXR, HDR) and resample it to `height` rows, keeping its energy.
+
+        Without `height`: the image's own rows, to the next lower multiple of 4, and FINEST at most. Raises
+        InputError as `read_radiance` does.
+        """
+        image = read_radiance(path, height or FINEST)
+        rows = height if height is not None else max(MIN_HEIGHT, image.shape[0] // 4 * 4)
+        return cls.from_radiance(lobe_matrices.resample(image, rows))
+
+    @property
+    def height(self) -> int:
+        """Rows h of the map."""
+        return int(self.raw.shape[0])
+
+    def radiance(self) -> Any:
+        """Linear radiance (h, 2h, 3), a tensor under AD; 0 with gradient 0 where |raw| is not < RAW_LIMIT."""
+        return mi.TensorXf(bounded(softplus(self.raw.array), self.raw.array), shape=tuple(self.raw.shape))
+
+    def unusable(self) -> int:
+        """How many raw values are not < RAW_LIMIT, and black; waits for the device."""
+        return int(dr.count(~(dr.abs(dr.detach(self.raw.array)) < RAW_LIMIT))[0])
+
+    def prefilter(self, levels: Levels = LEVELS) -> PrefilteredLight:
+        """The levels of this light, under AD; a fixed linear operator on the radiance (`prefilter`)."""
+        return boundary(self._prefilter(levels), "prefilter backward")
+
+    @phase("prefilter forward")
+    def _prefilter(self, levels: Levels) -> PrefilteredLight:
+        return PrefilteredLight(*prefilter(self.radiance(), levels))
+
+    def unfiltered(self) -> UnfilteredLight:
+        """The map of this light, under AD, for models that look up nothing but radiance."""
+        return UnfilteredLight(self.height, self.radiance().array)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the radiance as a float32 EXR that Mitsuba's `envmap` shows in the same directions; atomic.
+
+        Raises InputError when the place cannot be written.
+        """
+        path = Path(path)
+        with suppress(OSError):  # a folder that cannot be made cannot be written to either
+            path.parent.mkdir(parents=True, exist_ok=True)
+        write_exr(path, self.radiance().numpy())

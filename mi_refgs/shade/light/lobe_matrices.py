@@ -1,0 +1,210 @@
+"""The GGX lobe as a linear operator on a lat-long map, diagonal in azimuth. NumPy float64, no Dr.Jit.
+
+With N = V = R the lobe depends only on the angle between R and L, so on a lat-long grid the filter commutes
+with every rotation about the pole: it acts on each azimuthal frequency m separately, as a small matrix from
+input rows to output rows. Those matrices, built once a resolution, *are* the prefilter, the whole lobe
+included and nothing cut: where a lobe is wide, all but the lowest frequencies vanish and cost nothing.
+
+Grid    Rows stand at θ = πi/(h-1) from +y (first and last row are the poles), columns at φ = 2π(j+½)/w with
+        φ = atan2(x, -z). That is where Mitsuba's `envmap` puts the texels of an image, measured by
+        tests/shade/test_envmap.py.
+Radiance between texels is bilinear, as Mitsuba looks it up: the operator integrates the lobe against that
+function.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+LEVEL_ROUGHNESS = (0.1, 0.15, 0.22, 0.32, 0.45, 0.65, 1.0)
+"""Roughness of the filtered levels (level 0 is the map itself): α about doubles from one to the next, so that
+a mixture of two neighbours is within 6 % (L1) of the lobe between them. [measured, docs/decisions.md]"""
+
+LEVEL_MAX_HEIGHT = (128, 128, 128, 64, 32, 32, 32)
+"""Rows of each level, at most. Bilinear lookups of a point light are then off by 1.2, 1.1, 1.4, 0.4 and 0.3 %
+(L1) from the third level on; the first two are as fine as the finest map that is filtered. [measured]"""
+
+
+@dataclass(frozen=True)
+class Levels:
+    """The filtered levels of a light: roughness, rising to 1, and at most how many rows each has."""
+
+    roughness: tuple[float, ...] = LEVEL_ROUGHNESS
+    max_height: tuple[int, ...] = LEVEL_MAX_HEIGHT
+
+    @staticmethod
+    def some(count: int) -> Levels:
+        """So many of all levels, evenly chosen: the sharpest, the roughest, and those between."""
+        chosen = np.unique(np.linspace(0, len(LEVEL_ROUGHNESS) - 1, count).round().astype(int))
+        roughness = tuple(LEVEL_ROUGHNESS[i] for i in chosen)
+        return Levels(roughness, tuple(LEVEL_MAX_HEIGHT[i] for i in chosen))
+
+
+LEVELS = Levels()
+"""The levels of a light by default."""
+
+DROP_BELOW = 1e-5
+"""Matrix entries below this fraction of their level's largest are dropped: 0.05 % of a lobe (L1), 1e-4 of its
+peak at the worst."""
+
+HORIZON_CUTS = 0.5
+"""Roughness from which a lobe ends at the horizon rather than before it."""
+
+MIN_SUBSAMPLES = 2
+"""Quadrature points a texel side where the lobe is wider than a texel."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """One filtered level: `weights` (h_out, h_in, M) from Fourier coefficients of input to output rows."""
+
+    roughness: float
+    height: int
+    weights: np.ndarray
+
+
+def row_angles(h: int) -> np.ndarray:
+    """Polar angles (h,) of the rows, radians from +y; first and last row are the poles."""
+    return np.linspace(0.0, np.pi, h)
+
+
+def column_angles(w: int) -> np.ndarray:
+    """Azimuths (w,) of the columns, radians, φ = atan2(x, -z)."""
+    return (np.arange(w) + 0.5) * (2 * np.pi / w)
+
+
+def map_directions(h: int) -> np.ndarray:
+    """Unit world directions (h, 2h, 3) of the texels of a lat-long map."""
+    θ, φ = np.meshgrid(row_angles(h), column_angles(2 * h), indexing="ij")
+    return np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], axis=-1)
+
+
+def lobe(cos_angle: np.ndarray, roughness: float) -> np.ndarray:
+    """Unnormalised GGX lobe max(L·R, 0) D(R·H) of the angle between L and R, α = roughness². [Karis 2013]"""
+    α2 = roughness**4
+    d = 0.5 * (1 + α2) - (0.5 * (1 - α2)) * cos_angle  # = 1 + (α²-1) cos²(half the angle)
+    return np.maximum(cos_angle, 0) / (d * d)
+
+
+def row_areas(h: int) -> np.ndarray:
+    """∫ hat_i(θ) sinθ dθ (h,): a row's share of the sphere, linear between rows; they sum to 2."""
+    θ = row_angles(h)
+    s, c, d = np.sin(θ), np.cos(θ), np.pi / (h - 1)
+    # Exact integral of the linear ramp over one interval, seen from its left and from its right end.
+    left = c[:-1] + (s[:-1] - s[1:]) / d
+    right = -c[1:] + (s[1:] - s[:-1]) / d
+    return np.concatenate([left, [0.0]]) + np.concatenate([[0.0], right])
+
+
+def row_resampling(h_in: int, h_out: int) -> np.ndarray:
+    """(h_out, h_in) matrix between row grids: area-weighted hats to coarsen, linear to refine."""
+    step = np.pi / (min(h_in, h_out) - 1)
+    hat = np.maximum(0, 1 - np.abs(row_angles(h_out)[:, None] - row_angles(h_in)[None]) / step)
+    if h_out < h_in:
+        hat *= row_areas(h_in)
+    return hat / hat.sum(1, keepdims=True)
+
+
+def column_resampling(w_in: int, w_out: int) -> np.ndarray:
+    """(w_out, w_in) matrix between column grids, periodic; hats as in `row_resampling`."""
+    step = 2 * np.pi / min(w_in, w_out)
+    Δ = np.abs(column_angles(w_out)[:, None] - column_angles(w_in)[None])
+    hat = np.maximum(0, 1 - np.minimum(Δ, 2 * np.pi - Δ) / step)
+    return hat / hat.sum(1, keepdims=True)
+
+
+def hat_rows(count: int, fewer: int, periodic: bool = False) -> Any:
+    """`row_resampling(count, fewer)`, or of columns if `periodic`, sparse (fewer, count) float32."""
+    from scipy.sparse import csr_matrix
+
+    last = 0 if periodic else 1  # rows stand on both ends of their interval, columns do not
+    ratio = (count - last) / (fewer - last)
+    offset = 0.5 * (ratio - 1) if periodic else 0.0
+    centre = ratio * np.arange(fewer) + offset  # in steps of the finer grid
+    index = np.round(centre).astype(int)[:, None] + np.arange(-int(ratio) - 1, int(ratio) + 2)
+    weight = np.maximum(0, 1 - np.abs(centre[:, None] - index) / ratio)
+    if periodic:
+        index %= count
+    else:
+        weight[(index < 0) | (index >= count)] = 0
+        index = np.clip(index, 0, count - 1)
+        weight *= row_areas(count)[index]
+    weight /= weight.sum(axis=1, keepdims=True)
+    row = np.repeat(np.arange(fewer), index.shape[1])
+    matrix = csr_matrix((weight.ravel().astype(np.float32), (row, index.ravel())), shape=(fewer, count))
+    matrix.eliminate_zeros()
+    return matrix
+
+
+def resample(radiance: np.ndarray, height: int) -> np.ndarray:
+    """Radiance (h, w, 3) at (height, 2·height, 3), keeping its integral when it coarsens."""
+    h, w = radiance.shape[:2]
+    rows = np.tensordot(row_resampling(h, height), radiance.astype(np.float64), 1)
+    return np.einsum("ab,ibc->iac", column_resampling(w, 2 * height), rows)
+
+
+def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
+    """Matrices (h_out, h, h+1) of the lobe from input to output rows, frequencies 0 … h of w = 2h columns.
+
+    Entry (i, k, m) multiplies Σ_j x[k, j] (cos, sin)(mφ_j); the series Σ_m (a_m cos mφ + b_m sin mφ) is then
+    the filtered radiance of row i at any azimuth, and exactly the circulant filter of the w columns at the
+    columns themselves.
+    """
+    w, texel = 2 * h, np.pi / (h - 1)
+    core = 2 * roughness**2  # the lobe falls to a quarter at this angle, radians
+    s = max(MIN_SUBSAMPLES, int(np.ceil(2.5 * texel / core)) + 1)
+    t = (np.arange(s) + 0.5) / s
+    θ = (np.arange((h - 1) * s) + 0.5) * (texel / s)
+    # A sample lies between the texels d and d + 1: its bilinear weights, then the transform of the texels.
+    shares = np.stack([1 - t, t], axis=1)
+    m, d = np.arange(h + 1), np.arange(h)
+    # Over half the circle, the other half is its mirror image: (h, 2, h+1).
+    cosines = np.cos(2 * np.pi / w * m * (d[:, None, None] + np.array([0, 1])[:, None]))
+    cosines = cosines.reshape(2 * h, h + 1)
+    cos_φ = np.cos((np.arange(h * s) + 0.5) * (2 * np.pi / (w * s)))
+    out = np.zeros((h_out, h, h + 1))
+    for i, θ_out in enumerate(row_angles(h_out)[: (h_out + 1) // 2]):
+        near = θ <= θ_out + 0.5 * np.pi  # rows beyond hold no light of this hemisphere
+        cos_angle = np.outer(np.sin(θ_out) * np.sin(θ[near]), cos_φ)
+        cos_angle += (np.cos(θ_out) * np.cos(θ[near]))[:, None]
+        texels = np.zeros((len(θ), 2 * h))
+        texels[near] = (lobe(cos_angle, roughness).reshape(-1, h, s) @ shares).reshape(-1, 2 * h)
+        texels *= np.sin(θ)[:, None]
+        rows = np.einsum("sn,ksc->nkc", shares, texels.reshape(h - 1, s, 2 * h)) @ cosines
+        out[i, :-1] += rows[0]
+        out[i, 1:] += rows[1]
+        out[i] /= out[i, :, 0].sum()  # a constant map stays constant, exactly
+        out[h_out - 1 - i] = out[i, ::-1]
+    scale = np.full(h + 1, 2.0 / w)
+    scale[[0, -1]] = 1.0 / w
+    return out * scale
+
+
+def build_levels(h: int, levels: Levels = LEVELS) -> list[Level]:
+    """The filtered levels of a map (h, 2h), coarser ones on coarser grids.
+
+    Maps of more rows than the finest level are averaged down to it first, inside the same matrices.
+    """
+    h_in = min(h, levels.max_height[0])
+    built = []
+    for roughness, cap in zip(levels.roughness, levels.max_height, strict=True):
+        weights = fourier_rows(roughness, h_in, min(h_in, cap))
+        if h_in < h:
+            m = np.arange(h_in + 1)
+            first = column_resampling(2 * h, 2 * h_in)[0]
+            offset = column_angles(2 * h) - column_angles(2 * h_in)[0]
+            transfer = (first[:, None] * np.cos(m * offset[:, None])).sum(0) * (h_in / h)
+            weights = np.einsum("ikm,kn,m->inm", weights, row_resampling(h, h_in), transfer, optimize=True)
+        rows = weights.shape[0]
+        weights = weights[:, :, : rows + 1]  # a level of w columns holds frequencies up to w/2
+        if rows < h_in and roughness > HORIZON_CUTS:
+            # The edge at the horizon has a long series. Cut short, it rings: light would turn negative
+            # opposite a sun. Lanczos' factors fade it out.
+            weights = weights * np.sinc(np.arange(rows + 1) / (rows + 1))
+        kept = np.abs(weights) > DROP_BELOW * np.abs(weights).max()
+        kept[:, :, 0] = True  # the mean is never thinned: constants stay constant
+        built.append(Level(roughness, weights.shape[0], np.where(kept, weights, 0)))
+    return built

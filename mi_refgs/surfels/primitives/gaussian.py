@@ -1,0 +1,203 @@
+"""The screen footprint of a 3D Gaussian by EWA: the affine approximation of its projection, and a low-pass.
+
+A Gaussian has centre p (camera frame), unit axes t_0 t_1 t_2 and standard deviations s_k. With the slope
+q = (p_x, p_y)/p_z, no further from the picture than GAUSSIAN_SLOPE_MARGIN, one standard deviation along t_k
+moves the projected point by f v_k pixels, and the screen covariance is the sum of their outer products:
+
+    v_k = (s_k / p_z) (t_k.xy - q t_k.z)          Σ' = Σ_k (f v_k) (f v_k)ᵀ + λ I      [Zwicker 2001, eq. 31;
+                                                                                   3DGS, Kerbl 2023, eq. 5]
+    α = min(α_max, o exp(-ρ/2)),   ρ = δᵀ Σ'⁻¹ δ
+
+for a pixel at offset δ from the projected centre, and the sample lies at the depth of the centre. λ is the
+low-pass. Lengths enter as ratios to the depth, and ρ as the sum of two squares,
+
+    ρ = (a·δ)² + (b δ_y)²,   a = √(Σ'_yy / det) (1, -Σ'_xy / Σ'_yy),   b = 1 / √Σ'_yy
+
+whose determinant is a sum of squares too: (v_i × v_j) = (s_i s_j / p_z²) (q, 1)·t_k. Nothing cancels, so that
+needles and pancakes keep their digits in float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN, GAUSSIAN_LOW_PASS, GAUSSIAN_SLOPE_MARGIN, SIZE_RANGE
+from mi_refgs.surfels.primitives.primitive import Footprints, Primitive, rotation_axes
+from mi_refgs.surfels.primitives.screen import linear, reach, rectangle
+
+
+@dataclass(frozen=True)
+class GaussianSample:
+    """A Gaussian's footprint at one pixel, with the intermediate values that its derivatives reuse."""
+
+    alpha: Any  # after the clamp
+    z: Any  # depth of the centre
+    valid: Any  # contributes: α ≥ ALPHA_MIN
+    gaussian: Any  # exp(-ρ/2)
+    clamped: Any  # α_max was reached: no derivative
+    delta: Any  # pixel offset from the centre
+    u: Any  # a·δ
+    v: Any  # b δ_y
+
+
+class Gaussian(Primitive):
+    """A 3D Gaussian with three standard deviations along the axes of a rotation. [3DGS, §4]"""
+
+    name = "gaussian"
+    widths = {"position": 3, "rotation": 4, "scale": 3, "opacity": 1}  # noqa: RUF012
+    columns = 7  # a.x a.y b p.z centre.x centre.y opacity
+    sizes = ("scale",)
+
+    def project(self, surfels: Any, camera: Any, shift: Any = None) -> Footprints:
+        """Rows, and rectangles that hold every pixel with α ≥ ALPHA_MIN.
+
+        Culled: centre not beyond the near plane, opacity below ALPHA_MIN, non-finite.
+        """
+        p = camera.to_camera(surfels.position())
+        axes = [camera.rotation @ t for t in surfels.frame()]
+        s, opacity = surfels.scale(), surfels.opacity()
+        ahead = dr.detach((p.z > camera.near) & (p.z > 0))
+        # Divide by harmless numbers where culled: a masked Inf would still poison the adjoint.
+        z = dr.select(ahead, p.z, 1)
+        nearness = dr.rcp(z)
+        slope = mi.Vector2f(p.x, p.y) * nearness
+        visible = ahead & dr.detach(
+            (opacity >= ALPHA_MIN) & dr.isfinite(dr.sum(slope) + dr.sum(s) + opacity + dr.square(nearness))
+        )
+        s = dr.clip(dr.select(visible, s * nearness, 1), 1 / SIZE_RANGE, SIZE_RANGE)
+        focal, middle = mi.Vector2f(camera.fx, camera.fy), mi.Vector2f(camera.cx, camera.cy)
+        # In units of slope rather than pixels, so that fourth powers of sizes fit float32.
+        q = _near_picture(dr.select(visible, slope, 0), camera)
+        along = [
+            mi.Vector2f(*(dr.fma(-q[i], t.z, t[i]) for i in range(2))) * s[k] for k, t in enumerate(axes)
+        ]
+        facing = [dr.fma(q.x, t.x, dr.fma(q.y, t.y, t.z)) for t in axes]
+        low_pass = GAUSSIAN_LOW_PASS / dr.square(focal)
+        unfiltered = mi.Vector2f(*(sum(dr.square(v[i]) for v in along) for i in range(2)))
+        xx, yy = unfiltered + low_pass
+        xy = sum(v.x * v.y for v in along)
+        crossed = sum(dr.square(s[k - 2] * s[k - 1] * facing[k]) for k in range(3))
+        determinant = crossed + low_pass.x * yy + low_pass.y * unfiltered.x
+        a = dr.sqrt(yy * dr.rcp(determinant))
+        centre = focal * slope + middle
+        if shift is not None:
+            centre += mi.Vector2f(shift)
+        columns = [
+            a / focal.x,
+            -a * xy / (yy * focal.y),
+            dr.rsqrt(yy) / focal.y,
+            z,
+            centre.x,
+            centre.y,
+            opacity,
+        ]
+        columns = [dr.select(visible, column, 0) for column in columns]
+        with dr.suspend_grad():
+            # Rounding of the contour itself, in pixels.
+            half = dr.sqrt(reach(opacity) * mi.Vector2f(xx, yy)) * dr.abs(focal) * 1.0001 + 1e-3
+            return Footprints(columns, *rectangle(centre, -half, half, visible, camera), self)
+
+    def evaluate(self, row: Any, pixel: Any, near: Any) -> GaussianSample:
+        """The two linear forms of the pixel's offset; the centre is beyond the near plane."""
+        delta = mi.Vector2f(pixel.x - row[4], pixel.y - row[5])
+        u, v = linear(row[0], row[1], delta), row[2] * delta.y
+        gaussian = dr.exp(-0.5 * dr.fma(u, u, v * v))
+        alpha = row[6] * gaussian
+        clamped = alpha > ALPHA_MAX
+        alpha = dr.select(clamped, ALPHA_MAX, alpha)
+        return GaussianSample(alpha, row[3], alpha >= ALPHA_MIN, gaussian, clamped, delta, u, v)
+
+    def adjoint(self) -> GaussianAdjoint:
+        """See `Primitive.adjoint`."""
+        return GaussianAdjoint()
+
+    def evaluate_forward(self, row: Any, sample: GaussianSample, drow: Any) -> tuple[Any, Any]:
+        """Apply the chain rule, column by column."""
+        delta, ddelta = sample.delta, mi.Vector2f(-drow[4], -drow[5])
+        du = linear(drow[0], drow[1], delta) + linear(row[0], row[1], ddelta)
+        dv = drow[2] * delta.y + row[2] * ddelta.y
+        dalpha = drow[6] * sample.gaussian - sample.alpha * dr.fma(sample.u, du, sample.v * dv)
+        return dr.select(sample.clamped, 0, dalpha), drow[3]
+
+    def normal(self, surfels: Any) -> Any:
+        """The shortest axis, the third of equal ones; which one it is has no derivative. [3DGS-DR, §3.2]"""
+        first, second, third = surfels.frame()
+        s = dr.detach(surfels.scale())
+        shorter, least = s.x < s.y, dr.minimum(s.x, s.y)
+        return dr.select(s.z <= least, third, dr.select(shorter, first, second))
+
+    def overlaps(self, row: list[Any], low: Any, high: Any) -> Any:
+        """Whether the least ρ of the rectangle, on an edge that faces the centre, is within the contour."""
+        a_x, a_y, b, _, x, y, opacity = row[: self.columns]
+        r2 = reach(opacity) * 1.0005 + 1e-4  # rounding of ρ
+        low, high = mi.Vector2f(low.x - x, low.y - y), mi.Vector2f(high.x - x, high.y - y)
+        near_x, near_y = dr.clip(0, low.x, high.x), dr.clip(0, low.y, high.y)
+        # Along an edge, ρ is a parabola: least at y = -x a_x a_y / (a_y² + b²) for x, where a·δ = 0 for y.
+        on_x = dr.clip(-near_x * a_x * a_y / dr.fma(a_y, a_y, b * b), low.y, high.y)
+        on_y = dr.clip(-near_y * a_y / a_x, low.x, high.x)
+
+        def inside(x: Any, y: Any) -> Any:
+            u = linear(a_x, a_y, mi.Vector2f(x, y))
+            return dr.fma(u, u, dr.square(b * y)) <= r2
+
+        return inside(near_x, on_x) | inside(on_y, near_y)
+
+    def depth_near(self, row: list[Any], pixel: Any) -> Any:
+        """The centre's depth, wherever the tile is: a Gaussian has no plane, its sample lies there, and files
+        fitted elsewhere were fitted in this order. [3DGS, §6]"""
+        return row[3]
+
+    def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
+        """A ball as wide as the neighbours are far, whose third axis is the normal. [3DGS, §5.1]"""
+        return {"rotation": rotation, "scale": np.repeat(np.log(spacing)[:, None], 3, axis=1)}
+
+    def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The three axes, and the standard deviations along them."""
+        return rotation_axes(raw["rotation"]), np.exp(raw["scale"])
+
+
+def _near_picture(slope: Any, camera: Any) -> Any:
+    """Slopes brought to within GAUSSIAN_SLOPE_MARGIN of the picture, with no gradient across the border.
+
+    A crop window has the borders of its film, or Gaussians would change with the window.
+    """
+    limited = []
+    width, height = camera.film or (camera.width, camera.height)
+    for x, focal, middle, size in zip(
+        slope, (camera.fx, camera.fy), camera.centre, (width, height), strict=True
+    ):
+        ends = [
+            (share * size - middle) / focal for share in (-GAUSSIAN_SLOPE_MARGIN, 1 + GAUSSIAN_SLOPE_MARGIN)
+        ]
+        limited.append(dr.clip(x, dr.minimum(*ends), dr.maximum(*ends)))
+    return mi.Vector2f(*limited)
+
+
+class GaussianAdjoint:
+    """Adjoint of `Gaussian.evaluate`: sums over pixels of the adjoints of u = a·δ and v = b δ_y, times δ."""
+
+    def __init__(self) -> None:
+        self.u, self.v = [mi.Float(0)] * 3, [mi.Float(0)] * 2
+        self.depth, self.opacity = mi.Float(0), mi.Float(0)
+
+    def add(self, sample: GaussianSample, δalpha: Any, δz: Any) -> None:
+        """Take in a pixel, by the adjoints of its α and z."""
+        delta = sample.delta
+        δalpha = dr.select(sample.clamped, 0, δalpha)
+        self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)
+        self.depth = self.depth + δz
+        slope = -δalpha * sample.alpha  # α = o exp(-(u² + v²) / 2)
+        δu, δv = sample.u * slope, sample.v * slope
+        self.u = [self.u[0] + δu, dr.fma(δu, delta.x, self.u[1]), dr.fma(δu, delta.y, self.u[2])]
+        self.v = [self.v[0] + δv, dr.fma(δv, delta.y, self.v[1])]
+
+    def columns(self, row: Any) -> list[Any]:
+        """Adjoint of the seven columns."""
+        (u, *δa), (v, δb) = self.u, self.v
+        return [*δa, δb, self.depth, -u * row[0], -dr.fma(u, row[1], v * row[2]), self.opacity]

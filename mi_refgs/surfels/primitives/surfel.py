@@ -1,0 +1,285 @@
+"""The screen footprint of a surfel: ray-plane intersection in pixel offsets, with the 2D low-pass.
+
+A surfel has centre p, unit tangents t_u, t_v, normal n (camera frame) and standard deviations s_u, s_v. The
+ray through a pixel at offset δ from the projected centre meets its plane at depth z and tangent coordinates
+(u, v), in units of s:
+
+    w = 1 + c·δ        z = p_z / w        u = a·δ / w        v = b·δ / w                  [2DGS, eq. 8-10]
+
+With q = p/p_z and the projected tangents X_u = t_u.x - q.x t_u.z, Y_u = t_u.y - q.y t_u.z (X_v, Y_v
+likewise), a and b are the rows of the inverse of their matrix: a = (Y_v, -X_v) p_z/(s_u q·n), b = (-Y_u, X_u)
+p_z/(s_v q·n), and c = n/(q·n), each divided by the focal lengths. Offsets from the centre enter,
+not pixel coordinates: two large terms that cancel in the textbook form are gone. Lengths enter as ratios, so
+the unit of the scene is free; no difference of two products is rounded twice.
+Opacity is
+
+    α = min(α_max, o exp(-ρ/2)),   ρ = min(u² + v², 12 |δ|²)                                [2DGS, eq. 11]
+
+and the sample lies at depth z, or at the centre's depth where the low-pass is the smaller (there the
+intersection may be anywhere along the ray).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    EDGE_ON_COSINE,
+    LOW_PASS_INV_VARIANCE,
+    NORM_FLOOR,
+    SIZE_RANGE,
+    SORT_DEPTH_RANGE,
+    SORT_REACH,
+)
+from mi_refgs.surfels.primitives.primitive import Footprints, Primitive, rotation_axes
+from mi_refgs.surfels.primitives.screen import linear, reach, rectangle
+
+
+@dataclass(frozen=True)
+class SurfelSample:
+    """A surfel's footprint at one pixel, with the intermediate values that its derivatives reuse."""
+
+    alpha: Any  # after the clamp
+    z: Any  # depth of the sample
+    ratio: Any  # of that to the depth of the centre
+    valid: Any  # contributes: α ≥ ALPHA_MIN and beyond the near plane
+    gaussian: Any  # exp(-ρ/2)
+    clamped: Any  # α_max was reached: no derivative
+    low_pass: Any  # the 2D filter decides
+    delta: Any  # pixel offset from the centre
+    u: Any
+    v: Any
+
+
+class Surfel(Primitive):
+    """A flat Gaussian: the point p(u, v) = position + s_u u t_u + s_v v t_v, n = t_u × t_v. [2DGS, §4.1]"""
+
+    name = "surfel"
+    widths = {"position": 3, "rotation": 4, "scale": 2, "opacity": 1}  # noqa: RUF012
+    columns = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
+    sizes = ("scale",)
+
+    def project(self, surfels: Any, camera: Any, shift: Any = None) -> Footprints:
+        """Rows, and rectangles that hold every pixel with α ≥ ALPHA_MIN.
+
+        Culled: centre not beyond the near plane, edge-on by EDGE_ON_COSINE, opacity below ALPHA_MIN,
+        non-finite.
+        """
+        p = camera.to_camera(surfels.position())
+        t_u, t_v, n = (camera.rotation @ t for t in surfels.frame())
+        s = surfels.scale()
+        opacity = surfels.opacity()
+
+        ahead = dr.detach((p.z > camera.near) & (p.z > 0))
+        # Divide by harmless numbers where culled: a masked Inf would still poison the adjoint.
+        z = dr.select(ahead, p.z, 1)
+        nearness = dr.rcp(z)
+        slope = mi.Vector2f(p.x, p.y) * nearness
+        qn = dr.fma(slope.x, n.x, dr.fma(slope.y, n.y, n.z))
+        visible = ahead & dr.detach(
+            (dr.abs(qn) > EDGE_ON_COSINE * dr.sqrt(dr.fma(slope.x, slope.x, dr.fma(slope.y, slope.y, 1))))
+            & (opacity >= ALPHA_MIN)
+            & dr.isfinite(dr.sum(slope) + qn + opacity + s.x + s.y + dr.square(nearness))
+        )
+        inverse = dr.rcp(dr.select(visible, qn, 1))
+        s = dr.clip(dr.select(visible, s * nearness, 1), 1 / SIZE_RANGE, SIZE_RANGE)
+
+        focal = mi.Vector2f(camera.fx, camera.fy)
+        along_u, along_v = (
+            mi.Vector2f(*(dr.fma(-slope[i], t.z, t[i]) for i in range(2))) for t in (t_u, t_v)
+        )
+        of_u, of_v = inverse / s.x, inverse / s.y
+        centre = focal * slope + mi.Vector2f(camera.cx, camera.cy)
+        if shift is not None:
+            centre += mi.Vector2f(shift)
+        columns = [of_u * along_v.y / focal.x, -of_u * along_v.x / focal.y]
+        columns += [-of_v * along_u.y / focal.x, of_v * along_u.x / focal.y]
+        columns += [inverse * n.x / focal.x, inverse * n.y / focal.y]
+        columns += [z, centre.x, centre.y, opacity]
+        columns = [dr.select(visible, column, 0) for column in columns]
+
+        with dr.suspend_grad():
+            low, high = _extent(
+                t_u.z * s.x, t_v.z * s.y, along_u * s.x * focal, along_v * s.y * focal, opacity
+            )
+            return Footprints(columns, *rectangle(centre, low, high, visible, camera), self)
+
+    def evaluate(self, row: Any, pixel: Any, near: Any) -> SurfelSample:
+        """The row meets the ray through each pixel; see the comment above."""
+        delta = mi.Vector2f(pixel.x - row[7], pixel.y - row[8])
+        w = dr.fma(row[4], delta.x, dr.fma(row[5], delta.y, 1))
+        in_front = w > 0
+        ratio = dr.rcp(dr.select(in_front, w, 1))
+        u = ratio * linear(row[0], row[1], delta)
+        v = ratio * linear(row[2], row[3], delta)
+        rho_plane = dr.fma(u, u, v * v)
+        rho_screen = LOW_PASS_INV_VARIANCE * dr.fma(delta.x, delta.x, delta.y * delta.y)
+        low_pass = ~in_front | (rho_screen < rho_plane)
+        gaussian = dr.exp(-0.5 * dr.select(low_pass, rho_screen, rho_plane))
+        alpha = row[9] * gaussian
+        clamped = alpha > ALPHA_MAX
+        alpha = dr.select(clamped, ALPHA_MAX, alpha)
+        ratio = dr.select(low_pass, 1, ratio)
+        z = row[6] * ratio
+        valid = (alpha >= ALPHA_MIN) & (z > near)
+        return SurfelSample(alpha, z, ratio, valid, gaussian, clamped, low_pass, delta, u, v)
+
+    def adjoint(self) -> FootprintAdjoint:
+        """See `Primitive.adjoint`."""
+        return FootprintAdjoint()
+
+    def evaluate_forward(self, row: Any, sample: SurfelSample, drow: Any) -> tuple[Any, Any]:
+        """Apply the chain rule, column by column."""
+        plane = ~sample.low_pass
+        delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
+        ddelta = mi.Vector2f(-drow[7], -drow[8])
+
+        def tangent(i: int) -> Any:
+            """Tangent of the linear form in columns i and i + 1."""
+            return linear(drow[i], drow[i + 1], delta) + linear(row[i], row[i + 1], ddelta)
+
+        dw = dr.select(plane, tangent(4), 0)
+        dz = ratio * (drow[6] - sample.z * dw)
+        du, dv = ratio * (tangent(0) - u * dw), ratio * (tangent(2) - v * dw)
+        drho = dr.select(plane, 2 * (u * du + v * dv), 2 * LOW_PASS_INV_VARIANCE * dr.dot(delta, ddelta))
+        dalpha = drow[9] * sample.gaussian - 0.5 * sample.alpha * drho
+        return dr.select(sample.clamped, 0, dalpha), dz
+
+    def normal(self, surfels: Any) -> Any:
+        """The third axis."""
+        return surfels.frame()[2]
+
+    def overlaps(self, row: list[Any], low: Any, high: Any) -> Any:
+        """With r as in `_extent`, u² + v² ≤ r² is q ≤ 0 for q(δ) = (a·δ)² + (b·δ)² - r² (1 + c·δ)².
+
+        The least q of a rectangle lies at the minimum of q itself or on an edge that faces it, where q is a
+        parabola. [cf. Speedy-Splat, Hanson et al. 2025, §4: tiles by the exact ellipse]
+        """
+        a_x, a_y, b_x, b_y, c_x, c_y, _, x, y, opacity = row[: self.columns]
+        r2 = reach(opacity) * 1.0005 + 1e-4  # rounding of q
+        low, high = mi.Vector2f(low.x - x, low.y - y), mi.Vector2f(high.x - x, high.y - y)
+        # The matrix of q of a thin ellipse keeps no digit of its determinant. That of a sum of squares of
+        # linear forms is the sum of squares of their cross products, and q itself is best left in squares.
+        a_b, a_c, b_c = a_x * b_y - a_y * b_x, a_x * c_y - a_y * c_x, b_x * c_y - b_y * c_x
+        determinant = dr.square(a_b) - r2 * dr.fma(a_c, a_c, b_c * b_c)
+        xx = dr.fma(a_x, a_x, b_x * b_x) - r2 * c_x * c_x
+        xy = dr.fma(a_x, a_y, b_x * b_y) - r2 * c_x * c_y
+        yy = dr.fma(a_y, a_y, b_y * b_y) - r2 * c_y * c_y
+        ellipse = (determinant > 0) & (xx > 0) & (yy > 0)  # else the contour reaches behind the camera
+        along_x, along_y = -r2 * c_x, -r2 * c_y
+        scale = r2 / dr.select(ellipse, determinant, 1)
+        near_x = dr.clip(-scale * dr.fma(a_c, a_y, b_c * b_y), low.x, high.x)
+        near_y = dr.clip(scale * dr.fma(a_c, a_x, b_c * b_x), low.y, high.y)
+        on_x = dr.clip(-dr.fma(xy, near_x, along_y) / dr.select(ellipse, yy, 1), low.y, high.y)
+        on_y = dr.clip(-dr.fma(xy, near_y, along_x) / dr.select(ellipse, xx, 1), low.x, high.x)
+
+        def inside(x: Any, y: Any) -> Any:
+            delta = mi.Vector2f(x, y)
+            u, v = linear(a_x, a_y, delta), linear(b_x, b_y, delta)
+            return dr.fma(u, u, v * v) <= r2 * dr.square(1 + linear(c_x, c_y, delta))
+
+        by_plane = inside(near_x, on_x) | inside(on_y, near_y)
+        beside_x, beside_y = dr.clip(0, low.x, high.x), dr.clip(0, low.y, high.y)
+        by_screen = LOW_PASS_INV_VARIANCE * dr.fma(beside_x, beside_x, beside_y * beside_y) <= r2
+        return ~ellipse | by_plane | by_screen
+
+    def depth_near(self, row: list[Any], pixel: Any) -> Any:
+        """Depth of the surfel's plane there, up to SORT_REACH standard deviations from its centre.
+
+        Beyond (in the affine approximation) the plane says nothing about the surfel. Where neighbours on a
+        curved surface tilt away from each other, the one that is looked at is the nearest; in the order of
+        their centres, those on the camera's side of it would always come first, and the picture would depend
+        on the view as no surface does. [cf. StopThePop, Radl et al. 2024, §4: depth at the tile]
+        """
+        a_x, a_y, b_x, b_y, c_x, c_y, z, x, y = row[:9]
+        delta = mi.Vector2f(pixel.x - x, pixel.y - y)
+        u, v = linear(a_x, a_y, delta), linear(b_x, b_y, delta)
+        inside = dr.minimum(1, SORT_REACH * dr.rsqrt(dr.maximum(dr.fma(u, u, v * v), NORM_FLOOR)))
+        return z / dr.maximum(dr.fma(inside, linear(c_x, c_y, delta), 1), 1 / SORT_DEPTH_RANGE)
+
+    def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
+        """A disc as wide as the neighbours are far, in the tangent plane."""
+        return {"rotation": rotation, "scale": np.repeat(np.log(spacing)[:, None], 2, axis=1)}
+
+    def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The two tangents, and the standard deviations along them."""
+        return rotation_axes(raw["rotation"])[:, :2], np.exp(raw["scale"])
+
+
+class FootprintAdjoint:
+    """Adjoint of `evaluate`, summed over the pixels of one lane before it becomes that of the columns.
+
+    The sums are of adjoints times 1, δ.x and δ.y, for the three linear forms a·δ, b·δ, c·δ: all that the
+    pixels of a footprint have in common, the row itself, is applied once at the end.
+    """
+
+    def __init__(self) -> None:
+        self.a, self.b, self.c = ([mi.Float(0)] * 3 for _ in range(3))
+        self.depth, self.opacity = mi.Float(0), mi.Float(0)
+        self.screen = [mi.Float(0)] * 2
+
+    def add(self, sample: SurfelSample, δalpha: Any, δz: Any) -> None:
+        """Take in a pixel, by the adjoints of its α and z."""
+        plane = ~sample.low_pass
+        delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
+        # α = o gaussian, unless clamped;  gaussian = exp(-ρ/2)
+        δalpha = dr.select(sample.clamped, 0, δalpha)
+        self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)
+        minus_2δrho = δalpha * sample.alpha
+        # ρ = u² + v²,  u = a·δ / w,  v = b·δ / w
+        by_plane = dr.select(plane, -ratio * minus_2δrho, 0)
+        δa, δb = u * by_plane, v * by_plane  # of a·δ and b·δ
+        self.depth = dr.fma(ratio, δz, self.depth)  # z = p_z / w, or p_z under the low-pass
+        δw = -ratio * dr.fma(sample.z, δz, dr.fma(u, u, v * v) * -minus_2δrho)
+        # In the low-pass, ρ is a multiple of δ·δ.
+        by_screen = dr.select(plane, 0, minus_2δrho)
+        self.screen = [dr.fma(by_screen, d, total) for d, total in zip(delta, self.screen, strict=True)]
+        self.a = _moments(self.a, δa, delta)
+        self.b = _moments(self.b, δb, delta)
+        self.c = _moments(self.c, dr.select(plane, δw, 0), delta)
+
+    def columns(self, row: Any) -> list[Any]:
+        """Adjoint of the ten geometry columns."""
+        a, b, c = self.a, self.b, self.c
+        # δ = pixel - centre enters a·δ, b·δ, c·δ and ρ
+        δcentre = [
+            dr.fma(LOW_PASS_INV_VARIANCE, screen, -(a[0] * row[i] + b[0] * row[2 + i] + c[0] * row[4 + i]))
+            for i, screen in enumerate(self.screen)
+        ]
+        return [*a[1:], *b[1:], *c[1:], self.depth, *δcentre, self.opacity]
+
+
+def _moments(total: list[Any], x: Any, delta: Any) -> list[Any]:
+    return [total[0] + x, dr.fma(x, delta.x, total[1]), dr.fma(x, delta.y, total[2])]
+
+
+def _extent(depth_u: Any, depth_v: Any, along_u: Any, along_v: Any, opacity: Any) -> tuple[Any, Any]:
+    """Rectangle around the centre, in pixels, that holds every pixel with α ≥ ALPHA_MIN.
+
+    The contour u² + v² = r², r² = 2 ln(o/α_min), projects to a conic; its bounds per axis follow from the
+    tangent lines of the dual conic [2DGS, appendix A, with r for 3 and the origin at the projected centre]. A
+    contour that reaches behind the camera has no bounds: such a surfel is listed everywhere. For σ along t_u
+    and t_v: depth (mi.Float) in depths of the centre, and the way across the screen (mi.Vector2f) in pixels.
+    """
+    r2 = reach(opacity)
+    denominator = r2 * (dr.square(depth_u) + dr.square(depth_v)) - 1
+    bounded = denominator < -1e-4  # float32 margin: the bounds diverge at 0
+    f = r2 / dr.select(bounded, denominator, -1)
+    low_pass = dr.sqrt(r2 / LOW_PASS_INV_VARIANCE)
+    low, high = [], []
+    for axis in range(2):
+        x_u, x_v = along_u[axis], along_v[axis]
+        middle = f * (x_u * depth_u + x_v * depth_v)
+        half = dr.sqrt(dr.maximum(dr.square(middle) - f * (dr.square(x_u) + dr.square(x_v)), 0))
+        half = half * 1.0001 + 1e-3  # rounding of the contour itself, in pixels
+        low.append(dr.select(bounded, dr.minimum(middle - half, -low_pass), -dr.inf))
+        high.append(dr.select(bounded, dr.maximum(middle + half, low_pass), dr.inf))
+    return mi.Vector2f(*low), mi.Vector2f(*high)

@@ -1,0 +1,1 @@
+"""Path-traced data sets with ground truth."""

@@ -1,0 +1,241 @@
+"""Path tracing around a Mitsuba scene: its size, camera poses, one view, the environment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mi_refgs.constants import GOLDEN_ANGLE
+from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
+from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.synthesis.materials import materials_at
+
+SAMPLES_PER_LAUNCH = 1 << 24
+"""Largest number of paths traced at once; the path tracer keeps about 100 bytes for each."""
+SURFACE_SAMPLES = 4096
+"""Points on each shape that measure the scene's size; the farthest is found to about 1 %."""
+ENVIRONMENT_OVERSAMPLING = 4
+"""Directions per texel and axis of an environment that is turned, so that a small sun keeps its energy."""
+MAPS = {"normal": "XYZ", "depth": "Y", "albedo": "RGBA", "roughness": "YA", "metallic": "YA"}
+"""Channels of the maps of a view; A is 1 where the BSDF defines the material, 0 where it does not."""
+
+
+def bounding_sphere(shapes: Sequence[Any]) -> tuple[np.ndarray, float]:
+    """Centre (3,) of the shapes' bounding box, and the radius around it that holds every surface."""
+    boxes = [shape.bbox() for shape in shapes]
+    low = np.min([np.array(box.min, dtype=np.float64) for box in boxes], axis=0)
+    high = np.max([np.array(box.max, dtype=np.float64) for box in boxes], axis=0)
+    centre = (low + high) / 2
+    return centre, reach(shapes, centre)
+
+
+def reach(shapes: Sequence[Any], centre: np.ndarray) -> float:
+    """The radius around a centre (3,) that holds every surface of the shapes."""
+    import drjit as dr
+    import mitsuba as mi
+
+    side = math.isqrt(SURFACE_SAMPLES)
+    x, y = dr.meshgrid(dr.linspace(mi.Float, 0, 1 - 1e-6, side), dr.linspace(mi.Float, 0, 1 - 1e-6, side))
+    radius = 0.0
+    for shape in shapes:
+        if shape.is_mesh():
+            points = np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+        else:
+            points = np.array(shape.sample_position(0.0, mi.Point2f(x, y)).p, dtype=np.float64).T
+        radius = max(radius, float(np.linalg.norm(points - centre, axis=1).max()))
+    return radius
+
+
+def camera_poses(
+    count: int,
+    centre: np.ndarray,
+    distance: tuple[float, float],
+    elevation: tuple[float, float],
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """World-from-camera matrices (count, 4, 4) in Mitsuba's frame that look at `centre`, z up.
+
+    A spherical Fibonacci lattice over the band of elevations (degrees): equal areas, turned by a random
+    azimuth and jittered by a third of its spacing. Each camera's distance from the centre is uniform between
+    the two given.
+    """
+    low, high = (math.sin(math.radians(e)) for e in elevation)
+    jitter = rng.uniform(-1 / 3, 1 / 3, (count, 2))
+    z = low + (high - low) * (np.arange(count) + 0.5 + jitter[:, 0]) / count
+    spacing = math.sqrt(2 * math.pi * (high - low) / count)
+    ring = np.sqrt(1 - z**2)
+    azimuth = rng.uniform(0, 2 * math.pi) + GOLDEN_ANGLE * np.arange(count) + jitter[:, 1] * spacing / ring
+    outward = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
+    return poses_around(outward, centre, rng.uniform(*distance, (count, 1)))
+
+
+def poses_around(outward: np.ndarray, centre: np.ndarray, distance: float | np.ndarray) -> np.ndarray:
+    """World-from-camera matrices (N, 4, 4) in Mitsuba's frame, z up, that look at `centre` from unit
+    `outward` (N, 3) directions, none of them ±z; `distance` is one, or (N, 1)."""
+    left = np.cross([0.0, 0.0, 1.0], -outward)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    up = np.cross(-outward, left)
+    poses = np.tile(np.eye(4), (len(outward), 1, 1))
+    poses[:, :3, :] = np.stack([left, up, -outward, centre + distance * outward], axis=2)
+    return poses
+
+
+def environment_image(scene: Any, height: int) -> np.ndarray:
+    """Radiance (height, 2·height, 3) of the scene's environment, on the grid of Mitsuba's `envmap`.
+
+    Shown by an `envmap` with an identity `to_world` it is the same light: first row at +y, last at -y;
+    column 0 beside −z, turning to +x. An `envmap` of this size that is not turned comes back unchanged; what
+    is finer is averaged (`shade.lobe_matrices.resample`).
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    emitter = scene.environment()
+    params = mi.traverse(emitter)
+    if "data" in params and np.array_equal(np.array(params["to_world"].matrix).reshape(4, 4), np.eye(4)):
+        # Without the columns that Mitsuba adds on either side for its interpolation.
+        texels = np.array(params["data"], dtype=np.float64)[:, 1:-1, :3]
+        return (lobe_matrices.resample(texels, height) * np.array(params["scale"])).astype(np.float32)
+    rows = (height - 1) * ENVIRONMENT_OVERSAMPLING + 1
+    columns = 2 * height * ENVIRONMENT_OVERSAMPLING
+    index = dr.arange(mi.UInt32, rows * columns)
+    phi = (index % columns + 0.5) * (2 * dr.pi / columns)
+    theta = (index // columns) * (dr.pi / (rows - 1))
+    si = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
+    si.wi = -mi.Vector3f(dr.sin(theta) * dr.sin(phi), dr.cos(theta), -dr.sin(theta) * dr.cos(phi))
+    # A constant emitter answers with one value for all directions.
+    radiance = np.array(emitter.eval(si) + dr.zeros(mi.Float, rows * columns))
+    image = lobe_matrices.resample(radiance.T.reshape(rows, columns, 3), height)
+    image[[0, -1]] = image[[0, -1]].mean(axis=1, keepdims=True)  # a pole is one point
+    return image.astype(np.float32)
+
+
+class Tracer:
+    """One sensor that moves from view to view, so that each kernel is compiled once.
+
+    `size` is width and height, `fov` that of the shorter side in degrees. Pictures have alpha, and emitters
+    are hidden, unless `objects` name shapes of an open scene: then pictures show all, and maps are of those
+    shapes.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        *,
+        size: tuple[int, int],
+        fov: float,
+        spp: int,
+        max_depth: int,
+        near: float,
+        far: float,
+        objects: Sequence[Any] = (),
+    ) -> None:
+        import mitsuba as mi
+
+        self.scene, self.objects = scene, objects
+        self.width, self.height = size
+        pixels = self.width * self.height
+        paths = min(pixels * spp, SAMPLES_PER_LAUNCH)
+        what = f"image: {self.width} × {self.height} pixels"
+        require(BASE + PER_PATH * paths + 8 * PER_STACKED_VALUE * pixels, what, "make smaller ones")
+        self.passes = -(-self.width * self.height * spp // SAMPLES_PER_LAUNCH)
+        # The sampler's own grid of strata: it would round up by itself, but warn each time.
+        strata = math.isqrt(-(-spp // self.passes))
+        self.spp = strata * -(-spp // (self.passes * strata))
+        self.integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": not objects})
+        self.sensor = mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": fov,
+                "fov_axis": "smaller",
+                "near_clip": near,
+                "far_clip": far,
+                "sampler": {"type": "multijitter"},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": self.width,
+                    "height": self.height,
+                    "pixel_format": "rgb" if objects else "rgba",
+                    "component_format": "float32",
+                    "rfilter": {"type": "box"},
+                },
+            }
+        )
+        self.params = mi.traverse(self.sensor)
+
+    def picture(self, pose: np.ndarray, seed: int) -> np.ndarray:
+        """Premultiplied linear RGBA (H, W, 4) of one view; of an open scene RGB (H, W, 3)."""
+        import drjit as dr
+        import mitsuba as mi
+
+        self._look(pose)
+        seeds = [seed, *np.random.SeedSequence(seed).generate_state(self.passes)[1:]]
+        image = np.zeros((self.height, self.width, 3 if self.objects else 4))
+        with dr.suspend_grad():
+            for s in seeds:
+                part = mi.render(
+                    self.scene, sensor=self.sensor, integrator=self.integrator, spp=self.spp, seed=int(s)
+                )
+                image += np.array(part) / self.passes
+        return image
+
+    def maps(self, pose: np.ndarray, covered: np.ndarray) -> dict[str, np.ndarray]:
+        """The maps of MAPS at the pixels' centres, where `covered` (H, W): hidden lamps have none.
+
+        Of an open scene only where one of its objects is seen. A mean over a pixel at an edge would belong to
+        no surface.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        self._look(pose)
+        width, height = self.width, self.height
+
+        def plane(array: Any) -> np.ndarray:
+            return np.broadcast_to(np.array(array, dtype=np.float64), width * height).reshape(height, width)
+
+        with dr.suspend_grad():
+            index = dr.arange(mi.UInt32, width * height)
+            ray = self._rays(mi.Point2f((index % width + 0.5) / width, (index // width + 0.5) / height))
+            si = self.scene.ray_intersect(ray)
+            normal = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
+            wanted = si.is_valid() if not self.objects else mi.Bool(False)
+            for shape in self.objects:
+                wanted |= si.shape == mi.ShapePtr(shape)
+            hit = plane(wanted).astype(bool) & covered
+            depth = ((np.array(si.p).T - pose[:3, 3]) @ pose[:3, 2]).reshape(height, width)
+            found = {
+                "normal": np.array(normal).T.reshape(height, width, 3),
+                "depth": depth[..., None],
+            }
+            for name, (value, known) in vars(materials_at(self.scene, si)).items():
+                planes = [plane(x) for x in (value if dr.depth_v(value) > 1 else [value])]
+                found[name] = np.stack([*planes, plane(known)], axis=-1)
+        return {name: np.where(hit[..., None], array, 0) for name, array in found.items()}
+
+    def points(self, pose: np.ndarray, film: np.ndarray) -> np.ndarray:
+        """What a view shows at positions (N, 2) on its film, 0 … 1 from the upper left: world points (N, 3),
+        NaN where it shows nothing."""
+        import drjit as dr
+        import mitsuba as mi
+
+        self._look(pose)
+        with dr.suspend_grad():
+            si = self.scene.ray_intersect(self._rays(mi.Point2f(np.ascontiguousarray(film.T, np.float32))))
+            seen = np.array(si.is_valid()) & np.ones(len(film), dtype=bool)
+            return np.where(seen[:, None], np.array(si.p, dtype=np.float64).T, np.nan)
+
+    def _rays(self, film: Any) -> Any:
+        """Rays through positions (mi.Point2f) on the film."""
+        import mitsuba as mi
+
+        return self.sensor.sample_ray(0, 0.5, film, mi.Point2f(0.5))[0]
+
+    def _look(self, pose: np.ndarray) -> None:
+        import mitsuba as mi
+
+        self.params["to_world"] = mi.ScalarTransform4f(pose)
+        self.params.update()

@@ -1,0 +1,130 @@
+"""A path-traced data set as COLMAP's text files: `images/`, and `sparse/0/` with true cameras and points.
+
+Pictures are named by number so that every eighth is a test view, the share that readers of COLMAP hold out,
+for as long as there are test views; `sparse/0/test.txt` lists all of them. Points are places on surfaces
+whose colour is the same in the views that see them, as structure from motion finds them: mirrors have few.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mi_refgs.data.colmap_text import write_cameras, write_images, write_points, write_test_list
+from mi_refgs.data.readers import HOLDOUT
+from mi_refgs.data.region import REGION_FILE
+from mi_refgs.io.files import replace_file
+from mi_refgs.io.images import read_png
+from mi_refgs.io.ownership import OutputFolder
+from mi_refgs.synthesis.pathtrace import Tracer
+from mi_refgs.synthesis.write_views import Cameras
+
+CANDIDATES = 40_000
+"""Places on surfaces that are drawn; those of one colour become points."""
+POINT_VIEWS = 4
+"""Views of a point's track at most."""
+SAME_COLOUR = 0.04
+"""Largest standard deviation of a point's encoded colour over the views of its track: three times what the
+noise of 64 samples a pixel is."""
+SAME_PLACE = 1e-3
+"""Difference of depths, as part of them, within which a view sees a place and nothing before it."""
+
+
+def colmap_output(folder: Path, data: Path, cameras: Cameras) -> OutputFolder:
+    """Claim the COLMAP files of the data set in `data`; raises InputError where a foreign one is there."""
+    output = OutputFolder(folder, f"colmap of {data.resolve()}")
+    sparse = (f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D", "test"))
+    output.claim(*sparse, REGION_FILE, *(f"images/{file}" for file in _pictures(_order(cameras)[0])))
+    return output
+
+
+def write_colmap(output: OutputFolder, data: Path, cameras: Cameras, tracer: Tracer) -> None:
+    """Write the finished data set in `data` as COLMAP; raises InputError if a file cannot be written."""
+    folder = output.path
+    names, poses, tests = _order(cameras)
+    sparse, images = folder / "sparse" / "0", folder / "images"
+    pictures = _pictures(names)
+    for name, picture in zip(names, pictures, strict=True):
+        _copy(data / f"{name}.png", images / picture)
+    settings = cameras.settings
+    (width, height), focal = settings.resolution, settings.focal
+    shown = np.stack([read_png(images / picture)[..., :3] for picture in pictures])
+    points, colours, tracks, places = _points(shown, poses, tracer, focal, settings.seed)
+
+    write_cameras(sparse, [((width, height, focal, focal, width / 2, height / 2), None)])
+    seen: list[list[str]] = [[] for _ in pictures]
+    rows = []
+    for i, (point, colour) in enumerate(zip(points, colours, strict=True)):
+        track = []
+        for view, (x, y) in zip(tracks[i], places[i], strict=True):
+            track.append(f"{view + 1} {len(seen[view])}")
+            seen[view].append(f"{x:.3f} {y:.3f} {i + 1}")
+        r, g, b = np.round(255 * colour).astype(int)
+        rows.append(f"{i + 1} {' '.join(f'{c:.6f}' for c in point)} {r} {g} {b} 0 {' '.join(track)}")
+    write_points(sparse, rows)
+    write_images(sparse, pictures, poses, [1] * len(pictures), [" ".join(places) for places in seen])
+    write_test_list(sparse, [pictures[i] for i in tests])
+    if (data / REGION_FILE).is_file():
+        _copy(data / REGION_FILE, folder / REGION_FILE)
+
+
+def _pictures(names: Sequence[str]) -> list[str]:
+    return [f"{i:04d}.png" for i in range(len(names))]
+
+
+def _order(cameras: Cameras) -> tuple[list[str], np.ndarray, list[int]]:
+    """Names without ending and poses (N, 4, 4) of all views, and the places of the test views among them."""
+    views = {s: [(f"{s}/r_{i:03d}", p) for i, (p, _) in enumerate(cameras.of(s))] for s in ("train", "test")}
+    total = sum(map(len, views.values()))
+    left, ordered, tests = {s: iter(v) for s, v in views.items()}, [], []
+    for i in range(total):
+        first = ("test", "train") if i % HOLDOUT == 0 else ("train", "test")
+        for split in first:
+            view = next(left[split], None)
+            if view is not None:
+                tests += [i] if split == "test" else []
+                ordered.append(view)
+                break
+    return [name for name, _ in ordered], np.stack([pose for _, pose in ordered]), tests
+
+
+def _points(
+    shown: np.ndarray, poses: np.ndarray, tracer: Tracer, focal: float, seed: int
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]:
+    """Points (P, 3), encoded colours (P, 3), and of each point the views that see it and where, in pixels."""
+    count, height, width = shown.shape[:3]
+    rng = np.random.default_rng(seed)
+    share = -(-CANDIDATES // count)
+    drawn = [tracer.points(pose, rng.random((share, 2))) for pose in poses]
+    points = np.concatenate(drawn)
+    points = points[np.isfinite(points).all(axis=1)]
+    views: list[list[int]] = [[] for _ in points]
+    places: list[list[np.ndarray]] = [[] for _ in points]
+    colours: list[list[np.ndarray]] = [[] for _ in points]
+    for view in rng.permutation(count):
+        pose = poses[view]
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixel = np.array([width, height]) / 2 - focal * local[:, :2] / local[:, 2:]
+        inside = (local[:, 2] > 0) & (pixel >= 0).all(axis=1) & (pixel < [width, height]).all(axis=1)
+        wanted = np.flatnonzero(inside & (np.array([len(v) for v in views]) < POINT_VIEWS))
+        if not len(wanted):
+            continue
+        met = tracer.points(pose, pixel[wanted] / [width, height])
+        depth = (met - pose[:3, 3]) @ pose[:3, 2]
+        clear = np.abs(depth - local[wanted, 2]) < SAME_PLACE * local[wanted, 2]
+        for i in wanted[clear]:
+            views[i].append(int(view))
+            places[i].append(pixel[i])
+            column, row = pixel[i].astype(int)
+            colours[i].append(shown[view, row, column])
+    kept = [i for i, c in enumerate(colours) if len(c) > 1 and np.std(c, axis=0).max() < SAME_COLOUR]
+    mean = np.array([np.mean(colours[i], axis=0) for i in kept]).reshape(-1, 3)
+    return points[kept], mean, [np.array(views[i]) for i in kept], [np.array(places[i]) for i in kept]
+
+
+def _copy(source: Path, target: Path) -> None:
+    replace_file(target, lambda temporary: shutil.copyfile(source, temporary))

@@ -1,0 +1,536 @@
+"""From photographs to a data set: cameras of a scene that the tests photograph, and the sentences of those
+that fail."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks import capture as capture_benchmark
+from mi_refgs.capture import colmap, failure, output
+from mi_refgs.capture.compare import best_similarity, pose_errors
+from mi_refgs.capture.folder import LAST, holds, prepare, replace_output
+from mi_refgs.capture.frame import Similarity, region_of_interest, up_direction
+from mi_refgs.capture.masks import find_masks, mask_pixels
+from mi_refgs.capture.pairs import EXHAUSTIVE, pairs_to_match
+from mi_refgs.capture.photographs import find_photographs
+from mi_refgs.capture.solved import Solved
+from mi_refgs.cli import main
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.data.region import Region
+from mi_refgs.errors import InputError
+from mi_refgs.io.images import read_png
+from tests.scenes import photographed as scene
+
+COUNT = 9
+NAMES = [f"{i:02} ({i}).png" for i in range(COUNT)]
+needs_colmap = pytest.mark.skipif(not colmap.installed(), reason='pip install "mi_refgs[capture]"')
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[np.ndarray]:
+    """What a level camera sees from an arc."""
+    return [scene.photograph(shot) for shot in scene.around(COUNT)]
+
+
+@pytest.fixture(scope="module")
+def captured(pictures: Sequence[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with photographs, and data made of them: names have spaces, one lies on its side for EXIF to
+    turn, masks are given."""
+    folder = tmp_path_factory.mktemp("with space")
+    for i, picture in enumerate(pictures):
+        stored = np.rot90(picture) if i == 4 else picture
+        options = {"orientation": 6} if i == 4 else {}
+        scene.save(folder / "photographs" / NAMES[i], stored, focal35=38, **options)
+        mask = np.zeros(stored.shape[:2], dtype=np.uint8)
+        mask[: len(mask) // 2] = 255
+        Image.fromarray(mask).save(_made(folder / "masks") / NAMES[i])
+    arguments = ["--masks", str(folder / "masks")]
+    assert main(["capture", str(folder / "photographs"), "-o", str(folder / "data"), *arguments]) == 0
+    return folder
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _model(data: Path) -> Solved:
+    return Solved.of(colmap.load().Reconstruction(data / "sparse" / "0"))
+
+
+# ---------- The cameras ----------
+
+
+@needs_colmap
+def test_cameras_are_found_up_to_a_similarity(captured: Path) -> None:
+    solved = _model(captured / "data")
+    shots = scene.around(COUNT)
+    assert solved.names == NAMES
+    true = np.array([shot.origin for shot in shots])
+    similarity = best_similarity(solved.origin, true)
+    extent = np.linalg.norm(true - true.mean(axis=0), axis=1).max()
+    assert np.linalg.norm(similarity.apply(solved.origin) - true, axis=1).max() < 0.01 * extent
+    turned = solved.rotation @ similarity.rotation.T
+    cosine = [(np.trace(a @ b.rotation.T) - 1) / 2 for a, b in zip(turned, shots, strict=True)]
+    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.5
+    # The world is upright, and its unit ball holds the block.
+    assert similarity.rotation[2] @ [0, 0, 1] > np.cos(np.radians(1))
+    block = np.array([0, 0, scene.BLOCK[2] / 2])
+    assert np.linalg.norm(similarity.translation - block) < 0.5 * similarity.scale
+    assert 0.5 < similarity.scale < 2
+
+
+@needs_colmap
+def test_points_lie_on_what_was_photographed(captured: Path) -> None:
+    solved = _model(captured / "data")
+    similarity = best_similarity(solved.origin, np.array([shot.origin for shot in scene.around(COUNT)]))
+    points = similarity.apply(solved.points)
+    ground = abs(points[:, 2])
+    sides = [abs(abs(points[:, i]) - scene.BLOCK[i]) for i in (0, 1)]
+    top = abs(points[:, 2] - scene.BLOCK[2])
+    assert len(points) > 300
+    assert np.quantile(np.min([ground, top, *sides], axis=0), 0.9) < 0.02
+
+
+@needs_colmap
+def test_the_data_set_holds_pictures_masks_region_and_report(
+    captured: Path, pictures: list[np.ndarray]
+) -> None:
+    data = captured / "data"
+    report = json.loads((data / "capture.json").read_text())
+    assert (report["placed"], report["photographs"], report["not_placed"]) == (COUNT, COUNT, [])
+    assert 0 < report["mean_reprojection_error"] < 0.5 and report["mean_track_length"] > 2
+    assert json.loads((data / "region.json").read_text()) == {"centre": [0, 0, 0], "radius": 1}
+    assert (data / "capture.png").stat().st_size > 10_000
+    model = colmap.load().Reconstruction(data / "sparse" / "0")
+    [camera] = model.cameras.values()
+    assert camera.model_name == "PINHOLE" and (camera.width, camera.height) == (scene.WIDTH, scene.HEIGHT)
+    assert camera.focal_length_x == pytest.approx(scene.FOCAL, rel=0.02)
+    # The picture that lay on its side stands, and its mask with it.
+    assert np.array_equal(read_png(data / "images" / NAMES[4]) * 255, pictures[4])
+    mask = np.asarray(Image.open(data / "masks" / f"{NAMES[4]}.png"))
+    half = scene.WIDTH // 2
+    assert mask.shape == (scene.HEIGHT, scene.WIDTH) and not mask[:, :half].any() and mask[:, half:].all()
+    assert model.compute_mean_reprojection_error() == pytest.approx(
+        report["mean_reprojection_error"], rel=0.1
+    )
+
+
+@needs_colmap
+def test_a_fit_reads_it(captured: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Cameras, alpha from the masks, points and region, as one set that every eighth view tests."""
+    train, test = (read_dataset(captured / "data", split) for split in ("train", "test"))
+    assert [view.name for view in test.views] == [NAMES[0], NAMES[8]] and len(train.views) == COUNT - 2
+    assert all(view.alpha is not None and {0.0, 1.0} == {*np.unique(view.alpha)} for view in train.views)
+    assert train.region == Region((0, 0, 0), 1) and train.points is not None
+    shots = scene.around(COUNT)
+    truth = []
+    for i, view in [(int(view.name[:2]), view) for view in train.views]:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = shots[i].rotation.T * [-1, -1, 1], shots[i].origin
+        truth.append(replace(view, to_world=pose, fx=scene.FOCAL))
+    errors = pose_errors(train.views, truth)
+    assert errors.count == COUNT - 2 and errors.rotation.max() < 0.5 and errors.position.max() < 0.01
+    assert abs(errors.focal).max() < 0.02
+    with pytest.raises(KeyError):
+        pose_errors(train.views, test.views)
+    assert capture_benchmark.main([str(captured / "data")] * 2) == 0
+    out = capsys.readouterr().out
+    assert f"{COUNT} of {COUNT} pictures placed" in out and "| rotation, degrees | 0.000 | 0.000 |" in out
+
+
+@needs_colmap
+def test_the_reprojections_of_the_points_are_right(captured: Path) -> None:
+    """Straightened coordinates, moved cameras and moved points belong together."""
+    model = colmap.load().Reconstruction(captured / "data" / "sparse" / "0")
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() < 0.5
+
+
+@needs_colmap
+def test_a_second_run_does_nothing_and_finds_the_same(
+    captured: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = captured / "data"
+    before = {path.name: path.stat().st_mtime_ns for path in (data / "images").iterdir()}
+    model = _model(data)
+
+    def never(*_: object) -> None:
+        raise AssertionError("done already")
+
+    for name in ("extract", "match", "reconstruct"):
+        monkeypatch.setattr(colmap, name, never)
+    arguments = ["--masks", str(captured / "masks")]
+    assert main(["capture", str(captured / "photographs"), "-o", str(data), *arguments]) == 0
+    assert {path.name: path.stat().st_mtime_ns for path in (data / "images").iterdir()} == before
+    np.testing.assert_array_equal(_model(data).origin, model.origin)
+    region = ["--region", "0.1", "0.2", "0.3", "0.5"]
+    assert main(["capture", str(captured / "photographs"), "-o", str(data), *arguments, *region]) == 0
+    assert json.loads((data / "region.json").read_text()) == {"centre": [0.1, 0.2, 0.3], "radius": 0.5}
+
+
+@needs_colmap
+def test_an_interrupted_run_goes_on(captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Features and matches that are there are not made again, and the result is that of one run."""
+    photographs, data = captured / "photographs", tmp_path / "data"
+    whole, calls = colmap.match, []
+
+    def interrupted(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
+        whole(database, pairs[:10])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(colmap, "match", interrupted)
+    assert main(["capture", str(photographs), "-o", str(data)]) == 130
+    monkeypatch.setattr(colmap, "match", whole)
+    monkeypatch.setattr(colmap, "begin", lambda *_: calls.append("begin"))
+    assert main(["capture", str(photographs), "-o", str(data)]) == 0
+    assert not calls
+    assert not (data / "masks").exists()
+    np.testing.assert_allclose(_model(data).origin, _model(captured / "data").origin, atol=1e-6)
+
+
+@needs_colmap
+def test_a_distorted_lens_is_found_and_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shots = scene.around(10)
+    for i, shot in enumerate(shots):
+        scene.save(tmp_path / "photographs" / f"{i}.png", scene.photograph(shot, k1=-0.15))
+    assert main(["capture", str(tmp_path / "photographs"), "-o", str(tmp_path / "data")]) == 0
+    report = json.loads((tmp_path / "data" / "capture.json").read_text())
+    assert report["lens"]["model"] == "SIMPLE_RADIAL" and report["placed"] == 10
+    assert report["lens"]["cameras"][0]["parameters"][3] == pytest.approx(-0.15, abs=0.03)
+    [pinhole] = report["pinholes"]
+    # The picture is what a pinhole sees whose focal length is longer by the same factor.
+    zoom = pinhole["focal"][0] / report["lens"]["cameras"][0]["parameters"][0]
+    monkeypatch.setattr(scene, "FOCAL", scene.FOCAL * zoom)
+    wanted = scene.photograph(shots[3], samples=2) / 255
+
+    def error(folder: str) -> float:
+        return float(np.sqrt(np.mean((read_png(tmp_path / folder / "3.png") - wanted) ** 2)))
+
+    assert error("data/images") < 0.5 * error("photographs")
+    model = colmap.load().Reconstruction(tmp_path / "data" / "sparse" / "0")
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() < 0.6
+
+
+@needs_colmap
+def test_another_lens_makes_other_pictures(
+    captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pictures and cameras are of one lens; files that a person added stay, masks go where none are given."""
+    data = tmp_path / "data"
+    shutil.copytree(captured / "data", data)
+    (data / "sparse" / "0" / "test.txt").write_text(NAMES[3])
+    whole, inode = output.straighten, (data / "images" / NAMES[0]).stat().st_ino
+
+    def longer(*arguments: Any) -> dict[str, output.Straight]:
+        found = whole(*arguments)
+        return {name: replace(s, focal=(s.focal[0] * 1.01, s.focal[1] * 1.01)) for name, s in found.items()}
+
+    monkeypatch.setattr(output, "straighten", longer)
+    [before] = colmap.load().Reconstruction(data / "sparse" / "0").cameras.values()
+    command = ["capture", str(captured / "photographs"), "-o", str(data)]
+    assert main([*command, "--masks", str(captured / "masks")]) == 0
+    [after] = colmap.load().Reconstruction(data / "sparse" / "0").cameras.values()
+    assert after.focal_length_x == pytest.approx(1.01 * before.focal_length_x)
+    assert (data / "images" / NAMES[0]).stat().st_ino != inode and (data / "masks").is_dir()
+    assert main(command) == 0 and not (data / "masks").exists()
+    assert [view.name for view in read_dataset(data, "test").views] == [NAMES[3]]
+
+
+# ---------- The folder ----------
+
+
+def _output(folder: Path, *names: str) -> Path:
+    for name in names:
+        (_made((folder / name).parent) / folder.joinpath(name).name).write_text(folder.name)
+    return folder
+
+
+def _files(folder: Path) -> dict[str, str]:
+    """What the files of a data set hold; none of those that record it."""
+    files = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+    return {name: path.read_text() for name, path in files.items() if not name.startswith(".")}
+
+
+def test_a_capture_removes_what_the_last_one_wrote(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, own = tmp_path / "data", {"masks/x.png": "own", "sparse/0/test.txt": "own"}
+    prepare(data, [tmp_path / "photographs"])
+    first = ("images/a.png", "images/b.png", "masks/a.png", LAST)
+    replace_output(data, _output(tmp_path / "1", *first, "images/.a.png.0123456789ab.tmp.png"), "1")
+    assert _files(data) == dict.fromkeys(first, "1") and holds(data, "1") and not holds(data, "2")
+    for name, text in own.items():
+        (data / name).write_text(text)
+    prepare(data, [])
+    second = ("images/a.png", "images/c.png", LAST)
+    replace_output(data, _output(tmp_path / "2", *second), "2")
+    assert _files(data) == dict.fromkeys(second, "2") | own and holds(data, "2")
+    with pytest.raises(InputError, match=r"masks/x\.png: output: not written by a capture; move it"):
+        replace_output(data, _output(tmp_path / "3", "masks/x.png", LAST), "3")
+    assert _files(data) == dict.fromkeys(second, "2") | own and holds(data, "2")
+    # Between two files of the next output the process ends; the next one completes it.
+    whole = Path.rename
+    moved: list[Path] = []
+
+    def interrupted(path: Path, target: Path) -> Path:
+        if moved:
+            raise KeyboardInterrupt
+        moved.append(path)
+        return whole(path, target)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        replace_output(data, _output(tmp_path / "4", *first), "4")
+    assert not (data / LAST).exists() and not holds(data, "4")
+    monkeypatch.setattr(Path, "rename", whole)
+    replace_output(data, _output(tmp_path / "4", *first), "4")
+    assert _files(data) == dict.fromkeys(first, "4") | own and holds(data, "4")
+    (data / "images" / "b.png").unlink()
+    assert not holds(data, "4")
+
+
+@needs_colmap
+def test_a_folder_that_is_read_is_not_written(captured: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, photographs = captured / "data", captured / "photographs"
+    before = sorted(data.rglob("*"))
+    for arguments in [(data / "images", "-o", data), (photographs, "-o", captured)]:
+        assert "are read, and lie in it; choose another" in _refused(capsys, *arguments)
+    assert "are read" in _refused(capsys, photographs, "-o", data, "--masks", data / "masks")
+    assert sorted(data.rglob("*")) == before
+
+
+def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
+    """Whatever its folders are called."""
+    kept = _made(tmp_path / ".work") / "thesis.txt"
+    kept.write_text("own")
+    (tmp_path / "capture.json").write_text("{}")
+    with pytest.raises(InputError, match="not empty, and no capture"):
+        prepare(tmp_path, [])
+
+
+# ---------- The sentences ----------
+
+
+def _refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    assert main(["capture", *map(str, arguments)]) == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def _flat(i: int, pictures: list[np.ndarray]) -> np.ndarray:
+    return np.full((96, 128, 3), 100 + i, dtype=np.uint8)
+
+
+def _blurred(i: int, pictures: list[np.ndarray]) -> np.ndarray:
+    from scipy.ndimage import gaussian_filter
+
+    ramp = np.linspace(0, 255, 128)[None, :, None] * np.ones((96, 1, 3))
+    return gaussian_filter(np.roll(ramp, 9 * i, axis=1), (12, 12, 0)).astype(np.uint8)
+
+
+def _unrelated(i: int, pictures: list[np.ndarray]) -> np.ndarray:
+    return (scene.noise(50 + i, 192) * 255).astype(np.uint8)
+
+
+def _one_place(i: int, pictures: list[np.ndarray]) -> np.ndarray:
+    """The camera turns on the spot."""
+    target = np.array([0.35 * np.cos(i), 0.35 * np.sin(i), 0.3])
+    return scene.photograph(scene.look(np.array([3.0, 0.4, 1.6]), tuple(target)))
+
+
+@needs_colmap
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (_flat, "patterned ground"),
+        (_blurred, "hold still"),
+        (_unrelated, "two thirds"),
+        (_one_place, "walk around"),
+        (lambda i, pictures: pictures[0], "walk around"),
+    ],
+    ids=["flat", "blurred", "unrelated", "one place", "all alike"],
+)
+def test_a_set_that_cannot_be_placed_says_what_to_do(
+    make: object, words: str, pictures: list[np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for i in range(5):
+        scene.save(tmp_path / "photographs" / f"{i}.png", make(i, pictures))  # type: ignore[operator]
+    message = _refused(capsys, tmp_path / "photographs", "-o", tmp_path / "data")
+    assert words in message and str(tmp_path / "photographs") in message, message
+    assert not (tmp_path / "data" / "sparse").exists()
+
+
+def test_groups_that_share_nothing_are_counted(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"2 groups that share nothing \(4, 3 pictures\).*around c\.jpg"):
+        failure.check_placed(tmp_path, 9, [["a"] * 4, ["b"] * 3], "c.jpg")
+    failure.check_placed(tmp_path, 8, [["a"] * 4, ["b"] * 3], "c.jpg")
+
+
+def test_pictures_that_are_none_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pycolmap")
+    photographs = _made(tmp_path / "photographs")
+    assert "no such folder" in _refused(capsys, tmp_path / "none", "-o", tmp_path / "data")
+    for name in ("a.HEIC", "b.HEIC", "c.heic"):
+        (photographs / name).write_bytes(b"0")
+    assert "convert its .HEIC files to JPEG" in _refused(capsys, photographs, "-o", tmp_path / "data")
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        (photographs / name).write_bytes(b"0")
+    assert "a.jpg: pixels: not a readable image" in _refused(capsys, photographs, "-o", tmp_path / "data")
+    assert "unknown lens model" in _refused(capsys, photographs, "-o", tmp_path / "data", "--camera", "PIG")
+    for numbers in ((0, 0, 0, -1), (0, 0, float("nan"), 1), (0, 1e30, 0, 1), (0, 0, 0, 0)):
+        said = _refused(capsys, photographs, "-o", tmp_path, "--region", *numbers)
+        assert "--region: centre, radius: not three numbers and a positive one" in said
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        scene.save(photographs / name, np.zeros((8, 8, 3), dtype=np.uint8))
+    assert "choose another" in _refused(capsys, photographs, "-o", photographs)
+    for width in range(9, 13):
+        scene.save(photographs / f"{width}.jpg", np.zeros((8, width, 3), dtype=np.uint8))
+    assert "5 different sizes, such as 10 × 8 (10.jpg)" in _refused(capsys, photographs, "-o", tmp_path)
+    for width in range(9, 13):
+        (photographs / f"{width}.jpg").unlink()
+    (_made(tmp_path / "other") / "file").touch()
+    assert "not empty" in _refused(capsys, photographs, "-o", tmp_path / "other")
+    assert "no such folder" in _refused(
+        capsys, photographs, "-o", tmp_path / "data", "--masks", tmp_path / "no"
+    )
+
+
+def test_a_missing_library_says_how_to_install_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
+    assert 'pip install "mi_refgs[capture]"' in _refused(capsys, tmp_path, "-o", tmp_path / "data")
+
+
+# ---------- The parts ----------
+
+
+def test_exif_says_which_way_up_and_how_long_the_lens_is(tmp_path: Path) -> None:
+    wide = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+    for orientation in range(1, 9):
+        scene.save(tmp_path / f"{orientation}.png", wide, orientation=orientation, focal35=43.2666 * 0.75)
+    found = {p.orientation: p for p in find_photographs(tmp_path)}
+    shown = {1: wide, 2: wide[:, ::-1], 3: wide[::-1, ::-1], 4: wide[::-1]}
+    tall = wide.transpose(1, 0, 2)
+    shown |= {5: tall, 6: tall[:, ::-1], 7: tall[::-1, ::-1], 8: tall[::-1]}
+    for orientation, photograph in found.items():
+        upright = shown[orientation]
+        assert photograph.size == upright.shape[1::-1] and photograph.stored_size == (6, 4)
+        assert photograph.focal_pixels((30, 40)) == pytest.approx(
+            0.75 * 50, rel=0.05
+        )  # EXIF's is whole: 32 mm
+        # All lie one way, and `up` says where the top of the upright picture went.
+        lying = np.rot90(upright) if photograph.lying else upright
+        np.testing.assert_array_equal(np.asarray(photograph.load()), lying)
+        assert photograph.up == ((-1, 0) if photograph.lying else (0, -1))
+    assert len({photograph.kept_size for photograph in found.values()}) == 1
+
+
+def test_broken_exif_data_are_left_out(tmp_path: Path) -> None:
+    pixels = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+    for name in ("a.jpg", "b.jpg", "c.png"):
+        Image.fromarray(pixels).save(tmp_path / name, exif=b"Exif\0\0garbage")
+    for photograph in find_photographs(tmp_path):
+        assert (photograph.orientation, photograph.focal) == (1, None)
+        assert photograph.load().size == (6, 4) and photograph.load(3).size == (3, 2)
+        Image.fromarray(pixels).save(tmp_path / f"again{photograph.path.suffix}", exif=photograph.exif())
+    np.testing.assert_array_equal(np.asarray(photograph.load()), pixels)
+
+
+def test_a_mask_has_the_name_and_size_of_its_photograph(tmp_path: Path) -> None:
+    picture = np.zeros((4, 6, 3), dtype=np.uint8)
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        scene.save(tmp_path / "p" / name, picture)
+    photographs = find_photographs(tmp_path / "p")
+    mask = np.zeros((4, 6), dtype=np.uint8)
+    mask[1] = 255
+    masks = _made(tmp_path / "m")
+    Image.fromarray(mask).save(masks / "a.png")
+    Image.fromarray(mask.astype(np.uint16) * 100).save(masks / "b.jpg.png")  # 16 bits, not used in full
+    with pytest.raises(InputError, match=r"none for c\.jpg; add c\.png"):
+        find_masks(masks, photographs)
+    cut = np.dstack([np.full((4, 6, 3), 9, dtype=np.uint8), mask])
+    Image.fromarray(cut).save(masks / "c.PNG")
+    found = find_masks(masks, photographs)
+    for photograph in photographs:  # white where the object is; where a picture is cut out, its alpha
+        grey = round(25500 / 257) if photograph.name == "b.jpg" else 255
+        np.testing.assert_array_equal(
+            mask_pixels(found[photograph.name], photograph)[..., 0], np.where(mask > 0, grey, 0)
+        )
+    Image.fromarray(mask[:2]).save(masks / "c.PNG")
+    with pytest.raises(InputError, match=r"6 × 2 pixels, but c\.jpg has 6 × 4"):
+        find_masks(masks, photographs)
+
+
+def test_large_sets_match_neighbours_and_pictures_alike(rng: np.random.Generator) -> None:
+    """Pictures of ten places, each visited in every tenth picture: likeness finds them, order does not."""
+    places = rng.integers(0, 256, (10, 40, 128))
+    count = EXHAUSTIVE + 50
+    features = {
+        f"{i:03}": np.clip(places[i % 10] + rng.normal(0, 8, (40, 128)), 0, 255).astype(np.uint8)
+        for i in range(count)
+    }
+    pairs = set(pairs_to_match(features))
+    assert len(pairs) < 0.25 * count * (count - 1) / 2
+    assert all((f"{i:03}", f"{i + 1:03}") in pairs for i in range(count - 1))
+    far = [(a, b) for a, b in pairs if int(b) - int(a) > 8]
+    assert far and np.mean([int(a) % 10 == int(b) % 10 for a, b in far]) > 0.9
+    few = {name: features[name] for name in sorted(features)[:5]}
+    assert len(pairs_to_match(few)) == 10
+
+
+def _solved(origin: np.ndarray, target: tuple[float, float, float], points: np.ndarray) -> Solved:
+    shots = [scene.look(o, target) for o in origin]
+    rotation = np.array([shot.rotation for shot in shots])
+    names, length = [str(i) for i in range(len(shots))], np.full(len(points), 3)
+    return Solved(names, rotation, origin, np.full(len(shots), 0.4), points, length)
+
+
+@pytest.mark.parametrize("arc", [300.0, 5.0], ids=["around", "from the front"])
+def test_up_is_where_level_cameras_say(arc: float, rng: np.random.Generator) -> None:
+    """Level cameras, a quarter of which is rolled by up to 60°, in a world that is turned anyhow."""
+    origin = np.array([shot.origin for shot in scene.around(40, arc)])
+    solved = _solved(origin, (0, 0, 1.5), np.empty((0, 3)))
+    roll = np.where(np.arange(40) % 4 == 0, rng.uniform(-1, 1, 40), 0) * (arc > 90)
+    up = np.stack([np.sin(roll), -np.cos(roll)], axis=1)
+    world, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    world *= np.linalg.det(world)
+    turned = Solved(
+        solved.names,
+        solved.rotation @ world.T,
+        origin @ world.T,
+        solved.half_angle,
+        solved.points,
+        solved.length,
+    )
+    found = up_direction(turned, up) @ world
+    assert np.degrees(np.arccos(found[2])) < (1 if arc > 90 else 5)
+
+
+def test_the_region_is_what_most_cameras_look_at(rng: np.random.Generator) -> None:
+    origin = np.array([shot.origin for shot in scene.around(30, 300, radius=4)])
+    near = rng.normal((0.2, 0, 0.4), 0.15, (400, 3))
+    far = rng.uniform(-30, 30, (4000, 3))
+    region = region_of_interest(_solved(origin, (0.2, 0, 0.4), np.concatenate([near, far])))
+    assert np.linalg.norm(np.array(region.centre) - [0.2, 0, 0.4]) < 0.1
+    assert 0.4 < region.radius < 1.3
+    assert np.mean(region.contains(near)) > 0.9
+
+
+def test_the_best_similarity_is_found(rng: np.random.Generator) -> None:
+    points = rng.normal(size=(20, 3))
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    rotation *= np.linalg.det(rotation)
+    wanted = Similarity(2.5, rotation, np.array([1.0, 2, 3]))
+    found = best_similarity(points, wanted.apply(points))
+    assert found.scale == pytest.approx(2.5)
+    np.testing.assert_allclose(found.rotation, rotation, atol=1e-9)
+    np.testing.assert_allclose(found.translation, [1, 2, 3], atol=1e-9)

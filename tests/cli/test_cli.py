@@ -1,0 +1,477 @@
+"""Every command through `main`: what it writes and prints, and how it refuses bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.cli import demo, main
+from mi_refgs.fitting import cost_model, plan
+from mi_refgs.fitting.job import load_method
+from mi_refgs.fitting.runner import sized
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.exr import read_exr
+from mi_refgs.io.images import read_png, srgb_from_linear, write_png
+from mi_refgs.io.ownership import RECORD
+from mi_refgs.methods.presets import PRESETS
+from mi_refgs.methods.read import load_resolved
+from tests.helpers import ROOT
+from tests.scenes.tiny import SIZE, train_command
+
+COMMANDS = (
+    "doctor",
+    "demo",
+    "capture",
+    "dataset",
+    "train",
+    "eval",
+    "compare",
+    "render",
+    "relight",
+    "export",
+    "profile",
+    "view",
+)
+ARTEFACTS = ("surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "config.toml", "metrics.jsonl")
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the finished run, to be spoilt."""
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+# ---------- Help and output ----------
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as leave:
+        main([command, "--help"])
+    assert leave.value.code == 0
+    text = capsys.readouterr().out
+    assert f"example:\n  refgs {command}" in text and "--json" in text
+
+
+def test_json_is_all_that_is_printed(
+    run: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither Python's nor C++'s chatter on standard output gets between a pipe and the object."""
+    original = Trainer.__init__
+
+    def noisy(self: Trainer, *args: object) -> None:
+        print("from Python")
+        os.write(1, b"from C++\n")
+        original(self, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Trainer, "__init__", noisy)
+    dataset = json.loads((run / "dataset.json").read_text())["path"]
+    capfd.readouterr()
+    assert main(["train", dataset, "-o", str(run), "--resume", "--json"]) == 0
+    out, err = capfd.readouterr()
+    assert json.loads(out)["iterations"] == 6
+    assert "from Python" in err and "from C++" in err
+
+
+def test_doctor_reports_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["doctor", "--json"])
+    report = json.loads(capsys.readouterr().out)
+    assert report["mitsuba"] == mi.__version__ and report["usable"] == (code == 0)
+
+
+# ---------- The main job ----------
+
+
+def test_train_writes_a_run_folder(finished: Path) -> None:
+    for name in ARTEFACTS:
+        assert (finished / name).stat().st_size > 0, name
+    assert [path.name for path in (finished / "previews").iterdir()] == ["0000004.png"]
+    assert (finished / "checkpoints" / "0000006.npz").is_file()
+    assert load_resolved(finished / "config.toml").variant == "tiny"
+    lines = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
+    assert [line["iteration"] for line in lines] == [2, 4, 6]
+    left_over = [path.name for path in finished.rglob("*") if path.name.startswith(".")]
+    assert left_over == [RECORD]
+
+
+def test_train_tells_what_is_unusual(
+    data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*train_command(data, tmp_path / "run", method), "iterations=1", "--threads", "1"]) == 0
+    assert "only 3 training views" in capsys.readouterr().err
+    assert (tmp_path / "run" / "checkpoints" / "0000001.npz").is_file()  # though none was due
+
+
+def test_large_pictures_are_read_smaller_unless_told_otherwise(
+    data: Path,
+    method: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The size is chosen once: config.toml records it, and evaluation reads the same."""
+    slow = cost_model.Speed({"initial": [1.0, 4.0], "deferred": [1.0, 4.0]}, 0.0, 0.0)  # 10 ms a pixel
+    for name, value in {"speed_of": lambda *_: slow, "WORTH": 0, "LEAST": 10, "WHOLE": 0}.items():
+        monkeypatch.setattr(plan, name, value)
+    monkeypatch.setattr(cost_model, "SIZES", (10, 20))
+    minutes = (
+        (plan.START + 5) / plan.SAFETY / 60
+    )  # two iterations take 8 s, or 2 s on a quarter of the pixels
+    monkeypatch.setitem(PRESETS, "quick", replace(PRESETS["quick"], minutes=minutes))
+    run = tmp_path / "run"
+    assert main([*train_command(data, run, method), "iterations=2"]) == 0
+    out, err = capsys.readouterr()
+    assert "estimate: 12 s and 0.4 GB for 2 iterations on 10 × 10 pixels" in err
+    assert " in all, estimate 12 s), " in out
+    said = [line for line in err.splitlines() if "20 × 20 pixels are read as 10 × 10" in line]
+    assert len(said) == 1 and "data.downscale=1" in said[0] and "--minutes M" in said[0]
+    assert load_resolved(run / "config.toml").data.downscale == 2
+    monkeypatch.undo()
+    assert main(["eval", str(run)]) == 0
+    assert json.loads((run / "metrics.json").read_text())["image_size"] == [SIZE // 2, SIZE // 2]
+    chosen = sized(load_method(str(method), "quick", ["data.downscale=1"]), data)
+    assert chosen.data.downscale == 1
+    assert sized(load_method(str(method), "quick", []), data).data.downscale == 1
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_says_how_to_resume_and_resuming_changes_nothing(
+    number: int,
+    code: int,
+    heard_interrupts: None,
+    data: Path,
+    method: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    step = Trainer.step
+
+    def interrupted(self: Trainer) -> None:
+        step(self)
+        if self.iteration == 4:
+            os.kill(os.getpid(), number)
+
+    straight, run, one = tmp_path / "straight", tmp_path / "run", ("--threads", "1")
+    assert main(train_command(data, straight, method, *one)) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", interrupted)
+        assert main(train_command(data, run, method, *one)) == code
+    said = capsys.readouterr().err
+    assert f"interrupted at iteration 4; resume with: refgs train {data} -o {run} --resume" in said
+    with (run / "metrics.jsonl").open("a") as log:  # as after a kill between a log line and its checkpoint
+        log.write(json.dumps({"iteration": 6}) + "\n")
+    assert main(["train", str(data), "-o", str(run), "--resume", *one]) == 0
+    assert "resumed at iteration 4 of 6" in capsys.readouterr().err
+    for name in ("surfels.ply", "envmap.exr", "mesh.ply"):
+        assert (run / name).read_bytes() == (straight / name).read_bytes(), name
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["iteration"] for line in lines] == [2, 4, 6]
+
+
+def test_resume_refuses_another_method(run: Path, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for option, value in (("--preset", "paper"), ("--variant", "other.toml"), ("--set", "loss.ssim=0")):
+        assert main(["train", str(data), "-o", str(run), "--resume", option, value]) == 2
+        assert option in capsys.readouterr().err
+
+
+def test_export_writes_what_is_in_the_newest_checkpoint(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", str(finished), "-o", str(tmp_path / "out"), "--json"]) == 0
+    files = json.loads(capsys.readouterr().out)["files"]
+    for file in files:
+        assert Path(file).read_bytes() == (finished / Path(file).name).read_bytes()
+    assert {Path(file).name for file in files} >= {"surfels.ply", "envmap.exr", "mesh.ply", "scene.xml"}
+
+
+def test_render_writes_exr_with_aovs_and_png(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exr, png = tmp_path / "view.exr", tmp_path / "view.png"
+    assert main(["render", str(finished), "-o", str(exr), "--aov", "albedo", "nn:normal", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["width"] == SIZE
+    channels = read_exr(exr)
+    assert {"R", "G", "B", "A", "albedo.R", "nn.X"} <= channels.keys()
+    assert main(["render", str(finished / "scene.xml"), "-o", str(png)]) == 0
+    pixels = read_png(png)
+    assert pixels.shape == (SIZE, SIZE, 4)
+    assert np.abs(pixels[..., 3] - np.clip(channels["A"], 0, 1)).max() < 0.51 / 255
+    shown = np.clip(srgb_from_linear(channels["G"] / np.maximum(channels["A"], 1e-8)), 0, 1)
+    seen = channels["A"] > 0.1
+    assert seen.any() and np.abs(pixels[..., 1] - shown)[seen].max() < 0.51 / 255
+
+
+def test_aovs_come_after_those_of_the_scene(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What the scene has already is not repeated; a name of two types is refused."""
+    scene, out = finished / "with_aovs.xml", str(tmp_path / "view.exr")
+    text = (finished / "scene.xml").read_text()
+    own = '<string name="aovs" value=" nn : normal,depth:depth"/></integrator>'
+    scene.write_text(text.replace("</integrator>", own))
+
+    def layers(*aovs: str) -> list[str]:
+        assert main(["render", str(scene), "-o", out, "--json", *(["--aov", *aovs] if aovs else [])]) == 0
+        names = json.loads(capsys.readouterr().out)["channels"]
+        return list(dict.fromkeys(name.partition(".")[0] for name in names if "." in name))
+
+    assert layers() == ["nn", "depth"]
+    assert layers("albedo", "depth", "nn:normal", "albedo") == ["nn", "depth", "albedo"]
+    refused(["render", str(scene), "-o", out, "--aov", "nn:depth"], capsys, "aovs", "'nn' occurs twice")
+    scene.unlink()
+
+
+def test_render_shows_the_newest_checkpoint(finished: Path, run: Path, tmp_path: Path) -> None:
+    """As `load` and `refgs view` do: of artefacts that are older, nothing is shown."""
+    note = json.loads((run / "model.json").read_text())
+    (run / "model.json").write_text(json.dumps(note | {"iteration": 0}))
+    shutil.copyfile(ROOT / "scenes" / "lights" / "sky.exr", run / "envmap.exr")
+    images = []
+    for folder in (finished, run):
+        assert main(["render", str(folder), "-o", str(tmp_path / "out.exr")]) == 0
+        images.append(read_exr(tmp_path / "out.exr")["R"])
+    np.testing.assert_allclose(images[0], images[1], atol=1e-5)
+    assert json.loads((run / "model.json").read_text()) == note
+
+
+def test_dataset_traces_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        '<scene version="3.0.0"><emitter type="constant"/><shape type="sphere">'
+        '<bsdf type="diffuse"/></shape></scene>'
+    )
+    options = ["--views", "2", "--test-views", "1", "--size", "16", "--spp", "1", "--json"]
+    assert main(["dataset", str(scene), "-o", str(tmp_path / "out"), *options]) == 0
+    assert json.loads(capsys.readouterr().out)["train_views"] == 2
+    assert (tmp_path / "out" / "transforms_test.json").is_file()
+
+
+def test_demo_goes_from_nothing_to_a_contact_sheet_and_is_not_done_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("VIEWS", 3), ("TEST_VIEWS", 1), ("SIZE", 16), ("SAMPLES", 1)):
+        monkeypatch.setattr(demo, name, value)
+    settings = ["iterations=2", "surfels.count=60", "surfels.max_count=60", "light.height=8"]
+    command = ["demo", "-o", str(tmp_path / "demo"), "--json", "--set", *settings]
+    assert main(command) == 0
+    first = json.loads(capsys.readouterr().out)
+    sheet = Path(first["contact_sheet"])
+    assert sheet.is_file() and first["metrics"]["iterations"] == 2
+    written = {path: path.stat().st_mtime_ns for path in (tmp_path / "demo").rglob("*.[ep]*")}
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out) == first
+    assert {path: path.stat().st_mtime_ns for path in written} == written
+
+
+# ---------- Bad input: one sentence with file, field and remedy, and exit code 2 ----------
+
+
+def refused(argv: list[str], capsys: pytest.CaptureFixture[str], *parts: object) -> None:
+    capsys.readouterr()
+    assert main(argv) == 2
+    out, err = capsys.readouterr()
+    [said] = [line for line in err.splitlines() if line.startswith("refgs: ") and "warning" not in line][-1:]
+    assert not out and "Traceback" not in err
+    assert "; " in said or "such as" in said, said  # the remedy follows what is wrong
+    for part in parts:
+        assert str(part) in said, said
+
+
+@pytest.fixture
+def spoilt(data: Path, tmp_path: Path) -> Path:
+    """A copy of the data set, to be spoilt."""
+    return Path(shutil.copytree(data, tmp_path / "ball"))
+
+
+def edit(path: Path, change: Callable[[dict], object]) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_missing_picture(
+    spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (spoilt / "train" / "r_1.png").unlink()
+    refused(train_command(spoilt, tmp_path / "run", method), capsys, "r_1.png", "missing", "restore it")
+    assert not (tmp_path / "run").exists()  # so that the same command works once the picture is back
+
+
+def test_unreadable_picture(
+    spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (spoilt / "train" / "r_1.png").write_bytes(b"\x89PNG\r\n no")
+    refused(train_command(spoilt, tmp_path / "run", method), capsys, "r_1.png", "not a readable image")
+
+
+def test_wrong_json(spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (spoilt / "transforms_train.json").write_text('{"frames": [')
+    refused(train_command(spoilt, tmp_path / "run", method), capsys, "transforms_train.json", "JSON")
+
+
+def test_views_of_unequal_size(
+    spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A few sizes are fitted together; five are one sentence."""
+
+    def sizes(content: dict) -> None:
+        content["frames"] = [content["frames"][0] | {"file_path": f"train/r_{i}"} for i in range(5)]
+        for key in "wh":
+            content.pop(key)
+
+    edit(spoilt / "transforms_train.json", sizes)
+    for i in range(5):
+        write_png(spoilt / "train" / f"r_{i}.png", np.ones((SIZE, SIZE + 2 * i, 4)))
+    refused(
+        train_command(spoilt, tmp_path / "run", method), capsys, "transforms_train.json", "5 different sizes"
+    )
+
+
+def test_no_training_views(
+    spoilt: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit(spoilt / "transforms_train.json", lambda content: content.update(frames=[]))
+    command = train_command(spoilt, tmp_path / "run", method)
+    refused(command, capsys, "transforms_train.json", "zero training views")
+
+
+def test_missing_data(method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused(
+        train_command(tmp_path / "none", tmp_path / "run", method),
+        capsys,
+        tmp_path / "none",
+        "no such folder",
+    )
+
+
+def test_unknown_key_in_a_method(
+    data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(method.read_text().replace("degree", "degrees"))
+    refused(train_command(data, tmp_path / "run", wrong), capsys, "wrong.toml", "surfels", "degrees")
+    command = [*train_command(data, tmp_path / "run", method), "loss.sim=1"]
+    refused(command, capsys, "--set", "loss", "sim")
+    refused([*command[:-1], "loss.ssim"], capsys, "--set", "key=value")
+
+
+def test_a_value_that_is_nan_in_the_ply(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ply = run / "surfels.ply"
+    header, end, body = ply.read_bytes().partition(b"end_header\n")
+    ply.write_bytes(header + end + np.float32(np.nan).tobytes() + body[4:])
+    refused(["render", str(run), "-o", str(tmp_path / "x.exr")], capsys, "surfels.ply", "x: 1 values are NaN")
+    refused(["eval", str(run)], capsys, "surfels.ply", "x: 1 values are NaN")
+
+
+def test_a_property_that_the_ply_lacks(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ply = run / "surfels.ply"
+    ply.write_bytes(ply.read_bytes().replace(b"property float opacity", b"property float opaqueness"))
+    refused(["render", str(run), "-o", str(tmp_path / "x.exr")], capsys, "surfels.ply", "opacity", "missing")
+    refused(["eval", str(run)], capsys, "surfels.ply", "opacity", "missing")
+
+
+def test_a_run_whose_light_is_gone(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "envmap.exr").unlink()
+    for argv in (["eval", str(run)], ["edit", str(run), "-o", str(tmp_path / "new"), "--set", "opacity=1"]):
+        refused(argv, capsys, "envmap.exr", "light: missing")
+    refused(["render", str(run), "-o", str(tmp_path / "x.exr")], capsys, "envmap.exr", "light: missing")
+
+
+def test_what_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("eval", "export"):
+        refused([command, str(tmp_path)], capsys, tmp_path, "config.toml")
+    refused(["render", str(tmp_path), "-o", str(tmp_path / "x.exr")], capsys, "scene.xml", "missing")
+    refused(
+        ["render", str(tmp_path / "no.xml"), "-o", str(tmp_path / "x.exr")], capsys, "no.xml", "no such file"
+    )
+
+
+def test_a_run_that_is_there_already(
+    finished: Path, data: Path, method: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    refused(train_command(data, finished, method), capsys, finished, "--resume")
+
+
+def test_a_run_whose_data_is_gone(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "dataset.json").write_text(json.dumps({"path": str(tmp_path / "gone")}))
+    refused(["eval", str(run)], capsys, "dataset.json", "gone", "--data")
+    (run / "dataset.json").write_text("{}")
+    refused(["eval", str(run)], capsys, "dataset.json", "--data")
+
+
+def test_unwritable_output(
+    finished: Path, data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Below a regular file nobody can write, not even root."""
+    (tmp_path / "file").write_text("")
+    below = tmp_path / "file" / "out"
+    scene = tmp_path / "scene.xml"
+    scene.write_text('<scene version="3.0.0"><emitter type="constant"/><shape type="sphere"/></scene>')
+    tiny = ["--views", "1", "--size", "16", "--spp", "1"]
+    for argv in (
+        train_command(data, below, method),
+        ["dataset", str(scene), "-o", str(below), *tiny],
+        ["export", str(finished), "-o", str(below)],
+        ["render", str(finished), "-o", f"{below}.exr"],
+        ["render", str(finished), "-o", f"{below}.png"],
+    ):
+        refused(argv, capsys, below, "writable folder")
+
+
+@pytest.mark.parametrize(
+    ("argv", "parts"),
+    [
+        ([], ["COMMAND"]),
+        (["train"], ["DATA"]),
+        (["train", "here", "-o", "there", "--preset", "fast"], ["--preset", "quick, standard, paper"]),
+        (["train", "here", "-o", "there", "--variant", "nothing"], ["--variant", "nothing"]),
+        (["train", "here", "-o", "there", "--for", "nothing"], ["--for", "nothing", "relighting"]),
+        (
+            ["train", "here", "-o", "there", "--for", "relighting", "--variant", "no_pbr"],
+            ["--for", "--variant no_pbr", "one of the two"],
+        ),
+        (["train", "here", "-o", "there", "--threads", "0"], ["--threads"]),
+        (
+            ["train", "here", "-o", "there", "--mitsuba-variant", "scalar_rgb"],
+            ["--mitsuba-variant", "llvm_ad_rgb"],
+        ),
+        (["dataset", "no.xml", "-o", "there"], ["no.xml", "missing"]),
+        (["render", "no.xml", "-o", "x.bmp"], ["x.bmp", ".exr or .png"]),
+        (["render", "no.xml", "-o", "x.png", "--spp", "-1"], ["--spp"]),
+        (["export", "run", "--limit", "40"], ["--limit", "--prune"]),
+    ],
+)
+def test_bad_arguments(
+    argv: list[str],
+    parts: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused(argv, capsys, *parts)
+
+
+def test_bad_requests_of_render(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "x.exr")
+    refused(["render", str(finished), "-o", out, "--sensor", "1"], capsys, "--sensor", "give 0 to 0")
+    refused(["render", str(finished), "-o", out, "--aov", "colour"], capsys, "aovs", "colour", "albedo")
+    broken = tmp_path / "broken.xml"
+    broken.write_text("<scene")
+    refused(["render", str(broken), "-o", out], capsys, "broken.xml")
+    plain = tmp_path / "plain.xml"
+    plain.write_text('<scene version="3.0.0"><integrator type="path"/></scene>')
+    refused(["render", str(plain), "-o", out, "--aov", "albedo"], capsys, "plain.xml", "--aov", "refgs")

@@ -1,0 +1,393 @@
+"""A command touches only its own files: every command, run where others have the names of its output."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mi_refgs
+from mi_refgs.cli import build_parser, demo, main
+from mi_refgs.errors import InputError
+from mi_refgs.formats import FORMATS, options_of
+from mi_refgs.io.exr import write_exr
+from mi_refgs.io.ownership import RECORD, OutputFolder
+from mi_refgs.reconstruction.new_light import NewLight
+from mi_refgs.relighting.relight import relight
+from mi_refgs.runs.run import RUN_FILES, Run
+from mi_refgs.viewer.controls.saving import write_view
+from tests.scenes.tiny import train_command
+
+FOREIGN = b'{"of": "another program"}\n'  # JSON, so that model.json and its like can be read
+BALL = """<scene version="3.0.0">
+    <emitter type="constant"/>
+    <shape type="sphere"><bsdf type="diffuse"/></shape>
+</scene>"""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a command runs: a folder of its own with copies of what it reads."""
+
+    folder: Path
+
+    def __truediv__(self, name: str) -> Path:
+        return self.folder / name
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command line, and the files that it writes: those of a clean run, or `names` if that takes long."""
+
+    command: str
+    arguments: Callable[[Place], list[str]]
+    needs: tuple[str, ...] = ("run",)  # of what is copied into the place
+    names: tuple[str, ...] = ()
+    replaces: tuple[str, ...] = ()  # what the user names, which is replaced
+    every: bool = True  # whether each name is tried, or the last alone, because a refusal takes seconds
+
+
+def _train(place: Place) -> list[str]:
+    return train_command(place / "data", place / "out", place / "tiny.toml")
+
+
+def _dataset(place: Place, *more: str) -> list[str]:
+    size = ["--views", "1", "--test-views", "1", "--size", "4", "--spp", "1"]
+    return ["dataset", str(place / "ball.xml"), "-o", str(place / "out"), *size, *more]
+
+
+def _on(command: str, *more: str) -> Callable[[Place], list[str]]:
+    """A command on the run; @ in an argument is the place."""
+    return lambda place: [
+        command,
+        str(place / "run"),
+        *(text.replace("@", str(place.folder)) for text in more),
+    ]
+
+
+def _compare(place: Place) -> list[str]:
+    method = ["--variants", str(place / "tiny.toml"), "--preset", "quick"]
+    return ["compare", str(place / "data"), "-o", str(place / "out"), *method]
+
+
+BAKED = ("--faces", "100", "--texture", "64")
+SEED = "out/runs/data/tiny/seed0"
+CASES = [
+    Case("doctor", lambda place: ["doctor", str(place / "data")], ("data",)),
+    Case("completion", lambda place: ["completion", "bash"], ()),
+    Case("profile", _on("profile", "--size", "8"), ("bare@run",)),
+    Case(
+        "demo",
+        lambda place: ["demo", "-o", str(place / "out")],
+        (),
+        ("out/data/dataset.json", "out/data/train/r_000.png", "out/quick/mesh.ply", "out/quick/config.toml"),
+    ),
+    Case(
+        "capture",
+        lambda place: ["capture", str(place / "data/train"), "-o", str(place / "out")],
+        ("data",),
+        ("out/capture.json", "out/region.json", "out/images/r_0.png", "out/sparse/0/images.bin"),
+    ),
+    Case("dataset", _dataset, ("ball.xml",)),
+    Case(
+        "dataset",
+        lambda place: _dataset(place, "--colmap", str(place / "c"), "--relight", str(place / "light.exr")),
+        ("ball.xml", "light.exr"),
+        ("c/images/0001.png", "c/sparse/0/test.txt", "out/relight/light/test/r_000.exr"),
+    ),
+    Case(
+        "dataset",
+        lambda place: _dataset(place, "--overwrite"),
+        ("ball.xml", "run@out"),
+        ("out/dataset.json",),
+    ),
+    Case("train", _train, ("data", "tiny.toml")),
+    Case("eval", _on("eval")),
+    Case(
+        "compare",
+        _compare,
+        ("data", "tiny.toml"),
+        (
+            *(f"out/{name}" for name in ("compare.json", "table.json", "table.md", "index.html")),
+            *("out/pictures/data_psnr.png", "out/pictures/data_crops.png"),
+            *(f"{SEED}/{name}" for name in ("job.json", "job.log", "failed.json", "config.toml", "mesh.ply")),
+        ),
+    ),
+    Case("render", _on("render", "-o", "@/view.exr"), replaces=("view.exr",)),
+    Case("render", _on("render", "-o", "@/view.png"), replaces=("view.png",)),
+    Case("render", _on("render", "-o", "@/run/envmap.exr"), names=("run/envmap.exr",)),
+    Case("relight", _on("relight", "--envmap", "@/light.exr"), ("run", "light.exr"), every=False),
+    Case(
+        "relight",
+        _on("relight", "--envmap", "@/light.exr", "-o", "@/out", "--turntable", "2"),
+        ("run", "light.exr"),
+    ),
+    Case("edit", _on("edit", "-o", "@/out", "--set", "roughness=0.5", "--preview")),
+    Case("export", _on("export"), names=("run/background.exr",)),
+    Case("export", _on("export", "-o", "@/out")),
+    *(
+        Case(
+            "export",
+            _on("export", "--to", name, "-o", "@/out", *(BAKED if "faces" in options_of([name]) else ())),
+            names=(f"out/{name}{made.suffix}",) if made.suffix else (),
+            every=False,
+        )
+        for name, made in FORMATS.items()
+    ),
+    Case("export", _on("export", "--to", "3dgs-ply", "-o", "@/a.ply"), replaces=("a.ply",)),
+    Case("export", _on("export", "--to", "3dgs-ply", "-o", "@/run/surfels.ply"), names=("run/surfels.ply",)),
+    Case("import", lambda place: ["import", str(place / "a.ply"), "-o", str(place / "out")], ("a.ply",)),
+    Case(
+        "view",
+        lambda place: ["view"],
+        (),
+        ("views/view_000.png", "views/view_000.json", "views/view_001.exr"),
+    ),
+    Case(
+        "gallery",
+        lambda place: [
+            "gallery",
+            "-o",
+            str(place / "out"),
+            "--work",
+            str(place / "work"),
+            "--scenes",
+            "mirror_ring",
+        ],
+        (),
+        ("out/README.md", "out/gallery.json", "out/mirror_ring/turntable.webp"),
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def sources(finished: Path, data: Path, method: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What places are copied from."""
+    folder = tmp_path_factory.mktemp("sources")
+    shutil.copytree(finished, folder / "run")
+    shutil.copytree(data, folder / "data")
+    shutil.copy(method, folder / "tiny.toml")
+    shutil.copytree(finished, folder / "bare", ignore=shutil.ignore_patterns("checkpoints"))
+    assert main(["export", str(finished), "--to", "3dgs-ply", "-o", str(folder / "a.ply")]) == 0
+    (folder / "ball.xml").write_text(BALL)
+    write_exr(folder / "light.exr", np.ones((4, 8, 3), np.float32))
+    return folder
+
+
+@pytest.fixture
+def small_demo(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("VIEWS", 1), ("TEST_VIEWS", 1), ("SIZE", 8), ("SAMPLES", 1)):
+        monkeypatch.setattr(demo, name, value)
+
+
+def place_of(case: Case, sources: Path, folder: Path) -> Place:
+    """A place for a case; "run@out" is the run in the folder "out"."""
+    folder.mkdir()
+    for need in case.needs:
+        source, _, target = need.partition("@")
+        copy: Any = shutil.copytree if (sources / source).is_dir() else shutil.copy
+        copy(sources / source, folder / (target or source))
+    return Place(folder)
+
+
+def contents(place: Place) -> dict[str, bytes]:
+    """Every file of a place but the records, by its path."""
+    files = (path for path in sorted(place.folder.rglob("*")) if path.is_file() and path.name != RECORD)
+    return {path.relative_to(place.folder).as_posix(): path.read_bytes() for path in files}
+
+
+def tried(case: Case, names: tuple[str, ...]) -> list[str]:
+    """The names that are tried: in folders of an output folder one of each kind of file."""
+    kinds = {(Path(name).parent, Path(name).suffix if name.count("/") > 1 else name): name for name in names}
+    return [*kinds.values()] if case.every else [names[-1]]
+
+
+def run(case: Case, place: Place) -> int:
+    """Run the command; `refgs view` saves a view, which its page otherwise asks for."""
+    if case.command != "view":
+        return main(case.arguments(place))
+    planes = [np.full(4, 0.5, np.float32)] * 4
+    drawable: Any = SimpleNamespace(fine=lambda *_: planes)
+    pose: Any = SimpleNamespace(transforms=lambda *_: {})
+    look: Any = SimpleNamespace(what="picture", exposure=0.0)
+    for suffix in (".json", ".exr"):
+        write_view(drawable, pose, (2, 2), look, place / "views", suffix)
+    return 0
+
+
+def test_every_command_has_a_case() -> None:
+    parser = build_parser()
+    [commands] = [action.choices for action in parser._actions if isinstance(action.choices, dict)]
+    assert {case.command for case in CASES} == set(commands)
+
+
+@pytest.mark.usefixtures("small_demo")
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.command)
+def test_a_command_touches_only_its_own_files(
+    case: Case, sources: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A foreign file keeps every byte; a command that refuses says one sentence and changes nothing."""
+    names = case.names
+    if not names:
+        place = place_of(case, sources, tmp_path / "clean")
+        before = contents(place)
+        assert run(case, place) == 0, capsys.readouterr().err
+        names = tuple(name for name in contents(place) if name not in before)
+        assert {*case.replaces} <= {*names}
+    for i, name in enumerate(tried(case, names)):
+        place = place_of(case, sources, tmp_path / str(i))
+        if not (place / name).exists():
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
+            (place / name).write_bytes(FOREIGN)
+        before = contents(place)
+        capsys.readouterr()
+        code, after = run(case, place), contents(place)
+        said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("refgs: ")]
+        if name in case.replaces:
+            assert code == 0 and after[name] != FOREIGN
+            continue
+        assert after[name] == before[name], name
+        assert code in (0, 2), said
+        if code == 2:
+            assert after == before, f"{name}: refused, and yet changed something"
+            assert "; " in said[-1], said
+        else:
+            assert {key: after.get(key) for key in before} == before, f"{name}: changed another file"
+
+
+# ---------------- what is a command's own ----------------
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What a command says that refuses."""
+    capsys.readouterr()
+    assert main(arguments) == 2
+    return capsys.readouterr().err
+
+
+def test_an_export_replaces_only_one_of_the_same_run(
+    sources: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = (shutil.copytree(sources / "run", tmp_path / name) for name in ("first", "second"))
+    out = tmp_path / "out"
+    export = ["export", str(first), "-o", str(out)]
+    assert main(export) == 0
+    (out / "surfels.ply").write_bytes(b"spoilt")
+    assert main(export) == 0 and (out / "surfels.ply").read_bytes() == (first / "surfels.ply").read_bytes()
+    before = contents(Place(out))
+    other = ["export", str(second), "-o", str(out)]
+    assert "--overwrite" in refused(other, capsys) and contents(Place(out)) == before
+    (out / "background.exr").write_bytes(FOREIGN)
+    assert "background.exr: output: exists" in refused(export, capsys)
+    assert main([*other, "--overwrite"]) == 0 and not (out / "background.exr").exists()
+    assert "surfels.ply: output: exists" in refused(export, capsys)
+
+
+def test_a_run_is_never_overwritten(
+    sources: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not even with --overwrite; nor its files one by one, also in a run without checkpoints."""
+    shutil.copytree(sources / "run", tmp_path / "run")
+    bare = shutil.copytree(sources / "bare", tmp_path / "bare")
+    before = contents(Place(bare))
+    for more in ([], ["--overwrite"]):
+        command = ["export", str(tmp_path / "run"), "-o", str(bare), *more]
+        assert "holds a run, which is never overwritten" in refused(command, capsys)
+        (bare / "config.toml").rename(tmp_path / "config.toml")
+        assert "belongs to a run, which is never overwritten" in refused(command, capsys)
+        (tmp_path / "config.toml").rename(bare / "config.toml")
+    with pytest.raises(InputError, match="holds a run already"):
+        mi_refgs.load(tmp_path / "run").save(bare)
+    assert contents(Place(bare)) == before
+
+
+def test_saving_refuses_files_in_the_way(sources: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/mesh.ply").write_bytes(FOREIGN)
+    with pytest.raises(InputError, match=r"mesh\.ply: output: exists"):
+        mi_refgs.load(sources / "run").save(tmp_path / "out")
+    assert contents(Place(tmp_path / "out")) == {"mesh.ply": FOREIGN}
+
+
+def test_a_format_replaces_only_its_own_of_the_same_run(sources: Path, tmp_path: Path) -> None:
+    found, out = mi_refgs.load(sources / "run"), tmp_path / "out"
+    for _ in range(2):
+        assert all(path.is_file() for path in found.export("cameras", out))
+    copy = mi_refgs.load(shutil.copytree(sources / "run", tmp_path / "copy"))
+    in_memory = found.edit(set={"roughness": 0.5})
+    for other in (copy, in_memory):
+        with pytest.raises(InputError, match=r"overwrite=True"):
+            other.export("cameras", out)
+    copy.export("cameras", out, overwrite=True)
+    assert not [path for path in out.iterdir() if path.is_dir() and path.name.startswith(".")]
+
+
+def test_a_resumed_fit_leaves_other_logs_and_checkpoints(
+    data: Path, method: Path, sources: Path, tmp_path: Path
+) -> None:
+    run = shutil.copytree(sources / "run", tmp_path / "run")
+    foreign = [run / name for name in ("notes.jsonl", "checkpoints/9999999.npz", "checkpoints/0000001.npz")]
+    for path in foreign:
+        path.write_bytes(FOREIGN)
+    assert main(["train", str(data), "-o", str(run), "--resume"]) == 0
+    state = Run(run).load_checkpoint()
+    assert state is not None
+    Run(run).save_checkpoint(7, state)
+    Run(run).save_checkpoint(8, state)
+    assert all(path.read_bytes() == FOREIGN for path in foreign)
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {
+        *(path.name for path in foreign[1:]),
+        *("0000007.npz", "0000008.npz"),
+    }
+
+
+def test_a_folder_of_an_earlier_version_is_its_own(sources: Path, tmp_path: Path) -> None:
+    """A run without a record: its usual files are its own, and recorded with the first that is written."""
+    run = shutil.copytree(sources / "run", tmp_path / "run")
+    (run / RECORD).unlink()
+    (run / "notes.txt").write_bytes(FOREIGN)
+    assert main(["eval", str(run)]) == 0 and main(["eval", str(run)]) == 0 and main(["export", str(run)]) == 0
+    owners = Run(run).output.owners()
+    assert {"surfels.ply", "checkpoints/0000006.npz", "metrics.json"} <= owners.keys()
+    assert "notes.txt" not in owners and set(owners.values()) == {"run"}
+
+
+def test_every_file_of_a_run_is_listed(sources: Path, tmp_path: Path) -> None:
+    """Files that a run may get later are refused when it begins, not after minutes."""
+    run = shutil.copytree(sources / "run", tmp_path / "run")
+    assert main(["eval", str(run)]) == 0
+    listed = {path for pattern in RUN_FILES for path in run.glob(pattern)}
+    assert {path for path in run.rglob("*") if path.is_file() and path.name != RECORD} == listed
+
+
+def test_records_of_two_processes_add_up(tmp_path: Path) -> None:
+    """Lines are appended; half a line of a process that was killed is skipped."""
+    one, two = OutputFolder(tmp_path, "a"), OutputFolder(tmp_path, "b")
+    one.claim("x")
+    two.claim("y")
+    with (tmp_path / RECORD).open("a") as record:
+        record.write('{"owner": "c", "fi')
+    one.claim("z")
+    assert OutputFolder(tmp_path, "a").owners() == {"x": "a", "y": "b", "z": "a"}
+
+
+def test_another_map_of_the_same_name_gets_a_folder_of_its_own(sources: Path, tmp_path: Path) -> None:
+    shutil.copytree(sources / "run", tmp_path / "run")
+
+    def relit(light: Path, *more: str) -> str:
+        made = NewLight(light, rotate=float(more[0]) if more else 0.0)
+        return Path(relight(Run(tmp_path / "run"), made, turntable=1).result["output"]).name
+
+    for name, value in (("first", 1.0), ("second", 0.2)):
+        (tmp_path / name).mkdir()
+        write_exr(tmp_path / name / "studio.exr", np.full((4, 8, 3), value, np.float32))
+    first, second = (tmp_path / name / "studio.exr" for name in ("first", "second"))
+    assert [relit(first), relit(second), relit(first)] == ["studio", "studio_2", "studio"]
+    # Two rotations whose names are equal: six digits are not all of a number.
+    assert [relit(first, "90"), relit(first, "90.00000001")] == ["studio_r90", "studio_r90_2"]

@@ -1,0 +1,514 @@
+"""A repeated or resumed command with any option changed does what the option says, or refuses and names it.
+
+The options are those of the parser: a new one without a row fails. A row says what happens when a command
+that has run is given again with this option changed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from mi_refgs import methods
+from mi_refgs.cli import build_parser, main
+from mi_refgs.compare import execute, jobs
+from mi_refgs.compare.jobs import Job
+from mi_refgs.errors import InputError
+from mi_refgs.fitting import cost_model, plan
+from mi_refgs.fitting.progress import Progress
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.gallery.make import RECORD
+from mi_refgs.io.files import BusyError
+from mi_refgs.io.resources import resource_dir
+from mi_refgs.reconstruction import fit as reconstruct
+from mi_refgs.runs.run import LOCK, Run
+from mi_refgs.synthesis import make_dataset
+from tests.scenes.tiny import METHOD, SETTINGS, train_command
+from tests.synthesis.test_dataset import SCENE
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Exit code 2, and a sentence with these words; nothing is changed."""
+
+    argv: tuple[str, ...]
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Shows:
+    """The result is that of the option."""
+
+    argv: tuple[str, ...]
+    check: str  # name of a function below
+
+
+class Free(str):
+    """Why the option is no part of what is kept."""
+
+
+Row = Refused | Shows | Free
+
+HOW = Free("how it is computed, from here on")
+WHERE = Free("which output this is about")
+FORM = Free("how the result is printed")
+HASHED = Free("names the results of the steps that depend on it: see test_capture")
+WHOLE = Free("a file is written whole: see test_a_picture_is_rendered_anew")
+COMMON: dict[str, Row] = {"--json": FORM, "--mitsuba-variant": HOW, "--threads": HOW}
+
+
+def refused(option: str, *values: str, word: str = "") -> Refused:
+    return Refused((option, *values), (word or option,))
+
+
+KEPT: dict[str, dict[str, Row]] = {
+    "train": {
+        "data": Shows(("{moved}",), "trains_on_moved"),
+        "--output": WHERE,
+        "--variant": refused("--variant", "{other}"),
+        "--for": Refused(("--for", "relighting"), ("--for",)),
+        "--preset": refused("--preset", "standard"),
+        "--minutes": refused("--minutes", "0.001"),
+        "--set": refused("--set", "loss.ssim=0.4"),
+        "--resume": Free("absent, the run is refused: see test_a_run_is_not_begun_twice"),
+        "--view": Free("shows the fit"),
+    },
+    "demo": {
+        "--output": WHERE,
+        "--preset": Shows(("--preset", "standard"), "fits_in_a_folder_of_the_preset"),
+        "--set": refused("--set", "loss.ssim=0.4"),
+    },
+    "dataset": {
+        "scene": refused("{scene2}", word="SCENE"),
+        "--output": WHERE,
+        "--views": refused("--views", "3"),
+        "--test-views": refused("--test-views", "2"),
+        "--size": refused("--size", "6"),
+        "--object": refused("--object", "a"),
+        "--distance": refused("--distance", "3", "4"),
+        "--colmap": Shows(("--colmap", "{out}/colmap"), "writes_colmap"),
+        "--spp": refused("--spp", "2"),
+        "--seed": refused("--seed", "1"),
+        "--max-depth": refused("--max-depth", "3"),
+        "--elevation": refused("--elevation", "-10", "20"),
+        "--fov": refused("--fov", "30"),
+        "--light": refused("--light", "{light}"),
+        "--relight": Shows(("--relight", "{light}"), "has_another_light"),
+        "--overwrite": Shows(("--overwrite", "--views", "3"), "has_three_views"),
+    },
+    "compare": {
+        "data": refused("{elsewhere}", word="DATA"),
+        "--output": WHERE,
+        "--paper-table": Refused(("--paper-table", "1"), ("--paper-table", "DATA")),
+        "--variants": refused("--variants", "{other}"),
+        "--seeds": Shows(("--seeds", "0,1"), "has_two_seeds"),
+        "--preset": refused("--preset", "standard"),
+        "--set": refused("--set", "loss.ssim=0.4"),
+        "--workers": HOW,
+        "--cluster": HOW,
+        "--mitsuba-variant": Free("kept: see test_a_comparison_keeps_its_mitsuba_variant"),
+    },
+    "gallery": {
+        "--output": WHERE,
+        "--scenes": Free("adds scenes to the page: see test_gallery"),
+        "--work": Free("where the runs are, which have their own settings"),
+        "--views": refused("--views", "5"),
+        "--size": refused("--size", "25"),
+        "--preset": refused("--preset", "paper"),
+        "--set": refused("--set", "loss.ssim=0.4"),
+    },
+    "capture": {
+        **dict.fromkeys(("photographs", "--masks", "--camera"), HASHED),
+        "--output": WHERE,
+        "--region": Free("is written each time"),
+    },
+}
+"""Commands that go on from what they find."""
+ANEW: dict[str, dict[str, Row]] = {
+    "eval": {
+        "run_folder": WHERE,
+        "--data": Shows(("--data", "{moved}"), "anew"),
+        "--samples": Shows(("--samples", "4"), "anew"),
+        "--antialias": Shows(("--antialias",), "anew"),
+    },
+    "render": dict.fromkeys(
+        ("scene", "--output", "--sensor", "--camera", "--object", "--spp", "--aov"), WHOLE
+    ),
+}
+"""Commands that do everything again."""
+OTHERS = {
+    "doctor": "writes nothing",
+    "profile": "writes nothing",
+    "completion": "writes nothing",
+    "view": "names saved views by number",
+    "edit": "refuses an output that is there",
+    "import": "refuses an output that is there",
+    "relight": "does everything again",
+    "export": "does everything again",
+}
+
+
+def commands() -> dict[str, list[str]]:
+    """Names of the commands, each with its options and arguments."""
+    [found] = [a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction)]
+    return {
+        name: [(a.option_strings or [a.dest])[-1] for a in parser._actions if a.dest != "help"]
+        for name, parser in found.choices.items()
+    }
+
+
+def test_every_option_of_every_command_has_a_row() -> None:
+    found = commands()
+    assert found.keys() == {*KEPT, *ANEW, *OTHERS}
+    for name, rows in (KEPT | ANEW).items():
+        assert {*found[name]} == {*rows} | {*COMMON} & {*found[name]}, name
+
+
+@pytest.fixture(scope="module")
+def places(data: Path, method: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Files that rows name."""
+    folder = tmp_path_factory.mktemp("repeated")
+    other = folder / "twin" / method.name  # of the same name
+    other.parent.mkdir()
+    other.write_text(f"{METHOD}[rates]\ndecay = 0.25\n")
+    for name, text in (("scene", SCENE), ("scene2", SCENE.replace("0.7", "0.6"))):
+        (folder / f"{name}.xml").write_text(
+            text.replace('<shape type="sphere">', '<shape type="sphere" id="a">')
+        )
+    found = {
+        "data": data,
+        "method": method,
+        "other": other,
+        "moved": shutil.copytree(data, folder / "moved"),
+        "elsewhere": shutil.copytree(data, folder / "elsewhere" / data.name),
+        "scene": folder / "scene.xml",
+        "scene2": folder / "scene2.xml",
+        "light": resource_dir("scenes") / "lights" / "sky.exr",
+    }
+    return {name: str(path) for name, path in found.items()}
+
+
+Began = Callable[[str], tuple[list[str], Path]]
+"""Of a command that has run: its arguments, and its output."""
+
+
+@pytest.fixture
+def began(
+    places: dict[str, str],
+    finished: Path,
+    traced: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Began:
+    """Outputs of commands, and what takes long left out of their repetition."""
+    slow = cost_model.Speed({"initial": [1.0, 4.0], "deferred": [1.0, 4.0]}, 0.0, 0.0)
+    for name, value in {"speed_of": lambda *_: slow, "WORTH": 0, "LEAST": 10, "WHOLE": 0}.items():
+        monkeypatch.setattr(plan, name, value)
+    out = tmp_path / "out"
+
+    def train() -> list[str]:
+        shutil.copytree(finished, out)
+        return [
+            *train_command(Path(places["data"]), out, Path(places["method"]), "--resume"),
+            "data.downscale=1",
+        ]
+
+    def demonstration() -> list[str]:
+        shutil.copytree(finished, out / "quick")
+        monkeypatch.setattr(
+            make_dataset, "make_dataset", lambda *_, **__: shutil.copytree(places["data"], out / "data")
+        )
+        return ["demo", "-o", str(out)]
+
+    def dataset() -> list[str]:
+        shutil.copytree(traced, out)
+        return [*TRACE, "-o", str(out), places["scene"]]
+
+    def compare() -> list[str]:
+        def begin(wanted: list[Job], *_: object) -> None:
+            for job in wanted:
+                if not job.run.exists():
+                    job.run.create(job.method(), job.data)
+
+        monkeypatch.setattr(execute, "execute_all", begin)
+        options = ["--preset", "quick", "--variants", places["method"], "--set", *SETTINGS]
+        argv = ["compare", places["data"], "-o", str(out), *options]
+        assert main(argv) == 3  # nothing is fitted
+        return argv
+
+    def gallery() -> list[str]:
+        out.mkdir()
+        settings = {"views": 4, "size": 24, "preset": "quick", "set": []}
+        (out / RECORD).write_text(json.dumps({"settings": settings, "scenes": {}}))
+        return ["gallery", "-o", str(out), "--views", "4", "--size", "24", "--preset", "quick"]
+
+    made = {"train": train, "demo": demonstration, "dataset": dataset, "compare": compare, "gallery": gallery}
+    return lambda command: (made[command](), out)
+
+
+TRACE = ["dataset", "--views", "2", "--test-views", "1", "--size", "4", "--spp", "1"]
+
+
+@pytest.fixture(scope="module")
+def traced(places: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("traced") / "out"
+    assert main([*TRACE, "-o", str(out), places["scene"]]) == 0
+    return out
+
+
+def changed(argv: list[str], row: Refused | Shows, places: dict[str, str], out: Path) -> list[str]:
+    """The command with the row's option, or with another argument in place of its own."""
+    values = [value.format(**places, out=out) for value in row.argv]
+    if values[0].startswith("--"):
+        return [*argv, *values]
+    own = {places["data"], places["scene"]}
+    return [values[0] if value in own else value for value in argv]
+
+
+def tree(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+ROWS = [(command, option) for command, rows in KEPT.items() for option in rows]
+
+
+@pytest.mark.parametrize(
+    ("command", "option"), [row for row in ROWS if isinstance(KEPT[row[0]][row[1]], Refused)]
+)
+def test_what_cannot_be_changed_is_refused_by_name(
+    command: str, option: str, began: Began, places: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    row = KEPT[command][option]
+    assert isinstance(row, Refused)
+    argv, out = began(command)
+    before = tree(out)
+    capsys.readouterr()
+    assert main(changed(argv, row, places, out)) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert all(word in said for word in row.words), said
+    after = {path: content for path, content in tree(out).items() if path in before}
+    assert after == before or command == "demo"  # which makes its data set first
+
+
+@pytest.mark.parametrize(
+    ("command", "option"), [row for row in ROWS if isinstance(KEPT[row[0]][row[1]], Shows)]
+)
+def test_what_can_be_changed_shows(
+    command: str, option: str, began: Began, places: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = KEPT[command][option]
+    assert isinstance(row, Shows)
+    argv, out = began(command)
+    if command == "demo":
+        monkeypatch.setattr(
+            reconstruct, "fit", lambda *_, output, **__: shutil.copytree(out / "quick", output)
+        )
+        with pytest.raises(AttributeError):  # after the fit
+            main(changed(argv, row, places, out))
+    else:
+        assert main(changed(argv, row, places, out)) in (0, 3)
+    assert CHECKS[row.check](out, places)
+
+
+CHECKS: dict[str, Callable[[Path, dict[str, str]], bool]] = {
+    "trains_on_moved": lambda out, places: str(Run(out).dataset()) == places["moved"],
+    "fits_in_a_folder_of_the_preset": lambda out, places: (out / "standard").is_dir(),
+    "writes_colmap": lambda out, places: any((out / "colmap").rglob("cameras.txt")),
+    "has_another_light": lambda out, places: (out / "relight" / "sky" / "transforms_test.json").is_file(),
+    "has_three_views": lambda out, places: len([*(out / "train").glob("r_*.png")]) == 3,
+    "has_two_seeds": lambda out, places: len([*out.rglob("seed*/config.toml")]) == 2,
+}
+
+
+def test_the_same_command_goes_on(began: Began, capsys: pytest.CaptureFixture[str]) -> None:
+    """Options that say what a run was started with are no others, in other words too."""
+    argv, out = began("train")
+    state = tree(out / "checkpoints")
+    config = Run(out).method()
+    for more in ([], ["--minutes", "1e6"], ["--variant", config.file], ["--preset", "quick"]):
+        assert main([*argv, *more]) == 0
+    assert main([*argv[:4], "--resume"]) == 0 and tree(out / "checkpoints") == state
+    assert main([*argv[:4], "--resume", "--for", "relighting"]) == 2
+    assert "--for" in capsys.readouterr().err
+
+
+def test_a_method_that_differs_is_refused(began: Began, places: dict[str, str]) -> None:
+    """The Python call likewise, and the difference is named."""
+    _, out = began("train")
+    made = Run(out).method()
+    data = places["data"]
+    reconstruct.fit(data, made, output=out, resume=True, progress=Progress())
+    longer = dataclasses.replace(made, iterations=500)
+    with pytest.raises(InputError, match=r"method: iterations: the run was started with 6, .* 500"):
+        reconstruct.fit(data, longer, output=out, resume=True, progress=Progress())
+
+
+def test_minutes_and_a_size_are_one_too_many(
+    places: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    argv = train_command(Path(places["data"]), out, Path(places["method"]), "--minutes", "5")
+    assert main([*argv, "data.downscale=1"]) == 2
+    assert "--minutes: data.downscale=1" in capsys.readouterr().err and not out.exists()
+
+
+def test_a_comparison_keeps_its_mitsuba_variant(began: Began) -> None:
+    _, out = began("compare")
+    [job] = jobs.jobs_in(out)
+    jobs.require_same(job)
+    with pytest.raises(InputError, match="--mitsuba-variant: the run was made with llvm_ad_rgb"):
+        jobs.require_same(dataclasses.replace(job, mitsuba_variant="cuda_ad_rgb"))
+
+
+@pytest.mark.parametrize(
+    "option", ["--variants=a", "--seeds=1", "--preset=quick", "--set=a=1", "--workers=1"]
+)
+def test_a_table_that_is_made_again_takes_no_option_of_a_fit(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for more in ([], ["--paper-table", "1"]):
+        assert main(["compare", "-o", str(tmp_path), option, *more]) == 2
+        assert option.split("=")[0] in capsys.readouterr().err
+
+
+# ---------------- commands that do everything again ----------------
+
+
+def test_an_evaluation_is_made_anew(places: dict[str, str], finished: Path, tmp_path: Path) -> None:
+    """After another one it is what it would be without."""
+    used, fresh = (Path(shutil.copytree(finished, tmp_path / name)) for name in ("used", "fresh"))
+    assert main(["eval", str(used)]) == 0
+    first = json.loads((used / "metrics.json").read_text())
+    options = [
+        value.format(**places)
+        for row in ANEW["eval"].values()
+        if isinstance(row, Shows)
+        for value in row.argv
+    ]
+    assert all(main(["eval", str(folder), *options]) == 0 for folder in (used, fresh))
+    found = [json.loads((folder / "metrics.json").read_text()) for folder in (used, fresh)]
+    for result in (first, *found):
+        del result["ms_per_frame"]
+    assert found[0] == found[1] != first
+    assert found[0]["samples"] == 4 and found[0]["antialias"] and found[0]["dataset"] == places["moved"]
+
+
+def test_a_picture_is_rendered_anew(finished: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    assert main(["render", str(run), "-o", str(tmp_path / "used.exr")]) == 0
+    first = (tmp_path / "used.exr").read_bytes()
+    for name in ("used.exr", "fresh.exr"):
+        assert main(["render", str(run), "-o", str(tmp_path / name), "--spp", "4", "--aov", "albedo"]) == 0
+    assert (tmp_path / "used.exr").read_bytes() == (tmp_path / "fresh.exr").read_bytes() != first
+
+
+def test_an_output_that_is_there_is_refused(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the commands that make a new run."""
+    out = Path(shutil.copytree(finished, tmp_path / "out"))
+    before = tree(out)
+    for argv in (["edit", str(finished), "--set", "roughness=0.5"], ["import", "any.ply"]):
+        assert main([*argv, "-o", str(out)]) == 2 and tree(out) == before
+        assert str(out) in capsys.readouterr().err
+
+
+# ---------------- two processes on one run ----------------
+
+HOLD = """
+import fcntl, sys
+file = open(sys.argv[1], "a")
+fcntl.flock(file, fcntl.LOCK_EX)
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def live(finished: Path, tmp_path: Path) -> Iterator[tuple[Path, subprocess.Popen[str]]]:
+    """A run that another process changes, whose artefacts are older than its checkpoint."""
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    model = json.loads((run / "model.json").read_text())
+    (run / "model.json").write_text(json.dumps(model | {"iteration": 3}))
+    argv = [sys.executable, "-c", HOLD, str(run / LOCK)]
+    with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "held\n"
+        yield run, process
+        process.kill()
+
+
+def test_a_second_process_is_refused_until_the_first_ends(
+    live: tuple[Path, subprocess.Popen[str]],
+    places: dict[str, str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Commands that change the run are refused, those that look at it read the newest checkpoint."""
+    run, process = live
+    argv = train_command(Path(places["data"]), run, Path(places["method"]), "--resume")
+    before = tree(run)
+    for command in (argv, ["export", str(run)], ["export", str(tmp_path / "run"), "-o", str(run)]):
+        assert main(command) == 2
+        said = capsys.readouterr().err.strip().splitlines()[-1]
+        assert "another process trains this run" in said and str(run) in said
+    assert tree(run) == before
+    scene = reconstruct.load(run)
+    assert scene.trained.iteration == 6
+    for command in (
+        ["eval", str(run)],
+        ["render", str(run), "-o", str(tmp_path / "a.exr")],
+        ["export", str(run), "-o", str(tmp_path / "copy")],
+    ):
+        assert main(command) == 0
+    assert json.loads((run / "metrics.json").read_text())["iterations"] == 6
+    assert json.loads((run / "model.json").read_text())["iteration"] == 3  # nothing is written
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert main(argv) == 0 and not (run / LOCK).exists()
+
+
+def test_a_folder_that_is_being_trained_in_is_not_saved_to(
+    live: tuple[Path, subprocess.Popen[str]], finished: Path
+) -> None:
+    """Not even before it is a run."""
+    run, _ = live
+    (run / "config.toml").unlink()
+    with pytest.raises(BusyError, match="another process trains this run"):
+        reconstruct.load(finished).save(run)
+
+
+def test_a_fit_holds_its_run(places: dict[str, str], tmp_path: Path) -> None:
+    """From its first step to its artefacts, against other threads too."""
+    run, seen = Run(tmp_path / "run"), []
+
+    def attempt() -> None:
+        try:
+            with run.alone():
+                seen.append("free")
+        except BusyError:
+            seen.append("busy")
+
+    class Watch(Progress):
+        def step(self, trainer: Trainer) -> None:
+            thread = threading.Thread(target=attempt)
+            thread.start()
+            thread.join()
+
+    method = methods.load(places["method"], "quick", SETTINGS)
+    reconstruct.fit(places["data"], method, output=run.path, progress=Watch())
+    assert seen == ["busy"] * 6 and not (run.path / LOCK).exists()
+    attempt()
+    assert seen[-1] == "free"
+    with run.alone(), run.alone():
+        pass

@@ -1,0 +1,588 @@
+"""Comparisons: jobs that resume, rows that say why they failed, tables whose arithmetic is written here."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import threading
+import time
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.compare import execute, jobs, paper_table, plots, results
+from mi_refgs.compare.jobs import Job
+from mi_refgs.compare.paper import Figures, Place, place_of
+from mi_refgs.compare.table import Row, Scene, Statistic, Table
+from mi_refgs.compare.text import heading
+from mi_refgs.errors import InputError
+from mi_refgs.io.exr import write_exr
+from mi_refgs.io.images import read_png
+from mi_refgs.methods import load, names
+from mi_refgs.runs.run import Run
+from tests.scenes.tiny import SETTINGS, write_data, write_method
+
+SIX = [setting for setting in SETTINGS if "preview" not in setting]
+
+
+def command(data: Path, folder: Path, *variants: Path, more: tuple[str, ...] = ()) -> list[str]:
+    """Arguments of `refgs compare` for tiny methods."""
+    options = ["--preset", "quick", "--threads", "1", "--variants", *map(str, variants)]
+    return ["compare", str(data), "-o", str(folder), *options, *more, "--set", *SIX]
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny data set in a folder that is named after a scene of the paper."""
+    return write_data(tmp_path_factory.mktemp("shiny") / "ball")
+
+
+@pytest.fixture(scope="module")
+def variants(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The tiny method, and one that deviates from it and stands for a row of the paper."""
+    first = write_method(tmp_path_factory.mktemp("variants"))
+    second = first.with_name("other.toml")
+    about = (
+        '[about]\nname = "Other"\npaper_row = "2DGS"\ndeviations = ["a ball <and> no scene", "six steps"]\n'
+    )
+    second.write_text(f'extends = "tiny.toml"\n{about}[rates]\ndecay = 0.5\n')
+    return first, second
+
+
+@pytest.fixture(scope="module")
+def compared(
+    ball: Path, variants: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, int]:
+    """A comparison in which one of four jobs failed, and its exit code; do not change it."""
+    folder = tmp_path_factory.mktemp("compared")
+    broken = folder / "runs" / "ball" / "tiny" / "seed1"
+    broken.mkdir(parents=True)
+    (broken / "checkpoints").write_text("in the way")
+    code = main(command(ball, folder, *variants, more=("--seeds", "0,1", "--workers", "2")))
+    return folder, code
+
+
+# ---------- The main job ----------
+
+
+def test_a_comparison_has_a_run_for_each_job(compared: tuple[Path, int]) -> None:
+    folder, code = compared
+    assert code == 3  # one failed
+    for variant, seed in (("tiny", 0), ("other", 0), ("other", 1)):
+        run = Run(folder / "runs" / "ball" / variant / f"seed{seed}")
+        assert run.method().seed == seed and run.method().iterations == 6
+        curve = [json.loads(line) for line in (run.path / "curve.jsonl").read_text().splitlines()]
+        assert [point["iteration"] for point in curve] == [1, 2, 3, 4, 5, 6]
+        assert all(np.diff([point["seconds"] for point in curve]) > 0)
+        metrics = json.loads((run.path / "metrics.json").read_text())
+        assert abs(curve[-1]["psnr"] - metrics["psnr"]) < 0.01  # both on the two test views
+
+
+def test_a_failed_job_is_a_row_that_says_why(compared: tuple[Path, int]) -> None:
+    table = json.loads((compared[0] / "table.json").read_text())
+    [scene] = table["scenes"]
+    tiny, other = scene["rows"]
+    assert tiny["variant"] == "tiny" and tiny["seeds"] == [0] and list(tiny["failed"]) == ["1"]
+    assert "seed1: output: cannot be written" in tiny["failed"]["1"]
+    assert other["seeds"] == [0, 1] and not other["failed"]
+    assert f"tiny, seed 1: failed: {tiny['failed']['1']}" in (compared[0] / "table.md").read_text()
+
+
+def test_numbers_are_means_over_the_runs(compared: tuple[Path, int]) -> None:
+    folder, _ = compared
+    [scene] = json.loads((folder / "table.json").read_text())["scenes"]
+    other = scene["rows"][1]
+    metrics = [
+        json.loads((folder / "runs/ball/other" / f"seed{seed}" / "metrics.json").read_text())
+        for seed in (0, 1)
+    ]
+    values = [found["psnr"] for found in metrics]
+    number = other["numbers"]["psnr"]
+    assert number["values"] == values and values[0] != values[1]
+    assert number["mean"] == pytest.approx((values[0] + values[1]) / 2)
+    assert number["sd"] == pytest.approx(abs(values[0] - values[1]) / 2**0.5)
+    assert other["paper"]["psnr"]["value"] == 25.97
+    assert other["paper"]["psnr"]["difference"] == pytest.approx(number["mean"] - 25.97)
+    unmeasured = any(found.get("lpips") is None for found in metrics)
+    assert (other["numbers"]["lpips"] is None) == unmeasured
+    assert "800 × 800" in scene["note"] and "20 × 20" in scene["note"]
+    assert scene["published"]["Ref-NeRF"]["psnr"] == 33.16 and "2DGS" not in scene["published"]
+
+
+def test_a_finished_comparison_has_nothing_left_to_do(
+    compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nothing(*_: object) -> None:
+        raise AssertionError("a finished job was begun again")
+
+    monkeypatch.setattr(execute, "_process", nothing)
+    assert main(command(ball, compared[0], variants[1], more=("--seeds", "0,1"))) == 3
+
+
+def test_an_interrupted_run_goes_on_from_its_checkpoint(
+    compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """With one thread the resumed run is the straight one; what came after the checkpoint is done again."""
+    done = compared[0] / "runs" / "ball" / "other" / "seed0"
+    run = tmp_path / "runs" / "ball" / "other" / "seed0"
+    shutil.copytree(done, run)
+    (run / "checkpoints" / "0000006.npz").unlink()
+    for name in ("metrics.json", "surfels.ply", "model.json"):
+        (run / name).unlink()
+    assert main(command(ball, tmp_path, variants[1])) == 0
+    for name in ("surfels.ply", "envmap.exr"):
+        assert (run / name).read_bytes() == (done / name).read_bytes(), name
+    first, again = (
+        [json.loads(line) for line in (folder / "curve.jsonl").read_text().splitlines()]
+        for folder in (done, run)
+    )
+    assert [(p["iteration"], p["psnr"]) for p in again] == [(p["iteration"], p["psnr"]) for p in first]
+
+
+def test_metrics_of_an_older_checkpoint_do_not_finish_a_run(
+    compared: tuple[Path, int], ball: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(compared[0] / "runs" / "ball" / "other" / "seed0", folder)
+    job = Job(**(json.loads((folder / "job.json").read_text()) | {"folder": str(folder)}))
+    assert jobs.finished(job)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    for change in ({"iterations": 3}, {"dataset": str(tmp_path)}):
+        (folder / "metrics.json").write_text(json.dumps(metrics | change))
+        assert not jobs.finished(job)
+    (folder / "metrics.json").write_text("{")
+    assert not jobs.finished(job)
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    assert jobs.finished(job)
+    (folder / "checkpoints" / "0000006.npz").unlink()
+    assert not jobs.finished(job)
+
+
+# ---------- Crashes ----------
+
+
+def test_a_crash_is_retried_and_then_a_row(
+    ball: Path, variants: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each worker process dies of a segmentation fault before it does anything."""
+    crash = tmp_path / "crash"
+    crash.mkdir()
+    (crash / "sitecustomize.py").write_text(
+        "import os, sys\nif 'mi_refgs.compare.worker' in sys.orig_argv:\n"
+        f"    open({str(tmp_path / 'began')!r}, 'a').write('x')\n    os.kill(os.getpid(), 11)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(crash))
+    assert main(command(ball, tmp_path / "out", variants[0])) == 3
+    [scene] = json.loads((tmp_path / "out" / "table.json").read_text())["scenes"]
+    assert "SIGSEGV 3 times" in scene["rows"][0]["failed"]["0"]
+    assert (tmp_path / "began").read_text() == "x" * (1 + execute.RETRIES)
+
+
+def test_a_worker_ends_with_the_process_that_started_it(ball: Path, variants: tuple[Path, Path]) -> None:
+    """Its standard input closes, and it asks itself to end."""
+    import subprocess
+    import sys
+
+    code = (
+        "import os, time\nfrom mi_refgs.compare import worker\nimport threading\n"
+        "threading.Thread(target=worker._end_with_parent, daemon=True).start()\ntime.sleep(60)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
+    assert process.stdin is not None
+    process.stdin.close()
+    assert process.wait(30) == -15
+
+
+def test_a_worker_of_the_cluster_is_killed_midway(
+    ball: Path, variants: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Another worker goes on from the checkpoint; the log has each iteration once."""
+    distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
+    from mi_refgs.compare.cluster import run_on_cluster
+
+    settings = ("iterations=150", "checkpoint_every=10", "log_every=10", *SIX[1:3])
+    [job] = jobs.plan(tmp_path, [ball], [str(variants[1])], [0], "quick", settings, "llvm_ad_rgb", 1)
+    reports: list[tuple[Job, str | None]] = []
+    killed: list[int] = []
+
+    def kill(address: str) -> None:
+        until = time.monotonic() + 60
+        while not job.run.checkpoints() and time.monotonic() < until:
+            time.sleep(0.05)
+        with distributed.Client(address) as client:
+            [(worker, tasks)] = [item for item in client.processing().items() if item[1]]
+            assert tasks
+            killed.append(client.run(os.getpid, workers=[worker])[worker])
+        assert not job.run.checkpoints()[-1].stem.endswith("150")
+        os.kill(killed[0], signal.SIGKILL)
+
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        killer = threading.Thread(target=kill, args=[cluster.scheduler_address])
+        killer.start()
+        run_on_cluster([job], cluster.scheduler_address, 1, lambda *said: reports.append(said))
+        killer.join()
+    assert killed and reports == [(job, None)] and jobs.finished(job)
+    logged = [
+        json.loads(line)["iteration"] for line in (job.run.path / "metrics.jsonl").read_text().splitlines()
+    ]
+    assert logged == list(range(10, 151, 10))
+    assert (job.run.path / "job.log").read_text().count("resumed at iteration") == 1
+
+
+# ---------- Refusals ----------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["{data}", "--variants", "nothing_like_it", "-o", "{out}"], ["no such method"]),
+        (["{data}/none", "--variants", "{tiny}", "-o", "{out}"], ["no such folder"]),
+        (["{data}", "{twin}", "--variants", "{tiny}", "-o", "{out}"], ["'ball' stands there twice"]),
+        (["{data}", "--variants", "{tiny},{tiny}", "-o", "{out}"], ["'tiny' stands there twice"]),
+        (["{data}", "--variants", "{tiny}", "--seeds", "0,x", "-o", "{out}"], ["--seeds", "0,x"]),
+        (["{data}", "--variants", "{tiny}", "--seeds=-1", "-o", "{out}"], ["--seeds", "-1"]),
+        (["{data}", "--variants", "{tiny}", "--seeds", "1,1", "-o", "{out}"], ["'1' stands there twice"]),
+        (["{data}", "--variants", "{tiny}", "--set", "seed=2", "-o", "{out}"], ["--seeds"]),
+        (["{data}", "--variants", "{tiny}", "--workers", "0", "-o", "{out}"], ["--workers"]),
+        (["{data}", "-o", "{out}"], ["--variants", "ref_gaussian"]),
+        (["{data}", "--variants", "{tiny}"], ["-o"]),
+        (["-o", "{out}"], ["holds no comparison"]),
+        (["-o", "{out}", "--preset", "quick"], ["DATA"]),
+        (["--paper-table", "9"], ["--paper-table", "1, 2"]),
+        (["{data}", "--paper-table", "1"], ["drop DATA"]),
+    ],
+)
+def test_bad_input_is_one_sentence(
+    arguments: list[str],
+    words: list[str],
+    ball: Path,
+    variants: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "twin").mkdir()
+    os.symlink(ball, tmp_path / "twin" / "ball")
+    names = {"data": ball, "twin": tmp_path / "twin" / "ball", "tiny": variants[0], "out": tmp_path / "out"}
+    assert main(["compare", *(argument.format(**names) for argument in arguments)]) == 2
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1 and all(word in said for word in words), said
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_test_views_are_refused(
+    variants: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = write_data(tmp_path / "data")
+    content = json.loads((data / "transforms_test.json").read_text()) | {"frames": []}
+    (data / "transforms_test.json").write_text(json.dumps(content))
+    assert main(command(data, tmp_path / "out", variants[0])) == 2
+    assert "zero test views" in capsys.readouterr().err
+
+
+def test_pictures_are_looked_for_as_the_methods_read_them(
+    ball: Path, variants: tuple[Path, Path], tmp_path: Path
+) -> None:
+    data = shutil.copytree(ball, tmp_path / "ball")
+    for picture in data.glob("*/r_*.png"):
+        write_exr(picture.with_suffix(".exr"), read_png(picture))
+        picture.unlink()
+
+    def plan(*settings: str) -> list[Job]:
+        folder, options = tmp_path / "out", [*SIX, *settings]
+        return jobs.plan(folder, [data], [str(variants[0])], [0], "quick", options, "llvm_ad_rgb", 1)
+
+    assert len(plan("data.images='exr'")) == 1
+    with pytest.raises(InputError, match="png"):
+        plan()
+
+
+def test_images_of_different_sizes_are_not_set_side_by_side(
+    compared: tuple[Path, int],
+    ball: Path,
+    variants: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Before anything is fitted: two methods, or one and what the folder holds; and where runs are there."""
+    smaller = tmp_path / "smaller.toml"
+    smaller.write_text(f'extends = "{variants[0]}"\n[data]\ndownscale = 2\n')
+    copy = Path(shutil.copytree(compared[0], tmp_path / "copy"))
+    for path in copy.rglob("job.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"folder": str(path.parent)}))
+    for folder, chosen in ((tmp_path / "new", (variants[0], smaller)), (copy, (smaller,))):
+        assert main(command(ball, folder, *chosen)) == 2
+        said = capsys.readouterr().err.strip()
+        assert len(said.splitlines()) == 1 and "20 × 20" in said and "10 × 10" in said and "smaller" in said
+        assert not (folder / "runs/ball/smaller").exists()
+    metrics = copy / "runs/ball/other/seed1/metrics.json"
+    metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"image_size": [10, 10]}))
+    assert main(["compare", "-o", str(copy)]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "20 × 20" in said and "10 × 10" in said and "runs/ball/other/seed1" in said
+
+
+def test_the_size_of_images_stands_above_the_scores(compared: tuple[Path, int]) -> None:
+    [scene] = results.table(compared[0]).scenes
+    assert scene.downscale == 1 and heading(scene) == "ball (2 test views of 20 × 20 pixels)"
+    scene.downscale = 2
+    assert heading(scene) == "ball (2 test views of 20 × 20 pixels, downscaled by 2)"
+    for name in ("table.md", "index.html"):
+        assert "ball (2 test views of 20 × 20 pixels)" in (compared[0] / name).read_text()
+
+
+def test_other_settings_are_refused(
+    compared: tuple[Path, int],
+    ball: Path,
+    variants: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = Path(shutil.copytree(compared[0], tmp_path / "copy"))
+    for path in folder.rglob("job.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"folder": str(path.parent)}))
+
+    def refused(arguments: list[str], *words: str) -> None:
+        assert main(arguments) == 2
+        said = capsys.readouterr().err.strip()
+        assert len(said.splitlines()) == 1 and all(word in said for word in words), said
+
+    refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "compare.json", "--set", "loss.ssim=0.1")
+    refused([*command(ball, folder, variants[1]), "--preset", "standard"], "--preset", "quick", "standard")
+    changed = tmp_path / "other.toml"
+    text = variants[1].read_text().replace("tiny.toml", str(variants[0])).replace("0.5", "0.25")
+    changed.write_text(text)
+    refused(command(ball, folder, changed), "rates.decay", "0.5", "0.25", "config.toml")
+    moved = write_data(tmp_path / "elsewhere" / "ball")
+    refused(command(moved, folder, variants[1]), "dataset.json", str(ball), str(moved))
+    (folder / "compare.json").unlink()
+    refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "loss.ssim", "config.toml")
+
+
+# ---------- The page ----------
+
+
+class Page(HTMLParser):
+    """Checks that tags close in order, and collects what a page refers to."""
+
+    VOID = frozenset({"meta", "img", "br", "link", "hr"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.references: list[str] = []
+        self.anchors: set[str] = set()
+        self.tags: set[str] = set()
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        if tag not in self.VOID:
+            self.open.append(tag)
+        for name, value in attrs:
+            if name in ("src", "href") and value:
+                self.references.append(value)
+            if name == "id" and value:
+                assert value not in self.anchors
+                self.anchors.add(value)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_the_page_is_whole_and_stands_alone(compared: tuple[Path, int]) -> None:
+    folder, _ = compared
+    page = Page()
+    page.feed((folder / "index.html").read_text())
+    page.close()
+    assert page.open == [] and "script" not in page.tags
+    assert "pictures/ball_psnr.png" in page.references and "pictures/ball_crops.png" in page.references
+    for reference in page.references:
+        if reference.startswith("#"):
+            assert reference[1:] in page.anchors
+        else:
+            assert (folder / reference).is_file() and not reference.startswith(("http", "/")), reference
+    command_line = json.loads((folder / "compare.json").read_text())["command"]
+    for said in ("a ball <and> no scene", "llvm_ad_rgb", "cannot be written", "33.16", command_line):
+        assert said in page.text, said
+
+
+# ---------- Arithmetic ----------
+
+
+def test_statistics() -> None:
+    assert Statistic.of([3.0]) == Statistic(3.0, None, (3.0,))
+    number = Statistic.of([1.0, 2.0, 6.0])
+    assert number.mean == 3.0 and number.sd == pytest.approx(7**0.5)
+
+
+def test_the_crop_is_where_pictures_differ_most(rng: np.random.Generator) -> None:
+    """Against every square, tried one by one."""
+    truth, first, second = rng.random((3, 12, 9, 3))
+    score, row, column = plots.most_different(truth, [first, second], 4)
+
+    def error(picture: np.ndarray, y: int, x: int) -> float:
+        return float(np.mean((picture[y : y + 4, x : x + 4] - truth[y : y + 4, x : x + 4]) ** 2))
+
+    spread = {(y, x): abs(error(first, y, x) - error(second, y, x)) for y in range(9) for x in range(6)}
+    assert (row, column) == max(spread, key=lambda key: spread[key])
+    assert score == pytest.approx(spread[row, column])
+    lone, *place = plots.most_different(truth, [first], 4)
+    assert lone == pytest.approx(max(error(first, y, x) for y in range(9) for x in range(6)))
+    assert lone == pytest.approx(error(first, *place))
+
+
+# ---------- The paper ----------
+
+
+@pytest.mark.parametrize(
+    ("folder", "place"),
+    [
+        ("data/ball", ("Shiny Blender", "ball")),
+        ("data/chair_400", ("NeRF-Synthetic", "chair")),
+        ("ref_real/gardenspheres", ("Ref-Real", "garden")),
+        ("glossy_synthetic/teapot", ("Glossy Synthetic", "teapot")),
+        ("ShinyBlender/teapot", ("Shiny Blender", "teapot")),
+        ("data/teapot_glossy", ("Glossy Synthetic", "teapot")),
+        ("data/Angel_blender", ("Glossy Synthetic", "angel")),
+        ("data/teapot", None),
+        ("data/balls", None),
+        ("data/glass_ball", None),
+        ("data/glossy", None),
+    ],
+)
+def test_scenes_are_recognised_by_their_folders(folder: str, place: tuple[str, str] | None) -> None:
+    found = place_of(Path(folder))
+    assert (found and (found.data_set, found.scene)) == place
+
+
+def test_the_figures_of_the_paper_agree_with_each_other() -> None:
+    """Averages that its smaller tables print are those of Table 1, up to what the paper rounds."""
+    figures = Figures.read()
+    for table in figures.tables.values():
+        for systems in table.metrics.values():
+            assert {len(values) for values in systems.values()} == {len(table.columns)}
+    first = figures.tables[1]
+    assert len(first.columns) == 17 and len(first.metrics["psnr"]) == 8
+
+    def mean(metric: str, system: str, data_set: str) -> float:
+        values = first.metrics[metric][system]
+        return float(
+            np.mean([v for v, c in zip(values, first.columns, strict=True) if c.data_set == data_set])
+        )
+
+    assert mean("psnr", "Ref-Gaussian", "Shiny Blender") == pytest.approx(35.04, abs=0.006)
+    assert mean("ssim", "Ref-Gaussian", "Shiny Blender") == pytest.approx(0.973, abs=6e-4)
+    assert mean("lpips", "Ref-Gaussian", "Shiny Blender") == pytest.approx(0.056, abs=6e-4)
+    assert mean("psnr", "Ref-Gaussian", "Glossy Synthetic") == pytest.approx(30.33, abs=0.04)
+    assert mean("lpips", "Ref-Gaussian", "Glossy Synthetic") == pytest.approx(0.049, abs=6e-4)
+    for system, values in figures.tables[7].metrics["psnr"].items():
+        if system in first.metrics["psnr"]:
+            assert values == first.metrics["psnr"][system][: len(values)], system
+    assert figures.tables[3].metrics["normal_mae_deg_full"]["Ref-Gaussian"] == [2.15]
+    assert figures.tables[4].metrics["psnr"]["w/o Deferred rendering"] == [28.85]
+    assert figures.tables[5].metrics["fps"]["NeRO"] == [0.11]
+    assert figures.tables[6].metrics["psnr"]["NDE"] == [35.48]
+    assert figures.of(Place("NeRF-Synthetic", "ship"), "3DGS") == {
+        "psnr": 31.43,
+        "ssim": 0.906,
+        "lpips": 0.111,
+    }
+    assert figures.of(Place("Shiny Blender", "teapot"), "w/o 2DGS") == {"psnr": 44.25}
+
+
+def test_variants_name_rows_of_the_paper() -> None:
+    figures = Figures.read()
+    known = {s for t in figures.tables.values() for systems in t.metrics.values() for s in systems}
+    rows = {name: load(name).about.paper_row for name in names()}
+    assert rows["ref_gaussian"] == "Ref-Gaussian" and set(rows.values()) <= known | {""}
+    for name, row in rows.items():  # a row that a file inherits is another method's
+        assert load(name).about.name.startswith("w/o") == row.startswith("w/o"), name
+
+
+def scene_of(name: str, data_set: str, psnr: float, seconds: float) -> Scene:
+    """A scene of the paper with one finished row."""
+    row = Row("mine", "Mine", seeds=[0], runs=["run"], paper_row="Ref-Gaussian")
+    row.numbers = {"psnr": Statistic.of([psnr]), "train_seconds": Statistic.of([seconds])}
+    return Scene(name, name, rows=[row], place=Place(data_set, name))
+
+
+def test_a_table_of_the_paper_with_our_figures() -> None:
+    figures = Figures.read()
+    ours = Table(
+        [scene_of("ball", "Shiny Blender", 36.0, 1800), scene_of("car", "Shiny Blender", 30.0, 5400)]
+    )
+    found = paper_table.compared(1, ours, figures)
+    lines = {line.title: line for line in found.lines["psnr"]}
+    assert lines["  ours: mine"].values == (36.0, 30.0, *[None] * 15)
+    assert lines["  ours − paper"].values[:2] == pytest.approx((36.0 - 37.01, 30.0 - 31.04))
+    assert found.missing["Shiny Blender"] == ["coffee", "helmet", "teapot", "toaster"]
+    assert len(found.missing["Glossy Synthetic"]) == 8 and len(found.missing["Ref-Real"]) == 3
+    assert [line.title for line in found.lines["ssim"] if "ours" in line.title] == []
+    text = paper_table.text(found, figures)
+    assert (
+        "shiny_blender/toaster" in text
+        and "shiny_blender/ball" not in text
+        and "−1.01" in text.replace("-", "−")
+    )
+    assert "Ref-NeRF (published)" in text
+
+    means = paper_table.compared(6, ours, figures)
+    by_title = {line.title: line.values for line in means.lines["psnr"]}
+    assert by_title["  ours: mine"] == (33.0,) and by_title["  ours − paper"] == (None,) and means.partial
+    hours = {line.title: line.values for line in paper_table.compared(2, ours, figures).lines["train_hours"]}
+    assert hours["  ours: mine"] == (1.0,)
+
+
+def test_the_paper_table_needs_no_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", "--paper-table", "5"]) == 0
+    said = capsys.readouterr().out
+    assert "NeRO (published)" in said and "29.73" in said and "glossy_synthetic/tbell" in said
+    assert main(["compare", "--paper-table", "1", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["missing"]["Ref-Real"] == ["garden", "sedan", "toycar"]
+
+
+def test_an_unreadable_run_is_a_failed_row(compared: tuple[Path, int], tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(compared[0], tmp_path / "copy"))
+    for path in folder.rglob("job.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"folder": str(path.parent)}))
+    (folder / "runs" / "ball" / "other" / "seed0" / "config.toml").write_text("future = 1")
+    row = results.write(folder).scenes[0].rows[1]
+    assert row.seeds == [1] and "future" in row.failed[0]
+
+
+def test_a_job_travels_through_its_file(tmp_path: Path) -> None:
+    job = Job(str(tmp_path / "a"), "/data", "v.toml", 3, "quick", ("x=1",), "llvm_ad_rgb", None)
+    job.write()
+    assert Job.read(tmp_path / "a") == job
+    (tmp_path / "a" / "job.json").write_text("{}")
+    with pytest.raises(InputError, match=r"job.json"):
+        Job.read(tmp_path / "a")
+
+
+def test_a_run_that_chose_its_terms_is_still_the_same(ball: Path, tmp_path: Path) -> None:
+    """A finished fit of a method that selects its terms is not taken for one of other settings."""
+    variant = tmp_path / "choosing.toml"
+    variant.write_text(
+        'extends = "base_2dgs"\n[select.term.colour]\nafter = 1\ntrial = 1\n'
+        "change = { surfels = { degree = { radiance_sh = 0 } } }\n"
+    )
+    job = jobs.plan(tmp_path / "out", [ball], [str(variant)], [0], "quick", [], "llvm_ad_rgb", 1)[0]
+    chosen = job.method(["colour"])
+    job.run.create(chosen, str(ball))
+    assert chosen.terms == ("colour",) and chosen.surfels.degree_of("radiance_sh") == 0
+    jobs.require_same(job)
+    job.run.write_method(dataclasses.replace(chosen, seed=3))
+    with pytest.raises(InputError, match=r"seed: the run was made with 3"):
+        jobs.require_same(job)

@@ -1,0 +1,357 @@
+"""COLMAP's layout, text and binary, as this test writes it: cameras, pictures, copies, masks, points."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_refgs.data.colmap_model import MODELS, read_cameras, read_images, read_points
+from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
+from mi_refgs.data.lens import Lens
+from mi_refgs.data.region import region_of
+from mi_refgs.errors import InputError
+from mi_refgs.io.images import box_downscale, linear_from_srgb, read_png, write_png
+from tests.scenes.dots import COLOURS, POINTS, Shot, check
+
+SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]
+MODEL, VALUES = "PINHOLE", (110.0, 104.0, 50.3, 34.6)
+KINDS = ("txt", "bin")
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """w, x, y, z, by the eigenvector of Bar-Itzhack's matrix."""
+    m = rotation
+    k = np.array(
+        [
+            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [0, m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[2, 0] + m[0, 2]],
+            [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[2, 1] + m[1, 2]],
+            [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]],
+        ]
+    )
+    return np.linalg.eigh(k, UPLO="U")[1][:, -1]
+
+
+def write_text(
+    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
+) -> None:
+    """Cameras, images and points as COLMAP writes them as text."""
+    model.mkdir(parents=True, exist_ok=True)
+    size = f"{shots[0].width} {shots[0].height}"
+    (model / "cameras.txt").write_text(f"# comment\n7 {camera} {size} {' '.join(map(repr, values))}\n")
+    lines = ["# Image list with two lines of data per image:"]
+    for i, shot in enumerate(shots):
+        pose = " ".join(map(repr, [*quaternion(shot.rotation).tolist(), *shot.translation.tolist()]))
+        seen = "1.5 2.5 3 10.0 20.0 -1" if i % 2 else ""
+        lines += [f"{i + 1} {pose} 7 {shot.name}", seen]
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    lines = [
+        f"{i} {' '.join(map(repr, p.tolist()))} {' '.join(map(str, c))} 0.5 1 0 2 0 3 {i}"
+        for i, (p, c) in enumerate(zip(POINTS, COLOURS, strict=True))
+    ]
+    (model / "points3D.txt").write_text("# points\n\n" + "\n".join(lines) + "\n")
+
+
+def write_binary(
+    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
+) -> None:
+    """The same in COLMAP's binary records."""
+    model.mkdir(parents=True, exist_ok=True)
+    size = (shots[0].width, shots[0].height)
+    record = struct.pack("<iiQQ", 7, MODELS[camera][0] if camera in MODELS else 7, *size)
+    (model / "cameras.bin").write_bytes(
+        struct.pack("<Q", 1) + record + struct.pack(f"<{len(values)}d", *values)
+    )
+    data = struct.pack("<Q", len(shots))
+    for i, shot in enumerate(shots):
+        data += struct.pack("<i7di", i + 1, *quaternion(shot.rotation), *shot.translation, 7)
+        data += shot.name.encode() + b"\0"
+        data += struct.pack("<Qddqddq", 2, 1.5, 2.5, 3, 10, 20, -1) if i % 2 else struct.pack("<Q", 0)
+    (model / "images.bin").write_bytes(data)
+    data = struct.pack("<Q", len(POINTS))
+    for i, (point, colour) in enumerate(zip(POINTS, COLOURS, strict=True)):
+        data += struct.pack("<Q3d3BdQ6i", i, *point, *colour.tolist(), 0.5, 3, 1, 0, 2, 0, 3, i)
+    (model / "points3D.bin").write_bytes(data)
+
+
+WRITERS = {"txt": write_text, "bin": write_binary}
+
+
+def write(
+    folder: Path, kind: str = "bin", shots: list[Shot] = SHOTS, place: str = "sparse/0", **camera: object
+) -> Path:
+    for shot in shots:
+        shot.write(folder / "images")
+    WRITERS[kind](folder / place, shots, **camera)  # type: ignore[arg-type]
+    return folder
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0"])
+def test_cameras_see_the_points(kind: str, place: str, tmp_path: Path) -> None:
+    data = write(tmp_path, kind, place=place)
+    train, test = read_dataset(data, "train"), read_dataset(data, "test")
+    assert [view.name for view in test.views] == ["a.png", "i.png"]
+    assert [view.name for view in train.views] == [shot.name for shot in SHOTS[1:8]]
+    for dataset in (train, test):
+        for view in dataset.views:
+            shot = next(shot for shot in SHOTS if shot.name == view.name)
+            check(view, shot)
+            assert view.alpha is None and not view.linear
+            np.testing.assert_allclose(view.to_world[:3, 3], shot.camera_to_world[:3, 3], atol=1e-9)
+    assert train.points is not None and train.points.colour is not None and not train.notes
+    np.testing.assert_allclose(train.points.position, POINTS)
+    np.testing.assert_allclose(train.points.colour, linear_from_srgb(COLOURS / 255), atol=1e-6)
+
+
+LENSES: dict[str, tuple[tuple[float, ...], Lens]] = {
+    "SIMPLE_PINHOLE": ((107.0, 50.3, 34.6), Lens(False, ())),
+    "SIMPLE_RADIAL": ((107.0, 50.3, 34.6, -0.12), Lens(False, (-0.12,))),
+    "RADIAL": ((107.0, 50.3, 34.6, -0.12, 0.05), Lens(False, (-0.12, 0.05))),
+    "OPENCV": ((*VALUES, -0.1, 0.04, 0.012, -0.009), Lens(False, (-0.1, 0.04), (0.012, -0.009))),
+    "FULL_OPENCV": ((*VALUES, -0.1, 0.04, 0.012, -0.009, 0.02, 0, 0, 0),
+                    Lens(False, (-0.1, 0.04, 0.02), (0.012, -0.009))),
+    "OPENCV_FISHEYE": ((*VALUES, 0.06, -0.03, 0.01, 0.002), Lens(True, (0.06, -0.03, 0.01, 0.002))),
+    "SIMPLE_RADIAL_FISHEYE": ((107.0, 50.3, 34.6, 0.06), Lens(True, (0.06,))),
+    "RADIAL_FISHEYE": ((107.0, 50.3, 34.6, 0.06, -0.03), Lens(True, (0.06, -0.03))),
+    "FISHEYE": (VALUES, Lens(True, ())),
+    "SIMPLE_FISHEYE": ((107.0, 50.3, 34.6), Lens(True, ())),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_lens_is_undone(model: str, kind: str, tmp_path: Path) -> None:
+    values, lens = LENSES[model]
+    focal = (107.0, 107.0) if values[0] == 107.0 else (110.0, 104.0)
+    shots = [replace(shot, lens=lens, focal=focal) for shot in SHOTS[:3]]
+    views = read_dataset(write(tmp_path, kind, shots, camera=model, values=values), "train").views
+    for view, shot in zip(views, shots[1:], strict=True):
+        check(view, shot, tolerance=0.06)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_lenses_that_are_unknown(kind: str, tmp_path: Path) -> None:
+    data = write(tmp_path, kind, SHOTS[:2], camera="FOV", values=(*VALUES, 0.01))
+    with pytest.raises(InputError, match=rf"cameras\.{kind}: camera 7: the lens model .*undistort"):
+        read_dataset(data, "train")
+    rational = (*VALUES, 0.1, 0, 0, 0, 0, 0.2, 0, 0)
+    WRITERS[kind](data / "sparse/0", SHOTS[:2], "FULL_OPENCV", rational)
+    with pytest.raises(InputError, match=r"b\.png: camera 7: k4, k5, k6: .*undistort"):
+        read_dataset(data, "train")
+
+
+def copies(folder: Path, factor: int, ending: str = ".png") -> None:
+    (folder / f"images_{factor}").mkdir()
+    for path in sorted((folder / "images").iterdir()):
+        small = box_downscale(read_png(path), factor)
+        write_png(folder / f"images_{factor}" / path.with_suffix(ending).name, 0.5 * small)
+
+
+def test_smaller_copies_serve_where_they_divide(tmp_path: Path) -> None:
+    """The copies here are half as bright, so that a picture tells its file."""
+    data = write(tmp_path)
+    copies(data, 2)
+    copies(data, 4, ".PNG")
+    for downscale, bright in ((1, True), (2, False), (3, True), (4, False), (8, False)):
+        view = read_dataset(data, "train", downscale=downscale).views[0]
+        assert (view.width, view.height) == (96 // downscale, 72 // downscale)
+        expected = box_downscale(read_png(data / "images/b.png"), downscale)
+        np.testing.assert_allclose(view.image, expected if bright else 0.5 * expected, atol=0.01)
+        assert (view.fx, view.cx) == pytest.approx((110 / downscale, 50.3 / downscale))
+    assert fitting_downscale(data, "png", 48 * 36) == (2, 96, 72)
+    shutil.rmtree(data / "images")
+    assert fitting_downscale(data, "png", 10_000) == (1, 48, 36)
+    assert read_dataset(data, "train", downscale=2).views[0].width == 24
+
+
+def test_a_copy_of_rounded_size(tmp_path: Path) -> None:
+    """97 × 73 pixels whose copy has 49 × 37: intrinsics follow the file."""
+    shots = [replace(shot, width=97, height=73) for shot in SHOTS[:2]]
+    data = write(tmp_path, shots=shots)
+    (data / "images_2").mkdir()
+    for shot in shots:
+        across, down = 49 / 97, 37 / 73
+        small = replace(shot, width=49, height=37, focal=(110 * across, 104 * down))
+        replace(small, centre=(50.3 * across, 34.6 * down)).write(data / "images_2")
+    view = read_dataset(data, "train", downscale=2).views[0]
+    assert (view.width, view.height) == (49, 37)
+    assert (view.fx, view.cy) == pytest.approx((110 * 49 / 97, 34.6 * 37 / 73))
+
+
+def test_masks_are_alpha(tmp_path: Path) -> None:
+    data = write(tmp_path)
+    copies(data, 2)
+    (data / "masks").mkdir()
+    for i, shot in enumerate(SHOTS):
+        mask = np.zeros((72, 96, 3))
+        mask[:, 48:] = 1
+        name = (shot.name + ".png", shot.name)[i % 2]
+        write_png(data / "masks" / name, mask)
+    view = read_dataset(data, "train", downscale=2, background="black").views[0]
+    assert view.alpha is not None and view.alpha.sum() == 24 * 36
+    assert not view.image[:, :24].any() and view.image[:, 24:].max() > 0.9  # not of the copies
+    (data / "masks" / "b.png").unlink()
+    with pytest.raises(InputError, match=r"masks/b\.png\.png: mask: missing"):
+        read_dataset(data, "train")
+
+
+def test_points_of_wrong_matches_are_left_out(tmp_path: Path) -> None:
+    data = write(tmp_path, "txt")
+    rng = np.random.default_rng(0)
+    lines = []
+    for i in range(150):
+        x, y, z = rng.uniform(-1, 1, 3)
+        error, views = (5.0, 4) if i < 10 else (0.5, 2 if i < 30 else 3)
+        lines.append(f"{i} {x} {y} {z} 1 2 3 {error} {' '.join(f'{v} 0' for v in range(views))}")
+    (data / "sparse/0/points3D.txt").write_text("\n".join(lines))
+    points = read_dataset(data, "train").points
+    assert points is not None and len(points.position) == 120
+    (data / "sparse/0/points3D.txt").write_text("\n".join(lines[:50]))
+    points = read_dataset(data, "train").points
+    assert points is not None and len(points.position) == 50  # few points are better than none
+    (data / "sparse/0/points3D.txt").unlink()
+    assert read_dataset(data, "train").points is None
+
+
+def notes(data: Path) -> tuple[str, ...]:
+    found: Dataset = read_dataset(data, "train")
+    return found.notes
+
+
+def test_cameras_and_pictures_without_each_other(tmp_path: Path) -> None:
+    data = write(tmp_path)
+    SHOTS[0].write(data / "images/more")
+    (data / "images/c.png").unlink()
+    (data / "sparse/1").mkdir()
+    assert notes(data) == (
+        "1 of 9 cameras have no picture and are left out",
+        "1 of 9 pictures have no camera and are left out",
+        "sparse/1 holds another reconstruction, which is left out",
+    )
+    assert len(read_dataset(data, "train").views) == 7
+    shutil.rmtree(data / "images")
+    with pytest.raises(InputError, match="images: no such folder"):
+        read_dataset(data, "train")
+    (data / "images").mkdir()
+    with pytest.raises(InputError, match=r"images\.bin: none of its 9 pictures lies in .*images; put"):
+        read_dataset(data, "train")
+
+
+def test_names_stay_in_the_folder(tmp_path: Path) -> None:
+    data = write(tmp_path / "data")
+    SHOTS[0].write(tmp_path)
+    for name in ("../a.png", str(tmp_path / "a.png"), "."):
+        write_binary(data / "sparse/0", [replace(SHOTS[0], name=name), *SHOTS[1:]])
+        with pytest.raises(InputError, match="names no file in images"):
+            read_dataset(data, "test")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("1 0 0 0 0 0 0 3 7 a.png", "no usable numbers"),
+        ("1 nan 0 0 0 0 0 3 7 a.png", "no usable numbers"),
+        ("1 1 0 0 0 1e300 0 3 7 a.png", "no usable numbers"),
+        ("1 1 0 0 0 0 0 3 8 a.png", "there is no camera 8"),
+        ("1 1 0 0 0 0 0 3 7", "COLMAP: broken"),
+        ("1 1 0 0 0 0 0 x 7 a.png", "COLMAP: broken"),
+        ("1 1 0 0 0 0 0 3 7 a.png\n\n2 1 0 0 0 0 0 3 7 a.png", "occurs twice"),
+        ("1 1 0 0 0 0 0 3 7 a.png\n2 1 0 0 0 0 0 3 7 b.png", "no line of points"),
+        ("", "none of its 0 pictures"),
+    ],
+)
+def test_images_that_make_no_sense(line: str, said: str, tmp_path: Path) -> None:
+    data = write(tmp_path, "txt")
+    (data / "sparse/0/images.txt").write_text(line)
+    with pytest.raises(InputError, match=rf"images\.txt: .*{said}"):
+        read_dataset(data, "test")
+
+
+@pytest.mark.parametrize(
+    "line", ["7 PINHOLE 96 72 1 2 3", "7 PINHOLE 96 72 -1 2 3 4", "7 PINHOLE 0 72 1 2 3 4", "7 PINHOLE 96",
+             "7 PINHOLE 96 72 inf 2 3 4", "7 PINHOLE 96 72 1 2 3 nan", f"7 PINHOLE {'9' * 5000} 1 1 1 1 1"]
+)  # fmt: skip
+def test_cameras_that_make_no_sense(line: str, tmp_path: Path) -> None:
+    data = write(tmp_path, "txt")
+    (data / "sparse/0/cameras.txt").write_text(line)
+    with pytest.raises(InputError, match=r"cameras\.txt: "):
+        read_dataset(data, "test")
+
+
+def test_both_splits_mean_the_region_of_the_training_cameras(tmp_path: Path) -> None:
+    """Also a split of one view, whose camera alone looks at no point."""
+    data = write(tmp_path)
+    train, test = read_dataset(data, "train"), read_dataset(data, "test")
+    assert train.region is not None and test.region == train.region
+    assert train.region == region_of(train.views) != region_of(test.views)
+    (data / "sparse/0/test.txt").write_text("d.png\n")
+    train, test = read_dataset(data, "train"), read_dataset(data, "test")
+    assert len(test.views) == 1 and test.region == train.region == region_of(train.views)
+
+
+def test_a_focal_length_that_no_camera_has(tmp_path: Path) -> None:
+    data = write(tmp_path, "txt")
+    for focal in ("1e-30", "1e-10"):
+        (data / "sparse/0/cameras.txt").write_text(f"7 PINHOLE 96 72 {focal} 104 50 34")
+        with pytest.raises(InputError, match=r"images\.txt: .*camera 7: focal length: .* out of range"):
+            read_dataset(data, "train")
+
+
+def test_a_picture_of_another_shape_is_refused(tmp_path: Path) -> None:
+    """As turned upright by its EXIF data, after COLMAP saw it."""
+    data = write(tmp_path)
+    replace(SHOTS[1], width=72, height=96).write(data / "images")
+    with pytest.raises(InputError, match=r"b\.png: size: 72 × 96 pixels are no copy of 96 × 72"):
+        read_dataset(data, "train")
+
+
+def test_binary_files_that_end_anywhere(tmp_path: Path) -> None:
+    """Every length of each file but the whole one is one sentence, at once."""
+    model = write(tmp_path, shots=SHOTS[:3]) / "sparse/0"
+    for name, read in (("cameras", read_cameras), ("images", read_images), ("points3D", read_points)):
+        path = model / f"{name}.bin"
+        whole = path.read_bytes()
+        for length in range(len(whole)):
+            path.write_bytes(whole[:length])
+            with pytest.raises(InputError, match=rf"{name}\.bin: COLMAP: broken"):
+                read(path)
+        path.write_bytes(whole + b"\0")
+        with pytest.raises(InputError, match="1 bytes follow the last record"):
+            read(path)
+        path.write_bytes(struct.pack("<Q", 2**63) + whole[8:])
+        began = time.process_time()
+        with pytest.raises(InputError, match="are more than the file holds"):
+            read(path)
+        assert time.process_time() - began < 1
+        path.write_bytes(whole)
+
+
+def test_what_colmap_writes_itself(tmp_path: Path) -> None:
+    """Its own library writes our text as binary, and our reader finds the same in both."""
+    pycolmap = pytest.importorskip("pycolmap")
+    write_text(tmp_path / "a", SHOTS, "OPENCV", LENSES["OPENCV"][0])
+    (tmp_path / "b").mkdir()
+    images = (tmp_path / "a/images.txt").read_text().replace("1.5 2.5 3 10.0 20.0 -1", "")
+    (tmp_path / "a/images.txt").write_text(images)
+    points = (tmp_path / "a/points3D.txt").read_text().replace(" 1 0 2 0 3", "")
+    (tmp_path / "a/points3D.txt").write_text(
+        "\n".join(line[: line.find("0.5 ") + 3] for line in points.splitlines())
+    )
+    pycolmap.Reconstruction(str(tmp_path / "a")).write_binary(str(tmp_path / "b"))
+    assert read_cameras(tmp_path / "a/cameras.txt") == read_cameras(tmp_path / "b/cameras.bin")
+    ours, theirs = read_images(tmp_path / "a/images.txt"), read_images(tmp_path / "b/images.bin")
+    for a, b in zip(ours, theirs, strict=True):
+        assert (a.name, a.camera) == (b.name, b.camera)
+        np.testing.assert_allclose(a.rotation, b.rotation, atol=1e-12)
+        np.testing.assert_allclose(a.translation, b.translation, atol=1e-12)
+    text, binary = read_points(tmp_path / "a/points3D.txt"), read_points(tmp_path / "b/points3D.bin")
+    order, other = np.argsort(text.position[:, 0]), np.argsort(binary.position[:, 0])
+    np.testing.assert_allclose(text.position[order], binary.position[other])
+    np.testing.assert_array_equal(text.colour[order], binary.colour[other])

@@ -1,0 +1,351 @@
+"""The reader of multi-view data sets: conventions, compositing, intrinsics, what it says about bad input."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
+from mi_refgs.errors import InputError
+from mi_refgs.io.exr import read_exr_image, write_exr
+from mi_refgs.io.images import box_downscale, read_png, write_png
+
+ANGLE = 0.7  # camera_angle_x, radians
+WIDTH, HEIGHT = 6, 4
+
+
+def pose(azimuth: float) -> np.ndarray:
+    """OpenGL camera-to-world matrix 3 from (0.1, 0.2, 0.3), 20° above the horizon, z up."""
+    focus = np.array([0.1, 0.2, 0.3])
+    low = math.cos(0.35)
+    backward = np.array([math.cos(azimuth) * low, math.sin(azimuth) * low, math.sin(0.35)])
+    right = np.cross([0, 0, 1], backward)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, np.cross(backward, right), backward, focus + 3 * backward], axis=1)
+    return matrix
+
+
+@pytest.fixture
+def folder(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """Eight training and two test views of random RGBA pixels, PNG and EXR."""
+    for split, count in (("train", 8), ("test", 2)):
+        (tmp_path / split).mkdir()
+        frames = []
+        for i in range(count):
+            rgba = rng.random((HEIGHT, WIDTH, 4))
+            write_png(tmp_path / split / f"r_{i}.png", rgba)
+            rgba[..., :3] *= 3 * rgba[..., 3:]
+            write_exr(tmp_path / split / f"r_{i}.exr", rgba)
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose(0.7 * i).tolist()})
+        write(tmp_path, split, {"camera_angle_x": ANGLE, "frames": frames})
+    return tmp_path
+
+
+def read(folder: Path, split: str = "train") -> dict[str, Any]:
+    return json.loads((folder / f"transforms_{split}.json").read_text())
+
+
+def write(folder: Path, split: str, content: Any) -> None:
+    (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+
+
+def test_png_is_composited_as_displayed(folder: Path) -> None:
+    for background, value in (("white", 1), ("black", 0)):
+        data = read_dataset(folder, "train", background=background)
+        pixels = np.asarray(Image.open(folder / "train/r_3.png")) / 255
+        expected = pixels[..., 3:] * pixels[..., :3] + (1 - pixels[..., 3:]) * value
+        view = data.views[3]
+        assert (view.name, view.width, view.height, view.linear) == ("train/r_3", WIDTH, HEIGHT, False)
+        assert view.image.dtype == np.float32 and view.alpha is not None
+        np.testing.assert_allclose(view.image, expected, atol=1e-6)
+        np.testing.assert_allclose(view.alpha, pixels[..., 3], atol=1e-6)
+        np.testing.assert_array_equal(data.background, np.full(3, value, np.float32))
+
+
+def test_exr_is_linear_and_premultiplied(folder: Path) -> None:
+    view = read_dataset(folder, "train", images="exr").views[2]
+    pixels = read_exr_image(folder / "train/r_2.exr")
+    assert view.linear and view.image.max() > 1
+    np.testing.assert_allclose(view.image, pixels[..., :3] + 1 - pixels[..., 3:], atol=1e-6)
+
+
+def test_picture_without_alpha(folder: Path) -> None:
+    for i in range(8):
+        write_png(folder / f"train/r_{i}.png", read_png(folder / f"train/r_{i}.png")[..., :3])
+    view = read_dataset(folder, "train").views[0]
+    assert view.alpha is None
+    np.testing.assert_array_equal(view.image, read_png(folder / "train/r_0.png"))
+
+
+def test_downscale_averages_composited_pixels(folder: Path) -> None:
+    for images in ("png", "exr"):
+        full = read_dataset(folder, "train", images=images).views[1]
+        half = read_dataset(folder, "train", images=images, downscale=2).views[1]
+        np.testing.assert_allclose(half.image, box_downscale(full.image, 2), atol=1e-6)
+        assert (half.width, half.height) == (WIDTH // 2, HEIGHT // 2)
+        assert half.fx == full.fx / 2 and half.cy == full.cy / 2
+
+
+def test_downscale_leaves_out_what_fills_no_block(folder: Path) -> None:
+    """The camera then only divides: the top left corner of the picture stays where it was."""
+    full, third = (read_dataset(folder, "train", downscale=scale).views[1] for scale in (1, 3))
+    assert (third.width, third.height) == (WIDTH // 3, HEIGHT // 3) == (2, 1)
+    np.testing.assert_allclose(third.image, box_downscale(full.image[:3], 3), atol=1e-6)
+    np.testing.assert_allclose(
+        [third.fx, third.fy, third.cx, third.cy], np.array([full.fx, full.fy, full.cx, full.cy]) / 3
+    )
+
+
+def test_the_size_that_a_budget_of_pixels_affords(folder: Path) -> None:
+    """Photographs of 1080 × 1920 and their like, read no larger than asked for."""
+    Image.new("RGB", (1080, 1920)).save(folder / "large.jpg")
+    write_exr(folder / "large.exr", np.zeros((30, 21, 3)))
+    content = read(folder)
+    content["frames"] = [content["frames"][0] | {"file_path": "large.jpg"}]
+    write(folder, "train", content)
+    for pixels, factor in ((65536, 6), (1080 * 1920, 1), (1080 * 1920 - 1, 2), (1, 961)):
+        assert fitting_downscale(folder, "png", pixels) == (factor, 1080, 1920)
+    assert fitting_downscale(folder, "exr", 70) == (3, 21, 30)
+    view = read_dataset(folder, "train", downscale=7).views[0]
+    assert (view.width, view.height) == (1080 // 7, 1920 // 7)
+    assert view.cx == pytest.approx(1080 / 2 / 7) and view.cy == pytest.approx(1920 / 2 / 7)
+
+
+def test_camera_frame(folder: Path) -> None:
+    """Mitsuba's frame: +z forward, +x left, +y up; what lies right of the axis lands right."""
+    view = read_dataset(folder, "train").views[1]
+    opengl = pose(0.7)
+    np.testing.assert_allclose(view.to_world[:3, 2], -opengl[:3, 2])
+    np.testing.assert_allclose(view.to_world[:3, 0], -opengl[:3, 0])
+    np.testing.assert_allclose(view.to_world[:3, [1, 3]], opengl[:3, [1, 3]])
+    camera = view.camera()
+
+    def pixel(point: np.ndarray) -> np.ndarray:
+        import mitsuba as mi
+
+        local = camera.to_camera(mi.Point3f(*(float(x) for x in point)))
+        pixels = [camera.fx * local.x / local.z + camera.cx, camera.fy * local.y / local.z + camera.cy]
+        return np.array([float(p[0]) for p in pixels])
+
+    focus = np.array([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(pixel(focus), [WIDTH / 2, HEIGHT / 2], atol=1e-4)
+    focal = 0.5 * WIDTH / math.tan(ANGLE / 2)
+    step = pixel(focus + 0.3 * opengl[:3, 0] + 0.6 * opengl[:3, 1]) - pixel(focus)
+    np.testing.assert_allclose(step, [0.1 * focal, -0.2 * focal], atol=1e-4)
+
+
+def test_extent(folder: Path) -> None:
+    data = read_dataset(folder, "train")
+    origins = np.array([pose(0.7 * i)[:3, 3] for i in range(8)])
+    extent = 1.1 * max(np.linalg.norm(origins - origins.mean(axis=0), axis=1))
+    assert data.scene_extent == pytest.approx(extent)
+    lone = Dataset(folder, "train", data.views[:1], data.background, False, None)
+    assert lone.scene_extent == pytest.approx(1.1 * np.linalg.norm(pose(0)[:3, 3]))
+
+
+def test_intrinsics_per_file_and_per_frame(folder: Path) -> None:
+    content = read(folder)
+    del content["camera_angle_x"]
+    content |= {"fl_x": 9.0, "fl_y": 8.0, "cx": 2.5, "cy": 1.5, "w": WIDTH, "h": HEIGHT}
+    content["frames"][1] |= {"fl_x": 10.0, "cx": 3.25}
+    write(folder, "train", content)
+    first, second = read_dataset(folder, "train").views[:2]
+    assert (first.fx, first.fy, first.cx, first.cy) == (9, 8, 2.5, 1.5)
+    assert (second.fx, second.fy, second.cx, second.cy) == (10, 8, 3.25, 1.5)
+
+
+def test_holdout_without_a_test_file(folder: Path) -> None:
+    content = read(folder)
+    content["frames"] = content["frames"] + [
+        {**f, "file_path": f["file_path"].replace("train", "test")} for f in content["frames"][:2]
+    ]
+    write(folder, "train", content)
+    (folder / "transforms_test.json").unlink()
+    names = {split: [v.name for v in read_dataset(folder, split).views] for split in ("train", "test")}
+    assert names["test"] == ["test/r_0", "train/r_6"]  # sorted: test/r_0, test/r_1, train/r_0 … train/r_7
+    assert len(names["train"]) == 8 and not set(names["train"]) & set(names["test"])
+    (folder / "transforms_train.json").rename(folder / "transforms.json")
+    assert [v.name for v in read_dataset(folder, "test").views] == names["test"]
+
+
+def test_names_that_turn_back_inside_the_folder(folder: Path) -> None:
+    content = read(folder)
+    content["frames"][0]["file_path"] = "./test/../train/r_1.png"
+    write(folder, "train", content)
+    (folder / "links").symlink_to(folder / "train")  # followed: whoever made the folder made it
+    content["frames"][1]["file_path"] = "links/r_1.png"
+    write(folder, "train", content)
+    views = read_dataset(folder, "train").views
+    np.testing.assert_array_equal(views[0].image, views[1].image)
+
+
+def test_extension_may_be_given(folder: Path) -> None:
+    content = read(folder)
+    content["frames"][0]["file_path"] += ".png"
+    content["frames"][1]["file_path"] = "train/take.1"
+    (folder / "train/r_1.png").rename(folder / "train/take.1.png")
+    write(folder, "train", content)
+    views = read_dataset(folder, "train").views
+    assert [v.name for v in views[:2]] == ["train/r_0", "train/take.1"]
+    (folder / "train/take.1.exr").write_bytes((folder / "train/r_1.exr").read_bytes())
+    assert read_dataset(folder, "train", images="exr").views[1].linear
+
+
+def test_ground_truth_maps(folder: Path, rng: np.random.Generator) -> None:
+    normal = rng.normal(size=(HEIGHT, WIDTH, 3))
+    normal[:2, :3] = 0
+    depth = np.where(np.any(normal != 0, axis=-1), 2.0 + np.arange(WIDTH), 0)
+    write_exr(folder / "n.exr", normal, names="XYZ")
+    write_exr(folder / "d.exr", depth)
+    write_exr(folder / "environment.exr", np.ones((2, 4, 3)))
+    content = read(folder)
+    content["frames"][0] |= {"normal_path": "n.exr", "depth_path": "d.exr"}
+    write(folder, "train", content)
+    data = read_dataset(folder, "train", downscale=2)
+    assert data.environment == folder / "environment.exr"
+    view = data.views[0]
+    assert view.normal is not None and view.depth is not None and data.views[1].normal is None
+    np.testing.assert_allclose(np.linalg.norm(view.normal, axis=-1), [[0, 1, 1], [1, 1, 1]], atol=1e-6)
+    # The block half off the object takes the mean of its other half, column 3 alone.
+    np.testing.assert_allclose(view.depth, [[0, 5, 6.5], [2.5, 4.5, 6.5]])
+    assert read_dataset(folder, "train", truth=False).views[0].normal is None
+
+
+def edit(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
+    """Damage to the training file's content."""
+
+    def damage(folder: Path) -> None:
+        content = read(folder)
+        change(content)
+        write(folder, "train", content)
+
+    return damage
+
+
+def named(key: str, value: Any) -> Callable[[Path], None]:
+    """Another value of a key of the first frame."""
+    return edit(lambda content: content["frames"][0].update({key: value}))
+
+
+def diagonal(x: float, y: float, z: float) -> list[list[float]]:
+    return np.diag([x, y, z, 1.0]).tolist()
+
+
+def resize(folder: Path) -> None:
+    """One picture more than there may be sizes."""
+    for i in range(1, 6):
+        write_png(folder / f"train/r_{i}.png", np.ones((HEIGHT, WIDTH + i, 4)))
+
+
+def nan(folder: Path) -> None:
+    broken = np.ones((HEIGHT, WIDTH, 4))
+    broken[1, 2, 0] = np.nan
+    write_exr(folder / "train/r_4.exr", broken)
+
+
+def sixteen_bits(folder: Path) -> None:
+    Image.fromarray(np.full((HEIGHT, WIDTH), 4000, np.uint16)).save(folder / "train/r_0.png")
+
+
+def truncate(folder: Path) -> None:
+    file = folder / "train/r_0.png"
+    file.write_bytes(file.read_bytes()[:60])
+
+
+@pytest.mark.parametrize(
+    ("damage", "options", "words"),
+    [
+        (lambda f: (f / "transforms_train.json").unlink(), {}, ["transforms_train.json", "missing"]),
+        (lambda f: (f / "transforms_train.json").write_text("{"), {}, ["transforms_train.json", "JSON"]),
+        (lambda f: (f / "transforms_train.json").write_bytes(b"\xff\xfe"), {}, ["JSON", "read"]),
+        (lambda f: write(f, "train", [1]), {}, ["JSON", "not an object"]),
+        (edit(lambda c: c.pop("frames")), {}, ["frames", "missing"]),
+        (edit(lambda c: c.update(frames=[])), {}, ["zero training views"]),
+        (edit(lambda c: c.pop("camera_angle_x")), {}, ["camera_angle_x", "fl_x"]),
+        (edit(lambda c: c.update(camera_angle_x="wide")), {}, ["camera_angle_x", "'wide'"]),
+        (edit(lambda c: c.update(camera_angle_x=40)), {}, ["camera_angle_x", "radians"]),
+        (edit(lambda c: c.update(camera_angle_x=1e-320)), {}, ["camera_angle_x", "radians"]),
+        (edit(lambda c: c.update(w=800)), {}, ["r_0.png", "w = 800"]),
+        (edit(lambda c: c["frames"].insert(0, 3)), {}, ["frames[0]", "not an object"]),
+        (edit(lambda c: c["frames"][1].pop("file_path")), {}, ["frames[1].file_path"]),
+        (edit(lambda c: c["frames"][1].update(file_path="train/none")), {}, ["none.png", "missing"]),
+        (edit(lambda c: c["frames"][1].pop("transform_matrix")), {}, ["frames[1].transform_matrix", "4 × 4"]),
+        (edit(lambda c: c["frames"][1].update(transform_matrix=[[1, 2], [3]])), {}, ["frames[1]", "4 × 4"]),
+        (edit(lambda c: c["frames"][2].update(transform_matrix=diagonal(1, 1, 2))), {}, ["scale"]),
+        (edit(lambda c: c["frames"][2].update(transform_matrix=diagonal(1, 1, -1))), {}, ["mirror"]),
+        (edit(lambda c: c["frames"][2].update(transform_matrix=diagonal(1, math.nan, 1))), {}, ["rotation"]),
+        (edit(lambda c: c["frames"][0].update(depth_path="train/r_1.exr")), {}, ["[0].depth_path", "size"]),
+        (edit(lambda c: c["frames"][0].update(normal_path="none.exr")), {}, ["none.exr", "missing"]),
+        (named("file_path", "../r_0.png"), {}, ["frames[0].file_path", "'../r_0.png'", "folder"]),
+        (named("file_path", "train/../../r_0.png"), {}, ["frames[0].file_path", "folder"]),
+        (named("file_path", "/etc/passwd"), {}, ["frames[0].file_path", "folder"]),
+        (named("file_path", "."), {}, ["frames[0].file_path", "folder"]),
+        (named("file_path", 7), {}, ["frames[0].file_path", "7"]),
+        (named("file_path", "a" * 5000), {}, ["missing"]),
+        (named("file_path", "a\0b"), {}, ["missing"]),
+        (named("file_path", "\ud800"), {}, ["missing"]),
+        (named("exr_path", "../a.exr"), {"images": "exr"}, ["frames[0].exr_path", "folder"]),
+        (named("depth_path", "/a.exr"), {}, ["frames[0].depth_path", "folder"]),
+        (named("transform_matrix", [[10**400] * 4] * 4), {}, ["frames[0].transform_matrix"]),
+        (named("fl_x", 10**400), {}, ["fl_x", "number"]),
+        (named("cx", math.inf), {}, ["cx", "inf"]),
+        (lambda f: (f / "transforms_train.json").write_text("[" * 10**5), {}, ["JSON", "recursion"]),
+        (truncate, {}, ["r_0.png", "readable"]),
+        (sixteen_bits, {}, ["r_0.png", "8-bit"]),
+        (resize, {}, ["6 different sizes", "one size"]),
+        (nan, {"images": "exr"}, ["r_4.exr", "NaN", "row 1, column 2"]),
+        (lambda f: (f / "train/r_1.exr").write_text("no"), {"images": "exr"}, ["r_1.exr", "EXR"]),
+        (lambda f: None, {"downscale": 5}, ["r_0.png", "downscale", "smaller"]),
+        (lambda f: None, {"downscale": 0}, ["downscale"]),
+        (lambda f: None, {"background": "green"}, ["background", "green"]),
+        (lambda f: None, {"images": "tiff"}, ["images", "tiff"]),
+    ],
+)
+def test_bad_input_names_file_field_and_remedy(
+    folder: Path, damage: Callable[[Path], Any], options: dict[str, Any], words: list[str]
+) -> None:
+    damage(folder)
+    with pytest.raises(InputError) as caught:
+        read_dataset(folder, "train", **options)
+    message = str(caught.value)
+    assert message.startswith(str(folder)) and "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def test_missing_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        read_dataset(tmp_path / "none", "train")
+
+
+def test_lone_picture_leaves_zero_training_views(folder: Path) -> None:
+    edit(lambda c: c.update(frames=c["frames"][:1]))(folder)
+    (folder / "transforms_test.json").unlink()
+    with pytest.raises(InputError, match="zero training views"):
+        read_dataset(folder, "train")
+
+
+def test_an_averaged_view_shows_the_same_points(folder: Path) -> None:
+    """Pixels are means of blocks, and a point lands in the block of its pixel."""
+    view = read_dataset(folder, "train").views[0]
+    small = view.averaged(2)
+    assert (small.width, small.height) == (WIDTH // 2, HEIGHT // 2)
+    np.testing.assert_allclose(small.image[1, 2], view.image[2:4, 4:6].mean(axis=(0, 1)), atol=1e-6)
+    assert small.alpha is not None and view.alpha is not None
+    np.testing.assert_allclose(small.alpha[0, 1], view.alpha[:2, 2:4].mean(), atol=1e-6)
+    points = np.array([[0.1, 0.2, 0.3], [0.3, 0.1, 0.2]])
+    row, column, _ = view.project(points)
+    less, lesser, _ = small.project(points)
+    # Indices are integers at pixel centres.
+    np.testing.assert_allclose([(row + 0.5) / 2 - 0.5, (column + 0.5) / 2 - 0.5], [less, lesser], atol=1e-9)
+    assert view.averaged(4).image.shape == (1, 1, 3)
+    with pytest.raises(InputError, match=r"data.coarse: 6 × 4 pixels are less than a block of 5²"):
+        view.averaged(5)

@@ -1,0 +1,429 @@
+"""Layouts of data sets as this test writes them: nerfstudio, Shiny Blender, LLFF, NeRO's Glossy Synthetic."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_refgs.data.array_pickle import read_arrays
+from mi_refgs.data.dataset import fitting_downscale, read_dataset
+from mi_refgs.data.lens import Lens
+from mi_refgs.errors import InputError
+from mi_refgs.io.images import box_downscale, linear_from_srgb, read_png, write_png
+from tests.scenes.dots import COLOURS, POINTS, Shot, check
+
+SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV's axes
+
+
+# ---------------- nerfstudio and instant-ngp ----------------
+
+
+def nerfstudio(folder: Path, shots: list[Shot] = SHOTS, **content: Any) -> Path:
+    """`transforms.json` with intrinsics for the whole file, but for those of one frame."""
+    frames = []
+    for shot in shots:
+        shot.write(folder / "images")
+        pose = (shot.camera_to_world @ OPENGL).tolist()
+        frames.append({"file_path": f"images/{shot.name}", "transform_matrix": pose})
+        frames[-1] |= {"colmap_im_id": shot.index, "fl_x": shot.focal[0], "fl_y": shot.focal[1]}
+        frames[-1] |= {"cx": shot.centre[0], "cy": shot.centre[1], "w": shot.width, "h": shot.height}
+    whole = {"camera_model": "OPENCV", "fl_x": 1.0, "fl_y": 1.0, "cx": 1.0, "cy": 1.0} | content
+    (folder / "transforms.json").write_text(json.dumps(whole | {"frames": frames}))
+    return folder
+
+
+def mended(data: Path, change: Any) -> None:
+    content = json.loads((data / "transforms.json").read_text())
+    change(content)
+    (data / "transforms.json").write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_nerfstudio_with_intrinsics_of_every_frame(fisheye: bool, tmp_path: Path) -> None:
+    lens = Lens(fisheye, (0.05, -0.02, 0.0, 0.0)[: 4 if fisheye else 3])
+    shots = [
+        replace(shot, lens=lens, focal=(110.0 + shot.index, 104.0), centre=(49.0 + 0.3 * shot.index, 35.0))
+        for shot in SHOTS[:4]
+    ]
+    model = "OPENCV_FISHEYE" if fisheye else "OPENCV"
+    data = nerfstudio(tmp_path, shots, camera_model=model, k1=0.05, k2=-0.02, p1=0.0, p2=0.0)
+    views = read_dataset(data, "train").views
+    for view, shot in zip(views, shots[1:], strict=True):
+        check(view, shot, tolerance=0.06)
+
+
+def write_ply(path: Path, kind: str) -> None:
+    head = "element vertex 9\n" + "".join(f"property double {c}\n" for c in "xyz")
+    head += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+    if kind == "ascii":
+        rows = "".join(
+            f"{' '.join(map(repr, p.tolist()))} {' '.join(map(str, c))}\n"
+            for p, c in zip(POINTS, COLOURS, strict=True)
+        ).encode()
+    else:
+        table = np.zeros(9, dtype=[("p", "<f8", 3), ("c", "u1", 3)])
+        table["p"], table["c"] = POINTS, COLOURS
+        rows = table.tobytes()
+    path.write_bytes(f"ply\nformat {kind} 1.0\n{head}".encode() + rows)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_points_that_a_file_names(kind: str, tmp_path: Path) -> None:
+    """Poses and points share a frame: `applied_transform` was applied to both."""
+    moved = np.eye(4)[[0, 2, 1, 3]][:3].tolist()
+    data = nerfstudio(tmp_path, ply_file_path="sparse_pc.ply", applied_transform=moved)
+    write_ply(data / "sparse_pc.ply", kind)
+    found = read_dataset(data, "train")
+    assert found.points is not None and found.points.colour is not None
+    np.testing.assert_allclose(found.points.position, POINTS)
+    np.testing.assert_allclose(found.points.colour, linear_from_srgb(COLOURS / 255), atol=1e-6)
+    check(found.views[0], SHOTS[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("../a.ply", "ply_file_path: .* names no file"), ("no.ply", "missing"), (3, "names no file")],
+)
+def test_points_that_are_not_there(name: Any, said: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=said):
+        read_dataset(nerfstudio(tmp_path, ply_file_path=name), "train")
+
+
+def test_a_mask_that_a_frame_names(tmp_path: Path) -> None:
+    data = nerfstudio(tmp_path)
+    mask = np.zeros((72, 96, 3))
+    mask[36:] = 1
+    write_png(data / "mask.png", mask)
+    mended(data, lambda content: [frame.update(mask_path="mask.png") for frame in content["frames"]])
+    view = read_dataset(data, "train", downscale=2, background="black").views[0]
+    assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
+    assert not view.image[:18].any() and view.image[18:].any()
+
+
+def test_splits_that_a_file_names(tmp_path: Path) -> None:
+    data = nerfstudio(tmp_path, test_filenames=["images/c.png"], val_filenames=["images/d.png"])
+    names = {split: [v.name for v in read_dataset(data, split).views] for split in ("train", "test")}
+    assert names["test"] == ["images/c"] and len(names["train"]) == 7
+    mended(data, lambda content: content.update(train_filenames=["images/a.png", "images/b.png"]))
+    assert [v.name for v in read_dataset(data, "train").views] == ["images/a", "images/b"]
+    mended(data, lambda content: content.update(test_filenames=["images/no.png"]))
+    with pytest.raises(InputError, match="zero test views"):
+        read_dataset(data, "test")
+    mended(data, lambda content: content.update(test_filenames=[3]))
+    with pytest.raises(InputError, match="test_filenames: not a list of paths"):
+        read_dataset(data, "test")
+
+
+@pytest.mark.parametrize("name", ["a.PNG", "a.Png", "a.JPG", "a.jpeg", "a.b.JPEG", "a"])
+@pytest.mark.parametrize("written", [True, False])
+def test_a_file_path_finds_its_file_by_any_ending(name: str, written: bool, tmp_path: Path) -> None:
+    """With the file's ending, in other letters or of another kind, or without; a dot may be in the name."""
+    data = nerfstudio(tmp_path)
+    stem = name.rpartition(".")[0] or name
+    (data / "images/b.png").rename(data / "images" / (name if name != stem else f"{stem}.jpg"))
+    named = f"images/{stem}.png" if written else f"images/{stem}"
+    mended(data, lambda content: content["frames"][1].update(file_path=named))
+    (data / "images/a.png").unlink(missing_ok=True)
+    mended(data, lambda content: content.update(frames=[content["frames"][2], content["frames"][1]]))
+    [view] = read_dataset(data, "test" if named < "images/c.png" else "train").views
+    check(view, SHOTS[1])
+
+
+# ---------------- Shiny Blender ----------------
+
+
+def shiny(folder: Path, alpha: bool = True) -> Path:
+    """A disc whose normals and depths vary, with nothing around it."""
+    y, x = np.mgrid[:24, :32]
+    inside = (x - 15.5) ** 2 + (y - 11.5) ** 2 < 80
+    normal = np.stack([x / 32 - 0.5, y / 24 - 0.5, np.ones_like(x)], axis=-1)
+    normal = np.where(inside[..., None], normal / np.linalg.norm(normal, axis=-1, keepdims=True), 0)
+    disparity = np.where(inside, 1 / (1 + 3 + 0.1 * x), 0).astype(np.float32)
+    (folder / "test").mkdir()
+    rgba = np.concatenate([np.full((24, 32, 3), 0.5), inside[..., None]], axis=-1)
+    write_png(folder / "test/r_0.png", rgba if alpha else rgba[..., :3])
+    write_png(folder / "test/r_0_normal.png", 0.5 * normal + 0.5)
+    Image.fromarray(disparity).save(folder / "test/r_0_disp.tiff")
+    if not alpha:
+        write_png(folder / "test/r_0_alpha.png", np.repeat(inside[..., None], 3, axis=-1))
+    frame = {"file_path": "test/r_0", "transform_matrix": SHOTS[0].camera_to_world.tolist()}
+    for split in ("train", "test"):
+        (folder / f"transforms_{split}.json").write_text(
+            json.dumps({"camera_angle_x": 0.7, "frames": [frame]})
+        )
+    return folder
+
+
+@pytest.mark.parametrize("alpha", [True, False])
+def test_shiny_blender_has_normals_and_depths(alpha: bool, tmp_path: Path) -> None:
+    data = shiny(tmp_path, alpha)
+    view = read_dataset(data, "test").views[0]
+    assert view.normal is not None and view.depth is not None and view.alpha is not None
+    inside = view.alpha > 0
+    assert 240 < inside.sum() < 260 and (view.alpha[inside] == 1).all()
+    length = np.linalg.norm(view.normal, axis=-1)
+    np.testing.assert_allclose(length[inside], 1, atol=1e-6)
+    assert not length[~inside].any() and not view.depth[~inside].any()
+    row, column = 12, 20
+    expected = np.array([column / 32 - 0.5, row / 24 - 0.5, 1])
+    np.testing.assert_allclose(view.normal[row, column], expected / np.linalg.norm(expected), atol=6e-3)
+    assert view.depth[row, column] == pytest.approx(3 + 0.1 * column, rel=1e-5)
+    half = read_dataset(data, "test", downscale=2).views[0]
+    assert half.depth is not None and half.normal is not None and half.normal.shape == (12, 16, 3)
+    assert half.depth[6, 10] == pytest.approx(3 + 0.1 * 20.5, rel=1e-5)
+    assert read_dataset(data, "test", truth=False).views[0].normal is None
+
+
+def test_shiny_disparity_of_16_bits_and_broken(tmp_path: Path) -> None:
+    data = shiny(tmp_path)
+    file = data / "test/r_0_disp.tiff"
+    Image.fromarray(np.full((24, 32), 65535 // 4, dtype=np.uint16)).save(file)
+    depth = read_dataset(data, "test").views[0].depth
+    assert depth is not None and depth[3, 3] == pytest.approx(3, abs=1e-3)
+    Image.fromarray(np.full((20, 32), 65535 // 4, dtype=np.uint16)).save(file)
+    with pytest.raises(InputError, match=r"r_0_disp\.tiff: size: 32 × 20 pixels"):
+        read_dataset(data, "test")
+    Image.fromarray(np.zeros((24, 32, 3), dtype=np.uint8)).save(file)
+    with pytest.raises(InputError, match=r"r_0_disp\.tiff: pixels: not one channel"):
+        read_dataset(data, "test")
+    file.write_bytes(b"II*\0")
+    with pytest.raises(InputError, match=r"r_0_disp\.tiff: pixels: not a readable image"):
+        read_dataset(data, "test")
+
+
+# ---------------- LLFF ----------------
+
+
+def llff(folder: Path, factor: int = 1) -> Path:
+    rows = []
+    for shot in SHOTS:
+        same = replace(shot, focal=(107.0, 107.0), centre=(48.0, 36.0))
+        same.write(folder / "images")
+        right, down, forward, position = same.camera_to_world[:3].T
+        size = np.array([72 * factor, 96 * factor, 107.0 * factor])
+        matrix = np.stack([down, right, -forward, position, size], axis=-1)
+        rows.append([*matrix.ravel(), 1.0, 9.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    return folder
+
+
+@pytest.mark.parametrize("factor", [1, 4])
+def test_llff(factor: int, tmp_path: Path) -> None:
+    data = llff(tmp_path, factor)  # focal lengths are those of the original pictures, however small these are
+    train, test = read_dataset(data, "train"), read_dataset(data, "test")
+    assert (len(train.views), [view.name for view in test.views]) == (7, ["a.png", "i.png"])
+    for view in train.views:
+        shot = next(shot for shot in SHOTS if shot.name == view.name)
+        check(view, replace(shot, focal=(107.0, 107.0), centre=(48.0, 36.0)))
+    (data / "images_2").mkdir()
+    for path in (data / "images").iterdir():
+        write_png(data / "images_2" / path.name, 0.5 * box_downscale(read_png(path), 2))
+    view = read_dataset(data, "train", downscale=4).views[0]
+    assert view.width == 24 and view.fx == pytest.approx(107 / 4) and view.image.max() <= 0.5
+    assert fitting_downscale(data, "png", 2000) == (2, 96, 72)
+
+
+def test_llff_masks(tmp_path: Path) -> None:
+    """Of the whole pictures, so that smaller copies are left alone; all pictures have one, or none."""
+    data = llff(tmp_path)
+    for folder in ("images_2", "masks"):
+        (data / folder).mkdir()
+    mask = np.zeros((72, 96, 3))
+    mask[36:] = 1
+    for path in (data / "images").iterdir():
+        write_png(data / "images_2" / path.name, box_downscale(read_png(path), 2))
+        write_png(data / "masks" / path.name, mask)
+    view = read_dataset(data, "train", downscale=2, background="black").views[0]
+    assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
+    assert not view.image[:18].any() and view.image[18:].any()
+    (data / "masks/c.png").unlink()
+    with pytest.raises(InputError, match=r"masks/c\.png\.png: mask: missing"):
+        read_dataset(data, "train")
+
+
+def saved(folder: Path, array: Any) -> None:
+    np.save(folder / "poses_bounds.npy", array, allow_pickle=True)
+
+
+def test_llff_that_makes_no_sense(tmp_path: Path) -> None:
+    data = llff(tmp_path)
+    good = np.load(data / "poses_bounds.npy")
+    path = data / "poses_bounds.npy"
+    whole = path.read_bytes()
+    for length in range(0, len(whole), 7):
+        path.write_bytes(whole[:length])
+        with pytest.raises(InputError, match=r"poses_bounds\.npy: NumPy"):
+            read_dataset(data, "train")
+    path.write_bytes(whole.replace(b"(9, 17)", b"(10000000000, 17)").replace(b" " * 10, b"", 1))
+    with pytest.raises(InputError, match=r"poses_bounds\.npy: NumPy"):
+        read_dataset(data, "train")
+    infinite, sheared, flat = good.copy(), good.copy(), good.copy()
+    infinite[3, 2], sheared[1, 0], flat[1, 14] = np.inf, 7, 0
+    for array, said in (
+        (np.array([Code()], dtype=object), "NumPy: cannot be read"),
+        (good[:, :15], r"shape \(9, 15\)"),
+        (good[:8], "8 cameras, but images has 9 pictures"),
+        (infinite, "infinite"),
+        (sheared, r"b\.png: not a rotation"),
+        (flat, r"b\.png: height, width and focal length"),
+    ):
+        saved(data, array)
+        with pytest.raises(InputError, match=said):
+            read_dataset(data, "train")
+    with path.open("wb") as file:
+        np.savez(file, good)
+    with pytest.raises(InputError, match=r"poses_bounds\.npy: NumPy: cannot be read"):
+        read_dataset(data, "train")
+
+
+class Code:
+    """Pickled, it runs code when it is read."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (exec, ("raise SystemExit('code was run')",))
+
+
+# ---------------- NeRO ----------------
+
+
+def glossy(folder: Path, protocol: int = 4) -> Path:
+    for shot in SHOTS:
+        replace(shot, name=f"{shot.index}.png").write(folder)
+        depth = np.full((72, 96), 65535, dtype=np.uint16)
+        depth[:, 32:] = round(3.0 / 15 * 65535)
+        depth[:, 64:] = round(14.6 / 15 * 65535)
+        Image.fromarray(depth).save(folder / f"{shot.index}-depth.png")
+        pose = np.concatenate([shot.rotation, shot.translation[:, None]], axis=1)
+        matrix = np.array([[110.0, 0, 50.3], [0, 104.0, 34.6], [0, 0, 1]])
+        content = [pose.astype(np.float32), np.asfortranarray(matrix)]
+        (folder / f"{shot.index}-camera.pkl").write_bytes(pickle.dumps(content, protocol))
+    return folder
+
+
+@pytest.mark.parametrize("protocol", range(5))
+def test_glossy_synthetic(protocol: int, tmp_path: Path) -> None:
+    data = glossy(tmp_path, protocol)
+    train, test = read_dataset(data, "train"), read_dataset(data, "test")
+    assert ([v.name for v in train.views], [v.name for v in test.views]) == (
+        [*"1234567"], ["0", "8"],
+    )  # fmt: skip
+    view = test.views[0]
+    assert view.alpha is not None and view.depth is not None
+    expected = np.repeat([[0.0] * 32 + [1.0] * 32 + [0.0] * 32], 72, axis=0)
+    np.testing.assert_array_equal(view.alpha, expected)
+    np.testing.assert_allclose(view.depth, 3 * expected, atol=2e-4)
+    shot = SHOTS[0]
+    np.testing.assert_allclose(view.to_world[:3, 3], shot.camera_to_world[:3, 3], atol=1e-6)
+    for path in data.glob("*-depth.png"):
+        Image.fromarray(np.zeros((72, 96), dtype=np.uint16)).save(path)
+    for view, shot in zip(read_dataset(data, "train").views, SHOTS[1:8], strict=True):
+        check(view, shot)
+
+
+class Global:
+    """Pickled, it names a function of another module."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (np.memmap, ("/etc/passwd",))
+
+
+def shared(depth: int = 60) -> bytes:
+    """Instructions that leave a tuple of 2^depth leaves, each level of which holds the next one twice."""
+    return b")" + b"2\x86" * depth
+
+
+def array_of(
+    shape: bytes = b"(K\x03t", code: bytes = b"X\x02\0\0\0f8", order: bytes = b"X\x01\0\0\0<"
+) -> bytes:
+    """A list of one array of three numbers, by instructions for its shape and for their type and order."""
+    made = b"cnumpy.core.multiarray\n_reconstruct\n)R"
+    dtype = b"cnumpy\ndtype\n" + code + b"\x85R(K\x03" + order + b"tb"
+    return b"\x80\x03]" + made + b"(K\x01" + shape + dtype + b"\x89" + b"C\x18" + bytes(24) + b"tba."
+
+
+def test_pickles_that_are_no_arrays(tmp_path: Path) -> None:
+    path = tmp_path / "0-camera.pkl"
+    array = np.eye(3)
+    good = pickle.dumps([array, array], 4)
+    path.write_bytes(good)
+    np.testing.assert_array_equal(read_arrays(path)[1], array)
+    path.write_bytes(array_of())
+    np.testing.assert_array_equal(read_arrays(path), [np.zeros(3)])
+    hostile = {
+        "code of shared tuples": array_of(code=shared()),
+        "order of shared tuples": array_of(order=shared()),
+        "shape of shared tuples": array_of(shape=shared()),
+        "side of shared tuples": array_of(shape=b"(K\x03" + shared() + b"t"),
+        "name of shared tuples": b"\x80\x04" + shared() + b"2\x93.",
+        "sum of shared tuples": b"\x80\x04]" + shared() + b"a.",
+        "code": pickle.dumps([Code(), array]),
+        "global": pickle.dumps([Global()]),
+        "object array": pickle.dumps([np.array([Code()], dtype=object)]),
+        "structured": pickle.dumps([np.zeros(2, dtype=[("a", "f8")])]),
+        "huge memo": b"\x80\x04]r\xff\xff\xff\xff.",
+        "huge bytes": b"\x80\x05\x96" + (2**40).to_bytes(8, "little") + b"a.",
+        "persistent": b"Pa\n.",
+        "extension": b"\x80\x04\x82\x01.",
+        "no list": pickle.dumps(3),
+        "long": pickle.dumps([np.zeros(20_000)]),
+        "other size": good.replace((72).to_bytes(4, "little"), (9).to_bytes(4, "little")),
+        "state of a name": b"cnumpy\ndtype\n(lb.",
+        "a value called": b"\x80\x04]K\x01)R.",
+        "empty": b"",
+    }
+    for name, data in hostile.items():
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=r"0-camera\.pkl: pickle: no list of arrays") as caught:
+            print(name, read_arrays(path))
+        assert not isinstance(caught.value.__cause__, MemoryError)
+    for length in range(len(good)):
+        path.write_bytes(good[:length])
+        with pytest.raises(InputError):
+            read_arrays(path)
+
+
+def test_a_name_that_a_pickle_asks_for_is_not_looked_up(tmp_path: Path) -> None:
+    """Whatever it does to NumPy's names stays in records of its own."""
+    path = tmp_path / "0-camera.pkl"
+    path.write_bytes(b"cnumpy\nndarray\n}(Vshape\nI1\nsb.")  # sets attributes of a class
+    shape = np.ndarray.shape
+    with pytest.raises(InputError):
+        read_arrays(path)
+    assert np.ndarray.shape is shape
+
+
+@pytest.mark.parametrize(
+    ("pose", "matrix", "said"),
+    [
+        (np.zeros((4, 4)), np.eye(3), "not a pose of 3 × 4"),
+        (np.ones((3, 4)), np.eye(3), "not a rotation"),
+        (np.full((3, 4), np.nan), np.eye(3), "not a rotation"),
+        (np.eye(4)[:3], np.zeros((3, 3)), "K: no matrix"),
+        (np.eye(4)[:3], np.diag([np.inf, 1, 1]), "K: no matrix"),
+        (np.eye(4)[:3], np.diag([1.0, 1, 2]), "K: no matrix"),
+    ],
+)
+def test_cameras_that_make_no_sense(pose: Any, matrix: Any, said: str, tmp_path: Path) -> None:
+    data = glossy(tmp_path)
+    (data / "1-camera.pkl").write_bytes(pickle.dumps([pose, matrix]))
+    with pytest.raises(InputError, match=rf"1-camera\.pkl: .*{said}"):
+        read_dataset(data, "train")
+    (data / "0-depth.png").unlink()
+    with pytest.raises(InputError, match=r"0-depth\.png: file: missing"):
+        read_dataset(data, "test")
+
+
+def test_glossy_needs_some_views(tmp_path: Path) -> None:
+    data = glossy(tmp_path)
+    for i in range(1, 9):
+        (data / f"{i}-camera.pkl").unlink()
+    with pytest.raises(InputError, match="zero train views"):
+        read_dataset(data, "train")

@@ -1,0 +1,176 @@
+"""Lens distortion: pictures of a lens become those of a pinhole, or are refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.errors import InputError
+from mi_refgs.io.exr import write_exr
+from mi_refgs.io.images import write_png
+
+WIDTH, HEIGHT = 96, 120
+PINHOLE = {"fl_x": 80.0, "fl_y": 84.0, "cx": 50.0, "cy": 57.0}
+SIGMA = 1.6  # pixels, of a dot
+DOTS = [(x, y) for x in (-0.45, -0.2, 0.0, 0.25, 0.45) for y in (-0.5, -0.25, 0.1, 0.5)]  # image plane
+
+LENSES: dict[str, dict[str, Any]] = {
+    "barrel": {"k1": -0.2, "k2": 0.03},
+    "pincushion": {"k1": 0.15, "k2": 0.05, "k3": 0.01, "camera_model": "OPENCV"},
+    "tangential": {"p1": 0.02, "p2": -0.015},
+    "photograph": {"k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575},
+    "fisheye": {"is_fisheye": True, "k1": 0.05, "k2": -0.02, "k3": 0.003, "k4": -0.001},
+    "equidistant": {"camera_model": "OPENCV_FISHEYE", "k1": 0.0},
+}
+
+
+def seen_by(lens: dict[str, Any], x: float, y: float) -> tuple[float, float]:
+    """OpenCV's equations for one point, pixels from the top left corner."""
+    k1, k2, k3, k4, p1, p2 = (lens.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    r = math.hypot(x, y)
+    if lens.get("is_fisheye") or lens.get("camera_model") == "OPENCV_FISHEYE":
+        t = math.atan(r)
+        factor = t * (1 + k1 * t**2 + k2 * t**4 + k3 * t**6 + k4 * t**8) / r if r else 1.0
+        x, y = x * factor, y * factor
+    else:
+        radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6
+        x, y = (
+            x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
+            y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
+        )
+    return PINHOLE["fl_x"] * x + PINHOLE["cx"], PINHOLE["fl_y"] * y + PINHOLE["cy"]
+
+
+def dot(u: float, v: float) -> np.ndarray:
+    columns, rows = np.arange(WIDTH) + 0.5, np.arange(HEIGHT)[:, None] + 0.5
+    return np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2 * SIGMA**2))
+
+
+def dataset(folder: Path, lens: dict[str, Any], alpha: bool = False) -> Path:
+    """Two views of dots through a lens, linear, with maps."""
+    picture = np.stack([sum(dot(*seen_by(lens, x, y)) for x, y in DOTS)] * 3, axis=-1)
+    covered = (picture[..., 0] > 0.2).astype(float)
+    frames = []
+    for name in "ab":
+        write_exr(folder / f"{name}.exr", np.dstack([picture, picture[..., 0]]) if alpha else picture)
+        write_png(folder / f"{name}.png", np.clip(picture, 0, 1))
+        frames.append({"file_path": name, "transform_matrix": np.eye(4).tolist()})
+    write_exr(folder / "depth.exr", 3 * covered)
+    frames[0]["depth_path"] = "depth.exr"
+    content = {**PINHOLE, **lens, "frames": frames}
+    (folder / "transforms_train.json").write_text(json.dumps(content))
+    (folder / "transforms_test.json").write_text(json.dumps(content))
+    return folder
+
+
+def centroid(image: np.ndarray, u: float, v: float) -> tuple[float, float]:
+    """Centre of mass around a pixel, iterated so that the window is centred on what it measures."""
+    columns, rows = np.arange(image.shape[1]) + 0.5, np.arange(image.shape[0])[:, None] + 0.5
+    for _ in range(20):
+        weight = image * (np.hypot(columns - u, rows - v) < 4)
+        u, v = (weight * columns).sum() / weight.sum(), (weight * rows).sum() / weight.sum()
+    return u, v
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_points_land_where_a_pinhole_sees_them(tmp_path: Path, name: str) -> None:
+    """Points of a straight line therefore land on one."""
+    data = read_dataset(dataset(tmp_path, LENSES[name]), "train", images="exr")
+    view = data.views[0]
+    assert (view.width, view.height, view.cx, view.cy) == (WIDTH, HEIGHT, PINHOLE["cx"], PINHOLE["cy"])
+    assert (
+        view.fx / PINHOLE["fl_x"] == pytest.approx(view.fy / PINHOLE["fl_y"]) and view.fx >= PINHOLE["fl_x"]
+    )
+    image, measured = view.image[..., 0], 0
+    for x, y in DOTS:
+        u, v = view.fx * x + view.cx, view.fy * y + view.cy
+        if 5 < u < WIDTH - 5 and 5 < v < HEIGHT - 5:
+            assert math.dist(centroid(image, u, v), (u, v)) < 0.1
+            measured += 1
+    assert measured >= 12
+    if name in ("barrel", "equidistant"):
+        assert view.fx == PINHOLE["fl_x"]
+    if name == "pincushion":
+        assert 1.02 < view.fx / PINHOLE["fl_x"] < 1.2
+
+
+def test_every_pixel_has_data(tmp_path: Path) -> None:
+    """At the smallest zoom the image of one edge touches the picture's, and none leaves it."""
+    view = read_dataset(dataset(tmp_path, LENSES["pincushion"]), "train", images="exr").views[0]
+    x = (np.array([0.5, WIDTH - 0.5]) - view.cx) / view.fx
+    y = (np.array([0.5, HEIGHT - 0.5]) - view.cy) / view.fy
+    corners = np.array([seen_by(LENSES["pincushion"], a, b) for a in x for b in y])
+    gaps = np.concatenate([(corners - 0.5).ravel(), (np.array([WIDTH, HEIGHT]) - 0.5 - corners).ravel()])
+    assert -0.01 < gaps.min() < 0.01
+
+
+def test_alpha_and_maps_follow_the_picture(tmp_path: Path) -> None:
+    view = read_dataset(dataset(tmp_path, LENSES["barrel"], alpha=True), "train", images="exr").views[0]
+    assert view.alpha is not None and view.depth is not None
+    np.testing.assert_allclose(view.image[..., 0] - (1 - view.alpha), view.alpha, atol=1e-6)
+    for x, y in DOTS:
+        u, v = int(view.fx * x + view.cx), int(view.fy * y + view.cy)
+        if 5 < u < WIDTH - 5 and 5 < v < HEIGHT - 5:
+            assert view.depth[v, u] == pytest.approx(3)
+    assert set(np.unique(view.depth.round(5))) == {0, 3}
+
+
+def test_a_smaller_picture_has_the_same_camera(tmp_path: Path) -> None:
+    folder = dataset(tmp_path, LENSES["pincushion"])
+    full = read_dataset(folder, "train", images="exr").views[0]
+    half = read_dataset(folder, "train", images="exr", downscale=2).views[0]
+    np.testing.assert_allclose(
+        [2 * half.fx, 2 * half.cx, 2 * half.cy], [full.fx, full.cx, full.cy], rtol=3e-3
+    )
+    for x, y in DOTS[5:9]:
+        u, v = half.fx * x + half.cx, half.fy * y + half.cy
+        assert math.dist(centroid(half.image[..., 0], u, v), (u, v)) < 0.1
+
+
+def test_zero_coefficients_change_no_pixel(tmp_path: Path) -> None:
+    folder = dataset(tmp_path, {})
+    plain = read_dataset(folder, "train").views[0]
+    zeros = dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0) | {"is_fisheye": False}
+    content = json.loads((folder / "transforms_train.json").read_text()) | zeros
+    (folder / "transforms_train.json").write_text(json.dumps(content))
+    view = read_dataset(folder, "train").views[0]
+    np.testing.assert_array_equal(view.image, plain.image)
+    assert (view.fx, view.fy) == (plain.fx, plain.fy)
+
+
+@pytest.mark.parametrize(
+    ("lens", "words"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, ["camera_model", "undistort"]),
+        ({"camera_model": ["OPENCV"]}, ["camera_model"]),
+        ({"is_fisheye": "yes"}, ["camera_model"]),
+        ({"ftheta_p0": 0.1}, ["ftheta_p0"]),
+        ({"k1": 0.1, "k6": 0.1}, ["k6"]),
+        ({"k4": 0.1}, ["k4", "perspective"]),
+        ({"is_fisheye": True, "p1": 0.1}, ["p1", "fisheye"]),
+        ({"k1": "wide"}, ["k1", "'wide'"]),
+        ({"k1": math.nan}, ["k1", "nan"]),
+        ({"k1": 10**400}, ["k1"]),
+        ({"k1": -5.0}, ["frames[0]", "folds"]),
+        ({"k1": 1e9}, ["frames[0]", "half-way"]),
+    ],
+)
+def test_other_lenses_are_refused(tmp_path: Path, lens: dict[str, Any], words: list[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        read_dataset(dataset_of(tmp_path, lens), "train", images="exr")
+    for word in (str(tmp_path / "transforms_train.json"), *words):
+        assert word in str(caught.value)
+
+
+def dataset_of(folder: Path, lens: dict[str, Any]) -> Path:
+    """Pictures without distortion whose file claims a lens."""
+    dataset(folder, {})
+    content = json.loads((folder / "transforms_train.json").read_text()) | lens
+    (folder / "transforms_train.json").write_text(json.dumps(content))
+    return folder

@@ -1,0 +1,111 @@
+"""CONTRIBUTING's recipe "add a reader", followed: a layout of this test's own, from the folder to a fit.
+
+One class and one `register` are all that is added: cameras in a table of text, pictures without alpha beside
+it, and points to start from.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.data import readers
+from mi_refgs.data.dataset import fitting_downscale, read_dataset
+from mi_refgs.data.readers import PointCloud, ReadOptions, Recording
+from mi_refgs.data.view import View
+from mi_refgs.errors import InputError
+from mi_refgs.io.images import box_downscale, image_size, read_png, write_png
+from mi_refgs.surfels.ply import read_ply
+from tests.scenes.tiny import RADIUS, train_command, write_data, write_method
+
+
+class TableReader:
+    """`cameras.txt` has a line a picture: file, focal length in pixels, the 12 numbers of a pose."""
+
+    name = "table of cameras"
+    looks_for = "cameras.txt"
+
+    def recognises(self, folder: Path) -> bool:
+        return (folder / "cameras.txt").is_file()
+
+    def size(self, folder: Path, images: str) -> tuple[int, int]:
+        return image_size(folder / self._lines(folder, "train")[0][0])
+
+    def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
+        views = [self._view(folder, line, options.downscale) for line in self._lines(folder, split)]
+        points = np.loadtxt(folder / "points.txt", ndmin=2)
+        return Recording(tuple(views), PointCloud(points), source=folder / "cameras.txt")
+
+    def _lines(self, folder: Path, split: str) -> list[list[str]]:
+        lines = [line.split() for line in (folder / "cameras.txt").read_text().splitlines()]
+        return readers.held_out(lines, split)
+
+    def _view(self, folder: Path, line: list[str], downscale: int) -> View:
+        image = np.ascontiguousarray(box_downscale(read_png(folder / line[0]), downscale)[..., :3])
+        height, width = image.shape[:2]
+        focal, *pose = map(float, line[1:])
+        to_world = np.vstack([np.reshape(pose, (3, 4)), [0, 0, 0, 1]])
+        pixels = focal / downscale
+        centre = (width / 2, height / 2)
+        return View(line[0], width, height, pixels, pixels, *centre, to_world, image, None, None, None, False)
+
+
+@pytest.fixture
+def reader() -> Iterator[None]:
+    table = TableReader()
+    readers.register(table)
+    yield
+    readers.unregister(table)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The views of the tiny ball in the new layout: 9 training pictures and 2 test pictures, no alpha."""
+    views = read_dataset(write_data(tmp_path / "ball", views=11, truth=False), "train").views
+    out = tmp_path / "table"
+    out.mkdir()
+    lines = []
+    for i, view in enumerate(views):
+        write_png(out / f"{i}.png", view.image)
+        lines.append(" ".join(map(str, [f"{i}.png", view.fx, *view.to_world[:3].ravel()])))
+    (out / "cameras.txt").write_text("\n".join(lines))
+    directions = np.random.default_rng(0).normal(size=(300, 3))
+    np.savetxt(out / "points.txt", RADIUS * directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    return out
+
+
+def test_a_new_layout_is_recognised_and_read(folder: Path, reader: None) -> None:
+    train, test = read_dataset(folder, "train"), read_dataset(folder, "test", downscale=2)
+    assert (len(train.views), len(test.views)) == (9, 2) and test.views[0].width == train.views[0].width // 2
+    assert train.points is not None and train.points.position.shape == (300, 3)
+    assert fitting_downscale(folder, "png", 100) == (2, 20, 20)
+
+
+def test_a_fit_starts_from_its_points(folder: Path, tmp_path: Path, reader: None) -> None:
+    run = tmp_path / "run"
+    assert main(train_command(folder, run, write_method(tmp_path))) == 0
+    position = read_ply(run / "surfels.ply").to_numpy()["position"]
+    assert np.abs(np.linalg.norm(position, axis=1) - RADIUS).mean() < 0.1 * RADIUS
+    assert main(["eval", str(run)]) == 0
+
+
+def test_a_folder_that_no_reader_knows_is_named(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"table: data set: no layout is recognised.*transforms_train\.json"):
+        read_dataset(folder, "train")
+
+
+def test_a_reader_of_ones_own_is_asked_first() -> None:
+    """Also where it is registered before any data set was read."""
+    code = (
+        "import mi_refgs\nclass Own:\n    name = looks_for = 'own'\n"
+        "    def recognises(self, folder): return True\n"
+        "own = Own()\nmi_refgs.register_reader(own)\nfrom mi_refgs.data import dataset, readers\n"
+        "assert readers.READERS[0] is own and len(readers.READERS) > 1"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,105 @@
+"""`refgs doctor FOLDER`, and data sets that are unusual: one place, one view, pictures of several sizes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.data.dataset import MAX_SIZES, read_dataset
+from mi_refgs.data.survey import Survey, survey
+from mi_refgs.errors import InputError
+from mi_refgs.io.images import box_downscale, read_png, write_png
+from tests.data.test_colmap import SHOTS, write
+from tests.scenes.dots import Shot
+from tests.scenes.tiny import DISTANCE, train_command, write_data, write_method
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(["doctor", *arguments]) == 0
+    return capsys.readouterr().out
+
+
+def test_a_data_set_with_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = write_data(tmp_path / "ball", views=5)
+    found = survey(data)
+    assert (found.layout, found.views) == ("Blender / NeRF", {"train": 5, "test": 2})
+    assert found.size == (20, 20) and found.sizes == 1 and found.alpha == "all"
+    assert found.camera_distance == pytest.approx((DISTANCE, DISTANCE))
+    assert found.centre == pytest.approx((0, 0, 0), abs=1e-9)
+    assert found.truth == ("normal",) and found.environment and not found.points and found.region is None
+    assert found.missing == ("only 5 training views; expect surfaces that fit no others",)
+    text = said(capsys, str(data))
+    for part in ("5 train, 2 test", "20 × 20", "true maps    normal", "NOTE: only 5 training views"):
+        assert part in text
+    printed = json.loads(said(capsys, str(data), "--json"))
+    assert printed == json.loads(json.dumps(found.to_dict()))
+    assert {*printed} == {field.name for field in dataclasses.fields(Survey)}
+
+
+def test_a_reconstruction_with_gaps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = write(tmp_path)
+    (data / "images/c.png").unlink()
+    found = survey(data)
+    assert (found.layout, found.views, found.points) == ("COLMAP", {"train": 7, "test": 1}, 9)
+    assert found.alpha == "none" and found.region is not None
+    text = said(capsys, str(data))
+    assert "1 of 9 cameras have no picture" in text and "NOTE: no alpha" in text and "COLMAP" in text
+
+
+def test_folders_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder, words in ((tmp_path / "no", "no such folder"), (tmp_path, "no layout is recognised")):
+        assert main(["doctor", str(folder)]) == 2
+        assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("count", "words"), [(1, "a lone training view shows no shape"), (3, "stand in one place")]
+)
+def test_cameras_in_one_place(
+    count: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Named before anything is computed, with the exit code of bad input."""
+    data = write_data(tmp_path / "ball", views=count, truth=False)
+    content = json.loads((data / "transforms_train.json").read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = content["frames"][0]["transform_matrix"]
+    (data / "transforms_train.json").write_text(json.dumps(content))
+    assert words in said(capsys, str(data))
+    assert main(train_command(data, tmp_path / "run", write_method(tmp_path))) == 2
+    error = capsys.readouterr().err
+    assert f"{data}: cameras: " in error and words in error and not (tmp_path / "run").exists()
+
+
+def test_pictures_of_two_sizes_are_fitted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = write_data(tmp_path / "ball", views=6)
+    for split, count in (("train", 6), ("test", 2)):
+        content = json.loads((data / f"transforms_{split}.json").read_text())
+        focal = content.pop("fl_x")
+        for key in ("fl_y", "w", "h"):
+            del content[key]
+        for i in range(count):
+            frame, path = content["frames"][i], data / split / f"r_{i}.png"
+            frame["fl_x"] = focal
+            if i % 2:  # a strip at the right is cut off
+                write_png(path, read_png(path)[:, :16])
+                frame["cx"] = 10.0
+                frame.pop("normal_path")
+        (data / f"transforms_{split}.json").write_text(json.dumps(content))
+    assert "20 × 20, of 2 sizes" in said(capsys, str(data))
+    run = tmp_path / "run"
+    assert main(train_command(data, run, write_method(tmp_path))) == 0
+    assert main(["eval", str(run)]) == 0
+
+
+def test_pictures_of_many_sizes_are_refused(tmp_path: Path) -> None:
+    data = write(tmp_path, shots=[dataclasses.replace(shot, height=72) for shot in SHOTS])
+    for i in range(MAX_SIZES + 1):
+        shot: Shot = SHOTS[1 + i]
+        picture = box_downscale(read_png(data / "images" / shot.name), i + 1)
+        write_png(data / "images" / shot.name, picture)
+    with pytest.raises(InputError, match=r"pictures: 5 different sizes, such as .*bring all pictures to one"):
+        read_dataset(data, "train")

@@ -1,0 +1,276 @@
+"""The unit of length is free: a scene that is scaled as a whole, or moved far away, stays the same."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mi_refgs import methods
+from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.region import Region, write_region
+from mi_refgs.data.survey import require_several_sides, survey
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.initial import initial_surfels
+from mi_refgs.fitting.optim import Adam
+from mi_refgs.fitting.rates import Group
+from mi_refgs.fitting.schedule import Schedule
+from mi_refgs.occlusion.mesh import Mesh, write_mesh
+from mi_refgs.occlusion.tsdf import bounds_from_points
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.reference import splat as oracle
+from mi_refgs.reference.camera import look_at
+from mi_refgs.render.depth_normals import normals_from_depth
+from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import splat
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.init import neighbour_scale
+from mi_refgs.surfels.table import Surfels
+from tests.data import test_colmap
+from tests.scenes.integrator import COUNT, image, raw_channels, scene, sensor, sky
+from tests.scenes.tiny import write_data
+
+SCALES = (1e-6, 3e-3, 1e3, 1e6)
+TOLERANCE = 2e-5
+"""Largest error of images; float32 rounds a scaled scene anew."""
+SIZE = 40
+EYE = np.array([3.0, 1, 2])
+ORDERS = {
+    "surfel": Shading("surfel", "split_sum", "irradiance"),
+    "pixel": Shading("pixel", "split_sum", "sh", occlusion=True),
+}
+
+
+def scaled(raw: dict[str, np.ndarray], scale: float) -> dict[str, np.ndarray]:
+    """Raw channels of the scene in another unit."""
+    scale_log = (raw["scale"].astype(np.float64) + np.log(scale)).astype(np.float32)
+    return raw | {"position": raw["position"] * np.float32(scale), "scale": scale_log}
+
+
+def wall(scale: float) -> Mesh:
+    """A box that some of the reflections meet."""
+    box = trimesh.creation.box((0.2, 8, 8))
+    box.apply_translation((-2.5, 4, 0))
+    vertices = (box.vertices * scale).astype(np.float32)
+    return Mesh(vertices, box.faces.astype(np.uint32), 0.05 * scale)
+
+
+def camera(scale: float) -> Camera:
+    to_world = look_at(EYE, np.zeros(3))
+    to_world[:3, 3] *= scale
+    return Camera.from_pose(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world, 0.01 * scale)
+
+
+def rendered(scale: float, shading: Shading) -> tuple[Surfels, Frame, Any, Any]:
+    """Surfels with gradients, a view of them, and its depth normals with their mask."""
+    surfels = Surfels.from_numpy(scaled(raw_channels(), scale))
+    surfels.enable_grad()
+    light = EnvironmentLight.from_radiance(sky()).prefilter()
+    frame = render(surfels, camera(scale), shading, light, Occluder(wall(scale)))
+    return surfels, frame, *normals_from_depth(frame.depth, frame.alpha, camera(scale))
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_scaled_scene_has_the_same_picture_normals_and_gradients(scale: float, order: str) -> None:
+    def values(scale: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        surfels, frame, normal, valid = rendered(scale, ORDERS[order])
+        flat = [frame.alpha, frame.depth / scale, *frame.normal, *frame.radiance, *normal]
+        flat += [frame.maps["visibility"]] if "visibility" in frame.maps else []
+        weight = np.random.default_rng(0).normal(size=(len(flat), SIZE * SIZE)).astype(np.float32)
+        dr.backward(sum((dr.sum(x * mi.Float(w)) for x, w in zip(flat, weight, strict=True)), mi.Float(0)))
+        gradients = {name: dr.grad(raw).numpy() for name, raw in surfels.raw.items()}
+        gradients["position"] = gradients["position"] * scale
+        assert dr.count(valid)[0] > 300
+        return np.array([np.array(x) for x in flat]), gradients
+
+    (expected, slopes), (got, found) = values(1), values(scale)
+    np.testing.assert_allclose(got, expected, atol=TOLERANCE * max(1, np.abs(expected).max()))
+    for name, slope in slopes.items():
+        error = np.linalg.norm(found[name] - slope) / (np.linalg.norm(slope) + 1e-9)
+        assert error < 1e-3, (name, error)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_scaled_scene_is_the_same_through_the_plugin(scale: float, tmp_path: Path) -> None:
+    def picture(scale: float) -> np.ndarray:
+        write_mesh(tmp_path / f"{scale}.ply", wall(scale))
+        at = mi.ScalarTransform4f().look_at([float(scale * x) for x in EYE], [0, 0, 0], [0, 0, 1])
+        view = sensor(to_world=at, near_clip=0.01 * scale, far_clip=1e4 * scale)
+        raw = scaled(raw_channels(), scale)
+        return image(scene(view, raw, mesh=str(tmp_path / f"{scale}.ply"), aovs="n:normal,v:visibility"))
+
+    np.testing.assert_allclose(picture(scale), picture(1), atol=10 * TOLERANCE)
+
+
+@pytest.mark.parametrize("scale", [SCALES[0], SCALES[-1]])
+def test_initial_surfels_of_a_scaled_data_set_are_the_same(scale: float, tmp_path: Path) -> None:
+    scale = 2.0 ** round(np.log2(scale))  # exact, so that no point changes its place in the table
+    write_data(tmp_path, views=4)
+    small = read_dataset(tmp_path, "train")
+    for name in ("train", "test"):
+        file = tmp_path / f"transforms_{name}.json"
+        content = json.loads(file.read_text())
+        for frame in content["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, 3] *= scale
+            frame["transform_matrix"] = matrix.tolist()
+        file.write_text(json.dumps(content))
+    large = read_dataset(tmp_path, "train")
+    assert large.scene_extent == pytest.approx(scale * small.scene_extent)
+    assert large.views[0].camera().near[0] == pytest.approx(scale * small.views[0].camera().near[0])
+
+    def start(data: Dataset) -> dict[str, np.ndarray]:
+        method = methods.load("ref_gaussian", "quick", ["surfels.count=100"])
+        return initial_surfels(method, data, np.random.default_rng(3)).to_numpy()
+
+    expected, got = scaled(start(small), scale), start(large)
+    for name, values in expected.items():
+        unit = scale if name == "position" else 1
+        np.testing.assert_allclose(got[name] / unit, values / unit, atol=2e-5, err_msg=name)
+
+
+def test_lengths_without_a_neighbour_follow_the_extent() -> None:
+    points = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [2.0, 0, 0]])
+    for scale in (1, *SCALES):
+        np.testing.assert_allclose(neighbour_scale(scale * points), scale * neighbour_scale(points))
+        assert neighbour_scale(scale * points[4:])[0] == pytest.approx(scale * neighbour_scale(points[4:])[0])
+        low, high = bounds_from_points(scale * points[3:])
+        np.testing.assert_allclose(high - low, scale * np.subtract(*bounds_from_points(points[3:])[::-1]))
+    assert neighbour_scale(points[:1])[0] > 0
+    assert np.all(np.subtract(*bounds_from_points(points[:1])[::-1]) > 0)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_step_moves_positions_by_the_same_part_of_the_scene(scale: float) -> None:
+    """Gradients of a length have the inverse unit, Adam's ε too."""
+
+    def step(scale: float) -> np.ndarray:
+        groups = Schedule(methods.load("ref_gaussian", "quick"), 1).groups(scale)
+        params = {"position": mi.TensorXf(np.zeros((4, 3), np.float32))}
+        adam = Adam(params, {"position": groups["position"]})
+        slope = np.array([1e-7, 1e-12, 1e-15, 3e-17])[:, None] * np.ones(3)
+        dr.set_grad(params["position"], mi.TensorXf((slope / scale).astype(np.float32)))
+        adam.step(0)
+        return params["position"].numpy() / scale
+
+    np.testing.assert_allclose(step(scale), step(1), rtol=1e-4)
+    assert Group(1.0).unit == 1
+
+
+@pytest.mark.parametrize("shift", [1e3, 1e5])
+def test_far_from_the_origin_the_camera_is_as_exact_as_the_surfels(shift: float) -> None:
+    """Error against the oracle for positions that float32 holds exactly, and a camera that it does not."""
+    rng = np.random.default_rng(2)
+    away = shift * np.array([1, -0.7, 0.4])
+    raw = {
+        name: raw_channels()[name].astype(np.float64) for name in ("position", "rotation", "scale", "opacity")
+    }
+    raw["position"] = (raw["position"] + away).astype(np.float32).astype(np.float64)
+    to_world = look_at(EYE + away + 0.003 * rng.uniform(size=3), away)
+    pinhole = oracle.PinholeCamera(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world)
+    expected = oracle.splat(raw, np.zeros((COUNT, 0)), pinhole)
+    view = Camera.from_pose(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world, 0.01)
+    maps = splat(Surfels.from_numpy(raw), [], view)
+    keep = ~expected.band
+    assert keep.mean() > 0.95 and np.abs(expected.alpha).max() > 0.5
+    assert np.abs(maps.alpha.numpy().reshape(SIZE, SIZE) - expected.alpha)[keep].max() < 2e-5
+    assert np.abs(maps.depth.numpy().reshape(SIZE, SIZE) - expected.depth)[keep].max() < 1e-4
+
+
+# ---------------- data sets ----------------
+
+UTM = np.array([5e5, 4e6 + 4, 120.0])
+PLACES = {"small": (1e-5, 0 * UTM), "large": (1e5, 0 * UTM), "far": (1.0, UTM), "small and far": (1e-3, UTM)}
+"""Another unit of length, and what is added to positions."""
+
+
+def put(data: Path, scale: float, offset: np.ndarray) -> Path:
+    """The cameras, and the region, of a data set in another place and unit."""
+    for path in data.glob("transforms*.json"):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, 3] = scale * matrix[:3, 3] + offset
+            frame["transform_matrix"] = matrix.tolist()
+        path.write_text(json.dumps(content))
+    write_region(data, Region(tuple(offset.tolist()), 0.5 * scale))
+    return data
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_data_set_in_any_place_and_unit_is_the_same(place: str, tmp_path: Path) -> None:
+    """Read, surveyed, and begun to be fitted; both splits are relative to one point."""
+    scale, offset = PLACES[place]
+    plain = write_data(tmp_path / "plain", truth=False)
+    data = put(write_data(tmp_path / "data", truth=False), scale, offset)
+    for folder in (plain, data):  # a lone test view, whose own mean has another round number
+        content = json.loads((folder / "transforms_test.json").read_text())
+        (folder / "transforms_test.json").write_text(json.dumps(content | {"frames": content["frames"][:1]}))
+    before, after = (read_dataset(folder, "train") for folder in (plain, data))
+    test = read_dataset(data, "test")
+    assert after.offset == test.offset and after.region == test.region
+    assert any(after.offset) == any(offset) == any("relative to (500000, 4" in note for note in after.notes)
+    assert after.scene_extent == pytest.approx(scale * before.scene_extent, rel=1e-4)
+    rest = (offset - after.offset) / scale  # of the scene's middle
+    for dataset, folder in ((after, plain), (test, plain)):
+        for view, other in zip(dataset.views, read_dataset(folder, dataset.split).views, strict=True):
+            expected = other.to_world[:3, 3] + rest
+            np.testing.assert_allclose(view.to_world[:3, 3] / scale, expected, rtol=1e-4, atol=1e-5)
+            assert np.abs(view.to_world[:3, 3]).max() < 100 * after.scene_extent
+    assert after.region is not None
+    np.testing.assert_allclose(np.array(after.region.centre) / scale, rest, atol=1e-5)
+    require_several_sides(after)
+    assert not any("one place" in note for note in survey(data).missing)
+
+
+@pytest.mark.parametrize("offset", [0 * UTM, UTM])
+@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e5])
+def test_cameras_in_one_place_are_refused_in_any_unit(
+    scale: float, offset: np.ndarray, tmp_path: Path
+) -> None:
+    data = write_data(tmp_path / "data", truth=False)
+    for path in data.glob("transforms*.json"):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            frame["transform_matrix"] = content["frames"][0]["transform_matrix"]
+        path.write_text(json.dumps(content))
+    put(data, scale, offset)
+    with pytest.raises(InputError, match="stand in one place"):
+        require_several_sides(read_dataset(data, "train"))
+
+
+def test_a_far_reconstruction_keeps_its_points(tmp_path: Path) -> None:
+    """They move with the cameras, before anything is float32."""
+    shots = test_colmap.SHOTS
+    near = read_dataset(test_colmap.write(tmp_path / "near", "txt"), "train")
+    data = test_colmap.write(tmp_path / "far", "txt")
+    model = data / "sparse/0"
+    lines = (model / "images.txt").read_text().splitlines()
+    for i, shot in enumerate(shots):
+        words = lines[1 + 2 * i].split()
+        words[5:8] = [repr(float(x)) for x in shot.translation - shot.rotation @ UTM]
+        lines[1 + 2 * i] = " ".join(words)
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    lines = (model / "points3D.txt").read_text().splitlines()
+    for i, line in enumerate(lines[2:], 2):
+        words = line.split()
+        words[1:4] = [repr(float(x) + float(d)) for x, d in zip(words[1:4], UTM, strict=True)]
+        lines[i] = " ".join(words)
+    (model / "points3D.txt").write_text("\n".join(lines) + "\n")
+    moved = read_dataset(data, "train")
+    assert moved.points is not None and near.points is not None
+    rest = UTM - moved.offset
+    np.testing.assert_allclose(moved.points.position, near.points.position + rest, atol=1e-6)
+    for view, other in zip(moved.views, near.views, strict=True):
+        np.testing.assert_allclose(view.to_world[:3, 3], other.to_world[:3, 3] + rest, atol=1e-6)
+    assert moved.region is not None and near.region is not None
+    np.testing.assert_allclose(moved.region.centre, near.region.centre + rest, atol=1e-4)

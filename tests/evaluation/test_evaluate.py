@@ -1,0 +1,237 @@
+"""Evaluation: the numbers are those of the exported scene, and say why one of them is missing; pictures."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+import unicodedata
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs import methods
+from mi_refgs.compare import plots
+from mi_refgs.data import dataset
+from mi_refgs.evaluation import metrics, pictures
+from mi_refgs.evaluation.evaluate import evaluate, render_names
+from mi_refgs.evaluation.speed import TIMED_FRAMES, WARM_UP_FRAMES
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.images import read_png
+from mi_refgs.render.display import displayed
+from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.runs.run import Run
+from mi_refgs.surfels.ply import write_ply
+from tests.scenes.tiny import SETTINGS, SIZE, write_data, write_method
+
+KEYS = (
+    "psnr ssim flip flip_reason lpips lpips_reason normal_mae_deg normal_mae_deg_full normal_reason "
+    "albedo_psnr albedo_scale albedo_reason roughness_mae roughness_reason metallic_mae metallic_reason "
+    "surface_distance surface_accuracy surface_completeness surface_reason concave_share concave_reason "
+    "psnr_concave normal_mae_deg_concave albedo_psnr_concave surface_distance_concave "
+    "env_scale env_mae env_psnr env_correlation env_reason "
+    "train_seconds iterations surfels ms_per_frame variant preset dataset machine image_size downscale"
+).split()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data set `ball`, and a run fitted to it that was not exported."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("evaluate")
+    write_data(folder / "ball")
+    method = methods.load(str(write_method(folder)), "quick", SETTINGS)
+    run = Run(folder / "run")
+    run.create(method, str(folder / "ball"))
+    trainer = Trainer(method, dataset.read_dataset(folder / "ball", "train"), run)
+    trainer.train()
+    return folder
+
+
+@pytest.fixture
+def run(folder: Path, tmp_path: Path) -> Run:
+    """A copy of the run."""
+    return Run(shutil.copytree(folder / "run", tmp_path / "run"))
+
+
+def test_every_key_is_there_and_json_can_hold_it(run: Run) -> None:
+    result = evaluate(run)
+    assert result.keys() >= set(KEYS)
+    assert json.loads((run.path / "metrics.json").read_text()) == json.loads(
+        json.dumps(result, allow_nan=False)
+    )
+    assert result["iterations"] == 6 and result["variant"] == "tiny" and result["preset"] == "quick"
+    assert 0 < result["ms_per_frame"] and result["train_seconds"] > 0
+    assert 0 <= result["normal_mae_deg_full"] < result["normal_mae_deg"] <= 180
+    for key in ("flip", "lpips", "normal", "env", "albedo", "roughness", "metallic", "surface", "concave"):
+        names = [name for name in result if name.startswith(key) and not name.endswith(("reason", "concave"))]
+        missing = any(result[name] is None for name in names)
+        assert missing == bool(result[f"{key}_reason"]), key
+
+
+def test_the_numbers_are_those_of_the_trainer(run: Run, folder: Path) -> None:
+    """Exported, read back and measured: the state of the trainer, view by view."""
+    result = evaluate(run)
+    trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
+    views = dataset.read_dataset(folder / "ball", "test")
+    scores = []
+    for view in views.views:
+        planes = displayed(trainer.view(view.camera()), views.background, views.linear)
+        image = np.stack([np.array(plane).reshape(SIZE, SIZE) for plane in planes], axis=-1)
+        scores.append(metrics.psnr(image, view.image))
+    assert math.isclose(result["psnr"], np.mean(scores), abs_tol=1e-4)
+    assert [view["psnr"] for view in result["views"]] == pytest.approx(scores, abs=1e-4)
+
+
+def test_mitsuba_renders_the_exported_scene_as_the_trainer_does(run: Run, folder: Path) -> None:
+    evaluate(run)
+    scene = mi.load_file(str(run.path / "scene.xml"))
+    image = np.array(mi.render(scene))
+    frame = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run).view(
+        dataset.read_dataset(folder / "ball", "test").views[0].camera()
+    )
+    planes = [*frame.radiance, frame.alpha]
+    expected = np.stack([np.array(plane).reshape(SIZE, SIZE) for plane in planes], axis=-1)
+    assert frame.alpha[SIZE * SIZE // 2 + SIZE // 2] > 0.3
+    np.testing.assert_allclose(image, expected, atol=1e-5)
+
+
+def test_what_does_not_apply_is_null_with_a_reason(run: Run, tmp_path: Path) -> None:
+    plain = write_data(tmp_path / "plain", truth=False)
+    result = evaluate(run, plain)
+    assert result["dataset"] == str(plain)
+    for key in ("normal_mae_deg", "normal_mae_deg_full", "env_scale", "env_psnr"):
+        assert result[key] is None
+    assert "no true normals" in result["normal_reason"]
+    assert "environment.exr" in result["env_reason"]
+
+
+def test_the_artefacts_are_what_is_measured(run: Run) -> None:
+    """An edited PLY counts; a checkpoint that is newer than the artefacts replaces them."""
+    before = evaluate(run)
+    fitted = TrainedScene.read(run.path)
+    opacity = fitted.surfels.to_numpy() | {"opacity": np.full((fitted.surfels.count, 1), -20.0)}
+    write_ply(run.path / "surfels.ply", type(fitted.surfels).from_numpy(opacity))
+    empty = evaluate(run)
+    assert empty["psnr"] < before["psnr"]
+    note = json.loads((run.path / "model.json").read_text())
+    (run.path / "model.json").write_text(json.dumps(note | {"iteration": 3}))
+    assert evaluate(run)["psnr"] == pytest.approx(before["psnr"], abs=1e-6)
+
+
+def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Test views are rendered with materials and normals, also for the albedo; the timed frames without."""
+    asked: list[bool] = []
+
+    def rendered(*arguments: Any, aovs: bool, normals: bool, **others: Any) -> Frame:
+        asked.append(aovs or normals)
+        return render(*arguments, aovs=aovs, normals=normals, **others)  # type: ignore[misc]
+
+    monkeypatch.setattr("mi_refgs.runs.export.render", rendered)
+    evaluate(run)
+    assert asked == [True] * 4 + [False] * (WARM_UP_FRAMES + TIMED_FRAMES)
+
+
+def test_an_export_without_light_or_mesh_leaves_no_stale_one(run: Run, folder: Path) -> None:
+    evaluate(run)
+    camera = dataset.read_dataset(folder / "ball", "test").views[0].camera()
+    state = run.load_checkpoint()
+    assert state is not None
+    bare = {key: value for key, value in state.items() if not key.startswith("mesh/")}
+    export(TrainedScene.from_state(run.method(), bare), run.path, camera)
+    assert not (run.path / "mesh.ply").exists()
+    assert not TrainedScene.read(run.path).shading.occlusion
+
+
+def test_pictures_of_the_run(run: Run) -> None:
+    evaluate(run)
+    sheet = read_png(run.path / "contact_sheet.png")
+    assert sheet.shape[0] > 2 * pictures.CELL_MIN and sheet.shape[1] > 6 * pictures.CELL_MIN
+    assert sorted(path.name for path in (run.path / "eval").iterdir()) == ["test_r_0.png", "test_r_1.png"]
+
+
+def test_panels_show_what_there_is(run: Run, folder: Path) -> None:
+    trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
+    views = dataset.read_dataset(folder / "ball", "test")
+    view = views.views[0]
+    shot = pictures.RenderedView.of(trainer.view(view.camera()), views, view)
+    panels = pictures.panels(shot, view)
+    assert list(panels) == [
+        "ground truth", "render", "true normals", "normals", "albedo", "metallic", "roughness", "visibility"
+    ]  # fmt: skip
+    for title, picture in panels.items():
+        assert picture.shape == (SIZE, SIZE, 3), title
+        assert 0 <= picture.min() and picture.max() <= 1, title
+    assert np.all(panels["true normals"][0, 0] == 1)  # the corner shows no ball, hence white
+
+
+def test_lights_are_shown_at_one_exposure(rng: np.random.Generator) -> None:
+    truth = rng.uniform(0.1, 5, (8, 16, 3))
+    shown = pictures.lights(truth * [0.5, 2, 1], truth)
+    np.testing.assert_allclose(shown["recovered light"], shown["true light"], atol=1e-6)
+    dark = pictures.lights(np.zeros((8, 16, 3)))
+    assert np.all(dark["recovered light"] == 0)
+
+
+def test_a_sheet_holds_rows_of_different_length() -> None:
+    black, white = np.zeros((10, 30, 3)), np.ones((10, 30, 3))
+    sheet = pictures.sheet([{"a": black, "b": white}, {"a": black}], {"light": np.zeros((8, 16, 3))})
+    assert sheet.ndim == 3 and sheet.shape[2] == 3
+    assert (sheet[:, :, 0] == 0).sum() >= 2 * (13 * 10) * (13 * 30)
+
+
+def test_views_of_any_name_have_an_image_each() -> None:
+    """Also where file systems ignore case or compose accents; plain names stay as they are."""
+    names = [
+        "test/r_0",
+        "左",
+        "右",
+        "e\u0301",
+        "é",
+        "A",
+        "a",
+        "a",
+        "",
+        "!",
+        "x" * 300,
+        "x" * 301,
+        "b c",
+        "b/c",
+    ]
+    found = render_names([SimpleNamespace(name=name) for name in names])  # type: ignore[misc]
+    assert len({unicodedata.normalize("NFC", name).casefold() for name in found}) == len(names)
+    assert found[:3] == ["eval/test_r_0.png", "eval/左.png", "eval/右.png"]
+    assert all(len(name.encode()) < 255 and re.fullmatch(r"eval/[^./]+\.png", name) for name in found)
+    again = render_names([SimpleNamespace(name=name) for name in names[5:]])  # type: ignore[misc]
+    assert again == found[5:]
+
+
+def test_comparisons_read_the_image_of_each_view(
+    run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of views whose names have no ASCII letter."""
+    data = shutil.copytree(folder / "ball", tmp_path / "ball")
+    record = json.loads((data / "transforms_test.json").read_text())
+    for frame, name in zip(record["frames"], ("左", "右"), strict=True):
+        (data / f"{frame['file_path']}.png").rename(data / "test" / f"{name}.png")
+        frame |= {"file_path": f"./test/{name}"}
+    (data / "transforms_test.json").write_text(json.dumps(record))
+    result = evaluate(run, data)
+    images = {*(run.path / "eval").iterdir()}
+    assert len(images) == len(result["views"]) == 2
+    read: list[Path] = []
+
+    def noted(path: Path) -> np.ndarray:
+        read.append(path)
+        return read_png(path)
+
+    monkeypatch.setattr(plots, "read_png", noted)
+    scene: Any = SimpleNamespace(rows=[SimpleNamespace(runs=["run"], variant="tiny")], path=str(data))
+    assert plots.write_crops(tmp_path, scene, tmp_path / "crops.png") is not None
+    assert {*read} == images

@@ -1,0 +1,259 @@
+"""Pruning a fit: what its pictures do not need goes, nothing else does, and nothing is lost."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.constants import PRUNE_LIMIT
+from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation.prune import contributions, prune
+from mi_refgs.io.ownership import RECORD
+from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.runs.export import Pruned, TrainedScene
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import splat
+from mi_refgs.surfels.attributes import sh_columns
+from mi_refgs.surfels.table import Surfels
+from tests.scenes.tiny import write_data
+
+RADIANCE = Shading("surfel", "radiance", "sh")
+MIRROR = Shading("pixel", "split_sum", "irradiance", occlusion=True)
+DEGREE = 2
+HIDDEN, CLEAR, BEHIND = 5, 4, 3
+"""Rows planted inside the opaque ones, with an opacity below 1/255, and behind every camera."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("prune") / "ball")
+
+
+@pytest.fixture(scope="module")
+def train(folder: Path) -> Dataset:
+    return read_dataset(folder, "train")
+
+
+def needed(data: Dataset, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Raw channels of opaque surfels in a grid of 3 × 3 before each camera, all of which count."""
+    grid = [(x, y) for x in (-0.2, 0, 0.2) for y in (-0.2, 0, 0.2)]
+    position, rotation = [], []
+    for view in data.views:
+        right, up, forward = view.to_world[:3, :3].T
+        normal = -forward
+        turn = np.array([-normal[1], normal[0], 0, 1 + normal[2]])  # from z to the normal
+        position += [0.3 * normal + x * right + y * up for x, y in grid]
+        rotation += [turn / np.linalg.norm(turn)] * len(grid)
+    count = len(position)
+    colour = rng.uniform(-1, 1, (count, 3))
+    harmonics = np.hstack([colour, np.zeros((count, sh_columns(DEGREE) - 3))])
+    return {
+        "position": np.array(position),
+        "rotation": np.array(rotation),
+        "scale": np.full((count, 2), np.log(0.12)),
+        "opacity": np.full((count, 1), 8.0),
+        "radiance_sh": harmonics,
+        "albedo": rng.normal(size=(count, 3)),
+        "metallic": np.full((count, 1), 3.0),
+        "roughness": np.full((count, 1), -3.0),
+        "indirect_sh": np.zeros((count, sh_columns(DEGREE))),
+    }
+
+
+def with_useless(raw: dict[str, np.ndarray], rng: np.random.Generator) -> Surfels:
+    """The same rows with useless ones before, between and after them."""
+    extra = HIDDEN + CLEAR + BEHIND
+    rows = {name: np.repeat(values[:1], extra, axis=0) for name, values in raw.items()}
+    rows["position"] = rng.uniform(-0.02, 0.02, (extra, 3))
+    rows["scale"][:HIDDEN] = np.log(0.01)
+    rows["position"][HIDDEN : HIDDEN + CLEAR, 2] += 0.4
+    rows["opacity"][HIDDEN : HIDDEN + CLEAR] = -6.0
+    rows["position"][-BEHIND:, 2] += 50
+    place = np.linspace(0, len(raw["position"]), extra).astype(int)
+    return Surfels.from_numpy({name: np.insert(raw[name], place, rows[name], axis=0) for name in raw})
+
+
+def scene(surfels: Surfels, shading: Shading, **more: Any) -> TrainedScene:
+    light = EnvironmentLight.from_radiance(np.linspace(0.1, 2, 8 * 16 * 3).reshape(8, 16, 3))
+    return TrainedScene(surfels, light, walls(-1, 2), shading, 7, 1.5, **more)
+
+
+def walls(*heights: float, size: float = 20.0) -> Mesh:
+    """Horizontal triangles."""
+    corners = [[x * size, y * size, z] for z in heights for x, y in ((-1, -1), (1, -1), (0, 2))]
+    faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+    return Mesh(np.array(corners, np.float32), faces, 0.01)
+
+
+# ---------- What goes ----------
+
+
+def test_exactly_what_was_planted_goes(train: Dataset, folder: Path, rng: np.random.Generator) -> None:
+    raw = needed(train, rng)
+    whole = scene(with_useless(raw, rng), RADIANCE)
+    pruned, report = prune(whole, train, read_dataset(folder, "test"))
+    for name, values in pruned.surfels.to_numpy().items():
+        np.testing.assert_array_equal(values, raw[name][:, : values.shape[1]].astype(np.float32), name)
+    widths = {name: int(values.shape[1]) for name, values in pruned.surfels.raw.items()}
+    assert widths == {"position": 3, "rotation": 4, "scale": 2, "opacity": 1, "radiance_sh": 3}
+    assert pruned.light is None and pruned.mesh is None and pruned.shading == RADIANCE
+    assert report["before"]["surfels"] - report["after"]["surfels"] == HIDDEN + CLEAR + BEHIND
+    assert report["after"]["channels"] == widths
+    assert report["before"]["ply_bytes"] > 3 * report["after"]["ply_bytes"]
+    for split, count in (("train", 3), ("test", 2)):
+        assert (
+            report[split]["views"] == count and report[split]["mean"] >= report[split]["worst"] >= PRUNE_LIMIT
+        )
+    assert pruned.pruned == Pruned(whole.surfels.count, PRUNE_LIMIT, report["train"]["worst"])
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+
+
+def test_harmonics_keep_the_degree_that_shows(train: Dataset, rng: np.random.Generator) -> None:
+    raw = needed(train, rng)
+    raw["radiance_sh"][:, 3:12] = rng.normal(size=(len(raw["position"]), 9))
+    pruned, _ = prune(scene(Surfels.from_numpy(raw), RADIANCE), train)
+    assert pruned.surfels.sh_degree("radiance_sh") == 1
+
+
+@pytest.mark.parametrize("met", [False, True])
+def test_tracing_stays_where_it_shows(met: bool, train: Dataset, rng: np.random.Generator) -> None:
+    """Mirror rays from the floor meet the ceiling; a mesh that no ray meets goes, with what is seen of it."""
+    raw = needed(train, rng)
+    raw["indirect_sh"][:, :3] = 5.0
+    shading = replace(MIRROR, accuracy=Accuracy(visibility_rays=2))
+    mesh = walls(-1, 2) if met else walls(1000.0, size=0.1)
+    pruned, _ = prune(replace(scene(Surfels.from_numpy(raw), shading), mesh=mesh), train)
+    assert (pruned.mesh is not None) == pruned.shading.occlusion == met
+    assert pruned.shading.accuracy == (shading.accuracy if met else Accuracy())
+    assert pruned.surfels.has("indirect_sh") == met and not pruned.surfels.has("radiance_sh")
+    assert pruned.light is not None and pruned.surfels.has("metallic")
+
+
+def test_a_limit_that_nothing_meets_drops_nothing(train: Dataset, rng: np.random.Generator) -> None:
+    raw = needed(train, rng)
+    raw["radiance_sh"][:, 12:] = rng.normal(size=(len(raw["position"]), 15))
+    for name in ("albedo", "metallic", "roughness", "indirect_sh"):
+        del raw[name]
+    whole = scene(Surfels.from_numpy(raw), RADIANCE)
+    pruned, report = prune(whole, train, limit=99.0)
+    for name, values in pruned.surfels.to_numpy().items():
+        np.testing.assert_array_equal(values, whole.surfels.to_numpy()[name])
+    assert report["trials"] and not any(trial["dropped"] for trial in report["trials"])
+    assert report["train"]["worst"] == 100.0
+
+
+def test_alpha_counts_where_the_background_hides_it(train: Dataset, rng: np.random.Generator) -> None:
+    """White surfels before a white background: dropped, other backgrounds would show."""
+    raw = needed(train, rng)
+    raw["radiance_sh"][:] = 0
+    raw["radiance_sh"][:, :3] = 0.5 / 0.28209479
+    pruned, _ = prune(scene(Surfels.from_numpy(raw), RADIANCE), train)
+    assert pruned.surfels.count == len(raw["position"])
+
+
+def test_an_empty_table_and_one_that_shows_nothing(train: Dataset, rng: np.random.Generator) -> None:
+    raw = needed(train, rng)
+    for count in (0, 4):
+        rows = {name: values[:count] for name, values in raw.items()}
+        rows["opacity"] = np.full((count, 1), -20.0)
+        pruned, _ = prune(scene(Surfels.from_numpy(rows), RADIANCE), train)
+        assert pruned.surfels.count == min(count, 1)
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, 101.0, float("nan"), float("inf")])
+def test_a_limit_out_of_range_is_refused(limit: float, train: Dataset, rng: np.random.Generator) -> None:
+    with pytest.raises(InputError, match=r"--limit: .* dB is out of range; give"):
+        prune(scene(Surfels.from_numpy(needed(train, rng)), RADIANCE), train, limit=limit)
+
+
+def test_contributions_are_the_blended_weights(train: Dataset, rng: np.random.Generator) -> None:
+    """Against the forward blend of a feature that is 1 for one row alone; all together they are alpha."""
+    surfels = with_useless(needed(train, rng), rng)
+    cameras = [view.camera() for view in train.views]
+    weight = contributions(surfels, cameras)
+    expected, alpha = np.zeros(surfels.count), 0.0
+    for camera in cameras:
+        rows = np.eye(surfels.count, dtype=np.float32)
+        blended = splat(surfels, [mi.Float(row) for row in rows], camera)
+        expected += [float(dr.sum(one)[0]) for one in blended.features]
+        alpha += float(dr.sum(blended.alpha)[0])
+    np.testing.assert_allclose(weight, expected, rtol=1e-4, atol=1e-5)
+    assert weight.sum() == pytest.approx(alpha, rel=1e-5)
+    assert np.count_nonzero(weight == 0) >= CLEAR + BEHIND
+
+
+# ---------- The command ----------
+
+
+def test_a_pruned_run_shows_what_is_left_and_can_be_brought_back(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    assert main(["export", str(run), "--prune", "--limit", "25", "--json"]) == 0
+    said = capsys.readouterr()
+    report = json.loads(said.out)["pruned"]
+    assert "dB, dropped" in said.err
+    assert 0 < report["after"]["surfels"] < report["before"]["surfels"]
+    assert (
+        (run / "surfels.ply").stat().st_size == report["after"]["ply_bytes"] < report["before"]["ply_bytes"]
+    )
+    assert min(report["before"]["ms_per_frame"], report["after"]["ms_per_frame"]) > 0
+    assert "pruned: had" in (run / "scene.xml").read_text()
+    changed = {path.name for path, data in before.items() if not path.is_file() or path.read_bytes() != data}
+    assert changed <= {"surfels.ply", "mesh.ply", "scene.xml", "model.json"}
+
+    assert main(["eval", str(run), "--json"]) == 0
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics["surfels"] == report["after"]["surfels"]
+    assert metrics["pruned"] == {
+        "surfels": report["before"]["surfels"], "limit": 25.0, "psnr": report["train"]["worst"]
+    }  # fmt: skip
+    assert main(["eval", str(run)]) == 0
+    assert f"from {report['before']['surfels']} surfels" in capsys.readouterr().out
+    assert main(["render", str(run), "-o", str(tmp_path / "x.exr")]) == 0
+
+    assert main(["export", str(run)]) == 0
+    for path, content in before.items():
+        if path.name not in ("metrics.json", "contact_sheet.png", RECORD):
+            assert path.read_bytes() == content, path
+    assert TrainedScene.read(run).pruned is None
+
+
+@pytest.mark.parametrize("note", [7, {}, {"surfels": 5, "limit": 50, "psnr": float("nan")}])
+def test_a_note_that_cannot_be_read(note: object, finished: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    content = json.loads((run / "model.json").read_text())
+    (run / "model.json").write_text(json.dumps(content | {"pruned": note}))
+    with pytest.raises(
+        InputError, match=r"model\.json: cannot be read .*; write it again with `refgs export"
+    ):
+        TrainedScene.read(run)
+
+
+def test_nothing_is_pruned_for_good(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without checkpoints the artefacts are all there is: the pruned scene then goes to another folder."""
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    shutil.rmtree(run / "checkpoints")
+    before = (run / "surfels.ply").read_bytes()
+    for more in ([], ["-o", f"{run}/../run"]):
+        assert main(["export", str(run), "--prune", *more]) == 2
+        assert "checkpoints: none is left" in capsys.readouterr().err
+    assert main(["export", str(run), "--prune", "--limit", "25", "-o", str(tmp_path / "out")]) == 0
+    assert (run / "surfels.ply").read_bytes() == before
+    assert (tmp_path / "out" / "surfels.ply").stat().st_size < len(before)
+    capsys.readouterr()

@@ -1,0 +1,77 @@
+"""Helpers of the loss tests: planes, differences of a float64 definition, and one check of both modes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refgs.kernels.device import upload
+
+HEIGHT, WIDTH = 14, 17  # not square, and larger than SSIM's window in one axis only by a little
+STEP = 1e-5  # of the float64 definitions: truncation 1e-10, rounding 1e-11
+VALUE = 2e-6  # float32 sums of 700 numbers of size 1: observed 3e-7
+GRADIENT = 2e-5  # relative L2 against float64 differences: observed 1e-6 (SSIM 4e-6)
+
+
+def planes(image: np.ndarray) -> list[Any]:
+    """(H, W, 3) array → three planes."""
+    return [upload(image[..., c]) for c in range(image.shape[2])]
+
+
+def stack(planes_: list[Any]) -> np.ndarray:
+    return np.stack([np.array(dr.grad(p), dtype=np.float64) for p in planes_], axis=-1).reshape(
+        HEIGHT, WIDTH, -1
+    )
+
+
+def gradient(
+    function: Callable[[np.ndarray], float], at: np.ndarray, entries: np.ndarray | None = None
+) -> np.ndarray:
+    """Central differences of a float64 function, for all entries or those of a mask."""
+    slope = np.zeros(at.shape)
+    for index in zip(*np.nonzero(np.ones(at.shape, bool) if entries is None else entries), strict=True):
+        shifted = at.copy()
+        shifted[index] = at[index] + STEP
+        above = function(shifted)
+        shifted[index] = at[index] - STEP
+        slope[index] = (above - function(shifted)) / (2 * STEP)
+    return slope
+
+
+def check(
+    loss: Callable[[list[Any]], Any],
+    define: Callable[[np.ndarray], float],
+    image: np.ndarray,
+    share: float = 1.0,
+) -> None:
+    """Value, reverse-mode gradient and one forward-mode directional derivative of a loss of an image.
+
+    share: of the entries that are compared one by one (slow definitions); the image's rim is always among
+    them.
+    """
+    image = image.astype(np.float32).astype(np.float64)
+    leaves = planes(image)
+    dr.enable_grad(leaves)
+    value = loss(leaves)
+    assert abs(float(value[0]) - define(image)) < VALUE
+    dr.backward(value)
+    entries = np.random.default_rng(2).random(image.shape) < share
+    entries[0, :2] = entries[-1, -2:] = True
+    found, wanted = stack(leaves), gradient(define, image, entries)
+    assert np.linalg.norm(wanted) > 0
+    assert np.linalg.norm((found - wanted)[entries]) <= GRADIENT * np.linalg.norm(wanted)
+
+    direction = np.random.default_rng(3).normal(size=image.shape).astype(np.float32)
+    leaves = planes(image)
+    for leaf, towards in zip(leaves, planes(direction), strict=True):
+        dr.enable_grad(leaf)
+        dr.set_grad(leaf, towards)
+    value = loss(leaves)
+    dr.forward_to(value)
+    towards = direction.astype(np.float64)
+    expected = (define(image + STEP * towards) - define(image - STEP * towards)) / (2 * STEP)
+    scale = np.linalg.norm(found) * np.linalg.norm(direction)
+    assert abs(float(dr.grad(value)[0]) - expected) <= GRADIENT * scale

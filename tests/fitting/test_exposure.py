@@ -1,0 +1,342 @@
+"""Gains of pictures: what is fitted, its derivative, when they are switched on, what they cost elsewhere."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_refgs import methods
+from mi_refgs.data.dataset import Dataset, View
+from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, MAX_GAIN, fitted_gain, log_exposure
+from mi_refgs.errors import InputError
+from mi_refgs.fitting import exposure
+from mi_refgs.fitting.exposure import Exposure, exif_gains
+from mi_refgs.fitting.objective import GAIN_PRIOR, Target, objective
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.images import EXIF_IFD, srgb_from_linear
+from mi_refgs.kernels.device import upload
+from mi_refgs.methods.method import GAIN, DataOptions, ExposureOptions, Method, Refine
+from mi_refgs.methods.weights import LossWeights
+from mi_refgs.reference import losses as reference
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.runs.run import Run
+from tests.fitting.image_checks import HEIGHT, STEP, WIDTH, planes
+from tests.fitting.test_train import METHOD, ball, run_folder
+
+BACKGROUND = np.array([1.0, 0.5, 0.25], np.float32)
+GAINS = np.array([1.4, 0.7, 0.9])
+DECIDED = 8
+
+
+@pytest.fixture
+def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Premultiplied radiance, some of it beyond white, and alpha with empty and full pixels."""
+    alpha = np.clip(rng.uniform(-0.5, 1.5, (HEIGHT, WIDTH)), 0, 1)
+    return rng.uniform(0.01, 0.9, (HEIGHT, WIDTH, 3)) * alpha[..., None], alpha
+
+
+def shown(radiance: np.ndarray, alpha: np.ndarray, linear: bool, gain: np.ndarray) -> np.ndarray:
+    """The picture of exposed radiance, in float64, as its file has it."""
+    if linear:
+        return radiance * gain + (1 - alpha[..., None]) * BACKGROUND
+    x, y, z = map(float, BACKGROUND)
+    return reference.display_image(radiance * gain, alpha, (x, y, z))
+
+
+def view_of(image: np.ndarray, alpha: np.ndarray | None, linear: bool) -> View:
+    image = image.astype(np.float32)
+    alpha = None if alpha is None else alpha.astype(np.float32)
+    return View("a", WIDTH, HEIGHT, 20.0, 20.0, 8.0, 7.0, np.eye(4), image, alpha, None, None, linear)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize("cut_out", [False, True])
+def test_a_gain_is_found_beside_clipped_pixels(
+    linear: bool, cut_out: bool, picture: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """An 8-bit picture clips what the gain makes brighter than white."""
+    radiance, alpha = picture
+    if not cut_out:
+        radiance, alpha = radiance / np.maximum(alpha, 1e-9)[..., None], np.ones_like(alpha)
+    image = shown(radiance, alpha, linear, GAINS)
+    if not linear:
+        clipped = reference.display_image(
+            np.minimum(radiance * GAINS, alpha[..., None]), alpha, (1.0, 0.5, 0.25)
+        )
+        assert np.any(clipped < image - 0.05)
+        image = clipped
+    view = view_of(image, alpha if cut_out else None, linear)
+    found = fitted_gain(radiance, alpha, view, BACKGROUND)
+    np.testing.assert_allclose(found, GAINS, rtol=2e-3)
+    half = np.indices(alpha.shape)[0] < HEIGHT // 2
+    radiance[~half] *= 3  # not looked at
+    np.testing.assert_allclose(fitted_gain(radiance, alpha, view, BACKGROUND, half), GAINS, rtol=2e-3)
+    assert np.all(fitted_gain(0 * radiance, alpha, view, BACKGROUND) == 1)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_the_exposure_of_a_step_and_its_derivative(
+    linear: bool, picture: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
+) -> None:
+    """Value, both modes, against differences of the float64 definition; the prior is part of it."""
+    radiance, alpha = (x.astype(np.float32).astype(np.float64) for x in picture)
+    goal = shown(rng.uniform(0.01, 0.5, radiance.shape) * alpha[..., None], alpha, linear, np.ones(3))
+    view = view_of(goal, alpha, linear)
+    data = Dataset(Path("a"), "train", (view,), BACKGROUND, linear, None)
+    target = Target.of(view, BACKGROUND)
+    clipped = None if target.clipped is None else np.stack([np.array(x) for x in target.clipped], -1)
+    clipped = None if clipped is None else clipped.reshape(radiance.shape)
+    encode = np.vectorize(reference.srgb)
+    goal = encode(np.asarray(view.image, np.float64)) if linear else np.asarray(view.image, np.float64)
+
+    def define(log: np.ndarray) -> float:
+        image = shown(radiance, alpha, linear, np.exp(log))
+        image = encode(image) if linear else image
+        return reference.l1(image, goal, clipped) + GAIN_PRIOR * float(np.sum(log**2))
+
+    log = np.array([0.3, -0.4, 0.2])
+    leaves = [mi.Float(float(value)) for value in log]
+    dr.enable_grad(leaves)
+    frame = Frame(upload(alpha), upload(alpha), mi.Vector3f(0, 0, 1), mi.Color3f(*planes(radiance)))
+    weights = LossWeights(ssim=0, normal=0, alpha=0)
+    loss, _ = objective(frame, target, data, weights, 1, log_gain=leaves)
+    assert float(loss[0]) == pytest.approx(define(log), abs=3e-6)
+    expected = np.array(
+        [(define(log + STEP * axis) - define(log - STEP * axis)) / (2 * STEP) for axis in np.eye(3)]
+    )
+    dr.backward(loss, dr.ADFlag.ClearInterior)
+    found = np.array([float(dr.grad(leaf)[0]) for leaf in leaves])
+    np.testing.assert_allclose(found, expected, rtol=2e-4)
+    for leaf, tangent in zip(leaves, (0.5, -1.0, 2.0), strict=True):
+        dr.set_grad(leaf, mi.Float(tangent))
+    moved, _ = objective(frame, target, data, weights, 1, log_gain=leaves)
+    dr.forward_to(moved)
+    assert float(dr.grad(moved)[0]) == pytest.approx(expected @ [0.5, -1.0, 2.0], rel=2e-4)
+
+
+def test_the_gain_of_an_open_scene_counts_what_lies_behind(picture: tuple[np.ndarray, np.ndarray]) -> None:
+    """Pictures without alpha show object, surroundings and background at one exposure."""
+    radiance, alpha = picture
+    behind = np.array([0.3, 0.2, 0.4])
+    seen = radiance + (1 - alpha[..., None]) * behind
+    view = view_of(np.vectorize(reference.srgb)(np.minimum(seen * GAINS, 1)), None, False)
+    data = Dataset(Path("a"), "train", (view,), BACKGROUND, False, None)
+    opacity, colour = upload(alpha), mi.Color3f(*(float(x) for x in behind))
+    frame = Frame(opacity, opacity, None, mi.Color3f(*planes(radiance)), background=colour)
+    gain, image = exposure.with_gain(frame, view, data)
+    np.testing.assert_allclose(gain, GAINS, rtol=2e-3)
+    np.testing.assert_allclose(np.minimum(image, 1), view.image, atol=2e-3)
+
+
+def exposed(data: Dataset, log: np.ndarray) -> Dataset:
+    """The data set with log gains (V, 3) on its 8-bit pictures with a white background."""
+    views = []
+    for view, gain in zip(data.views, np.exp(log), strict=True):
+        assert view.alpha is not None
+        alpha = view.alpha[..., None]
+        colour = np.clip(srgb_from_linear(view.colour(data.background) * gain), 0, 1)
+        image = (alpha * colour + (1 - alpha) * data.background).astype(np.float32)
+        views.append(dataclasses.replace(view, image=image))
+    return dataclasses.replace(data, views=tuple(views))
+
+
+@pytest.fixture
+def method(tmp_path: Path) -> Method:
+    """Without refinement, so that a few dozen steps settle."""
+    path = tmp_path / "small.toml"
+    path.write_text(METHOD)
+    small = methods.load_resolved(path)
+    rates = dataclasses.replace(small.rates, channel={"albedo": 0.1, "radiance_sh": 0.1, "opacity": 0.2})
+    options = ExposureOptions(after=DECIDED, rate=3e-3)
+    return dataclasses.replace(
+        small, refine=Refine(), mesh=None, data=DataOptions(), iterations=120, exposure=options, rates=rates
+    )
+
+
+def fit(method: Method, data: Dataset) -> Trainer:
+    trainer = Trainer(method, data)
+    while trainer.iteration < method.iterations:
+        trainer.step()
+    return trainer
+
+
+def perfect(data: Dataset) -> Any:
+    """In place of `Exposure._frame`: frames that show the pictures of a data set as they are."""
+
+    def frame(_: Exposure, view: View) -> Frame:
+        own = next(other for other in data.views if other.name == view.name)
+        assert own.alpha is not None
+        radiance = own.alpha[..., None] * own.colour(data.background)
+        opacity = upload(own.alpha)
+        return Frame(opacity, opacity, None, mi.Color3f(*(upload(radiance[..., c]) for c in range(3))))
+
+    return frame
+
+
+def test_gains_are_switched_on_where_pictures_have_them(
+    method: Method, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They begin as those that bring the render to each picture, up to the mean of all views."""
+    log, said = rng.uniform(-0.5, 0.3, (12, 3)), list[str]()
+    trainer = Trainer(method, exposed(ball(views=12), log))
+    trainer.exposure.tell = said.append
+    monkeypatch.setattr(Exposure, "_frame", perfect(ball(views=12)))
+    trainer.exposure.decide(DECIDED - 1)
+    assert trainer.exposure.decision is None
+    trainer.exposure.decide(DECIDED)
+    decision, gains = trainer.exposure.decision, trainer.exposure.gains()
+    assert decision is not None and decision["gains"] and decision["iteration"] == DECIDED
+    assert decision["psnr_gain"] > decision["psnr"] + 10 and len(said) == 1 and "stays" in said[0]
+    assert gains is not None
+    np.testing.assert_allclose(np.log(gains), log - log.mean(axis=0), atol=5e-3)
+    record = trainer.exposure.record()
+    assert record is not None and record["gain"]["3"] == gains[3].round(5).tolist()
+    trainer.params[GAIN] = trainer.params[GAIN] + 0.3  # what all have in common is the scene's
+    used = trainer.exposure.log_gain(3)
+    assert used is not None
+    np.testing.assert_allclose([float(value[0]) for value in used], np.log(gains[3]), atol=1e-6)
+    trainer.exposure.decide(DECIDED + 1)
+    assert len(said) == 1
+
+
+def test_gains_that_fit_half_of_the_pixels_only_do_not_pay(
+    method: Method, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every other square of a picture has another exposure: what is fitted to some is wrong for the rest."""
+    data, squares = ball(views=4), []
+    for view in data.views:
+        row, column = np.indices((view.height, view.width)) // exposure.BLOCK
+        factor = np.where((row + column) % 2 == 0, 0.5, 1.0)[..., None]
+        assert view.alpha is not None
+        alpha = view.alpha[..., None]
+        colour = srgb_from_linear(view.colour(data.background) * factor)
+        image = (alpha * colour + (1 - alpha) * data.background).astype(np.float32)
+        squares.append(dataclasses.replace(view, image=image))
+    trainer = Trainer(method, dataclasses.replace(data, views=tuple(squares)))
+    monkeypatch.setattr(Exposure, "_frame", perfect(data))
+    trainer.exposure.decide(DECIDED)
+    decision = trainer.exposure.decision
+    assert decision is not None and not decision["gains"] and decision["psnr_gain"] < decision["psnr"] - 3
+
+
+def test_where_gains_do_not_pay_the_fit_stays_what_it_was(method: Method, one_thread: None) -> None:
+    method = dataclasses.replace(method, iterations=DECIDED + 4)
+    trainer, without = fit(method, ball()), fit(dataclasses.replace(method, exposure=None), ball())
+    assert trainer.exposure.decision is not None and not trainer.exposure.decision["gains"]
+    assert without.exposure.decision is None
+    found, expected = trainer.state(), without.state()
+    assert found.keys() - expected.keys() == {"exposure"} and GAIN not in trainer.params
+    for name in expected.keys() - {"seconds"}:
+        assert np.array_equal(found[name], expected[name]), name
+    choices: list[tuple[Any, bool]] = [("off", False), ("on", True)]
+    for gains, there in choices:
+        chosen = Trainer(dataclasses.replace(method, exposure=ExposureOptions(gains, after=2)), ball())
+        chosen.exposure.decide(method.iterations)
+        assert (chosen.exposure.decision is not None) == (GAIN in chosen.params) == there
+
+
+@pytest.mark.parametrize("stop", [DECIDED - 1, DECIDED + 3])
+def test_a_fit_with_gains_resumes_bit_for_bit(
+    stop: int, method: Method, rng: np.random.Generator, tmp_path: Path, one_thread: None
+) -> None:
+    """Started by EXIF data; stopped before or after the decision, which is not repeated."""
+    options = dataclasses.replace(method.exposure or ExposureOptions(), gains="on")
+    method = dataclasses.replace(method, exposure=options, iterations=DECIDED + 6)
+    data = exposed(ball(), rng.uniform(-0.5, 0.3, (6, 3)))
+    views = tuple(dataclasses.replace(view, exposure=0.1 * i) for i, view in enumerate(data.views))
+    data = dataclasses.replace(data, views=views)
+    straight = fit(method, data)
+    first = Trainer(method, data, run_folder(tmp_path / "run", method))
+    said: list[str] = []
+    while first.iteration < stop:
+        first.step()
+    first.save()
+    second = Trainer(method, data, Run(tmp_path / "run"))
+    second.exposure.tell = said.append
+    while second.iteration < method.iterations:
+        second.step()
+    assert len(said) == (stop < DECIDED)
+    expected, found = straight.state(), second.state()
+    assert expected.keys() == found.keys() and f"params/{GAIN}" in found
+    for name in expected.keys() - {"seconds"}:
+        assert np.array_equal(expected[name], found[name]), name
+    fewer = dataclasses.replace(data, views=data.views[1:])
+    with pytest.raises(InputError, match="5 training views, but the checkpoint has gains of 6"):
+        Trainer(method, fewer, Run(tmp_path / "run"))
+
+
+def test_a_warm_step_with_gains_compiles_nothing(method: Method) -> None:
+    """Another view has other gains, and no other kernel; a view's gain moves with its own gradient."""
+    trainer = Trainer(dataclasses.replace(method, exposure=ExposureOptions(gains="on", after=2)), ball())
+    while trainer.iteration < 16:
+        trainer.step()
+    dr.sync_thread()
+    misses = dr.detail.launch_stats()[2]
+    for _ in range(4):
+        trainer.step()
+    dr.sync_thread()
+    assert dr.detail.launch_stats()[2] == misses
+    for _ in range(2):
+        trainer.optimiser.reset(GAIN)
+        before = trainer.params[GAIN].numpy()
+        trainer.step()
+        index = trainer.schedule.view(trainer.iteration)
+        moved = np.flatnonzero(np.any(trainer.params[GAIN].numpy() != before, axis=1))
+        assert moved.tolist() == [index]
+
+
+def photograph(path: Path, settings: dict[int, Any] | None) -> Path:
+    picture, exif = Image.new("RGB", (8, 8)), Image.Exif()
+    if settings is not None:
+        exif.get_ifd(EXIF_IFD).update(settings)
+    picture.save(path, exif=exif)
+    return path
+
+
+def test_exif_data_tell_the_exposure(tmp_path: Path, method: Method) -> None:
+    """A stop is a factor of two; what lacks one of the three numbers, or has nonsense, tells nothing."""
+    usual: dict[int, Any] = {EXPOSURE_TIME: 0.01, F_NUMBER: 2.0, ISO: 100}
+    changes: list[dict[int, Any]] = [{}, {EXPOSURE_TIME: 0.02}, {ISO: 50}, {F_NUMBER: 4.0}]
+    log = [
+        log_exposure(photograph(tmp_path / f"{i}.jpg", {**usual, **change}))
+        for i, change in enumerate(changes)
+    ]
+    assert log[0] == pytest.approx(np.log(0.01 * 100 / 4), rel=1e-6)
+    assert [value - log[0] for value in log if value is not None and log[0] is not None] == pytest.approx(
+        np.log([1, 2, 0.5, 0.25]), abs=1e-5
+    )
+    broken: list[dict[int, Any] | None] = [
+        None,
+        {EXPOSURE_TIME: 0.01},
+        usual | {ISO: 0},
+        usual | {F_NUMBER: 0.0},
+    ]
+    for settings in broken:
+        assert log_exposure(photograph(tmp_path / "none.jpg", settings)) is None
+    assert log_exposure(tmp_path / "picture.exr") is None
+    for name in ("garbage.jpg", "garbage.png"):
+        Image.new("RGB", (8, 8)).save(tmp_path / name, exif=b"Exif\0\0garbage")
+        assert log_exposure(tmp_path / name) is None
+    data = ball(views=4)
+    known = [dataclasses.replace(view, exposure=x) for view, x in zip(data.views, log, strict=True)]
+    gains = exif_gains(dataclasses.replace(data, views=tuple(known)))
+    assert gains is not None
+    np.testing.assert_allclose(gains[:, 1], np.log([1, 2, 0.5, 0.25]) + np.log(2) / 2, atol=1e-5)
+    trainer = Trainer(method, dataclasses.replace(data, views=tuple(known)))
+    np.testing.assert_array_equal(trainer.params[GAIN].numpy(), gains)
+    trainer.step()  # gains wait for the decision
+    np.testing.assert_array_equal(trainer.params[GAIN].numpy(), gains)
+    alike = tuple(dataclasses.replace(view, exposure=log[0]) for view in known)
+    assert exif_gains(dataclasses.replace(data, views=alike)) is None
+    assert exif_gains(dataclasses.replace(data, views=(*known[:-1], data.views[-1]))) is None
+    wild = [dataclasses.replace(v, exposure=x) for v, x in zip(data.views, (-600, 0, 0.1, 600), strict=True)]
+    gains = exif_gains(dataclasses.replace(data, views=tuple(wild)))
+    assert gains is not None
+    np.testing.assert_allclose(np.exp(gains[[0, 3], 0]), [1 / MAX_GAIN, MAX_GAIN], rtol=1e-6)

@@ -1,0 +1,80 @@
+"""Fits to pictures nobody would wish for: they run with finite numbers, or end with one sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mi_refgs import methods
+from mi_refgs.data.dataset import Dataset, View
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.images import linear_from_srgb
+from tests.fitting.test_train import METHOD, ball
+
+STEPS = 14
+"""Into the deferred stage, with the first mesh, a reset and two rounds of densifying."""
+
+
+def changed(change: Callable[[View], dict[str, Any]], linear: bool = False, views: int = 6) -> Dataset:
+    data = ball(views=views)
+    found = tuple(dataclasses.replace(view, **change(view), linear=linear) for view in data.views)
+    return dataclasses.replace(data, views=found, linear=linear)
+
+
+def radiance(view: View, peak: float) -> dict[str, Any]:
+    """The ball in linear, premultiplied radiance on white; its highlight reaches `peak`."""
+    linear = linear_from_srgb(view.image).astype(np.float32)
+    assert view.alpha is not None
+    highlight = (view.alpha > 0) & (view.image.min(axis=-1) > 0.5)
+    linear[highlight] = peak
+    return {"image": linear}
+
+
+BLACK = {"image": np.zeros((24, 24, 3), np.float32)}
+WHITE = {"image": np.ones((24, 24, 3), np.float32)}
+
+CASES: dict[str, Callable[[], Dataset]] = {
+    "black": lambda: changed(lambda view: BLACK),
+    "white": lambda: changed(lambda view: WHITE),
+    "under-exposed": lambda: changed(lambda view: {"image": np.round(view.image * 3) / 255}),
+    "over-exposed": lambda: changed(lambda view: {"image": np.minimum(50 * view.image, 1)}),
+    "opaque everywhere": lambda: changed(lambda view: {"alpha": np.ones((24, 24), np.float32)}),
+    "without alpha": lambda: changed(lambda view: {"alpha": None}),
+    "black without alpha": lambda: changed(lambda view: BLACK | {"alpha": None}),
+    "two views": lambda: changed(lambda view: {}, views=2),
+    "peak of 1e6": lambda: changed(lambda view: radiance(view, 1e6), linear=True),
+    "peak of 1e30": lambda: changed(lambda view: radiance(view, 1e30), linear=True),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_fit_stays_finite(name: str, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(METHOD)
+    method = dataclasses.replace(methods.load_resolved(tmp_path / "small.toml"), iterations=STEPS)
+    trainer = Trainer(method, CASES[name]())
+    trainer.train()
+    assert trainer.iteration == STEPS and trainer.skipped == 0 and not trainer.notices
+    for key, values in trainer.state().items():
+        assert np.all(np.isfinite(values)), key
+    frame = trainer.view(trainer.targets[0].camera)
+    assert all(np.all(np.isfinite(plane.numpy())) for plane in [*frame.radiance, frame.alpha])
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        changed(lambda view: {"alpha": np.zeros((24, 24), np.float32)}),
+        changed(lambda view: {}, views=1),
+    ],
+    ids=["nothing but background", "one view"],
+)
+def test_what_cannot_be_begun_is_one_sentence(data: Dataset, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(METHOD)
+    with pytest.raises(InputError, match=r"^\w+: [^.]*; [^.]*$"):
+        Trainer(methods.load_resolved(tmp_path / "small.toml"), data)

@@ -1,0 +1,132 @@
+"""Steps whose loss or gradient is not finite: not applied, culprits named and removed, or one sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs import methods
+from mi_refgs.errors import InputError
+from mi_refgs.fitting import health
+from mi_refgs.fitting.optim import Adam
+from mi_refgs.fitting.skips import Skipped
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.methods.method import Method
+from mi_refgs.surfels.primitives.surfel import Surfel
+from mi_refgs.surfels.table import Surfels
+from tests.fitting.test_train import METHOD, ball, run_folder
+
+
+@pytest.fixture
+def method(tmp_path: Path) -> Method:
+    path = tmp_path / "small.toml"
+    path.write_text(METHOD)
+    return methods.load_resolved(path)
+
+
+def spoil_gradient(monkeypatch: pytest.MonkeyPatch, name: str, rows: list[int], views: set[int]) -> None:
+    """Give `rows` of a tensor a NaN gradient whenever one of the views is shown."""
+    original = Adam.step
+
+    def step(self: Adam, iteration: int, loss: object = None) -> None:
+        if trainers[0].schedule.view(iteration + 1) in views:
+            gradient = np.array(dr.grad(self.params[name]).numpy())
+            gradient[[row for row in rows if row < len(gradient)], 0] = np.nan
+            dr.set_grad(self.params[name], mi.TensorXf(gradient))
+        original(self, iteration, loss)
+
+    trainers: list[Trainer] = []
+    created = Trainer.__init__
+
+    def init(self: Trainer, *args: object) -> None:
+        trainers.append(self)
+        created(self, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Trainer, "__init__", init)
+    monkeypatch.setattr(Adam, "step", step)
+
+
+def test_surfels_with_a_gradient_that_is_not_finite_are_removed_and_named(
+    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps on view 2 fail until the next check, every third iteration; then the culprits are gone."""
+    spoil_gradient(monkeypatch, "albedo", [17, 52], {2})
+    still = dataclasses.replace(method, refine=methods.Refine(), iterations=9)
+    run = run_folder(tmp_path / "run", still)
+    trainer = Trainer(still, ball(), run)
+    before = trainer.surfels.to_numpy()["albedo"]
+    failed = [i for i in range(1, 10) if trainer.schedule.view(i) == 2]
+
+    def look(state: Trainer) -> None:
+        if state.iteration == failed[0]:
+            # Nothing of the step has been applied.
+            assert all(np.all(np.isfinite(tensor.numpy())) for tensor in state.params.values())
+            monkeypatch.undo()
+
+    trainer.train(look)
+    assert trainer.skipped == 1 and trainer.surfels.count == len(before) - 2
+    [said] = trainer.notices
+    assert said == f"iteration {failed[0]}, view 2: albedo not finite at surfels 17, 52: 2 were removed"
+    assert len(trainer.control.table.gradient_sum) == trainer.surfels.count
+    lines = (run.path / "metrics.jsonl").read_text().splitlines()
+    assert json.loads(lines[-1])["skipped_steps"] == 1
+
+
+@pytest.mark.parametrize("name", ["position", "roughness", "indirect_sh"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_surfels_that_are_not_finite_are_removed_and_the_fit_goes_on(
+    name: str, value: float, method: Method
+) -> None:
+    trainer = Trainer(dataclasses.replace(method, iterations=12), ball())
+    trainer.step()
+    raw = trainer.surfels.to_numpy()
+    raw[name][[3, 9], 0] = value
+    trainer.control.table.replace(Surfels.from_numpy(raw))
+    trainer.train()
+    assert (
+        "2 were removed" in trainer.notices[0] and f"{name} not finite at surfels 3, 9" in trainer.notices[0]
+    )
+    assert trainer.iteration == 12 and np.isfinite(trainer.statistics()["loss"])
+    for found in trainer.state().values():
+        assert np.all(np.isfinite(found))
+
+
+def test_values_too_large_to_render_are_named_beside_those_that_are_not_finite(method: Method) -> None:
+    """The larger ones would stay, and be named by another channel, if the look were for NaN alone."""
+    raw = Trainer(method, ball()).surfels.to_numpy()
+    raw["indirect_sh"][4, 0], raw["roughness"][9, 0] = 1e30, np.nan
+    rows = health.culprits(Surfels.from_numpy(raw), Skipped(0, 0, {}))
+    assert {name: at.tolist() for name, at in rows.items()} == {"roughness": [9], "indirect_sh": [4]}
+
+
+def test_a_fit_in_which_every_step_fails_ends_with_one_sentence(
+    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Too many surfels to be the cause: nothing is removed, nothing changes, and the view is named."""
+    spoil_gradient(monkeypatch, "scale", list(range(1000)), set(range(6)))
+    run = run_folder(tmp_path / "run", method)
+    trainer = Trainer(dataclasses.replace(method, refine=methods.Refine()), ball(), run)
+    before = trainer.surfels.to_numpy()
+    with pytest.raises(InputError, match=r"view \d: scale not finite; .*look at that picture"):
+        trainer.train()
+    assert trainer.iteration == 3 * method.log_every
+    after = trainer.surfels.to_numpy()
+    for name in Surfel.widths:  # materials begin anew in iteration 9, with the deferred stage
+        np.testing.assert_array_equal(after[name], before[name])
+
+
+def test_a_light_that_is_not_finite_ends_a_fit_with_one_sentence(method: Method, tmp_path: Path) -> None:
+    run = run_folder(tmp_path / "run", method)
+    trainer = Trainer(method, ball(), run)
+    light = np.array(trainer.params["light"].numpy())
+    light[3, 4, 1] = np.nan
+    trainer.params["light"] = mi.TensorXf(light)
+    with pytest.raises(InputError, match="light: a texel is not finite or too large; "):
+        trainer.train()
+    assert not run.checkpoints()

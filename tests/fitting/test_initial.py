@@ -1,0 +1,105 @@
+"""What a fit starts from: surfels on and inside the visual hull, coloured by the pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from mi_refgs import methods
+from mi_refgs.data import dataset, hull
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.initial import initial_surfels
+from tests.scenes.tiny import RADIUS, write_data
+
+COUNT = 2_000
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hull of fewer voxels: pictures of 20² show no more."""
+    monkeypatch.setattr(hull, "visual_hull", functools.partial(hull.visual_hull, resolution=32))
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> dataset.Dataset:
+    """Twelve views of a ball coloured by its normals, at RADIUS around the origin."""
+    return dataset.read_dataset(
+        write_data(tmp_path_factory.mktemp("hull") / "ball", views=12, truth=False), "train"
+    )
+
+
+def start(ball: dataset.Dataset, inside: float, seed: int = 0, *settings: str) -> dict[str, np.ndarray]:
+    assigned = [f"surfels.count={COUNT}", f"surfels.inside={inside}", *settings]
+    method = methods.load("ref_gaussian", "quick", assigned)
+    surfels = initial_surfels(method, ball, np.random.default_rng(seed))
+    return surfels.to_numpy() | {"normal": np.array(surfels.frame()[2]).T}
+
+
+def test_the_share_inside_is_spread_over_the_volume(ball: dataset.Dataset) -> None:
+    """Below 0.8 of the radius lies half of the volume of the ball, and nothing of its surface."""
+    deep = {}
+    for share in (0.0, 0.5, 1.0):
+        table = start(ball, share)
+        distance = np.linalg.norm(table["position"], axis=1)
+        assert len(distance) == COUNT
+        deep[share] = np.mean(distance < 0.8 * RADIUS)
+    assert deep[0.0] == 0
+    # The hull of twelve views is up to a tenth wider than the ball.
+    assert 0.35 < deep[1.0] < 0.55 and deep[0.5] == pytest.approx(deep[1.0] / 2, abs=0.04)
+
+
+def test_normals_and_colours_of_both_kinds(ball: dataset.Dataset) -> None:
+    table = start(ball, 0.5)
+    distance = np.linalg.norm(table["position"], axis=1)
+    outward = np.sum(table["normal"] * table["position"], axis=1) / distance
+    inner, outer = distance < 0.8 * RADIUS, distance > 0.95 * RADIUS
+    assert np.median(outward[outer]) > 0.9
+    assert abs(outward[inner].mean()) < 0.15 and np.mean(outward[inner] < 0) > 0.4
+    colour = 0.5 + init_colour(table)
+    assert np.all(np.isfinite(colour)) and np.all((colour >= 0) & (colour <= 1))
+
+
+def init_colour(table: dict[str, np.ndarray]) -> np.ndarray:
+    """What a surfel's constant harmonic adds to grey."""
+    return table["radiance_sh"][:, :3] * 0.28209479
+
+
+def test_albedo_starts_with_the_hue_of_the_pictures(ball: dataset.Dataset) -> None:
+    """As bright everywhere as its initial value; without it, it is grey."""
+    table = start(ball, 0.5, 0, "surfels.from_pictures=['albedo']", "surfels.initial.albedo=0.6")
+    albedo, colour = 1 / (1 + np.exp(-table["albedo"])), 0.5 + init_colour(table)
+    hue = 0.6 * colour / colour.max(axis=1, keepdims=True)
+    # Its own jitter breaks ties, and its ends are cut off.
+    assert np.abs(albedo - np.clip(hue, 0.02, 0.9)).max() < 0.026
+    assert np.abs(albedo - 0.6).max() > 0.3
+    assert np.abs(1 / (1 + np.exp(-start(ball, 0.5)["albedo"])) - 0.5).max() < 0.026
+
+
+def test_the_same_seed_gives_the_same_start(ball: dataset.Dataset) -> None:
+    one, two, other = start(ball, 0.5), start(ball, 0.5), start(ball, 0.5, seed=1)
+    assert all(np.array_equal(one[name], two[name]) for name in one)
+    assert not np.array_equal(one["position"], other["position"])
+
+
+def test_without_alpha_surfels_fill_the_box(ball: dataset.Dataset) -> None:
+    bare = dataclasses.replace(
+        ball, views=tuple(dataclasses.replace(view, alpha=None) for view in ball.views)
+    )
+    table = start(bare, 0.5)
+    assert len(table["position"]) == COUNT and np.linalg.norm(table["position"], axis=1).max() > 1.1 * RADIUS
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.5, float("nan")])
+def test_a_share_out_of_range_is_refused(ball: dataset.Dataset, share: float) -> None:
+    with pytest.raises(InputError, match=r"surfels(\.|: )inside"):
+        start(ball, share)
+
+
+@pytest.mark.parametrize("variant", methods.names())
+def test_methods_start_alike(variant: str) -> None:
+    """A method is compared with another one from the same points."""
+    full, other = (methods.load(name, "quick").surfels for name in ("ref_gaussian", variant))
+    assert (full.inside, full.count, full.max_count) == (other.inside, other.count, other.max_count)

@@ -1,0 +1,266 @@
+"""Losses against their float64 definitions: values, and gradients against central differences."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.data.dataset import View
+from mi_refgs.fitting import losses
+from mi_refgs.fitting.objective import Target
+from mi_refgs.fitting.ssim import ssim
+from mi_refgs.io.images import srgb_from_linear
+from mi_refgs.reference import losses as reference
+from mi_refgs.render import display
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from tests.fitting.image_checks import GRADIENT, HEIGHT, STEP, VALUE, WIDTH, check, gradient, planes, stack
+from tests.helpers import level_maps
+
+
+@pytest.fixture
+def images(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Two correlated images, so that no term of SSIM is negligible."""
+    first = rng.random((HEIGHT, WIDTH, 3))
+    return first, np.clip(0.6 * first + 0.4 * rng.random((HEIGHT, WIDTH, 3)), 0, 1).astype(np.float32).astype(
+        np.float64
+    )
+
+
+def test_l1(images: tuple[np.ndarray, np.ndarray]) -> None:
+    image, target = images
+    check(lambda x: losses.l1(x, planes(target)), lambda x: reference.l1(x, target), image)
+
+
+def test_l1_at_equality_has_no_slope(images: tuple[np.ndarray, np.ndarray]) -> None:
+    leaves = planes(images[0])
+    dr.enable_grad(leaves)
+    value = losses.l1(leaves, planes(images[0]))
+    dr.backward(value)
+    assert float(value[0]) == 0 and np.all(stack(leaves) == 0)
+
+
+def test_l1_of_clipped_highlights(images: tuple[np.ndarray, np.ndarray]) -> None:
+    image, target = images
+    target = target.copy()
+    target[3:9, 4:12] = 1.0
+    image = image * 1.6
+    clipped = target >= 254.5 / 255
+    assert np.any(clipped & (image > 1)) and np.any(clipped & (image < 1))
+    check(
+        lambda x: losses.l1(
+            losses.clip_highlights(x, planes(target), losses.saturated(planes(target))), planes(target)
+        ),
+        lambda x: reference.l1(x, target, clipped),
+        image,
+    )
+
+
+def test_saturated_is_the_last_8_bit_value() -> None:
+    (mask,) = losses.saturated([mi.Float(254 / 255, 254.4 / 255, 1.0, 1.7)])
+    assert list(np.array(mask)) == [False, False, True, True]
+
+
+def test_only_the_objects_own_colour_is_a_highlight() -> None:
+    """Composites of 8-bit colours: white behind empty pixels and edges is none, a white edge on black is."""
+    alpha = np.array([0, 1 / 255, 0.2, 0.5, 1, 0, 1 / 255, 0.2, 0.5, 1], np.float32)
+    own = np.array([0.3, 254 / 255, 0.3, 254 / 255, 254 / 255, 1, 1, 1, 1, 1], np.float32)
+    for background in (0.0, 1.0):
+        image = own * alpha + (1 - alpha) * np.float32(background)
+        (mask,) = losses.saturated([mi.Float(image)], mi.Float(alpha), [background])
+        assert np.array(mask).tolist() == [False] * 6 + [True] * 4
+
+
+@pytest.mark.parametrize("covered", [0.0, 1.0])
+def test_a_floater_brighter_than_a_white_background_costs(covered: float) -> None:
+    """Over the background it does, over a highlight of the object it does not."""
+    image, alpha = np.ones((4, 4, 3), np.float32), np.full((4, 4), covered, np.float32)
+    view = View("a", 4, 4, 4, 4, 2, 2, np.eye(4), image, alpha, None, None, linear=False)
+    target = Target.of(view, np.ones(3))
+    radiance = [mi.Float(np.full(16, 3.0)) for _ in range(3)]
+    dr.enable_grad(radiance)
+    shown = display.display_image(radiance, mi.Float(np.full(16, 0.5)), [1.0, 1.0, 1.0])
+    assert target.clipped is not None
+    loss = losses.l1(losses.clip_highlights(shown, target.image, target.clipped), target.image)
+    dr.backward(loss)
+    slope = np.abs(dr.grad(radiance[0]).numpy())
+    assert (float(loss[0]) > 0.1 and slope.min() > 0) if not covered else (float(loss[0]) == slope.max() == 0)
+
+
+def test_ssim(images: tuple[np.ndarray, np.ndarray]) -> None:
+    image, target = images
+    # The loop over windows is slow: differences on a part of the image, whose window meets two borders.
+    image, target = image[:, :, :1], target[:, :, :1]
+    image = image.astype(np.float32).astype(np.float64)
+    leaf = planes(image)
+    dr.enable_grad(leaf)
+    value = ssim(leaf, planes(target), WIDTH, HEIGHT)
+    assert abs(float(value[0]) - reference.ssim(image, target)) < VALUE
+    dr.backward(value)
+    found = stack(leaf)
+
+    def patch(values: np.ndarray) -> float:
+        whole = image.copy()
+        whole[:3, :4] = values
+        return reference.ssim(whole, target)
+
+    wanted = gradient(patch, image[:3, :4])
+    assert np.linalg.norm(found[:3, :4] - wanted) <= GRADIENT * np.linalg.norm(wanted)
+    middle = image.copy()
+    direction = np.random.default_rng(1).normal(size=image.shape)
+    slope = (
+        reference.ssim(middle + STEP * direction, target) - reference.ssim(middle - STEP * direction, target)
+    ) / (2 * STEP)
+    assert abs(np.sum(found * direction) - slope) <= GRADIENT * np.linalg.norm(found) * np.linalg.norm(
+        direction
+    )
+
+
+def test_ssim_forward_mode_is_the_transpose(images: tuple[np.ndarray, np.ndarray]) -> None:
+    image, target = images
+    leaves = planes(image)
+    dr.enable_grad(leaves)
+    value = losses.d_ssim(leaves, planes(target), WIDTH, HEIGHT)
+    dr.backward(value)
+    found = stack(leaves)
+    direction = np.random.default_rng(1).normal(size=image.shape)
+    leaves = planes(image)
+    for leaf, towards in zip(leaves, planes(direction), strict=True):
+        dr.enable_grad(leaf)
+        dr.set_grad(leaf, towards)
+    value = losses.d_ssim(leaves, planes(target), WIDTH, HEIGHT)
+    dr.forward_to(value)
+    assert float(dr.grad(value)[0]) == pytest.approx(np.sum(found * direction), rel=1e-4)
+
+
+def test_ssim_of_equal_images_is_one_and_flat(images: tuple[np.ndarray, np.ndarray]) -> None:
+    leaves = planes(images[0])
+    dr.enable_grad(leaves)
+    value = losses.d_ssim(leaves, planes(images[0]), WIDTH, HEIGHT)
+    dr.backward(value)
+    assert abs(float(value[0])) < 1e-6 and np.abs(stack(leaves)).max() < 1e-6
+
+
+def test_alpha_loss(rng: np.random.Generator) -> None:
+    alpha, target = rng.random((HEIGHT, WIDTH, 1)), (rng.random((HEIGHT, WIDTH, 1)) > 0.5).astype(np.float64)
+    check(
+        lambda x: losses.alpha_loss(x[0], planes(target)[0]),
+        lambda x: reference.alpha_loss(x, target),
+        0.05 + 0.9 * alpha,
+    )
+
+
+def test_srgb_matches_the_file_reader_and_has_a_slope_at_zero() -> None:
+    linear = np.array([-0.1, 0, 1e-30, 0.001, 0.0031308, 0.0032, 0.5, 1, 4, 1000], dtype=np.float32)
+    x = mi.Float(linear)
+    dr.enable_grad(x)
+    y = display.srgb_from_linear(x)
+    dr.backward(y)
+    np.testing.assert_allclose(np.array(y), srgb_from_linear(linear), rtol=2e-6, atol=1e-9)
+    assert np.array(dr.grad(x))[1] == pytest.approx(12.92)
+    assert np.all(np.isfinite(np.array(dr.grad(x)))) and np.all(np.diff(np.array(y)) > 0)
+
+
+def test_display_image(rng: np.random.Generator) -> None:
+    alpha = 0.05 + 0.9 * rng.random((HEIGHT, WIDTH, 1))
+    radiance = 2 * alpha * rng.random((HEIGHT, WIDTH, 3)) ** 2
+    both = np.concatenate([radiance, alpha], axis=-1)
+    weights = rng.normal(size=(HEIGHT, WIDTH, 3)) / 100
+    background = (1.0, 0.5, 0.0)
+
+    def loss(x: list[Any]) -> Any:
+        image = display.display_image(x[:3], x[3], background)
+        return dr.sum(sum((a * b for a, b in zip(image, planes(weights), strict=True)), mi.Float(0)))
+
+    rounded = weights.astype(np.float32)
+    check(
+        loss,
+        lambda x: float(np.sum(rounded * reference.display_image(x[..., :3], x[..., 3], background))),
+        both,
+    )
+
+
+def test_display_image_shows_the_background_of_empty_pixels() -> None:
+    radiance, alpha = mi.Float(0, 0, 1e-9), mi.Float(0, 1e-7, 1e-8)
+    dr.enable_grad(radiance, alpha)
+    (image,) = display.display_image([radiance], alpha, (0.25,))
+    dr.backward(image)
+    np.testing.assert_allclose(np.array(image), 0.25, atol=1e-6)
+    assert np.all(np.array(dr.grad(radiance)) == 0)
+    np.testing.assert_allclose(np.array(dr.grad(alpha)), -0.25)
+
+
+@pytest.mark.parametrize(("count", "edge"), [(3, 1.0), (2, 10.0)])
+def test_smoothness(
+    count: int, edge: float, images: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
+) -> None:
+    guide, _ = images
+    check(
+        lambda x: losses.smoothness(x, planes(guide), WIDTH, HEIGHT, edge),
+        lambda x: reference.smoothness(x, guide, edge),
+        rng.normal(size=(HEIGHT, WIDTH, count)),
+        share=0.04,
+    )
+
+
+def test_half_metal(rng: np.random.Generator) -> None:
+    """Alpha says what counts and gets no gradient; metals and dielectrics cost nothing."""
+    alpha = rng.random((HEIGHT, WIDTH, 1)).astype(np.float32)
+    check(
+        lambda x: losses.half_metal(x[0], planes(alpha)[0]),
+        lambda x: reference.half_metal(x, alpha),
+        0.1 + 0.8 * rng.random((HEIGHT, WIDTH, 1)),
+    )
+    weight = mi.Float(1, 1, 0.5)
+    dr.enable_grad(weight)
+    value = losses.half_metal(mi.Float(0, 1, 0), weight)
+    assert float(value[0]) == 0
+    assert not dr.grad_enabled(losses.half_metal(mi.Float(0.5, 0.5, 0.5), weight))
+
+
+def test_the_colour_of_a_light(rng: np.random.Generator) -> None:
+    """Against the definition, by the light's texels; a grey light, however uneven, costs nothing."""
+    texels = rng.uniform(0.1, 2, (8, 16, 3))
+
+    def loss(light: EnvironmentLight) -> Any:
+        return losses.light_colour(light.prefilter())
+
+    def define(values: np.ndarray, scale: float) -> float:
+        level = level_maps(EnvironmentLight.from_radiance(values).prefilter())[-1]
+        return reference.light_colour(level, scale)
+
+    light = EnvironmentLight.from_radiance(texels)
+    scale = reference.mean_irradiance(level_maps(light.prefilter())[-1])
+    dr.enable_grad(light.raw)
+    value = loss(light)
+    assert float(value[0]) == pytest.approx(define(texels, scale), rel=1e-4) and float(value[0]) > 0.01
+    dr.backward(value)
+    slope = dr.grad(light.raw).numpy() / -np.expm1(-texels)  # softplus' slope, in terms of softplus
+    step = rng.normal(size=texels.shape)
+    difference = (define(texels + 0.01 * step, scale) - define(texels - 0.01 * step, scale)) / 0.02
+    assert np.sum(slope * step) == pytest.approx(difference, rel=2e-2)
+    grey = EnvironmentLight.from_radiance(np.repeat(texels[..., :1], 3, axis=-1))
+    assert float(loss(grey)[0]) < 1e-6
+
+
+def test_second_call_compiles_nothing(images: tuple[np.ndarray, np.ndarray]) -> None:
+    image, target = images
+
+    def once(scale: float) -> int:
+        leaves = planes(image * scale)
+        dr.enable_grad(leaves)
+        goal = planes(target)
+        dr.eval(leaves, goal)
+        misses = sum(dr.detail.launch_stats()[1:])
+        value = 0.8 * losses.l1(leaves, goal) + 0.2 * losses.d_ssim(leaves, goal, WIDTH, HEIGHT)
+        dr.backward(value)
+        dr.eval(value, [dr.grad(leaf) for leaf in leaves])
+        dr.sync_thread()
+        return sum(dr.detail.launch_stats()[1:]) - misses
+
+    once(1.0)
+    once(0.9)
+    assert once(0.8) == 0

@@ -1,0 +1,125 @@
+"""What a step lowers: zero for the perfect picture, and the sum that the method's weights say."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs import methods
+from mi_refgs.data.dataset import Dataset, View, read_dataset
+from mi_refgs.fitting import losses
+from mi_refgs.fitting.objective import Target, objective
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.images import linear_from_srgb
+from mi_refgs.kernels.device import upload
+from mi_refgs.methods.weights import LossWeights
+from mi_refgs.reference import losses as reference
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from tests.fitting.image_checks import HEIGHT, WIDTH
+
+BACKGROUND = np.array([1.0, 0.5, 0.25], np.float32)
+
+
+def made(linear: bool, radiance: np.ndarray, alpha: np.ndarray) -> tuple[Dataset, Target]:
+    """A data set of one picture of premultiplied linear radiance (H, W, 3), and its target."""
+    if linear:
+        image = radiance + (1 - alpha[..., None]) * BACKGROUND
+    else:
+        a = alpha[..., None]
+        encoded = np.vectorize(reference.srgb)(radiance / np.maximum(a, 1e-9))
+        image = a * encoded + (1 - a) * BACKGROUND
+    image, alpha = image.astype(np.float32), alpha.astype(np.float32)
+    view = View("a", WIDTH, HEIGHT, 20.0, 20.0, 8.0, 7.0, np.eye(4), image, alpha, None, None, linear)
+    return Dataset(Path("a"), "train", (view,), BACKGROUND, linear, None), Target.of(view, BACKGROUND)
+
+
+def frame_of(radiance: np.ndarray, alpha: np.ndarray) -> Frame:
+    flat = np.full(alpha.shape, 2.0, np.float32)
+    normal = mi.Vector3f(0, 0, upload(-alpha.astype(np.float32)))
+    planes = [upload(radiance[..., c].astype(np.float32)) for c in range(3)]
+    opacity = upload(alpha.astype(np.float32))
+    return Frame(alpha=opacity, depth=upload(flat), normal=normal, radiance=mi.Color3f(*planes))
+
+
+@pytest.fixture
+def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Premultiplied radiance below 1, and alpha with empty and full pixels."""
+    alpha = np.clip(rng.uniform(-0.5, 1.5, (HEIGHT, WIDTH)), 0, 1)
+    colour = linear_from_srgb(rng.uniform(0.05, 0.9, (HEIGHT, WIDTH, 3)))
+    return colour * alpha[..., None], alpha
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_a_perfect_picture_costs_nothing(linear: bool, picture: tuple[np.ndarray, np.ndarray]) -> None:
+    """8-bit pictures are composited as displayed, linear ones before they are encoded; either once."""
+    data, target = made(linear, *picture)
+    weights = LossWeights(ssim=0.2, normal=0.0, alpha=0.3)
+    loss, error = objective(frame_of(*picture), target, data, weights, 1)
+    assert abs(float(loss[0])) < 1e-5 and float(error[0]) < 1e-10
+
+
+def test_terms_are_weighed_as_the_method_says(
+    picture: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
+) -> None:
+    data, target = made(True, *picture)
+    radiance, alpha = rng.uniform(0, 0.5, (HEIGHT, WIDTH, 3)), rng.uniform(0, 1, (HEIGHT, WIDTH))
+    weights = LossWeights(ssim=0.3, normal=0.0, smooth=0.0, alpha=0.4)
+    loss, error = objective(frame_of(radiance, alpha), target, data, weights, 1)
+    shown, goal = (
+        np.vectorize(reference.srgb)(x + (1 - a[..., None]) * BACKGROUND)
+        for x, a in ((radiance, alpha), picture)
+    )
+    expected = 0.7 * reference.l1(shown, goal) + 0.3 * (1 - reference.ssim(shown, goal))
+    expected += 0.4 * reference.alpha_loss(alpha, picture[1])
+    assert float(loss[0]) == pytest.approx(expected, abs=2e-5)
+    assert float(error[0]) == pytest.approx(np.mean((shown - goal) ** 2), rel=1e-4)
+
+
+def test_priors_are_weighed_as_the_method_says(
+    picture: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
+) -> None:
+    data, target = made(True, *picture)
+    radiance, alpha = picture
+    maps = {name: rng.uniform(0, 1, alpha.shape) for name in ("metallic", "roughness")}
+    frame = dataclasses.replace(
+        frame_of(radiance, alpha), maps={name: upload(x.astype(np.float32)) for name, x in maps.items()}
+    )
+    light = EnvironmentLight.from_radiance(rng.uniform(0.1, 2, (8, 16, 3))).prefilter()
+
+    def loss(iteration: int = 1, **weights: Any) -> float:
+        chosen = LossWeights(ssim=0, normal=0, **weights)
+        return float(objective(frame, target, data, chosen, iteration, light)[0][0])
+
+    rest, half = loss(), reference.half_metal(maps["metallic"], alpha)
+    assert loss(half_metal=0.3) - rest == pytest.approx(0.3 * half, rel=1e-3)
+    rise: dict[str, Any] = {"half_metal": 0.3, "half_metal_start": 10, "half_metal_rise": 100}
+    for iteration, share in ((10, 0), (11, 0.01), (60, 0.5), (500, 1)):
+        assert loss(iteration, **rise) - rest == pytest.approx(share * 0.3 * half, rel=1e-2, abs=1e-6)
+    smooth = np.stack([alpha * maps["roughness"], alpha * maps["metallic"]], axis=-1)
+    guide = np.stack([np.array(plane).reshape(alpha.shape) for plane in target.image], axis=-1)
+    expected = 0.2 * reference.smoothness(smooth, guide, 10.0)
+    assert loss(materials=0.2) - rest == pytest.approx(expected, rel=1e-3)
+    expected = 0.4 * float(losses.light_colour(light)[0])
+    assert loss(light_colour=0.4) - rest == pytest.approx(expected, rel=1e-3) and expected > 0.01
+
+
+def test_the_weight_of_normals_rises_linearly(data: Path, method: Path) -> None:
+    views = read_dataset(data, "train", truth=False)
+    trainer = Trainer(methods.load(str(method), "quick", ["surfels.count=200", "loss.alpha=0"]), views)
+    target = trainer.targets[0]
+    frame = trainer.view(target.camera)
+
+    def loss(iteration: int, **weights: Any) -> float:
+        return float(objective(frame, target, views, LossWeights(ssim=0, **weights), iteration)[0][0])
+
+    rest, full = loss(1, normal=0), loss(1, normal=0.2)
+    assert full - rest > 1e-3
+    rise: dict[str, Any] = {"normal": 0.2, "normal_rise": 100}
+    for iteration, share in ((1, 0.01), (50, 0.5), (100, 1), (1000, 1)):
+        assert loss(iteration, **rise) - rest == pytest.approx(share * (full - rest), rel=1e-3)

@@ -1,0 +1,248 @@
+"""The fit of pictures without alpha: what it starts from, its two tables, checkpoints, the default method."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_refgs import methods
+from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.picture_files import PictureFile
+from mi_refgs.data.readers import PointCloud
+from mi_refgs.data.region import REGION_FILE, Region
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation.evaluate import load_split
+from mi_refgs.evaluation.progress import Bar
+from mi_refgs.fitting import exchange
+from mi_refgs.fitting.initial import initial_parameters, is_open
+from mi_refgs.fitting.job import default_method
+from mi_refgs.fitting.runner import begin
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.images import linear_from_srgb, read_png, write_png
+from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.run import Run
+from mi_refgs.shade.light.lobe_matrices import map_directions
+from mi_refgs.surfels.table import Surfels
+from tests.scenes.tiny import FOCAL, METHOD, SIZE, write_data
+
+REGION = Region((0.0, 0.0, 0.0), 0.7)
+STEPS = 12
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Eight views of the tiny ball in front of a coloured sky, without alpha."""
+    folder = write_data(tmp_path_factory.mktemp("open"), views=8, truth=False)
+    offset = (np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL
+    x, y = np.meshgrid(offset, -offset)
+    for split in ("train", "test"):
+        for frame in json.loads((folder / f"transforms_{split}.json").read_text())["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            ray = np.stack([x, y, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
+            ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+            path = folder / f"{frame['file_path']}.png"
+            rgba = read_png(path)
+            alpha = rgba[..., 3:]
+            write_png(path, alpha * rgba[..., :3] + (1 - alpha) * (0.5 + 0.3 * ray))
+    (folder / REGION_FILE).write_text(json.dumps({"centre": REGION.centre, "radius": REGION.radius}))
+    return read_dataset(folder, "train")
+
+
+@pytest.fixture(scope="module")
+def method(tmp_path_factory: pytest.TempPathFactory) -> Method:
+    """The tiny method with surroundings, edits of the tables and a reset."""
+    path = tmp_path_factory.mktemp("method") / "tiny.toml"
+    path.write_text(METHOD + "[surroundings]\ndegree = 1\nheight = 8\n")
+    settings = [
+        f"iterations={STEPS}", "surfels.count=80", "surfels.max_count=100",
+        "surroundings.count=60", "surroundings.max_count=90", "log_every=4",
+        "refine.densify={ start = 0, until = 10, every = 4 }", "refine.gradient=1e-5",
+        "refine.reset={ start = 0, until = 6, every = 6 }", "loss.normal=0.1",
+    ]  # fmt: skip
+    return methods.load(str(path), "quick", settings)
+
+
+def test_what_an_open_fit_starts_from(data: Dataset, method: Method) -> None:
+    """Small surfels in the region, others outside with sizes that grow with distance; no material columns."""
+    assert is_open(method, data) and not is_open(replace(method, surroundings=None), data)
+    params = initial_parameters(method, data, np.random.default_rng(0), True)
+    inner, outer = params["position"].numpy(), params["surroundings/position"].numpy()
+    assert np.all(REGION.contains(inner)) and not np.any(REGION.contains(outer))
+    names = {name.removeprefix("surroundings/") for name in params if name.startswith("surroundings/")}
+    assert names == {"position", "rotation", "scale", "opacity", "radiance_sh"}
+    assert method.surroundings is not None
+    for name in ("opacity", "surroundings/opacity"):  # nearly transparent: pictures show through the cloud
+        np.testing.assert_allclose(
+            1 / (1 + np.exp(-params[name].numpy())), method.surroundings.opacity, atol=1e-6
+        )
+    size = np.exp(params["surroundings/scale"].numpy()).max(axis=1)
+    distance = np.linalg.norm(outer, axis=1)
+    assert np.all(size <= 1.001 * method.surroundings.size * distance)
+    assert np.exp(params["scale"].numpy()).max() < REGION.radius
+    views = [view.project(outer)[2] for view in data.views]
+    assert np.mean(np.any(views, axis=0)) > 0.99
+    # The sky is 0.5 + 0.3 d in the direction d, encoded; what no view sees is grey.
+    trainer = Trainer(method, data)
+    assert [table.max_count for table in trainer.control.tables] == [100, 90]
+    scene = TrainedScene.from_state(method, trainer.state())
+    assert scene.surroundings is not None and scene.surroundings.background is not None
+    assert np.ptp(scene.surroundings.background.radiance().numpy(), axis=(0, 1)).max() < 1e-6
+    assert scene.light is not None
+    sky = scene.light.radiance().numpy()
+    seen = np.abs(sky - 0.5).max(axis=-1) > 1e-3
+    error = np.abs(sky - linear_from_srgb(0.5 + 0.3 * map_directions(8))).max(axis=-1)[seen]
+    assert 0.1 < seen.mean() < 0.9 and np.mean(error < 0.05) > 0.2  # the ball hides the rest
+
+
+def test_sparse_points_start_on_their_side_of_the_border(data: Dataset, method: Method) -> None:
+    rng = np.random.default_rng(1)
+    near, far = rng.normal(size=(2, 30, 3))
+    near *= 0.4 / np.linalg.norm(near, axis=1, keepdims=True)
+    far *= 3 / np.linalg.norm(far, axis=1, keepdims=True)
+    colour = np.concatenate([np.tile([1.0, 0, 0], (30, 1)), np.tile([0, 0, 1.0], (30, 1))])
+    known = replace(data, points=PointCloud(np.concatenate([near, far]), colour))
+    no_random = replace(
+        method,
+        surfels=replace(method.surfels, inside=0.0, count=30),
+        surroundings=replace(method.surroundings, scattered=0.0, count=30),  # type: ignore[type-var]
+    )
+    params = initial_parameters(no_random, known, np.random.default_rng(0), True)
+    found = params["position"].numpy()
+    np.testing.assert_allclose(np.sort(found, axis=0), np.sort(near, axis=0), atol=1e-6)
+    around = params["surroundings/position"].numpy()
+    np.testing.assert_allclose(np.linalg.norm(around, axis=1), 3, rtol=1e-5)
+    assert params["radiance_sh"].numpy()[:, 0].min() > params["surroundings/radiance_sh"].numpy()[:, 0].max()
+    half = replace(no_random, surfels=replace(no_random.surfels, inside=0.5))
+    mixed = initial_parameters(half, known, np.random.default_rng(0), True)["position"].numpy()
+    assert np.mean(np.abs(np.linalg.norm(mixed, axis=1) - 0.4) < 1e-5) == pytest.approx(0.5)
+
+
+def test_surfels_that_cross_the_border_change_tables(method: Method) -> None:
+    """Beyond the margin; with their geometry and harmonics, without history, and within the limits."""
+    rng = np.random.default_rng(0)
+
+    def table(names: tuple[str, ...], distance: list[float], degree: int) -> Surfels:
+        raw = {n: rng.normal(size=(len(distance), method.surfels.columns(n))) for n in names}
+        raw["radiance_sh"] = rng.normal(size=(len(distance), 3 * (degree + 1) ** 2))
+        raw["position"] = np.array(distance)[:, None] * REGION.radius * [1.0, 0, 0]
+        return Surfels.from_numpy(raw)
+
+    inner = table(method.surfels.names, [0.2, 0.9, 1.01, 1.2, 5.0], 1)
+    around = SurroundingsOptions(degree=0).names("surfel")
+    outer = table(around, [2.0, 0.5, 0.99, 1.5], 0)
+    own, other = exchange.exchanged(inner, outer, method, REGION, rng)
+    distance = own.surfels.to_numpy()["position"][:, 0] / REGION.radius
+    np.testing.assert_allclose(distance, [0.2, 0.9, 1.01, 0.5], rtol=1e-5)
+    np.testing.assert_allclose(
+        other.surfels.to_numpy()["position"][:, 0] / REGION.radius, [2.0, 0.99, 1.5, 1.2, 5.0], rtol=1e-5
+    )
+    assert own.parent[:3].tolist() == [0, 1, 2] and own.fresh.tolist() == [False] * 3 + [True]
+    assert {*other.surfels.raw} == {*around} and other.fresh.tolist() == [False] * 3 + [True] * 2
+    before, after = inner.to_numpy(), other.surfels.to_numpy()
+    np.testing.assert_array_equal(after["scale"][3:], before["scale"][3:])
+    np.testing.assert_array_equal(after["radiance_sh"][3:], before["radiance_sh"][3:, :3])
+    entered = own.surfels.to_numpy()
+    np.testing.assert_array_equal(entered["radiance_sh"][3, :3], outer.to_numpy()["radiance_sh"][1])
+    assert np.all(entered["radiance_sh"][3, 3:] == 0)
+    assert 1 / (1 + np.exp(-entered["metallic"][3, 0])) == pytest.approx(method.surfels.start("metallic"))
+
+    full = replace(method, surfels=replace(method.surfels, max_count=5))
+    assert exchange.exchanged(inner, outer, full, REGION, rng)[0].surfels.count == 3
+    gone = table(method.surfels.names, [2.0, 3.0], 1)
+    assert exchange.exchanged(gone, outer, method, REGION, rng)[0].surfels.count == 2  # one left, one came
+
+
+def test_resume_repeats_a_straight_run_bit_for_bit(data: Dataset, method: Method, one_thread: None) -> None:
+    """Both tables, the background and their history, across edits of the tables."""
+    straight = Trainer(method, data)
+    for _ in range(5):
+        straight.step()
+    resumed = Trainer(method, data, state=straight.state())
+    for trainer in (straight, resumed):
+        while trainer.iteration < STEPS:
+            trainer.step()
+    one, other = straight.state(), resumed.state()
+    assert one.keys() == other.keys() and "optimiser/surroundings/scale/first" in one
+    for name in one.keys() - {"seconds"}:
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+    assert len(one["params/surroundings/position"]) != 60  # it was edited
+
+
+def test_a_run_keeps_the_region_that_it_was_started_with(
+    data: Dataset, method: Method, tmp_path: Path
+) -> None:
+    """However region.json is edited: a resumed fit says so, and what evaluates the run goes by its own."""
+    folder, run, said = shutil.copytree(data.path, tmp_path / "data"), Run(tmp_path / "run"), list[str]()
+    begin(method, read_dataset(folder, "train"), run)
+    assert run.region() == REGION
+    begin(method, read_dataset(folder, "train"), run, said.append)
+    assert said == [] and load_split(run, method, "test").region == REGION
+    for text in ('{"centre": [0, 0, 0.1], "radius": 0.7}', '{"centre": [0, 0, 0], "radius": 0.5}', None):
+        (folder / REGION_FILE).unlink()
+        if text is not None:
+            (folder / REGION_FILE).write_text(text)
+        else:
+            (folder / REGION_FILE).symlink_to("nowhere")
+        resumed = begin(method, read_dataset(folder, "train"), run, said.append)
+        assert resumed.data.region == REGION and load_split(run, method, "test").region == REGION
+        assert "region: it has changed" in said.pop() and not said
+    (run.path / "dataset.json").write_text(json.dumps({"path": str(folder), "region": {"radius": 1}}))
+    with pytest.raises(InputError, match=r"dataset\.json: centre, radius"):
+        load_split(run, method, "test")
+
+
+def test_a_fit_of_an_open_scene_improves(data: Dataset, method: Method) -> None:
+    """Object, surroundings and background learn; whatever is of alpha has no part in it."""
+    trainer = Trainer(replace(method, iterations=100, refine=Refine()), data)
+    start = {name: np.array(x) for name, x in trainer.state().items() if name.startswith("params/")}
+    errors = []
+    for _ in range(80):
+        trainer.step()
+        errors.append(float(trainer.error[0]))
+    assert np.mean(errors[-8:]) < 0.7 * np.mean(errors[:8])
+    end = trainer.state()
+    for name in ("params/background", "params/light"):
+        assert np.abs(end[name] - start[name]).max() > 1e-3, name
+    assert trainer.skipped == 0 and all(np.isfinite(x).all() for n, x in end.items() if n in start)
+
+
+def test_a_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> None:
+    trainer = Trainer(method, data)
+    raw = trainer.control.around.surfels.to_numpy()
+    raw["opacity"][[3, 5]] = np.nan
+    trainer.control.around.replace(Surfels.from_numpy(raw))
+    for _ in range(2):
+        trainer.step()
+    trainer.check()
+    assert trainer.control.around.surfels.count == 58 and trainer.surfels.count == 80
+    assert "surroundings/opacity" in trainer.notices[0]
+
+
+def test_the_method_for_photographs_is_the_default_without_alpha(
+    data: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert default_method(data.path, progress=Bar()) == "photographs"
+    assert "without alpha" in capsys.readouterr().err
+    assert default_method(write_data(tmp_path, views=3, truth=False)) is None
+    assert capsys.readouterr().err == ""
+
+
+def test_the_default_method_is_chosen_without_decoding_pictures(
+    data: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PictureFile, "decode", lambda _: pytest.fail("a picture was decoded"))
+    assert default_method(data.path) == "photographs"
+
+
+@pytest.mark.parametrize(
+    "setting", ["count=0", "degree=4", "scattered=1.5", "size=0", "prune_extent=-1", "reach=0", "height=10"]
+)
+def test_surroundings_that_cannot_be_made(setting: str) -> None:
+    with pytest.raises(Exception, match=f"surroundings.{setting.partition('=')[0]}: .*; give"):
+        methods.load("ref_gaussian", "quick", [f"surroundings.{setting}"])

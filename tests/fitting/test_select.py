@@ -1,0 +1,355 @@
+"""Terms by trial: what is tried when, what decides, what an unused term leaves behind, and resumption."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs import methods, splat
+from mi_refgs.cli import main
+from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.errors import InputError
+from mi_refgs.fitting import select
+from mi_refgs.fitting.branch import branched
+from mi_refgs.fitting.runner import begin
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.images import linear_from_srgb
+from mi_refgs.methods.method import LIGHT, Method
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.runs.run import Run
+from mi_refgs.surfels.ply import read_ply
+from tests.scenes.tiny import train_command, write_data
+
+METHOD = """
+extends = "base_2dgs"
+drop = ["refine"]
+iterations = 2_000
+checkpoint_every = 4
+log_every = 2
+
+[surfels]
+degree = { radiance_sh = 0 }
+
+[stage.radiance]
+until = 2_000
+
+[select]
+holdout = 3
+
+[select.term.degree]
+after = 2
+trial = 2
+change = { surfels = { degree = { radiance_sh = 1 } } }
+
+[select.term.specular]
+after = 5
+trial = 2
+drop = ["stage"]
+[select.term.specular.change]
+surfels = { channels = ["radiance_sh", "albedo", "metallic", "roughness"] }
+light = { height = 8 }
+stage = { deferred = { until = 2_000, light_levels = 3 } }
+
+[select.term.interreflection]
+after = 8
+trial = 2
+needs = ["specular"]
+[select.term.interreflection.change]
+surfels = { channels = ["radiance_sh", "albedo", "metallic", "roughness", "indirect_sh"] }
+mesh = { extract = { start = 8, until = 20, every = 4 }, resolution = 12 }
+"""
+SETTINGS = ["iterations=12", "surfels.count=60", "surfels.max_count=60"]
+
+
+@pytest.fixture
+def variant(tmp_path: Path) -> str:
+    path = tmp_path / "own.toml"
+    path.write_text(METHOD)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("select") / "ball", views=9, truth=False)
+
+
+@pytest.fixture
+def views(folder: Path) -> Dataset:
+    return read_dataset(folder, "train", truth=False)
+
+
+def judged(monkeypatch: pytest.MonkeyPatch, scores: list[float]) -> list[int]:
+    """Let trials end with these PSNRs, the rival's first; returns the views of each trial's fit."""
+    rest, seen = iter(scores), []
+
+    def psnr(trainer: Trainer, judges: Dataset) -> float:
+        assert {v.name for v in judges.views}.isdisjoint(v.name for v in trainer.data.views)
+        seen.append(len(trainer.data.views))
+        return next(rest)
+
+    monkeypatch.setattr(select, "held_out_psnr", psnr)
+    steps = itertools.count()  # all take the same time
+    monkeypatch.setattr(select.time, "process_time", lambda: float(next(steps)))
+    return seen
+
+
+def fitted(variant: str, views: Dataset, run: Path) -> Trainer:
+    trainer = begin(methods.load(variant, "quick", SETTINGS), views, Run(run))
+    trainer.train()
+    return trainer
+
+
+def test_terms_stay_if_they_earn_their_price(
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Degree 1 brings too little and goes; the two others stay. Held-out views are fitted at the end only."""
+    seen = judged(monkeypatch, [20.01, 20.0, 25.0, 20.0, 27.0, 25.0])
+    trainer = fitted(variant, views, tmp_path / "run")
+    assert [(row["term"], row["iteration"], row["stays"]) for row in trainer.decisions] == [
+        ("degree", 2, False),
+        ("specular", 5, True),
+        ("interreflection", 8, True),
+    ]
+    assert seen == [6] * 6 and len(trainer.data.views) == 9 and trainer.iteration == 12
+    assert trainer.method.terms == ("specular", "interreflection")
+    assert {*trainer.params} >= {LIGHT, "indirect_sh"} and not trainer.occluder.empty
+    assert trainer.surfels.sh_degree() == 0
+
+
+def test_a_term_without_what_it_needs_is_not_tried(
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged(monkeypatch, [21.0, 20.0, 19.0, 20.0])
+    trainer = fitted(variant, views, tmp_path / "run")
+    assert [row["stays"] for row in trainer.decisions] == [True, False, False]
+    assert trainer.decisions[2]["reason"] == "needs specular"
+    assert trainer.surfels.sh_degree() == 1 and LIGHT not in trainer.params
+    text = select.table(trainer.decisions)
+    assert "left out (needs specular)" in text and "+1.00 dB" in text and len(text.splitlines()) == 4
+
+
+def test_the_price_is_of_time_and_memory() -> None:
+    cheap, dear = select.Trial(20.0, 5.0, 1.0), select.Trial(20.5, 25.0, 11.0)
+    method = methods.load("auto", "quick")
+    assert method.select is not None
+    asked = select.asked(cheap, dear, method.select)
+    expected = method.select.gain + 20 * method.select.gain_per_ms + 10 * method.select.gain_per_mb
+    assert asked == pytest.approx(expected)
+    assert select.asked(dear, cheap, method.select) == pytest.approx(method.select.gain - expected)
+
+
+@pytest.fixture
+def launches() -> Iterator[None]:
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    yield
+    dr.set_flag(dr.JitFlag.KernelHistory, False)
+    dr.kernel_history_clear()
+
+
+def test_a_term_that_is_off_is_absent(
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, launches: None
+) -> None:
+    """Channels, parameters, features of the blend, launches and rays of a step, and the PLY's properties."""
+    features: list[int] = []
+    rays: list[int] = []
+    blend, visible = splat.blend, Occluder.visible
+
+    def counted_blend(footprints: Any, columns: list[Any], *rest: Any) -> Any:
+        features.append(len(columns))
+        return blend(footprints, columns, *rest)
+
+    def counted_visible(self: Occluder, point: Any, *rest: Any) -> Any:
+        rays.append(dr.width(point))
+        return visible(self, point, *rest)
+
+    monkeypatch.setattr(splat, "blend", counted_blend)
+    monkeypatch.setattr(Occluder, "visible", counted_visible)
+    counted = {}
+    for name, scores in (("off", [0.0, 9.0] * 2), ("on", [0.0, 9.0] + [9.0, 0.0] * 2)):
+        judged(monkeypatch, scores)
+        trainer = fitted(variant, views, tmp_path / name)
+        features.clear()
+        rays.clear()
+        dr.kernel_history_clear()
+        trainer.step()
+        dr.sync_thread()
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        counted[name] = (len(trainer.params), features[-1], len(kernels), sum(rays))
+    assert counted["off"][:2] == (5, 6) and counted["off"][3] == 0
+    assert counted["on"][0] == 10 and counted["on"][1] == 14 and counted["on"][3] > 0
+    assert counted["off"][2] < counted["on"][2]
+
+
+def test_an_interrupted_selection_resumes_where_it_was(
+    variant: str, folder: Path, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed after the second decision: the same decisions, and tables of the same shapes."""
+    scores = [19.0, 20.0, 25.0, 20.0, 27.0, 25.0]
+    judged(monkeypatch, scores)
+    straight = fitted(variant, views, tmp_path / "straight")
+
+    class KilledError(Exception):
+        pass
+
+    judged(monkeypatch, scores[:4])
+    run = Run(tmp_path / "run")
+    trainer = begin(methods.load(variant, "quick", SETTINGS), views, run)
+    step = trainer.step
+
+    def killed_step() -> None:
+        if len(trainer.decisions) == 2 and trainer.iteration == 7:
+            raise KilledError
+        step()
+
+    monkeypatch.setattr(trainer, "step", killed_step)
+    with pytest.raises(KilledError):
+        trainer.train()
+    judged(monkeypatch, scores[4:])
+    resumed = begin(run.method(), views, run)
+    assert len(resumed.decisions) == 2 and resumed.method.terms == ("specular",)
+    resumed.train()
+    assert [row["stays"] for row in resumed.decisions] == [row["stays"] for row in straight.decisions]
+    for name, tensor in straight.params.items():
+        assert tensor.shape == resumed.params[name].shape
+
+
+def test_a_run_keeps_its_decisions(
+    variant: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On the command line, with real trials: config.toml, decisions.json and the PLY tell of one method."""
+    run = tmp_path / "run"
+    command = train_command(folder, run, Path(variant))
+    assert main([*command[: command.index("--set")], "--json", "--set", *SETTINGS]) == 0
+    printed = capsys.readouterr()
+    assert "refgs: interreflection " in printed.err
+    assert json.loads(printed.out)["decisions"] == json.loads((run / "decisions.json").read_text())
+    rows = json.loads((run / "decisions.json").read_text())
+    method = Run(run).method()
+    assert [row["term"] for row in rows] == ["degree", "specular", "interreflection"]
+    assert method.terms == tuple(row["term"] for row in rows if row["stays"])
+    assert {*read_ply(run / "surfels.ply").raw} == {*method.surfels.names}
+    assert main(["eval", str(run)]) == 0
+
+
+# ---------------- going on with another method ----------------
+
+
+def other(variant: str, *terms: str) -> Method:
+    return methods.load(variant, "quick", SETTINGS, terms)
+
+
+def test_branching_keeps_what_both_methods_have(variant: str, views: Dataset) -> None:
+    trainer = Trainer(other(variant), views)
+    for _ in range(3):
+        trainer.step()
+    before = {name: np.array(tensor.numpy()) for name, tensor in trainer.params.items()}
+    rich = branched(trainer, other(variant, "degree", "specular"))
+    state = rich.state()
+    assert rich.iteration == 3 and {*rich.params} == {*before, "albedo", "metallic", "roughness", LIGHT}
+    np.testing.assert_array_equal(rich.params["position"].numpy(), before["position"])
+    harmonics = rich.params["radiance_sh"].numpy()
+    np.testing.assert_array_equal(harmonics[:, :3], before["radiance_sh"])
+    assert np.all(harmonics[:, 3:] == 0)
+    moments = state["optimiser/radiance_sh/second"].reshape(-1, 12)
+    assert np.all(moments[:, 3:] == 0) and np.any(moments[:, :3] > 0)
+    assert np.all(state["optimiser/albedo/second"] == 0) and state["optimiser/albedo/steps"] == 0
+    poor = branched(rich, other(variant))
+    assert {*poor.params} == {*before}
+    np.testing.assert_array_equal(poor.params["radiance_sh"].numpy(), before["radiance_sh"])
+    rich.step()
+    poor.step()
+    np.testing.assert_array_equal(trainer.params["position"].numpy(), before["position"])
+
+
+def test_branching_resamples_the_light(variant: str, views: Dataset) -> None:
+    trainer = Trainer(other(variant, "specular"), views)
+    trainer.params[LIGHT] = mi.TensorXf(np.linspace(-1, 2, 8 * 16 * 3).reshape(8, 16, 3).astype(np.float32))
+    method = other(variant, "specular")
+    assert method.light is not None
+    finer = branched(trainer, replace(method, light=replace(method.light, height=16)))
+    assert finer.light is not None and trainer.light is not None
+    mean = finer.light.radiance().numpy().mean((0, 1))
+    np.testing.assert_allclose(mean, trainer.light.radiance().numpy().mean((0, 1)), rtol=0.02)
+
+
+# ---------------- what is refused, and what a trial must not spoil ----------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("holdout = 3", "holdout = 1", ["select.holdout", "1"]),
+        ('needs = ["specular"]', 'needs = ["speculr"]', ["interreflection", "speculr"]),
+        ("light = { height = 8 }", "light = { height = 10 }", ["light.height", "10"]),
+        ("degree = { radiance_sh = 1 } } }", "degrees = { radiance_sh = 1 } } }", ["degrees"]),
+        ("after = 5", "after = 9", ["interreflection", "tried later"]),
+        ("after = 5\n", 'after = 5\nneeds = ["specular"]\n', ["specular", "tried later"]),
+        ("after = 5\n", 'after = 8\nneeds = ["interreflection"]\n', ["specular", "tried later"]),
+    ],
+)
+def test_a_selection_that_cannot_be_made_is_refused_at_once(
+    old: str, new: str, words: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "own.toml"
+    assert old in METHOD
+    path.write_text(METHOD.replace(old, new))
+    with pytest.raises(InputError) as error:
+        methods.load(str(path), "quick")
+    assert all(word in str(error.value) for word in words), error.value
+
+
+def test_trials_end_with_the_fit(
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A term that has no room left is not tried, and no step is made beyond the last iteration."""
+    judged(monkeypatch, [21.0, 20.0, 19.0, 20.0])
+    settings = ["iterations=7", *SETTINGS[1:]]
+    trainer = begin(methods.load(variant, "quick", settings), views, Run(tmp_path / "run"))
+    trainer.train()
+    assert trainer.iteration == 7 and len(trainer.decisions) == 2
+    assert Run(tmp_path / "run").method().terms == ("degree",)
+
+
+def test_a_rival_that_fails_is_left_out(
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: Any) -> Trainer:
+        raise InputError("refine.prune_opacity: no surfel is left")
+
+    monkeypatch.setattr(select, "branched", failing)
+    trainer = fitted(variant, views, tmp_path / "run")
+    assert not any(row["stays"] for row in trainer.decisions) and trainer.iteration == 12
+    assert "no surfel is left" in trainer.decisions[0]["reason"]
+
+
+def test_the_time_of_trials_counts(
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The seconds of a fit hold the steps of both sides of a trial, and the judges' pictures."""
+    begin_ = time.perf_counter()
+    trainer = begin(methods.load(variant, "quick", SETTINGS), views, Run(tmp_path / "run"))
+    before = time.perf_counter()
+    trainer.train()
+    wall = time.perf_counter() - before
+    assert 0.5 * wall < trainer.seconds <= wall + 0.1 < time.perf_counter() - begin_ + 0.2
+
+
+def test_linear_pictures_are_judged_as_they_are_shown(
+    variant: str, views: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The score of a picture in linear radiance is that of the same picture as a PNG."""
+    trainer = Trainer(other(variant), views)
+    encoded = select.held_out_psnr(trainer, views)
+    linear = tuple(replace(v, image=linear_from_srgb(v.image), linear=True) for v in views.views)
+    judges = replace(views, views=linear, linear=False)
+    assert select.held_out_psnr(trainer, judges) == pytest.approx(encoded, abs=1e-4)

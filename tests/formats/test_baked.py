@@ -1,0 +1,427 @@
+"""Meshes with baked textures: a known scene in glTF, USD and plain Mitsuba, read back by other libraries."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mi_refgs.cli import main
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation.pictures import planes
+from mi_refgs.formats import Shot, gltf_mesh, write
+from mi_refgs.formats import usd as usd_format
+from mi_refgs.formats.bake import bake
+from mi_refgs.formats.principled import base_colour, diffuse_share
+from mi_refgs.formats.shots import shots_around
+from mi_refgs.formats.surface import surface, texels, unwrap
+from mi_refgs.formats.textured import TexturedMesh
+from mi_refgs.io.exr import read_exr_image
+from mi_refgs.io.images import linear_from_srgb, read_png
+from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.shade.brdf import split_sum
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.attributes import logit
+from mi_refgs.surfels.table import Surfels
+from tests.helpers import run_python
+from tests.scenes.known import CENTRES, CLAY, METAL, RADII, known_mesh, known_surfels
+
+SHIFT = np.array([0.1, 0.4, -0.2])
+"""By which the balls are moved, so that no axis can stand for another."""
+MIDDLES = CENTRES + SHIFT
+TEXTURE = 256
+FACES = 2000
+SIZE = 96
+"""Pixels of the cameras that are exported."""
+MATERIALS = METAL | {"roughness": 0.1}, CLAY
+"""The metal's is a mirror, nearly."""
+FORMATS = "mitsuba,gltf-mesh,usd"
+
+
+def coloured_light() -> EnvironmentLight:
+    """A map with another colour in each of the six directions."""
+    row, column = np.mgrid[0:32, 0:64]
+    phi, theta = (column + 0.5) / 64 * 2 * np.pi, row / 31 * np.pi
+    direction = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
+    image = np.full((32, 64, 3), 0.05)
+    colours = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.8, 0.8, 0), (0, 0.8, 0.8), (0.8, 0, 0.8)]
+    for i, colour in enumerate(colours):
+        axis = np.eye(3)[i % 3] * (1 if i < 3 else -1)
+        image += 3 * np.exp(12 * (direction @ axis - 1))[..., None] * np.array(colour)
+    return EnvironmentLight.from_radiance(image)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What the three formats were written from, and where."""
+
+    trained: TrainedScene
+    shots: list[Shot]
+    folder: Path
+    baked: TexturedMesh
+
+
+def trained_scene() -> TrainedScene:
+    raw = known_surfels().to_numpy()
+    raw["position"] += SHIFT.astype(np.float32)
+    rough = np.array([material["roughness"] for material in MATERIALS])
+    raw["roughness"] = logit(rough[np.arange(len(raw["position"])) % 2])[:, None].astype(np.float32)
+    mesh = known_mesh()
+    mesh = replace(mesh, vertices=(mesh.vertices + SHIFT).astype(np.float32), voxel=0.01)
+    shading = Shading(diffuse="irradiance", occlusion=True)
+    return TrainedScene(Surfels.from_numpy(raw), coloured_light(), mesh, shading, 1, 0.0)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    """The balls in all three formats."""
+    mi.set_variant("llvm_ad_rgb")  # before that of the tests
+    trained = trained_scene()
+    around = shots_around(trained.surfels)
+    shots = [
+        replace(shot, camera=shot.camera.resized(SIZE)) for shot in (around[1], around[3], *around[4::4])
+    ]
+    folder = tmp_path_factory.mktemp("baked")
+    options = {"faces": FACES, "texture": TEXTURE}
+    write(trained, FORMATS.split(","), folder, shots, options)
+    return Exported(trained, shots, folder, bake(trained, shots, FACES, TEXTURE))
+
+
+def ball_of(points: np.ndarray) -> np.ndarray:
+    """Which ball points (N, 3) are on."""
+    return np.linalg.norm(points[:, None] - MIDDLES, axis=-1).argmin(axis=1)
+
+
+def at(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Values of an image at coordinates (N, 2), v upwards, of the nearest texel."""
+    size = len(image)
+    column = np.minimum((uv[:, 0] * size).astype(int), size - 1)
+    row = np.minimum(((1 - uv[:, 1]) * size).astype(int), size - 1)
+    return image[row, column]
+
+
+def check_materials(
+    ball: np.ndarray, albedo: np.ndarray, roughness: np.ndarray, metallic: np.ndarray
+) -> None:
+    """Values at points of balls are those of the known scene."""
+    for name, found in (("albedo", albedo), ("roughness", roughness), ("metallic", metallic)):
+        true = np.array([np.broadcast_to(material[name], found.shape[1:]) for material in MATERIALS])
+        error = np.abs(found - true[ball]).reshape(len(ball), -1).max(axis=1)
+        assert np.quantile(error, 0.99) < 0.02, name
+
+
+# ---------------- the surface and its textures ----------------
+
+
+def test_charts_fill_a_texture_without_overlap(exported: Exported) -> None:
+    """Areas add up to that of the covered texels: what overlaps would be counted twice."""
+    mesh = surface(exported.trained.mesh or Mesh.empty(), FACES)
+    assert FACES / 2 < len(mesh.faces) <= FACES
+    chart = unwrap(mesh, TEXTURE)
+    assert chart.uv.min() >= 0 and chart.uv.max() <= 1
+    corner = chart.uv[chart.faces]
+    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    covered, triangle, barycentric = texels(chart, TEXTURE)
+    assert area.sum() == pytest.approx(covered.mean(), rel=0.02)
+    assert covered.mean() > 0.3
+    shares = np.array(barycentric).T
+    shares = np.concatenate([1 - shares.sum(axis=1, keepdims=True), shares], axis=1)
+    place = np.einsum("tc,tcd->td", shares, corner[triangle.numpy()])
+    row, column = np.nonzero(covered)
+    wanted = np.stack([(column + 0.5) / TEXTURE, 1 - (row + 0.5) / TEXTURE], axis=1)
+    np.testing.assert_allclose(place, wanted, atol=1e-5)
+
+
+def test_textures_have_the_known_materials(exported: Exported) -> None:
+    made = exported.baked
+    ball = ball_of(made.vertices)
+    check_materials(ball, at(made.albedo, made.uv), at(made.roughness, made.uv), at(made.metallic, made.uv))
+    for image in (made.albedo, made.roughness, made.metallic):
+        assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
+
+
+def test_every_texel_of_a_seam_has_a_material(exported: Exported) -> None:
+    """Lookups beside a chart find the nearest texel of one, not a background."""
+    albedo = exported.baked.albedo.reshape(-1, 3)
+    distance = np.min([np.abs(albedo - material["albedo"]).max(axis=1) for material in MATERIALS], axis=0)
+    assert np.quantile(distance, 0.99) < 0.03
+
+
+def test_normals_and_places_are_those_of_the_balls(exported: Exported) -> None:
+    made = exported.baked
+    ball = ball_of(made.vertices)
+    outward = made.vertices - MIDDLES[ball]
+    radius = np.linalg.norm(outward, axis=1)
+    np.testing.assert_allclose(radius, RADII[ball], atol=0.02)
+    angle = np.degrees(np.arccos(np.clip((made.normals * outward).sum(axis=1) / radius, -1, 1)))
+    assert np.quantile(angle, 0.95) < 3
+    crossed = trimesh.Trimesh(made.vertices, made.faces, process=False).face_normals
+    assert ((crossed * made.normals[made.faces[:, 0]]).sum(axis=1) > 0.8).all()
+
+
+def test_a_mesh_below_the_surface_moves_out(exported: Exported) -> None:
+    """The balls' mesh 1.5 voxels too small becomes as large as their outlines."""
+    trained = exported.trained
+    assert trained.mesh is not None
+    ball = ball_of(trained.mesh.vertices)
+    inward = (trained.mesh.vertices - MIDDLES[ball]) * (0.015 / RADII[ball])[:, None]
+    small = replace(trained.mesh, vertices=(trained.mesh.vertices - inward).astype(np.float32))
+    made = bake(replace(trained, mesh=small), exported.shots, FACES, 64)
+    radius = np.linalg.norm(made.vertices - MIDDLES[ball_of(made.vertices)], axis=1)
+    assert np.abs(np.median(radius / RADII[ball_of(made.vertices)]) - 1) < 0.012
+
+
+# ---------------- formats ----------------
+
+
+def test_gltf_has_y_up_and_the_textures(exported: Exported) -> None:
+    scene: Any = trimesh.load(exported.folder / "gltf-mesh.glb", process=False)
+    mesh = scene.geometry["object"]
+    ours = np.stack([mesh.vertices[:, 0], -mesh.vertices[:, 2], mesh.vertices[:, 1]], axis=1)
+    np.testing.assert_allclose(ours, exported.baked.vertices, atol=1e-6)
+    normals = np.stack([mesh.vertex_normals[:, 0], -mesh.vertex_normals[:, 2], mesh.vertex_normals[:, 1]], 1)
+    np.testing.assert_allclose(normals, exported.baked.normals, atol=1e-5)
+    material = mesh.visual.material
+    albedo = linear_from_srgb(np.asarray(material.baseColorTexture, np.float32)[..., :3] / 255)
+    surface_ = np.asarray(material.metallicRoughnessTexture, np.float32) / 255
+    uv = np.asarray(mesh.visual.uv)
+    check_materials(ball_of(ours), at(albedo, uv), at(surface_[..., 1], uv), at(surface_[..., 2], uv))
+    assert material.metallicFactor == 1 and material.roughnessFactor == 1
+    # glTF's camera looks along its −z.
+    pose = np.array(scene.camera_transform)
+    eye = exported.shots[0].camera.pose()
+    np.testing.assert_allclose(pose[:3, 3], eye[[0, 2, 1], 3] * [1, 1, -1], atol=1e-5)
+    np.testing.assert_allclose(-pose[:3, 2], eye[[0, 2, 1], 2] * [1, 1, -1], atol=1e-5)
+    np.testing.assert_allclose(pose[:3, 1], eye[[0, 2, 1], 1] * [1, 1, -1], atol=1e-5)
+
+
+STOCK = """
+import sys
+import mitsuba as mi
+mi.set_variant(sys.argv[3])
+import numpy as np
+scene = mi.load_file(sys.argv[1] + "/scene.xml", spp=int(sys.argv[4]))
+np.save(sys.argv[2], np.stack([np.array(mi.render(scene, sensor=i)) for i in range(len(scene.sensors()))]))
+assert "mi_refgs" not in sys.modules
+"""
+
+
+@pytest.mark.parametrize(("variant", "spp"), [("llvm_ad_rgb", 64), ("scalar_rgb", 16)])
+def test_plain_mitsuba_shows_what_we_show(exported: Exported, tmp_path: Path, variant: str, spp: int) -> None:
+    """Without this package: a mirror under a light of six colours, and clay, direction by direction."""
+    run_python(STOCK, exported.folder / "mitsuba", tmp_path / "p.npy", variant, spp, folder=tmp_path)
+    theirs = np.load(tmp_path / "p.npy")
+    view = exported.trained.renderer(samples=4)
+    for shot, picture in zip(exported.shots[:2], theirs, strict=True):
+        frame = view(shot.camera)
+        ours = planes([*frame.radiance, frame.alpha], SIZE, SIZE)
+        np.testing.assert_allclose(picture[..., 3].mean(), ours[..., 3].mean(), rtol=0.02)
+        inside = (ours[..., 3] > 0.99) & (picture[..., 3] > 0.99)
+        mirror = inside & (planes(frame.maps["metallic"], SIZE, SIZE) > 0.9)
+        assert mirror.sum() > 500
+        error, size = np.abs(ours - picture)[..., :3], ours[..., :3]
+        assert error[inside].mean() < 0.35 * size[inside].mean()
+        for turned in (ours[:, ::-1], ours[::-1]):
+            assert np.abs(turned - picture)[mirror][:, :3].mean() > 3 * error[mirror].mean()
+
+
+def test_plain_mitsuba_reads_textures_as_they_are_meant(exported: Exported) -> None:
+    folder = exported.folder / "mitsuba"
+    base = base_colour(exported.baked)
+    np.testing.assert_allclose(linear_from_srgb(read_png(folder / "albedo.png")), base, atol=0.01)
+    scene = mi.load_file(str(folder / "scene.xml"))
+    si = dr_interaction(exported.baked)
+    params = mi.traverse(scene.shapes()[0].bsdf())
+    assert {name for name in params.keys() if name.endswith(".data")} == {
+        f"{name}.data" for name in ("base_color", "roughness", "metallic")
+    }
+    bsdf = scene.shapes()[0].bsdf()
+    shown = np.array(bsdf.eval_diffuse_reflectance(si)).T
+    assert np.quantile(np.abs(shown - at(base, exported.baked.uv)), 0.98) < 0.02
+    text = (folder / "scene.xml").read_text()
+    assert text.count('name="raw" value="true"') == 2 and text.count('name="raw" value="false"') == 1
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.5, 0.9])
+def test_principled_reflects_as_much_as_our_model(roughness: float) -> None:
+    """Of constant light, over all directions of view: sampled weights against the split-sum table."""
+    import drjit as dr
+
+    known, share = diffuse_share()
+    rgb = {"type": "rgb", "value": [0.6 * float(np.interp(roughness, known, share))] * 3}
+    bsdf = mi.load_dict({"type": "principled", "base_color": rgb, "roughness": roughness, "specular": 0.5})
+    count = 1 << 18
+    random = mi.PCG32(count)
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    cosine = dr.sqrt(random.next_float32())
+    si.wi = mi.Vector3f(dr.sqrt(1 - cosine * cosine), 0, cosine)
+    points = mi.Point2f(random.next_float32(), random.next_float32())
+    _, weight = bsdf.sample(mi.BSDFContext(), si, random.next_float32(), points)
+    scale, bias = split_sum(cosine, mi.Float(roughness))
+    specular = 0.04 * scale + bias
+    ours = dr.mean(specular + (1 - specular) * 0.6)
+    assert float(dr.mean(weight.x)[0]) == pytest.approx(float(ours[0]), rel=0.01)
+
+
+def dr_interaction(made: TexturedMesh) -> Any:
+    """Surface interactions at the vertices, with the coordinates of the PLY."""
+    import drjit as dr
+
+    si = dr.zeros(mi.SurfaceInteraction3f, len(made.uv))
+    si.uv = mi.Point2f(np.stack([made.uv[:, 0], 1 - made.uv[:, 1]]))
+    si.wi = mi.Vector3f(0, 0, 1)
+    return si
+
+
+def test_usd_says_what_the_mesh_and_its_light_are(exported: Exported, tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import Gf, UsdGeom, UsdLux, UsdShade, UsdUtils
+
+    stage = usd.Stage.Open(str(exported.folder / "usd.usdz"))
+    made = exported.baked
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and stage.GetDefaultPrim().GetPath() == "/root"
+    mesh = UsdGeom.Mesh.Get(stage, "/root/object")
+    np.testing.assert_allclose(np.array(mesh.GetPointsAttr().Get()), made.vertices, atol=1e-6)
+    np.testing.assert_allclose(np.array(mesh.GetNormalsAttr().Get()), made.normals, atol=1e-6)
+    assert (np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3) == made.faces).all()
+    material, _ = UsdShade.MaterialBindingAPI(mesh.GetPrim()).ComputeBoundMaterial()
+    source = material.ComputeSurfaceSource()[0]
+    folder = tmp_path / "unpacked"
+    assert UsdUtils.ExtractUsdzPackage(str(exported.folder / "usd.usdz"), str(folder), False, False)
+    uv = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
+    shown = {}
+    for name, space, channel in (
+        ("diffuseColor", "sRGB", "rgb"),
+        ("roughness", "raw", "r"),
+        ("metallic", "raw", "r"),
+    ):
+        texture, output, _ = source.GetInput(name).GetConnectedSource()
+        image = UsdShade.Shader(texture.GetPrim())
+        assert output == channel and image.GetInput("sourceColorSpace").Get() == space
+        file = next(folder.rglob(Path(image.GetInput("file").Get().path).name))
+        picture = read_png(file)
+        shown[name] = at(linear_from_srgb(picture) if space == "sRGB" else picture[..., 0], uv)
+    check_materials(ball_of(made.vertices), shown["diffuseColor"], shown["roughness"], shown["metallic"])
+
+    # The layout of the dome's texture, from the documentation of UsdLux: longitude π at the left edge, 0 in
+    # the middle; latitude π/2 at the first row; longitude 0 is +z and π/2 is +x, latitude π/2 is +y.
+    light = UsdLux.DomeLight.Get(stage, "/root/light")
+    assert light.GetLocalTransformation() == Gf.Matrix4d(1)
+    assert light.GetTextureFormatAttr().Get() == "latlong"
+    panorama = read_exr_image(next(folder.rglob("envmap.exr")))
+    for axis in np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0.48, 0.64]]]):
+        longitude, latitude = np.arctan2(axis[0], axis[2]), np.arcsin(axis[1])
+        column = int((0.5 - longitude / (2 * np.pi)) * 64) % 64
+        row = min(int((0.5 - latitude / np.pi) * 32), 31)
+        assert exported.trained.light is not None
+        with_light = exported.trained.light.unfiltered().radiance(mi.Vector3f(*map(float, axis)))
+        np.testing.assert_allclose(panorama[row, column], np.array(with_light).ravel(), atol=0.2)
+
+
+def off_centre() -> Camera:
+    """A camera whose principal point is far from the middle, and whose pixels are not square."""
+    pose = shots_around(trained_scene().surfels)[2].camera.pose()
+    return Camera.from_pose(64, 48, -70.0, -55.0, 40.5, 17.0, pose)
+
+
+def test_a_usd_camera_keeps_the_principal_point() -> None:
+    """Points land where our camera sees them, by USD's own frustum."""
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import Gf, UsdGeom
+
+    camera = off_centre()
+    stage = usd.Stage.CreateInMemory()
+    prim = UsdGeom.Camera.Define(stage, "/camera")
+    usd_format._add_camera(prim, camera, Gf)
+    frustum = prim.GetCamera(0).frustum
+    matrix = np.array(frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix())
+    points = MIDDLES[:, None] + np.array([[0.0, 0, 0], [0.2, 0, 0], [0, 0.2, 0], [0, 0, 0.2]])
+    for point in points.reshape(-1, 3):
+        clip = np.append(point, 1) @ matrix
+        x, y = (clip[:2] / clip[3] + 1) / 2
+        local = np.array(camera.to_camera(mi.Point3f(*map(float, point)))).ravel()
+        ours = local[0] / local[2] * -70 + 40.5, local[1] / local[2] * -55 + 17
+        np.testing.assert_allclose((64 * x, 48 * (1 - y)), ours, atol=1e-3)
+
+
+def test_a_gltf_camera_that_loses_its_principal_point_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    for camera, said in ((off_centre(), True), (shots_around(trained_scene().surfels)[0].camera, False)):
+        gltf_mesh._add_camera({"nodes": [], "scenes": [{"nodes": []}]}, camera)
+        text = "8.5 pixels to the right and -7.0 below" in capsys.readouterr().err
+        assert text is said
+
+
+def test_usd_passes_its_own_validators(exported: Exported) -> None:
+    pytest.importorskip("pxr.UsdValidation")
+    from pxr import Usd, UsdValidation
+
+    stage = Usd.Stage.Open(str(exported.folder / "usd.usdz"))
+    registry = UsdValidation.ValidationRegistry()
+    validators = registry.GetOrLoadAllValidators()
+    assert len(validators) > 10
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert [error.GetMessage() for error in errors] == []
+
+
+# ---------------- what cannot be written ----------------
+
+
+@pytest.mark.parametrize("package", ["xatlas", "fast_simplification"])
+def test_a_missing_package_is_named(
+    exported: Exported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    again = replace(exported.trained, iteration=2)
+    with pytest.raises(InputError, match=rf'{package} is not installed; pip install "mi_refgs\[export\]"'):
+        write(again, ["gltf-mesh"], tmp_path / "a.glb", exported.shots)
+
+
+def test_a_missing_usd_is_named(exported: Exported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pxr.UsdUtils", None)
+    with pytest.raises(InputError, match=r'pxr.UsdUtils is not installed; pip install "mi_refgs\[export\]"'):
+        write(exported.trained, ["usd"], tmp_path / "a.usdz", exported.shots)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"light": None}, "light: the run has none; fit one with materials and a light, as"),
+        ({"mesh": None}, "mesh: the run has none; fit one with occlusion, as `--for relighting` does"),
+        ({"mesh": Mesh.empty()}, "mesh: the run has none that textures could be baked to"),
+    ],
+)
+def test_a_run_without_light_or_mesh_is_refused(
+    exported: Exported, tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    shading = Shading(diffuse="irradiance", occlusion=False)
+    scene = replace(exported.trained, shading=shading, **change)
+    with pytest.raises(InputError) as caught:
+        write(scene, ["gltf-mesh"], tmp_path / "a.glb", exported.shots)
+    assert str(caught.value).startswith(message)
+
+
+def test_a_method_without_materials_is_refused(exported: Exported, tmp_path: Path) -> None:
+    raw = {k: v for k, v in exported.trained.surfels.raw.items() if k not in ("albedo", "metallic")}
+    scene = replace(exported.trained, surfels=Surfels(raw))
+    with pytest.raises(InputError, match="albedo, metallic: the run has none; fit one with materials"):
+        write(scene, ["mitsuba"], tmp_path, exported.shots)
+
+
+@pytest.mark.parametrize("option", ["--faces=3", "--texture=7", "--texture=100000"])
+def test_numbers_out_of_range_get_one_sentence(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    assert main(["export", str(finished), "--to", "usd", option, "-o", str(tmp_path / "a.usdz")]) == 2
+    said = capsys.readouterr().err
+    assert f"{option.split('=')[0]}: {option.split('=')[1]} is out of range" in said
+    assert said.count("\n") == 1

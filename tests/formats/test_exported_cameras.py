@@ -1,0 +1,148 @@
+"""`--to cameras` of every layout of data sets, read back with the package's own readers."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.data.lens import Lens
+from mi_refgs.data.readers import READERS, reader_of
+from mi_refgs.fitting.job import load_method
+from mi_refgs.formats import Shot
+from mi_refgs.formats.cameras import CAMERAS
+from mi_refgs.io.images import box_downscale, read_png, write_png
+from mi_refgs.reconstruction.provenance import Source
+from mi_refgs.runs.export import TrainedScene
+from tests.data import test_colmap, test_layouts
+from tests.data.test_layouts import SHOTS
+from tests.scenes.tiny import write_data
+
+JPEGS = [replace(shot, name=f"{shot.index}/{shot.name[0]}.JPG") for shot in SHOTS]
+BENT = Lens(False, (0.05, -0.02, 0.01), (1e-3, -2e-3))
+FISHEYE = Lens(True, (0.05, -0.02, 0.0, 0.0))
+
+
+def nerfstudio(folder: Path, lens: Lens = BENT) -> Path:
+    """JPEG files, each with its own focal length, behind one kind of lens; one test view is named."""
+    shots = [replace(shot, focal=(110.0 + shot.index, 104.0), lens=lens) for shot in JPEGS]
+    given = dict(zip(("k1", "k2", "k3", "k4")[: len(lens.radial)], lens.radial, strict=True))
+    given |= {} if lens.fisheye else dict(zip(("p1", "p2"), lens.tangential, strict=True))
+    model = "OPENCV_FISHEYE" if lens.fisheye else "OPENCV"
+    return test_layouts.nerfstudio(
+        folder, shots, camera_model=model, test_filenames=["images/3/d.JPG"], **given
+    )
+
+
+def masked(folder: Path) -> Path:
+    """Masks that frames name."""
+    data = nerfstudio(folder)
+    write_png(data / "mask.png", np.indices((72, 96)).sum(axis=0)[..., None].repeat(3, -1) % 2)
+    test_layouts.mended(data, lambda content: [f.update(mask_path="mask.png") for f in content["frames"]])
+    return data
+
+
+def colmap(folder: Path, camera: str, values: tuple[float, ...]) -> Path:
+    return test_colmap.write(folder, shots=JPEGS, camera=camera, values=values)
+
+
+def llff(folder: Path, masks: bool = False) -> Path:
+    """With smaller copies of another ending."""
+    data = test_layouts.llff(folder)
+    (data / "images_2").mkdir()
+    for path in (data / "images").iterdir():
+        half = np.round(255 * box_downscale(read_png(path), 2)).astype(np.uint8)
+        Image.fromarray(half).save(data / "images_2" / f"{path.stem}.jpg")
+        if masks:
+            (data / "masks").mkdir(exist_ok=True)
+            shutil.copy(path, data / "masks")
+    return data
+
+
+PINHOLE = (110.0, 104.0, 50.3, 34.6)
+LAYOUTS: dict[str, dict[str, Callable[[Path], Path]]] = {
+    "Blender / NeRF": {
+        "blender": lambda folder: write_data(folder / "ball", truth=False),
+        "exr": lambda folder: write_exr_data(folder / "ball"),
+        "perspective": nerfstudio,
+        "fisheye": lambda folder: nerfstudio(folder, FISHEYE),
+        "masked": masked,
+    },
+    "COLMAP": {
+        "pinhole": lambda folder: colmap(folder, "PINHOLE", PINHOLE),
+        "opencv": lambda folder: colmap(folder, "OPENCV", (*PINHOLE, 0.05, -0.02, 1e-3, -2e-3)),
+        "full": lambda folder: colmap(folder, "FULL_OPENCV", (*PINHOLE, 0.05, -0.02, 1e-3, 0, 0.01, 0, 0, 0)),
+        "fisheye": lambda folder: colmap(folder, "OPENCV_FISHEYE", (*PINHOLE, 0.05, -0.02, 0, 0)),
+    },
+    "LLFF": {"copies": llff, "masks": lambda folder: llff(folder, True)},
+    "NeRO Glossy Synthetic": {"depths": test_layouts.glossy},
+}
+"""Ways to write a data set, by the name of the reader; a new reader adds its own."""
+CASES = [pytest.param(name, kind, id=f"{name}-{kind}") for name, kinds in LAYOUTS.items() for kind in kinds]
+CAMERA_FILES = ("transforms*.json", "poses_bounds.npy", "*-camera.pkl", "sparse")
+
+
+def write_exr_data(folder: Path) -> Path:
+    """The tiny data set with EXR files beside the PNG files."""
+    from mi_refgs.io.exr import write_exr
+
+    data = write_data(folder, truth=False)
+    for path in data.glob("*/*.png"):
+        write_exr(path.with_suffix(".exr"), read_png(path))
+    return data
+
+
+def test_every_reader_has_a_layout() -> None:
+    assert {reader.name for reader in READERS} == {*LAYOUTS}
+
+
+@pytest.mark.parametrize(("reader", "kind"), CASES)
+def test_exported_cameras_are_those_of_the_files(reader: str, kind: str, tmp_path: Path) -> None:
+    """Beside the files of the data set, whatever size the fit read them at: the same pictures and cameras."""
+    data = LAYOUTS[reader][kind](tmp_path / "data" if kind not in ("blender", "exr") else tmp_path)
+    assert reader_of(data).name == reader
+    images = "exr" if kind == "exr" else "png"
+    method = load_method(None, "quick", ["data.downscale=2", f"data.images='{images}'"])
+    trained = cast(TrainedScene, None)
+    shots = Source(method, data).shots(trained, "test", "train")
+    out = tmp_path / "out"
+    CAMERAS.write(trained, out, shots)
+    names = [f.split()[-1] for f in (out / "sparse/0/images.txt").read_text().splitlines()[1::2]]
+    below = data / "images" if (data / "images").is_dir() else data
+    assert names and all((below / name).is_file() for name in names)
+    for source in ("transforms.json", "sparse"):
+        if images == "exr" and source == "sparse":
+            continue  # our reader of COLMAP takes no EXR
+        again = tmp_path / source.replace(".", "_")
+        into = again / "images" if source == "sparse" and kind == "blender" else again
+        shutil.copytree(data, into, ignore=shutil.ignore_patterns(*CAMERA_FILES))
+        (shutil.copytree if source == "sparse" else shutil.copy)(out / source, again / source)
+        for split, read_at in (("test", 1), ("train", 2)):
+            options: dict[str, Any] = {"downscale": read_at, "images": images, "truth": False}
+            before, after = (read_dataset(folder, split, **options) for folder in (data, again))
+            assert len(before.views) == len(after.views)
+            for view, other in zip(before.views, after.views, strict=True):
+                np.testing.assert_allclose(other.to_world, view.to_world, atol=1e-6)
+                for name in ("width", "height", "fx", "fy", "cx", "cy"):
+                    assert getattr(other, name) == pytest.approx(getattr(view, name), rel=1e-6)
+                if (view.alpha is None or other.alpha is not None) and (read_at == 1 or kind != "copies"):
+                    np.testing.assert_allclose(other.image, view.image, atol=1e-5)
+                # Depth as a mask has no name in other layouts, and COLMAP's masks lie in a folder of theirs.
+                assert (other.alpha is None) == (view.alpha is None) or kind in ("depths", "masked")
+
+
+def test_cameras_of_no_file_have_names(tmp_path: Path) -> None:
+    """Such as those of a reader that gives arrays, and those around a run without data."""
+    camera = read_dataset(write_data(tmp_path / "ball", views=1, truth=False), "train").views[0].camera()
+    shots = [Shot("a.jpg", "test", camera), Shot("train/r_0", "train", camera)]
+    CAMERAS.write(cast(TrainedScene, None), tmp_path, shots)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    assert [frame["file_path"] for frame in content["frames"]] == ["a.jpg", "train/r_0.png"]

@@ -1,0 +1,206 @@
+"""The registry of formats, `refgs export --to`, and the cameras of a run in files of other programs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.errors import InputError
+from mi_refgs.formats import FORMATS, Format, Option, register, write
+from mi_refgs.formats.shots import shots_around, turntable_cameras
+from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.reconstruction.provenance import Source
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.run import Run
+from mi_refgs.surfels.table import Surfels
+from tests.helpers import run_python
+
+
+@pytest.fixture
+def plain() -> Iterator[list[Any]]:
+    """A format `plain` with an option `level`, and what its `write` was called with."""
+    calls: list[Any] = []
+
+    def put(trained: TrainedScene, target: Path, shots: Any, level: int) -> list[Path]:
+        calls.append((trained, target, shots, level))
+        target.write_text(str(level))
+        return [target]
+
+    register(Format("plain", "a number", ".txt", put, (Option("level", 3, "the number"),)))
+    yield calls
+    del FORMATS["plain"]
+
+
+# ---------------- the registry ----------------
+
+
+def test_declarations_import_nothing_that_computes(tmp_path: Path) -> None:
+    found = run_python(
+        "import sys, mi_refgs.formats; print([n for n in ('numpy', 'mitsuba') if n in sys.modules])",
+        folder=tmp_path,
+    )
+    base = run_python(
+        "import sys, mi_refgs; print([n for n in ('numpy', 'mitsuba') if n in sys.modules])", folder=tmp_path
+    )
+    assert found == base
+
+
+def test_a_registered_format_is_a_choice_of_the_command(
+    plain: list[Any], finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "number.txt"
+    assert main(["export", str(finished), "--to", "plain", "-o", str(target), "--level", "7", "--json"]) == 0
+    assert target.read_text() == "7"
+    assert json.loads(capsys.readouterr().out)["files"] == [str(target)]
+    trained, _, shots, _ = plain[0]
+    assert trained.surfels.count > 0 and [shot.split for shot in shots] == ["test"] * 2 + ["train"] * 3
+    with pytest.raises(SystemExit):
+        main(["export", "--help"])
+    assert "plain         a number" in capsys.readouterr().out
+
+
+def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: Path, tmp_path: Path) -> None:
+    assert main(["export", str(finished), "--to", "plain,cameras", "-o", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "plain.txt").read_text() == "3"
+    assert (tmp_path / "out" / "cameras" / "transforms.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--to", "gif", "-o", "OUT"], "--to: gif: unknown format; use one of "),
+        (["--to", "plain"], "--to: names no place; say with -o"),
+        (["--level", "3"], "--level: belongs to a format; name it with --to"),
+        (
+            ["--to", "cameras", "--level", "3", "-o", "OUT"],
+            "--level: means nothing to cameras (plain",
+        ),
+        (["--to", "plain", "-o", "OUT.ply"], "suffix: plain writes .txt"),
+    ],
+)
+def test_bad_arguments_get_one_sentence(
+    plain: list[Any],
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    arguments = [word.replace("OUT", str(tmp_path / "out")) for word in arguments]
+    assert main(["export", str(finished), *arguments]) == 2
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1 and "Traceback" not in said
+
+
+def test_an_option_is_the_same_in_all_formats(plain: list[Any]) -> None:
+    def write(trained: TrainedScene, target: Path, shots: Any) -> list[Path]:
+        return []
+
+    with pytest.raises(InputError, match="level: another format's differs"):
+        register(Format("other", "", ".txt", write, (Option("level", 4, "the number"),)))
+    assert "other" not in FORMATS
+    with pytest.raises(InputError, match="there is one of this name"):
+        register(FORMATS["plain"])
+
+
+# ---------------- cameras ----------------
+
+
+@pytest.mark.parametrize("layout", ["transforms.json", "sparse"])
+def test_exported_cameras_are_those_of_the_data_set(
+    finished: Path, data: Path, tmp_path: Path, layout: str
+) -> None:
+    """Read back with the pictures beside them: the same views in the same splits."""
+    out = tmp_path / "out"
+    assert main(["export", str(finished), "--to", "cameras", "-o", str(out)]) == 0
+    again = tmp_path / "again"
+    again.mkdir()
+    copy = shutil.copytree if (out / layout).is_dir() else shutil.copy
+    copy(out / layout, again / layout)
+    for split in ("train", "test"):
+        place = again / split if layout == "transforms.json" else again / "images" / split
+        shutil.copytree(data / split, place)
+    for split in ("train", "test"):
+        before, after = (read_dataset(folder, split) for folder in (data, again))
+        there = {Path(view.name).stem: view for view in after.views}
+        assert len(before.views) == len(there)
+        for view in before.views:
+            other = there[Path(view.name).stem]
+            np.testing.assert_allclose(other.to_world, view.to_world, atol=1e-6)
+            for name in ("width", "height", "fx", "fy", "cx", "cy"):
+                assert getattr(other, name) == pytest.approx(getattr(view, name), rel=1e-6)
+
+
+@pytest.mark.parametrize("record", [None, "{}", '{"path": "gone"}'])
+def test_a_run_without_data_has_cameras_around_its_surfels(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], record: str | None
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    (run / "dataset.json").unlink()
+    if record is not None:
+        (run / "dataset.json").write_text(record)
+    trained = TrainedScene.read(run)
+    shots = Source.of(Run(run)).shots(trained, "test", "train")
+    assert len(shots) == 64 and shots[0].split == "test"
+    position = trained.surfels.to_numpy()["position"]
+    for shot in shots[::7]:
+        pose = shot.camera.pose()
+        local = (position - pose[:3, 3]) @ pose[:3, :3]
+        pixel = np.abs(local[:, :2] / local[:, 2:]) * abs(shot.camera.fx[0])
+        assert np.mean((pixel < shot.camera.width / 2).all(axis=1) & (local[:, 2] > 0)) > 0.9
+    assert main(["export", str(run)]) == 0
+    assert ("gone" in (record or "")) == ("is gone; cameras are around" in capsys.readouterr().err)
+    assert main(["export", str(run), "--data", str(tmp_path / "none")]) == 2
+    shutil.rmtree(run / "checkpoints")
+    (run / "model.json").unlink()
+    assert main(["export", str(run)]) == 2
+    assert "checkpoints: none yet" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+def test_a_stray_does_not_move_a_turntable(finished: Path, mesh: bool) -> None:
+    """One surfel, or one vertex, far out: the cameras look at what they looked at without it."""
+    import mitsuba as mi
+
+    trained = TrainedScene.read(finished)
+    position = trained.surfels.to_numpy()["position"]
+    if mesh:
+        trained = replace(trained, mesh=Mesh(position, np.zeros((0, 3), np.uint32), 0.1))
+    cameras = [shot.camera for shot in shots_around(trained.surfels)]
+    before = turntable_cameras(trained, cameras, 3)
+    far = position.copy()
+    far[0, 0] = 300
+    if mesh:
+        moved = replace(trained, mesh=Mesh(far, np.zeros((0, 3), np.uint32), 0.1))
+    else:
+        raw = trained.surfels.raw | {"position": mi.TensorXf(far)}
+        moved = replace(trained, surfels=Surfels(raw))
+    for camera, other in zip(before, turntable_cameras(moved, cameras, 3), strict=True):
+        np.testing.assert_allclose(other.pose()[:3, 3], camera.pose()[:3, 3], atol=0.1)
+
+
+def test_nothing_to_look_at_is_said(finished: Path) -> None:
+    trained = TrainedScene.read(finished)
+    import mitsuba as mi
+
+    with pytest.raises(InputError, match="there are none"):
+        shots_around(trained.surfels.gather(mi.UInt32()))
+
+
+def test_python_writes_formats_too(plain: list[Any], finished: Path, tmp_path: Path) -> None:
+    trained = TrainedScene.read(finished)
+    shots = shots_around(trained.surfels)
+    found = write(trained, ["plain"], tmp_path / "n.txt", shots, {"level": 5})
+    assert found == {"plain": [tmp_path / "n.txt"]} and plain[0][3] == 5
+    with pytest.raises(InputError, match="no format"):
+        write(trained, [], tmp_path, shots)

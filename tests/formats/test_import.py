@@ -1,0 +1,382 @@
+"""PLY files of other programs: read, drawn by their own formulas, refused in one sentence, taken on."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.constants import GAUSSIAN_LOW_PASS
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation.pictures import planes
+from mi_refgs.formats.incoming import read_cameras, read_splats
+from mi_refgs.io.exr import read_exr
+from mi_refgs.io.images import read_png
+from mi_refgs.reference import splat as oracle
+from mi_refgs.reference.lookup import harmonics
+from mi_refgs.reference.pinhole import PinholeCamera
+from mi_refgs.render.display import displayed
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.shade.points import ShadingPoints
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Camera
+
+SIZE, FOCAL, COUNT = 48, 60.0, 40
+BACKGROUND = np.array([0.2, 0.5, 0.9])
+LAYOUTS = {"3DGS of degree 0": (3, 0), "3DGS of degree 3": (3, 3), "2DGS": (2, 2)}
+"""Sizes of a splat, and the degree of its colour."""
+
+
+def raw_of(sizes: int, degree: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Raw values as the files hold them, quaternions w first; colours go beyond black and white."""
+    terms = (degree + 1) ** 2
+    position = rng.uniform(-0.5, 0.5, (COUNT, 3))
+    position[:, 2] = np.linspace(-0.6, 0.6, COUNT)  # far enough apart for every rule of sorting
+    turn = np.concatenate([np.ones((COUNT, 1)), 0.25 * rng.normal(size=(COUNT, 3))], axis=1)
+    return {
+        "position": position.astype(np.float32),
+        "dc": (3 * rng.normal(size=(COUNT, 3))).astype(np.float32),
+        "rest": (0.3 * rng.normal(size=(COUNT, 3, terms - 1))).astype(np.float32),
+        "opacity": rng.normal(size=(COUNT, 1)).astype(np.float32),
+        "scale": np.log(rng.uniform(0.1, 0.25, (COUNT, sizes))).astype(np.float32),
+        "rotation": turn.astype(np.float32),
+    }
+
+
+def their_bytes(raw: dict[str, np.ndarray]) -> bytes:
+    """The file as the released code writes it: f_rest channel after channel, zero normals."""
+    terms, sizes = raw["rest"].shape[2], raw["scale"].shape[1]
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
+    names += [f"f_rest_{i}" for i in range(3 * terms)]
+    names += ["opacity", *(f"scale_{i}" for i in range(sizes)), *(f"rot_{i}" for i in range(4))]
+    header = "ply\nformat binary_little_endian 1.0\n" + f"element vertex {COUNT}\n"
+    header += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    body = b""
+    for i in range(COUNT):
+        row = [*raw["position"][i], 0.0, 0.0, 0.0, *raw["dc"][i], *raw["rest"][i].ravel()]
+        row += [*raw["opacity"][i], *raw["scale"][i], *raw["rotation"][i]]
+        body += struct.pack(f"<{len(names)}f", *row)
+    return header.encode() + body
+
+
+def pinhole() -> PinholeCamera:
+    """A camera 3 units below the splats, which looks up at them."""
+    pose = np.eye(4)
+    pose[:3, 3] = [0.1, -0.05, -3]
+    return PinholeCamera(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose, 0.01)
+
+
+def their_picture(raw: dict[str, np.ndarray], camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Encoded colours, composited as they are, in float64; and where a cut may fall either way."""
+    table = {
+        "position": raw["position"].astype(np.float64),
+        "rotation": raw["rotation"][:, [1, 2, 3, 0]].astype(np.float64),
+        "scale": raw["scale"].astype(np.float64),
+        "opacity": raw["opacity"].astype(np.float64),
+    }
+    towards = table["position"] - camera.to_world[:3, 3]
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    coefficients = np.concatenate([raw["dc"][:, :, None], raw["rest"]], axis=2)
+    columns = coefficients.transpose(0, 2, 1).reshape(COUNT, -1).astype(np.float64)
+    colour = np.maximum(0, harmonics(columns, towards) + 0.5)
+    maps = oracle.splat(table, colour, camera)
+    return maps.features + (1 - maps.alpha[..., None]) * BACKGROUND, maps.band
+
+
+@pytest.fixture(params=LAYOUTS, ids=[name.replace(" ", "-") for name in LAYOUTS])
+def theirs(request: pytest.FixtureRequest, tmp_path: Path, rng: np.random.Generator) -> Path:
+    path = tmp_path / "theirs.ply"
+    path.write_bytes(their_bytes(raw_of(*LAYOUTS[request.param], rng)))
+    return path
+
+
+# ---------------- pictures ----------------
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_file_is_shown_by_its_own_formula(name: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    raw = raw_of(*LAYOUTS[name], rng)
+    path = tmp_path / "theirs.ply"
+    path.write_bytes(their_bytes(raw))
+    camera = pinhole()
+    goal, band = their_picture(raw, camera)
+    scene = read_splats(path)
+    assert scene.surfels.sh_degree() == LAYOUTS[name][1]
+    seen = Camera.from_pose(
+        SIZE, SIZE, camera.fx, camera.fy, camera.cx, camera.cy, camera.to_world, camera.near
+    )
+    frame = scene.renderer()(seen)
+    shown = planes(displayed(frame, BACKGROUND, False), SIZE, SIZE)
+    assert goal.max() > 1 and goal.std() > 0.1 and band.mean() < 0.2
+    assert np.abs(shown - goal)[~band].max() < 2e-4
+    assert GAUSSIAN_LOW_PASS == 0.3  # theirs
+
+
+def test_the_command_makes_a_run_that_is_shown_the_same(
+    theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rendered of scene.xml, and of what TrainedScene.read gives; edited; exported."""
+    run = tmp_path / "run"
+    assert main(["import", str(theirs), "-o", str(run), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["surfels"] == COUNT and report["cameras"] == 4
+    assert main(["render", str(run), "-o", str(tmp_path / "out.png")]) == 0
+    import mi_refgs
+
+    made = mi_refgs.load(run)
+    camera = made.camera(0)
+    frame = TrainedScene.read(run).renderer()(camera)
+    size = camera.height, camera.width
+    encoded = planes(displayed(frame, np.zeros(3), False), *size)
+    picture = read_png(tmp_path / "out.png")
+    assert picture.shape == (*size, 4) and encoded.max() > 0.5
+    goal = np.minimum(encoded, planes(frame.alpha, *size)[..., None])  # 8 bits end at white
+    assert np.abs(picture[..., :3] * picture[..., 3:] - goal).max() < 3 / 255
+    assert main(["export", str(run)]) == 0
+    assert main(["import", str(theirs), "-o", str(run)]) == 2
+    assert "holds a run already" in capsys.readouterr().err
+
+
+def test_one_gaussian_is_said_in_the_singular(
+    tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, run = their_bytes(raw_of(3, 0, rng)), tmp_path / "run"
+    header, end, body = whole.partition(b"end_header\n")
+    path = tmp_path / "one.ply"
+    path.write_bytes(header.replace(b"vertex 40", b"vertex 1") + end + body[: len(body) // COUNT])
+    assert main(["import", str(path), "-o", str(run)]) == 0
+    assert f"{run}: 1 gaussian of degree 0, 4 cameras in scene.xml" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("form", ["gltf-mesh", "mitsuba"])
+def test_what_a_run_lacks_is_said_of_its_folder(
+    theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str
+) -> None:
+    run = tmp_path / "run"
+    assert main(["import", str(theirs), "-o", str(run)]) == 0
+    assert main(["export", str(run), "--to", form, "-o", str(tmp_path / "out")]) == 2
+    assert f"{run}: albedo, metallic, roughness: the run has none; fit one" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_python_imports_what_the_command_does(theirs: Path, tmp_path: Path, linear: bool) -> None:
+    """In memory, saved, and by the command: the same picture bit for bit; colours differ by what they are."""
+    import mi_refgs
+
+    made = mi_refgs.import_splats(str(theirs), linear=linear)
+    assert made.folder is None and made.method.variant == "theirs" and len(made.cameras()) == 4
+    picture = made.render(1, size=32)
+    assert picture[..., :3].max() > 0.1
+    np.testing.assert_array_equal(made.save(tmp_path / "saved").render(1, size=32), picture)
+    run = tmp_path / "run"
+    assert main(["import", str(theirs), "-o", str(run), *(["--linear"] if linear else [])]) == 0
+    np.testing.assert_array_equal(mi_refgs.load(run).render(1, size=32), picture)
+    other = mi_refgs.import_splats(theirs, linear=not linear).render(1, size=32)
+    assert np.abs(other - picture).max() > 0.05
+    with pytest.raises(InputError, match="cannot be read"):
+        mi_refgs.import_splats(tmp_path / "no.ply")
+
+
+def test_what_was_imported_is_exported_as_it_was(theirs: Path, tmp_path: Path) -> None:
+    """Encoded colours are not fitted anew; Gaussians come back bit for bit."""
+    run, again = tmp_path / "run", tmp_path / "again.ply"
+    assert main(["import", str(theirs), "-o", str(run)]) == 0
+    assert main(["export", str(run), "--to", "3dgs-ply", "-o", str(again)]) == 0
+    before, after = (read_splats(path).surfels.to_numpy() for path in (theirs, again))
+    columns = before["radiance_sh"].shape[1]
+    np.testing.assert_array_equal(after["radiance_sh"][:, :columns], before["radiance_sh"])
+    assert not after["radiance_sh"][:, columns:].any() and after["scale"].shape[1] == 3
+    if before["scale"].shape[1] == 3:
+        np.testing.assert_array_equal(after["position"], before["position"])
+
+
+def test_linear_colours_come_back_to_the_same_picture(tmp_path: Path, rng: np.random.Generator) -> None:
+    """surfels.ply of a run that has colours alone → a run: the same picture."""
+    path, run = tmp_path / "theirs.ply", tmp_path / "run"
+    path.write_bytes(their_bytes(raw_of(2, 2, rng)))
+    scene = read_splats(path, linear=True)
+    assert scene.shading == Shading("surfel", "radiance")
+    assert main(["import", str(path), "-o", str(run), "--linear"]) == 0
+    camera = Camera.from_pose(32, 32, -40.0, -40.0, 16.0, 16.0, pinhole().to_world)
+    first, second = (s.renderer()(camera) for s in (scene, TrainedScene.read(run)))
+    for a, b in zip(first.radiance, second.radiance, strict=True):
+        assert np.abs(a.numpy() - b.numpy()).max() <= 1e-6 < a.numpy().max()
+
+
+def test_the_model_is_the_inverse_of_the_encoding() -> None:
+    """Values below and above the straight part, and the derivative, against differences of the formula."""
+    import drjit as dr
+
+    encoded = np.array([0.0, 0.02, 0.04, 0.05, 0.5, 1.0, 1.7])
+    formula = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    plane = mi.Float(encoded.astype(np.float32))
+    dr.enable_grad(plane)
+    points = ShadingPoints(mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1), radiance=mi.Color3f(plane))
+    shading = Shading("pixel", "displayed")
+    out = shading.model.shade(points, None, shading).total()
+    np.testing.assert_allclose(np.array(dr.detach(out.x)), formula, rtol=1e-5, atol=1e-7)
+    dr.forward(plane)
+    slope = np.where(encoded <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((encoded + 0.055) / 1.055) ** 1.4)
+    np.testing.assert_allclose(np.array(dr.grad(out.x)), slope, rtol=1e-4)
+
+
+# ---------------- what is no such file ----------------
+
+
+def broken(kind: str, whole: bytes) -> bytes:
+    """A file that is wrong in one way."""
+    header, end, body = whole.partition(b"end_header\n")
+    if kind == "missing":
+        return whole.replace(b"property float rot_3\n", b"property float other\n")
+    if kind == "colourless":
+        return header.replace(b"f_dc_", b"a_dc_").replace(b"f_rest_", b"a_rest_") + end + body
+    if kind == "materials":
+        return whole.replace(b"property float nx\n", b"property float metallic\n")
+    if kind == "compressed":
+        return (
+            b"ply\nformat binary_little_endian 1.0\nelement chunk 0\nproperty float min_x\nelement vertex 1\n"
+            b"property uint packed_position\nproperty uint packed_rotation\nend_header\n" + bytes(8)
+        )
+    if kind == "mesh":
+        return (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+            b"element face 0\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n"
+        )
+    if kind == "garbage":
+        return header.replace(b"binary_little_endian", b"ascii") + end + b"what is this? " * 2000
+    if kind == "empty":
+        return header.replace(b"vertex 40", b"vertex 0") + end
+    if kind == "degree":
+        return whole.replace(b"property float f_rest_44\n", b"property float nothing\n")
+    return {"truncated": whole[:-7], "nothing": b"", "text": b"hello\n"}[kind]
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("missing", "rot_3: the property is missing"),
+        ("colourless", "f_dc_0: the property is missing"),
+        ("materials", "metallic: materials of a run"),
+        ("compressed", "packed_position: a compressed PLY"),
+        ("mesh", "vertex: a mesh, no Gaussians"),
+        ("garbage", ""),
+        ("empty", "there are none"),
+        ("degree", "f_rest_*: 44 properties"),
+        ("truncated", ""),
+        ("nothing", "not a PLY file; give the PLY file of 3DGS or 2DGS"),
+        ("text", "not a PLY file; give the PLY file of 3DGS or 2DGS"),
+    ],
+)
+def test_other_files_get_one_sentence(
+    kind: str, message: str, tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "file.ply"
+    path.write_bytes(broken(kind, their_bytes(raw_of(3, 3, rng))))
+    assert main(["import", str(path), "-o", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert str(path) in said and message in said and said.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_file_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["import", str(tmp_path / "no.ply"), "-o", str(tmp_path / "run")]) == 2
+    assert "cannot be read" in capsys.readouterr().err
+
+
+# ---------------- cameras ----------------
+
+
+def transforms() -> dict[str, object]:
+    frame = {"transform_matrix": (pinhole().to_world @ MITSUBA_FROM_OPENGL).tolist()}
+    return {"w": 64, "h": 48, "camera_angle_x": 0.8, "frames": [frame, {**frame, "w": 32, "fl_x": 40.0}]}
+
+
+def test_cameras_of_a_transforms_file_are_those_of_the_run(theirs: Path, tmp_path: Path) -> None:
+    file, run = tmp_path / "transforms.json", tmp_path / "run"
+    file.write_text(json.dumps(transforms()))
+    assert main(["import", str(theirs), "-o", str(run), "--transforms", str(file)]) == 0
+    first, second = (Camera.from_sensor(sensor) for sensor in mi.load_file(str(run / "scene.xml")).sensors())
+    assert (first.width, first.height, second.width) == (64, 48, 32)
+    np.testing.assert_allclose(first.pose(), pinhole().to_world, atol=1e-6)
+    np.testing.assert_allclose([-first.fx[0], -second.fx[0]], [32 / np.tan(0.4), 40], rtol=1e-4)
+    assert main(["render", str(run), "-o", str(tmp_path / "a.exr"), "--sensor", "1"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frames": []}, "frames: missing or empty"),
+        ({"w": None}, "frames[0].w: None is no usable number"),
+        ({"w": 1e6}, "is no size of a picture"),
+        ({"fl_x": -3}, "is no focal length"),
+        ({"k1": 0.1}, "frames[0].k1: no pinhole"),
+        ({"frames": [{}]}, "transform_matrix: no 4 × 4 matrix"),
+        ({"frames": [{"transform_matrix": (2 * np.eye(4)).tolist()}]}, "not a rotation and a translation"),
+    ],
+)
+def test_bad_cameras_are_named(change: dict[str, object], message: str, tmp_path: Path) -> None:
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps({**transforms(), **change}))
+    with pytest.raises(InputError) as caught:
+        read_cameras(file)
+    assert message in str(caught.value) and str(file) in str(caught.value)
+
+
+def test_a_run_is_rendered_from_the_cameras_of_a_file(
+    theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The picture of that frame's camera, which is no sensor of the run; wrong frames are one sentence."""
+    import mi_refgs
+
+    file, run, out = tmp_path / "camera.json", tmp_path / "run", tmp_path / "out.exr"
+    file.write_text(json.dumps(transforms()))
+    assert main(["import", str(theirs), "-o", str(run)]) == 0
+    command = ["render", str(run), "-o", str(out), "--camera", str(file), "--sensor"]
+    assert main([*command, "1"]) == 0
+    camera = read_cameras(file)[1]
+    goal = mi_refgs.load(run).render(camera)
+    channels = read_exr(out)
+    picture = np.stack([channels[name] for name in "RGBA"], axis=-1)
+    assert picture.shape == goal.shape == (camera.height, camera.width, 4) and goal[..., 3].max() > 0.5
+    np.testing.assert_allclose(picture, goal, atol=2e-3)
+    capsys.readouterr()
+    assert main([*command, "2"]) == 2
+    assert capsys.readouterr().err == (f"refgs: {file}: --sensor: 2: the file has 2 frames; give 0 to 1\n")
+
+
+def test_a_scene_without_sensors_needs_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The scene is any of Mitsuba's: a white sphere in uniform light."""
+    scene, file, out = tmp_path / "scene.xml", tmp_path / "camera.json", tmp_path / "out.png"
+    scene.write_text(
+        '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>'
+        '<shape type="sphere"><bsdf type="diffuse"/></shape></scene>'
+    )
+    file.write_text(json.dumps(transforms()))
+    command = ["render", str(scene), "-o", str(out)]
+    assert main(command) == 2
+    assert "sensor: the scene has none; add one, or give a file with --camera" in capsys.readouterr().err
+    assert main([*command, "--camera", str(file)]) == 0
+    assert read_png(out).shape[:2] == (48, 64)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e5])
+def test_cameras_of_a_file_see_scenes_of_every_size(scale: float, tmp_path: Path) -> None:
+    """A black ball in white light, whose camera has no near plane: it is not cut off."""
+    scene, file, out = tmp_path / "scene.xml", tmp_path / "camera.json", tmp_path / "out.exr"
+    scene.write_text(
+        '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>'
+        f'<shape type="sphere"><float name="radius" value="{scale}"/>'
+        '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf></shape></scene>'
+    )
+    pose = np.array(mi.ScalarTransform4f().look_at([4 * scale, 0, 0], [0, 0, 0], [0, 0, 1]).matrix)
+    frame = {"transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist()}
+    file.write_text(json.dumps({"w": 16, "h": 12, "camera_angle_x": 0.8, "frames": [frame]}))
+    assert main(["render", str(scene), "-o", str(out), "--camera", str(file)]) == 0
+    seen = read_exr(out)["R"]
+    assert seen[5:7, 7:9].max() == 0 and seen[0, 0] == pytest.approx(1)

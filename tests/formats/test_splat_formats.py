@@ -1,0 +1,301 @@
+"""3D Gaussians of a scene for other viewers, as PLY and as glTF; and a view with its layers as EXR."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation.pictures import planes
+from mi_refgs.formats import Shot, write
+from mi_refgs.formats.shots import shots_around
+from mi_refgs.formats.splats import THIN, gaussians
+from mi_refgs.io.exr import read_exr
+from mi_refgs.io.ownership import RECORD
+from mi_refgs.render.display import display_image
+from mi_refgs.render.pipeline import render
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.sh import sh_basis
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.attributes import SH_DC, logit
+from mi_refgs.surfels.ply import read_ply
+from mi_refgs.surfels.table import Surfels
+
+COUNT, SIZE = 1500, 64
+BACKWARDS = np.diag([-1.0, 1.0, -1.0, 1.0])  # half a turn about the camera's y axis
+
+
+def ball(rng: np.random.Generator, count: int = COUNT) -> dict[str, np.ndarray]:
+    """Opaque surfels on the unit sphere, with materials."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, k * np.pi * (3 - np.sqrt(5))
+    ring = np.sqrt(1 - z**2)
+    normal = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    rotation = np.concatenate([np.stack([-normal[:, 1], normal[:, 0]], 1), 0 * z[:, None], 1 + z[:, None]], 1)
+    rotation *= np.where(rng.random((count, 1)) < 0.5, 1, -1)  # the same
+    return {
+        "position": normal,
+        "rotation": rotation,
+        "scale": np.full((count, 2), np.log(0.06)),
+        "opacity": np.full((count, 1), logit(0.95)),
+        "albedo": logit(np.clip(0.5 + 0.4 * normal, 0.01, 0.99)),
+        "metallic": np.full((count, 1), logit(0.2)),
+        "roughness": np.full((count, 1), logit(0.6)),
+    }
+
+
+def sky() -> EnvironmentLight:
+    """A light that changes with the direction."""
+    rows, columns = np.meshgrid(np.linspace(0, 1, 16), np.linspace(0, 2 * np.pi, 32), indexing="ij")
+    texels = np.stack([1.2 - rows, 0.7 + 0.3 * np.sin(columns), 0.3 + rows], axis=-1)
+    return EnvironmentLight.from_radiance(mi.TensorXf(texels.astype(np.float32)))
+
+
+@pytest.fixture
+def scene(rng: np.random.Generator) -> TrainedScene:
+    """The ball under the sky, shaded in the G-buffer."""
+    surfels = Surfels.from_numpy(ball(rng))
+    return TrainedScene(surfels, sky(), None, Shading("pixel", "split_sum", "irradiance"), 1, 0.0)
+
+
+@pytest.fixture
+def shots(scene: TrainedScene) -> list[Shot]:
+    """Few small cameras around it."""
+    found = shots_around(scene.surfels)[::3]
+    return [replace(shot, camera=shot.camera.resized(SIZE)) for shot in found]
+
+
+def encoded(scene: TrainedScene, camera: Camera, alone: bool = False) -> np.ndarray:
+    """Display-encoded on black, (H, W, 4) with alpha."""
+    scene = replace(scene, surroundings=None) if alone else scene
+    frame = scene.renderer(aovs=False)(camera)
+    shown = display_image(list(frame.radiance), frame.alpha, [0.0] * 3)
+    return planes([*shown, frame.alpha], camera.height, camera.width)
+
+
+def their_picture(table: Surfels, camera: Camera) -> np.ndarray:
+    """The formula of 3DGS (H, W, 4): colours blended as they are."""
+    frame = render(table, camera, Shading("surfel", "radiance"), normals=False)
+    return planes([*frame.radiance, frame.alpha], camera.height, camera.width)
+
+
+def db(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((a - b) ** 2)))
+
+
+# ---------------- Gaussians ----------------
+
+
+def test_gaussians_show_what_the_scene_shows(scene: TrainedScene, shots: list[Shot]) -> None:
+    """At cameras between those that colours were fitted to, colour and outline, on both grounds."""
+    table = gaussians(scene, shots, 3, False)
+    assert table.primitive.name == "gaussian" and table.sh_degree() == 3
+    for shot in [shot for shot in shots if shot.split == "test"]:
+        ours, theirs = encoded(scene, shot.camera), their_picture(table, shot.camera)
+        inside = ours[..., 3] > 0.99
+        assert inside.mean() > 0.3
+        assert db(theirs[inside, :3], ours[inside, :3]) > 34
+        assert db(theirs[..., :3], ours[..., :3]) > 28
+        assert db(theirs[..., 3], ours[..., 3]) > 19  # its outline is long for so few pixels
+
+
+def test_more_harmonics_show_more(scene: TrainedScene, shots: list[Shot]) -> None:
+    """Of a smooth metal, whose colour turns with the camera."""
+    raw = scene.surfels.to_numpy()
+    raw |= {"metallic": np.full((COUNT, 1), 6.0), "roughness": np.full((COUNT, 1), -1.0)}
+    scene = replace(scene, surfels=Surfels.from_numpy(raw))
+    camera = shots[0].camera
+    ours = encoded(scene, camera)
+    inside = ours[..., 3] > 0.99
+    found = []
+    for degree in (0, 1, 3):
+        theirs = their_picture(gaussians(scene, shots, degree, False), camera)
+        found.append(db(theirs[inside, :3], ours[inside, :3]))
+    assert found[0] + 4 < found[1] < found[2], found
+
+
+def test_the_third_axis_is_the_thin_normal(scene: TrainedScene, shots: list[Shot]) -> None:
+    """Sizes and opacities stay; surfels move inwards by less than a pixel, whichever way normals point."""
+    before = scene.surfels.to_numpy()
+    after = gaussians(scene, shots, 0, False).to_numpy()
+    np.testing.assert_array_equal(after["scale"][:, :2], before["scale"])
+    np.testing.assert_allclose(after["scale"][:, 2], np.log(0.06 * THIN), rtol=1e-5)
+    np.testing.assert_array_equal(after["opacity"], before["opacity"])
+    np.testing.assert_array_equal(after["rotation"], before["rotation"])
+    radius = np.linalg.norm(after["position"], axis=1)
+    camera = shots[0].camera
+    pixel = np.linalg.norm(camera.pose()[:3, 3]) / camera.focal
+    seen = before["position"][:, 2] > -0.3  # the cameras stand above
+    assert (radius[seen] < 1 - 0.3 * pixel).mean() > 0.95 and radius.min() > 1 - pixel
+
+
+def test_what_no_camera_sees_has_the_colour_of_its_neighbours(scene: TrainedScene, shots: list[Shot]) -> None:
+    """Not the grey of coefficients that are zero."""
+    camera = replace(shots[0].camera, width=SIZE // 2)
+    table = gaussians(scene, [Shot("only", "train", camera)], 0, False).to_numpy()
+    place = camera.to_camera(scene.surfels.position())
+    column = (camera.fx * place.x / place.z + camera.cx).numpy()
+    beside = column > camera.width + 8
+    assert beside.sum() > 50 and np.abs(table["radiance_sh"][beside]).max(axis=1).min() > 1e-3
+
+
+def test_views_that_see_nothing_change_nothing(scene: TrainedScene, shots: list[Shot]) -> None:
+    """A camera that looks away is as good as none; where all do, there are colours all the same."""
+    away = [replace(shot, camera=shot.camera.moved(shot.camera.pose() @ BACKWARDS)) for shot in shots]
+    train = [shot for shot in shots if shot.split == "train"]
+    few, more = (gaussians(scene, given, 1, False).to_numpy() for given in (train, [*train, away[0]]))
+    np.testing.assert_allclose(more["radiance_sh"], few["radiance_sh"], atol=1e-4)
+    none = gaussians(scene, away, 1, False).to_numpy()
+    assert all(np.isfinite(table).all() for table in none.values())
+
+
+def test_surroundings_come_along_unless_the_object_is_asked_for(
+    scene: TrainedScene, shots: list[Shot], rng: np.random.Generator
+) -> None:
+    around = {
+        name: values
+        for name, values in ball(rng, 400).items()
+        if name not in ("albedo", "metallic", "roughness")
+    }
+    around["position"] = around["position"] * 0.4 + np.array([0, 0, -1.4])
+    around["scale"] = around["scale"] + np.log(0.8)
+    around["radiance_sh"] = np.tile((np.array([0.8, 0.1, 0.1]) - 0.5) / SH_DC, (400, 1))
+    both = replace(scene, surroundings=Surroundings(Surfels.from_numpy(around)))
+    camera = shots[0].camera
+    whole, alone = (gaussians(both, shots, 2, object) for object in (False, True))
+    assert whole.count == COUNT + 400 and alone.count == COUNT
+    assert db(their_picture(whole, camera)[..., :3], encoded(both, camera)[..., :3]) > 26
+    assert db(their_picture(alone, camera)[..., :3], encoded(both, camera, alone=True)[..., :3]) > 28
+
+
+def test_nothing_and_degrees_out_of_range_are_refused(scene: TrainedScene, shots: list[Shot]) -> None:
+    with pytest.raises(InputError, match="--degree: 4 is out of range"):
+        gaussians(scene, shots, 4, False)
+    with pytest.raises(InputError, match="there are none"):
+        gaussians(replace(scene, surfels=scene.surfels.gather(mi.UInt32())), shots, 1, False)
+
+
+# ---------------- files ----------------
+
+
+def test_the_ply_file_has_the_order_of_properties_that_others_expect(
+    scene: TrainedScene, shots: list[Shot], tmp_path: Path
+) -> None:
+    (file,) = write(scene, ["3dgs-ply"], tmp_path / "a.ply", shots, {"degree": 1})["3dgs-ply"]
+    header = file.read_bytes().partition(b"end_header\n")[0].decode().splitlines()
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
+    names += [*(f"f_rest_{i}" for i in range(9)), "opacity", *(f"scale_{i}" for i in range(3))]
+    names += [f"rot_{i}" for i in range(4)]
+    assert header[1:] == [
+        "format binary_little_endian 1.0",
+        f"element vertex {COUNT}",
+        *(f"property float {name}" for name in names),
+    ]
+    assert read_ply(file).primitive.name == "gaussian"
+
+
+def columns_of(file: Path) -> tuple[dict[str, Any], Callable[[str], np.ndarray]]:
+    """JSON of a binary glTF file, and its attributes by name."""
+    data = file.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    content = json.loads(data[20 : 20 + size])
+    rest, binary = struct.unpack_from("<I4s", data, 20 + size)
+    assert (magic, version, length, kind, binary) == (b"glTF", 2, len(data), b"JSON", b"BIN\0")
+    assert size % 4 == rest % 4 == 0 and content["buffers"][0]["byteLength"] == rest == len(data) - 28 - size
+
+    def column(name: str) -> np.ndarray:
+        accessor = content["accessors"][content["meshes"][0]["primitives"][0]["attributes"][name]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        view = content["bufferViews"][accessor["bufferView"]]
+        offset = 28 + size + view["byteOffset"]
+        values = np.frombuffer(data, "<f4", accessor["count"] * width, offset).reshape(-1, width)
+        assert values.nbytes == view["byteLength"] and accessor["componentType"] == 5126
+        if "min" in accessor:
+            np.testing.assert_array_equal(values.min(axis=0), np.float32(accessor["min"]))
+            np.testing.assert_array_equal(values.max(axis=0), np.float32(accessor["max"]))
+        return values
+
+    return content, column
+
+
+def test_the_gltf_file_holds_the_same_gaussians_activated(
+    scene: TrainedScene, shots: list[Shot], tmp_path: Path
+) -> None:
+    files = write(scene, ["3dgs-ply", "gltf-splats"], tmp_path, shots, {"degree": 2})
+    table = read_ply(files["3dgs-ply"][0])
+    content, column = columns_of(files["gltf-splats"][0])
+    raw, prefix = table.to_numpy(), "KHR_gaussian_splatting"
+    primitive = content["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0 and content["extensionsUsed"] == [prefix]
+    assert primitive["extensions"][prefix]["kernel"] == "ellipse"
+    assert primitive["extensions"][prefix]["colorSpace"] == "srgb_rec709_display"
+    np.testing.assert_array_equal(column("POSITION"), raw["position"])
+    np.testing.assert_allclose(column(f"{prefix}:SCALE"), np.exp(raw["scale"]), rtol=1e-5)
+    np.testing.assert_allclose(column(f"{prefix}:OPACITY")[:, 0], table.opacity().numpy(), atol=1e-6)
+    rotation = column(f"{prefix}:ROTATION")
+    np.testing.assert_allclose(np.linalg.norm(rotation, axis=1), 1, atol=1e-6)
+    q = table.rotation()
+    np.testing.assert_allclose(rotation, np.stack([q.x, q.y, q.z, q.w], axis=1), atol=1e-6)
+    # Harmonics by degree and order give the colour of the table in any direction.
+    toward = mi.Vector3f(0.48, -0.6, 0.64)
+    basis = [float(f[0]) for f in sh_basis(toward, 2)]
+    names = [f"{prefix}:SH_DEGREE_{k}_COEF_{n}" for k in range(3) for n in range(2 * k + 1)]
+    colour = sum(column(name) * y for name, y in zip(names, basis, strict=True))
+    coefficients = raw["radiance_sh"].reshape(COUNT, 9, 3)
+    np.testing.assert_allclose(colour, np.einsum("nkc,k->nc", coefficients, basis), atol=1e-5)
+    assert len(primitive["attributes"]) == 5 + 9
+    shown = column("COLOR_0")
+    assert shown.min() >= 0 and shown.max() <= 1 and shown.shape[1] == 4
+    x, y, z, w = content["nodes"][0]["rotation"]  # +z of the data is +y of glTF
+    np.testing.assert_allclose(
+        [2 * (x * z + w * y), 2 * (y * z - w * x), w * w + z * z - x * x - y * y], [0, 1, 0], atol=1e-7
+    )
+
+
+def test_the_exr_file_has_every_layer(scene: TrainedScene, shots: list[Shot], tmp_path: Path) -> None:
+    (file,) = write(scene, ["exr"], tmp_path / "view.exr", shots, {"view": 1, "samples": 1})["exr"]
+    layers = read_exr(file)
+    frame = scene.renderer()(shots[1].camera)
+    for i, letter in enumerate("RGB"):
+        np.testing.assert_allclose(layers[letter], planes(frame.radiance, SIZE, SIZE)[..., i], atol=1e-6)
+        terms = sum(layers[f"{name}.{letter}"] for name in ("diffuse", "specular", "indirect"))
+        np.testing.assert_allclose(terms, layers[letter], atol=1e-5)
+        albedo = planes(frame.maps["albedo"], SIZE, SIZE)[..., i]
+        np.testing.assert_allclose(layers[f"albedo.{letter}"], albedo, atol=1e-6)
+    np.testing.assert_allclose(layers["A"], planes(frame.alpha, SIZE, SIZE), atol=1e-6)
+    np.testing.assert_allclose(layers["depth.Z"], planes(frame.depth, SIZE, SIZE), atol=1e-6)
+    solid = layers["A"] > 0.99
+    normal = np.stack([layers[f"normal.{letter}"] for letter in "XYZ"], axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(normal[solid], axis=-1), 1, atol=1e-5)
+    np.testing.assert_allclose(layers["roughness.V"][solid], 0.6, atol=1e-3)
+    assert {"metallic.V", "visibility.V"} <= {*layers} and solid.mean() > 0.2
+
+
+def test_views_of_an_exr_file_are_counted(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", str(finished), "--to", "exr", "-o", str(tmp_path / "a.exr"), "--view", "9"]) == 2
+    assert "--view: 9 is out of range; there are 5, give 0 to 4" in capsys.readouterr().err
+    assert (
+        main(["export", str(finished), "--to", "exr, 3dgs-ply, gltf-splats,", "-o", str(tmp_path / "all")])
+        == 0
+    )
+    assert {path.name for path in (tmp_path / "all").iterdir()} == {
+        RECORD,
+        "exr.exr",
+        "3dgs-ply.ply",
+        "gltf-splats.glb",
+    }

@@ -1,0 +1,110 @@
+"""Image files, the sRGB curve, and files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from mi_refgs.errors import InputError
+from mi_refgs.io.exr import read_exr, read_exr_image, write_exr
+from mi_refgs.io.files import replace_file, write_bytes
+from mi_refgs.io.images import linear_from_srgb, srgb_from_linear, write_png
+from tests.helpers import run_python
+
+
+def test_srgb_curve() -> None:
+    x = np.linspace(0, 4, 1001)
+    np.testing.assert_allclose(linear_from_srgb(srgb_from_linear(x)), x, atol=1e-9)
+    known = srgb_from_linear(np.array([0.0, 0.0031308, 0.5, 1.0]))
+    np.testing.assert_allclose(known, [0, 0.04045, 0.735357, 1], atol=1e-5)
+    assert np.isfinite(srgb_from_linear(np.array([-1.0]))).all()
+
+
+def test_exr_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
+    image = rng.normal(size=(5, 7, 3)).astype(np.float32)
+    write_exr(tmp_path / "a.exr", image, names="XYZ")
+    np.testing.assert_array_equal(read_exr_image(tmp_path / "a.exr", vectors=True), image)
+    with pytest.raises(InputError, match=r"a\.exr: channels: found X, Y, Z; export R, G, B"):
+        read_exr_image(tmp_path / "a.exr")
+    write_exr(tmp_path / "a.exr", image[..., 0], half=True)
+    np.testing.assert_allclose(read_exr(tmp_path / "a.exr")["Y"], image[..., 0], rtol=1e-3)
+    write_exr(tmp_path / "b.exr", image[..., :2], names="UV")
+    with pytest.raises(InputError, match="channels: found U, V"):
+        read_exr_image(tmp_path / "b.exr")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "b.exr"]
+
+
+def test_unwritable_output(tmp_path: Path) -> None:
+    for write_file, name in ((write_png, "none/a.png"), (write_exr, "none/a.exr")):
+        with pytest.raises(InputError, match=r"none/a.*writable"):
+            write_file(tmp_path / name, np.zeros((2, 2, 3)))
+
+
+def test_colours_in_other_primaries_are_refused(tmp_path: Path) -> None:
+    """Mitsuba would convert them; taken as they are, they would be wrong without a word."""
+    planes = {name: np.ones((2, 4), np.float32) for name in "RGB"}
+    for name, chromaticities in (
+        ("srgb", (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)),
+        ("ap1", (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)),
+    ):
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header | {"chromaticities": chromaticities}, planes).write(str(tmp_path / f"{name}.exr"))
+    assert read_exr_image(tmp_path / "srgb.exr").shape == (2, 4, 3)
+    with pytest.raises(InputError, match=r"ap1\.exr: chromaticities: .* convert"):
+        read_exr_image(tmp_path / "ap1.exr")
+
+
+def test_files_are_replaced_whole_or_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    write_bytes(path, b"old")
+
+    class Killed(BaseException):
+        pass
+
+    def torn(temporary: Path) -> None:
+        assert temporary.parent == tmp_path and temporary.suffix == ".txt"
+        temporary.write_bytes(b"ne")
+        raise Killed
+
+    with pytest.raises(Killed):
+        replace_file(path, torn)
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.txt"]
+    write_bytes(path, b"new")
+    assert path.read_bytes() == b"new" and os.listdir(tmp_path) == ["a.txt"]
+    # Not even removing the temporary file may hide the reason: neither below a file, nor in a lost folder.
+    for place in (path / "b.txt", tmp_path / "none" / "b.txt"):
+        with pytest.raises(InputError, match=r"b\.txt: output: cannot be written \(.*\); choose a writable"):
+            write_bytes(place, b"")
+
+
+ONE_THREAD = """
+import sys
+from pathlib import Path
+import mi_refgs, mitsuba as mi, drjit as dr
+mi.set_variant("llvm_ad_rgb")
+dr.set_thread_count(1)
+from mi_refgs.synthesis.scene_file import load_scene
+from mi_refgs.io.exr import mitsuba_exr
+from mi_refgs.shade.light.envmap import EnvironmentLight
+folder = Path(sys.argv[1])
+EnvironmentLight.constant(0.5, 8).write(folder / "light.exr")
+assert EnvironmentLight.from_file(folder / "light.exr").height == 8
+load_scene(folder / "scene.xml")
+with mitsuba_exr():
+    mi.Bitmap(str(folder / "light.exr")).write(str(folder / "mitsuba.hdr"))
+assert dr.thread_count() == 1
+assert EnvironmentLight.from_file(folder / "mitsuba.hdr").height == 8
+"""
+
+
+def test_no_file_waits_for_a_second_thread(tmp_path: Path) -> None:
+    """Mitsuba's own EXR files never finish on one thread; a process of its own can be stopped."""
+    scene = (
+        '<scene version="3.0.0"><emitter type="envmap"><string name="filename" value="light.exr"/></emitter>'
+    )
+    (tmp_path / "scene.xml").write_text(f'{scene}<shape type="sphere"/></scene>')
+    run_python(ONE_THREAD, tmp_path, folder=tmp_path)

@@ -1,0 +1,209 @@
+"""PLY files: bit-exact round trip, 2DGS's layout, tolerance of other writers' files, and every refusal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from mi_refgs.errors import InputError
+from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.ply import read_ply, write_ply
+from mi_refgs.surfels.table import Surfels
+
+GEOMETRY = ["x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
+
+
+def table(count: int, rng: np.random.Generator, degree: int = 3) -> Surfels:
+    shape = {name: (count, channel.width(degree)) for name, channel in CHANNELS.items()}
+    return Surfels.from_numpy({name: rng.normal(size=size) for name, size in shape.items()})
+
+
+def write_file(
+    path: Path, columns: dict[str, np.ndarray], kind: str = "binary_little_endian", dtype: str = "f4"
+) -> Path:
+    """A PLY file by hand, as another program would write it."""
+    count = len(next(iter(columns.values())))
+    names = {"f4": "float", "f8": "double"}
+    header = f"ply\nformat {kind} 1.0\ncomment by hand\nelement vertex {count}\n"
+    header += "".join(f"property {names[dtype]} {name}\n" for name in columns) + "end_header\n"
+    if kind == "ascii":
+        body = "".join(
+            " ".join(repr(float(c[i])) for c in columns.values()) + "\n" for i in range(count)
+        ).encode()
+    else:
+        order = "<" if "little" in kind else ">"
+        rows = np.zeros(count, dtype=[(name, order + dtype) for name in columns])
+        for name, values in columns.items():
+            rows[name] = values
+        body = rows.tobytes()
+    path.write_bytes(header.encode() + body)
+    return path
+
+
+def geometry(rng: np.random.Generator, count: int = 4) -> dict[str, np.ndarray]:
+    return {name: rng.normal(size=count).astype(np.float32) for name in GEOMETRY}
+
+
+@pytest.mark.parametrize("count", [0, 1, 100])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_round_trip_is_bit_exact(count: int, degree: int, tmp_path: Path, rng: np.random.Generator) -> None:
+    surfels = table(count, rng, degree)
+    write_ply(tmp_path / "a.ply", surfels)
+    again = read_ply(tmp_path / "a.ply")
+    assert list(again.raw) == list(surfels.raw)
+    for name, values in surfels.to_numpy().items():
+        assert values.tobytes() == again.to_numpy()[name].tobytes()
+    write_ply(tmp_path / "b.ply", again)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "b.ply"]
+
+
+def test_layout_is_that_of_2dgs(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Names, order, w-first quaternion and channel-major harmonics, read by another library."""
+    surfels = table(3, rng)
+    write_ply(tmp_path / "a.ply", surfels)
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    names = [line.split()[2] for line in header if line.startswith("property")]
+    start = [
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        *(f"f_rest_{i}" for i in range(45)),
+    ]
+    start += ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert names[: len(start)] == start
+    assert names[len(start) :][:5] == ["albedo_0", "albedo_1", "albedo_2", "metallic", "roughness"]
+    data = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
+    raw = surfels.to_numpy()
+    np.testing.assert_array_equal(data["rot_0"].ravel(), raw["rotation"][:, 3])
+    np.testing.assert_array_equal(data["rot_1"].ravel(), raw["rotation"][:, 0])
+    np.testing.assert_array_equal(data["f_dc_2"].ravel(), raw["radiance_sh"][:, 2])
+    # Coefficient k = 1..15 of colour c is f_rest_{15 c + k - 1}; in the table it is column 3 k + c.
+    np.testing.assert_array_equal(data["f_rest_17"].ravel(), raw["radiance_sh"][:, 3 * 3 + 1])
+    np.testing.assert_array_equal(data["ind_rest_44"].ravel(), raw["indirect_sh"][:, 3 * 15 + 2])
+
+
+@pytest.mark.parametrize(
+    ("kind", "dtype"),
+    [
+        ("binary_little_endian", "f4"),
+        ("binary_little_endian", "f8"),
+        ("binary_big_endian", "f4"),
+        ("ascii", "f4"),
+    ],
+)
+def test_files_of_other_programs(kind: str, dtype: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    """Other formats, other order, unknown properties; absent groups give absent channels."""
+    columns = {"confidence": np.ones(4), **dict(reversed(geometry(rng).items()))}
+    surfels = read_ply(write_file(tmp_path / "a.ply", columns, kind, dtype))
+    assert list(surfels.raw) == ["position", "rotation", "scale", "opacity"]
+    np.testing.assert_array_equal(surfels.to_numpy()["scale"][:, 1], columns["scale_1"])
+    np.testing.assert_array_equal(surfels.to_numpy()["rotation"][:, 3], columns["rot_0"])
+
+
+def test_a_file_of_3dgs_is_read_and_written_as_it_was(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Its properties, in its order; a third scale is what tells it from surfels."""
+    rest = [f"f_rest_{i}" for i in range(45)]
+    order = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity"]
+    order += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    columns = {name: rng.normal(size=4).astype(np.float32) for name in order}
+    columns |= {name: np.zeros(4, np.float32) for name in ("nx", "ny", "nz")}
+    path = write_file(tmp_path / "3dgs.ply", columns)
+    gaussians = read_ply(path)
+    assert gaussians.primitive.name == "gaussian" and gaussians.sh_degree() == 3
+    np.testing.assert_array_equal(gaussians.to_numpy()["scale"][:, 2], columns["scale_2"])
+    write_ply(tmp_path / "again.ply", gaussians)
+    written, read = ((tmp_path / name).read_bytes() for name in ("again.ply", "3dgs.ply"))
+    assert written[written.index(b"element") :] == read[read.index(b"element") :]
+    del columns["scale_1"]
+    with pytest.raises(InputError, match=r"scale_1: the property is missing"):
+        read_ply(write_file(tmp_path / "a.ply", columns))
+
+
+@pytest.mark.parametrize("missing", GEOMETRY)
+def test_missing_property_is_named(missing: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    columns = geometry(rng)
+    del columns[missing]
+    with pytest.raises(InputError, match=rf"a\.ply: {missing}: the property is missing; export"):
+        read_ply(write_file(tmp_path / "a.ply", columns))
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ({"albedo_0": 0, "albedo_2": 0}, "albedo_1: the property is missing"),
+        ({"f_dc_0": 0, "f_dc_1": 0}, "f_dc_2: the property is missing"),
+        ({"ind_rest_0": 0}, r"ind_rest_\*: 1 properties; use 0, 9, 24 or 45"),
+    ],
+)
+def test_partial_groups_are_refused(
+    extra: dict[str, int], message: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    columns = geometry(rng) | {name: np.zeros(4) for name in extra}
+    with pytest.raises(InputError, match=rf"a\.ply: {message}"):
+        read_ply(write_file(tmp_path / "a.ply", columns))
+
+
+def test_values_that_are_not_finite_are_counted(tmp_path: Path, rng: np.random.Generator) -> None:
+    columns = geometry(rng)
+    columns["opacity"][1:3] = np.nan, np.inf
+    with pytest.raises(InputError, match=r"a\.ply: opacity: 2 values are NaN or infinite; remove"):
+        read_ply(write_file(tmp_path / "a.ply", columns))
+    columns["opacity"] = np.full(4, 1e300)
+    with pytest.raises(InputError, match="opacity: 4 values"):
+        read_ply(write_file(tmp_path / "a.ply", columns, dtype="f8"))
+
+
+def test_broken_files_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    path = write_file(tmp_path / "a.ply", geometry(rng))
+    whole = path.read_bytes()
+    text = write_file(tmp_path / "t.ply", geometry(rng), "ascii").read_bytes()
+    face_first = whole.replace(b"element vertex", b"element face 2\nproperty float q\nelement vertex")
+    for data, message in [
+        (whole[:-1], "vertex: 4 rows are more than the file holds; the file is truncated"),
+        (whole[:60], "no end_header; the file is truncated"),
+        (b"", "not a PLY file"),
+        (b"\x89PNG\r\n", "not a PLY file"),
+        (text[:-30], "row 3 is broken|rows are more than"),
+        (text.replace(text.split()[-1], b"zero"), "row 3 is broken"),
+        (
+            whole.replace(b"format binary_little_endian", b"format pdp_endian"),
+            "no format or no element",
+        ),
+        (face_first + bytes(8), "face: the vertices must come first"),
+        (
+            whole.replace(b"property float scale_1", b"property list uchar int scale_1"),
+            "scale_1: not a number property",
+        ),
+        (whole.replace(b"float scale_1", b"float scale_0"), "a property of vertex occurs twice"),
+    ]:
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=message):
+            read_ply(path)
+    with pytest.raises(InputError, match=r"gone\.ply: file: cannot be read"):
+        read_ply(tmp_path / "gone.ply")
+
+
+def test_unwritable_output_and_bad_values_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    surfels = table(3, rng)
+    with pytest.raises(InputError, match="output: cannot be written"):
+        write_ply(tmp_path / "missing" / "a.ply", surfels)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="output: cannot be written"):
+        write_ply(tmp_path / "file" / "a.ply", surfels)
+    write_ply(tmp_path / "a.ply", surfels)
+    before = (tmp_path / "a.ply").read_bytes()
+    raw = surfels.to_numpy()
+    raw["albedo"] = np.full((3, 3), np.nan)
+    with pytest.raises(InputError, match="albedo: 9 values are NaN"):
+        write_ply(tmp_path / "a.ply", Surfels.from_numpy(raw))
+    assert (tmp_path / "a.ply").read_bytes() == before

@@ -1,0 +1,166 @@
+"""Arrays on the device: the values, and one kernel whatever the memory that they come from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mi_refgs
+from mi_refgs.errors import InputError
+from mi_refgs.kernels.device import upload, upload_tensor
+from tests.helpers import run_python
+from tests.scenes.integrator import raw_channels
+
+
+@pytest.mark.parametrize("offset", range(5))
+def test_an_upload_is_a_copy_that_needs_one_kernel(offset: int) -> None:
+    """NumPy arrays at every alignment of 4 bytes: Dr.Jit's own memory is always aligned."""
+    values = np.arange(1000, dtype=np.float32)[offset:]
+    array = upload(values)
+    np.testing.assert_array_equal(array.numpy(), values)
+    values[0] = -1
+    assert array[0] == offset
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(array * dr.opaque(mi.Float, 2))
+        kernels = [kernel["ir"].getvalue() for kernel in dr.kernel_history() if "ir" in kernel]
+    assert kernels
+    assert "align 1," not in kernels[-1]
+
+
+def test_other_shapes_types_and_nothing() -> None:
+    table = np.arange(6).reshape(2, 3)
+    np.testing.assert_array_equal(upload(table.T).numpy(), table.T.ravel())
+    integers = upload(table, mi.UInt32)
+    assert isinstance(integers, mi.UInt32)
+    np.testing.assert_array_equal(integers.numpy(), table.ravel())
+    assert dr.width(upload(np.zeros((0, 3)))) == 0
+    signs = upload(table - 3, mi.Int32)
+    assert isinstance(signs, mi.Int32)
+    np.testing.assert_array_equal(signs.numpy(), table.ravel() - 3)
+    odd = upload(table % 2 == 1, mi.Bool)
+    assert isinstance(odd, mi.Bool)
+    np.testing.assert_array_equal(odd.numpy(), table.ravel() % 2 == 1)
+    tensor = upload_tensor(table, mi.TensorXu)
+    assert isinstance(tensor, mi.TensorXu)
+    np.testing.assert_array_equal(tensor.numpy(), table)
+    assert isinstance(upload_tensor(table), mi.TensorXf)
+
+
+UNUSABLE: dict[str, Callable[[], object]] = {
+    "an array": lambda: upload(np.zeros(3)),
+    "a tensor": lambda: upload_tensor(np.zeros((3, 2))),
+    "surfels": lambda: mi_refgs.Surfels.from_numpy(raw_channels()),
+    "a light": lambda: mi_refgs.EnvironmentLight.constant(),
+    "a mesh": lambda: mi_refgs.Occluder(tetrahedron()),
+    "points": lambda: mi_refgs.from_points(np.zeros((3, 3)), np.zeros((3, 3)), rng=np.random.default_rng()),
+    "a PLY file": lambda: mi_refgs.import_splats("some.ply"),
+    "a run": lambda: mi_refgs.load("some"),
+    "a fit": lambda: mi_refgs.fit("some", "some"),
+    "a plugin": lambda: mi.load_dict({"type": "refgs", "filename": "some.ply"}),
+}
+"""What a variant without arrays or derivatives cannot make."""
+
+
+def tetrahedron() -> mi_refgs.Mesh:
+    faces = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]], np.uint32)
+    return mi_refgs.Mesh(np.vstack([np.zeros(3), np.eye(3)]).astype(np.float32), faces, 0.1)
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral"])
+@pytest.mark.parametrize("what", UNUSABLE)
+def test_a_variant_that_cannot_render_is_one_sentence(what: str, variant: str) -> None:
+    mi.set_variant(variant)
+    with pytest.raises(Exception, match=f"variant: '{variant}' is not supported; call mi.set_variant"):
+        UNUSABLE[what]()
+
+
+def test_what_was_made_under_another_variant_is_not_rendered() -> None:
+    surfels = mi_refgs.Surfels.from_numpy(raw_channels())
+    camera, shading = mi_refgs.Camera.look_at([3, 0, 0], size=8), mi_refgs.Shading("surfel", "radiance")
+    made = mi_refgs.TrainedScene(surfels, None, None, shading, 1, 1.0)
+    mi.set_variant("scalar_rgb")
+    for draw in (lambda: mi_refgs.render_frame(surfels, camera, shading), lambda: made.renderer()(camera)):
+        with pytest.raises(InputError, match="variant: 'scalar_rgb' is not supported"):
+            draw()
+
+
+GUARDED = """
+import ctypes, mmap, sys
+import mi_refgs, mitsuba as mi, drjit as dr, numpy as np
+mi.set_variant("llvm_ad_rgb")
+from mi_refgs.kernels.device import upload, upload_tensor
+
+def guarded(values):  # copied to the end of pages that none follows: to read beyond it ends the process
+    size, pages = values.nbytes, -(-values.nbytes // mmap.PAGESIZE)
+    memory = mmap.mmap(-1, (pages + 1) * mmap.PAGESIZE)
+    end = ctypes.addressof(ctypes.c_char.from_buffer(memory)) + pages * mmap.PAGESIZE
+    assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(end), ctypes.c_size_t(mmap.PAGESIZE), 0) == 0
+    own = np.frombuffer(memory, values.dtype, values.size, pages * mmap.PAGESIZE - size).reshape(values.shape)
+    own[...] = values
+    return own
+
+count = 1001
+values = guarded((np.arange(3 * count) % 7).astype(sys.argv[2]))[2 * count:]
+table = guarded((np.arange(3 * count) % 7).astype(sys.argv[2]).reshape(count, 3))
+array = eval(sys.argv[1])
+flat = array.array if dr.is_tensor_v(array) else dr.ravel(array)
+numbers = dr.select(flat, 1, 0) if dr.is_mask_v(flat) else flat + 0 * dr.opaque(type(flat), 1)
+dr.eval(numbers)
+expected = table if dr.is_tensor_v(array) or dr.depth_v(array) > 1 else values
+np.testing.assert_array_equal(numbers.numpy(), expected.ravel())
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pages are protected by mprotect")
+@pytest.mark.parametrize(
+    ("array", "dtype"),
+    [
+        ("upload(values)", "float32"),
+        ("upload(values, mi.UInt32)", "uint32"),
+        ("upload(values, mi.Bool)", "bool"),
+        ("upload_tensor(table)", "float32"),
+        ("mi.Point3f(table.T)", "float32"),
+        ("mi.Vector3f(np.ascontiguousarray(table.T))", "float32"),
+    ],
+)
+def test_nothing_is_read_beyond_the_end_of_an_array(array: str, dtype: str, tmp_path: Path) -> None:
+    """Kernels read whole packets of flat arrays; arrays of vectors are copied by Dr.Jit itself."""
+    run_python(GUARDED, array, dtype, folder=tmp_path)
+
+
+GARBAGE = """
+import gc
+import mi_refgs, mitsuba as mi, drjit as dr
+mi.set_variant("llvm_ad_rgb")
+from mi_refgs.kernels.device import replayed
+
+def drop_a_scene():
+    cycle = [mi.load_dict({"type": "scene", "plate": {"type": "rectangle"}})]
+    dr.eval(cycle[0].ray_test(mi.Ray3f(mi.Point3f(0, 0, 1), mi.Vector3f(0, 0, -1))))
+    cycle.append(cycle)
+
+def double(x):
+    gc.set_threshold(1, 1, 1)
+    kept = [[] for _ in range(100)]  # enough new objects for the collector to run
+    return 2 * x + len(kept) - 100
+
+gc.set_threshold(10**6)
+drop_a_scene()
+y = replayed(double)(dr.opaque(mi.Float, 1, 10))
+assert gc.isenabled()
+gc.collect()
+print(y[0])
+"""
+
+
+def test_garbage_is_not_collected_while_a_function_is_recorded(tmp_path: Path) -> None:
+    """To release a scene then would abort the process."""
+    assert run_python(GARBAGE, folder=tmp_path) == "2.0"

@@ -1,0 +1,131 @@
+"""What is computed says beforehand how much memory it needs, and is refused where there is less."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from mi_refgs.cli import build_parser, main
+from mi_refgs.errors import InputError
+from mi_refgs.io.resources import resource_dir
+from mi_refgs.kernels import memory
+from tests.scenes.integrator import refused, scene, sensor
+from tests.scenes.tiny import train_command
+
+BOUNDED = {
+    "train": ["train", "DATA"],
+    "eval": ["eval", "RUN"],
+    "render": ["render", "RUN", "-o", "OUT/a.exr"],
+    "relight": ["relight", "RUN", "--envmap", "RUN/envmap.exr", "-o", "OUT"],
+    "edit": ["edit", "RUN", "--where", "metallic > 0.5", "--set", "roughness=0.3", "-o", "OUT"],
+    "export": ["export", "RUN", "--to", "exr", "-o", "OUT"],
+    "import": ["import", "RUN/surfels.ply", "-o", "OUT"],
+    "profile": ["profile", "RUN"],
+    "view": ["view", "RUN", "--port", "0"],
+    "dataset": ["dataset", "SCENE", "-o", "OUT"],
+}
+"""Commands that need memory, and arguments with which each is refused where there is none."""
+UNBOUNDED = {
+    "demo": "dataset, train and render, one after the other",
+    "compare": "train and eval in processes of their own",
+    "gallery": "train, render and relight, one after the other",
+    "capture": "COLMAP, which keeps to memory itself, and one photograph at a time",
+    "doctor": "reads headers",
+    "completion": "prints a script",
+}
+"""Commands that need none beyond that of others, or none that grows, and why."""
+
+
+def commands() -> set[str]:
+    for action in build_parser()._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return {*action.choices}
+    raise AssertionError("no commands")
+
+
+def test_every_command_is_listed_with_its_bound() -> None:
+    assert commands() == BOUNDED.keys() | UNBOUNDED.keys() and not BOUNDED.keys() & UNBOUNDED.keys()
+
+
+@pytest.mark.parametrize("name", BOUNDED)
+def test_a_command_without_memory_is_refused_in_one_sentence(
+    name: str,
+    data: Path,
+    finished: Path,
+    method: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(memory, "available", lambda: 0.0)
+    monkeypatch.setattr(memory, "resident", lambda: 1e3)
+    places = {"DATA": data, "RUN": finished, "OUT": tmp_path, "SCENE": resource_dir("scenes") / "diffuse.xml"}
+    arguments = train_command(data, tmp_path / "run", method) if name == "train" else BOUNDED[name]
+    for word, place in places.items():
+        arguments = [text.replace(word, str(place)) for text in arguments]
+    capsys.readouterr()
+    assert main(arguments) == 2
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "GB of memory" in message and "1e-06 GB are available; " in message
+
+
+def test_images_are_refused_and_rendered_again_where_they_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the plugin too, with derivatives sooner, in one sentence with the numbers and a remedy."""
+    of = scene(sensor(film={"width": 600, "height": 500}))
+    monkeypatch.setattr(memory, "resident", lambda: 0.1e9)
+    monkeypatch.setattr(memory, "available", lambda: 0.2e9)
+    sentence = "image: 600 × 500 pixels of 24 surfels: needs 0.44 GB of memory, 0.3 GB are available; ask for"
+    refused(sentence, lambda: mi.render(of, spp=1).numpy())
+    monkeypatch.setattr(memory, "available", lambda: 0.37e9)
+    params = mi.traverse(of)
+    dr.enable_grad(params["integrator.albedo"])
+    image = mi.render(of, params, spp=1)
+    assert image.shape == (500, 600, 3)
+    sentence = "24 surfels: needs 0.5 GB of memory, 0.47 GB are available"
+    refused(sentence, lambda: dr.backward(dr.sum(image, axis=None)))
+
+
+def test_the_least_of_machine_and_control_groups_is_available(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the group and of those around it; page cache can be had back; both versions; nothing is no limit."""
+    proc, groups = tmp_path / "proc", tmp_path / "cgroup"
+    monkeypatch.setattr(memory, "PROC", proc)
+    monkeypatch.setattr(memory, "CGROUPS", groups)
+    assert memory.available() > 1e8 and memory.resident() == 0  # neither: what the system has built in
+
+    (proc / "self").mkdir(parents=True)
+    (proc / "self/statm").write_text("100 7 0 0")
+    (proc / "meminfo").write_text("MemTotal: 9000 kB\nMemAvailable: 5000 kB\n")
+    assert memory.available() == 5000 * 1024 and memory.resident() % 7 == 0 < memory.resident()
+
+    def group(place: str, names: tuple[str, str], limit: str, used: int, cache: int) -> None:
+        folder = groups / place
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in zip(names, (limit, str(used)), strict=True):
+            (folder / name).write_text(text)
+        (folder / "memory.stat").write_text(f"anon 5\ninactive_file {cache}\n")
+
+    second, first = ("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")
+    (proc / "self/cgroup").write_text("0::/a/b\n")
+    assert memory.available() == 5000 * 1024
+    group("a/b", second, "max", 10, 0)
+    group("a", second, "4000000", 1000, 200)
+    assert memory.available() == 4_000_000 - 1000 + 200
+    group("a/b", second, "3000000", 1000, 0)
+    assert memory.available() == 3_000_000 - 1000
+    (proc / "self/cgroup").write_text("4:cpu,memory:/box\n3:pids:/a\n")
+    group("memory/box", first, "2000", 3000, 0)
+    assert memory.available() == 0
+
+
+def test_a_need_counts_what_the_process_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "resident", lambda: 2e9)
+    monkeypatch.setattr(memory, "available", lambda: 1e9)
+    memory.require(3e9, "a", "b")
+    with pytest.raises(InputError, match=r"^a: needs 3\.1 GB of memory, 3 GB are available; b$"):
+        memory.require(3.1e9, "a", "b")

@@ -1,0 +1,450 @@
+"""One image by every route: whichever way a scene is rendered, its image and every AOV are the same.
+
+Routes, states of a scene and features are lists that the test crosses: every shading of every method and of
+every registered reflectance model goes through every route, and every pair of the other features occurs.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs import Reconstruction, import_splats, load
+from mi_refgs.cli import main
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
+from mi_refgs.evaluation.pictures import planes
+from mi_refgs.formats import FORMATS, Shot
+from mi_refgs.io.exr import read_exr
+from mi_refgs.methods import read
+from mi_refgs.plugins.aovs import suffixes
+from mi_refgs.reconstruction.provenance import Source
+from mi_refgs.render.load_scene import load_scene
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.export import SCENE, TrainedScene
+from mi_refgs.runs.save import save
+from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.reflectance import MODELS
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.ply import write_ply
+from mi_refgs.surfels.table import Surfels
+from mi_refgs.viewer import fine
+from mi_refgs.viewer.develop import PICTURE, SURROUNDINGS, Look, seen_of
+from mi_refgs.viewer.drawable import Drawable, Sample
+from mi_refgs.viewer.fitted import Fitted
+from mi_refgs.viewer.mitsuba_scene import MitsubaScene
+from mi_refgs.viewer.pose import Pose
+from tests.plugins.test_integrator_surroundings import behind, far_channels
+from tests.render.test_scene_xml import OTHER
+from tests.scenes.integrator import raw_channels, sky
+from tests.splat.test_shown import mesh
+
+WIDTH, HEIGHT, FOV, NEAR = 16, 12, 40.0, 0.05
+CROP = (4, 3, 9, 7)
+"""Offset and size of a crop window, pixels."""
+TOLERANCE = 1e-5
+"""Of an image or an AOV, in parts of its largest value, at least 1."""
+
+Maps = dict[str, np.ndarray]
+"""The image (H, W, 4) as IMAGE, linear and premultiplied, and AOVs (H, W, C) by type."""
+IMAGE = "image"
+
+
+# ---------------- what is rendered ----------------
+
+
+def shadings() -> list[tuple[Shading, str]]:
+    """Each shading once, with its primitive: of all stages of all methods, and of all models."""
+    found: dict[tuple[Shading, str], None] = {}
+    for name in read.names():
+        method = read.load(name, "quick")
+        for (_, stage), meshed in itertools.product(method.stages(), {False, method.mesh is not None}):
+            found[Shading.of(stage, meshed), method.surfels.primitive] = None
+    for name, model in MODELS.items():
+        for order in model.orders:
+            found[Shading(order, name), "surfel"] = None
+        plain = Shading(model.orders[0], name, diffuse="irradiance")
+        traced = replace(plain, occlusion=plain.traceable)
+        options = {key: OTHER[key] for key in model.honours if traced.occlusion or key not in NEED_OCCLUSION}
+        if options:
+            found[replace(traced, accuracy=Accuracy(**options)), "surfel"] = None
+    return [*found]
+
+
+SHADINGS = shadings()
+
+
+def sensor(crop: bool = False) -> Any:
+    """The sensor of every scene."""
+    x, y, width, height = CROP if crop else (0, 0, WIDTH, HEIGHT)
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": FOV,
+            "near_clip": NEAR,
+            "to_world": mi.ScalarTransform4f().look_at([3, 1, 2], [0, 0, 0], [0, 0, 1]),
+            "film": {
+                "type": "hdrfilm",
+                "width": WIDTH,
+                "height": HEIGHT,
+                "crop_offset_x": x,
+                "crop_offset_y": y,
+                "crop_width": width,
+                "crop_height": height,
+                "pixel_format": "rgba",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+            },
+        }
+    )
+
+
+def trained(shading: Shading, primitive: str, around: str, meshed: bool, bare: bool) -> TrainedScene:
+    """Few surfels with sharp and with soft outlines, of every channel or with their colours alone."""
+    rng = np.random.default_rng(3)
+    raw = raw_channels()
+    raw["scale"] = raw["scale"] - 0.7
+    raw["opacity"] = raw["opacity"] + rng.uniform(0, 5, raw["opacity"].shape).astype(np.float32)
+    raw["tint"] = rng.normal(size=raw["albedo"].shape).astype(np.float32)
+    raw["normal_offset"] = 0.1 * rng.normal(size=raw["albedo"].shape).astype(np.float32)
+    others = far_channels()
+    if primitive == "gaussian":
+        for table in (raw, others):
+            table["scale"] = np.concatenate([table["scale"], table["scale"][:, :1] - 1], axis=1)
+    if bare:
+        raw = {name: raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
+    map_behind = behind() if around == "surroundings and a map" else None
+    return TrainedScene(
+        Surfels.from_numpy(raw),
+        EnvironmentLight.from_radiance(sky()) if "albedo" in raw else None,
+        mesh() if meshed or shading.occlusion else None,
+        shading,
+        7,
+        1.5,
+        surroundings=None if around == "nothing" else Surroundings(Surfels.from_numpy(others), map_behind),
+    )
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene in a state: in memory, as a run folder, and what of it is rendered."""
+
+    made: Reconstruction
+    folder: Path
+    samples: int
+    crop: bool
+    alone: bool  # without what is around the object
+    scratch: Path  # for files of a route
+    part: int  # which third of the variables a page draws, one by one
+
+    @property
+    def names(self) -> list[str]:
+        """The AOVs that the surfels have."""
+        channels = self.made.trained.surfels.raw
+        return [name for name in suffixes() if name in channels or name in GEOMETRY]
+
+    def of_whole(self, whole: Maps) -> Maps:
+        """What the crop window leaves of maps of the whole film."""
+        x, y, width, height = CROP if self.crop else (0, 0, WIDTH, HEIGHT)
+        return {name: value[y : y + height, x : x + width] for name, value in whole.items()}
+
+
+GEOMETRY = ("normal", "depth", "alpha", "visibility", "diffuse", "specular", "indirect")
+
+
+# ---------------- routes ----------------
+
+
+def by_reconstruction(case: Case) -> Maps:
+    options: Any = {"samples": case.samples, "alone": case.alone}
+    view = sensor(case.crop)
+    return {IMAGE: case.made.render(view, **options)} | case.made.aovs(view, case.names, **options)
+
+
+def by_its_mitsuba_scene(case: Case) -> Maps:
+    scene = case.made.scene(sensor(), aovs=case.names, alone=case.alone)
+    return of_mitsuba(scene, sensor(case.crop), case)
+
+
+def by_scene_file(case: Case) -> Maps:
+    """The image of `mi.load_file` without AOVs; and those."""
+    path = case.folder / SCENE
+    maps = of_mitsuba(load_scene(path, case.names, case.alone), 0, case)
+    scene = load_scene(path, alone=True) if case.alone else mi.load_file(str(path))
+    return maps | {IMAGE: mi.render(scene, spp=case.samples).numpy()}
+
+
+def by_command_of_a_run(case: Case) -> Maps:
+    return of_command(case, case.folder)
+
+
+def by_command_of_a_scene(case: Case) -> Maps:
+    return of_command(case, case.folder / SCENE)
+
+
+def by_command_with_a_camera(case: Case) -> Maps:
+    """The camera in a file, which has no crop window."""
+    camera, path = Camera.from_sensor(sensor()), case.scratch / "camera.json"
+    numbers = {"fl_x": -camera.fx[0], "fl_y": -camera.fy[0], "cx": camera.cx[0], "cy": camera.cy[0]}
+    frames = [{"transform_matrix": (camera.pose() @ MITSUBA_FROM_OPENGL).tolist()}]
+    path.write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "near": NEAR, **numbers, "frames": frames}))
+    return case.of_whole(of_command(case, case.folder, "--camera", path))
+
+
+def by_viewer_of_a_run(case: Case) -> Maps:
+    return of_viewer(case, Fitted(case.made.trained))
+
+
+def by_viewer_of_a_scene(case: Case) -> Maps:
+    return of_viewer(case, MitsubaScene(load_scene(case.folder / SCENE), "scene.xml"))
+
+
+def by_layers(case: Case) -> Maps:
+    """`refgs export --to exr`, which has the depth along the axis, and what is behind as a layer."""
+    path, camera = case.scratch / "layers.exr", Camera.from_sensor(sensor(case.crop))
+    shots = [Shot("view", "test", camera)]
+    options = {"view": 0, "samples": case.samples, "object": case.alone}
+    FORMATS["exr"].write(case.made.trained, path, shots, **options)
+    layers = read_exr(path)
+    found = {IMAGE: np.stack([layers[letter] for letter in "RGBA"], axis=-1)}
+    if "background.R" in layers:
+        through = np.stack([layers[f"background.{letter}"] for letter in "RGB"], axis=-1)
+        found[IMAGE][..., :3] += (1 - layers["A"][..., None]) * through
+        found[IMAGE][..., 3] = 1
+    return found | of_layers(layers, [name for name in case.names if name not in ("depth", "alpha")])
+
+
+ROUTES: tuple[Callable[[Case], Maps], ...] = (
+    by_reconstruction,
+    by_its_mitsuba_scene,
+    by_scene_file,
+    by_command_of_a_run,
+    by_command_of_a_scene,
+    by_command_with_a_camera,
+    by_viewer_of_a_run,
+    by_viewer_of_a_scene,
+    by_layers,
+)
+"""Every way to an image; the first one is compared with all others."""
+
+
+def of_mitsuba(scene: Any, view: Any, case: Case) -> Maps:
+    image = mi.render(scene, sensor=view, spp=case.samples).numpy()
+    film = (scene.sensors()[view] if isinstance(view, int) else view).film()
+    names = [channel.name for channel in film.bitmap().struct_()]
+    layers = dict(zip(names, np.moveaxis(image, -1, 0), strict=True))
+    return {IMAGE: image[..., :4]} | of_layers(layers, case.names)
+
+
+def of_command(case: Case, scene: Path, *more: object) -> Maps:
+    """What `refgs render` writes."""
+    path = case.scratch / "out.exr"
+    command = ["render", scene, "-o", path, "--spp", case.samples, "--aov", *case.names, *more]
+    assert main([str(word) for word in [*command, *(["--object"] if case.alone else [])]]) == 0
+    layers = read_exr(path)
+    return {IMAGE: np.stack([layers[letter] for letter in "RGBA"], axis=-1)} | of_layers(layers, case.names)
+
+
+def of_layers(layers: dict[str, np.ndarray], names: Sequence[str]) -> Maps:
+    """AOVs of an EXR file, whose channels are NAME.LETTER."""
+    found: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    for key in sorted(layers, key=lambda key: "RGBXYZ".find(key[-1])):
+        if (name := key.partition(".")[0]) in found:
+            found[name].append(layers[key])
+    return {name: np.stack(values, axis=-1) for name, values in found.items()}
+
+
+def of_viewer(case: Case, drawable: Drawable) -> Maps:
+    """The planes that a page shows at one sample per pixel, and those that it saves at several."""
+    view = Camera.from_sensor(sensor())
+    pose = Pose(view.pose(), 2 * np.arctan(HEIGHT / 2 / -view.fy[0]), WIDTH / HEIGHT, NEAR)
+    around = not case.alone and case.made.trained.surroundings is not None
+    backdrop = SURROUNDINGS if around else "white"
+    assert backdrop in drawable.backdrops
+    found = {}
+    pictures = [PICTURE, *drawable.variables[1 + case.part :: 3]]
+    for what in pictures:
+        look = Look(what, backdrop=backdrop)
+        if case.samples == 1:
+            shown = drawable.draw(Sample(pose, WIDTH, HEIGHT, look, settled=True)).planes
+        else:
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(fine, "GRID", round(case.samples**0.5))
+                shown = drawable.fine(pose, WIDTH, HEIGHT, look)
+        found[IMAGE if what == PICTURE else what] = planes(seen_of(shown, look), HEIGHT, WIDTH)
+    return case.of_whole(found)
+
+
+# ---------------- states ----------------
+
+
+def run_of(made: Reconstruction, folder: Path) -> Path:
+    """A run folder of a reconstruction, seen by the sensor of all scenes."""
+    save(made.trained, folder, made.method, Camera.from_sensor(sensor()))
+    return folder
+
+
+def as_fitted(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
+    return made, run_of(made, scratch / "fitted")
+
+
+def saved_and_loaded(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
+    again = load(run_of(made, scratch / "fitted"))
+    return again, run_of(again, scratch / "again")
+
+
+def exported(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
+    """By `refgs export -o`, whose folder is no run."""
+    run, out = run_of(made, scratch / "fitted"), scratch / "exported"
+    assert main(["export", str(run), "-o", str(out)]) == 0
+    return made.changed(TrainedScene.read(out)), out
+
+
+def edited(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
+    """In memory, and by `refgs edit`."""
+    run, out = run_of(made, scratch / "fitted"), scratch / "edited"
+    command = [
+        "edit",
+        str(run),
+        "-o",
+        str(out),
+        "--where",
+        "x > 0.2",
+        "--rotate",
+        "z",
+        "20",
+        "--scale",
+        "1.2",
+    ]
+    assert main(command) == 0
+    return made.edit(where="x > 0.2", rotate=("z", 20), scale=1.2), out
+
+
+def through_a_ply(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
+    """Display-encoded 3D Gaussians as `refgs export --to` writes them; linear ones as every run has them."""
+    path, run, encoded = scratch / "splats.ply", scratch / "imported", made.trained.shading.model.encoded
+    if encoded:
+        FORMATS["3dgs-ply"].write(made.trained, path, [], degree=1, object=False)
+    else:
+        write_ply(path, made.trained.surfels)
+    assert main(["import", str(path), "-o", str(run), *([] if encoded else ["--linear"])]) == 0
+    return import_splats(path, linear=not encoded), run
+
+
+STATES = (as_fitted, saved_and_loaded, exported, edited)
+CHANGED = (edited,)
+"""States that show another image than the scene had before."""
+
+FEATURES: dict[str, tuple[Any, ...]] = {
+    "samples": (1, 4),
+    "crop": (False, True),
+    "around": ("nothing", "surroundings", "surroundings and a map", "surroundings, left out"),
+    "meshed": (False, True),
+    "state": STATES,
+}
+
+
+def pairwise(features: dict[str, tuple[Any, ...]], seed: int) -> list[dict[str, Any]]:
+    """Rows of one value for each feature in which every pair of values of two features occurs."""
+    rng = np.random.default_rng(seed)
+    rows = [dict(zip(features, values, strict=True)) for values in itertools.product(*features.values())]
+
+    def pairs(row: dict[str, Any]) -> set[Any]:
+        return set(itertools.combinations(row.items(), 2))
+
+    rows = [rows[i] for i in rng.permutation(len(rows))]
+    left, chosen = set().union(*map(pairs, rows)), []
+    while left:
+        chosen.append(max(rows, key=lambda row: len(pairs(row) & left)))
+        left -= pairs(chosen[-1])
+    return chosen
+
+
+ROWS = pairwise(FEATURES, seed=5)
+
+
+LOSSLESS = [
+    (Shading("pixel", "displayed"), "gaussian"),
+    (Shading("surfel", "radiance"), "gaussian"),
+    (Shading("surfel", "radiance"), "surfel"),
+]
+"""What a PLY file of another program holds whole."""
+
+
+def cases() -> Iterator[Any]:
+    """Every shading and every row, at least once; and what goes through files of other programs."""
+    count = max(len(SHADINGS), len(ROWS))
+    crossed = [(*SHADINGS[i % len(SHADINGS)], ROWS[i % len(ROWS)]) for i in range(count)]
+    alone = {"samples": 4, "crop": True, "around": "nothing", "meshed": False, "state": through_a_ply}
+    for index, (shading, primitive, row) in enumerate([*crossed, *((*one, alone) for one in LOSSLESS)]):
+        options = "-".join(shading.accuracy.chosen())
+        rays = "traced" if shading.occlusion else "open"
+        state = row["state"].__name__
+        name = f"{primitive}-{shading.at}-{shading.reflectance}-{shading.diffuse}-{rays}-{options}-{state}"
+        yield pytest.param(shading, primitive, row, index % 3, id=name)
+
+
+# ---------------- the law ----------------
+
+
+def assert_same(expected: Maps, found: Maps, route: str) -> None:
+    assert IMAGE in found
+    for name, values in found.items():
+        wanted = expected[name]
+        assert values.shape == wanted.shape, (route, name)
+        scale = max(1.0, np.abs(wanted).max())
+        worst = np.abs(values - wanted).max() / scale
+        assert worst <= TOLERANCE, f"{route}: {name}: differs by {worst:.2g}"
+
+
+@pytest.mark.parametrize(("shading", "primitive", "row", "part"), [*cases()])
+def test_every_route_gives_one_image(
+    shading: Shading, primitive: str, row: dict[str, Any], part: int, tmp_path: Path
+) -> None:
+    alone = row["around"] == "surroundings, left out"
+    around = "surroundings and a map" if alone else row["around"]
+    scene = trained(shading, primitive, around, row["meshed"], bare=row["state"] is through_a_ply)
+    made = Reconstruction(scene, Source(read.load("ref_gaussian", "quick")))
+    state, folder = row["state"](made, tmp_path)
+    crop_sensor_of(folder / SCENE, row["crop"])
+    case = Case(state, folder, row["samples"], row["crop"], alone, tmp_path, part)
+    before = state if row["state"] in CHANGED else made
+    expected = ROUTES[0](replace(case, made=before))
+    assert 0.2 < np.mean(expected["alpha"] > 0.1) and expected[IMAGE][..., :3].max() > 0.1
+    for route in ROUTES:
+        assert_same(expected, route(case), route.__name__)
+
+
+def crop_sensor_of(path: Path, crop: bool) -> None:
+    """Put the sensor of every scene, by its crop window, into a scene file."""
+    tree = ElementTree.parse(path)
+    root = tree.getroot()
+    for old in root.findall("sensor"):
+        root.remove(old)
+    one = ElementTree.SubElement(root, "sensor", type="perspective", id="sensor")
+    ElementTree.SubElement(one, "float", name="fov", value=str(FOV))
+    ElementTree.SubElement(one, "float", name="near_clip", value=str(NEAR))
+    transform = ElementTree.SubElement(one, "transform", name="to_world")
+    pose = np.array(sensor().world_transform().matrix, np.float64).ravel()
+    ElementTree.SubElement(transform, "matrix", value=" ".join(map(repr, map(float, pose))))
+    film = ElementTree.SubElement(one, "film", type="hdrfilm")
+    numbers = {"width": WIDTH, "height": HEIGHT}
+    if crop:
+        keys = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
+        numbers |= dict(zip(keys, CROP, strict=True))
+    for name, value in numbers.items():
+        ElementTree.SubElement(film, "integer", name=name, value=str(value))
+    for name, text in (("pixel_format", "rgba"), ("component_format", "float32")):
+        ElementTree.SubElement(film, "string", name=name, value=text)
+    ElementTree.SubElement(film, "rfilter", type="box")
+    tree.write(path)

@@ -1,0 +1,340 @@
+"""Methods as data: every shipped file loads, presets scale it, and anything unknown is refused by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import typing
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mi_refgs import methods
+from mi_refgs.errors import InputError
+from mi_refgs.fitting import refine
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.methods.presets import scaled
+from mi_refgs.methods.window import ITERATIONS, Window
+from mi_refgs.surfels.table import Surfels
+from tests.fitting.test_train import ball
+
+
+@pytest.mark.parametrize("variant", methods.names())
+@pytest.mark.parametrize("preset", methods.PRESETS)
+def test_shipped_methods_load_and_read_back(variant: str, preset: str, tmp_path: Path) -> None:
+    method = methods.load(variant, preset)
+    assert method.iterations == methods.PRESETS[preset].iterations == method.stages()[-1][1].until
+    path = tmp_path / "config.toml"
+    path.write_text(methods.dump(method))
+    assert methods.load_resolved(path) == method
+
+
+def test_presets_scale_the_whole_schedule() -> None:
+    quick, standard = methods.load("ref_gaussian", "quick"), methods.load("ref_gaussian", "standard")
+    factor = standard.iterations / quick.iterations
+    for name, stage in quick.stage.items():
+        assert standard.stage[name].until == pytest.approx(stage.until * factor, abs=factor)
+    assert quick.refine.densify is not None and standard.refine.densify is not None
+    assert standard.refine.densify.until == pytest.approx(quick.refine.densify.until * factor, abs=factor)
+
+
+def test_a_preset_scales_every_number_of_iterations(tmp_path: Path) -> None:
+    path = tmp_path / "long.toml"
+    path.write_text(
+        "iterations = 4000\n[light]\n[stage.first]\nuntil = 1000\n[stage.last]\nuntil = 4000\n"
+        "[refine.propagate]\nwhen = {start = 0, until = 4000, every = 100}\nhold = 200\n"
+        "[loss]\nsmooth_until = 3000\n"
+        "[data]\ncoarse = [{ until = 1000, block = 2 }, { until = 400, block = 4 }]\n"
+    )
+    method = methods.load(str(path), "quick")
+    assert method.iterations == 2000 and [stage.until for _, stage in method.stages()] == [500, 2000]
+    assert method.refine.propagate is not None
+    assert (method.refine.propagate.hold, method.loss.smooth_until) == (100, 1500)
+    assert [method.data.block_at(i) for i in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]
+
+
+def test_only_declared_fields_are_scaled() -> None:
+    """A field that is called like one that counts iterations stays what it is; nothing is lost below it."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Other:
+        until: int = 8
+        hold: int = dataclasses.field(default=8, metadata=ITERATIONS)
+        after: dict[str, Window] = dataclasses.field(default_factory=lambda: {"a": Window(0, 8, 2)})
+
+    assert scaled(Other(), 0.5) == Other(8, 4, {"a": Window(0, 4, 1)})
+    assert scaled(Other(hold=0), 0.5).hold == 0 and scaled(Other(hold=1), 0.1).hold == 1
+
+
+def test_every_number_of_iterations_is_declared() -> None:
+    """The intervals of checkpoints, previews and logs are of the run, not of its schedule."""
+    names = {"until", "hold", "after", "trial", "iterations"}
+    waiting: list[Any] = [methods.Method]
+    for kind in waiting:
+        hints = typing.get_type_hints(kind) if dataclasses.is_dataclass(kind) and kind is not Window else {}
+        for field in dataclasses.fields(kind) if hints else ():
+            counts = field.name in names or field.name.endswith(("_start", "_rise", "_until"))
+            assert (field.metadata == ITERATIONS) == counts, f"{kind.__name__}.{field.name}"
+        waiting += [part for hint in hints.values() for part in (hint, *typing.get_args(hint))]
+        waiting += [] if hints else typing.get_args(kind)
+
+
+def test_stages_and_windows_meet_without_gap_or_overlap() -> None:
+    method = methods.load("ref_gaussian", "quick")
+    names = [method.stage_at(i)[0] for i in range(1, method.iterations + 1)]
+    order = [name for name, _ in method.stages()]
+    assert sorted(set(names), key=names.index) == order
+    assert [names[stage.until - 1] for _, stage in method.stages()] == order
+    window = methods.Window(2, 8, 3)
+    assert [i for i in range(12) if window.due(i)] == [3, 6]
+    assert [window.since(i) for i in (3, 4, 6, 7, 9, 20)] == [None, 1, 3, 1, 3, 14]
+
+
+@settings(deadline=None)
+@given(
+    st.integers(0, 500),
+    st.integers(0, 3000),
+    st.integers(1, 400),
+    st.sampled_from([2_000 / 6_000, 4_000 / 6_000, 50_000 / 6_000, 1.0]) | st.floats(0.1, 20),
+)
+def test_a_scaled_window_keeps_its_events(start: int, length: int, every: int, factor: float) -> None:
+    """The k-th event of the file is the k-th of the preset, at its own time times the factor, rounded."""
+    until = start + length
+    events = [k for k in range(1, until // every + 1) if k * every > start]
+    window = scaled(methods.Window(start, until, every), factor)
+    last = math.ceil(factor * until) + 1
+    assert window.count(last) == len(events)
+    due = [i for i in range(last + 1) if window.due(i)]
+    if factor * every >= 1:
+        np.testing.assert_allclose(due, [factor * every * k for k in events], atol=0.5 + 1e-6)
+        expected = [None, *np.diff(due).tolist()]
+        assert [window.since(i) for i in due] == expected[: len(due)]
+
+
+MANY_EVENTS = """
+iterations = 7_000
+[surfels]
+channels = ["radiance_sh", "albedo", "metallic", "roughness"]
+sh_raise = { start = 0, until = 1_000, every = 333 }
+[light]
+[stage.one]
+until = 1_111
+at = "surfel"
+diffuse = "irradiance"
+[stage.two]
+until = 7_000
+restart = ["metallic"]
+[mesh]
+extract = { start = 1_111, until = 5_001, every = 567 }
+[refine]
+densify = { start = 200, until = 3_001, every = 130 }
+reset = { start = 0, until = 1_999, every = 444 }
+propagate = { when = { start = 0, until = 2_601, every = 650 } }
+"""
+"""Few of these numbers are whole, or multiples of each other, once a preset has scaled them."""
+
+
+EVENTS = {
+    "ref_gaussian": {"degree": 2, "densify": 14, "reset_opacity": 2, "mesh": 8},
+    "ref_gaussian_paper": {"degree": 3, "densify": 48, "reset_opacity": 8, "propagate_normals": 16}
+    | {"mesh": 16, "restart": 1},
+    "many": {"degree": 3, "densify": 22, "reset_opacity": 4, "propagate_normals": 4, "mesh": 7}
+    | {"restart": 1},
+}
+"""Of methods that no other one's windows make up."""
+
+
+@pytest.mark.parametrize("variant", EVENTS)
+def test_every_preset_has_the_same_events_in_the_same_order(
+    variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a trainer does over the whole fit, its steps left out."""
+    (tmp_path / "many.toml").write_text(MANY_EVENTS)
+    path = str(tmp_path / "many.toml") if variant == "many" else variant
+    done: list[str] = []
+
+    def recorder(name: str, result: Callable[[Surfels], Any]) -> Callable[..., Any]:
+        def record(surfels: Surfels, *_: object, **__: object) -> Any:
+            done.append(name)
+            return result(surfels)
+
+        return record
+
+    def same(surfels: Surfels) -> refine.TableEdit:
+        rows = np.arange(surfels.count, dtype=np.uint32)
+        return refine.TableEdit(surfels, rows, rows < 0)
+
+    monkeypatch.setattr(refine, "densify_and_prune", recorder("densify", same))
+    for name in ("reset_opacity", "propagate_normals", "restart"):
+        monkeypatch.setattr(refine, name, recorder(name, lambda surfels: surfels))
+    monkeypatch.setattr(Trainer, "extract_mesh", lambda self: done.append("mesh"))
+    monkeypatch.setattr(Trainer, "_gradient_step", lambda self, iteration, stage: None)
+    sequences = {}
+    for preset in methods.PRESETS:
+        method = methods.load(path, preset, ["surfels.count=20", "surfels.max_count=20"])
+        trainer = Trainer(method, ball())
+        done.clear()
+        while trainer.iteration < method.iterations:
+            degree = trainer.schedule.sh_degree(trainer.iteration)
+            trainer.step()
+            done += ["degree"] * (trainer.schedule.sh_degree(trainer.iteration) - degree)
+        sequences[preset] = list(done)
+    counts = {name: Counter(done) for name, done in sequences.items()}
+    assert counts["quick"] == counts["standard"] == counts["paper"], counts
+    assert sequences["quick"] == sequences["standard"] == sequences["paper"]
+    assert counts["quick"] == EVENTS[variant]
+
+
+def test_assignments_are_applied_unscaled() -> None:
+    method = methods.load(
+        "ref_gaussian", "quick", ["loss.ssim=0.3", "mesh.resolution=64", "refine.densify.until=7"]
+    )
+    assert method.mesh is not None and method.refine.densify is not None
+    assert (method.loss.ssim, method.mesh.resolution, method.refine.densify.until) == (0.3, 64, 7)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "iterations = 10\n[stage.a]\nuntil = 10\n[loss]\nsim = 1",
+            ["own.toml", "loss", "unknown key 'sim'"],
+        ),
+        ("iterations = 10\n[stage.a]\nuntil = 'x'", ["own.toml", "until", "expected int"]),
+        (
+            "iterations = 10\n[stage.a]\nuntil = 10\nat = 'voxel'",
+            ["own.toml", "'voxel' is not allowed", "surfel"],
+        ),
+        ("iterations = 10", ["own.toml", "missing key 'stage'"]),
+        ("[stage.a]\nuntil = 10", ["own.toml", "missing key 'iterations'"]),
+        ("iterations = [", ["own.toml", "not valid TOML"]),
+        (
+            "iterations = 10\n[stage.a]\nuntil = 10\n[refine]\nreset = {start = 0, until = 9, every = 0}",
+            ["own.toml", "refine: reset", "'every' above 0"],
+        ),
+        (
+            "iterations = 10\n[stage.a]\nuntil = 10\n[data]\ncoarse = [{ until = 5, block = 1 }]",
+            ["own.toml", "data.coarse", "block of 1", "2 or more"],
+        ),
+        (
+            "iterations = 10\n[stage.a]\nuntil = 10\n[light]\nevery = 0",
+            ["own.toml", "light.every: 0", "1 or more"],
+        ),
+    ],
+)
+def test_bad_files_are_named(text: str, words: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as error:
+        methods.load(str(path))
+    assert all(word in str(error.value) for word in words), error.value
+
+
+@pytest.mark.parametrize("assignment", ["loss.sim=1", "loss", "iterations.x=1"])
+def test_bad_assignments_are_named(assignment: str) -> None:
+    with pytest.raises(InputError, match=r"--set|unknown key"):
+        methods.load("ref_gaussian", "quick", [assignment])
+
+
+def test_unknown_names_list_the_known_ones() -> None:
+    with pytest.raises(InputError, match="ref_gaussian"):
+        methods.load("no_such_method")
+    with pytest.raises(InputError, match="standard"):
+        methods.load("ref_gaussian", "slow")
+
+
+def test_extends_changes_only_what_it_says(tmp_path: Path) -> None:
+    child = tmp_path / "child.toml"
+    child.write_text('extends = "ref_gaussian"\n[loss]\nssim = 0.5\n')
+    base, changed = methods.load("ref_gaussian"), methods.load(str(child))
+    assert changed.loss == dataclasses.replace(base.loss, ssim=0.5)
+    assert dataclasses.replace(changed, loss=base.loss, variant=base.variant, file=base.file) == base
+    assert Path(child).stem == changed.variant
+
+
+@pytest.mark.parametrize("base", methods.names())
+def test_extends_takes_every_shipped_method_and_own_files(base: str, tmp_path: Path) -> None:
+    """A shipped method that extends another one, and an own file beside or below the one that names it."""
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "own.toml").write_text(f'extends = "{base}"\n[loss]\nssim = 0.5\n')
+    grandchild = tmp_path / "grandchild.toml"
+    grandchild.write_text('extends = "below/own.toml"\ndrop = ["refine"]\n[loss]\nnormal = 0.3\n')
+    shipped, changed = methods.load(base), methods.load(str(grandchild))
+    assert changed.loss == dataclasses.replace(shipped.loss, ssim=0.5, normal=0.3)
+    assert changed.refine.densify is None and changed.refine.reset is None
+    same = dataclasses.replace(changed, loss=shipped.loss, refine=shipped.refine, variant=base, file=base)
+    assert same == shipped
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('extends = "own.toml"', ["own.toml: extends: the file extends itself", "break"]),
+        ('extends = "other.toml"', ["own.toml: extends: the file extends itself"]),
+        ('extends = "gone.toml"', ["own.toml: extends: gone.toml: no such method", "ref_gaussian"]),
+        ('extends = "ref_gausian"', ["own.toml: extends: ref_gausian: no such method", "ref_gaussian"]),
+        ("extends = 3", ["own.toml: extends: expected a name", "3"]),
+        ('extends = "ref_gaussian"\ndrop = "mesh"', ["own.toml: drop: expected a list"]),
+        ('extends = "ref_gaussian"\ndrop = ["seed.x"]', ["own.toml: drop: no key 'seed.x'"]),
+        ('drop = ["mesh"]', ["own.toml: extends: expected a name", "None"]),
+        ('extends = "wrong.toml"', ["wrong.toml: not valid TOML"]),
+    ],
+)
+def test_wrong_extends_are_named(text: str, words: list[str], tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text(text + "\n")
+    (tmp_path / "other.toml").write_text('extends = "own.toml"\n')
+    (tmp_path / "wrong.toml").write_text("[")
+    with pytest.raises(InputError) as error:
+        methods.load(str(tmp_path / "own.toml"))
+    assert all(word in str(error.value) for word in words), error.value
+
+
+def test_an_unknown_primitive_is_refused() -> None:
+    chosen = methods.load("ref_gaussian", "quick", ["surfels.primitive='gaussian'"])
+    assert chosen.surfels.columns("scale") == 3
+    with pytest.raises(
+        InputError, match=r"surfels\.primitive: 'ball' is unknown; use one of surfel, gaussian"
+    ):
+        methods.load("ref_gaussian", "quick", ["surfels.primitive='ball'"])
+
+
+def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
+    """`--for` finds one method; a file that extends it is for something else."""
+    assert methods.for_purpose("relighting") == "relighting"
+    purposes = [methods.load(name).about.purpose for name in methods.names()]
+    assert sorted(filter(None, purposes)) == ["photographs", "relighting"]
+    own = tmp_path / "own.toml"
+    own.write_text('extends = "relighting"\n[about]\nname = "mine"\n')
+    assert methods.load(str(own)).about.purpose == ""
+    for word in ("", "speed"):
+        with pytest.raises(InputError, match=r"--for.*relighting"):
+            methods.for_purpose(word)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("stage.deferred.rates.tint=2.0", "rates: there is no 'tint'"),
+        ("stage.deferred.rates.metallic=-1.0", "metallic: -1.0 is no factor"),
+        ("stage.deferred.rates.light=nan", "out of range|no factor"),
+        ("surfels.from_pictures=['metallic']", "metallic"),
+        ("surfels.channels=['metallic', 'roughness']", "albedo"),
+        ("refine.relocate={when={start=0, until=9, every=3}, grow=-0.1}", r"relocate\.grow: -0\.1"),
+    ],
+)
+def test_bad_settings_of_relighting_are_named(assignment: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        methods.load("relighting", "quick", [assignment])
+
+
+@pytest.mark.parametrize("prior", ["half_metal", "materials", "light_colour"])
+def test_a_prior_needs_what_it_is_about(prior: str) -> None:
+    with pytest.raises(InputError, match=rf"loss\.{prior}: .*drop it"):
+        methods.load("base_2dgs", "quick", [f"loss.{prior}=0.1"])
+    methods.load("ref_gaussian", "quick", [f"loss.{prior}=0.1"])

@@ -1,0 +1,228 @@
+"""Depth fusion of all of space, by contraction: against the float64 oracle, and shapes near and far."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mi_refgs.data.region import Region
+from mi_refgs.fitting.surface import surface_of
+from mi_refgs.occlusion import tsdf
+from mi_refgs.occlusion.mesh import Mesh, extract_mesh
+from mi_refgs.reference import occlusion as ref
+from mi_refgs.reference.camera import look_at
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.relightable import relightable
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.init import from_points
+from mi_refgs.surfels.table import Surfels
+from tests.occlusion.fusion_oracle import fused_points
+
+SIZE = 80
+FOCAL = SIZE / (2 * np.tan(np.radians(30)))
+REGION = Region((0.1, -0.1, 0.2), 0.8)
+BALL = np.array([0.1, 0.0, 0.15])
+BALL_RADIUS, FLOOR = 0.35, -0.3
+SPACE = (np.full(3, -2.0), np.full(3, 2.0))
+
+
+def ring_of_views(count: int) -> list[np.ndarray]:
+    """Cameras above the floor, at two heights, that look at the ball."""
+    angle = 2 * np.pi * np.arange(count) / count
+    height = np.where(np.arange(count) % 2 == 0, 0.4, 1.5)
+    where = np.stack([2 * np.cos(angle), 2 * np.sin(angle), height], axis=1)
+    return [look_at(eye, BALL) for eye in where]
+
+
+def ball_and_floor(to_world: np.ndarray) -> np.ndarray:
+    """Depth (SIZE, SIZE) of a ball above an infinite floor; 0 where a ray meets neither."""
+    j, i = np.mgrid[:SIZE, :SIZE] + 0.5
+    local = np.stack([(SIZE / 2 - i) / FOCAL, (SIZE / 2 - j) / FOCAL, np.ones_like(i)], axis=-1)
+    ray, eye = local @ to_world[:3, :3].T, to_world[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        floor = np.where(ray[..., 2] < 0, (FLOOR - eye[2]) / ray[..., 2], np.inf)
+        squared, half = np.sum(ray**2, axis=-1), ray @ (eye - BALL)
+        root = np.sqrt(half**2 - squared * (np.sum((eye - BALL) ** 2) - BALL_RADIUS**2))
+        ball = np.where(np.isfinite(root), (-half - root) / squared, np.inf)
+    depth = np.minimum(floor, ball)
+    return np.where(np.isfinite(depth), depth, 0)
+
+
+def fuse(depths: list[np.ndarray], poses: list[np.ndarray], resolution: int, region: Region) -> tsdf.TSDF:
+    flat = [mi.Float(d.ravel().astype(np.float32)) for d in depths]
+    alpha = [dr.select(d > 0, mi.Float(1), 0) for d in flat]
+    cameras = [Camera.from_pose(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose) for pose in poses]
+    return tsdf.fuse(flat, alpha, cameras, SPACE, resolution, carve=False, region=region)
+
+
+@pytest.fixture(scope="module")
+def ball_mesh() -> Mesh:
+    mi.set_variant("llvm_ad_rgb")
+    poses = ring_of_views(24)
+    return extract_mesh(fuse([ball_and_floor(pose) for pose in poses], poses, 64, REGION))
+
+
+def test_matches_the_float64_specification() -> None:
+    poses = ring_of_views(7)
+    depths = [ball_and_floor(pose) for pose in poses]
+    depths[2][30:40, 30:40] = 0
+    fused = fuse(depths, poses, 24, REGION)
+    rng = np.random.default_rng(2)
+    index = rng.integers(0, fused.volume.shape, (4000, 3))
+    place = fused.origin + fused.voxel * index
+    index = index[np.linalg.norm(place, axis=1) < fused.end]
+    points = REGION.expand(fused.origin + fused.voxel * index)
+    region = np.array(REGION.centre), REGION.radius
+    expected = fused_points(points, depths, poses, FOCAL, fused.voxel, carve=False, region=region)
+    wrong = np.abs(fused.volume[tuple(index.T)] - expected) > 1e-3
+    # Points within rounding of a texel border or of a threshold may fall on its other side.
+    assert wrong.mean() < 0.005, wrong.mean()
+    assert (expected == -1).any() and (expected == 1).any() and (np.abs(expected) < 0.9).mean() > 0.05
+
+
+def test_inside_of_the_region_it_is_the_bounded_field() -> None:
+    """The same voxels in the same places have the same values, if all that they are told of lies inside."""
+    poses = ring_of_views(6)
+    depths = [ref.depth_map(ref.sphere(tuple(BALL), BALL_RADIUS), pose, FOCAL, SIZE) for pose in poses]
+    opened = fuse(depths, poses, 40, REGION)
+    low, high = np.array(REGION.centre) - REGION.radius, np.array(REGION.centre) + REGION.radius
+    flat = [mi.Float(d.ravel().astype(np.float32)) for d in depths]
+    cameras = [Camera.from_pose(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose) for pose in poses]
+    alpha = [dr.select(d > 0, mi.Float(1), 0) for d in flat]
+    bounded = tsdf.fuse(flat, alpha, cameras, (low, high), 40, carve=False)
+    inner = opened.volume[20:61, 20:61, 20:61]
+    corner = np.moveaxis(np.indices(inner.shape), 0, -1) / 20 - 1
+    well_inside = np.linalg.norm(corner, axis=-1) < 1
+    np.testing.assert_allclose(inner[well_inside], bounded.volume[well_inside], atol=2e-3)
+    assert (np.abs(inner[well_inside]) < 0.9).mean() > 0.1
+
+
+def test_near_and_far_surfaces_are_within_a_voxel(ball_mesh: Mesh) -> None:
+    vertices = ball_mesh.vertices.astype(np.float64)
+    assert ball_mesh.voxel == pytest.approx(REGION.radius / 32)
+    distance = np.linalg.norm(vertices - np.array(REGION.centre), axis=1) / REGION.radius
+    place = REGION.contract(vertices)
+    voxel = 1 / 32
+    on_ball = np.abs(np.linalg.norm(vertices - BALL, axis=1) - BALL_RADIUS) / ball_mesh.voxel
+    level = vertices.copy()
+    level[:, 2] = FLOOR
+    on_floor = np.linalg.norm(REGION.contract(level) - place, axis=1) / voxel
+    seen = distance < 12  # farther, no view's picture has a pixel for a voxel
+    error = np.minimum(on_ball, on_floor)[seen]
+    assert np.quantile(error, 0.99) < 1 and np.sqrt(np.mean(error**2)) < 0.35, (
+        np.quantile(error, 0.99),
+        np.sqrt(np.mean(error**2)),
+    )
+    assert (on_ball < 1).sum() > 500 and (distance[on_floor < 1] > 8).sum() > 100
+
+
+def test_it_is_closed_but_for_the_end_of_space_and_winds_outward(ball_mesh: Mesh) -> None:
+    solid = trimesh.Trimesh(ball_mesh.vertices.astype(np.float64), ball_mesh.faces, process=False)
+    assert solid.is_winding_consistent
+    edges, count = np.unique(np.sort(solid.edges, axis=1), axis=0, return_counts=True)
+    single = ball_mesh.vertices[np.unique(edges[count == 1])]
+    place = np.linalg.norm(REGION.contract(single), axis=1)
+    assert len(single) and place.min() > 2 - 6 / 32  # the floor ends where space does, and nowhere else
+    middle, normal = solid.triangles_center, solid.face_normals
+    near = np.linalg.norm(middle - np.array(REGION.centre), axis=1) < 4
+    ball = near & (np.abs(np.linalg.norm(middle - BALL, axis=1) - BALL_RADIUS) < 0.5 * ball_mesh.voxel)
+    outward = (middle - BALL) / np.linalg.norm(middle - BALL, axis=1, keepdims=True)
+    assert np.quantile(np.sum(normal * outward, axis=1)[ball], 0.05) > 0.8
+    floor = near & ~ball & (np.linalg.norm(middle[:, :2] - BALL[:2], axis=1) > 0.6)
+    assert np.quantile(normal[floor, 2], 0.05) > 0.8
+
+
+def test_a_room_is_a_cavity_that_stays() -> None:
+    """A ball in a closed box: what is behind walls was never seen, and a small thing near is no floater."""
+    half = np.full(3, 4.0)
+
+    def shape(points: np.ndarray) -> np.ndarray:
+        ball = np.linalg.norm(points - BALL, axis=-1) - 0.2
+        return np.minimum(ball, np.min(half - np.abs(points), axis=-1))
+
+    poses = [look_at(BALL + eye, BALL + 0.01) for eye in 2.0 * trimesh.creation.icosphere(1).vertices]
+    poses += [look_at(BALL - eye / 4, BALL + 3 * eye) for eye in trimesh.creation.icosphere(0).vertices]
+    depths = [ref.depth_map(shape, pose, FOCAL, SIZE) for pose in poses]
+    mesh = extract_mesh(fuse(depths, poses, 48, REGION))
+    away = np.abs(shape(mesh.vertices.astype(np.float64)))
+    near = np.linalg.norm(mesh.vertices - BALL, axis=1) < 0.5
+    assert near.sum() > 50 and (~near).sum() > 1000
+    assert np.quantile(away[near], 0.95) < mesh.voxel
+    solid = trimesh.Trimesh(mesh.vertices.astype(np.float64), mesh.faces, process=False)
+    inward = -np.sum(solid.face_normals * solid.triangles_center, axis=1)
+    far = np.linalg.norm(solid.triangles_center - BALL, axis=1) > 2
+    assert np.quantile(inward[far], 0.05) > 0  # walls face the room
+
+
+def test_all_views_and_regions_share_one_kernel() -> None:
+    def run(region: Region, count: int) -> None:
+        poses = ring_of_views(8)[:count]
+        fuse([np.full((SIZE, SIZE), 2.0)] * count, poses, 16, region)
+
+    run(REGION, 2)
+    before = dr.detail.launch_stats()
+    run(Region((0.5, 0.0, 0.0), 0.7), 8)
+    assert dr.detail.launch_stats()[1:] == before[1:], "recompiled"
+
+
+def sheet(normal: np.ndarray, points: np.ndarray, size: float) -> Surfels:
+    """Opaque round surfels of one normal."""
+    made = from_points(
+        points,
+        np.tile(normal, (len(points), 1)),
+        rng=np.random.default_rng(0),
+        channels=["radiance_sh"],
+        opacity=0.99,
+    )
+    raw = made.to_numpy()
+    raw["scale"] = np.full_like(raw["scale"], np.log(size))
+    return Surfels.from_numpy(raw)
+
+
+def test_surroundings_are_in_the_mesh_where_it_is_unbounded() -> None:
+    """A small sheet in the region above a wide floor, which is there with its surfels and a region."""
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21)), axis=-1).reshape(-1, 2)
+    up = np.array([0.0, 0.0, 1.0])
+    own = sheet(up, np.column_stack([0.35 * grid + [0.1, -0.1], np.full(len(grid), 0.2)]), 0.03)
+    floor = sheet(up, np.column_stack([5 * grid, np.full(len(grid), -0.6)]), 0.4)
+    cameras = [
+        Camera.from_pose(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, look_at(eye, np.zeros(3)))
+        for eye in (np.array([x, y, 2.0]) for x, y in ((2, 0), (0, 2), (-2, 0.1), (0.1, -2)))
+    ]
+    with dr.suspend_grad():
+        both = surface_of(own, cameras, 64, floor, REGION)
+        alone = surface_of(own, cameras, 64)
+    assert np.abs(alone.vertices[:, :2]).max() < 1
+    far = np.linalg.norm(both.vertices[:, :2], axis=1) > 2.5
+    assert far.sum() > 100
+    top = both.vertices[far & (both.vertices[:, 2] > -0.75)]
+    assert len(top) > 50 and np.abs(top[:, 2] + 0.6).mean() < 3 * both.voxel
+    on_sheet = np.abs(both.vertices - [0.1, -0.1, 0.2]).max(axis=1) < 0.3
+    assert np.abs(both.vertices[on_sheet][:, 2] - 0.2).min() < both.voxel
+
+
+def test_relighting_keeps_what_is_around_out_of_the_mesh() -> None:
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), axis=-1).reshape(-1, 2)
+    raw = sheet(np.array([0.0, 0.0, 1.0]), np.column_stack([grid, np.zeros(len(grid))]), 0.1).to_numpy()
+    raw |= {"albedo": np.zeros((81, 3)), "metallic": np.zeros((81, 1)), "roughness": np.zeros((81, 1))}
+    balls = [trimesh.creation.icosphere(2, 0.08), trimesh.creation.icosphere(2, 0.5)]
+    balls[1].apply_translation([6, 0, 0])
+    joined: Any = trimesh.util.concatenate(balls)
+    mesh = Mesh(np.asarray(joined.vertices, np.float32), np.asarray(joined.faces, np.uint32), 0.01)
+    surfels = Surfels.from_numpy({name: np.asarray(values, np.float32) for name, values in raw.items()})
+    shading = Shading(diffuse="irradiance", occlusion=True)
+    scene = TrainedScene(surfels, EnvironmentLight.constant(1.0, 8), mesh, shading, 1, 0.0)
+    assert relightable(scene).mesh is mesh
+    lit = relightable(replace(scene, surroundings=Surroundings(surfels)))
+    assert lit.mesh is not None and lit.surroundings is None
+    np.testing.assert_allclose(np.linalg.norm(lit.mesh.vertices, axis=1), 0.08, rtol=1e-3)
+    assert len(lit.mesh.faces) == len(balls[0].faces)

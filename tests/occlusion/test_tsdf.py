@@ -1,0 +1,255 @@
+"""Depth fusion and extraction against shapes whose distance is known, and against the float64
+specification."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from mi_refgs.errors import InputError
+from mi_refgs.occlusion import mesh as meshes
+from mi_refgs.occlusion import tsdf
+from mi_refgs.reference import occlusion as ref
+from mi_refgs.reference.camera import look_at
+from mi_refgs.splat.camera import Camera
+from tests.occlusion.fusion_oracle import fused_points
+
+SIZE = 96
+FOCAL = SIZE / (2 * np.tan(np.radians(20)))
+BOX = (np.full(3, -1.25), np.full(3, 1.25))
+
+SHAPES = {"sphere": ref.sphere((0, 0, 0), 1), "torus": ref.torus(0.8, 0.3)}
+
+
+def directions(count: int) -> np.ndarray:
+    """Fibonacci points on the unit sphere."""
+    i = np.arange(count) + 0.5
+    z, phi = 1 - 2 * i / count, i * np.pi * (1 + 5**0.5)
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
+
+
+def ring_of_views(where: np.ndarray) -> list[np.ndarray]:
+    return [look_at(4.0 * d, np.zeros(3)) for d in where]
+
+
+def camera(pose: np.ndarray) -> Camera:
+    return Camera.from_pose(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose)
+
+
+def fuse(
+    depths: list[np.ndarray], poses: list[np.ndarray], resolution: int = 48, carve: bool = True
+) -> tsdf.TSDF:
+    flat = [mi.Float(d.ravel().astype(np.float32)) for d in depths]
+    alpha = [dr.select(d > 0, mi.Float(0.6), 0.4) for d in flat]
+    flat = [dr.select(d > 0, d, 3.5) for d in flat]  # a faint veil is no surface, whatever its depth
+    return tsdf.fuse(flat, alpha, [camera(p) for p in poses], BOX, resolution, carve=carve)
+
+
+def as_trimesh(mesh: meshes.Mesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices.astype(np.float64), mesh.faces, process=False)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_surface_is_closed_outward_and_within_a_voxel(name: str) -> None:
+    """Both directions of the Hausdorff distance, so that neither extra nor missing surface passes."""
+    shape = SHAPES[name]
+    poses = ring_of_views(directions(12))
+    depths = [ref.depth_map(shape, p, FOCAL, SIZE) for p in poses]
+    fused = fuse(depths, poses)
+    start = time.perf_counter()
+    fused = fuse(depths, poses)
+    middle = time.perf_counter()
+    mesh = meshes.extract_mesh(fused)
+    print(
+        f"{name}: fuse {1e3 * (middle - start):.0f} ms, extract {1e3 * (time.perf_counter() - middle):.0f} ms"
+    )
+    error = np.abs(shape(mesh.vertices.astype(np.float64))) / mesh.voxel
+    solid = as_trimesh(mesh)
+    assert error.max() < 1 and np.sqrt(np.mean(error**2)) < 0.2, (error.max(), np.sqrt(np.mean(error**2)))
+    assert solid.is_watertight and solid.is_winding_consistent
+    assert solid.area_faces.min() > 0
+    assert len(np.unique(mesh.faces)) == len(mesh.vertices)
+    assert solid.euler_number == (2 if name == "sphere" else 0)
+    volume = {"sphere": 4 / 3 * np.pi, "torus": 2 * np.pi**2 * 0.8 * 0.3**2}[name]
+    assert abs(solid.volume / volume - 1) < 0.03
+    points = np.random.default_rng(1).uniform(-1.2, 1.2, (4000, 3))
+    for _ in range(4):
+        points -= shape(points)[:, None] * ref.normal(shape, points)
+    away, _ = cKDTree(mesh.vertices).query(points)
+    assert away.max() < 1.5 * mesh.voxel  # the nearest vertex, not the nearest point: up to ½ face more
+
+
+@pytest.mark.parametrize("carve", [True, False])
+def test_matches_the_float64_specification(carve: bool) -> None:
+    """Two objects, one hiding the other, one view with a hole in it, and one that sees only part of the
+    box."""
+    shape = ref.union(ref.sphere((0.2, 0, 0.3), 0.6), ref.box((0, 0.1, -0.7), (0.9, 0.8, 0.15)))
+    poses = ring_of_views(directions(9)[1:])
+    poses[3][:3, 3] += np.array([1.5, 0.5, 0])
+    depths = [ref.depth_map(shape, p, FOCAL, SIZE) for p in poses]
+    depths[2][40:50, 40:50] = 0
+    fused = fuse(depths, poses, 40, carve=carve)
+    index = np.random.default_rng(2).integers(0, fused.volume.shape, (2500, 3))
+    points = fused.origin + fused.voxel * index
+    expected = fused_points(points, depths, poses, FOCAL, fused.voxel, carve=carve)
+    wrong = np.abs(fused.volume[tuple(index.T)] - expected) > 1e-4
+    # Points within rounding of a texel border or of a threshold may fall on its other side.
+    assert wrong.mean() < 0.003, wrong.mean()
+    # The scene shows every kind of voxel.
+    assert (expected == -1).any() and (expected == 1).any() and (np.abs(expected) < 0.9).any()
+
+
+def test_views_from_above_still_give_a_solid() -> None:
+    """The underside is nobody's: it is bounded by the visual hull, and there is no second wall behind the
+    surface."""
+    where = directions(24)
+    poses = ring_of_views(where[where[:, 2] > 0.05])
+    depths = [ref.depth_map(SHAPES["sphere"], p, FOCAL, SIZE) for p in poses]
+    mesh = meshes.extract_mesh(fuse(depths, poses))
+    solid = as_trimesh(mesh)
+    assert solid.is_watertight and len(solid.split()) == 1
+    top = mesh.vertices[mesh.vertices[:, 2] > 0.2]
+    assert np.abs(np.linalg.norm(top, axis=1) - 1).max() < mesh.voxel
+
+
+def test_one_leaking_view_drills_no_tunnel() -> None:
+    """A hole in the alpha of one of 24 views would otherwise carve through the whole object."""
+    poses = ring_of_views(directions(24))
+    depths = [ref.depth_map(SHAPES["sphere"], p, FOCAL, SIZE) for p in poses]
+    depths[5][44:52, 44:52] = 0
+    fused = fuse(depths, poses)
+    corner = fused.origin + fused.voxel * np.moveaxis(np.indices(fused.volume.shape), 0, -1)
+    assert (fused.volume[SHAPES["sphere"](corner) < -6 * fused.voxel] == -1).all()
+    solid = as_trimesh(meshes.extract_mesh(fused))
+    assert solid.is_watertight and solid.euler_number == 2
+    assert abs(solid.volume / (4 / 3 * np.pi) - 1) < 0.03
+
+
+def test_floaters_go_and_second_objects_stay() -> None:
+    """A speck of 0.1 radius beside two balls; the wall of a cavity inside is no object either."""
+    shape = ref.union(
+        ref.sphere((-0.5, 0, 0), 0.5), ref.sphere((0.7, 0, 0), 0.3), ref.sphere((0, 0.9, 0.9), 0.1)
+    )
+    axes = [np.linspace(-1.2, 1.2, 61)] * 3
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    cavity = 0.3 - np.linalg.norm(grid - np.array([-0.5, 0, 0]), axis=-1)
+    volume = np.clip(np.maximum(shape(grid), cavity) / 0.2, -1, 1).astype(np.float32)
+    mesh = meshes.extract_mesh(tsdf.TSDF(volume, np.full(3, -1.2), 0.04))
+    parts = as_trimesh(mesh).split()
+    assert sorted(round(float(p.volume), 1) for p in parts) == [0.1, 0.5]
+    assert (shape(mesh.vertices) < 0.04).all() and mesh.vertices[:, 1].max() < 0.6
+
+
+def test_objects_cut_by_the_box_get_a_lid() -> None:
+    """A field that is inside everywhere still gives a closed box; exact zeros give no degenerate triangle."""
+    mesh = meshes.extract_mesh(tsdf.TSDF(np.full((4, 5, 6), -1, np.float32), np.zeros(3), 0.5))
+    assert as_trimesh(mesh).is_watertight
+    mesh = meshes.extract_mesh(tsdf.TSDF(np.zeros((3, 3, 3), np.float32), np.zeros(3), 0.5))
+    assert len(mesh.faces) == 0
+    volume = np.ones((5, 5, 5), np.float32)
+    volume[2, 2, 2], volume[1, 2, 2] = -1, 0
+    solid = as_trimesh(meshes.extract_mesh(tsdf.TSDF(volume, np.zeros(3), 0.5)))
+    assert solid.is_watertight and solid.area_faces.min() > 0
+
+
+def test_nothing_seen_is_an_empty_mesh() -> None:
+    """All-background, NaN depth, and no views at all."""
+    poses = ring_of_views(directions(2))
+    for value in (0.0, np.nan, np.inf):
+        depth = mi.TensorXf(np.full((SIZE, SIZE), value, np.float32))
+        alpha = mi.TensorXf(np.full((SIZE, SIZE), 1.0 if value else 0.0, np.float32))
+        fused = tsdf.fuse([depth] * 2, [alpha] * 2, [camera(p) for p in poses], BOX, 16)
+        assert np.isfinite(fused.volume).all()
+        assert len(meshes.extract_mesh(fused).faces) == 0
+    assert (tsdf.fuse([], [], [], BOX, 16).volume == 1).all()
+
+
+def test_all_views_share_one_kernel() -> None:
+    """Other poses, image sizes, boxes and views compile nothing; generators are read once."""
+    pose = ring_of_views(directions(7))
+
+    def views(size: int, count: int) -> Iterator[Camera]:
+        for p in pose[:count]:
+            yield Camera.from_pose(size, size, -FOCAL, -FOCAL, size / 2, size / 2, p)
+
+    def run(size: int, count: int, shift: float) -> None:
+        image = [dr.full(mi.Float, 4, size * size)] * count
+        tsdf.fuse(iter(image), iter(image), views(size, count), (BOX[0] + shift, BOX[1] + shift), 24)
+
+    run(32, 2, 0.0)
+    before = dr.detail.launch_stats()
+    run(40, 7, 0.1)
+    after = dr.detail.launch_stats()
+    assert after[1:] == (before[1], before[2]), "recompiled"
+    assert after[0] - before[0] < 7 * 3 + 8
+
+
+def test_bounds_ignore_floaters_but_keep_thin_ends() -> None:
+    """1 % of points ten sizes away; a pole with 0.5 % of the points."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1, 1, (10000, 3))
+    points[:100] = rng.normal(0, 10, (100, 3))
+    points[100:150] = np.stack([np.zeros(50), np.zeros(50), rng.uniform(1, 1.3, 50)], axis=1)
+    points[200] = np.nan
+    lo, hi = tsdf.bounds_from_points(points)
+    assert (lo < -1).all() and (hi > 1).all() and hi[2] > 1.3
+    assert (hi - lo).max() < 4
+    lo, hi = tsdf.bounds_from_points(np.array([[5.0, 5, 5]]))
+    assert (hi.astype(np.float32) > lo.astype(np.float32)).all()
+    with pytest.raises(InputError, match="position"):
+        tsdf.bounds_from_points(np.full((4, 3), np.nan))
+
+
+def test_bad_arguments() -> None:
+    """One sentence each."""
+    with pytest.raises(InputError, match="no volume"):
+        tsdf.fuse([], [], [], (np.zeros(3), np.zeros(3)), 32)
+    with pytest.raises(InputError, match="resolution"):
+        tsdf.fuse([], [], [], BOX, 4096)
+    with pytest.raises(ValueError, match="pixels"):
+        tsdf.fuse([mi.Float(1, 2)], [mi.Float(1, 2)], [camera(np.eye(4))], BOX, 8)
+
+
+def test_a_part_of_a_mesh_has_whole_triangles_and_their_vertices_alone() -> None:
+    vertices = np.arange(15, dtype=np.float32).reshape(5, 3)
+    mesh = meshes.Mesh(vertices, np.array([[0, 1, 2], [4, 3, 1], [2, 1, 3]], np.uint32), 0.1)
+    part = mesh.of_vertices(np.array([True, True, False, True, True]))
+    np.testing.assert_array_equal(part.vertices, vertices[[1, 3, 4]])
+    np.testing.assert_array_equal(part.faces, [[2, 1, 0]])
+    assert part.voxel == 0.1 and part.faces.dtype == np.uint32
+    assert mesh.of_vertices(np.zeros(5, bool)).faces.shape == (0, 3)
+
+
+def test_mesh_file_round_trip(tmp_path: Path) -> None:
+    """Vertices, faces, voxel, and the empty mesh; foreign files get a voxel from their edges."""
+    solid = trimesh.creation.icosphere(2)
+    mesh = meshes.Mesh(np.asarray(solid.vertices, np.float32), np.asarray(solid.faces, np.uint32), 0.0123)
+    for case in (mesh, meshes.Mesh.empty(0.5)):
+        meshes.write_mesh(tmp_path / "mesh.ply", case)
+        back = meshes.read_mesh(tmp_path / "mesh.ply")
+        assert back.voxel == case.voxel
+        np.testing.assert_array_equal(back.vertices, case.vertices)
+        np.testing.assert_array_equal(back.faces, case.faces)
+    assert [p.name for p in tmp_path.iterdir()] == ["mesh.ply"]
+    meshes.write_mesh(tmp_path / "mesh.ply", mesh)
+    assert mi.load_dict({"type": "ply", "filename": str(tmp_path / "mesh.ply")}).face_count() == len(
+        mesh.faces
+    )
+    solid.export(tmp_path / "foreign.obj")
+    assert meshes.read_mesh(tmp_path / "foreign.obj").voxel == pytest.approx(12**0.5 / 256, rel=0.2)
+    with pytest.raises(InputError, match="no such file"):
+        meshes.read_mesh(tmp_path / "none.ply")
+    (tmp_path / "bad.ply").write_text("hello")
+    with pytest.raises(InputError, match="not a PLY file"):
+        meshes.read_mesh(tmp_path / "bad.ply")
+    with pytest.raises(InputError, match="cannot be written"):
+        meshes.write_mesh(tmp_path / "no" / "mesh.ply", mesh)

@@ -1,0 +1,264 @@
+"""The `refgs` plugin: scenes, lights, parameters, refusals, variants."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mi_refgs.constants import TILE_SIZES, tile_size
+from mi_refgs.reference.camera import look_at
+from mi_refgs.render.pipeline import render
+from mi_refgs.render.scene_xml import write_scene_xml
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.ply import write_ply
+from mi_refgs.surfels.table import Surfels
+from tests.scenes.integrator import (
+    COUNT,
+    HEIGHT,
+    WIDTH,
+    image,
+    integrator,
+    plane_mesh,
+    raw_channels,
+    refused,
+    scene,
+    sensor,
+    sky,
+)
+
+
+def run_folder(folder: Path, background: tuple[float, float, float] | None = None) -> tuple[Surfels, Camera]:
+    """What a fit leaves behind, with a principal point off the centre."""
+    surfels = Surfels.from_numpy(raw_channels())
+    write_ply(folder / "surfels.ply", surfels)
+    EnvironmentLight.from_radiance(sky()).write(folder / "envmap.exr")
+    plane_mesh(folder)
+    shifted = sensor(principal_point_offset_x=0.1, principal_point_offset_y=-0.2)
+    camera = Camera.from_sensor(mi.load_dict(shifted))
+    write_scene_xml(
+        folder / "scene.xml",
+        ply="surfels.ply",
+        envmap="envmap.exr",
+        mesh="mesh.ply",
+        shading=Shading(occlusion=True),
+        camera=camera,
+        background=background,
+    )
+    return surfels, camera
+
+
+def test_exported_scene_renders_the_same_view(tmp_path: Path) -> None:
+    surfels, camera = run_folder(tmp_path)
+    loaded = mi.load_file(str(tmp_path / "scene.xml"))
+    occluder = loaded.integrator().occluder
+    light = EnvironmentLight.from_radiance(sky()).prefilter()
+    frame = render(surfels, camera, Shading(occlusion=True), light, occluder)
+    expected = np.concatenate([frame.radiance.numpy(), frame.alpha.numpy()[None]]).T.reshape(HEIGHT, WIDTH, 4)
+    result = image(loaded)
+    assert expected[..., 3].max() > 0.5
+    assert np.ptp(loaded.integrator().occluder.mesh().vertices) > 0
+    np.testing.assert_allclose(result, expected, atol=1e-5)
+    assert image(mi.load_file(str(tmp_path / "scene.xml"), spp=4)).shape == result.shape
+
+
+def test_parameter_keys_do_not_depend_on_the_address(tmp_path: Path) -> None:
+    run_folder(tmp_path, background=(1, 0.5, 0.25))
+    params = mi.traverse(mi.load_file(str(tmp_path / "scene.xml")))
+    assert [key.removeprefix("refgs.") for key in params.keys() if key.startswith("refgs.")] == [
+        *raw_channels(),
+        "light",
+    ]
+    anonymous = '<scene version="3.0.0"><integrator type="refgs">'
+    anonymous += f'<string name="filename" value="{tmp_path}/surfels.ply"/>'
+    params = mi.traverse(mi.load_string(anonymous + "</integrator></scene>"))
+    assert "refgs.roughness" in params and "refgs.light" not in params
+
+
+def test_background_is_under_alpha(tmp_path: Path) -> None:
+    run_folder(tmp_path)
+    transparent = image(mi.load_file(str(tmp_path / "scene.xml")))
+    run_folder(tmp_path, background=(1, 0.5, 0.25))
+    opaque = image(mi.load_file(str(tmp_path / "scene.xml")))
+    assert np.all(opaque[..., 3] == 1)
+    expected = transparent[..., :3] + (1 - transparent[..., 3:]) * np.array([1, 0.5, 0.25])
+    np.testing.assert_allclose(opaque[..., :3], expected, atol=1e-6)
+
+
+def test_light_of_the_scene_equals_own_light(tmp_path: Path) -> None:
+    EnvironmentLight.from_radiance(sky()).write(tmp_path / "sky.exr")
+    turn = mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 70)
+    for transform in (mi.ScalarTransform4f(), turn):
+        emitter = {
+            "type": "envmap",
+            "filename": str(tmp_path / "sky.exr"),
+            "scale": 2.0,
+            "to_world": transform,
+        }
+        nested = image(scene(light=emitter))
+        channels = integrator()
+        del channels["light"]
+        outside = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor(), "sky": emitter})
+        np.testing.assert_allclose(image(outside), nested, atol=1e-5)
+    assert np.abs(nested - image(scene())).max() > 0.05
+
+
+def test_turned_light_turns_with_the_scene(tmp_path: Path) -> None:
+    """Rotating the light, the surfels' SH-free part and the camera together changes nothing."""
+    EnvironmentLight.from_radiance(sky()).write(tmp_path / "sky.exr")
+    turn = mi.ScalarTransform4f().rotate([0, 1, 0], 90)  # a quarter turn about the pole moves whole columns
+    raw = {
+        name: values for name, values in raw_channels().items() if name not in ("radiance_sh", "indirect_sh")
+    }
+    matrix = np.array(turn.matrix)[:3, :3]
+    turned = dict(raw, position=(raw["position"] @ matrix.T).astype(np.float32))
+    rotation = Rotation.from_matrix(matrix) * Rotation.from_quat(raw["rotation"])
+    turned["rotation"] = rotation.as_quat().astype(np.float32)
+    emitter = {"type": "envmap", "filename": str(tmp_path / "sky.exr")}
+    before = image(scene(raw=raw, light=emitter))
+    moved = sensor(to_world=turn @ sensor()["to_world"])
+    after = image(scene(moved, raw=turned, light=dict(emitter, to_world=turn)))
+    np.testing.assert_allclose(after, before, atol=2e-4)
+    assert np.abs(image(scene(moved, raw=turned, light=emitter)) - before).max() > 0.02
+
+
+def test_constant_emitters() -> None:
+    channels = integrator()
+    del channels["light"]
+    emitter = {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1.0, 2.0]}}
+    own = image(scene(light=emitter))
+    outside = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor(), "sky": emitter})
+    np.testing.assert_allclose(image(outside), own, rtol=1e-3, atol=1e-4)
+    assert mi.traverse(scene(light=emitter))["integrator.light"].shape[2] == 3
+
+
+def test_terms_add_up_and_radiance_needs_no_light() -> None:
+    parts = [image(scene(terms=term)) for term in ("diffuse", "specular", "indirect")]
+    np.testing.assert_allclose(sum(parts), image(scene()), atol=1e-5)
+    assert parts[0].max() > 0.1 and parts[1].max() > 0.01
+    channels = integrator(reflectance="radiance")
+    del channels["light"]
+    bare = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor()})
+    assert image(bare).max() > 0.1
+
+
+def test_shapes_of_the_scene_are_not_rendered() -> None:
+    ball = {"type": "sphere", "radius": 2.0}
+    both = mi.load_dict({"type": "scene", "integrator": integrator(), "sensor": sensor(), "ball": ball})
+    np.testing.assert_array_equal(image(both), image(scene()))
+
+
+# ---------------- parameters ----------------
+
+
+def test_surfel_count_may_change() -> None:
+    of, other = scene(), raw_channels(COUNT + 9, seed=5)
+    params = mi.traverse(of)
+    tensors = {name: params[f"integrator.{name}"] for name in other}
+    for name, values in other.items():
+        params[f"integrator.{name}"] = mi.TensorXf(values)
+    params.update()
+    np.testing.assert_array_equal(image(of), image(scene(raw=other)))
+    assert of.integrator().surfels.count == COUNT + 9
+    assert all(of.integrator().surfels.raw[name] is tensor for name, tensor in tensors.items())
+
+
+@pytest.mark.parametrize(
+    ("key", "shape", "words"),
+    [
+        ("position", (3, 3), "rotation: shape"),
+        ("rotation", (COUNT, 3), "rotation: 3 columns"),
+        ("opacity", (COUNT,), "opacity: shape"),
+        ("radiance_sh", (COUNT, 10), "radiance_sh: 10 columns"),
+        ("light", (8, 8, 3), "light: shape"),
+    ],
+)
+def test_wrong_shapes_are_refused(key: str, shape: tuple[int, ...], words: str) -> None:
+    params = mi.traverse(scene())
+    params[f"integrator.{key}"] = dr.zeros(mi.TensorXf, shape)
+    with pytest.raises(Exception, match=words):
+        params.update()
+
+
+# ---------------- refusals ----------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"shade_at": "voxel"}, "shade_at: 'voxel' is unknown"),
+        ({"reflectance": "phong"}, "reflectance: 'phong'"),
+        ({"terms": "diffuse,caustic"}, "terms: 'caustic'"),
+        ({"terms": ""}, "terms: '' names none; use some of diffuse, specular, indirect"),
+        ({"terms": " ,"}, "terms: ' ,' names none"),
+        ({"aovs": "normal"}, "<name>:<type>"),
+        ({"aovs": "a:colour"}, "unknown type 'colour'"),
+        ({"aovs": "a:depth,a:normal"}, "occurs twice"),
+        ({"occlusion": True}, "no mesh"),
+        ({"mesh": "nowhere.ply"}, "nowhere.ply: mesh: no such file"),
+        ({"filename": "nowhere.ply"}, "nowhere.ply: file: cannot be read"),
+        ({"light": {"type": "point"}}, "not a PointLight"),
+        ({"max_depth": 3}, "unreferenced property"),
+    ],
+)
+def test_bad_properties_are_refused(changes: dict, words: str) -> None:
+    with pytest.raises(Exception, match=words):
+        mi.load_dict(integrator(**changes))
+
+
+def test_missing_channels_are_refused() -> None:
+    raw = raw_channels()
+    del raw["roughness"]
+    with pytest.raises(Exception, match="roughness: the surfels have no such channel"):
+        mi.load_dict(integrator(raw, reflectance="split_sum"))
+    with pytest.raises(Exception, match="there are no surfels"):
+        mi.load_dict({"type": "refgs"})
+    channels = integrator()
+    del channels["light"]
+    dark = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor()})
+    refused("light: there is none", lambda: image(dark))
+
+
+def test_nesting_in_stock_integrators_is_refused() -> None:
+    nested = {"type": "aov", "aovs": "d:depth", "inner": integrator()}
+    outer = mi.load_dict({"type": "scene", "integrator": nested, "sensor": sensor()})
+    refused("whole images only", lambda: image(outer))
+
+
+@pytest.mark.parametrize("factor", [1 - 1e-3, 1, 1 + 1e-3])
+@pytest.mark.parametrize("limit", [limit for limit, _ in TILE_SIZES[:-1]])
+@pytest.mark.parametrize("size", [(512, 512), (1024, 1024), (801, 333)])
+def test_an_exported_scene_has_the_trainers_tiles(
+    size: tuple[int, int], limit: float, factor: float, tmp_path: Path
+) -> None:
+    """Also at the focal lengths where tiles change size: a sensor's float32 rays give 511.9998 for 512."""
+    width, height = size
+    focal = limit * factor
+    pose = look_at(np.random.default_rng(1).normal(size=3), np.zeros(3))
+    camera = Camera.from_pose(width, height, -focal, -focal, width / 2 + 3, height / 2 - 5, pose, 0.01)
+    write_scene_xml(tmp_path / "scene.xml", ply="a.ply", shading=Shading(), camera=camera)
+    root = ElementTree.parse(tmp_path / "scene.xml").getroot()
+    root.remove(root.find("integrator"))  # type: ignore[arg-type]
+    exported = Camera.from_sensor(mi.load_string(ElementTree.tostring(root, encoding="unicode")).sensors()[0])
+    assert exported.focal == pytest.approx(focal, rel=2e-6)
+    assert exported.tile == camera.tile == tile_size(focal)
+
+
+# ---------------- variants ----------------
+
+
+def test_variants() -> None:
+    of = scene()
+    before = image(of)
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(Exception, match="'scalar_rgb' is not supported"):
+        mi.load_dict({"type": "refgs"})
+    mi.set_variant("llvm_ad_rgb")
+    np.testing.assert_array_equal(image(scene()), before)

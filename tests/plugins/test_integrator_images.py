@@ -1,0 +1,129 @@
+"""Images of the `refgs` plugin: AOVs, films, crop windows, samples, sensors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.constants import tile_size
+from tests.scenes.integrator import (
+    HEIGHT,
+    WIDTH,
+    image,
+    plane_mesh,
+    refused,
+    scene,
+    sensor,
+)
+
+EVERY_AOV = "al:albedo,m:metallic,r:roughness,n:normal,dd.y:depth,a:alpha,v:visibility"
+EVERY_AOV += ",di:diffuse,sp:specular,ind:indirect"
+
+
+def test_aovs_follow_mitsubas_names(tmp_path: Path) -> None:
+    of = scene(sensor(film={"pixel_format": "rgba"}), aovs=EVERY_AOV, mesh=plane_mesh(tmp_path))
+    names = ["al.R", "al.G", "al.B", "m.Y", "r.Y", "n.X", "n.Y", "n.Z", "dd.y.T", "a.Y", "v.Y"]
+    names += [f"{term}.{c}" for term in ("di", "sp", "ind") for c in "RGB"]
+    assert of.integrator().aov_names() == names
+    result = image(of)
+    assert result.shape == (HEIGHT, WIDTH, 4 + len(names))
+    rgb, alpha, aov = (
+        result[..., :3],
+        result[..., 3],
+        dict(zip(names, np.moveaxis(result[..., 4:], 2, 0), strict=True)),
+    )
+    np.testing.assert_array_equal(aov["a.Y"], alpha)
+    for i, c in enumerate("RGB"):
+        np.testing.assert_allclose(aov[f"di.{c}"] + aov[f"sp.{c}"] + aov[f"ind.{c}"], rgb[..., i], atol=1e-6)
+    seen = alpha > 0.01
+    assert seen.any() and not seen.all()
+    length = sum(aov[f"n.{c}"] ** 2 for c in "XYZ")
+    np.testing.assert_allclose(length[seen], 1, atol=1e-5)
+    assert 0 < aov["v.Y"][seen].mean() < 1 and aov["ind.R"].max() > 0
+    assert np.all((aov["r.Y"][seen] > 0) & (aov["r.Y"][seen] < 1))
+    assert all(np.all(values[alpha == 0] == 0) for values in aov.values())
+    # The film holds the same picture, in layers.
+    layers = dict(of.sensors()[0].film().bitmap().split())
+    assert set(layers) == {"<root>", "al", "m", "r", "n", "dd.y", "a", "v", "di", "sp", "ind"}
+    assert np.allclose(
+        np.array(layers["n"]), np.stack([aov[f"n.{c}"] for c in "XYZ"], -1), atol=1e-3
+    )  # float16 film
+
+
+def test_depth_is_that_of_mitsuba() -> None:
+    """One large opaque disc against a rectangle in the same plane under Mitsuba's own `aov` integrator."""
+    raw = {
+        "position": [[0, 0, 0]],
+        "rotation": [[0, 0, 0, 1]],
+        "scale": np.log([[50.0, 50.0]]),
+        "opacity": [[9.0]],
+        "radiance_sh": [[1.0, 1.0, 1.0]],
+    }
+    view = sensor(near_clip=0.5, film={"width": 5, "height": 5})
+    channels = {name: mi.TensorXf(np.array(values, np.float32)) for name, values in raw.items()}
+    ours = {"type": "refgs", "aovs": "d:depth", **channels}
+    plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100)}
+    stock = mi.load_dict(
+        {"type": "scene", "integrator": {"type": "aov", "aovs": "d:depth"}, "sensor": view, "plate": plate}
+    )
+    reference = image(stock, spp=4096)[..., 0]
+    depth = image(mi.load_dict({"type": "scene", "integrator": ours, "sensor": view}), spp=64)[..., 3]
+    np.testing.assert_allclose(depth, reference, rtol=1e-2)  # the noise of the reference's jitter
+
+
+def test_supersampling_is_a_box_filter_over_pixel_centres() -> None:
+    fine = image(scene(sensor(film={"width": 3 * WIDTH, "height": 3 * HEIGHT})))
+    mean = fine.reshape(HEIGHT, 3, WIDTH, 3, 3).mean((1, 3))
+    of = scene()
+    for spp in (5, 9):
+        np.testing.assert_allclose(image(of, spp=spp), mean, atol=2e-5)
+    np.testing.assert_array_equal(image(of), image(of, spp=1, seed=7))
+    assert np.abs(image(of) - mean).max() > 1e-3
+
+
+@pytest.mark.parametrize("spp", [1, 4])
+def test_crop_window_is_part_of_the_whole(spp: int) -> None:
+    crop = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 9, "crop_height": 7}
+    part = scene(sensor(film=crop))
+    np.testing.assert_allclose(image(part, spp=spp), image(scene(), spp=spp)[2:9, 3:12], atol=2e-5)
+    assert list(part.sensors()[0].film().bitmap().size()) == [9, 7]
+
+
+def test_principal_point_moves_the_image() -> None:
+    # By whole tiles, in which surfels have an order.
+    dx, dy = tile_size(WIDTH)
+    moved = image(scene(sensor(principal_point_offset_x=dx / WIDTH, principal_point_offset_y=dy / HEIGHT)))
+    still = image(scene())
+
+    def difference(down: int, right: int) -> float:
+        kept = np.s_[max(down, 0) : HEIGHT + min(down, 0), max(right, 0) : WIDTH + min(right, 0)]
+        return float(np.abs(np.roll(still, (down, right), (0, 1)) - moved)[kept].max())
+
+    shifts = [difference(*offset) for offset in ((dy, dx), (dy, -dx), (-dy, dx), (-dy, -dx))]
+    assert min(shifts) < 2e-5
+
+
+def test_film_writes_and_luminance_films_work(tmp_path: Path) -> None:
+    of = scene()
+    result = image(of)
+    of.sensors()[0].film().write(str(tmp_path / "out.exr"))
+    written = np.array(mi.Bitmap(str(tmp_path / "out.exr")))
+    np.testing.assert_allclose(written, result, atol=2e-3)  # float16 film
+    grey = image(scene(sensor(film={"pixel_format": "luminance"})))
+    np.testing.assert_allclose(grey[..., 0], result @ [0.212671, 0.71516, 0.072169], atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["thinlens", "orthographic", "batch"])
+def test_other_sensors_are_refused(kind: str) -> None:
+    camera = sensor(type=kind)
+    if kind == "thinlens":
+        camera |= {"aperture_radius": 0.1, "focus_distance": 3.0}
+    else:
+        del camera["fov"]
+    if kind == "batch":
+        del camera["to_world"]
+        camera["a"] = sensor()
+    refused("use a `perspective` sensor", lambda: image(scene(camera)))

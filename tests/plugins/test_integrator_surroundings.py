@@ -1,0 +1,160 @@
+"""The plugin, scene.xml and a run's files with what is around and behind the object, and the object alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.errors import InputError
+from mi_refgs.io.exr import read_exr_image
+from mi_refgs.render.pipeline import render
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.export import AROUND_FILE, BACKGROUND_MAP, SCENE, TrainedScene, export
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.ply import write_ply
+from mi_refgs.surfels.table import Surfels
+from tests.plugins.test_integrator_derivatives import check_derivatives
+from tests.scenes.integrator import HEIGHT, WIDTH, image, raw_channels, refused, scene, sensor, sky
+
+PREFIX = "surroundings_"
+
+
+def far_channels(count: int = 30) -> dict[str, np.ndarray]:
+    """Discs around the object, some of them before it, with radiance alone."""
+    raw = raw_channels(count, seed=4)
+    raw["position"] = 1.7 * raw["position"]
+    return {name: raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
+
+
+def behind() -> EnvironmentLight:
+    return EnvironmentLight.from_radiance(0.3 + sky(16))
+
+
+def open_scene(camera: dict | None = None, **changes: Any) -> mi.Scene:
+    around = {PREFIX + name: mi.TensorXf(values) for name, values in far_channels().items()}
+    return scene(camera, **{**around, "background": behind().raw, **changes})
+
+
+def camera() -> Camera:
+    return Camera.from_sensor(mi.load_dict(sensor()))
+
+
+@pytest.mark.parametrize("key", [*(PREFIX + name for name in far_channels()), "background", "albedo"])
+def test_derivatives_of_what_is_around(key: str) -> None:
+    check_derivatives(open_scene(), f"integrator.{key}")
+
+
+@pytest.mark.parametrize("key", [f"{PREFIX}position", f"{PREFIX}radiance_sh", "background", "radiance_sh"])
+def test_derivatives_when_shading_at_surfels(key: str) -> None:
+    check_derivatives(open_scene(shade_at="surfel"), f"integrator.{key}", spp=4)
+
+
+def test_the_picture_is_that_of_the_renderer() -> None:
+    """All over what is behind, opaque; and without both the object alone, transparent."""
+    rgba = sensor(film={"pixel_format": "rgba"})
+    seen = image(open_scene(rgba))
+    surfels, light = Surfels.from_numpy(raw_channels()), EnvironmentLight.from_radiance(sky())
+    around = Surroundings(Surfels.from_numpy(far_channels()), behind())
+    shading = Shading()
+    frame = render(surfels, camera(), shading, shading.light_of(light), surroundings=around)
+    expected = frame.radiance + (1 - frame.alpha) * frame.background
+    np.testing.assert_allclose(seen[..., :3].reshape(-1, 3), expected.numpy().T, atol=1e-5)
+    np.testing.assert_array_equal(seen[..., 3], 1)
+    transparent = image(scene(rgba))
+    assert transparent[..., 3].min() < 0.5 and np.abs(transparent[..., :3] - seen[..., :3]).max() > 0.1
+
+
+def test_one_of_the_two_is_enough() -> None:
+    """A background alone is opaque; surroundings alone stay transparent where nothing is."""
+    rgba = sensor(film={"pixel_format": "rgba"})
+    plain, before = image(scene(rgba)), image(scene(rgba, background=behind().raw))
+    np.testing.assert_array_equal(before[..., 3], 1)
+    empty = plain[..., 3] == 0
+    assert empty.any() and (before[empty][:, :3] > 0.3).all()
+    around = {PREFIX + name: mi.TensorXf(values) for name, values in far_channels().items()}
+    seen = image(scene(rgba, **around))
+    assert seen[..., 3].max() < 1 and seen[..., 3].mean() > plain[..., 3].mean()
+
+
+def test_values_that_cannot_be_used_are_told_of_and_left_out() -> None:
+    raw = far_channels()
+    raw["position"][3] = np.nan
+    bad = {PREFIX + name: mi.TensorXf(values) for name, values in raw.items()}
+    with pytest.warns(RuntimeWarning, match=r"1 surroundings in position \(first: 3\)"):
+        of = open_scene(**bad)
+    left = {PREFIX + name: mi.TensorXf(np.delete(values, 3, axis=0)) for name, values in raw.items()}
+    np.testing.assert_array_equal(image(of), image(open_scene(**left)))
+
+
+def test_refusals(tmp_path: Path) -> None:
+    raw = far_channels()
+    write_ply(tmp_path / "bare.ply", Surfels.from_numpy({n: x for n, x in raw.items() if n != "radiance_sh"}))
+    solid = raw | {"scale": np.repeat(raw["scale"][:, :1], 3, axis=1)}
+    write_ply(tmp_path / "solid.ply", Surfels.from_numpy(solid))
+    for words, changes in (
+        ("surroundings: radiance_sh", {"surroundings": str(tmp_path / "bare.ply")}),
+        ("surroundings: scale: not the primitive", {"surroundings": str(tmp_path / "solid.ply")}),
+        ("none.ply", {"surroundings": str(tmp_path / "none.ply")}),
+        ("none.exr", {"background": str(tmp_path / "none.exr")}),
+        ("shape (5, 8, 3)", {"background": mi.TensorXf(np.ones((5, 8, 3), np.float32))}),
+    ):
+        refused(words, partial(scene, **changes))
+
+
+def fitted() -> TrainedScene:
+    around = Surroundings(Surfels.from_numpy(far_channels()), behind())
+    light, surfels = EnvironmentLight.from_radiance(sky()), Surfels.from_numpy(raw_channels())
+    return TrainedScene(surfels, light, None, Shading(), 7, 1.5, surroundings=around)
+
+
+def test_a_runs_files_hold_both_and_lose_them(tmp_path: Path) -> None:
+    """Written, read back, rendered alike by the run and by its scene.xml; what is stale goes."""
+    made = fitted()
+    files = {path.name for path in export(made, tmp_path, camera())}
+    assert {AROUND_FILE, BACKGROUND_MAP} <= files
+    frame, again = made.renderer()(camera()), TrainedScene.read(tmp_path).renderer()(camera())
+    for name in ("radiance", "alpha", "background", "share"):
+        np.testing.assert_allclose(getattr(again, name), getattr(frame, name), atol=1e-5)
+    expected = (frame.radiance + (1 - frame.alpha) * frame.background).numpy().T.reshape(HEIGHT, WIDTH, 3)
+    seen = image(mi.load_file(str(tmp_path / SCENE)))
+    np.testing.assert_allclose(seen[..., :3], expected, atol=1e-4)
+    np.testing.assert_array_equal(seen[..., 3], 1)
+    files = {path.name for path in export(replace(made, surroundings=None), tmp_path, camera())}
+    assert not {AROUND_FILE, BACKGROUND_MAP} & files
+    assert not (tmp_path / AROUND_FILE).exists() and not (tmp_path / BACKGROUND_MAP).exists()
+    assert TrainedScene.read(tmp_path).surroundings is None
+
+
+def test_the_object_alone_is_rendered_on_transparency(tmp_path: Path, capsys: Any) -> None:
+    made = fitted()
+    export(made, tmp_path, camera())
+    for name, more in (("all", []), ("alone", ["--object"])):
+        assert main(["render", str(tmp_path), "-o", str(tmp_path / f"{name}.exr"), *more]) == 0
+    capsys.readouterr()
+    whole, alone = (read_exr_image(tmp_path / f"{name}.exr") for name in ("all", "alone"))
+    np.testing.assert_array_equal(whole[..., 3], 1)
+    frame = replace(made, surroundings=None).renderer()(camera())
+    np.testing.assert_allclose(alone[..., 3].ravel(), frame.alpha.numpy(), atol=1e-4)
+    np.testing.assert_allclose(alone[..., :3].reshape(-1, 3), frame.radiance.numpy().T, atol=1e-4)
+    (tmp_path / "plain.xml").write_text('<scene version="3.0.0"><sensor type="perspective"/></scene>')
+    assert main(["render", str(tmp_path / "plain.xml"), "-o", str(tmp_path / "x.exr"), "--object"]) == 2
+    assert "--object: the scene has no `refgs`" in capsys.readouterr().err
+
+
+def test_surroundings_of_another_primitive_in_a_run(tmp_path: Path) -> None:
+    export(fitted(), tmp_path, camera())
+    raw = far_channels()
+    write_ply(
+        tmp_path / AROUND_FILE, Surfels.from_numpy(raw | {"scale": np.repeat(raw["scale"][:, :1], 3, 1)})
+    )
+    with pytest.raises(InputError, match="surroundings: scale"):
+        TrainedScene.read(tmp_path)

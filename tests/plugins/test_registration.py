@@ -1,0 +1,141 @@
+"""Plugins follow Mitsuba from variant to variant; each case is a fresh process: import order counts."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.helpers import run_python
+
+STAND_IN = """
+import mitsuba as mi
+from mi_refgs.kernels.device import require_supported_variant
+
+class RefGSIntegrator(mi.SamplingIntegrator):
+    def __init__(self, props):
+        require_supported_variant("refgs")
+        super().__init__(props)
+    def to_string(self):
+        return f"stand-in under {mi.variant()}"
+
+mi.register_integrator("refgs", RefGSIntegrator)
+"""
+
+PRELUDE = """
+import sys
+{order}
+from mi_refgs import plugins
+plugins.PLUGINS["refgs"] = ("register_integrator", "stand_in")
+
+def make():
+    try:
+        return repr(mi.load_dict({{"type": "refgs"}}))
+    except RuntimeError as error:
+        return str(error).strip().splitlines()[-1]
+"""
+
+
+def run(code: str, folder: Path, order: str = "import mi_refgs, mitsuba as mi") -> list[str]:
+    """Lines that `code` prints after the plugin's module was replaced by a stand-in, in a fresh process."""
+    (folder / "stand_in.py").write_text(STAND_IN)
+    return run_python(PRELUDE.format(order=order) + code, folder=folder).splitlines()
+
+
+def test_every_switch_registers_again(tmp_path: Path) -> None:
+    code = """
+for variant in ["llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral", "llvm_ad_rgb"]:
+    mi.set_variant(variant)
+    print(make())
+"""
+    first, scalar, spectral, again = run(code, tmp_path)
+    assert first == again == "stand-in under llvm_ad_rgb"
+    assert "'scalar_rgb' is not supported; call mi.set_variant('llvm_ad_rgb')" in scalar
+    assert "'llvm_ad_spectral' is not supported" in spectral
+
+
+def test_each_supported_variant_gets_its_own_class(tmp_path: Path) -> None:
+    """The base class differs from variant to variant; here a second one counts as supported."""
+    code = """
+from mi_refgs.kernels import device
+device.is_supported = plugins.is_supported = lambda variant: "_ad_" in variant
+for variant in ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"]:
+    mi.set_variant(variant)
+    print(make(), isinstance(mi.load_dict({"type": "refgs"}), mi.SamplingIntegrator))
+"""
+    assert run(code, tmp_path) == [
+        "stand-in under llvm_ad_rgb True",
+        "stand-in under llvm_ad_mono True",
+        "stand-in under llvm_ad_rgb True",
+    ]
+
+
+def test_scalar_first_does_not_import_the_plugin(tmp_path: Path) -> None:
+    lines = run("mi.set_variant('scalar_rgb')\nprint('stand_in' in sys.modules)", tmp_path)
+    assert lines == ["False"]
+
+
+def test_import_after_the_variant_registers_at_once(tmp_path: Path) -> None:
+    order = "import mitsuba as mi\nmi.set_variant('llvm_ad_mono')\nimport mi_refgs"
+    code = "print(make())\nmi.set_variant('llvm_ad_rgb')\nprint(make())"
+    mono, rgb = run(code, tmp_path, order)
+    assert "'llvm_ad_mono' is not supported" in mono
+    assert rgb == "stand-in under llvm_ad_rgb"
+
+
+def test_loading_twice_is_harmless(tmp_path: Path) -> None:
+    code = "mi.set_variant('llvm_ad_rgb')\nplugins.load()\nplugins.load()\nprint(make())"
+    assert run(code, tmp_path) == ["stand-in under llvm_ad_rgb"]
+
+
+def test_beside_mitsubas_own_loading(tmp_path: Path) -> None:
+    """Mitsuba 3.10 imports the entry point under the first variant, even scalar, and then reloads it."""
+    code = """
+import importlib
+modules = []
+def autoload(old, new):
+    if modules:
+        importlib.reload(modules[0])
+    else:
+        modules.append(importlib.import_module("stand_in"))
+mi.detail.add_variant_callback(autoload)
+for variant in ["scalar_rgb", "llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral", "llvm_ad_rgb"]:
+    mi.set_variant(variant)
+    print(make())
+"""
+    lines = run(code, tmp_path)
+    assert lines[1] == lines[4] == "stand-in under llvm_ad_rgb"
+    for line in (lines[0], lines[2], lines[3]):
+        assert "is not supported" in line
+
+
+REAL = "mi_refgs.plugins.integrator"
+
+
+@pytest.mark.skipif(importlib.util.find_spec(REAL) is None, reason="the integrator does not exist yet")
+def test_the_real_integrator_is_found_under_its_name() -> None:
+    """Without surfels it cannot be made, but Mitsuba must know it after every switch."""
+    code = f"""
+import importlib, sys
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+importlib.import_module("{REAL}")
+for variant in ["llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral", "llvm_ad_rgb"]:
+    mi.set_variant(variant)
+    importlib.reload(sys.modules["{REAL}"])
+    try:
+        mi.load_dict({{"type": "refgs"}})
+    except RuntimeError as error:
+        text = str(error)
+        assert "not found" not in text, text
+        print("refused" if f"'{{variant}}' is not supported" in text else "known")
+"""
+    repository = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=repository, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["known", "refused", "refused", "known"]

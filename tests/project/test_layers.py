@@ -1,0 +1,312 @@
+"""The rules that keep the package in layers, read off its syntax trees and tried on planted breaches."""
+
+from __future__ import annotations
+
+import ast
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.helpers import ROOT, imported_packages
+
+PACKAGE = "mi_refgs"
+
+FLAT = {"Float", "UInt32", "Int32", "Bool", "TensorXf", "TensorXu", "TensorXi", "TensorXb"}
+"""Arrays that Dr.Jit wraps around NumPy's memory, without a copy, where they are made of a NumPy array."""
+
+FLOORS: list[set[str]] = [
+    {"constants", "errors", "llvm", "progress"},
+    {"kernels"},
+    {"io"},
+    {"surfels"},
+    {"splat"},
+    {"data"},
+    {"occlusion"},
+    {"shade"},
+    {"render"},
+    {"capture", "methods", "plugins", "synthesis"},
+    {"runs"},
+    {"fitting"},
+    {"doctor", "evaluation", "profiling"},
+    {"compare", "editing", "formats"},
+    {"reconstruction"},
+    {"relighting"},
+    {"gallery", "viewer"},
+    {"cli"},
+    {"__main__"},
+]
+"""The rooms of the package from the ground up: a room imports from the floors below it only.
+
+Rooms of one floor do not import each other. `reference` imports `constants` only, and nothing of the package
+imports it. The package's own `__init__` contains the public names: rooms import only `__version__` from it.
+"""
+
+
+def module_name(path: Path) -> str:
+    """Dotted name below the package: "" for its `__init__`, "splat.tiles", "splat" for splat's `__init__`."""
+    parts = list(path.relative_to(ROOT / PACKAGE).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def sources() -> dict[str, str]:
+    """Module name → source of every file of the package."""
+    return {module_name(path): path.read_text() for path in sorted((ROOT / PACKAGE).rglob("*.py"))}
+
+
+PACKAGES = {module_name(path) for path in (ROOT / PACKAGE).rglob("__init__.py")}
+
+
+def imports(module: str, source: str) -> Iterator[str]:
+    """Names below the package that `source` imports: "" for the package itself, "splat.camera", …"""
+    package = module if module in PACKAGES else module.rpartition(".")[0]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            parent = node.module or ""
+            if node.level:
+                above = [PACKAGE, *filter(None, package.split("."))]
+                parent = ".".join([*above[: len(above) - node.level + 1], *filter(None, [parent])])
+            names = [f"{parent}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            first, _, rest = name.partition(".")
+            if first == PACKAGE:
+                yield rest
+
+
+def layer_breaches(modules: dict[str, str]) -> list[str]:
+    """Imports that `FLOORS` does not allow."""
+    floor = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
+    found = []
+    for module, source in modules.items():
+        room = module.partition(".")[0]
+        if room not in floor and room not in ("", "reference"):
+            found.append(f"{module}: no floor is declared for it")
+            continue
+        for imported in imports(module, source):
+            target = imported.partition(".")[0]
+            if room in ("", target) or imported == "__version__":
+                continue
+            if room == "reference":
+                allowed = target == "constants"
+            else:
+                allowed = floor.get(target, len(FLOORS)) < floor[room]
+            if not allowed:
+                found.append(f"{module}: imports {imported or PACKAGE}")
+    return found
+
+
+def strings_outside_docstrings(source: str) -> set[str]:
+    """String constants of `source` that are values: bare strings document, and may cite a method by name."""
+    tree = ast.parse(source)
+    bare = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    return {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in bare
+    }
+
+
+def variant_names() -> set[str]:
+    """What the variants are called: their files' names, and the names that they give themselves; but for the
+    purposes that they say they are for, which are what code may ask for."""
+    names, purposes = set(), set()
+    for path in (ROOT / "variants").glob("*.toml"):
+        about = tomllib.loads(path.read_text()).get("about", {})
+        names |= {path.stem} | ({about["name"]} if "name" in about else set())
+        purposes.add(about.get("purpose"))
+    return names - purposes
+
+
+def numpy_fields(modules: dict[str, str]) -> set[str]:
+    """Names of fields that are NumPy arrays in every class of the package that has them."""
+    kinds: dict[str, set[bool]] = {}
+    for source in modules.values():
+        for owner in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef)):
+            for node in (node for node in owner.body if isinstance(node, ast.AnnAssign)):
+                kinds.setdefault(ast.unparse(node.target), set()).add(is_numpy_type(node.annotation))
+    return {name for name, found in kinds.items() if found == {True}}
+
+
+def is_numpy_type(annotation: ast.expr | None) -> bool:
+    return annotation is not None and ast.unparse(annotation) in ("np.ndarray", "np.ndarray | None")
+
+
+def wrapped_arrays(source: str, fields: set[str]) -> list[str]:
+    """Calls such as `mi.Float(values)` of what is a NumPy array for all that one function shows."""
+    return [
+        ast.unparse(call)
+        for function in ast.walk(ast.parse(source))
+        if isinstance(function, ast.FunctionDef)
+        for names in [numpy_names(function, fields)]
+        for call in ast.walk(function)
+        if isinstance(call, ast.Call)
+        and isinstance(call.func, ast.Attribute)
+        and call.func.attr in FLAT
+        and call.args
+        and is_numpy(call.args[0], names, fields)
+    ]
+
+
+def numpy_names(function: ast.FunctionDef, fields: set[str]) -> set[str]:
+    """Arguments and variables of a function that are NumPy arrays wherever they get a value."""
+    every = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    names = {argument.arg for argument in every if is_numpy_type(argument.annotation)}
+    for _ in range(3):  # values may follow from later ones, in loops
+        given: dict[str, list[bool]] = {name: [True] for name in names}
+        for node in ast.walk(function):
+            if isinstance(node, ast.Assign):
+                pairs = [(target, node.value) for target in node.targets]
+            elif isinstance(node, ast.For | ast.comprehension):
+                pairs = [(node.target, node.iter)]
+            else:
+                continue
+            for target, value in pairs:
+                if isinstance(target, ast.Name):
+                    given.setdefault(target.id, []).append(is_numpy(value, names, fields))
+        names = {name for name, found in given.items() if all(found)}
+    return names
+
+
+def is_numpy(value: ast.expr, names: set[str], fields: set[str]) -> bool:
+    """Whether an expression is a NumPy array: by its function, its method, or what it is made of."""
+    match value:
+        case ast.Call(func=ast.Attribute(value=ast.Name(id="np"))):
+            return True
+        case ast.Call(func=ast.Attribute(attr="astype" | "ravel" | "reshape" | "numpy" | "flatten")):
+            return not ast.unparse(value).startswith("dr.")
+        case ast.Attribute(attr=attr):
+            return attr == "T" or attr in fields
+        case ast.Name(id=name):
+            return name in names
+        case ast.Subscript(value=inner) | ast.UnaryOp(operand=inner):
+            return is_numpy(inner, names, fields)
+        case ast.BinOp(left=left, right=right):
+            return is_numpy(left, names, fields) or is_numpy(right, names, fields)
+        case ast.Compare(left=left):
+            return is_numpy(left, names, fields)
+    return False
+
+
+# ---------- The rules ----------
+
+
+def test_imports_point_down() -> None:
+    assert layer_breaches(sources()) == []
+
+
+def test_only_the_configuration_opens_toml() -> None:
+    readers = {
+        module for module, source in sources().items() if {"tomllib", "toml"} & imported_packages(source)
+    }
+    assert readers <= {"methods.read"}
+
+
+def test_the_reference_is_plain_numpy() -> None:
+    for module, source in sources().items():
+        if module.partition(".")[0] == "reference":
+            assert not {"drjit", "mitsuba"} & imported_packages(source), module
+
+
+def test_no_code_knows_a_variant_by_name() -> None:
+    """A method is data: nothing under the package may compare with, or choose, a variant's name."""
+    names = variant_names()
+    for module, source in sources().items():
+        assert not names & strings_outside_docstrings(source), module
+
+
+def test_numpy_arrays_reach_the_device_by_upload() -> None:
+    """Kernels read beyond the end of wrapped ones: `device.upload` and `upload_tensor` copy them."""
+    modules = sources()
+    fields = numpy_fields(modules)
+    found = {
+        module: wrapped_arrays(source, fields)
+        for module, source in modules.items()
+        if module.partition(".")[0] != "reference" and module != "kernels.device"
+    }
+    assert {module: calls for module, calls in found.items() if calls} == {}
+
+
+# ---------- The rules hold what they say ----------
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("splat.tiles", "from mi_refgs.render import pipeline"),
+        ("splat.tiles", "import mi_refgs.fitting.train"),
+        ("splat.tiles", "def f():\n    from mi_refgs.shade.brdf import split_sum"),
+        ("occlusion.mesh", "from mi_refgs.shade.brdf import split_sum"),
+        ("splat.tiles", "from ..shade import brdf"),
+        ("splat", "from ..render import pipeline"),
+        ("surfels.table", "from mi_refgs.reference import splat"),
+        ("cli", "from mi_refgs.reference import splat"),
+        ("plugins.integrator", "from mi_refgs.cli import main"),
+        ("constants", "import mi_refgs"),
+        ("doctor", "from mi_refgs import Surfels"),
+        ("cli", "from mi_refgs import read_ply"),
+        ("novelty", "import numpy"),
+    ],
+)
+def test_a_planted_import_is_found(module: str, source: str) -> None:
+    assert layer_breaches({module: source})
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("shade.brdf", "from mi_refgs.splat.camera import Camera"),
+        ("shade.brdf", "from ..splat.camera import Camera"),
+        ("shade.brdf", "from .sh import sh_basis\nfrom mi_refgs.errors import InputError"),
+        ("splat", "from .blend import blend"),
+        ("doctor", "from mi_refgs import __version__, llvm"),
+        ("render.pipeline", "from mi_refgs import splat\nimport numpy as np"),
+    ],
+)
+def test_a_permitted_import_is_not(module: str, source: str) -> None:
+    assert layer_breaches({module: source}) == []
+
+
+def test_a_planted_name_is_found() -> None:
+    source = (
+        '"""Cites two_d."""\ndef f(x):\n    """Cites two_d."""\n    return x == "two_d" or f"{x} no two_d"\n'
+    )
+    assert strings_outside_docstrings(source) == {"two_d", " no two_d"}
+    assert strings_outside_docstrings('"""two_d"""\nWIDTH = 3\n"""two_d"""') == set()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "mi.Float(np.arange(3.0))",
+        "mi.TensorXf(np.ascontiguousarray(x, np.float32))",
+        "mi.Float(view.depth.ravel())",
+        "mi.Bool(edit.fresh)",
+        "mi.UInt32(mesh.faces[:, 0])",
+        "mi.Bool(a > 0)",
+        "[mi.Float(column) for column in a.T]",
+        "y = 2 * a; z = y[3:]; mi.Float(z)",
+    ],
+)
+def test_a_planted_wrapped_array_is_found(body: str) -> None:
+    source = f"def f(a: np.ndarray, x):\n    {body}"
+    assert wrapped_arrays(source, {"fresh", "faces"})
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "mi.Float(x)",
+        "mi.Bool(x > 0)",
+        "mi.Point3f(a.T)",
+        "mi.Float(0)",
+        "mi.TensorXf(dr.ravel(x), shape=(3, 3))",
+        "y = a; y = x; mi.Float(y)",
+    ],
+)
+def test_what_is_not_flat_or_not_of_numpy_is_no_wrapped_array(body: str) -> None:
+    assert not wrapped_arrays(f"def f(a: np.ndarray, x):\n    {body}", {"fresh"})

@@ -1,0 +1,257 @@
+"""Sdist and wheel hold what they should, install in clean environments, and declare command and plugins."""
+
+from __future__ import annotations
+
+import configparser
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import mi_refgs
+from mi_refgs.doctor import EXTRAS
+from mi_refgs.errors import InputError
+from mi_refgs.io.resources import resource_dir
+from tests.helpers import ROOT, imported_packages
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+LEFT_OUT = {".git", ".venv", "runs", "data", "site", "build", "dist"}
+"""Folders of a checkout that are no part of the project."""
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the sdist, and the wheel that was built of the sdist; without a network, from a copy."""
+    needed = 77  # the setuptools that knows licence expressions, as pyproject.toml requires
+    if int(importlib.metadata.version("setuptools").split(".")[0]) < needed:
+        pytest.skip(f"building needs setuptools {needed} (the dev extra brings it)")
+    source = tmp_path_factory.mktemp("source") / "checkout"
+    ignore = shutil.ignore_patterns("__pycache__", "*.egg-info", ".*_cache", ".hypothesis")
+    source.mkdir()
+    for path in ROOT.iterdir():
+        if path.is_dir() and path.name not in LEFT_OUT:
+            shutil.copytree(path, source / path.name, ignore=ignore)
+        elif path.is_file() and path.name not in LEFT_OUT:
+            shutil.copy(path, source)
+    target = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "build", "--no-isolation", "-o", str(target), "."]
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return target
+
+
+@pytest.fixture(scope="module")
+def sdist(built: Path) -> Path:
+    [path] = built.glob("*.tar.gz")
+    return path
+
+
+@pytest.fixture(scope="module")
+def wheel(built: Path) -> Path:
+    [path] = built.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module", params=["*.whl", "*.tar.gz"])
+def environment(
+    request: pytest.FixtureRequest, built: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A clean environment with the wheel or the sdist installed by pip; what they depend on is this one's."""
+    [package] = built.glob(request.param)
+    folder = tmp_path_factory.mktemp("environment")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True, timeout=120)
+    here = Path(sysconfig.get_path("purelib"))
+    backend = tmp_path_factory.mktemp("backend")  # setuptools alone: pip must see no other mi_refgs
+    for path in [here / "setuptools", here / "_distutils_hack", *here.glob("setuptools-*.dist-info")]:
+        (backend / path.name).symlink_to(path)
+    options = ["--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "-qq"]
+    command = [sys.executable, "-m", "pip", "--python", str(folder), "install", *options, str(package)]
+    done = subprocess.run(
+        command,
+        env=os.environ | {"PYTHONPATH": str(backend)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    [site] = folder.glob("lib/python*/site-packages")
+    others = {str(here), sysconfig.get_path("platlib")}
+    (site / "others.pth").write_text("\n".join(others))
+    return folder
+
+
+def run_in(environment: Path, *command: str) -> str:
+    """Standard output of a command of an environment, started away from the checkout."""
+    clean = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    done = subprocess.run(
+        [str(environment / "bin" / command[0]), *command[1:]],
+        cwd=environment,
+        env=clean,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_installed_package_finds_its_modules_and_data(environment: Path) -> None:
+    code = """
+import mi_refgs, json
+from mi_refgs.methods.read import load
+from mi_refgs.io.resources import resource_dir
+scenes = resource_dir("scenes")
+scene = (scenes / "glossy_demo.xml").is_file()
+print(json.dumps([mi_refgs.__file__, str(scenes), load("relighting").variant, scene]))
+"""
+    module, scenes, variant, scene = json.loads(run_in(environment, "python", "-c", code))
+    package = Path(module).parent
+    assert environment in package.parents and environment in Path(scenes).parents
+    assert (package / "py.typed").is_file() and variant == "relighting" and scene
+
+
+def test_installed_command_examines_the_installation(environment: Path) -> None:
+    found = json.loads(run_in(environment, "refgs", "doctor", "--json"))
+    assert found["usable"] and found["mi_refgs"] == mi_refgs.__version__
+
+
+def test_installed_package_registers_its_plugins(environment: Path) -> None:
+    code = """
+import mi_refgs, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+print(type(mi.load_dict({"type": "refgs_bsdf"})).__name__)
+"""
+    assert run_in(environment, "python", "-W", "error", "-c", code).strip() == "RefGSBSDF"
+
+
+def test_sdist_holds_all_that_the_checks_need(sdist: Path) -> None:
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"setup.sh", "mkdocs.yml", ".ci/run", "CITATION.cff", "CHANGELOG.md", "pyproject.toml"} <= names
+    for folder in ("mi_refgs", "tests", "docs", "benchmarks", "scenes", "variants"):
+        for path in (ROOT / folder).rglob("*"):
+            if path.is_file() and "__pycache__" not in path.parts:
+                assert str(path.relative_to(ROOT)) in names, path
+    assert not {
+        name for name in names if "__pycache__" in name or name.startswith((".venv", "runs", "site/"))
+    }
+
+
+@pytest.fixture(scope="module")
+def unpacked(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that holds the wheel's contents."""
+    folder = tmp_path_factory.mktemp("unpacked")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def test_wheel_holds_every_module_and_data_file(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        packed = set(archive.namelist())
+    expected = {str(path.relative_to(ROOT)) for path in (ROOT / "mi_refgs").rglob("*.py")}
+    expected |= {f"mi_refgs/variants/{path.name}" for path in (ROOT / "variants").glob("*.toml")}
+    expected |= {
+        f"mi_refgs/{path.relative_to(ROOT)}"
+        for path in (ROOT / "scenes").rglob("*")
+        if path.suffix in {".toml", ".xml", ".ply", ".exr"}
+    }
+    assert expected | {"mi_refgs/py.typed"} <= packed
+
+
+def test_wheel_holds_nothing_else(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        tops = {name.split("/")[0] for name in archive.namelist()}
+    assert tops == {"mi_refgs", *(top for top in tops if top.endswith(".dist-info"))}
+
+
+def test_wheel_declares_the_command_and_the_plugin(unpacked: Path) -> None:
+    [path] = unpacked.glob("*.dist-info/entry_points.txt")
+    points = configparser.ConfigParser()
+    points.read(path)
+    assert points["console_scripts"]["refgs"] == "mi_refgs.cli:main"
+    assert points["mitsuba"]["refgs"] == "mi_refgs.plugins.integrator"
+
+
+def test_plugins_and_entry_points_name_the_same_modules() -> None:
+    from mi_refgs.plugins import PLUGINS
+
+    modules = {name: module for name, (_, module) in PLUGINS.items()}
+    assert modules == PROJECT["project"]["entry-points"]["mitsuba"]
+
+
+def test_every_package_is_listed() -> None:
+    packages = {
+        ".".join(path.parent.relative_to(ROOT).parts) for path in (ROOT / "mi_refgs").rglob("__init__.py")
+    }
+    assert packages | {"mi_refgs.variants", "mi_refgs.scenes"} == set(
+        PROJECT["tool"]["setuptools"]["packages"]
+    )
+
+
+IMPORT_NAMES = {
+    "scikit_image": "skimage",
+    "pillow": "pil",
+    "mitsuba": "drjit",
+    "dask": "distributed",
+    "openexr": "imath",
+}
+"""What a distribution brings under another name than its own, in lower case."""
+
+
+def imported(source: str) -> set[str]:
+    """First names of what a file imports that is neither Python's nor its own package's."""
+    return imported_packages(source) - sys.stdlib_module_names - {"mi_refgs"}
+
+
+def declared(requirements: list[str]) -> set[str]:
+    """Import names that a list of requirements provides, in lower case."""
+    names = {re.split(r"[^\w.-]", requirement)[0].lower().replace("-", "_") for requirement in requirements}
+    return names | {IMPORT_NAMES[name] for name in names if name in IMPORT_NAMES}
+
+
+def test_every_import_is_declared() -> None:
+    """What the package imports is a dependency, or belongs to an extra that a user may leave out."""
+    project = PROJECT["project"]
+    extras = [
+        line for name, lines in project["optional-dependencies"].items() if name != "dev" for line in lines
+    ]
+    known = declared(project["dependencies"] + extras)
+    for path in (ROOT / "mi_refgs").rglob("*.py"):
+        missing = {name for name in imported(path.read_text()) if name.lower() not in known}
+        assert not missing, f"{path.name} imports {missing}, which pyproject.toml does not declare"
+
+
+def test_doctor_looks_for_what_the_extras_bring() -> None:
+    extras = PROJECT["project"]["optional-dependencies"]
+    for name, distribution in EXTRAS.items():
+        assert any(line.startswith(distribution) for line in extras[name]), name
+
+
+def test_version_is_stated_once() -> None:
+    assert re.fullmatch(r"\d+\.\d+\.\d+", mi_refgs.__version__)
+    assert PROJECT["project"]["dynamic"] == ["version"]
+
+
+@pytest.mark.parametrize("name", ["variants", "scenes"])
+def test_checkout_finds_its_data(name: str) -> None:
+    assert resource_dir(name) == ROOT / name
+
+
+def test_missing_data_is_one_sentence() -> None:
+    with pytest.raises(InputError, match="absent: the folder is missing from this installation"):
+        resource_dir("absent")

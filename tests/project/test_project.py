@@ -1,0 +1,75 @@
+"""What surrounds the code: citation, changelog, hosted checks, hooks and issue templates say what is true."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import mi_refgs
+from tests.helpers import ROOT
+
+TEMPLATES = sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
+
+
+def read(path: Path) -> Any:
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+def test_citation_is_complete_and_of_this_version() -> None:
+    """Keys that version 1.2.0 of the format requires, and their types."""
+    cited = read(ROOT / "CITATION.cff")
+    assert cited["cff-version"] == "1.2.0" and cited["type"] == "software"
+    assert cited["version"] == mi_refgs.__version__
+    assert isinstance(cited["message"], str) and isinstance(cited["title"], str)
+    for work in (cited, *cited["references"]):
+        assert work["authors"] and all({"name", "family-names"} & set(author) for author in work["authors"])
+    [paper] = cited["references"]
+    assert paper["title"] == "Reflective Gaussian Splatting" and paper["year"] == 2025
+    licence = re.search(r'^license = "(.*)"', (ROOT / "pyproject.toml").read_text(), flags=re.MULTILINE)
+    assert licence is not None and cited["license"] == licence[1]
+
+
+def test_changelog_has_this_version_first() -> None:
+    headings = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
+    assert all(re.fullmatch(r"\d+\.\d+\.\d+ \((unreleased|\d{4}-\d\d-\d\d)\)", text) for text in headings)
+    assert headings[0].split()[0] == mi_refgs.__version__
+
+
+def test_hosted_checks_are_those_of_ci() -> None:
+    steps = read(ROOT / ".github" / "workflows" / "ci.yml")["jobs"]["checks"]["steps"]
+    assert [step["run"] for step in steps if "run" in step] == [".ci/run"]
+
+
+def test_hosted_checks_run_the_oldest_python() -> None:
+    job = read(ROOT / ".github" / "workflows" / "ci.yml")["jobs"]["checks"]
+    oldest = re.search(r'requires-python = ">=(.*)"', (ROOT / "pyproject.toml").read_text())
+    assert oldest is not None and oldest[1] in job["strategy"]["matrix"]["python"]
+
+
+@pytest.mark.parametrize(
+    "path", [pytest.param(path, id=path.stem) for path in TEMPLATES if path.stem != "config"]
+)
+def test_templates_ask_for_the_installation(path: Path) -> None:
+    form = read(path)
+    assert form["name"] and form["description"] and form["body"]
+    assert len({part["id"] for part in form["body"]}) == len(form["body"])
+    assert "refgs doctor --json" in path.read_text()
+
+
+def test_hooks_are_valid_and_their_tools_here() -> None:
+    config = ROOT / ".pre-commit-config.yaml"
+    command = [sys.executable, "-m", "pre_commit", "validate-config", str(config)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stdout
+    tools = f"{Path(sys.executable).parent}:/usr/bin:/bin"
+    for repository in read(config)["repos"]:
+        assert repository["repo"] == "local"  # nothing is downloaded
+        for hook in repository["hooks"]:
+            assert shutil.which(hook["entry"].split()[0], path=tools), hook["id"]

@@ -1,0 +1,80 @@
+"""The tutorials run, with their assertions and without a warning; what is kept of them is small and clean."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.helpers import ROOT
+
+FOLDER = ROOT / "docs" / "tutorials"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+MOST_BYTES = 300_000
+MOST_SECONDS = 60
+"""Of a processor that has nothing else to do; a busy one counts up to twice as many."""
+
+
+def cells(path: Path) -> list[Any]:
+    """The cells of code."""
+    return [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+
+
+def outputs(path: Path) -> list[Any]:
+    """All that is kept."""
+    return [output for cell in cells(path) for output in cell.outputs]
+
+
+def test_there_are_four() -> None:
+    assert len(NOTEBOOKS) == 4
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_tutorial_runs(path: Path) -> None:
+    """In its own process and folder; every one asserts what it shows."""
+    done = subprocess.run(
+        [sys.executable, FOLDER / "run.py", "--check", path],
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    seconds = re.search(r": (\d+) s of CPU", done.stderr)
+    assert seconds and int(seconds[1]) < 2 * MOST_SECONDS
+    assert any(re.search(r"^ *(assert |np\.testing\.)", cell.source, re.MULTILINE) for cell in cells(path))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_what_is_kept_is_small_and_shows_pictures(path: Path) -> None:
+    """Pictures that are not of one colour; no errors, messages, numbers of runs, addresses or paths."""
+    assert path.stat().st_size < MOST_BYTES
+    found = outputs(path)
+    assert {output.output_type for output in found} <= {"display_data", "execute_result", "stream"}
+    assert not [output for output in found if output.get("name") == "stderr"]
+    data = [output.data for output in found if "data" in output]
+    pictures = [Image.open(io.BytesIO(base64.b64decode(d["image/jpeg"]))) for d in data if "image/jpeg" in d]
+    assert len(pictures) >= 2
+    for picture in pictures:
+        assert min(np.ptp(np.asarray(picture.convert("RGB")), axis=(0, 1))) > 100
+    text = path.read_text(encoding="utf-8")
+    text = re.sub(r'"image/jpeg": "[^"]*"', "", text)
+    assert not re.search(r"/(home|tmp|root|work|usr|Users)/|0x[0-9a-f]{6,}", text)
+    assert re.search(r'"execution_count": [^n]', text) is None
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_every_cell_ran(path: Path) -> None:
+    """A cell that ends with a picture or a print has kept it."""
+    for cell in cells(path):
+        if re.search(r"^(show|print|plt\.show)\(", cell.source, re.MULTILINE):
+            assert cell.outputs, cell.source

@@ -1,0 +1,303 @@
+"""`mi_refgs.load` and `fit`: one object that renders, gives a Mitsuba scene, changes and is written again."""
+
+from __future__ import annotations
+
+import gc
+import shutil
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mi_refgs
+from mi_refgs import Camera, InputError, NewLight, Reconstruction
+from mi_refgs.cli import main
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.exr import read_exr_image
+from mi_refgs.methods.read import assignments, load_resolved
+from mi_refgs.runs.run import Run
+from tests.scenes.integrator import sky
+from tests.scenes.known import SIZE, write_known_data, write_known_run
+from tests.scenes.tiny import SETTINGS
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data set of two balls, and the run that has found everything."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("known")
+    write_known_run(write_known_data(folder), folder / "run")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def balls(folder: Path) -> Reconstruction:
+    """That run."""
+    return mi_refgs.load(folder / "run")
+
+
+def psnr(ours: np.ndarray, truth: np.ndarray) -> float:
+    """Of linear premultiplied pictures, in dB."""
+    return float(-10 * np.log10(np.mean((ours - truth) ** 2)))
+
+
+# ---------------- pictures ----------------
+
+
+def test_the_picture_is_the_path_tracers(folder: Path, balls: Reconstruction) -> None:
+    """Of the first test view: right place, orientation, premultiplication and encoding."""
+    truth = read_exr_image(folder / "data/test/r_000.exr")
+    ours = balls.render(0, samples=4)
+    assert ours.shape == (SIZE, SIZE, 4) and ours.dtype == np.float32
+    assert psnr(ours, truth) > 23 > psnr(ours[:, ::-1], truth) + 5
+
+
+def test_whatever_stands_for_a_camera_gives_one_picture(balls: Reconstruction) -> None:
+    """An index, a view and a camera alike; a Mitsuba sensor and `look_at` of the same numbers alike."""
+    first = balls.render()
+    np.testing.assert_array_equal(balls.render(balls.views().views[0]), first)
+    np.testing.assert_array_equal(balls.render(balls.cameras()[0]), first)
+    assert not np.array_equal(balls.render(-1), first)
+    eye, middle, up = [2.0, 2.5, 1.0], [0.1, 0.0, 0.2], [0.0, 0.3, 1.0]
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": 35,
+            "to_world": mi.ScalarTransform4f().look_at(eye, middle, up),
+            "film": {"type": "hdrfilm", "width": 48, "height": 32},
+        }
+    )
+    camera = Camera.look_at(eye, middle, up, fov=35, size=(48, 32))
+    np.testing.assert_allclose(balls.render(sensor), balls.render(camera), atol=2e-3)
+
+
+def test_other_pixels_show_the_same_view(balls: Reconstruction) -> None:
+    """Twice as many, averaged, are 2 × 2 samples; and one number is the longer side."""
+    fine = balls.render(0, size=2 * SIZE)
+    mean = fine.reshape(SIZE, 2, SIZE, 2, 4).mean(axis=(1, 3))
+    np.testing.assert_allclose(mean, balls.render(0, samples=4), atol=1e-5)
+    camera = Camera.look_at([3, 0, 1], size=(64, 32))
+    assert balls.render(camera, size=20).shape == (10, 20, 4)
+    assert balls.render(camera, size=(9, 7)).shape == (7, 9, 4)
+
+
+def test_aovs_are_the_known_materials(balls: Reconstruction) -> None:
+    maps = balls.aovs(0, ["albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular"])
+    inside = balls.render(0)[..., 3] > 0.99
+    assert maps["albedo"].shape == (SIZE, SIZE, 3) and maps["depth"].shape == (SIZE, SIZE, 1)
+    metal = inside & (maps["metallic"][..., 0] > 0.9)
+    clay = inside & (maps["metallic"][..., 0] < 0.1)
+    assert min(metal.sum(), clay.sum()) > 100
+    np.testing.assert_allclose(np.median(maps["albedo"][metal], axis=0), [0.9, 0.6, 0.3], atol=0.01)
+    np.testing.assert_allclose(np.median(maps["roughness"][clay]), 0.5, atol=0.01)
+    np.testing.assert_allclose(np.linalg.norm(maps["normal"][inside], axis=-1), 1, atol=1e-5)
+    summed = maps["diffuse"] + maps["specular"] + balls.aovs(0, ["indirect"])["indirect"]
+    np.testing.assert_allclose(summed, balls.render(0)[..., :3], atol=1e-5)
+
+
+def test_surroundings_make_a_picture_opaque(folder: Path, balls: Reconstruction) -> None:
+    """What is behind the object shows through, and `alone` leaves it out."""
+    from dataclasses import replace
+
+    from mi_refgs.render.surroundings import Surroundings, nothing_around
+
+    behind = mi_refgs.EnvironmentLight.constant(0.25, height=8)
+    around = Surroundings(nothing_around(balls.trained.surfels), behind)
+    open_scene = balls.changed(replace(balls.trained, surroundings=around))
+    whole, alone = open_scene.render(0), open_scene.render(0, alone=True)
+    np.testing.assert_allclose(alone, balls.render(0), atol=1e-6)
+    np.testing.assert_allclose(whole[..., :3], alone[..., :3] + 0.25 * (1 - alone[..., 3:]), atol=1e-5)
+    assert (whole[..., 3] == 1).all()
+
+
+def test_cameras_without_the_data_set(balls: Reconstruction, tmp_path: Path) -> None:
+    """All around the object, which they show whole; a turntable goes round at one height."""
+    shutil.copytree(balls.folder or Path(), tmp_path / "run")
+    Run(tmp_path / "run").write_dataset(str(tmp_path / "gone"), None)
+    lost = mi_refgs.load(tmp_path / "run")
+    for camera in (*lost.cameras()[:2], *lost.turntable(2)):
+        picture = lost.render(camera, size=24)
+        assert picture[8:16, 8:16, 3].mean() > 0.5 and picture[[0, -1], :, 3].max() < 0.01
+    places = [camera.pose()[:3, 3] for camera in lost.turntable(4)]
+    assert np.ptp([place[2] for place in places]) < 1e-6 and np.ptp(places, axis=0)[0] > 1
+    with pytest.raises(InputError, match="gone is gone; use cameras"):
+        lost.views()
+
+
+# ---------------- Mitsuba ----------------
+
+
+def test_the_scene_renders_alike_and_differentiates(balls: Reconstruction) -> None:
+    """Each sensor shows its camera; roughness and light have gradients."""
+    scene = balls.scene([0, 1], aovs=["normal"])
+    for i in range(2):
+        image = mi.render(scene, sensor=i, spp=1).numpy()
+        difference = np.abs(image[..., :4] - balls.render(i))
+        assert image.shape == (SIZE, SIZE, 7) and np.median(difference) < 1e-5 and difference.mean() < 1e-3
+    params = mi.traverse(scene)
+    for key in ("refgs.roughness", "refgs.light"):
+        dr.enable_grad(params[key])
+    dr.backward(dr.mean(mi.render(scene, params, spp=1), axis=None))
+    for key in ("refgs.roughness", "refgs.light"):
+        assert np.abs(dr.grad(params[key]).numpy()).max() > 0, key
+
+
+# ---------------- run folders ----------------
+
+
+def test_what_is_saved_renders_the_same_bits(balls: Reconstruction, tmp_path: Path) -> None:
+    """Of a run; and of what was changed in memory."""
+    saved = balls.save(tmp_path / "new")
+    assert saved.folder == tmp_path / "new" and not (tmp_path / "new/checkpoints").exists()
+    again = mi_refgs.load(tmp_path / "new")
+    relit = again.relight(sky(32), rotate=30)
+    for before, after in (
+        (balls, saved),
+        (balls, again),
+        (relit, relit.save(tmp_path / "relit")),
+    ):
+        np.testing.assert_array_equal(before.render(1), after.render(1))
+    assert again.source == balls.source
+
+
+def test_commands_take_what_is_saved(
+    balls: Reconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder without checkpoints is a run."""
+    run = tmp_path / "new"
+    balls.save(run)
+    assert main(["eval", str(run)]) == 0
+    assert main(["render", str(run), "-o", str(tmp_path / "view.png")]) == 0
+    assert main(["export", str(run)]) == 0
+    assert "PSNR" in capsys.readouterr().out
+    assert mi_refgs.load(run).evaluate()["psnr"] > 22
+    with pytest.raises(InputError, match="holds a run already"):
+        balls.save(run)
+
+
+# ---------------- changes ----------------
+
+
+@pytest.mark.parametrize("form", ["path", "array", "light", "new light"])
+def test_a_light_in_any_form_gives_one_picture(folder: Path, balls: Reconstruction, form: str) -> None:
+    """That of the path tracer under it: the data set has the views."""
+    file = folder / "dusk.exr"
+    given: dict[str, Any] = {
+        "path": file,
+        "array": read_exr_image(file)[..., :3],
+        "light": mi_refgs.EnvironmentLight.from_file(folder / "data/relight/dusk/environment.exr"),
+        "new light": NewLight(file),
+    }
+    relit = balls.relight(given[form])
+    truth = read_exr_image(folder / "data/relight/dusk/test/r_001.exr")
+    assert psnr(relit.render(1, samples=4), truth) > 25 > psnr(balls.render(1, samples=4), truth)
+    assert relit.folder is None
+
+
+def test_an_edit_changes_what_it_selects(balls: Reconstruction) -> None:
+    before = balls.aovs(0, ["roughness", "metallic"])
+    changed = balls.edit(where="metallic > 0.5", set={"roughness": 0.8})
+    after = changed.aovs(0, ["roughness", "metallic"])
+    metal = before["metallic"] > 0.99
+    np.testing.assert_allclose(after["roughness"][metal], 0.8, atol=1e-3)
+    clay = (before["metallic"] < 0.01) & (before["roughness"] > 0)
+    np.testing.assert_array_equal(after["roughness"][clay], before["roughness"][clay])
+    assert changed.folder is None and balls.trained.surfels.count == changed.trained.surfels.count
+    two = changed.edit(move=(0, 3, 0), join=balls)
+    assert two.trained.surfels.count == 2 * balls.trained.surfels.count
+
+
+def test_another_format_is_written(balls: Reconstruction, tmp_path: Path) -> None:
+    files = balls.export("cameras", tmp_path / "cameras")
+    assert (tmp_path / "cameras/transforms.json") in files
+
+
+# ---------------- fitting ----------------
+
+
+def test_a_fit_is_what_the_command_makes(data: Path, method: Path, finished: Path, tmp_path: Path) -> None:
+    """The same folder, with previews; settings as a mapping are those of `--set`."""
+    settings = {key: int(value) for key, value in (text.split("=") for text in SETTINGS)}
+    with pytest.warns(UserWarning, match="only 3 training views"):
+        found = mi_refgs.fit(
+            data, method, preset="quick", settings=settings, output=tmp_path / "run", progress=False
+        )
+    assert load_resolved(tmp_path / "run/config.toml") == load_resolved(finished / "config.toml")
+    names = {path.relative_to(finished) for path in finished.rglob("*") if path.is_file()}
+    assert {path.relative_to(tmp_path / "run") for path in (tmp_path / "run").rglob("*.*")} == names
+    assert found.trained.iteration == 6 and found.folder == tmp_path / "run"
+    np.testing.assert_array_equal(found.render(), mi_refgs.load(tmp_path / "run").render())
+
+
+def test_a_temporary_folder_goes_with_its_last_user(data: Path, method: Path) -> None:
+    class Heard(mi_refgs.Progress):
+        """Counts steps."""
+
+        steps, said = 0, ""
+
+        def say(self, message: str) -> None:
+            self.said += message
+
+        def step(self, trainer: Trainer) -> None:
+            self.steps += 1
+
+    heard = Heard()
+    found = mi_refgs.fit(data, method, preset="quick", settings=SETTINGS, progress=heard)
+    folder = found.folder
+    assert folder is not None and str(folder) in heard.said and heard.steps == 6
+    kept = found.changed(found.trained)
+    del found, heard
+    gc.collect()
+    assert (folder / "surfels.ply").is_file()
+    del kept
+    gc.collect()
+    assert not folder.exists()
+
+
+def test_settings_are_text_of_toml() -> None:
+    found = assignments({"a": 1, "b.c": 0.5, "d": True, "e": "x", "f": [1, 2]})
+    assert found == ["a=1", "b.c=0.5", "d=true", 'e="x"', "f=[\n    1,\n    2,\n]"]
+    assert assignments(["a=1"]) == ["a=1"]
+
+
+# ---------------- refusals ----------------
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda r: r.render(99), "camera: 99: test has 3; give 0 to 2"),
+        (lambda r: r.render("front"), "camera: str: no camera; give a Camera"),
+        (lambda r: r.render(size=0), "size: .* pixels; give whole numbers from 1"),
+        (lambda r: r.render(samples=0), "samples: 0 is out of range"),
+        (lambda r: r.aovs(0, ["colour"]), "aovs: colour: unknown; use some of .*albedo"),
+        (lambda r: r.aovs(0, ["tint"]), "aovs: tint: the surfels have no such channel"),
+        (lambda r: r.scene(aovs=["colour"]), "unknown type 'colour'"),
+        (lambda r: r.turntable(0), "turntable: 0 is out of range"),
+        (lambda r: r.relight("none.exr"), "none.exr: file: missing"),
+        (lambda r: r.relight(np.ones((4, 8))), "is no lat-long map; give linear radiance"),
+        (lambda r: r.export("obj", "x.obj"), "obj: unknown format; use one of"),
+        (lambda r: r.edit(where="metallic > 2", cut=True), "none of the 6000 surfels is in it; choose"),
+        (lambda r: r.changed(r.trained).evaluate(), "only in memory; measure what save"),
+        (lambda r: Camera.look_at([0, 0, 1], up=[0, 0, 1]), "up: no direction besides that of the view"),
+        (lambda r: Camera.look_at([1, 0, 0], fov=180), "fov, size: 180 degrees"),
+        (lambda r: mi_refgs.load("nowhere"), "nowhere: config.toml: missing"),
+        (lambda r: mi_refgs.fit("nowhere", progress=False), "nowhere"),
+        (lambda r: mi_refgs.fit("x", resume=True), "resume: there is no run .* give its folder as `output`"),
+        (lambda r: mi_refgs.fit("x", r.method, preset="quick"), "a Method has its own; change it, or name"),
+        (lambda r: mi_refgs.fit("x", settings={"a": None}), "settings: .*; give numbers"),
+    ],
+)
+def test_bad_input_is_one_sentence(balls: Reconstruction, call: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message) as refused:
+        call(balls)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_variant_must_be_set(balls: Reconstruction) -> None:
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(InputError, match=r"mi_refgs.load: variant: .* call mi.set_variant\('llvm_ad_rgb'\)"):
+        mi_refgs.load(balls.folder or "")

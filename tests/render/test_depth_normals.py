@@ -1,0 +1,164 @@
+"""Neighbours, depth normals and the losses on them, against their float64 definitions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.constants import COVERAGE_FLOOR
+from mi_refgs.fitting import losses
+from mi_refgs.reference import losses as reference
+from mi_refgs.render import display
+from mi_refgs.render.depth_normals import normals_from_depth
+from mi_refgs.render.stencil import neighbours
+from mi_refgs.splat.camera import Camera
+from tests.fitting.image_checks import HEIGHT, STEP, VALUE, WIDTH, gradient, planes, stack
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (4, 1), (3, 4)])
+def test_neighbours_adjoint_is_the_transpose(size: tuple[int, int], rng: np.random.Generator) -> None:
+    width, height = size
+    steps = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+    matrix = np.zeros((len(steps), width * height, width * height))
+    for source in range(width * height):
+        unit = np.zeros(width * height, dtype=np.float32)
+        unit[source] = 1
+        matrix[:, :, source] = [np.array(out) for out in neighbours(mi.Float(unit), width, height, steps)]
+    weights = rng.normal(size=(len(steps), width * height))
+    plane = mi.Float(rng.normal(size=width * height).astype(np.float32))
+    dr.enable_grad(plane)
+    out = neighbours(plane, width, height, steps)
+    dr.backward(
+        sum((o * mi.Float(w.astype(np.float32)) for o, w in zip(out, weights, strict=True)), mi.Float(0))
+    )
+    np.testing.assert_allclose(np.array(dr.grad(plane)), np.einsum("ki,kij->j", weights, matrix), atol=1e-5)
+
+
+# ---------------- depth normals ----------------
+
+INTRINSICS = (-21.0, -19.0, 7.3, 8.1)  # Mitsuba's signs, off-centre
+ROTATION = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
+ROTATION = ROTATION * np.sign(np.linalg.det(ROTATION))
+
+
+def expected_depth(blended: Any, alpha: Any) -> Any:
+    """z = D / A as the renderer forms it: 0 where the pixel is empty, with a finite gradient."""
+    seen = alpha > COVERAGE_FLOOR
+    return dr.select(seen, blended / dr.select(seen, alpha, 1.0), 0.0)
+
+
+def camera() -> Camera:
+    to_world = np.eye(4)
+    to_world[:3, :3], to_world[:3, 3] = ROTATION, (1.0, 2.0, 3.0)
+    return Camera.from_pose(WIDTH, HEIGHT, *INTRINSICS, to_world)
+
+
+def test_depth_normals_of_a_plane_are_exact() -> None:
+    """A plane n · X = 1 has depth 1 / (n · ray) at the pixel centres, and its normal comes back at every
+    pixel."""
+    fx, fy, cx, cy = INTRINSICS
+    plane = np.array([0.1, -0.2, 0.4])
+    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones_like(row)], axis=-1)
+    depth = 1 / (rays @ plane)
+    normal, valid = normals_from_depth(
+        mi.Float(depth.ravel().astype(np.float32)), dr.ones(mi.Float, WIDTH * HEIGHT), camera()
+    )
+    mask = np.array(valid).reshape(HEIGHT, WIDTH)
+    assert mask[1:-1, 1:-1].all() and mask.sum() == (WIDTH - 2) * (HEIGHT - 2)
+    found = np.stack([np.array(c) for c in normal], axis=-1).reshape(HEIGHT, WIDTH, 3)
+    wanted = -ROTATION @ plane / np.linalg.norm(plane)
+    np.testing.assert_allclose(found[mask], np.broadcast_to(wanted, (mask.sum(), 3)), atol=2e-5)
+    assert np.all(found[~mask] == 0)
+
+
+def test_steps_between_surfaces_have_no_normal(rng: np.random.Generator) -> None:
+    """Steps of every size on a wavy surface: the oracle's normals, and none exactly where it has none."""
+    depth = (
+        3 + 0.1 * rng.random((HEIGHT, WIDTH)) + np.linspace(0, 4, WIDTH) * (np.arange(HEIGHT) > 6)[:, None]
+    )
+    depth = depth.astype(np.float32).astype(np.float64)
+    alpha = np.ones((HEIGHT, WIDTH))
+    expected, wanted = reference.normals_from_depth(depth, alpha, *INTRINSICS, ROTATION)
+    normal, valid = normals_from_depth(
+        mi.Float(depth.ravel().astype(np.float32)), dr.ones(mi.Float, WIDTH * HEIGHT), camera()
+    )
+    np.testing.assert_array_equal(np.array(valid).reshape(HEIGHT, WIDTH), wanted)
+    found = np.stack([np.array(c) for c in normal], axis=-1).reshape(HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+    edge = wanted[6:8, 1:-1]
+    assert edge[:, :2].all() and not edge[:, -5:].any()  # small steps are slopes, large ones are not
+
+
+def test_normal_consistency_through_the_depth(rng: np.random.Generator) -> None:
+    """Value and gradients to N, D and A of the whole chain; two holes in the alpha switch their
+    neighbourhoods off."""
+    alpha = 0.4 + 0.6 * rng.random((HEIGHT, WIDTH, 1))
+    alpha[5, 5], alpha[9, 3:6] = 0, 0
+    depth = alpha * (3 + 0.3 * rng.random((HEIGHT, WIDTH, 1)))
+    packed = np.concatenate([rng.normal(size=(HEIGHT, WIDTH, 3)), depth, alpha], axis=-1)
+    weight = alpha[..., 0].astype(np.float32).astype(np.float64)
+
+    def loss(x: list[Any]) -> Any:
+        z = expected_depth(x[3], x[4])
+        depth_normal, valid = normals_from_depth(z, x[4], camera())
+        return losses.normal_consistency(mi.Vector3f(*x[:3]), depth_normal, valid, x[4])
+
+    def define(x: np.ndarray) -> float:
+        seen = x[..., 4] >= 1 / 255
+        z = np.where(seen, x[..., 3] / np.where(seen, x[..., 4], 1), 0)
+        depth_normal, valid = reference.normals_from_depth(z, x[..., 4], *INTRINSICS, ROTATION)
+        return reference.normal_consistency(x[..., :3], depth_normal, valid, weight)
+
+    at = packed.astype(np.float32).astype(np.float64)
+    leaves = planes(at)
+    dr.enable_grad(leaves)
+    value = loss(leaves)
+    assert abs(float(value[0]) - define(at)) < VALUE
+    dr.backward(value)
+    found = stack(leaves)
+    direction = rng.normal(size=at.shape) * (at != 0)
+    for channels in (slice(0, 3), slice(3, 4), slice(4, 5)):
+        part = np.zeros(at.shape)
+        part[..., channels] = direction[..., channels]
+        slope = (define(at + STEP * part) - define(at - STEP * part)) / (2 * STEP)
+        scale = np.linalg.norm(found[..., channels]) * np.linalg.norm(part)
+        assert scale > 0 and abs(np.sum(found * part) - slope) <= 1e-4 * scale
+    wanted = gradient(
+        lambda z: define(np.concatenate([at[..., :3], z, at[..., 4:]], axis=-1)), at[..., 3:4] + 0.0
+    )
+    assert np.linalg.norm(found[..., 3:4] - wanted) <= 2e-4 * np.linalg.norm(wanted)
+
+
+def test_aligned_and_empty_pixels_cost_nothing() -> None:
+    empty = dr.zeros(mi.Float, 4)
+    normal = mi.Vector3f(0, 0, mi.Float(0.5, 1.0, 0, 0))
+    alpha = mi.Float(0.5, 1.0, 0, 0)
+    value = losses.normal_consistency(
+        normal, mi.Vector3f(0, 0, 1) + empty, mi.Bool(True, True, True, False), alpha
+    )
+    assert float(value[0]) == 0
+
+
+def test_empty_image_gives_finite_gradients() -> None:
+    """Nothing seen anywhere: every loss stays finite, forwards and backwards."""
+    size = WIDTH * HEIGHT
+    leaves = [dr.zeros(mi.Float, size) for _ in range(5)]
+    dr.enable_grad(leaves)
+    z = expected_depth(leaves[3], leaves[4])
+    depth_normal, valid = normals_from_depth(z, leaves[4], camera())
+    image = display.display_image(leaves[:3], leaves[4], (1.0, 1.0, 1.0))
+    target = [dr.ones(mi.Float, size)] * 3
+    total = (
+        losses.l1(image, target)
+        + losses.d_ssim(image, target, WIDTH, HEIGHT)
+        + losses.normal_consistency(mi.Vector3f(*leaves[:3]), depth_normal, valid, leaves[4])
+        + losses.smoothness(leaves[:3], target, WIDTH, HEIGHT)
+        + losses.alpha_loss(leaves[4], dr.zeros(mi.Float, size))
+    )
+    dr.backward(total)
+    assert np.isfinite(float(total[0])) and np.all(np.isfinite(stack(leaves)))

@@ -1,0 +1,202 @@
+"""Images in passes: the same as in one, with the same derivatives, kernels and less at a time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.occlusion.mesh import read_mesh
+from mi_refgs.plugins import film
+from mi_refgs.render import passes
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.export import TrainedScene
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.table import Surfels
+from tests.plugins.test_integrator_surroundings import behind, far_channels, open_scene
+from tests.scenes.integrator import HEIGHT, WIDTH, hollow_mesh, plane_mesh, raw_channels, scene, sensor, sky
+
+FEW = 512
+"""Samples of a pass in these tests: two rows of pixels or more of 4 × 4 samples."""
+
+SHADINGS = {
+    "pixel": Shading(),
+    "surfel": Shading(at="surfel"),
+    "mirror rays": Shading(occlusion=True),
+    "lobe rays": Shading(occlusion=True, accuracy=Accuracy(visibility_rays=4)),
+    "antialias": Shading(accuracy=Accuracy(antialias=True)),
+    "irradiance": Shading(diffuse="irradiance", occlusion=True, accuracy=Accuracy(ambient_rays=8)),
+    "monte_carlo": Shading(at="surfel", reflectance="monte_carlo", occlusion=True),
+}
+
+
+def leaves(tree: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Every array of a frame with its name."""
+    if is_dataclass(tree):
+        tree = {field.name: getattr(tree, field.name) for field in fields(tree)}
+    if isinstance(tree, dict):
+        for key, value in tree.items():
+            yield from leaves(value, f"{name}.{key}")
+    elif tree is not None and not isinstance(tree, bool):
+        yield name, np.array(tree, np.float64)
+
+
+@pytest.mark.parametrize("samples", [1, 16])
+@pytest.mark.parametrize("around", [False, True])
+@pytest.mark.parametrize("name", SHADINGS)
+def test_a_frame_in_passes_is_the_whole_frame(
+    name: str, around: bool, samples: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shading = SHADINGS[name]
+    beside = Surroundings(Surfels.from_numpy(far_channels()), behind()) if around else None
+    mesh = read_mesh(Path(hollow_mesh(tmp_path))) if shading.occlusion else None
+    light, surfels = EnvironmentLight.from_radiance(sky()), Surfels.from_numpy(raw_channels())
+    view = TrainedScene(surfels, light, mesh, shading, 1, 0.0, surroundings=beside).renderer(samples=samples)
+    eye = Camera.from_sensor(mi.load_dict(sensor()))
+    whole = dict(leaves(view(eye)))
+    monkeypatch.setattr(passes, "PASS_SAMPLES", FEW if samples > 1 else 64)
+    assert len(passes.bands(eye, round(samples**0.5), shading.neighbours)) > 1
+    parts = dict(leaves(view(eye)))
+    assert whole.keys() == parts.keys() and {".alpha", ".radiance", ".maps.roughness"} <= parts.keys()
+    for key, value in whole.items():
+        np.testing.assert_allclose(parts[key], value, atol=2e-5, err_msg=key)
+
+
+@pytest.mark.parametrize("samples", [1, 4])
+@pytest.mark.parametrize("name", SHADINGS)
+def test_a_crop_window_is_part_of_the_whole(name: str, samples: int, tmp_path: Path) -> None:
+    """With the random numbers of the whole, and the neighbours beside the window."""
+    shading = SHADINGS[name]
+    mesh = read_mesh(Path(hollow_mesh(tmp_path))) if shading.occlusion else None
+    light, surfels = EnvironmentLight.from_radiance(sky()), Surfels.from_numpy(raw_channels())
+    view = TrainedScene(surfels, light, mesh, shading, 1, 0.0).renderer(samples=samples)
+    crop = {"crop_offset_x": 5, "crop_offset_y": 2, "crop_width": 7, "crop_height": 6}
+    whole, part = (
+        dict(leaves(view(Camera.from_sensor(mi.load_dict(sensor(film=film)))))) for film in ({}, crop)
+    )
+    for key, value in whole.items():
+        if value.shape[-1] == HEIGHT * WIDTH:
+            value = value.reshape(*value.shape[:-1], HEIGHT, WIDTH)[..., 2:8, 5:12]
+            value = value.reshape(*value.shape[:-2], -1)
+        np.testing.assert_allclose(part[key], value, atol=2e-5, err_msg=key)
+
+
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(passes, "PASS_SAMPLES", FEW)
+    monkeypatch.setattr(film, "DERIVATIVE_SAMPLES", FEW)
+
+
+@pytest.mark.parametrize("kind", ["open", "surfel", "antialias"])
+def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In both modes, of parameters computed from others; on a film whose channels are not those rendered."""
+    options: dict[str, Any] = {"aovs": "d:depth,n:normal,a:albedo", "mesh": plane_mesh(tmp_path)}
+    camera = sensor(film={"pixel_format": "luminance_alpha" if kind == "surfel" else "rgb"})
+    if kind == "surfel":
+        of = scene(camera, aovs=options["aovs"], shade_at="surfel")
+    else:
+        of = (open_scene if kind == "open" else scene)(camera, antialias=kind == "antialias", **options)
+    params = mi.traverse(of)
+    keys = ["integrator.position", "integrator.opacity", "integrator.albedo", "integrator.light"]
+    start = {key: mi.TensorXf(params[key]) for key in keys}
+    rng = np.random.default_rng(5)
+    moved = {
+        key: mi.TensorXf(rng.normal(size=value.shape).astype(np.float32)) for key, value in start.items()
+    }
+
+    def derivatives() -> tuple[np.ndarray, ...]:
+        amount = mi.Float(0)
+        dr.enable_grad(amount)
+        for key in keys:
+            params[key] = start[key] + moved[key] * amount
+        params.update()
+        image = mi.render(of, params, spp=16)
+        weight = np.random.default_rng(2).normal(size=image.shape).astype(np.float32)
+        dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
+        shown = np.array(of.sensors()[0].film().bitmap())
+        reverse = np.array(dr.grad(amount))
+        leaf = {key: mi.TensorXf(value) for key, value in start.items()}
+        for key, value in leaf.items():
+            dr.enable_grad(value)
+            params[key] = value
+        params.update()
+        dr.backward(dr.sum(mi.render(of, params, spp=16) * mi.TensorXf(weight), axis=None))
+        gradients = [dr.grad(value).numpy() for value in leaf.values()]
+        amount = mi.Float(0)
+        dr.enable_grad(amount)
+        for key in keys:
+            params[key] = start[key] + moved[key] * amount
+        params.update()
+        again = mi.render(of, params, spp=16)
+        dr.forward(amount)
+        tangent = dr.grad(again).numpy()
+        return (image.numpy(), shown, tangent, reverse, *gradients)
+
+    whole = derivatives()
+    assert np.abs(whole[2]).max() > 1 and all(np.abs(value).max() > 1e-4 for value in whole[4:])
+    few(monkeypatch)
+    for i, (one, several) in enumerate(zip(whole, derivatives(), strict=True)):
+        scale = np.abs(one).max()
+        np.testing.assert_allclose(several, one, atol=3e-5 * scale, err_msg=str(i))
+
+
+def history(of: mi.Scene, spp: int, backward: bool) -> list[dict[str, Any]]:
+    """Kernels of a render."""
+    params = mi.traverse(of)
+    leaf = mi.TensorXf(params["integrator.albedo"])
+    dr.enable_grad(leaf)
+    params["integrator.albedo"] = leaf
+    params.update()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        image = mi.render(of, params, spp=spp)
+        dr.eval(image)
+        if backward:
+            dr.kernel_history_clear()
+            dr.backward(dr.sum(image, axis=None))
+            dr.eval(dr.grad(leaf))
+        return [dict(kernel) for kernel in dr.kernel_history([dr.KernelType.JIT])]
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_passes_share_their_kernels_and_take_few_samples_at_a_time(
+    backward: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of = scene(sensor(film={"height": 16}))
+    samples = 16 * WIDTH * 64
+    assert max(kernel["size"] for kernel in history(of, 64, backward)) >= samples
+    few(monkeypatch)
+    count = len(passes.bands(Camera.from_sensor(of.sensors()[0]), 8))
+    assert count == 16
+    kernels = history(of, 64, backward)
+    assert max(kernel["size"] for kernel in kernels) < samples / 2  # which the light's texels are
+    times = Counter(kernel["hash"] for kernel in kernels)
+    assert len(times) < len(kernels) / count + 12
+    assert sum(n % count == 0 for n in times.values()) > len(times) / 2
+
+
+def test_bands_cover_every_row_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Equally high without neighbours; inside the image with them; one if it fits."""
+    eye = Camera.look_at((0, 0, 3), up=(0, 1, 0), size=(30, 103))
+    assert [band.rows for band in passes.bands(eye)] == [103]
+    for factor, margin in ((1, 0), (1, 1), (2, 0), (3, 1), (8, 0)):
+        found = passes.bands(eye, factor, margin, 30 * 24 * factor**2)
+        assert sum(band.rows for band in found) == 103 and len(found) > 1
+        top = 0
+        for band in found:
+            assert band.camera.offset[1] == top - band.first[1] and band.first in ((0, 0), (0, margin))
+            assert band.camera.width * (band.camera.height - 2 * margin) * factor**2 <= 30 * 24 * factor**2
+            top += band.rows
+        heights = {band.camera.height for band in found}
+        assert len(heights) == 1 if not margin else max(heights) <= 26
+    assert HEIGHT < 103

@@ -1,0 +1,205 @@
+"""Surfels to image: both orders against float64, the side of normals, harmonics, bounds of opacity."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.reference import shade as reference
+from mi_refgs.reference import splat as oracle
+from mi_refgs.reference.camera import look_at
+from mi_refgs.reference.pinhole import rotation_matrix
+from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.shade import brdf
+from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.table import Surfels
+from tests.helpers import level_maps
+from tests.scenes.integrator import HEIGHT, WIDTH, raw_channels, sky
+
+COLOUR = Shading(at="surfel", reflectance="radiance")
+
+
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-x))
+
+
+def discs(**channels: Any) -> Surfels:
+    """Surfels at the origin that face +z, grey and opaque unless `channels` says otherwise."""
+    count = max(len(values) for values in channels.values())
+    raw = {
+        "position": np.zeros((count, 3)),
+        "rotation": np.tile([0.0, 0, 0, 1], (count, 1)),
+        "scale": np.full((count, 2), np.log(0.3)),
+        "opacity": np.full((count, 1), 20.0),
+        "radiance_sh": np.zeros((count, 3)),
+    }
+    return Surfels.from_numpy(raw | channels)
+
+
+def seen_from(*origin: float, size: int = 1, focal: float = 8.0) -> Camera:
+    """A camera of size × size pixels that looks at the origin."""
+    pose = look_at(np.array(origin), np.zeros(3), up=(0, 1, 0))
+    return Camera.from_pose(size, size, -focal, -focal, size / 2, size / 2, pose)
+
+
+def channel(frame: Frame, name: str) -> np.ndarray:
+    return np.array(getattr(frame, name), dtype=np.float64).T
+
+
+# ---------------- the two orders ----------------
+
+
+def attributes(raw: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.ndarray]:
+    """What is blended or shaded, surfel by surfel."""
+    direction = raw["position"] - origin
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    normal = np.array([rotation_matrix(q)[:, 2] for q in raw["rotation"]])
+    away = np.sum(normal * direction, axis=1) > 0.25
+    coefficients = raw["radiance_sh"].reshape(len(normal), -1, 3)
+    basis = np.array([reference.sh_basis(d, 1) for d in direction])
+    return {
+        "normal": np.where(away[:, None], -normal, normal),
+        "view": -direction,
+        "albedo": sigmoid(raw["albedo"]),
+        "metallic": sigmoid(raw["metallic"][:, 0]),
+        "roughness": sigmoid(raw["roughness"][:, 0]),
+        "radiance": np.maximum(0.5 + np.einsum("ni,nic->nc", basis, coefficients), 0),
+    }
+
+
+@pytest.mark.parametrize("diffuse", ["sh", "irradiance"])
+@pytest.mark.parametrize("at", ["pixel", "surfel"])
+def test_pixels_are_shaded_by_the_oracle(at: Any, diffuse: Any) -> None:
+    """Blend then shade, and shade then blend: both written out with the oracles of splatting and shading."""
+    light = EnvironmentLight.from_radiance(sky(8)).prefilter()
+    table, levels = brdf.table().astype(np.float64), level_maps(light)
+
+    def shaded(**point: Any) -> np.ndarray:
+        terms = reference.shade(
+            table,
+            levels,
+            lobe_matrices.LEVEL_ROUGHNESS,
+            diffuse=diffuse,
+            visibility=None,
+            indirect=None,
+            **point,
+        )
+        return np.sum(terms, axis=0)
+
+    raw = {name: values.astype(np.float64) for name, values in raw_channels().items()}
+    to_world = look_at(np.array([3.0, 1, 2]), np.zeros(3))
+    view = oracle.PinholeCamera(WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, to_world, near=0.01)
+    camera = Camera.from_pose(WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, to_world, near=0.01)
+    frame = render(Surfels.from_numpy(raw), camera, Shading(at=at, diffuse=diffuse), light)
+
+    values = attributes(raw, to_world[:3, 3])
+    points = [{name: column[i] for name, column in values.items()} for i in range(len(raw["position"]))]
+    if at == "surfel":
+        features = np.array([shaded(**point) for point in points])
+        expected = oracle.splat(raw, features, view)
+        radiance = expected.features
+    else:
+        del values["view"]
+        widths = [1 if column.ndim == 1 else 3 for column in values.values()]
+        expected = oracle.splat(raw, np.column_stack(list(values.values())), view)
+        radiance = np.zeros((HEIGHT, WIDTH, 3))
+        for row, column in zip(*np.nonzero(expected.alpha > 1e-3), strict=True):
+            a = expected.alpha[row, column]
+            parts = np.split(expected.features[row, column] / a, np.cumsum(widths)[:-1])
+            point = {n: p if len(p) == 3 else p[0] for n, p in zip(values, parts, strict=True)}
+            local = np.array([(column + 0.5 - 8.3) / -19, (row + 0.5 - 5.6) / -20, 1])
+            radiance[row, column] = a * shaded(view=-to_world[:3, :3] @ local, **point)
+    keep = ~expected.band & ((expected.alpha > 2e-3) | (expected.alpha < 5e-4))
+    assert keep.mean() > 0.9 and np.mean(expected.alpha > 0.3) > 0.2
+    found = channel(frame, "radiance").reshape(HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(found[keep], radiance[keep], atol=3e-4)
+
+
+# ---------------- attributes of one surfel ----------------
+
+
+@pytest.mark.parametrize("degrees", [0, 50, 80, 100, 115, 130, 180])
+def test_normals_are_turned_to_the_camera_unless_they_only_lean_away(degrees: float) -> None:
+    """A surfel turned about +y; up to 14° (a cosine of ¼) behind the silhouette its normal stays."""
+    half = np.radians(degrees) / 2
+    turned = discs(rotation=np.array([[0, np.sin(half), 0, np.cos(half)]]))
+    normal = channel(render(turned, seen_from(0, 0, 4.0), COLOUR), "normal")[0]
+    outward = np.array([np.sin(2 * half), 0, np.cos(2 * half)])
+    expected = -outward if outward[2] < -0.25 else outward
+    assert np.linalg.norm(normal) > 0.1
+    np.testing.assert_allclose(normal / np.linalg.norm(normal), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, None])
+def test_colour_of_harmonics_up_to_a_degree(degree: int | None, rng: np.random.Generator) -> None:
+    coefficients = 0.3 * rng.normal(size=(1, 48))
+    origin = np.array([1.0, -2.0, 3.0])
+    camera = seen_from(*origin)
+    frame = render(discs(radiance_sh=coefficients), camera, COLOUR, sh_degree=degree)
+    basis = reference.sh_basis(-origin / np.linalg.norm(origin), 3)
+    basis[(4 if degree is None else degree + 1) ** 2 :] = 0
+    expected = np.maximum(0.5 + basis @ coefficients.reshape(16, 3), 0)
+    found = channel(frame, "radiance")[0] / channel(frame, "alpha")[0]
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_opacity_and_the_size_on_screen_have_their_bounds() -> None:
+    """An opaque surfel covers 0.99; one far smaller than a pixel is a Gaussian of the pixel's variance."""
+    camera = seen_from(0, 0, 4.0, size=4)
+    large, small = (discs(scale=np.full((1, 2), np.log(scale))) for scale in (10.0, 1e-4))
+    assert channel(render(large, camera, COLOUR), "alpha") == pytest.approx(0.99)
+    alpha = channel(render(small, camera, COLOUR), "alpha").reshape(4, 4)
+    # The four pixels in the middle have their centres half a pixel from it along each axis.
+    assert alpha[1:3, 1:3] == pytest.approx(np.exp(-0.5 * 12 * 0.5))
+    assert np.count_nonzero(alpha) == 4
+
+
+def test_layers_show_down_to_the_least_transmittance() -> None:
+    """Each layer halves the light; the 13th is the last before 1e-4."""
+    layers = discs(opacity=np.zeros((20, 1)), scale=np.full((20, 2), np.log(100.0)))
+    alpha = channel(render(layers, seen_from(0, 0, 4.0), COLOUR), "alpha")
+    assert 1 - alpha == pytest.approx(2.0**-13, rel=1e-2)
+
+
+def test_samples_before_the_near_plane_are_cut() -> None:
+    """A disc crosses the plane, though its centre lies beyond."""
+    tilted = np.array([[np.sin(0.5), 0, 0, np.cos(0.5)]])
+    leaning = discs(rotation=tilted, scale=np.full((1, 2), np.log(2.0)))
+    raw = {name: values.astype(np.float64) for name, values in leaning.to_numpy().items()}
+    covered = []
+    for near in (0.01, 3.5):
+        camera = replace(seen_from(0, 0, 4.0, size=12), near=dr.opaque(mi.Float, near))
+        view = oracle.PinholeCamera(
+            12, 12, -8.0, -8.0, 6, 6, look_at(np.array([0, 0, 4.0]), np.zeros(3), up=(0, 1, 0)), near
+        )
+        expected = oracle.splat(raw, np.zeros((1, 0)), view)
+        alpha = channel(render(leaning, camera, COLOUR), "alpha").reshape(12, 12)
+        np.testing.assert_allclose(alpha[~expected.band], expected.alpha[~expected.band], atol=1e-5)
+        covered.append(np.count_nonzero(alpha))
+    assert 0.2 * covered[0] < covered[1] < 0.8 * covered[0]
+
+
+def test_normals_are_blended_only_where_something_needs_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At surfels a picture needs none: three features fewer, and the same radiance."""
+    from mi_refgs import splat
+
+    blend, features = splat.blend, []
+
+    def counted(footprints: Any, columns: list[Any], *rest: Any) -> Any:
+        features.append(len(columns))
+        return blend(footprints, columns, *rest)
+
+    monkeypatch.setattr(splat, "blend", counted)
+    surfels = discs(radiance_sh=np.full((3, 3), 0.2))
+    camera = seen_from(0, 0, 4.0, size=12)
+    frames = [render(surfels, camera, COLOUR, normals=normals) for normals in (True, False)]
+    assert features == [6, 3] and frames[1].normal is None
+    np.testing.assert_array_equal(*(frame.radiance.numpy() for frame in frames))

@@ -1,0 +1,180 @@
+"""The scene.xml of a run shows what the run shows: camera, options and all."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.errors import InputError
+from mi_refgs.occlusion.mesh import read_mesh
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.render.scene_xml import write_scene_xml
+from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.reflectance import MODELS
+from mi_refgs.shade.shading import Shading
+from mi_refgs.shade.visibility import mirror_visibility
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.table import Surfels
+from tests.scenes.integrator import HEIGHT, WIDTH, hollow_mesh, image, plane_mesh, raw_channels, sensor, sky
+
+OTHER: dict[str, Any] = {
+    "dominant": True,
+    "multiscatter": True,
+    "visibility_rays": 3,
+    "traced_bounces": 1,
+    "ambient_rays": 16,
+    "light_levels": 2,
+    "directions": 5,
+    "antialias": True,
+}
+"""A value for each option that is not its default."""
+
+
+def shading_with(option: str) -> Shading:
+    """A shading whose model honours the option, with OTHER's value."""
+    name = next(name for name, model in MODELS.items() if option in model.honours)
+    accuracy = Accuracy(**{option: OTHER[option]})
+    return Shading(MODELS[name].orders[0], name, diffuse="irradiance", occlusion=True, accuracy=accuracy)
+
+
+def fitted(folder: Path, shading: Shading) -> TrainedScene:
+    made = hollow_mesh if shading.accuracy.ambient_rays else plane_mesh
+    mesh = read_mesh(made(folder)) if shading.occlusion else None
+    surfels = Surfels.from_numpy(raw_channels())
+    return TrainedScene(surfels, EnvironmentLight.from_radiance(sky()), mesh, shading, 7, 1.5)
+
+
+def view(ratio: float = 1.0, sign: float = -1.0, cx: float = WIDTH / 2, cy: float = HEIGHT / 2) -> Camera:
+    """Focal lengths of 18 · ratio and 18 pixels."""
+    pose = np.array(sensor()["to_world"].matrix)
+    return Camera.from_pose(WIDTH, HEIGHT, sign * 18 * ratio, sign * 18, cx, cy, pose)
+
+
+def shown(folder: Path, made: TrainedScene, camera: Camera) -> tuple[mi.Scene, np.ndarray, np.ndarray]:
+    """The exported scene, its picture, and that of the fit."""
+    export(made, folder, camera)
+    scene = mi.load_file(str(folder / "scene.xml"))
+    frame = made.renderer()(camera)
+    expected = np.concatenate([frame.radiance.numpy(), frame.alpha.numpy()[None]]).T
+    return scene, image(scene), expected.reshape(camera.height, camera.width, 4)
+
+
+@pytest.mark.parametrize("option", [field.name for field in fields(Accuracy)])
+def test_every_option_of_accuracy_goes_round(option: str, tmp_path: Path) -> None:
+    """Through scene.xml and through model.json; and the pictures are the same."""
+    shading = shading_with(option)
+    made = fitted(tmp_path, shading)
+    scene, seen, expected = shown(tmp_path / "run", made, view())
+    assert scene.integrator().shading == shading and TrainedScene.read(tmp_path / "run").shading == shading
+    np.testing.assert_allclose(seen, expected, atol=1e-5)
+    plain = replace(made, shading=replace(shading, accuracy=Accuracy())).renderer()(view())
+    assert np.abs(plain.radiance.numpy().T.reshape(HEIGHT, WIDTH, 3) - seen[..., :3]).max() > 1e-3
+
+
+def test_all_other_options_of_shading_go_round(tmp_path: Path) -> None:
+    for shading in (Shading("surfel"), Shading("surfel", "radiance"), Shading(diffuse="irradiance")):
+        scene, seen, expected = shown(tmp_path, fitted(tmp_path, shading), view())
+        assert scene.integrator().shading == shading
+        np.testing.assert_allclose(seen, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize(("cx", "cy"), [(WIDTH / 2, HEIGHT / 2), (3.3, 10.1), (-1.0, 13.5)])
+def test_square_pixels_are_the_view_itself(cx: float, cy: float, sign: float, tmp_path: Path) -> None:
+    """On its head too, and with a principal point outside the picture."""
+    _, seen, expected = shown(tmp_path, fitted(tmp_path, Shading("surfel")), view(1, sign, cx, cy))
+    np.testing.assert_allclose(seen, expected, atol=1e-5)
+    assert expected[..., 3].max() > 0.2
+
+
+@pytest.mark.parametrize("ratio", [1.001, 1.1, 1 / 1.1, 2.0])
+def test_other_pixels_keep_directions_and_extent(
+    ratio: float, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    camera = view(ratio, cx=7.0, cy=6.5)
+    scene, seen, _ = shown(tmp_path, fitted(tmp_path, Shading("surfel")), camera)
+    exported = Camera.from_sensor(scene.sensors()[0])
+    height, width = seen.shape[:2]
+    stretch = max(1, 1 / ratio), max(1, ratio)
+    assert abs(width - WIDTH * stretch[0]) <= 0.5 and abs(height - HEIGHT * stretch[1]) <= 0.5
+    point = mi.Point3f(rng.uniform(-1, 1, (3, 50)).astype(np.float32))
+    there, here = (pixels(which, point) for which in (exported, camera))
+    np.testing.assert_allclose(there, here * np.array(stretch)[:, None], atol=2e-4)
+    text = (tmp_path / "scene.xml").read_text()
+    assert ("square pixels" in text) == ((width, height) != (WIDTH, HEIGHT))
+
+
+def pixels(camera: Camera, point: Any) -> np.ndarray:
+    """Where points land, (2, N)."""
+    local = camera.to_camera(point)
+    return np.array([camera.fx * local.x / local.z + camera.cx, camera.fy * local.y / local.z + camera.cy])
+
+
+def test_what_no_scene_can_say_is_refused(tmp_path: Path) -> None:
+    camera = Camera.from_pose(8, 8, 10, -10, 4, 4, np.eye(4))
+    with pytest.raises(InputError, match="fx, fy: 10 and -10 pixels mirror"):
+        write_scene_xml(tmp_path / "scene.xml", ply="a.ply", shading=Shading(), camera=camera)
+    with pytest.raises(InputError, match="cannot be written"):
+        write_scene_xml(tmp_path / "no" / "scene.xml", ply="a.ply", shading=Shading(), camera=view())
+    with pytest.raises(InputError, match="mesh: there is none"):
+        write_scene_xml(tmp_path / "s.xml", ply="a.ply", shading=Shading(occlusion=True), camera=view())
+
+
+# ---------------- rays only where they are needed ----------------
+
+
+@pytest.mark.parametrize("options", [{}, {"visibility_rays": 2}, {"traced_bounces": 1}])
+def test_rays_start_at_covered_pixels_only(
+    options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """First hits for what is seen, mirror rays for what they hit: counted at the scene that traces them."""
+    accuracy = Accuracy(**options)
+    made = fitted(tmp_path, Shading(diffuse="irradiance", occlusion=True, accuracy=accuracy))
+    hits: list[int] = []
+    trace = Occluder.first_hit
+
+    def counted(self: Occluder, origin: Any, direction: Any, active: Any = True) -> Any:
+        width = dr.width(direction)
+        hits.append(int(dr.count(mi.Bool(active) & dr.full(mi.Bool, True, width))[0]))
+        return trace(self, origin, direction, active)
+
+    monkeypatch.setattr(Occluder, "first_hit", counted)
+    frame = made.renderer()(view(0.4))
+    covered = int((frame.alpha.numpy() > 1e-3).sum())
+    assert 0 < covered < 0.7 * WIDTH * HEIGHT
+    assert hits == [covered]
+
+
+def test_mirror_rays_start_at_hits_only(tmp_path: Path) -> None:
+    mesh = read_mesh(plane_mesh(tmp_path))
+    occluder, asked = Occluder(mesh), []
+    test = occluder._scene.ray_test
+
+    class Counted:
+        """The occluder's scene, which notes how many rays are asked of it."""
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(scene, name)
+
+        def ray_test(self, ray: Any, active: Any) -> Any:
+            asked.append(int(dr.count(active)[0]))
+            return test(ray, active)
+
+    scene, occluder._scene = occluder._scene, Counted()
+    camera = view()
+    ray = camera.rays()
+    _, hit = occluder.first_hit(camera.origin, ray)
+    towards = -dr.normalize(ray)
+    covered = dr.arange(mi.UInt32, WIDTH * HEIGHT) % 2 == 0
+    answer = mirror_visibility(occluder, camera.origin, ray, towards, towards, covered)
+    assert 0 < int(dr.count(hit)[0]) < WIDTH * HEIGHT
+    assert asked == [int(dr.count(hit & covered)[0])]
+    assert dr.all((answer == 1) | (hit & covered))

@@ -1,0 +1,223 @@
+"""Open scenes: object, surroundings and background in one picture, against float64."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from benchmarks.stability import measure
+from benchmarks.stability.case import camera, plain
+from mi_refgs.kernels.device import upload, upload_tensor
+from mi_refgs.reference import surroundings as oracle
+from mi_refgs.render.display import displayed, srgb_from_linear
+from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.samples import box_mean, supersampled
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.table import Surfels
+from tests.benchmarks.benchmark_runs import ROOT  # first: it lets `benchmarks` be found
+
+assert ROOT
+OTHERS = 30
+CASES = [("pixel", "sh"), ("surfel", "irradiance")]
+MAPS = ("radiance", "alpha", "depth", "normal", "share", "albedo", "metallic", "roughness", "background")
+
+
+def around(seed: int = 4) -> dict[str, np.ndarray]:
+    """Discs behind, beside and before the object of the plain case."""
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(OTHERS, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    raw = {
+        "position": direction * rng.uniform(0.4, 2.0, (OTHERS, 1)),
+        "rotation": rng.normal(size=(OTHERS, 4)),
+        "scale": np.log(rng.uniform(0.2, 0.5, (OTHERS, 2))),
+        "opacity": rng.uniform(-1, 1, (OTHERS, 1)),
+        "radiance_sh": 0.2 * rng.normal(size=(OTHERS, 12)),
+    }
+    return {name: values.astype(np.float32) for name, values in raw.items()}
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The plain case with surroundings: the product and the oracle."""
+
+    at: str
+    diffuse: str
+
+    @cached_property
+    def case(self) -> Any:
+        case = plain("open", at=self.at, diffuse=self.diffuse, camera=camera())
+        return replace(case, raw={n: x for n, x in case.raw.items() if n != "indirect_sh"}).rounded()
+
+    @cached_property
+    def values(self) -> dict[str, np.ndarray]:
+        """Every parameter (float32) by name, as in a fit."""
+        rng = np.random.default_rng(9)
+        found = {name: np.asarray(x, np.float32) for name, x in self.case.raw.items()}
+        found |= {f"surroundings/{name}": x for name, x in around().items()}
+        background = rng.normal(size=(8, 16, 3)).astype(np.float32)
+        return found | {"light": np.asarray(self.case.light, np.float32), "background": background}
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        raw = {n: np.concatenate([self.case.raw[n], x]) for n, x in around().items() if n != "radiance_sh"}
+        pixels = np.arange(self.case.camera.width * self.case.camera.height)
+        colour = np.zeros((len(raw["scale"]), 3))
+        return measure.product_order(replace(self.case, raw=raw | {"radiance_sh": colour}), pixels)
+
+    def truth(self, values: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        case = replace(self.case, raw={n: values[n] for n in self.case.raw})
+        pixels = np.arange(case.camera.width * case.camera.height)
+        scene = measure.scene_of(case, pixels, self.order, measure.light_of(values["light"]))
+        others = {name: values[f"surroundings/{name}"] for name in around()}
+        return oracle.render(oracle.OpenScene(scene, others, values["background"]))
+
+    def frame(self, params: dict[str, Any], eye: Camera | None = None) -> Frame:
+        surfels = Surfels({name: params[name] for name in self.case.raw})
+        others = Surfels({name: params[f"surroundings/{name}"] for name in around()})
+        behind = Surroundings(others, EnvironmentLight(params["background"]))
+        light = EnvironmentLight(params["light"]).prefilter()
+        shading = Shading(self.at, "split_sum", self.diffuse)  # type: ignore[arg-type]
+        eye = eye or measure.fast_camera(self.case)
+        return render(surfels, eye, shading, light, aovs=True, surroundings=behind)
+
+    def planes(self, params: dict[str, Any]) -> dict[str, list[Any]]:
+        frame = self.frame(params)
+        named = {name: getattr(frame, name) for name in MAPS if hasattr(frame, name)} | frame.maps
+        found = {name: [*value] if dr.depth_v(value) > 1 else [value] for name, value in named.items()}
+        return {name: found[name] for name in MAPS}
+
+
+@pytest.fixture(scope="module", params=CASES, ids=lambda case: " ".join(case))
+def pair(request: pytest.FixtureRequest) -> Pair:
+    return Pair(*request.param)
+
+
+@pytest.fixture(scope="module")
+def weights(pair: Pair) -> dict[str, np.ndarray]:
+    """Random numbers for each value of each map, 0 near a declared discontinuity."""
+    rng = np.random.default_rng(11)
+    maps, band = pair.truth(pair.values)
+    return {
+        name: np.where(band[:, None], 0, rng.normal(size=maps[name].shape) / np.abs(maps[name]).max())
+        for name in MAPS
+    }
+
+
+def test_the_picture_is_that_of_float64(pair: Pair) -> None:
+    """Radiance, alpha and depth of both; share and materials of the object; the background by its rays."""
+    maps, band = pair.truth(pair.values)
+    planes = pair.planes({name: upload_tensor(x) for name, x in pair.values.items()})
+    assert np.mean(~band) > 0.9 and 0.1 < np.mean(maps["share"] / maps["alpha"].clip(1e-3) > 0.5) < 0.9
+    for name in MAPS:
+        found = np.stack([np.broadcast_to(np.array(x), len(band)) for x in planes[name]], 1)
+        keep = ~band & (np.abs(maps["share"][:, 0] - 1e-3) > 5e-4)  # COVERAGE_FLOOR
+        np.testing.assert_allclose(
+            found[keep], maps[name][keep], atol=2e-4 * np.abs(maps[name]).max(), err_msg=name
+        )
+
+
+def test_both_derivative_modes_are_those_of_float64(pair: Pair, weights: dict[str, np.ndarray]) -> None:
+    """Each class of parameters along a random direction, against central differences of the oracle."""
+    params = {name: upload_tensor(x) for name, x in pair.values.items()}
+    dr.enable_grad(list(params.values()))
+    dr.backward(weighted(pair.planes(params), weights))
+    adjoint = {name: np.asarray(dr.grad(x).numpy(), np.float64) for name, x in params.items()}
+
+    rng, step = np.random.default_rng(3), 1e-7
+    for name, values in pair.values.items():
+        direction = rng.normal(size=values.shape).astype(np.float32)
+        sides = []
+        for sign in (1, -1):
+            moved = np.asarray(values, np.float64) + sign * step * direction
+            maps, _ = pair.truth(pair.values | {name: moved})
+            sides.append(sum(float(np.sum(w * maps[key])) for key, w in weights.items()))
+        expected = (sides[0] - sides[1]) / (2 * step)
+        size = max(abs(expected), 0.05 * float(np.linalg.norm(adjoint[name])))
+        assert np.sum(adjoint[name] * direction) == pytest.approx(expected, abs=0.01 * size), name
+
+        fresh = {key: upload_tensor(x) for key, x in pair.values.items()}
+        dr.enable_grad(fresh[name])
+        dr.set_grad(fresh[name], upload_tensor(direction))
+        total = weighted(pair.planes(fresh), weights)
+        dr.enqueue(dr.ADMode.Forward, fresh[name])
+        dr.traverse(dr.ADMode.Forward)
+        assert dr.grad(total).numpy()[0] == pytest.approx(expected, abs=0.01 * size), name
+
+
+def weighted(planes: dict[str, list[Any]], weights: dict[str, np.ndarray]) -> Any:
+    total = mi.Float(0)
+    for name, table in weights.items():
+        for plane, w in zip(planes[name], table.T, strict=True):
+            total += dr.sum(plane * upload(np.ascontiguousarray(w, np.float32)))
+    return total
+
+
+# ---------------- what a camera shows of it ----------------
+
+
+def test_what_lies_behind_is_exposed_as_the_rest_is() -> None:
+    """Composited in linear radiance, whatever the pictures are; a gain is of object and background alike."""
+    half = mi.Float([0.5, 0.5])
+    frame = Frame(half, half, None, mi.Color3f(0.1), background=mi.Color3f(0.4, 0.2, 0.0))
+    gain = [mi.Float(2), mi.Float(1), mi.Float(1)]
+    for linear in (False, True):
+        planes = displayed(frame, np.ones(3), linear, gain)
+        for plane, value in zip(planes, (2 * (0.1 + 0.5 * 0.4), 0.1 + 0.5 * 0.2, 0.1), strict=True):
+            np.testing.assert_allclose(
+                np.array(plane), np.array(srgb_from_linear(mi.Float([value] * 2))), rtol=1e-6
+            )
+
+
+def test_a_pixel_is_the_mean_of_its_samples() -> None:
+    """Maps of the object are weighted by its own opacity, not by that of everything; the background by what
+    it is seen through, so that compositing the mean is the mean of composites."""
+    pair = Pair("pixel", "sh")
+    params = {name: upload_tensor(x) for name, x in pair.values.items()}
+    eye = measure.fast_camera(pair.case)
+    fine = pair.frame(params, eye.supersampled(2))
+    frame = supersampled(lambda camera: pair.frame(params, camera), eye, 4)
+
+    def mean(value: Any) -> np.ndarray:
+        return np.array(box_mean(value, eye, 2))
+
+    np.testing.assert_allclose(np.array(frame.share), mean(fine.share), rtol=1e-6)
+    seen = mean(fine.share) > 0.01
+    rough = mean(fine.maps["roughness"] * fine.share)[seen] / mean(fine.share)[seen]
+    np.testing.assert_allclose(np.array(frame.maps["roughness"])[seen], rough, rtol=1e-4)
+    for plane, samples in zip(frame.background, fine.background, strict=True):
+        seen_behind = mean((1 - fine.alpha) * samples)
+        np.testing.assert_allclose(np.array((1 - frame.alpha) * plane), seen_behind, rtol=1e-4, atol=1e-3)
+
+
+def test_an_empty_table_shows_nothing_and_a_screened_one_leaves_rows_out() -> None:
+    pair = Pair("pixel", "sh")
+    params = {name: upload_tensor(x) for name, x in pair.values.items()}
+    own = {name: params[name] for name in pair.case.raw}
+    others = {name: np.array(x) for name, x in around().items()}
+    light = EnvironmentLight(params["light"]).prefilter()
+    eye, shading = measure.fast_camera(pair.case), Shading("pixel", "split_sum", "sh")
+
+    def radiance(surroundings: Surroundings | None) -> np.ndarray:
+        frame = render(Surfels(own), eye, shading, light, surroundings=surroundings)
+        return np.array(frame.radiance)
+
+    alone = radiance(None)
+    empty = Surfels.from_numpy({name: x[:0] for name, x in others.items()})
+    np.testing.assert_allclose(radiance(Surroundings(empty)), alone, atol=1e-6)
+    kept = radiance(Surroundings(Surfels.from_numpy({n: x[:3] for n, x in others.items()})))
+    for name in ("position", "radiance_sh"):  # that show nothing by themselves, and that would show
+        broken = {n: x.copy() for n, x in others.items()}
+        broken[name][3:] = np.nan
+        screened = Surfels(Surfels.from_numpy(broken).raw, screened=True)
+        np.testing.assert_allclose(radiance(Surroundings(screened)), kept, atol=1e-6)
+    assert np.abs(kept - alone).max() > 0.05

@@ -1,0 +1,210 @@
+"""Checkpoints: what is cut off, flipped or wrong is found, named and passed over; no run is lost unasked."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from shutil import copytree
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.io.ownership import RECORD
+from mi_refgs.runs import checkpoint
+from mi_refgs.runs.run import Run
+
+State = dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def state(finished: Path) -> State:
+    """What a fit of the full method has saved, with a mesh whose vertices have a surfel each."""
+    newest = checkpoint.read(Run(finished).checkpoints()[-1])
+    assert "mesh/faces" in newest and "params/light" in newest
+    ones = np.ones_like(newest["mesh/vertices"].T)
+    around = {"surfels": ones[:1].astype(np.uint32), "weights": ones[:1], "normals": ones}
+    return newest | {f"mesh/{name}": values for name, values in around.items()}
+
+
+def test_what_is_written_is_read(state: State) -> None:
+    read = checkpoint.decode(checkpoint.encode(state))
+    assert read.keys() == state.keys()
+    for name, values in state.items():
+        assert read[name].dtype == values.dtype and np.array_equal(read[name], values), name
+    with np.load(io.BytesIO(checkpoint.encode(state))) as archive:  # by anyone who has NumPy
+        assert set(archive.files) == state.keys()
+
+
+def test_a_cut_anywhere_is_found(state: State) -> None:
+    data = checkpoint.encode(state)
+    lengths = {0, 1, 22, len(data) - 1, *np.linspace(0, len(data) - 1, 300).astype(int).tolist()}
+    for length in lengths:
+        with pytest.raises(checkpoint.DamagedError):
+            checkpoint.decode(data[:length])
+
+
+def test_a_flipped_bit_anywhere_is_found(state: State, rng: np.random.Generator) -> None:
+    data = bytearray(checkpoint.encode(state))
+    ends = [*range(200), *range(len(data) - 200, len(data))]
+    for place in (*ends, *rng.integers(len(data), size=300).tolist()):
+        bit = 1 << int(rng.integers(8))
+        data[place] ^= bit
+        with pytest.raises(checkpoint.DamagedError):
+            checkpoint.decode(bytes(data))
+        data[place] ^= bit
+    checkpoint.decode(bytes(data))
+
+
+def without(name: str) -> Callable[[State], object]:
+    return lambda state: state.pop(name)
+
+
+def replaced(name: str, change: Callable[[np.ndarray], Any]) -> Callable[[State], object]:
+    return lambda state: state.update({name: np.asarray(change(state[name].copy()))})
+
+
+def spoilt(value: float) -> Callable[[np.ndarray], np.ndarray]:
+    def change(values: np.ndarray) -> np.ndarray:
+        values.reshape(-1)[-1] = value
+        return values
+
+    return change
+
+
+WRONG = {
+    "no iteration": without("iteration"),
+    "no opacity": without("params/opacity"),
+    "no moments": without("optimiser/scale/second"),
+    "no optimiser of a tensor": lambda s: [
+        s.pop(key) for key in list(s) if key.startswith("optimiser/scale")
+    ],
+    "no vertices": without("mesh/vertices"),
+    "rows cut": replaced("params/albedo", lambda x: x[:-1]),
+    "columns cut": replaced("params/rotation", lambda x: x[:, :3]),
+    "flat": replaced("params/position", lambda x: x.ravel()),
+    "moments cut": replaced("optimiser/position/first", lambda x: x[1:]),
+    "statistics cut": replaced("gradient_sum", lambda x: x[1:]),
+    "a light of another shape": replaced("params/light", lambda x: x[:, :-1]),
+    "NaN": replaced("params/roughness", spoilt(np.nan)),
+    "infinite light": replaced("params/light", spoilt(np.inf)),
+    "infinite moments": replaced("optimiser/light/second", spoilt(np.inf)),
+    "negative square": replaced("optimiser/light/second", spoilt(-1)),
+    "no usual gradient": without("optimiser/light/usual"),
+    "NaN seconds": replaced("seconds", lambda x: np.nan),
+    "negative iteration": replaced("iteration", lambda x: -1),
+    "a face without its vertex": replaced("mesh/faces", spoilt(10**6)),
+    "a vertex of a surfel that is not there": replaced("mesh/surfels", spoilt(10**6)),
+    "negative weights of surfels": replaced("mesh/weights", spoilt(-1)),
+    "text": replaced("params/metallic", lambda x: x.astype(str)),
+    "objects": replaced("params/metallic", lambda x: x.astype(object)),
+    "complex": replaced("params/metallic", lambda x: x.astype(complex)),
+    "an unknown channel": lambda s: s.update({"params/colour": s["params/albedo"]}),
+}
+
+
+@pytest.mark.parametrize("change", WRONG.values(), ids=WRONG)
+def test_wrong_content_is_found_though_its_checksum_is_right(
+    state: State, change: Callable[[State], object]
+) -> None:
+    changed = dict(state)
+    change(changed)
+    data = checkpoint.encode(changed)
+    assert data[-64:].decode() == hashlib.sha256(data[:-64]).hexdigest()
+    with pytest.raises(checkpoint.DamagedError):
+        checkpoint.decode(data)
+
+
+def test_an_archive_of_something_else_is_found() -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("iteration.npy", b"\x93NUMPY\x01\x00 no")
+        archive.comment = b"sha256 " + b"0" * 64
+    content = buffer.getvalue()[:-64]
+    with pytest.raises(checkpoint.DamagedError, match=r"no \.npz"):
+        checkpoint.decode(content + hashlib.sha256(content).hexdigest().encode())
+
+
+def damage(path: Path, how: str) -> None:
+    data = path.read_bytes()
+    half = len(data) // 2
+    path.write_bytes(
+        {
+            "empty": b"",
+            "cut": data[: len(data) - 1000],
+            "half": data[:half],
+            "flipped": data[:half] + bytes([data[half] ^ 16]) + data[half + 1 :],
+        }[how]
+    )
+
+
+@pytest.mark.parametrize("how", ["empty", "cut", "half", "flipped"])
+def test_resume_goes_on_from_the_checkpoint_before_and_says_so(
+    how: str, finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Run(copytree(finished, tmp_path / "run"))
+    before, newest = run.checkpoints()
+    damage(newest, how)
+    command = ["train", str(data), "-o", str(run.path), "--resume"]
+    assert main(command) == 0
+    said = capsys.readouterr().err
+    assert f"{newest}: damaged" in said and "resumed at iteration 3 of 6" in said
+    assert checkpoint.read(newest)["iteration"] == 6 and run.checkpoints() == [before, newest]
+
+
+def test_a_fit_is_not_begun_anew_when_every_checkpoint_is_damaged(
+    finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Run(copytree(finished, tmp_path / "run"))
+    for path in run.checkpoints():
+        damage(path, "half")
+    command = ["train", str(data), "-o", str(run.path), "--resume"]
+    assert main(command) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert all(part in said for part in ("0000006.npz: damaged", "begin anew", str(run.path / "checkpoints")))
+    assert len(run.checkpoints()) == 2
+    # The artefacts are of iteration 6 and need no checkpoint.
+    assert main(["eval", str(run.path)]) == 0
+
+
+def test_resume_clears_what_a_killed_process_left(finished: Path, data: Path, tmp_path: Path) -> None:
+    run = Run(copytree(finished, tmp_path / "run"))
+    log = run.path / "metrics.jsonl"
+    whole = log.read_bytes()
+    log.write_bytes(whole + b'{"iteration": 6, "loss": 0.\x00\xff{')
+    left = [
+        run.path / "checkpoints" / ".0000009.npz.0123456789ab.tmp.npz",
+        run.path / ".surfels.ply.0123456789ab.tmp.ply",
+    ]
+    for path in left:
+        path.write_bytes(b"half")
+    (run.path / ".notes").write_text("mine")
+    copy = run.path / "checkpoints" / "0000006 copy.npz"
+    copy.write_bytes(b"mine")
+    run.checkpoints()[-1].unlink()
+    assert main(["train", str(data), "-o", str(run.path), "--resume"]) == 0
+    assert {path.name for path in run.path.rglob(".*")} == {RECORD, ".notes"} and copy.exists()
+    lines = log.read_bytes().splitlines()
+    assert lines[:1] == whole.splitlines()[:1] and len(lines) == 3
+
+
+def test_a_method_that_changed_since_is_refused(
+    finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Run(copytree(finished, tmp_path / "run"))
+    config = run.path / "config.toml"
+    for old, new, name in (
+        ("height = 8", "height = 16", "light"),
+        ("radiance_sh = 1", "radiance_sh = 2", "sh"),
+    ):
+        text = config.read_text()
+        assert old in text
+        config.write_text(text.replace(old, new))
+        assert main(["train", str(data), "-o", str(run.path), "--resume"]) == 2
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert "config.toml" in said and name in said and "undo" in said
+        config.write_text(text)

@@ -1,0 +1,300 @@
+"""Options of accuracy: the float64 oracle, derivatives, and the integrals they approach."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.errors import InputError
+from mi_refgs.reference import lobe as exact
+from mi_refgs.reference import shade as reference
+from mi_refgs.shade import brdf
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.points import reflect
+from mi_refgs.shade.shading import Shading
+from mi_refgs.shade.split_sum import multiple_scattering, shade
+from tests.helpers import check_slopes, level_maps, unit, vector
+from tests.shade.test_models import N, points_of, scene
+
+OPTIONS = (Accuracy(dominant=True), Accuracy(multiscatter=True), Accuracy(dominant=True, multiscatter=True))
+CASES = [(options, "irradiance", "open") for options in OPTIONS] + [(OPTIONS[2], "sh", "indirect")]
+
+
+@pytest.fixture(scope="module")
+def radiance() -> np.ndarray:
+    return np.random.default_rng(3).uniform(0.1, 3, (16, 32, 3))
+
+
+def oracle(
+    values: dict[str, Any], levels: list[np.ndarray], diffuse: str, options: Accuracy, k: int
+) -> np.ndarray:
+    one: dict[str, Any] = {name: None if x is None else x[k] for name, x in values.items()}
+    return reference.shade(
+        brdf.table().astype(np.float64),
+        levels,
+        lobe_matrices.LEVEL_ROUGHNESS,
+        diffuse=diffuse,
+        dominant=options.dominant,
+        multiscatter=options.multiscatter,
+        **one,
+    )
+
+
+# ---------------- the settings ----------------
+
+
+def test_everything_is_off_by_default(radiance: np.ndarray, rng: np.random.Generator) -> None:
+    """Same bits as without the argument; each option changes the picture."""
+    assert Shading().accuracy == Accuracy() == Accuracy(False, False, 1, 0)
+    points = points_of(scene(rng, "open"))
+    light = EnvironmentLight.from_radiance(radiance).prefilter()
+    plain, same = shade(points, light), shade(points, light, "sh", Accuracy())
+    np.testing.assert_array_equal(plain.total().numpy(), same.total().numpy())
+    for options in OPTIONS:
+        changed = shade(points, light, "sh", options).specular.numpy()
+        assert np.abs(changed - plain.specular.numpy()).max() > 0.01
+
+
+def test_shading_survives_json() -> None:
+    shading = Shading(occlusion=True, accuracy=Accuracy(True, False, 8, 3))
+    assert Shading(**json.loads(json.dumps(asdict(shading)))) == shading
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"dominant": 1},
+        {"multiscatter": "true"},
+        {"traced_bounces": None},
+        {"traced_bounces": -1},
+        {"traced_bounces": True},
+        {"visibility_rays": 0},
+        {"visibility_rays": 2.0},
+        {"visibility_rays": True},
+    ],
+)
+def test_bad_settings_are_refused(bad: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=next(iter(bad))):
+        Accuracy(**bad)
+
+
+# ---------------- terms and derivatives ----------------
+
+
+@pytest.mark.parametrize(("options", "diffuse", "occlusion"), CASES)
+def test_terms_against_the_oracle(
+    options: Accuracy, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
+) -> None:
+    light = EnvironmentLight.from_radiance(radiance).prefilter()
+    levels, values = level_maps(light), scene(rng, occlusion)
+    terms = shade(points_of(values), light, diffuse, options)
+    expected = np.array([oracle(values, levels, diffuse, options, k) for k in range(N)])
+    for n, term in enumerate(vars(terms.filled()).values()):
+        got = np.broadcast_to(term.numpy().T, (N, 3))
+        np.testing.assert_allclose(got, expected[:, n], rtol=2e-4, atol=5e-5)
+
+
+@pytest.mark.parametrize(("options", "diffuse", "occlusion"), CASES[2:])
+def test_derivatives_of_the_points(
+    options: Accuracy, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
+) -> None:
+    """Every input of every point against one-sided differences of the oracle, with random weights; where the
+    two sides disagree, a kink of the lookup is near."""
+    light = EnvironmentLight.from_radiance(radiance).prefilter()
+    levels, values = level_maps(light), scene(rng, occlusion)
+    points, weight = points_of(values), rng.normal(size=(N, 3, 3))
+    used = {name: getattr(points, name) for name, x in values.items() if x is not None}
+    dr.enable_grad(list(used.values()))
+    terms = shade(points, light, diffuse, options)
+    loss = sum(
+        dr.dot(mi.Vector3f(term), vector(weight[:, n]))
+        for n, term in enumerate(vars(terms.filled()).values())
+    )
+    dr.backward(loss)
+
+    def value(name: str, k: int, x: Any) -> float:
+        changed = dict(values)
+        changed[name] = np.array(values[name], np.float64)
+        changed[name][k] = x
+        return float((oracle(changed, levels, diffuse, options, k) * weight[k]).sum())
+
+    for name, array in used.items():
+        gradient = np.array(dr.grad(array)).reshape(-1, N).T
+        check_slopes(name, gradient, values[name], value, rng)
+        assert name == "radiance" or np.abs(gradient).max() > 0, f"{name} receives no gradient"
+
+
+@pytest.mark.parametrize("options", OPTIONS)
+def test_derivative_of_the_light(options: Accuracy, radiance: np.ndarray, rng: np.random.Generator) -> None:
+    """Outgoing radiance is linear in radiance: any step will do."""
+    points = points_of(scene(rng, "visibility"))
+    weight = vector(rng.normal(size=(N, 3)))
+    raw = EnvironmentLight.from_radiance(radiance).raw
+    dr.enable_grad(raw)
+    lit = shade(points, EnvironmentLight(raw).prefilter(), "irradiance", options)
+    dr.backward(dr.dot(mi.Vector3f(lit.total()), weight))
+    gradient = dr.grad(raw).numpy() / -np.expm1(-radiance)
+
+    def loss(map_: np.ndarray) -> float:
+        light = EnvironmentLight.from_radiance(map_).prefilter()
+        total = shade(points, light, "irradiance", options).total()
+        return float((total.numpy().astype(np.float64) * weight.numpy()).sum())
+
+    for _ in range(3):
+        step = rng.normal(size=radiance.shape)
+        difference = (loss(radiance + 0.02 * step) - loss(radiance - 0.02 * step)) / 0.04
+        assert abs((gradient * step).sum() - difference) < 2e-3 * np.linalg.norm(gradient)
+
+
+@pytest.mark.parametrize("options", OPTIONS)
+def test_degenerate_points_stay_finite(options: Accuracy, radiance: np.ndarray) -> None:
+    """Zero normals and views, from behind, roughness 0 and 1 (and beyond), colours beyond 1: finite values
+    and gradients."""
+    normals = [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 0, -1], [0, 1, 0], [1e-25, 0, 0], [1e15, 0, 1e15]]
+    views = [[0, 0, 1], [0, 0, 0], [1, 0, 1e-6], [0, -1, 0]]
+    cases = [
+        (n, v, r, m, a)
+        for n in normals
+        for v in views
+        for r in (-1.0, 0.0, 0.3, 1.0, 7.0)
+        for m in (0.0, 1.0)
+        for a in (0.0, 1.0, 1.5, -3.0, 1e6)
+    ]
+    n, v, r, m, a = (np.array(x, np.float64) for x in zip(*cases, strict=True))
+    values: dict[str, Any] = {"normal": n, "view": v, "albedo": np.tile(a[:, None], 3), "metallic": m}
+    values |= {"roughness": r, "radiance": None}
+    values |= {"visibility": np.full(len(r), 0.5), "indirect": np.zeros((len(r), 3))}
+    points = points_of(values)
+    raw = EnvironmentLight.from_radiance(radiance).raw
+    inputs = [
+        getattr(points, name) for name in ("normal", "view", "albedo", "metallic", "roughness", "indirect")
+    ]
+    dr.enable_grad(raw, *inputs)
+    total = shade(points, EnvironmentLight(raw).prefilter(), "irradiance", options).total()
+    dr.backward(total)
+    for array in (total, dr.grad(raw).array, *map(dr.grad, inputs)):
+        assert dr.all(dr.isfinite(array), axis=None)
+    assert total.numpy()[:, a >= 0].min() > -1e-6
+    leaf = mi.Float(r.astype(np.float32))
+    dr.enable_grad(leaf)
+    dr.set_grad(leaf, 1)
+    total = shade(
+        points.replaced(roughness=leaf), EnvironmentLight(raw).prefilter(), "irradiance", options
+    ).total()
+    assert dr.all(dr.isfinite(dr.forward_to(total)), axis=None)
+
+
+# ---------------- what they are for ----------------
+
+
+def lit_by(
+    map_: np.ndarray, cosines: list[float], roughness: float, options: Accuracy, f0: float
+) -> np.ndarray:
+    """Specular radiance (C,) of a metal under a map, by `shade`; its normal is +x."""
+    view = np.array([[c, np.sqrt(1 - c * c), 0] for c in cosines])
+    values = {
+        "normal": np.tile([1.0, 0, 0], (len(view), 1)),
+        "view": view,
+        "albedo": np.full((len(view), 3), f0),
+        "metallic": np.ones(len(view)),
+        "roughness": np.full(len(view), roughness),
+        "radiance": None,
+        "indirect": None,
+    }
+    light = EnvironmentLight.from_radiance(map_).prefilter()
+    return shade(points_of(values), light, "irradiance", options).specular.numpy()[0].astype(np.float64)
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.5, 0.7, 0.9])
+def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -> None:
+    """Under a gradient, split sum against brute force: nearer in sum, and over twice as near where lobes are
+    wide."""
+    h = 32
+    up, around = lobe_matrices.row_angles(h)[:, None, None], lobe_matrices.column_angles(2 * h)[None, :, None]
+    map_ = np.tile(2 + np.cos(up) + 0.8 * np.sin(up) * np.sin(around), 3)
+    cosines = [0.1, 0.3, 0.5, 0.7, 0.9]
+    truth = [
+        exact.reflected(
+            lambda d: reference.bilinear_many(map_, d),
+            np.array([1.0, 0, 0]),
+            np.array([c, np.sqrt(1 - c * c), 0]),
+            roughness,
+            np.full(3, 0.8),
+        )[0]
+        for c in cosines
+    ]
+    mirror, dominant = (
+        np.linalg.norm(lit_by(map_, cosines, roughness, options, 0.8) - truth)
+        for options in (Accuracy(), OPTIONS[0])
+    )
+    print(f"roughness {roughness}: mirror {mirror:.4f}, dominant {dominant:.4f}")
+    assert dominant < (0.8 if roughness < 0.6 else 0.5) * mirror
+
+
+def test_a_white_metal_loses_nothing(rng: np.random.Generator) -> None:
+    """The furnace: A + B with one bounce, 1 with all of them, at any angle and roughness."""
+    values = scene(rng, "open")
+    values["albedo"], values["metallic"] = np.ones((N, 3)), np.ones(N)
+    light = EnvironmentLight.constant(1.0, 16).prefilter()
+    total = shade(points_of(values), light, "irradiance", OPTIONS[1]).total().numpy()
+    assert shade(points_of(values), light, "irradiance").total().numpy().min() < 0.5
+    np.testing.assert_allclose(total, 1, atol=2e-4)
+
+
+@pytest.mark.parametrize("roughness", [0.4, 0.7, 1.0])
+def test_multiple_scattering_comes_closer_to_a_walk_in_the_microsurface(
+    roughness: float, rng: np.random.Generator
+) -> None:
+    """Coloured metals in the furnace, against Heitz's random walk, whose first bounce is the table.
+
+    The formula gives too little, never too much: the bounces absorb by the mean of Schlick's term.
+    """
+    f0 = np.array([0.95, 0.7, 0.3, 0.04])
+    left = np.array([0.07, 0.25, 0.56, 0.9])  # largest part of the energy that is still missing, by f0
+    for cosine in (0.2, 0.6, 0.95):
+        walk, noise = exact.microsurface_walk(cosine, roughness, f0, rng, 40000)
+        white, _ = exact.microsurface_walk(cosine, roughness, np.ones(1), rng, 2000)
+        np.testing.assert_allclose(white, 1, atol=2e-3)
+        a, b = brdf.split_sum(mi.Float(cosine), mi.Float(roughness))
+        for channel, value in enumerate(f0):
+            single = value * float(a[0]) + float(b[0])
+            further = multiple_scattering(mi.Color3f(value), mi.Color3f(single), a + b).numpy()[0, 0]
+            missing = walk[channel] - single
+            error = missing - further
+            assert -3 * noise[channel] < error < left[channel] * missing + 3 * noise[channel], (cosine, value)
+            assert error < (0.07 if value > 0.5 else 0.025), (cosine, value)  # of the light that falls in
+
+
+def test_the_walks_first_bounce_is_the_brute_force_integral(rng: np.random.Generator) -> None:
+    """Two independent oracles: a black second bounce leaves F0 A + B."""
+    n, f0 = np.array([0, 0, 1.0]), np.array([0.3])
+    for cosine, roughness in ((0.3, 0.4), (0.8, 0.9)):
+        v = np.array([np.sqrt(1 - cosine**2), 0, cosine])
+        once = exact.reflected(lambda d: np.ones((len(d), 1)), n, v, roughness, f0)
+        a, b = reference.split_sum(cosine, roughness, 800)
+        np.testing.assert_allclose(once, f0 * a + b, rtol=2e-3)
+        single, noise = exact.microsurface_walk(cosine, roughness, f0, rng, 40000, bounces=1)
+        assert abs(single - once) < 4 * noise + 1e-3
+
+
+def test_a_point_seen_from_behind_keeps_its_mirror_direction(radiance: np.ndarray) -> None:
+    """With roughness 0 the dominant direction is the mirror direction, wherever the camera is."""
+    rng = np.random.default_rng(5)
+    values = scene(rng, "open")
+    values["roughness"] = np.zeros(N)
+    values["normal"] = unit(rng.normal(size=(N, 3)))
+    light = EnvironmentLight.from_radiance(radiance).prefilter()
+    points = points_of(values)
+    mirrored = shade(points.replaced(), light).specular.numpy()
+    np.testing.assert_allclose(
+        shade(points, light, "sh", OPTIONS[0]).specular.numpy(), mirrored, rtol=2e-4, atol=2e-4
+    )
+    assert dr.all(dr.isfinite(reflect(points.view, points.normal)), axis=None)

@@ -1,0 +1,226 @@
+"""The share of diffuse light that arrives at a mesh: against rays one by one, and where it is used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mi_refgs.errors import InputError
+from mi_refgs.occlusion.mesh import Mesh, read_mesh
+from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
+from mi_refgs.reference import shade as reference
+from mi_refgs.reference.ambient import ambient as exact
+from mi_refgs.render.pipeline import render
+from mi_refgs.shade import ambient, brdf
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.ggx_sampling import lobe_turn
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.table import Surfels
+from tests.helpers import level_maps, unit
+from tests.scenes.corner import VOXEL, corner, gradient_sky, wall_surfels
+from tests.scenes.integrator import HEIGHT, WIDTH, hollow_mesh, plane_mesh, raw_channels, sensor, sky
+
+RAYS = 12
+LOGIT: dict[str, Any] = {"albedo": (1.0, 0.0, -1.0), "metallic": -0.5, "roughness": 0.2}
+"""Materials of every surfel, so that all hits have them."""
+
+
+def parted_corner() -> Mesh:
+    """A floor and a wall beside it that do not touch: no ray starts in a plane of the other plate."""
+    mesh = corner(3)
+    vertices = mesh.vertices.copy()
+    vertices[len(vertices) // 2 :, 0] -= 0.15
+    return Mesh(vertices, mesh.faces, VOXEL)
+
+
+def directions(normals: np.ndarray, rays: int) -> np.ndarray:
+    """The rays (V, K, 3) of vertices."""
+    frame = mi.Frame3f(mi.Vector3f(normals.T.astype(np.float32)))
+    turn, count = lobe_turn(dr.arange(mi.UInt32, len(normals))), mi.UInt32(rays)
+    return np.stack(
+        [ambient.ambient_direction(frame, turn, mi.UInt32(k), count).numpy().T for k in range(rays)], 1
+    )
+
+
+def test_ratios_against_rays_one_by_one() -> None:
+    """With shadows of a light that is not the same from everywhere, and two bounces."""
+    mesh, surfels = parted_corner(), wall_surfels(metallic=LOGIT["metallic"], roughness=LOGIT["roughness"])
+    light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
+    occluder = Occluder(mesh)
+    ambient.prepare(occluder, surfels, light, Accuracy(ambient_rays=RAYS))
+    assert occluder.ambient is not None
+    found = occluder.ambient.numpy()
+
+    levels, table = level_maps(light), brdf.table().astype(np.float64)
+    normals = occluder.surface(surfels).around.normal.numpy().T.astype(np.float64)
+    share = {name: 1 / (1 + np.exp(-np.array(value))) for name, value in LOGIT.items()}
+
+    def outgoing(normal: np.ndarray, view: np.ndarray, free: bool, ratio: np.ndarray) -> np.ndarray:
+        terms = reference.shade(
+            table,
+            levels,
+            LEVEL_ROUGHNESS,
+            normal=normal,
+            view=view,
+            **share,
+            radiance=np.zeros(3),
+            visibility=float(free),
+            indirect=None,
+            diffuse="irradiance",
+            ambient=ratio,
+        )
+        return np.asarray(terms.sum(0))
+
+    blur = ambient.ray_roughness(RAYS)
+    expected, once = (
+        exact(
+            mesh.vertices.astype(np.float64),
+            mesh.faces.astype(int),
+            normals,
+            directions(normals, RAYS).astype(np.float64),
+            lambda ω: reference.specular(levels, LEVEL_ROUGHNESS, ω, blur),
+            outgoing,
+            offset=OFFSET_VOXELS * VOXEL,
+            bounces=bounces,
+            brightest=ambient.BRIGHTEST,
+        )
+        for bounces in (ambient.BOUNCES, 1)
+    )
+    assert np.abs(once - expected).max() > 5e-3
+    assert found.min() < 0.9 and np.ptp(found, axis=1).max() > 0.05
+    # A ray may pass an edge on this side in one and on that side in the other.
+    off = np.abs(found - expected).max(1)
+    assert np.sort(off)[: int(0.9 * len(off))].max() < 2e-3 and off.max() < 0.1
+
+
+def test_a_white_furnace_stays_white() -> None:
+    """Between two plates of albedo 1 nothing is lost: what is blocked comes back from the other plate."""
+    mesh, surfels = parted_corner(), wall_surfels(albedo=np.full((400, 3), 9.0), metallic=-9.0, roughness=3.0)
+    occluder = Occluder(mesh)
+    ambient.prepare(
+        occluder, surfels, EnvironmentLight.constant(1.0, 8).prefilter(), Accuracy(ambient_rays=9)
+    )
+    assert occluder.ambient is not None
+    np.testing.assert_allclose(occluder.ambient.numpy(), 1, atol=1e-3)
+
+
+def test_rays_are_spread_as_the_cosine() -> None:
+    """Mean cosine 2/3, mean squared cosine 1/2, no side preferred; above the surface."""
+    normals = unit(np.random.default_rng(1).normal(size=(7, 3)))
+    ω = directions(normals, 64)
+    cosine = np.einsum("vkc,vc->vk", ω, normals)
+    np.testing.assert_allclose(np.linalg.norm(ω, axis=2), 1, atol=1e-6)
+    np.testing.assert_allclose(cosine.mean(1), 2 / 3, atol=2e-3)
+    np.testing.assert_allclose((cosine**2).mean(1), 0.5, atol=1e-3)
+    np.testing.assert_allclose(ω.mean(1), 2 / 3 * normals, atol=0.02)
+    assert cosine.min() > 0 and np.ptp(ω[:, 0] - normals, axis=0).min() > 0.05
+
+
+def test_one_ray_stands_for_its_part_of_the_hemisphere() -> None:
+    """π / K of the projected hemisphere is the solid angle 4 π α² of the lobe."""
+    for rays in (1, 16, 256):
+        assert 4 * ambient.ray_roughness(rays) ** 4 * rays == pytest.approx(1)
+
+
+def ball() -> Mesh:
+    shape = trimesh.creation.icosphere(subdivisions=2, radius=0.7)
+    return Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.uint32), 0.02)
+
+
+def test_what_is_convex_gets_all_light() -> None:
+    """Whatever the light; and where the pixel's ray misses the mesh too."""
+    raw = raw_channels(4000)
+    x, y, z = raw["position"].T
+    raw["rotation"] = np.stack([-y, x, 0 * x, 1 + z], 1)  # without noise
+    occluder, surfels = Occluder(ball()), Surfels.from_numpy(raw)
+    ambient.prepare(
+        occluder, surfels, EnvironmentLight.from_radiance(sky()).prefilter(), Accuracy(ambient_rays=9)
+    )
+    assert occluder.ambient is not None
+    np.testing.assert_allclose(occluder.ambient.numpy(), 1, atol=1e-6)
+    origin, ray = mi.Point3f(0, 0, 3), mi.Vector3f([0.0, 0.4, 0.1], [0.0, 0.4, 0], [-1.0, -1, -2])
+    ratio = ambient.ambient_of_pixels(occluder, origin, ray, True)
+    np.testing.assert_allclose(ratio.numpy(), np.ones((3, 3)), atol=1e-6)
+
+
+def test_pixels_read_what_the_mesh_holds() -> None:
+    """Linear over a face, in the order of its corners; 1 where nothing is hit or covered."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    mesh = Mesh(vertices, np.array([[0, 1, 2]], np.uint32), 1e-3)
+    occluder = Occluder(mesh)
+    with pytest.raises(InputError, match="prepare"):
+        ambient.ambient_of_pixels(occluder, mi.Point3f(0, 0, 1), mi.Vector3f(0, 0, -1), True)
+    colours = np.array([[0.1, 0.2, 0.3], [0.9, 0.4, 0.5], [0.6, 0.7, 0.8]])
+    occluder.ambient = ambient.VertexColours.of(mesh, colours)
+    at = np.array([[0.2, 0.3], [0.6, 0.1], [0.1, 0.1], [2, 2]])
+    ray = mi.Vector3f(at[:, 0], at[:, 1], -np.ones(4)) - mi.Vector3f(0, 0, 0)
+    ratio = ambient.ambient_of_pixels(occluder, mi.Point3f(0, 0, 1), ray, mi.Bool([True, True, False, True]))
+    shares = np.column_stack([1 - at.sum(1), at])
+    expected = np.where([[True], [True], [False], [False]], shares @ colours, 1)
+    np.testing.assert_allclose(ratio.numpy().T, expected, atol=1e-5)
+    occluder.update(mesh)
+    assert occluder.ambient is None
+
+
+def test_the_diffuse_term_is_multiplied_and_nothing_else(tmp_path: Path) -> None:
+    mesh, surfels = read_mesh(plane_mesh(tmp_path)), Surfels.from_numpy(raw_channels())
+    light = EnvironmentLight.from_radiance(sky()).prefilter()
+    occluder = Occluder(mesh)
+    pose = np.array(sensor()["to_world"].matrix)
+    camera = Camera.from_pose(WIDTH, HEIGHT, -18, -18, WIDTH / 2, HEIGHT / 2, pose)
+
+    def terms(rays: int) -> Any:
+        shading = Shading(diffuse="irradiance", occlusion=True, accuracy=Accuracy(ambient_rays=rays))
+        return render(surfels, camera, shading, light, occluder).terms
+
+    plain = terms(0)
+    occluder.ambient = ambient.VertexColours.of(mesh, np.full(mesh.vertices.shape, [0.5, 0.25, 2.0]))
+    half = terms(8)
+    factor = half.diffuse.numpy() / np.maximum(plain.diffuse.numpy(), 1e-9)
+    met = (np.abs(factor - 1).max(0) > 1e-3) & (plain.diffuse.numpy().min(0) > 1e-6)
+    assert 0 < met.mean() < 1
+    np.testing.assert_allclose(factor[:, met].T, np.tile([0.5, 0.25, 2.0], (met.sum(), 1)), rtol=1e-4)
+    for name in ("specular", "indirect"):
+        np.testing.assert_array_equal(getattr(half, name).numpy(), getattr(plain, name).numpy())
+
+
+def test_the_plugin_follows_its_parameters(tmp_path: Path) -> None:
+    """Ratios are those of the present light and materials, whether the light is its own or the scene's."""
+    own = {"type": "envmap", "bitmap": mi.Bitmap(sky())}
+    surfels = {name: mi.TensorXf(x) for name, x in raw_channels().items()}
+    path = hollow_mesh(tmp_path)
+
+    def loaded(inside: bool) -> Any:
+        integrator = {
+            "type": "refgs",
+            "mesh": str(path),
+            "diffuse": "irradiance",
+            "ambient_rays": 32,
+            **surfels,
+        } | ({"sun": own} if inside else {})
+        rest = {} if inside else {"sun": own}
+        return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor(), **rest})
+
+    for inside, ending in ((True, ".light"), (False, "sun.data")):
+        scene = loaded(inside)
+        params = mi.traverse(scene)
+        key = next(key for key in params.keys() if key.endswith(ending))
+        before = mi.render(scene, params, spp=1).numpy()
+        ratio = scene.integrator().occluder.ambient.numpy()
+        assert ratio.min() < 0.99
+        values = params[key].numpy().copy()
+        values[..., : values.shape[1] // 2, :] *= 0.1
+        params[key] = mi.TensorXf(values)
+        params.update()
+        after = mi.render(scene, params, spp=1).numpy()
+        changed = scene.integrator().occluder.ambient.numpy()
+        assert np.abs(changed - ratio).max() > 0.01 and np.abs(after - before).max() > 0.01

@@ -1,0 +1,60 @@
+"""The scene's environment as a light: turned and mirrored as Mitsuba shows it."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.errors import InputError
+from mi_refgs.plugins.light import emitter_light, own_light
+from mi_refgs.shade.light.light import RotatedLight
+from tests.scenes.integrator import sky
+
+AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+
+
+def T(matrix: object = None) -> mi.ScalarTransform4f:
+    return mi.ScalarTransform4f() if matrix is None else mi.ScalarTransform4f(matrix)
+
+
+TURNS = {
+    "as it is": lambda: T(),
+    "turned": lambda: T().rotate([0.6, 0.8, 0], 70),
+    "mirrored in x": lambda: T().scale([-1, 1, 1]),
+    "mirrored in y": lambda: T().scale([1, -1, 1]),
+    "mirrored in z and turned": lambda: T().rotate([0.6, 0, 0.8], 40).scale([1, 1, -1]),
+    "inverted": lambda: T().scale(-1),
+    "moved": lambda: T().translate([3, 1, 2]),
+}
+
+
+def emitter(to_world: object) -> mi.Emitter:
+    return mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(sky()), "to_world": to_world})
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_radiance_is_that_of_mitsuba(turn: str, rng: np.random.Generator) -> None:
+    """Along the axes and between them, of the scene's own light and of the integrator's copy."""
+    oblique = rng.normal(size=(50, 3))
+    directions = np.vstack([AXES, oblique / np.linalg.norm(oblique, axis=1, keepdims=True)])
+    world = mi.Vector3f(directions.T.astype(np.float32))
+    made = emitter(TURNS[turn]())
+    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    si.wi = -world
+    truth = made.eval(si).numpy()
+    np.testing.assert_allclose(emitter_light(made).radiance(world).numpy(), truth, rtol=1e-3)
+    own, matrix = own_light(made)
+    light = own.prefilter() if matrix is None else RotatedLight(own.prefilter(), matrix)
+    np.testing.assert_allclose(light.radiance(world).numpy(), truth, rtol=1e-3)
+
+
+@pytest.mark.parametrize("factors", [[2, 2, 2], [1, 2, 1], [-1, 1, 1.001]])
+def test_scale_and_shear_are_refused(factors: list[float]) -> None:
+    with pytest.raises(InputError, match="remove scale and shear"):
+        emitter_light(emitter(T().scale(factors)))
+    sheared = np.eye(4)
+    sheared[0, 1] = 0.1
+    with pytest.raises(InputError, match="remove scale and shear"):
+        own_light(emitter(T(sheared)))

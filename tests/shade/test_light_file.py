@@ -1,0 +1,145 @@
+"""Lat-long images of lights: every format in strips, averaged as a whole map is, in little memory."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from mi_refgs.errors import InputError
+from mi_refgs.io import files
+from mi_refgs.io.exr import write_exr
+from mi_refgs.io.images import image_size, linear_from_srgb, read_png, write_png
+from mi_refgs.reconstruction.new_light import NewLight
+from mi_refgs.shade.light import envmap, lobe_matrices
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.light_file import read_radiance
+from tests.helpers import run_python
+
+
+def write_hdr(path: Path, mantissa: np.ndarray) -> None:
+    """A Radiance picture without run lengths of bytes (H, W, 3), all with the exponent of 1/256 per step."""
+    height, width = mantissa.shape[:2]
+    pixels = np.concatenate([mantissa, np.full((height, width, 1), 128, np.uint8)], axis=-1)
+    path.write_bytes(f"#?RADIANCE\n\n-Y {height} +X {width}\n".encode() + pixels.tobytes())
+
+
+def write_map(path: Path, kind: str, rng: np.random.Generator, height: int = 37) -> np.ndarray:
+    """A random map of `kind`, and its linear radiance."""
+    bytes_ = rng.integers(0, 256, (height, 74, 3), dtype=np.uint8)
+    values = (bytes_ / 256).astype(np.float32)
+    if kind == "hdr":
+        write_hdr(path, bytes_)
+    elif kind == "png":
+        write_png(path, values)
+        return np.asarray(linear_from_srgb(read_png(path)))
+    elif kind == "tiled":
+        planes = {name: np.ascontiguousarray(values[..., i]) for i, name in enumerate("RGB")}
+        tiles = OpenEXR.TileDescription()
+        tiles.xSize = tiles.ySize = 16
+        OpenEXR.File({"type": OpenEXR.tiledimage, "tiles": tiles}, planes).write(str(path))
+    elif kind == "window":
+        planes = {name: np.ascontiguousarray(values[..., i]) for i, name in enumerate("RGB")}
+        window = (np.array([5, -9], np.int32), np.array([78, height - 10], np.int32))
+        header = {"type": OpenEXR.scanlineimage, "dataWindow": window, "displayWindow": window}
+        OpenEXR.File(header, planes).write(str(path))
+    elif kind == "grey":
+        values = np.repeat(values[..., :1], 3, axis=-1)
+        write_exr(path, values[..., 0])
+    else:
+        write_exr(path, values, half=kind == "half")
+    return values
+
+
+@pytest.mark.parametrize("kind", ["exr", "half", "tiled", "window", "grey", "hdr", "png"])
+@pytest.mark.parametrize("rows", [64, 12])
+def test_a_map_read_in_strips_is_the_map(
+    kind: str, rows: int, tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Strips of 5 rows; a map that is finer than wanted is averaged as `resample` does."""
+    monkeypatch.setattr(files, "STRIP_ROWS", 5)
+    path = tmp_path / f"map.{kind if kind in ('hdr', 'png') else 'exr'}"
+    values = write_map(path, kind, rng)
+    expected = values if rows > len(values) else lobe_matrices.resample(values, rows)
+    np.testing.assert_allclose(read_radiance(path, rows), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("fine", "coarse"), [(9, 8), (37, 12), (1000, 7), (16, 8), (5, 2)])
+def test_sparse_matrices_are_the_dense_ones(fine: int, coarse: int) -> None:
+    for periodic, dense in (
+        (False, lobe_matrices.row_resampling(fine, coarse)),
+        (True, lobe_matrices.column_resampling(fine, coarse)),
+    ):
+        sparse = lobe_matrices.hat_rows(fine, coarse, periodic).toarray()
+        np.testing.assert_allclose(sparse, dense, atol=1e-6)
+
+
+READ = """
+import json, resource, sys
+import mi_refgs, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+from pathlib import Path
+from mi_refgs.reconstruction import new_light as light
+from mi_refgs.shade.light.envmap import EnvironmentLight
+light.HEIGHT = 64  # what a light of many rows takes is no matter of its file
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+small, large = map(Path, sys.argv[1:])
+for path in (small, large):
+    heights = [light.NewLight(path).read().height, EnvironmentLight.from_file(path, 64).height]
+    print(json.dumps([heights, peak()]))
+"""
+
+
+def test_a_large_map_takes_little_memory(tmp_path: Path) -> None:
+    """26 Mpx in 0.1 MB, of which three float32 channels would take 300 MB."""
+    write_exr(tmp_path / "small.exr", np.full((64, 128), 0.5), half=True)
+    plane = np.full((3600, 7200), 0.5, np.float16)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"Y": plane}).write(str(tmp_path / "large.exr"))
+    lines = run_python(READ, tmp_path / "small.exr", tmp_path / "large.exr", folder=tmp_path).splitlines()
+    (_, before), (heights, after) = map(json.loads, lines)
+    assert heights == [64, 64]
+    assert after - before < 250, f"{after - before:.0f} MB more"
+
+
+def test_more_pixels_than_the_bound_are_refused_by_the_header(tmp_path: Path) -> None:
+    write_exr(tmp_path / "a.exr", np.ones((4, 6, 3)))
+    good = (tmp_path / "a.exr").read_bytes()
+    window, large = struct.pack("<4i", 0, 0, 5, 3), struct.pack("<4i", 0, 0, 2**15 - 1, 2**13)
+    (tmp_path / "a.exr").write_bytes(good.replace(window, large) + bytes(2**22))
+    for read in (image_size, read_radiance, EnvironmentLight.from_file, lambda path: NewLight(path).read()):
+        with pytest.raises(InputError, match=r"a\.exr: size: 32768 × 8193 pixels are more than 268 million"):
+            read(tmp_path / "a.exr")
+
+
+def test_a_light_without_a_height_has_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(envmap, "FINEST", 16)
+    for rows, expected in ((22, 16), (14, 12)):
+        write_exr(tmp_path / "a.exr", np.full((rows, 2 * rows), 0.5))
+        assert EnvironmentLight.from_file(tmp_path / "a.exr").height == expected
+
+
+def test_what_is_no_light(tmp_path: Path) -> None:
+    hole = np.ones((9, 8, 3))
+    hole[7, 5, 1] = np.nan
+    write_exr(tmp_path / "hole.exr", hole)
+    write_exr(tmp_path / "xyz.exr", np.ones((4, 8, 3)), names="XYZ")
+    write_exr(tmp_path / "row.exr", np.ones((1, 8, 3)))
+    write_hdr(tmp_path / "cut.hdr", np.ones((9, 16, 3), np.uint8))
+    (tmp_path / "cut.hdr").write_bytes((tmp_path / "cut.hdr").read_bytes()[:-9])
+    write_exr(tmp_path / "cut.exr", np.random.default_rng(0).random((64, 64, 3)))
+    (tmp_path / "cut.exr").write_bytes((tmp_path / "cut.exr").read_bytes()[:-9000])
+    for name, words in {
+        "hole.exr": "NaN or infinite values, the first at row 7, column 5",
+        "xyz.exr": "channels: found X, Y, Z; export R, G, B",
+        "row.exr": "8 × 1 pixels are no lat-long image",
+        "cut.hdr": "truncated",
+        "cut.exr": "pixels: not a readable EXR file",
+        "none.exr": "cannot be read",
+    }.items():
+        with pytest.raises(InputError, match=words):
+            read_radiance(tmp_path / name)

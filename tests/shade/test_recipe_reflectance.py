@@ -1,0 +1,126 @@
+"""CONTRIBUTING's recipe "add a reflectance model", followed: Lambert and Phong under a light.
+
+One channel, one class and two `register`s are all that is added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.shade import reflectance
+from mi_refgs.shade.points import ShadingPoints, Terms, reflect, safe_normalize
+from mi_refgs.shade.reflectance import Reflectance, SurfelView
+from mi_refgs.shade.shading import Shading
+from mi_refgs.surfels import attributes as channels
+from mi_refgs.surfels.attributes import Channel
+from mi_refgs.surfels.ply import read_ply
+from mi_refgs.surfels.table import Surfels
+from tests.scenes.integrator import raw_channels, scene
+from tests.scenes.tiny import train_command, write_data
+
+SHININESS = Channel("shininess", (1,), "sigmoid", 0.02, ("shininess",), initial=0.5, aov="Y")
+SHARE = 0.3  # of the light that the lobe reflects
+
+
+class Phong(Reflectance):
+    """albedo irradiance(n), and a lobe about the mirror direction that narrows with the shininess."""
+
+    name = "phong"
+
+    def channels(self, diffuse: str) -> tuple[str, ...]:
+        return ("albedo", "shininess")
+
+    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+        return {name: surfels.value(name) for name in self.channels(shading.diffuse)}
+
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+        normal, view = safe_normalize(points.normal), safe_normalize(points.view)
+        lobe = light.specular(reflect(view, normal), 1 - points.shininess)
+        return Terms(points.albedo * light.irradiance(normal), SHARE * lobe)
+
+
+METHOD = """
+iterations = 2000
+[surfels]
+channels = ["albedo", "shininess"]
+[light]
+height = 8
+[stage.only]
+until = 2000
+reflectance = "phong"
+"""
+
+
+@pytest.fixture(autouse=True)
+def phong() -> Iterator[None]:
+    channels.register(SHININESS)
+    reflectance.register(Phong())
+    yield
+    reflectance.unregister("phong")
+    channels.unregister("shininess")
+
+
+def raw() -> dict[str, np.ndarray]:
+    """Geometry and albedo of the usual discs, and their shininess."""
+    usual = raw_channels()
+    kept = {name: usual[name] for name in ("position", "rotation", "scale", "opacity", "albedo")}
+    return kept | {"shininess": 0.3 * usual["metallic"]}
+
+
+@pytest.mark.parametrize("order", ["pixel", "surfel"])
+def test_the_plugin_renders_and_differentiates_it(order: str) -> None:
+    """Chosen by its name alone, in both orders, with an AOV of its channel; slopes by differences."""
+    of = scene(raw=raw(), reflectance="phong", shade_at=order, aovs="sh:shininess")
+    params = mi.traverse(of)
+    key = "integrator.shininess"
+    start = params[key].numpy().copy()
+    weight = np.random.default_rng(0).normal(size=np.shape(mi.render(of, spp=1).numpy()))
+
+    def loss(values: np.ndarray) -> Any:
+        params[key] = mi.TensorXf(values.astype(np.float32))
+        params.update()
+        return float((mi.render(of, spp=1).numpy() * weight).sum())
+
+    step = np.random.default_rng(1).normal(size=start.shape)
+    expected = (loss(start + 0.01 * step) - loss(start - 0.01 * step)) / 0.02
+    leaf = mi.TensorXf(start)
+    dr.enable_grad(leaf)
+    params[key] = leaf
+    params.update()
+    image = mi.render(of, params, spp=1)
+    assert np.ptp(image.numpy()[..., -1]) > 0.1, "the AOV shows the channel"
+    dr.backward(dr.sum(image * mi.TensorXf(weight.astype(np.float32)), axis=None))
+    assert (dr.grad(leaf).numpy() * step).sum() == pytest.approx(expected, rel=2e-2, abs=1e-2)
+
+
+def test_the_picture_is_what_the_model_says() -> None:
+    """Under a constant light of 1 the radiance is albedo + SHARE: blending is linear."""
+    white = {"type": "constant", "radiance": 1.0}
+    of = scene(raw=raw(), reflectance="phong", shade_at="surfel", aovs="n:albedo,a:alpha", light=white)
+    image = mi.render(of, spp=1).numpy()
+    alpha = image[..., -1:]
+    full = alpha[..., 0] > 0.1
+    assert full.sum() > 20
+    expected = alpha * (image[..., -4:-1] + SHARE)
+    np.testing.assert_allclose(image[full][:, :3], expected[full], rtol=2e-3)
+
+
+def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
+    """`refgs train` with a table that names it; the exported surfels have the channel, and it has moved."""
+    (tmp_path / "own.toml").write_text(METHOD)
+    data = write_data(tmp_path / "data")
+    assert main(train_command(data, tmp_path / "run", tmp_path / "own.toml")) == 0
+    fitted = read_ply(tmp_path / "run" / "surfels.ply")
+    assert fitted.has("shininess") and not fitted.has("roughness")
+    moved = fitted.to_numpy()["shininess"]
+    assert np.isfinite(moved).all() and np.ptp(moved) > 0
+    rendered = mi.render(mi.load_file(str(tmp_path / "run" / "scene.xml")), spp=1).numpy()
+    assert np.isfinite(rendered).all() and rendered.max() > 0.1

@@ -1,0 +1,162 @@
+"""Shading where its formulas are at their ends: against the float64 oracle, and the energy that leaves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight
+from mi_refgs.shade.split_sum import shade
+from tests.helpers import level_maps, unit
+from tests.shade.test_models import oracle, points_of
+
+N = 24
+AXES = np.concatenate([np.eye(3), -np.eye(3)])
+TERMS = ("diffuse", "specular", "indirect")
+
+
+def points(rng: np.random.Generator, **fixed: Any) -> dict[str, Any]:
+    """Points seen from above, with some of their values fixed."""
+    view = unit(rng.normal(size=(N, 3)))
+    values = {
+        "normal": unit(unit(rng.normal(size=(N, 3))) + 1.3 * view),
+        "view": view,
+        "albedo": rng.uniform(0.1, 0.9, (N, 3)),
+        "metallic": rng.uniform(0.1, 0.9, N),
+        "roughness": rng.uniform(0.05, 0.95, N),
+        "radiance": rng.uniform(0.1, 2, (N, 3)),
+        "visibility": rng.uniform(0, 1, N),
+        "indirect": rng.uniform(0.1, 1, (N, 3)),
+    }
+    return values | {name: np.broadcast_to(x, values[name].shape).copy() for name, x in fixed.items()}
+
+
+def tilted(view: np.ndarray, cosine: float, rng: np.random.Generator) -> np.ndarray:
+    """Unit normals at this cosine to unit views."""
+    across = np.cross(view, unit(rng.normal(size=view.shape)))
+    return cosine * view + np.sqrt(1 - cosine**2) * unit(across)
+
+
+def mirrored_to(view: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Normals that mirror views to unit targets."""
+    return unit(view + target)
+
+
+def case(name: str, rng: np.random.Generator) -> dict[str, Any]:
+    values = points(rng)
+    view = values["view"]
+    across_the_seam = rng.normal(size=(N, 3)) * (1e-4, 1, 0) + [0, 0, -1]
+    cases: dict[str, dict[str, Any]] = {
+        "roughness 0": {"roughness": 0.0},
+        "roughness 1": {"roughness": 1.0},
+        "roughness 1e-6": {"roughness": 1e-6},
+        "metallic 0": {"metallic": 0.0},
+        "metallic 1": {"metallic": 1.0},
+        "black albedo": {"albedo": 0.0, "metallic": 1.0},
+        "n·v = 1e-3": {"normal": tilted(view, 1e-3, rng)},
+        "n·v = 0": {"normal": tilted(view, 0.0, rng)},
+        "n·v < 0": {"normal": tilted(view, -0.3, rng)},
+        "n = v": {"normal": view},
+        "normals of length 1e-9": {"normal": 1e-9 * values["normal"]},
+        "normals of length 1e15": {"normal": 1e15 * values["normal"]},
+        "towards the axes": {"normal": mirrored_to(view, AXES[np.arange(N) % 6])},
+        "beside the pole": {"normal": mirrored_to(view, unit(rng.normal(size=(N, 3)) * 0.01 + [0, 1, 0]))},
+        "beside the seam": {"normal": mirrored_to(view, unit(across_the_seam))},
+    }
+    return values | {key: np.broadcast_to(x, values[key].shape).copy() for key, x in cases[name].items()}
+
+
+NAMES = (
+    "roughness 0, roughness 1, roughness 1e-6, metallic 0, metallic 1, black albedo, n·v = 1e-3, n·v = 0, "
+    "n·v < 0, n = v, normals of length 1e-9, normals of length 1e15, towards the axes, beside the pole, "
+    "beside the seam"
+).split(", ")
+LIGHTS = {
+    "smooth": lambda rng: rng.uniform(0.1, 3, (16, 32, 3)),
+    "a peak of 1e6": lambda rng: np.where(rng.random((16, 32, 1)) < 0.01, 1e6, 0.3) * np.ones(3),
+    "black": lambda rng: np.zeros((16, 32, 3)),
+    "the smallest map": lambda rng: rng.uniform(0.1, 3, (MIN_HEIGHT, 2 * MIN_HEIGHT, 3)),
+}
+
+
+@pytest.mark.parametrize(
+    ("light", "diffuse"), [("smooth", "sh"), *((light, "irradiance") for light in LIGHTS)]
+)
+def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.random.Generator) -> None:
+    """Error ≤ 1e-4 of the brightest term, and gradients of albedo, metallic and radiance to 1 %.
+
+    The terms are at most quadratic in each of them up to S = 1, so that the oracle's central difference is
+    exact.
+    """
+    radiance = LIGHTS[light](rng)
+    radiance[[0, -1]] = radiance[[0, -1]].mean(axis=1, keepdims=True)  # a pole has no azimuth, so one colour
+    prefiltered = EnvironmentLight.from_radiance(radiance).prefilter()
+    levels = level_maps(prefiltered)
+    for name in NAMES:
+        values = case(name, rng)
+        made = points_of(values)
+        leaves = {
+            key: getattr(made, key) for key in ("albedo", "metallic", "radiance", "roughness", "normal")
+        }
+        dr.enable_grad(*leaves.values())
+        terms = shade(made, prefiltered, diffuse)
+        found = np.stack([np.broadcast_to(getattr(terms, t).numpy(), (3, N)).T for t in TERMS], 1)
+        expected = np.array([oracle(values, levels, diffuse, k) for k in range(N)])
+        limit = 1e-4 * max(np.abs(expected).max(), 1e-3)
+        np.testing.assert_allclose(found, expected, atol=limit, rtol=1e-4, err_msg=f"{name}, {light}")
+        dr.backward(terms.total())
+        for key, leaf in leaves.items():
+            gradient = np.array(dr.grad(leaf)).reshape(-1, N).T
+            assert np.isfinite(gradient).all(), f"{name}, {light}: δ{key}"
+            if key not in ("albedo", "metallic", "radiance"):
+                continue
+            for column in range(gradient.shape[1]):
+                slopes = []
+                for step in (5e-3, -5e-3):
+                    moved = {n: x.copy() for n, x in values.items()}
+                    moved[key].reshape(N, -1)[:, column] += step
+                    slopes.append(np.array([oracle(moved, levels, diffuse, k).sum() for k in range(0, N, 8)]))
+                slope = 100 * (slopes[0] - slopes[1])
+                scale = max(np.abs(slope).max(), 1e-3)
+                np.testing.assert_allclose(
+                    gradient[::8, column], slope, atol=1e-2 * scale, err_msg=f"{name}, {light}: δ{key}"
+                )
+
+
+@pytest.mark.parametrize("dominant", [False, True])
+@pytest.mark.parametrize("multiscatter", [False, True])
+def test_energy_under_a_constant_light_of_1(dominant: bool, multiscatter: bool) -> None:
+    """No more than 1 leaves any material at any angle, and a white one without absorption returns all."""
+    cosine, roughness, metallic, albedo = (
+        x.ravel()
+        for x in np.meshgrid(
+            (np.arange(64) + 0.5) / 64,
+            np.linspace(0, 1, 17),
+            [0, 0.25, 0.5, 0.75, 1],
+            [0, 0.5, 1],
+            indexing="ij",
+        )
+    )
+    count = len(cosine)
+    normal = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], 1)
+    values = {
+        "normal": normal,
+        "view": np.tile([0.0, 0, 1], (count, 1)),
+        "albedo": np.repeat(albedo[:, None], 3, 1),
+        "metallic": metallic,
+        "roughness": roughness,
+        "radiance": None,
+        "visibility": None,
+        "indirect": None,
+    }
+    light = EnvironmentLight.constant(1.0, 16).prefilter()
+    accuracy = Accuracy(dominant=dominant, multiscatter=multiscatter)
+    terms = shade(points_of(values), light, "irradiance", accuracy)
+    total = terms.total().numpy()[0]
+    assert total.min() >= 0 and total.max() <= 1 + 1e-3
+    white = (albedo == 1) & ((metallic == 0) | multiscatter & (metallic == 1))
+    assert total[white].min() >= 1 - 1e-3

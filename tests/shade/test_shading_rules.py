@@ -1,0 +1,198 @@
+"""What can be shaded how: one sentence from one place, whoever asks."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mi_refgs.errors import InputError
+from mi_refgs.methods.read import load
+from mi_refgs.render.pipeline import render
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.points import ShadingPoints, Terms
+from mi_refgs.shade.reflectance import Reflectance, SurfelView, register, unregister
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.table import CHANNELS, Surfels
+from tests.scenes.integrator import image, raw_channels, scene
+
+LIGHT = "[light]\nheight = 16\n"
+STAGE = "[stage.only]\nuntil = 100\n"
+
+IMPOSSIBLE = {
+    "no light": (STAGE, ["stage.only", "light", "add it"]),
+    "no light in a later stage": (
+        f"[stage.first]\nuntil = 50\nreflectance = 'radiance'\n{STAGE}",
+        ["stage.only", "light"],
+    ),
+    "no roughness": (
+        f"[surfels]\nchannels = ['radiance_sh', 'albedo', 'metallic']\n{LIGHT}{STAGE}",
+        ["stage.only", "roughness", "no such channel"],
+    ),
+    "no harmonics": (
+        f"[surfels]\nchannels = ['albedo', 'metallic', 'roughness']\n{LIGHT}{STAGE}",
+        ["stage.only", "radiance_sh", "no such channel"],
+    ),
+    "no harmonics for radiance": (
+        f"[surfels]\nchannels = ['albedo']\n{STAGE}reflectance = 'radiance'",
+        ["stage.only", "radiance_sh"],
+    ),
+    "a channel misspelt": (f"[surfels]\nchannels = ['albdeo']\n{STAGE}", ["'albdeo' is unknown", "albedo"]),
+    "no samples": (
+        f"[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nsamples = 0",
+        ["stage.only", "samples: 0"],
+    ),
+    "bounces of a model that traces none": (
+        f"[surfels]\nchannels = ['albedo', 'roughness']\n{LIGHT}{STAGE}reflectance = 'monte_carlo'\n"
+        "at = 'surfel'\ntraced_bounces = 1\n[mesh]",
+        ["stage.only", "traced_bounces: needs reflectance = split_sum"],
+    ),
+    "materials reset that are none": (
+        f"[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nrestart = ['metallic']",
+        ["stage.only", "restart", "metallic"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", IMPOSSIBLE)
+def test_impossible_methods_are_refused_when_they_are_read(case: str, tmp_path: Path) -> None:
+    text, words = IMPOSSIBLE[case]
+    path = tmp_path / "own.toml"
+    path.write_text(f"iterations = 100\n{text}")
+    with pytest.raises(InputError) as info:
+        load(str(path))
+    assert all(word in str(info.value) for word in ["own.toml", *words])
+    assert "\n" not in str(info.value)
+
+
+def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
+    """`at` keeps its default, "pixel": blending is linear, so that it is the same picture."""
+    path = tmp_path / "own.toml"
+    path.write_text(
+        f"iterations = 100\n[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'"
+    )
+    stage = load(str(path)).stage["only"]
+    assert stage.at == "pixel" and Shading.of(stage, mesh=True) == Shading("surfel", "radiance")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"at": "surfel", "occlusion": True}, "occlusion: needs shade_at = pixel"),
+        ({"reflectance": "radiance", "occlusion": True}, "occlusion: needs shade_at = pixel"),
+        (
+            {"reflectance": "radiance", "accuracy": Accuracy(dominant=True)},
+            "dominant: needs reflectance",
+        ),
+        (
+            {"accuracy": Accuracy(visibility_rays=4)},
+            "visibility_rays, traced_bounces, ambient_rays: need occlusion",
+        ),
+        ({"diffuse": "sh", "accuracy": {"ambient_rays": 9}}, "need diffuse = irradiance"),
+        (
+            {"accuracy": {"traced_bounces": 1}},
+            "visibility_rays, traced_bounces, ambient_rays: need occlusion",
+        ),
+    ],
+)
+def test_what_is_not_allowed_together_is_refused(options: dict, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        Shading(**options)
+    keys = {"at": "shade_at"}
+    accuracy = options.pop("accuracy", {})
+    accuracy = accuracy if isinstance(accuracy, dict) else vars(accuracy)
+    with pytest.raises(Exception, match=words if "occlusion" not in options else "occlusion"):
+        scene(**{keys.get(name, name): value for name, value in options.items()}, **accuracy)
+
+
+def test_rendering_without_what_it_needs_is_refused() -> None:
+    surfels = Surfels.from_numpy(raw_channels())
+    camera = Camera.from_pose(4, 4, -4, -4, 2, 2, np.eye(4))
+    with pytest.raises(InputError, match="light: reflectance = split_sum needs one"):
+        render(surfels, camera, Shading())
+    with pytest.raises(InputError, match="there is no mesh to trace"):
+        render(surfels, camera, Shading(occlusion=True), SimpleNamespace())
+    del surfels.raw["metallic"]
+    with pytest.raises(InputError, match="metallic: the surfels have no such channel"):
+        render(surfels, camera, Shading(), SimpleNamespace())
+
+
+def test_every_mode_that_is_not_refused_renders() -> None:
+    """Each reflectance, order and diffuse with the channels that `check` asks for, and no other."""
+    raw = raw_channels()
+    for reflectance in ("radiance", "split_sum"):
+        for diffuse in ("sh", "irradiance"):
+            for at in ("pixel", "surfel"):
+                shading = Shading(at, reflectance, diffuse)
+                few = {name: values for name, values in raw.items() if name not in needless(shading)}
+                options: dict = {"shade_at": at, "reflectance": reflectance, "diffuse": diffuse}
+                assert image(scene(raw=few, **options)).max() > 0.05
+
+
+def needless(shading: Shading) -> set[str]:
+    found = set()
+    for name in (name for name in CHANNELS if not CHANNELS[name].geometry):
+        try:
+            shading.check([other for other in CHANNELS if other != name])
+            found.add(name)
+        except InputError:
+            pass
+    return found
+
+
+def test_a_stage_says_how_many_directions(tmp_path: Path) -> None:
+    """A model that sums over the hemisphere is occluded at surfels; others have no directions."""
+    path = tmp_path / "own.toml"
+    text = "iterations = 100\n[surfels]\nchannels = ['albedo', 'roughness']\n" + LIGHT + STAGE
+    path.write_text(f"{text}at = 'surfel'\nreflectance = 'monte_carlo'\ndirections = 8")
+    shading = Shading.of(load(str(path)).stage["only"], mesh=True)
+    assert shading.occlusion and shading.accuracy == Accuracy(directions=8)
+    path.write_text(f"{text}at = 'surfel'\ndiffuse = 'irradiance'\ndirections = 8")
+    with pytest.raises(InputError, match="directions: needs reflectance = monte_carlo"):
+        load(str(path))
+
+
+class Complete(Reflectance):
+    """A model with all that is needed."""
+
+    name = "complete"
+
+    def channels(self, diffuse: str) -> tuple[str, ...]:
+        return ("albedo",)
+
+    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+        return {"albedo": surfels.albedo()}
+
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+        return Terms(points.albedo)
+
+
+INCOMPLETE: dict[str, tuple[dict[str, Any], str]] = {
+    "no channels": ({"channels": Reflectance.channels}, "channels is missing; write that method"),
+    "no attributes": ({"attributes": Reflectance.attributes}, "attributes is missing"),
+    "no shade": ({"shade": Reflectance.shade}, "shade is missing"),
+    "rays of its own, and none": ({"visibility": "own"}, "trace is missing"),
+    "no such rays": ({"visibility": "many"}, "visibility: 'many' is not allowed; use none or mirror or own"),
+    "no such lookup": ({"light": "sharp"}, "light: 'sharp' is not allowed"),
+    "no order": ({"orders": ()}, "orders: () is not allowed; use pixel or surfel"),
+    "a name in place of orders": ({"orders": "pixel"}, "orders: 'pixel' is not allowed"),
+    "no such option": ({"accuracy": ("speed",)}, "accuracy: ('speed',) is not allowed; use dominant"),
+    "no name": ({"name": ""}, "no name"),
+    "another's name": ({"name": "split_sum"}, "another model's"),
+}
+
+
+@pytest.mark.parametrize("case", INCOMPLETE)
+def test_an_incomplete_model_is_refused_when_it_is_registered(case: str) -> None:
+    changes, words = INCOMPLETE[case]
+    with pytest.raises(InputError, match=f"^reflectance: .*{re.escape(words)}"):
+        register(type("Incomplete", (Complete,), changes)())
+    with pytest.raises(InputError, match="no model; give an object of a subclass of Reflectance"):
+        register(Complete)  # type: ignore[arg-type]
+    register(Complete())
+    unregister("complete")

@@ -1,0 +1,483 @@
+"""What blocked mirror rays hit, shaded there: materials on the mesh, radiance, derivatives."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.errors import InputError
+from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.reference import lobe as exact
+from mi_refgs.reference import shade as reference
+from mi_refgs.shade import brdf, reflection
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.ggx_sampling import Lobe
+from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
+from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
+from mi_refgs.shade.points import ShadingPoints
+from mi_refgs.shade.split_sum import shade
+from mi_refgs.surfels.table import Surfels
+from tests.helpers import level_maps, unit, vector
+from tests.scenes.corner import (
+    EYE,
+    FLOOR,
+    LOW_EYE,
+    VOXEL,
+    WALL,
+    WALL_COLOUR,
+    channel,
+    channel_surfels,
+    corner,
+    floor_points,
+    gradient_sky,
+    mirrored,
+    seen,
+    wall_blocks,
+    wall_hit,
+    wall_surfels,
+    with_materials,
+)
+
+# ---------------- materials on the mesh ----------------
+
+
+def test_materials_of_the_surfels_reach_the_hits() -> None:
+    """A colour that is linear in the place: vertices mix their neighbours, hits their corners, in the right
+    order."""
+    rng = np.random.default_rng(3)
+    count = 20000
+    position = np.stack(
+        [np.zeros(count), WALL * rng.uniform(size=count), FLOOR * rng.uniform(-1, 1, count)], 1
+    )
+    colour = np.stack([0.2 + 0.4 * position[:, 1], 0.5 + 0.2 * position[:, 2], np.full(count, 0.3)], 1)
+    surfels = Surfels.from_numpy(
+        {
+            "position": position,
+            "rotation": np.tile([0, np.sqrt(0.5), 0, np.sqrt(0.5)], (count, 1)),
+            "scale": np.full((count, 2), np.log(0.05)),
+            "opacity": np.full(count, 1.0),
+            "albedo": np.log(colour / (1 - colour)),
+            "metallic": np.full(count, -1.0),
+            "roughness": np.full(count, 0.5),
+        }
+    )
+    occluder = Occluder(corner())
+    occluder.set_materials(surfels)
+    y, z = rng.uniform(0.1, WALL - 0.1, 500), rng.uniform(-FLOOR + 0.1, FLOOR - 0.1, 500)
+    origin = mi.Point3f(
+        dr.full(mi.Float, 1, 500), mi.Float(y.astype(np.float32)), mi.Float(z.astype(np.float32))
+    )
+    hit = occluder.closest(origin, mi.Vector3f(-1, 0, 0), mi.Vector3f(1, 0, 0))
+    assert dr.all(hit.valid)
+    np.testing.assert_allclose(hit.point.numpy(), [0 * y, y, z], atol=1e-5)
+    found = occluder.surface(surfels).at(hit.triangle, hit.barycentric, hit.valid)
+    expected = np.stack([0.2 + 0.4 * y, 0.5 + 0.2 * z, np.full(500, 0.3)])
+    np.testing.assert_allclose(found.albedo.numpy(), expected, atol=0.02)
+    np.testing.assert_allclose(found.metallic.numpy(), 1 / (1 + math.e), rtol=1e-5)
+    np.testing.assert_allclose(found.normal.numpy().T, np.tile([1, 0, 0], (500, 1)), atol=1e-4)
+    distance = np.linalg.norm(position[np.array(found.surfel)][:, 1:] - np.stack([y, z], 1), axis=1)
+    assert distance.max() < 0.35  # half a cell's diagonal
+    missed = occluder.closest(origin, mi.Vector3f(1, 0, 0), mi.Vector3f(1, 0, 0))
+    assert (
+        not dr.any(missed.valid)
+        and dr.all(missed.triangle == 0)
+        and dr.all(missed.barycentric == 0, axis=None)
+    )
+
+
+def test_vertices_mix_surfels_by_opacity_and_footprint() -> None:
+    """Three surfels by the formula, exp(-½ (u²/s_u² + v²/s_v² + distance²/voxel²)); one alone far away."""
+    position = np.array([[0.2, 0.1, 0.0], [-0.1, 0.3, 0.05], [0.0, -0.4, -0.08]])
+    scale = np.array([[0.3, 0.2], [0.25, 0.4], [0.5, 0.3]])
+    opacity, colour = np.array([0.9, 0.5, 0.2]), np.array([0.1, 0.5, 0.9])
+    logit = np.log(colour / (1 - colour))
+    surfels = Surfels.from_numpy(
+        {
+            "position": position,
+            "rotation": np.tile([0.0, 0, 0, 1], (3, 1)),
+            "scale": np.log(scale),
+            "opacity": np.log(opacity / (1 - opacity)),
+            "albedo": np.tile(logit[:, None], 3),
+            "metallic": logit,
+            "roughness": logit,
+        }
+    )
+    vertices = np.array([[0, 0, 0], [0.4, 0, 0], [0, 0.4, 0.1], [50, 0, 0]], np.float32)
+    mesh = Mesh(vertices, np.array([[0, 1, 2], [1, 3, 2]], np.uint32), 0.1)
+    rows = np.array(with_materials(mesh, surfels).surface(surfels).rows).reshape(4, 8)
+    for vertex, row in zip(vertices[:3], rows, strict=False):
+        u, v, w = (vertex - position).T
+        weight = opacity * np.exp(-0.5 * ((u / scale[:, 0]) ** 2 + (v / scale[:, 1]) ** 2 + (w / 0.1) ** 2))
+        np.testing.assert_allclose(row[:5], (weight @ colour) / weight.sum(), rtol=1e-4)
+    np.testing.assert_allclose(rows[3, :5], 0.1, rtol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 5:], axis=1), 1, rtol=1e-5)
+
+
+def test_misuse_is_refused() -> None:
+    occluder, surfels = Occluder(corner()), wall_surfels()
+    with pytest.raises(InputError, match="none are set"):
+        occluder.surface(surfels)
+    occluder.set_materials(surfels)
+    with pytest.raises(InputError, match="399"):
+        occluder.surface(surfels.gather(dr.arange(mi.UInt32, 399)))
+    occluder.update(corner())
+    with pytest.raises(InputError, match="none are set"):
+        occluder.surface(surfels)
+    bare = Surfels({name: x for name, x in surfels.raw.items() if name != "metallic"})
+    with pytest.raises(InputError, match="metallic"):
+        occluder.set_materials(bare)
+    with pytest.raises(InputError, match="none to take"):
+        occluder.set_materials(surfels.gather(mi.UInt32()))
+
+
+# ---------------- traced light ----------------
+
+
+def true_reflection(
+    place: np.ndarray, view: np.ndarray, roughness: float, wall_roughness: float
+) -> np.ndarray:
+    """What the metal floor reflects, (3,), by quadrature of quadratures: the sky, or a metal wall, itself lit
+    by what of the sky the floor leaves it."""
+    map_, x, y = gradient_sky(), np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
+
+    def sky(d: np.ndarray) -> np.ndarray:
+        return np.where(d[:, 1:2] < 0, 0, reference.bilinear_many(map_, d))  # the floor is long
+
+    def incoming(d: np.ndarray) -> np.ndarray:
+        out = reference.bilinear_many(map_, d)
+        for k in np.flatnonzero(wall_blocks(place, d)[0]):
+            out[k] = exact.reflected(sky, x, -d[k], wall_roughness, np.array(WALL_COLOUR), 12)
+        return out
+
+    return exact.reflected(incoming, y, view, roughness, np.array([0.8, 0.7, 0.6]), 24)
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.45])
+def test_traced_light_comes_closer_to_the_integral(roughness: float) -> None:
+    """Two plates, brute force with one bounce: mirror ray alone, traced mirror ray, traced lobe."""
+    place, points = floor_points(roughness, count=10)
+    truth = [
+        true_reflection(p, unit(v), roughness, 0.35)
+        for p, v in zip(place, points.view.numpy().T.astype(np.float64), strict=True)
+    ]
+    surfels = wall_surfels(
+        albedo=np.tile(np.log(np.array(WALL_COLOUR) / (1 - np.array(WALL_COLOUR))), (400, 1)),
+        metallic=14.0,
+        roughness=np.log(0.35 / 0.65),
+    )
+    light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
+    error = {}
+    for name, accuracy in {
+        "mirror ray": Accuracy(),
+        "8 rays": Accuracy(visibility_rays=8),
+        "traced mirror ray": Accuracy(traced_bounces=1),
+        "8 traced rays": Accuracy(visibility_rays=8, traced_bounces=1),
+        "all options": Accuracy(dominant=True, visibility_rays=64, traced_bounces=1),
+    }.items():
+        terms = shade(seen(points, place, accuracy, surfels, light), light, "irradiance", accuracy)
+        got = (terms.filled().specular + terms.filled().indirect).numpy().T
+        error[name] = float(np.mean((got - truth) ** 2 / np.square(truth)))
+    print(f"relMSE at roughness {roughness}: " + ", ".join(f"{k}: {e:.4f}" for k, e in error.items()))
+    assert error["8 rays"] < error["mirror ray"]
+    assert error["8 traced rays"] < 0.25 * error["mirror ray"]
+    assert max(error["8 traced rays"], error["all options"]) < 0.5 * error["traced mirror ray"]
+
+
+@pytest.mark.parametrize("diffuse", ["irradiance", "sh"])
+def test_a_traced_mirror_ray_is_shaded_as_a_pixel_is(diffuse: Any) -> None:
+    """The hit against the oracle's `shade` there, with the wall's own materials, normal and harmonics."""
+    place, points = floor_points(0.3)
+    surfels = wall_surfels()
+    harmonics = np.random.default_rng(4).normal(size=12) * 0.2
+    surfels = Surfels(
+        surfels.raw | {"radiance_sh": mi.TensorXf(np.tile(harmonics, (400, 1)).astype(np.float32))}
+    )
+    light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
+    found = seen(points, place, Accuracy(traced_bounces=1), surfels, light, diffuse)
+    indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
+    assert 0 < visibility.mean() < 0.8 and (indirect[visibility == 1] == 0).all()
+    levels = level_maps(light)
+    for k in np.flatnonzero(visibility == 0):
+        direction = mirrored(place)[k, 0]
+        basis = reference.sh_basis(direction, 1)
+        own = np.maximum(0.5 + basis @ harmonics.reshape(4, 3), 0)
+        terms = reference.shade(
+            brdf.table().astype(np.float64),
+            levels,
+            LEVEL_ROUGHNESS,
+            normal=np.array([1.0, 0, 0]),
+            view=-direction,
+            albedo=1 / (1 + np.exp([-1.0, 0, 1])),
+            metallic=float(1 / (1 + np.exp(-1.5))),
+            roughness=float(1 / (1 + np.exp(-0.2))),
+            radiance=own,
+            visibility=None,
+            indirect=None,
+            diffuse=diffuse,
+        )
+        np.testing.assert_allclose(indirect[k], terms.sum(0), rtol=1e-3)
+
+
+def test_a_hit_in_the_dark_is_dark() -> None:
+    """A lid before the wall: the wall is seen in the floor, but its own mirror ray is blocked."""
+    base = corner()
+    lid = np.array([[-1, 3, -9], [9, 3, -9], [9, 3, 9], [-1, 3, 9]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32) + len(base.vertices)
+    lidded = Mesh(
+        np.concatenate([base.vertices, lid]), np.concatenate([base.faces, faces]).astype(np.uint32), VOXEL
+    )
+    place, points = floor_points(0.2)
+    light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
+    accuracy, surfels = Accuracy(traced_bounces=1), wall_surfels(metallic=14.0)
+    open_, dark = (
+        seen(points, place, accuracy, surfels, light, occluder=occluder).indirect.numpy()
+        for occluder in (with_materials(base, surfels), with_materials(lidded, surfels))
+    )
+    hits = open_[0] > 0
+    assert hits.any() and dark[:, hits].max() < 1e-4 < open_[:, hits].min()
+
+
+# ---------------- further bounces ----------------
+
+
+def oracle_of_walls(light: PrefilteredLight, surfels: Surfels, diffuse: str) -> exact.Outgoing:
+    """What leaves the walls of a channel, by the float64 `shade`."""
+    table, levels = brdf.table().astype(np.float64), level_maps(light)
+    raw = {name: x.numpy().astype(np.float64)[[0, -1]] for name, x in surfels.raw.items()}
+    materials = {name: 1 / (1 + np.exp(-raw[name])) for name in ("albedo", "metallic", "roughness")}
+
+    def outgoing(wall: int, normal: np.ndarray, view: np.ndarray, free: float, beyond: np.ndarray) -> Any:
+        own = reference.sh_basis(-view, 1) @ raw["radiance_sh"][wall].reshape(4, 3) + 0.5
+        terms = reference.shade(
+            table,
+            levels,
+            LEVEL_ROUGHNESS,
+            normal=normal,
+            view=view,
+            albedo=materials["albedo"][wall],
+            metallic=float(materials["metallic"][wall, 0]),
+            roughness=float(materials["roughness"][wall, 0]),
+            radiance=np.maximum(own, 0),
+            visibility=free,
+            indirect=beyond,
+            diffuse=diffuse,
+        )
+        return terms.sum(0)
+
+    return outgoing
+
+
+def harmonic_channel_surfels(albedo: np.ndarray | None = None, uneven: float = 0.0) -> Surfels:
+    """Surfels of a channel with harmonics, those of a wall alike but for `uneven`."""
+    rng, surfels = np.random.default_rng(4), channel_surfels(albedo)
+    harmonics = np.repeat(0.2 * rng.normal(size=(2, 12)), 400, 0) + uneven * rng.normal(size=(800, 12))
+    return Surfels(surfels.raw | {"radiance_sh": mi.TensorXf(harmonics.astype(np.float32))})
+
+
+def lengths(place: np.ndarray, directions: np.ndarray) -> list[int]:
+    """Number of walls that rays from points of the floor of a channel meet one after the other."""
+    found = []
+    for origin, direction in zip(place, directions, strict=True):
+        count, hit = 0, wall_hit(origin, direction)
+        while hit is not None:
+            direction = direction * [-1, 1, 1]
+            count, hit = count + 1, wall_hit(hit[0], direction)
+        found.append(count)
+    return found
+
+
+@pytest.mark.parametrize("diffuse", ["irradiance", "sh"])
+@pytest.mark.parametrize("bounces", [1, 2, 3])
+def test_bounces_of_a_mirror_ray_against_the_oracle(bounces: int, diffuse: Any) -> None:
+    """To and fro between two walls, recursion in float64: rays that end before the last bounce, and after."""
+    place, points = floor_points(0.3, eye=LOW_EYE)
+    surfels = harmonic_channel_surfels()
+    light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
+    occluder = with_materials(channel(), surfels)
+    accuracy = Accuracy(traced_bounces=bounces)
+    found = seen(points, place, accuracy, surfels, light, diffuse, occluder, LOW_EYE)
+    indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
+    outgoing, mirrors = oracle_of_walls(light, surfels, diffuse), mirrored(place, LOW_EYE)[:, 0]
+    for k, mirror in enumerate(mirrors):
+        expected = exact.chain(wall_hit, outgoing, place[k], mirror, bounces)
+        assert visibility[k] == (expected is None)
+        np.testing.assert_allclose(indirect[k], 0 if expected is None else expected, rtol=2e-3)
+    assert {1, 2, 3, 4} <= set(lengths(place, mirrors))
+
+
+@pytest.mark.parametrize("rays", [2, 6])
+def test_bounces_of_rays_of_the_lobe_against_the_oracle(rays: int) -> None:
+    """The mean over the blocked rays, one by one, and a single bright ray among them held back."""
+    place, points = floor_points(0.4, count=25, eye=LOW_EYE)
+    surfels = harmonic_channel_surfels()
+    sky = gradient_sky()
+    sky[1:4, 4:7] += 40.0  # a lamp
+    light = EnvironmentLight.from_radiance(sky).prefilter()
+    accuracy = Accuracy(visibility_rays=rays, traced_bounces=2)
+    occluder = with_materials(channel(), surfels)
+    found = seen(points, place, accuracy, surfels, light, "irradiance", occluder, LOW_EYE)
+    indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
+    lobe = Lobe.of(points.normal, points.view, points.roughness, mi.Color3f(0.8, 0.7, 0.6))
+    samples = [lobe.sample(mi.UInt32(i), mi.UInt32(rays)) for i in range(rays)]
+    direction = np.stack([d.numpy().T for d, _ in samples], 1).astype(np.float64)
+    weight = np.stack([np.array(w) for _, w in samples], 1).astype(np.float64)
+    outgoing, levels, held = oracle_of_walls(light, surfels, "irradiance"), level_maps(light), 0
+    for k, mirror in enumerate(mirrored(place, LOW_EYE)[:, 0]):
+        arriving = [exact.chain(wall_hit, outgoing, place[k], d, 2) for d in direction[k]]
+        blocked = np.array([x is not None for x in arriving]) & (weight[k] > 0)
+        radiance = np.array([np.zeros(3) if x is None else x for x in arriving])
+        free = reference.specular(levels, LEVEL_ROUGHNESS, mirror, 0.4)
+        np.testing.assert_allclose(visibility[k], weight[k][~blocked].sum() / weight[k].sum(), atol=1e-4)
+        if blocked.any():
+            expected = exact.blocked_mean(radiance, weight[k], blocked, free, 1 - 3 * 0.4**2)
+            np.testing.assert_allclose(indirect[k], expected, rtol=5e-3)
+            plain = weight[k][blocked] @ radiance[blocked] / weight[k][blocked].sum()
+            held += bool((expected < 0.9 * plain).any())
+    assert held > 2
+
+
+@pytest.mark.parametrize("rays", [1, 4])
+def test_bounces_add_light_and_converge(rays: int) -> None:
+    """Every bounce adds light somewhere and takes none anywhere; the last ones add next to nothing."""
+    place, points = floor_points(0.3, count=300, eye=LOW_EYE)
+    surfels = channel_surfels()
+    light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
+    occluder = with_materials(channel(), surfels)
+    images = [
+        seen(
+            points,
+            place,
+            Accuracy(visibility_rays=rays, traced_bounces=bounces),
+            surfels,
+            light,
+            occluder=occluder,
+            eye=LOW_EYE,
+        ).indirect.numpy()
+        for bounces in (1, 2, 3, 6, 7)
+    ]
+    steps = [after - before for before, after in pairwise(images)]
+    for step in steps:
+        assert step.min() > (-1e-5 if rays == 1 else -0.02)  # a brighter ray may hold another back less
+    size = [float(step.mean()) for step in steps]
+    assert size[0] > size[1] > size[2] > size[3] and size[0] > 0.01 and size[3] < 0.01 * size[0]
+
+
+# ---------------- derivatives ----------------
+
+
+@pytest.mark.parametrize("rays", [1, 5])
+@pytest.mark.parametrize("name", ["light", "albedo", "metallic", "roughness", "radiance_sh"])
+def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two bounces, both modes against central differences of the indirect radiance, with random weights and
+    steps; what is held back of bright rays stays as it was, as the derivative has it."""
+    rng = np.random.default_rng(8)
+    place, points = floor_points(0.4, count=60, eye=LOW_EYE)
+    surfels = harmonic_channel_surfels(rng.normal(size=(400, 3)), 0.1)
+    occluder = with_materials(channel(), surfels)
+    sky = gradient_sky()
+    sky[1:4, 4:7] += 20.0  # a lamp
+    leaves = surfels.raw | {"light": EnvironmentLight.from_radiance(sky).raw}
+    accuracy = Accuracy(visibility_rays=rays, traced_bounces=2)
+    diffuse = "sh" if name == "radiance_sh" else "irradiance"
+    weight = vector(rng.normal(size=(len(place), 3)))
+
+    def indirect(value: Any) -> Any:
+        changed = leaves | {name: value}
+        light = EnvironmentLight(changed.pop("light")).prefilter()
+        return seen(points, place, accuracy, Surfels(changed), light, diffuse, occluder, LOW_EYE).indirect
+
+    kept: list[Any] = []
+    held_back = reflection._firefly_clamp
+
+    def keep(*arguments: Any) -> Any:
+        if not kept:
+            kept.append(held_back(*arguments))
+            dr.eval(kept)
+        return kept[0]
+
+    assert max(lengths(place, mirrored(place, LOW_EYE)[:, 0])) > 1
+    monkeypatch.setattr(reflection, "_firefly_clamp", keep)
+
+    base = leaves[name].numpy().copy()
+    step = rng.normal(size=base.shape).astype(np.float32)
+    ends = [
+        np.sum(indirect(mi.TensorXf(base + t * step)).numpy().astype(np.float64) * weight.numpy())
+        for t in (-0.01, 0.01)
+    ]
+    difference = (ends[1] - ends[0]) / 0.02
+    assert abs(difference) > 1e-3
+    assert rays == 1 or 0 < (kept[0].numpy() < 0.9).mean() < 0.5
+
+    leaf = mi.TensorXf(base)
+    dr.enable_grad(leaf)
+    dr.backward(dr.sum(dr.dot(mi.Vector3f(indirect(leaf)), weight)))
+    reverse = float(np.sum(dr.grad(leaf).numpy().astype(np.float64) * step))
+    leaf = mi.TensorXf(base)
+    dr.enable_grad(leaf)
+    dr.set_grad(leaf, mi.TensorXf(step))
+    tangent = dr.forward_to(indirect(leaf))
+    forward = float(np.sum(tangent.numpy().astype(np.float64) * weight.numpy()))
+    print(f"{name}, {rays} rays: {difference:.5f} {reverse:.5f} {forward:.5f}")
+    scale = float(np.linalg.norm(tangent.numpy()) * np.linalg.norm(weight.numpy())) / np.sqrt(len(place))
+    assert abs(reverse - forward) < 1e-4 * scale
+    assert abs(forward - difference) < 5e-3 * scale
+
+
+def test_rays_and_geometry_are_detached() -> None:
+    place, points = floor_points(0.4)
+    surfels, light = wall_surfels(), EnvironmentLight.from_radiance(gradient_sky()).prefilter()
+    occluder = with_materials(corner(), surfels)
+    surfels.enable_grad()
+    dr.enable_grad(points.normal, points.view, points.roughness, points.albedo)
+    for rays in (1, 3):
+        accuracy = Accuracy(visibility_rays=rays, traced_bounces=1)
+        found = seen(points, place, accuracy, surfels, light, occluder=occluder)
+        assert not dr.grad_enabled(found.visibility)
+        dr.backward(dr.sum(found.indirect.x))
+        assert dr.all(dr.grad(points.roughness) == 0) and dr.all(dr.grad(points.normal) == 0, axis=None)
+        assert dr.all(dr.grad(surfels.raw["position"]).array == 0)
+        assert not dr.all(dr.grad(surfels.raw["roughness"]).array == 0)
+
+
+def test_degenerate_pixels_stay_finite() -> None:
+    """Views from behind and along surfaces, no normal, roughness out of range, rays that miss, no mesh."""
+    rng = np.random.default_rng(2)
+    cases = [
+        (n, r)
+        for n in ([0, 1, 0], [0, -1, 0], [1, 0, 0], [0, 0, 0], [1e-25, 0, 0], [1e15, 1e15, 0])
+        for r in (-1.0, 0.0, 1e-6, 0.5, 1.0, 9.0)
+    ]
+    normal, roughness = (np.array(x, np.float64) for x in zip(*cases, strict=True))
+    count = len(cases)
+    place = np.stack([rng.uniform(-0.5, 0.9, count), np.zeros(count), rng.uniform(-3, 0.6, count)], 1)
+    points = ShadingPoints(
+        normal=vector(normal),
+        view=vector(unit(EYE - place)),
+        albedo=mi.Color3f(5, -1, 0.5) + dr.zeros(mi.Color3f, count),
+        metallic=dr.full(mi.Float, 1, count),
+        roughness=mi.Float(roughness.astype(np.float32)),
+    )
+    light, surfels = EnvironmentLight.from_radiance(gradient_sky()), wall_surfels()
+    empty = Occluder(Mesh.empty())
+    empty.set_materials(surfels)
+    for occluder in (with_materials(corner(), surfels), empty):
+        for accuracy in (
+            Accuracy(visibility_rays=7),
+            Accuracy(True, True, 7, 3),
+            Accuracy(True, True, 1, 3),
+        ):
+            raw = mi.TensorXf(light.raw)
+            dr.enable_grad(raw)
+            prefiltered = EnvironmentLight(raw).prefilter()
+            found = seen(points, place, accuracy, surfels, prefiltered, occluder=occluder)
+            assert dr.all((found.visibility >= 0) & (found.visibility <= 1))
+            total = shade(found, prefiltered, "irradiance", accuracy).total()
+            dr.backward(dr.sum(total.x + total.y + total.z))
+            assert dr.all(dr.isfinite(total), axis=None) and dr.all(dr.isfinite(dr.grad(raw)), axis=None)

@@ -1,0 +1,173 @@
+"""Values that are NaN, infinite or huge: they end no process, spoil no picture, and are named."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+import warnings
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.surfels.attributes import CHANNELS
+from tests.scenes.integrator import COUNT, integrator, plane_mesh, raw_channels, scene, sensor, sky
+
+BAD = (np.nan, np.inf, -np.inf, 1e38, -1e38)
+CULPRITS = [3, 8, 11, 17, 20]  # one for each
+
+# What a program meets that steps its materials to NaN: the lookup of a level by a NaN roughness.
+PROGRAM = """
+    import sys
+    sys.path.insert(0, "tests")
+    import mitsuba as mi
+    mi.set_variant("llvm_ad_rgb")
+    import mi_refgs
+    import drjit as dr
+    from tests.scenes.integrator import scene
+    made = scene(shade_at=sys.argv[1])
+    params = mi.traverse(made)
+    params["integrator.roughness"] = dr.full(mi.TensorXf, float("nan"), (24, 1))
+    params.update()
+    dr.enable_grad(params["integrator.roughness"])
+    dr.backward(dr.sum(mi.render(made, params)))
+    print(dr.grad(params["integrator.roughness"]).numpy().sum())
+"""
+
+
+@pytest.mark.parametrize("at", ["pixel", "surfel"])
+def test_a_nan_roughness_does_not_end_the_process(at: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(PROGRAM), at], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr[-500:]
+    assert float(done.stdout) == 0
+
+
+def rendered(made: mi.Scene, values: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The image with these parameters, and the gradient of a weighted sum of it."""
+    params = mi.traverse(made)
+    for name, value in values.items():
+        params[f"integrator.{name}"] = mi.TensorXf(value)
+    params.update()
+    for name in values:
+        dr.enable_grad(params[f"integrator.{name}"])
+    image = mi.render(made, params, spp=1)
+    weights = np.random.default_rng(5).normal(size=image.shape).astype(np.float32)
+    dr.backward(dr.sum(image * mi.TensorXf(weights)))
+    # Dr.Jit's view of its own memory must not outlive the tensor.
+    gradients = {name: np.array(dr.grad(params[f"integrator.{name}"]).numpy()) for name in values}
+    return image.numpy(), gradients
+
+
+def options(kind: str, folder: Path) -> dict[str, Any]:
+    if kind in ("pixel", "surfel"):
+        return {"shade_at": kind, "diffuse": "sh"}
+    mesh = {"mesh": plane_mesh(folder), "diffuse": "irradiance" if kind == "bounces" else "sh"}
+    return mesh | ({"traced_bounces": 1, "visibility_rays": 2} if kind == "bounces" else {})
+
+
+@pytest.mark.filterwarnings("ignore:refgs:RuntimeWarning")
+@pytest.mark.parametrize("kind", ["pixel", "surfel", "mesh", "bounces"])
+def test_a_surfel_with_such_a_value_is_as_good_as_absent(kind: str, tmp_path: Path) -> None:
+    raw = raw_channels()
+    made = scene(**options(kind, tmp_path))
+    light = np.array(mi.traverse(made)["integrator.light"].numpy())
+    others = np.setdiff1d(np.arange(COUNT), CULPRITS)
+    wanted, gradients = rendered(
+        made, {name: value[others] for name, value in raw.items()} | {"light": light}
+    )
+    assert wanted.max() > 0.1
+    for channel in raw:
+        values = {name: value.copy() for name, value in raw.items()}
+        # A large number saturates where the activation has a bound, and does so without a NaN.
+        values[channel][CULPRITS, -1] = (*BAD[:3], np.nan, np.inf) if CHANNELS[channel].bounded else BAD
+        image, found = rendered(made, values | {"light": light})
+        np.testing.assert_allclose(image, wanted, rtol=1e-5, atol=1e-6, err_msg=channel)
+        for name, gradient in found.items():
+            case, expected = f"{channel}: δ{name}", gradients[name]
+            if name != "light":
+                assert not gradient[CULPRITS].any(), case
+                gradient = gradient[others]
+            np.testing.assert_allclose(
+                gradient, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max(), err_msg=case
+            )
+
+
+@pytest.mark.filterwarnings("ignore:refgs:RuntimeWarning")
+def test_the_materials_of_a_mesh_stay_finite_without_a_new_search_for_neighbours(tmp_path: Path) -> None:
+    for diffuse in ("sh", "irradiance"):
+        made = scene(mesh=plane_mesh(tmp_path), traced_bounces=1, diffuse=diffuse)
+        for channel in ("roughness", "radiance_sh"):
+            values = raw_channels()[channel]
+            values[CULPRITS] = np.nan
+            image, gradients = rendered(made, {channel: values})
+            assert np.isfinite(image).all()
+            assert np.isfinite(gradients[channel]).all()
+            assert not gradients[channel][CULPRITS].any()
+
+
+@pytest.mark.filterwarnings("ignore:refgs:RuntimeWarning")
+def test_such_a_texel_of_the_light_is_black() -> None:
+    made = scene()
+    raw = raw_channels()
+    light = np.array(mi.traverse(made)["integrator.light"].numpy())
+    light[7, 11:16, 1] = -80  # a radiance of 1e-35
+    wanted, gradients = rendered(made, raw | {"light": light})
+    light[7, 11:16, 1] = BAD
+    image, found = rendered(made, raw | {"light": light})
+    np.testing.assert_allclose(image, wanted, rtol=1e-5, atol=1e-6)
+    assert not found["light"][7, 11:16, 1].any()
+    for name, gradient in found.items():
+        np.testing.assert_allclose(gradient, gradients[name], rtol=1e-3, atol=1e-5, err_msg=name)
+
+
+def test_such_a_texel_of_the_scene_s_light_is_black() -> None:
+    def made(values: object) -> np.ndarray:
+        light = {"type": "envmap", "bitmap": mi.Bitmap(sky())}
+        shader = {name: value for name, value in integrator().items() if name != "light"}
+        loaded = mi.load_dict({"type": "scene", "integrator": shader, "sensor": sensor(), "light": light})
+        params = mi.traverse(loaded)
+        data = np.array(params["light.data"].numpy())
+        data[7, 11:16, 1] = values
+        params["light.data"] = mi.TensorXf(data)
+        params.update()
+        return mi.render(loaded, spp=1).numpy()
+
+    np.testing.assert_allclose(made(BAD), made(0), rtol=1e-5, atol=1e-6)
+
+
+def test_finite_extremes_leave_everything_finite() -> None:
+    raw = raw_channels()
+    rng = np.random.default_rng(8)
+    made = scene()
+    for _ in range(20):
+        values = {name: value.copy() for name, value in raw.items()}
+        for value in values.values():
+            exponent = rng.uniform(-18, 18, value.shape)
+            value += np.where(
+                rng.random(value.shape) < 0.2, rng.choice([-1, 1], value.shape) * 10**exponent, 0
+            )
+        image, gradients = rendered(made, values)
+        assert np.isfinite(image).all()
+        assert all(np.isfinite(gradient).all() for gradient in gradients.values())
+
+
+def test_the_plugin_names_channel_number_and_first_surfel_once() -> None:
+    made = scene()
+    params = mi.traverse(made)
+    mi.render(made, spp=1)
+    values = raw_channels()["metallic"]
+    values[CULPRITS] = np.nan
+    params["integrator.metallic"] = mi.TensorXf(values)
+    params.update()
+    with pytest.warns(RuntimeWarning, match=r"5 surfels in metallic \(first: 3\)"):
+        mi.render(made, spp=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        params.update({"integrator.metallic": mi.TensorXf(values)})
+        mi.render(made, spp=1)

@@ -1,0 +1,213 @@
+"""Pictures without derivatives: the same ones as with them, and nothing that nobody asks for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mi_refgs import splat
+from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.reference.camera import look_at
+from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.points import TERMS
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Camera
+from mi_refgs.splat.lanes import Grid, Lanes, Places
+from mi_refgs.surfels.table import Surfels
+from tests.render.test_surroundings import around
+from tests.scenes.integrator import image, raw_channels, scene, sky
+
+MAPS = ("albedo", "metallic", "roughness", "visibility")
+ALL = {*MAPS, *TERMS, "normal", "depth"}
+
+
+def camera_at(focal: float, offset: tuple[int, int] = (0, 0)) -> Camera:
+    """A view with the tiles of its focal length, from as much farther away."""
+    pose = look_at(np.array([1.0, 1.5, 3.0]) * focal / 30, np.zeros(3), up=(0, 1, 0))
+    return replace(Camera.from_pose(45, 38, -focal, -focal, 20.0, 22.0, pose), offset=offset)
+
+
+def mesh() -> Mesh:
+    """A ball below the discs, and one that stands beside it in the way of its mirror rays."""
+    balls = [trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.8, 1.2)]
+    vertices = [np.asarray(ball.vertices, np.float32) for ball in balls]
+    faces = np.asarray(balls[0].faces, np.uint32)
+    both = np.concatenate([vertices[0], vertices[1] + np.array([-1.8, 1.2, 0.8], np.float32)])
+    return Mesh(both, np.concatenate([faces, faces + len(vertices[0])]).astype(np.uint32), 0.05)
+
+
+def things(gaussians: bool = False) -> Surfels:
+    raw = raw_channels(200)
+    raw["scale"] = raw["scale"] - 1.0
+    if gaussians:
+        raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1]], axis=1)
+    return Surfels.from_numpy(raw)
+
+
+def both(surfels: Surfels, view: Camera, shading: Shading, **more: Any) -> list[Frame]:
+    """Frames with everything: with derivatives, and without."""
+    light = EnvironmentLight.from_radiance(sky())
+    given = (surfels, view, shading, shading.light_of(light), Occluder(mesh()))
+    return [render(*given, aovs=True, derivatives=derivatives, **more) for derivatives in (True, False)]
+
+
+def values(frame: Frame) -> dict[str, np.ndarray]:
+    terms = {} if frame.terms is None else frame.terms.known()
+    named = {"radiance": frame.radiance, "alpha": frame.alpha, "depth": frame.depth, "normal": frame.normal}
+    every = named | {"share": frame.share, "background": frame.background} | terms | frame.maps
+    return {name: np.array(value) for name, value in every.items() if value is not None}
+
+
+def assert_same(expected: Frame, found: Frame) -> None:
+    """Maps are divided by alpha, so that only those of pixels that show something are alike."""
+    wanted, got = values(expected), values(found)
+    assert {*wanted} == {*got}
+    seen = np.array(expected.alpha) > 0.02
+    assert 0.02 < seen.mean() < 0.98
+    if "visibility" in wanted:
+        assert 0.02 < wanted["visibility"][seen].mean() < 0.995
+    for name, value in wanted.items():
+        assert got[name].shape == value.shape, name
+        part = seen if name in (*MAPS, "depth") else slice(None)
+        np.testing.assert_allclose(got[name][..., part], value[..., part], atol=2e-5, rtol=5e-6, err_msg=name)
+    np.testing.assert_allclose(got["radiance"], wanted["radiance"], atol=2e-6)
+    np.testing.assert_allclose(got["alpha"], wanted["alpha"], atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    "focal, offset", [(30.0, (0, 0)), (30.0, (3, 2)), (600.0, (5, 3)), (1100.0, (13, 6))]
+)
+def test_the_picture_is_the_same_with_tiles_of_every_size(focal: float, offset: tuple[int, int]) -> None:
+    shading = Shading("pixel", "split_sum", "sh", occlusion=True)
+    assert_same(*both(things(), camera_at(focal, offset), shading))
+
+
+@pytest.mark.parametrize("at", ["surfel", "pixel"])
+@pytest.mark.parametrize("gaussians", [False, True])
+def test_the_picture_is_the_same_in_both_orders(at: Any, gaussians: bool) -> None:
+    assert_same(*both(things(gaussians), camera_at(30.0), Shading(at, "split_sum", "irradiance")))
+
+
+@pytest.mark.parametrize("at", ["surfel", "pixel"])
+def test_the_picture_is_the_same_among_surroundings(at: Any) -> None:
+    light = EnvironmentLight.from_radiance(sky())
+    near = around()
+    near["position"] = near["position"] * 3
+    others = Surroundings(Surfels.from_numpy(near), light)
+    shading = Shading(at, "split_sum", "irradiance")
+    assert_same(*both(things(), camera_at(30.0), shading, surroundings=others))
+
+
+def test_rays_of_a_lobe_are_those_of_the_pixel() -> None:
+    accuracy = Accuracy(visibility_rays=4)
+    shading = Shading("pixel", "split_sum", "irradiance", occlusion=True, accuracy=accuracy)
+    assert_same(*both(things(), camera_at(30.0), shading))
+
+
+def test_antialiasing_sees_the_neighbours_in_the_image() -> None:
+    shading = Shading()
+    accuracy = replace(shading.accuracy, antialias=True)
+    assert_same(*both(things(), camera_at(30.0), replace(shading, accuracy=accuracy)))
+
+
+def test_nothing_in_view_is_black() -> None:
+    behind = replace(camera_at(30.0), origin=mi.Point3f(-9, -15, -30))
+    for frame in (
+        render(things(), behind, Shading(reflectance="radiance"), aovs=True, derivatives=False),
+        render(things().gather(mi.UInt32()), behind, Shading(reflectance="radiance"), derivatives=False),
+    ):
+        assert dr.width(frame.alpha) == 45 * 38 and not np.array(frame.alpha).any()
+        assert not np.array(frame.radiance).any()
+
+
+@pytest.mark.parametrize("name", ["project", "list_by_tile"])
+def test_nothing_in_view_is_looked_for_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    behind = replace(camera_at(30.0), origin=mi.Point3f(-9, -15, -30))
+    made, calls = getattr(splat, name), []
+
+    def counted(*given: Any) -> Any:
+        calls.append(name)
+        return made(*given)
+
+    monkeypatch.setattr(splat, name, counted)
+    frame = render(things(), behind, Shading(reflectance="radiance"), aovs=["depth"], derivatives=False)
+    assert calls == [name] and not np.array(frame.depth).any()
+
+
+@pytest.mark.parametrize("at", ["surfel", "pixel"])
+@pytest.mark.parametrize("name", ["", *sorted(ALL)])
+def test_a_frame_has_what_is_asked_for(at: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And blends no more channels than that takes."""
+    blend, blended = splat.blend_shown, []
+
+    def counted(footprints: Any, features: list[Any], lists: Any, view: Camera, depth: bool) -> Any:
+        blended.append(len(features) + depth)
+        return blend(footprints, features, lists, view, depth)
+
+    monkeypatch.setattr(splat, "blend_shown", counted)
+    light = EnvironmentLight.from_radiance(sky())
+    shading = Shading(at, "split_sum", "sh", occlusion=at == "pixel")
+    given = (things(), camera_at(30.0), shading, shading.light_of(light), Occluder(mesh()))
+    asked = {name} - {""}
+    found = values(render(*given, aovs=asked, derivatives=False))
+    has = {*TERMS} if name in TERMS else {name} - {""}
+    nothing = {"visibility"} if at == "surfel" else set()  # is traced
+    assert {*found} == {"radiance", "alpha"} | (has - nothing)
+    more = {"albedo": 3, "normal": 3, "diffuse": 3, "specular": 3, "metallic": 1, "roughness": 1}
+    deferred = 14 + (name == "depth")
+    assert blended == [deferred if at == "pixel" else 3 + (more | {"depth": 1}).get(name, 0)]
+
+
+def test_every_pixel_of_a_chosen_packet_has_one_place() -> None:
+    view = camera_at(30.0, (3, 2))
+    footprints = splat.project(things(), view)
+    lists = splat.list_by_tile(footprints, view)
+    grid = Grid(lists, view)
+    chosen = grid.filled()
+    assert 0 < dr.width(chosen) < grid.packets
+    places = Places.of(grid, chosen, Lanes.of(grid, chosen))
+    there, raster = np.array(places.there), np.array(places.raster)
+    back = raster[np.array(places.place)[there]]
+    np.testing.assert_array_equal(back, np.flatnonzero(there))
+    alpha = np.array(splat.splat(things(), [], view).alpha)
+    assert not alpha[~there].any() and alpha[there].any()
+
+
+def test_another_view_is_no_other_kernel() -> None:
+    """The number of packets that hold something changes from view to view."""
+    shading = Shading(reflectance="radiance")
+
+    def frame(distance: float) -> None:
+        pose = look_at(np.array([1.0, 1.5, 3.0]) * distance, np.zeros(3), up=(0, 1, 0))
+        view = Camera.from_pose(45, 38, -30.0, -30.0, 20.0, 22.0, pose)
+        dr.eval(render(things(), view, shading, derivatives=False).radiance)
+        dr.sync_thread()
+
+    frame(1.0)
+    misses = dr.detail.launch_stats()[1:]
+    frame(1.6)
+    assert dr.detail.launch_stats()[1:] == misses
+
+
+def test_the_plugin_filters_a_light_that_changes_again() -> None:
+    """It keeps what it filtered for the next picture, until its parameters change."""
+    changing = scene()
+    before = image(changing)
+    params = mi.traverse(changing)
+    key = next(name for name in params.keys() if name.endswith(".light"))
+    brighter = mi.TensorXf(params[key] + 1)
+    params[key] = brighter
+    params.update()
+    after = image(changing)
+    assert np.abs(after - before).max() > 0.1
+    np.testing.assert_allclose(after, image(scene(light=brighter)), atol=1e-6)

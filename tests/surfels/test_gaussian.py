@@ -1,0 +1,330 @@
+"""3D Gaussians by EWA against their float64 oracle: pictures, both derivatives, lists, degenerate rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs import constants
+from mi_refgs.cli import main
+from mi_refgs.constants import ALPHA_MIN, GAUSSIAN_LOW_PASS
+from mi_refgs.fitting import refine
+from mi_refgs.kernels.device import upload
+from mi_refgs.methods import Refine
+from mi_refgs.reference import gaussian as exact
+from mi_refgs.reference import picture
+from mi_refgs.reference import splat as oracle
+from mi_refgs.reference.blend import differentiate
+from mi_refgs.reference.footprint import Rules
+from mi_refgs.render.pipeline import Shading, render
+from mi_refgs.splat import blend, list_by_tile, project
+from mi_refgs.surfels.init import from_points
+from mi_refgs.surfels.ply import read_ply, write_ply
+from mi_refgs.surfels.primitives.gaussian import GaussianAdjoint
+from mi_refgs.surfels.table import Surfels
+from tests.scenes.tiny import train_command, write_data, write_method
+from tests.splat.test_splat import (
+    PARAMETERS,
+    Mutation,
+    Scene,
+    check_transpose,
+    fast_gradients,
+    fast_maps,
+    gradient_errors,
+    loss_weights,
+    make_scene,
+    outside_band,
+)
+
+IMAGE_TOLERANCE = 1e-5  # observed 2e-6
+GRADIENT_TOLERANCE = 1e-3  # relative L2
+
+
+def gaussians(seed: int) -> Scene:
+    """The surfels of `make_scene` (sub-pixel, clamped, behind the camera, on top of each other) with a third
+    axis, needles and pancakes among them, and some whose centres lie beside the picture."""
+    scene = make_scene(seed)
+    rng, count = np.random.default_rng(seed + 7), len(scene.features)
+    scale = np.concatenate([scene.raw["scale"], np.log(rng.uniform(0.005, 0.4, (count, 1)))], axis=1)
+    position, kind = scene.raw["position"].copy(), np.arange(count) % 10
+    scale[kind == 3] = np.log(0.002)
+    scale[kind == 7] = np.log([0.5, 0.5, 1e-4])
+    scale[kind == 8] = np.log([1.0, 1e-3, 1e-3])
+    beside = kind == 9
+    position[beside] += scene.camera.to_world[:3, 0] * rng.choice([-2.5, 2.5], (beside.sum(), 1))
+    scale[beside] = np.log(0.8)
+    raw = scene.raw | {"scale": scale, "position": position}
+    raw = {name: values.astype(np.float32).astype(np.float64) for name, values in raw.items()}
+    return Scene(raw, scene.features, scene.camera)
+
+
+def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
+    """Derivatives of Σ weights · maps in float64: complex steps of the footprints, sums of compositing."""
+    return differentiate(
+        scene.raw, scene.features, scene.camera, np.moveaxis(weights, 2, 0).reshape(6, -1)
+    ).gradients
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_image_matches_oracle(seed: int) -> None:
+    scene = gaussians(seed)
+    expected, got = oracle.splat(scene.raw, scene.features, scene.camera), fast_maps(scene)
+    keep, shape = outside_band(expected), expected.alpha.shape
+    for k in range(scene.features.shape[1]):
+        error = np.abs(got.features[k].numpy().reshape(shape) - expected.features[..., k])
+        assert error[keep].max() <= IMAGE_TOLERANCE
+    assert np.abs(got.alpha.numpy().reshape(shape) - expected.alpha)[keep].max() <= IMAGE_TOLERANCE
+    depth = np.abs(got.depth.numpy().reshape(shape) - expected.depth)[keep]
+    assert depth.max() <= IMAGE_TOLERANCE * (np.abs(scene.raw["position"]).max() + 5)
+
+
+@pytest.mark.parametrize("seed", [8, 15])
+def test_the_two_oracles_agree(seed: int) -> None:
+    """Matrices of one Gaussian after another, and the arrays whose complex steps are the derivatives."""
+    scene = gaussians(seed)
+    x, y = (v.ravel() + 0.5 for v in np.meshgrid(range(scene.camera.width), range(scene.camera.height)))
+    sample = exact.footprint(scene.raw, scene.camera, Rules(), x, y)
+    culled = exact.culled(scene.raw, scene.camera, Rules())
+    assert culled.any() and not culled.all()
+    found, _ = exact.images(scene.raw, scene.camera, 1e-3)
+    for i, (alpha, z, _) in enumerate(found):
+        if not culled[i]:
+            np.testing.assert_allclose(sample.alpha[i], alpha.ravel(), atol=1e-8)
+            np.testing.assert_allclose(sample.z[i], z.ravel())
+
+
+@pytest.mark.parametrize("name", ["position", "rotation", "scale", "opacity"])
+def test_the_oracles_derivatives_are_its_differences(name: str) -> None:
+    scene = gaussians(8)
+    weights = loss_weights(scene, 8)
+    slopes, step = exact_gradients(scene, weights)[name], 1e-6
+    columns = [(row, k) for row in range(len(slopes)) for k in range(slopes.shape[1])]
+    for row, k in columns[:: max(len(columns) // 12, 1)]:
+        sides = []
+        for sign in (1, -1):
+            raw = {channel: values.copy() for channel, values in scene.raw.items()}
+            raw[name][row, k] += sign * step
+            maps = oracle.splat(raw, scene.features, scene.camera)
+            values = np.concatenate([maps.features, maps.depth[..., None], maps.alpha[..., None]], axis=-1)
+            sides.append(np.sum(values * weights))
+        difference = (sides[0] - sides[1]) / (2 * step)
+        assert slopes[row, k] == pytest.approx(difference, abs=2e-5 * max(np.abs(slopes).max(), 1))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_gradients_match_the_oracle(seed: int) -> None:
+    scene = gaussians(seed)
+    weights = loss_weights(scene, seed)
+    expected, got = exact_gradients(scene, weights), fast_gradients(scene, weights)
+    errors = gradient_errors(got, expected)
+    assert max(errors.values()) <= GRADIENT_TOLERANCE, errors
+    for name in PARAMETERS:  # none missing: a non-zero derivative never comes back as zero
+        strong = np.abs(expected[name]).max(axis=1) > 1e-3 * max(np.abs(expected[name]).max(), 1e-9)
+        assert np.all(np.abs(got[name]).max(axis=1)[strong] > 0), name
+
+
+@pytest.mark.parametrize("tile", [size for _, size in constants.TILE_SIZES], ids=str)
+def test_pictures_and_gradients_with_tiles_of_every_size(
+    tile: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(constants, "TILE_SIZES", ((np.inf, tile),))
+    test_image_matches_oracle(12)
+    test_gradients_match_the_oracle(8)
+
+
+@pytest.mark.parametrize("seed", [3, 9, 14])
+def test_forward_mode_is_the_transpose_of_reverse(seed: int) -> None:
+    check_transpose(gaussians(seed), seed)
+
+
+def _scale_column(index: int) -> Mutation:
+    def mutate(monkeypatch: pytest.MonkeyPatch) -> None:
+        original = GaussianAdjoint.columns
+
+        def mutant(self: GaussianAdjoint, row: list) -> list:
+            columns = original(self, row)
+            columns[index] = columns[index] * 1.1
+            return columns
+
+        monkeypatch.setattr(GaussianAdjoint, "columns", mutant)
+
+    return mutate
+
+
+@pytest.mark.parametrize("mutate", [_scale_column(i) for i in range(7)])
+def test_mutants_of_the_adjoint_are_caught(mutate: Mutation, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = gaussians(8)
+    weights = loss_weights(scene, 8)
+    mutate(monkeypatch)
+    errors = gradient_errors(fast_gradients(scene, weights), exact_gradients(scene, weights))
+    assert max(errors.values()) > GRADIENT_TOLERANCE
+
+
+def test_shift_receives_the_screen_translation_gradient() -> None:
+    """The shift moves the projected centre alone, as the principal point does where nothing is clamped."""
+    scene = gaussians(0)
+    weights = loss_weights(scene, 0)
+    shift = mi.Point2f(dr.zeros(mi.Float, 1), dr.zeros(mi.Float, 1))
+    dr.enable_grad(shift)
+    maps = project(scene.surfels(), scene.fast_camera(), shift)
+    lists = list_by_tile(maps, scene.fast_camera())
+    alpha = blend(maps, [], lists, scene.fast_camera()).alpha
+    dr.backward(dr.sum(alpha * upload(weights[..., 5])))
+    step, sides = 1e-5, []
+    for sign in (1, -1):
+        moved = oracle.PinholeCamera(**{**scene.camera.__dict__, "cx": scene.camera.cx + sign * step})
+        sides.append(np.sum(weights[..., 5] * oracle.splat(scene.raw, scene.features, moved).alpha))
+    assert dr.grad(shift).x[0] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(0, 20, 3))
+def test_tile_lists_hold_what_contributes_and_little_else(seed: int) -> None:
+    scene = gaussians(seed)
+    camera = scene.fast_camera()
+    lists = list_by_tile(project(scene.surfels(), camera), camera)
+    begin, end, row = (x.numpy() for x in (lists.pair_begin, lists.pair_end, lists.surfel_from_pair))
+    listed = {(int(i), tile) for tile in range(len(begin)) for i in row[begin[tile] : end[tile]]}
+    y, x = (v.ravel() for v in np.mgrid[0 : camera.height, 0 : camera.width])
+    tile = y // camera.tile[1] * lists.tiles_x + x // camera.tile[0]
+    alpha = exact.footprint(scene.raw, scene.camera, Rules(), x + 0.5, y + 0.5).alpha
+    alpha[exact.culled(scene.raw, scene.camera, Rules())] = 0
+    strong = alpha >= ALPHA_MIN * (1 + 1e-3)
+    needed = {(int(i), int(tile[pixel])) for i, pixel in zip(*np.nonzero(strong), strict=True)}
+    assert needed <= listed and len(listed) <= 1.25 * len(needed) + 20
+    depth = exact.sort_key(scene.raw, scene.camera, np.zeros(1, int), (0, 0))[:, 0]
+    for first, last in zip(begin, end, strict=True):
+        assert np.all(np.diff(depth[row[first:last]]) >= 0)
+
+
+@pytest.mark.parametrize("values", ["zero_scale", "huge_scale", "one_huge", "zero_quaternion", "at_camera"])
+def test_degenerate_rows_stay_finite(values: str) -> None:
+    scene = gaussians(9)
+    raw = {name: x.copy() for name, x in scene.raw.items()}
+    if values == "zero_quaternion":
+        raw["rotation"][:] = 0
+    elif values == "at_camera":
+        raw["position"][:] = scene.camera.to_world[:3, 3]
+    else:
+        raw["scale"][:, : 1 if values == "one_huge" else 3] = -1e4 if values == "zero_scale" else 1e4
+    degenerate = Scene(raw, scene.features, scene.camera)
+    maps = fast_maps(degenerate)
+    assert all(np.all(np.isfinite(x.numpy())) for x in [*maps.features, maps.depth, maps.alpha])
+    gradients = fast_gradients(degenerate, np.ones((scene.camera.height, scene.camera.width, 6)))
+    assert all(np.all(np.isfinite(x)) for x in gradients.values())
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_the_unit_does_not_matter(factor: float) -> None:
+    scene = gaussians(12)
+    pose = scene.camera.to_world.copy()
+    pose[:3, 3] *= factor
+    camera = oracle.PinholeCamera(
+        **{**scene.camera.__dict__, "to_world": pose, "near": scene.camera.near * factor}
+    )
+    raw = scene.raw | {
+        "position": scene.raw["position"] * factor,
+        "scale": scene.raw["scale"] + np.log(factor),
+    }
+    one, other = fast_maps(scene), fast_maps(Scene(raw, scene.features, camera))
+    for a, b in zip([*one.features, one.alpha], [*other.features, other.alpha], strict=True):
+        assert np.mean(np.abs(a.numpy() - b.numpy()) > 2e-4) <= 0.01
+
+
+def test_a_point_covers_what_the_low_pass_covers() -> None:
+    """Far below a pixel only the filter is left: 2π λ pixels, of which the cut takes α_min / o."""
+    raw = {
+        "position": np.array([[0.0, 0, 1]]),
+        "rotation": np.array([[0.0, 0, 0, 1]]),
+        "scale": np.full((1, 3), -20.0),
+        "opacity": np.full((1, 1), 0.0),
+    }
+    places, mass = 8, 0.0
+    for i in range(places * places):
+        x, y = (8 + (k + 0.5) / places for k in divmod(i, places))
+        scene = Scene(raw, np.zeros((1, 0)), oracle.PinholeCamera(16, 16, -20, -20, x, y, np.eye(4)))
+        mass += fast_maps(scene).alpha.numpy().sum() / places**2
+    assert mass == pytest.approx(2 * np.pi * GAUSSIAN_LOW_PASS * (0.5 - ALPHA_MIN), rel=1e-2)
+
+
+# ---------------- tables ----------------
+
+
+def test_a_3dgs_file_of_ours_is_rendered_as_the_oracle_has_it(tmp_path: Path) -> None:
+    """Points to a file to a picture of its radiance, against the file's numbers in float64."""
+    rng = np.random.default_rng(1)
+    made = from_points(
+        rng.normal(size=(60, 3)) * 0.4,
+        colours=rng.uniform(size=(60, 3)),
+        rng=rng,
+        primitive="gaussian",
+        channels=["radiance_sh"],
+        degree={"radiance_sh": 2},
+        opacity=0.7,
+    )
+    raw = made.to_numpy()
+    raw["scale"] += rng.normal(size=(60, 3)).astype(np.float32)
+    raw["radiance_sh"][:, 3:] = 0.2 * rng.normal(size=(60, 24))
+    write_ply(tmp_path / "3dgs.ply", Surfels.from_numpy(raw))
+    surfels, scene = read_ply(tmp_path / "3dgs.ply"), gaussians(15)
+    camera = scene.camera
+    frame = render(surfels, scene.fast_camera(), Shading(at="surfel", reflectance="radiance"))
+    double = {name: values.astype(np.float64) for name, values in surfels.to_numpy().items()}
+    pixels = np.arange(camera.width * camera.height)
+    key = exact.sort_key(double, camera, pixels, (0, 0))
+    order = np.argsort(key, axis=0, kind="stable")
+    truth = picture.render(picture.Scene(double, camera, pixels, order, "surfel", "radiance"))
+    assert truth.band.mean() < 0.05 and truth.maps["alpha"].max() > 0.9
+    found = {"radiance": frame.radiance, "normal": frame.normal, "alpha": [frame.alpha]}
+    for name, values in found.items():
+        error = np.abs(np.array(values, np.float64).T.reshape(len(pixels), -1) - truth.maps[name])
+        assert error[~truth.band].max() <= IMAGE_TOLERANCE, name
+
+
+def test_the_normal_is_the_shortest_axis() -> None:
+    scales = np.log([[1, 2, 3], [2, 1, 3], [3, 2, 1], [1, 1, 1], [1, 1, 2]])
+    raw = {
+        "position": np.zeros((5, 3)),
+        "rotation": np.random.default_rng(0).normal(size=(5, 4)),
+        "scale": scales,
+        "opacity": np.zeros((5, 1)),
+    }
+    surfels = Surfels.from_numpy(raw)
+    axes = np.stack([np.array(axis).T for axis in surfels.frame()], axis=1)
+    expected = axes[np.arange(5), [0, 1, 2, 2, 0]]
+    normal = np.array(surfels.primitive.normal(surfels)).T
+    assert np.abs(np.sum(normal * expected, axis=1)[:4] - 1).max() < 1e-6
+
+
+def test_children_are_samples_of_their_parent() -> None:
+    """Split in all three directions, 1.6 times smaller; small ones are cloned in place."""
+    count = 2000
+    raw = {
+        "position": np.zeros((count, 3)),
+        "rotation": np.tile([0.0, 0, 0, 1], (count, 1)),
+        "scale": np.log(np.tile([0.3, 0.1, 0.05], (count, 1))),
+        "opacity": np.zeros((count, 1)),
+    }
+    hot = np.full(count, 1.0)
+    options, rng = Refine(prune_extent=1.0), np.random.default_rng(0)
+    edited = refine.densify_and_prune(Surfels.from_numpy(raw), hot, 1.0, options, 4 * count, rng)
+    children = edited.surfels.to_numpy()
+    assert len(edited.parent) == 2 * count and edited.fresh.all()
+    np.testing.assert_allclose(children["position"].std(axis=0), [0.3, 0.1, 0.05], rtol=0.05)
+    np.testing.assert_allclose(np.exp(children["scale"][0]), np.array([0.3, 0.1, 0.05]) / 1.6, rtol=1e-5)
+    tiny = Surfels.from_numpy(raw | {"scale": raw["scale"] - 5})
+    cloned = refine.densify_and_prune(tiny, hot, 1.0, options, 4 * count, rng).surfels.to_numpy()
+    assert len(cloned["scale"]) == 2 * count and not cloned["position"].any()
+
+
+def test_the_whole_method_runs_on_them(tmp_path: Path) -> None:
+    """Both stages, the mesh, the run's files and its scene; the method only names another primitive."""
+    data, run = write_data(tmp_path / "data"), tmp_path / "run"
+    command = train_command(data, run, write_method(tmp_path))
+    assert main([*command, "surfels.primitive='gaussian'"]) == 0
+    assert read_ply(run / "surfels.ply").primitive.name == "gaussian"
+    assert main(["eval", str(run)]) == 0
+    assert np.isfinite(np.array(mi.render(mi.load_file(str(run / "scene.xml"))))).all()

@@ -1,0 +1,104 @@
+"""Initial surfels from points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from mi_refgs.errors import InputError
+from mi_refgs.surfels import init
+from mi_refgs.surfels.attributes import Channel, sigmoid
+
+
+def test_from_points(rng: np.random.Generator) -> None:
+    points, normals = rng.normal(size=(200, 3)), rng.normal(size=(200, 3))
+    normals[0] = (0, 0, 5)
+    colours = rng.random((200, 3))
+    degree = {"radiance_sh": 1}
+    surfels = init.from_points(points, normals, colours, rng=rng, degree=degree, opacity=0.2, roughness=0.3)
+    surfels.validate()
+    np.testing.assert_allclose(
+        np.array(surfels.frame()[2]).T, normals / np.linalg.norm(normals, axis=1)[:, None], atol=1e-6
+    )
+    squared = np.sort(np.sum((points[:, None] - points[None]) ** 2, axis=-1), axis=1)[:, 1:4]
+    np.testing.assert_allclose(np.array(surfels.scale())[0], np.sqrt(squared.mean(axis=1)), rtol=1e-5)
+    np.testing.assert_allclose(np.array(surfels.radiance_sh()[0]).T * 0.28209479 + 0.5, colours, atol=1e-6)
+    np.testing.assert_allclose(np.array(surfels.opacity()), 0.2, rtol=1e-6)
+    np.testing.assert_allclose(np.array(surfels.roughness()), 0.3, rtol=1e-6)
+    assert np.abs(np.array(surfels.albedo()) - 0.5).max() <= 0.0251
+    assert np.all(surfels.to_numpy()["indirect_sh"] == 0) and surfels.sh_degree() == 1
+
+
+def test_random_rotations_are_uniform(rng: np.random.Generator) -> None:
+    """The mean normal of 20000 uniform rotations is 0 to 3 / √20000, its second moment 1/3."""
+    normal = np.array(init.from_points(rng.random((20000, 3)), rng=rng, channels=()).frame()[2])
+    assert np.abs(normal.mean(axis=1)).max() < 0.02
+    np.testing.assert_allclose(normal @ normal.T / 20000, np.eye(3) / 3, atol=0.02)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_few_or_doubled_points_have_finite_scales(count: int, rng: np.random.Generator) -> None:
+    surfels = init.from_points(np.ones((count, 3)), np.zeros((count, 3)), rng=rng, channels=("radiance_sh",))
+    surfels.validate()
+    assert surfels.count == count and list(surfels.raw) == [
+        "position",
+        "rotation",
+        "scale",
+        "opacity",
+        "radiance_sh",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"normals": np.zeros((3, 3))}, r"normals: shape \(3, 3\), expected \(4, 3\)"),
+        ({"points": np.full((4, 3), np.nan)}, "points: 12 values are NaN"),
+        ({"degree": {"radiance_sh": 4}}, "degree of radiance_sh: 4"),
+        ({"opacity": 1.5}, r"opacity: 1\.5"),
+        ({"channels": ("albdeo",)}, "albdeo: unknown"),
+    ],
+)
+def test_bad_points_are_refused(change: dict[str, object], message: str, rng: np.random.Generator) -> None:
+    with pytest.raises(InputError, match=message):
+        init.from_points(**({"points": np.zeros((4, 3)), "rng": rng} | change))  # type: ignore[arg-type]
+
+
+def test_random_normals_are_uniform(rng: np.random.Generator) -> None:
+    normals = init.random_normals(20_000, rng)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(normals.T @ normals / 20_000, np.eye(3) / 3, atol=0.02)
+    assert all(kstest(axis, "uniform", (-1, 2)).pvalue > 1e-3 for axis in normals.T)  # Archimedes
+
+
+def test_a_channel_starts_at_its_activated_value(rng: np.random.Generator) -> None:
+    """Whatever the activation; a size that is none is refused."""
+    declared = {
+        "exp": Channel("width", (2,), "exp", 1e-3, ("w_0", "w_1"), initial=0.2),
+        "sigmoid": Channel("share", (2,), "sigmoid", 1e-3, ("s_0", "s_1"), initial=0.2),
+        "identity": Channel("offset", (2,), "identity", 1e-3, ("o_0", "o_1"), initial=0.2),
+    }
+    activate: dict[str, Callable[..., np.ndarray]] = {
+        "exp": np.exp,
+        "sigmoid": sigmoid,
+        "identity": np.asarray,
+    }
+    for kind, channel in declared.items():
+        for value in (None, 0.7):
+            raw = channel.start(5, 2, rng, value)
+            assert raw.shape == (5, 2)
+            np.testing.assert_allclose(activate[kind](raw), 0.2 if value is None else value, rtol=1e-6)
+    for value in (0.0, -1.0, np.inf):
+        with pytest.raises(InputError, match=r"width: .* is no size; start it above 0"):
+            declared["exp"].start(1, 1, rng, value)
+
+
+def test_harmonics_start_with_a_constant_part(rng: np.random.Generator) -> None:
+    """0.4 from everywhere: the constant coefficient times Y_0, and nothing beside it."""
+    surfels = init.from_points(rng.random((5, 3)), rng=rng, degree={"indirect_sh": 1}, indirect_sh=0.4)
+    raw = surfels.to_numpy()["indirect_sh"]
+    np.testing.assert_allclose(raw[:, :3] * 0.28209479, 0.4, rtol=1e-6)
+    assert np.all(raw[:, 3:] == 0)

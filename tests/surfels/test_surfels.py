@@ -1,0 +1,189 @@
+"""The surfel table: activations, degenerate rows, gradients in both modes, rows, refusals."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mi_refgs.errors import InputError
+from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.table import Surfels
+
+
+def raw_table(count: int, rng: np.random.Generator, degree: int = 2) -> dict[str, np.ndarray]:
+    return {
+        name: rng.normal(size=(count, channel.width(degree))).astype(np.float32)
+        for name, channel in CHANNELS.items()
+    }
+
+
+# ---------------- values ----------------
+
+
+@pytest.mark.parametrize("count", [1, 2, 37])
+def test_activations(count: int, rng: np.random.Generator) -> None:
+    raw = raw_table(count, rng)
+    surfels = Surfels.from_numpy(raw)
+    surfels.validate()
+
+    def sigmoid(name: str) -> np.ndarray:
+        return 1 / (1 + np.exp(-raw[name].astype(np.float64)))
+
+    np.testing.assert_array_equal(np.array(surfels.position()).T, raw["position"])
+    np.testing.assert_allclose(np.array(surfels.scale()).T, np.exp(raw["scale"]), rtol=1e-6)
+    np.testing.assert_allclose(np.array(surfels.albedo()).T, sigmoid("albedo"), rtol=1e-6)
+    for name in ("opacity", "metallic", "roughness"):
+        np.testing.assert_allclose(np.array(surfels.value(name)), sigmoid(name)[:, 0], rtol=1e-6)
+    axes = Rotation.from_quat(raw["rotation"]).as_matrix()
+    for column, axis in enumerate(surfels.frame()):
+        np.testing.assert_allclose(np.array(axis).T, axes[:, :, column], atol=1e-6)
+    assert surfels.sh_degree("radiance_sh") == surfels.sh_degree("indirect_sh") == 2
+    coefficient = surfels.radiance_sh()[4]
+    np.testing.assert_array_equal(np.array(coefficient).T, raw["radiance_sh"][:, 12:15])
+    for name, values in surfels.to_numpy().items():
+        np.testing.assert_array_equal(values, raw[name])
+
+
+def test_quaternion_sign_and_length_do_not_matter(rng: np.random.Generator) -> None:
+    raw = raw_table(5, rng)
+    frames = []
+    for factor in (1, -1, 1e-10, 1e30):
+        raw["rotation"] = (raw["rotation"] / np.abs(raw["rotation"]).max() * factor).astype(np.float32)
+        frames.append(np.array(Surfels.from_numpy(raw).frame()[2]))
+        np.testing.assert_allclose(frames[-1], frames[0], atol=1e-6)
+
+
+def test_degenerate_rows_stay_finite() -> None:
+    """Zero quaternion = identity without gradient; huge logits and log scales saturate; nothing becomes
+    NaN."""
+    huge = 3e38
+    rotation = np.array([[0, 0, 0, 0], [1e-35, 0, 0, 0], [huge, huge, -huge, huge], [0, 0, 0, 1]])
+    rows = np.array([huge, -huge, 0.0, 60.0])[:, None]
+    surfels = Surfels.from_numpy(
+        {"position": np.zeros((4, 3)), "rotation": rotation, "scale": np.repeat(rows, 2, 1), "opacity": rows}
+    )
+    surfels.enable_grad()
+    t_u, t_v, n = surfels.frame()
+    total = t_u.y + 2 * t_v.z + 3 * n.x + n.z + surfels.opacity() + surfels.scale().x * 1e-6
+    assert np.all(np.isfinite(np.array(total)))
+    np.testing.assert_array_equal(np.array(n)[:, 0], [0, 0, 1])
+    np.testing.assert_allclose(np.array(surfels.opacity()), [1, 0, 0.5, 1], atol=1e-12)
+    dr.backward(total)
+    for tensor in surfels.raw.values():
+        assert np.all(np.isfinite(dr.grad(tensor).numpy()))
+    assert np.all(dr.grad(surfels.raw["rotation"]).numpy()[:2] == 0)
+
+
+# ---------------- derivatives ----------------
+
+
+def everything(surfels: Surfels) -> object:
+    """Every accessor of every channel, with a weight of its own per entry."""
+    arrays = [*surfels.position(), *surfels.scale(), surfels.opacity(), *surfels.albedo(), surfels.metallic()]
+    arrays += [surfels.roughness(), *(entry for axis in surfels.frame() for entry in axis)]
+    arrays += [*surfels.value("tint"), *surfels.value("normal_offset")]
+    arrays += [
+        part for name in ("radiance_sh", "indirect_sh") for colour in surfels.value(name) for part in colour
+    ]
+    generator = np.random.default_rng(9)
+    total = mi.Float(0)
+    for array in arrays:
+        total += array * mi.Float(generator.normal(size=surfels.count).astype(np.float32))
+    return total
+
+
+def test_gradients_of_every_channel(rng: np.random.Generator) -> None:
+    """Reverse mode against central differences in float32 (step 1e-2, truncation 1e-4) and forward mode
+    against reverse."""
+    raw = raw_table(6, rng, degree=1)
+    surfels = Surfels.from_numpy(raw)
+    surfels.enable_grad()
+    dr.backward(dr.sum(everything(surfels)))
+    for name in CHANNELS:
+        found = dr.grad(surfels.raw[name]).numpy()
+        wanted = np.zeros(found.shape)
+        for column in range(found.shape[1]):
+            # Rows are independent: one shift of a whole column gives every row's derivative.
+            totals = []
+            for step in (0.01, -0.01):
+                shifted = {key: values.copy() for key, values in raw.items()}
+                shifted[name][:, column] += np.float32(step)
+                totals.append(np.array(everything(Surfels.from_numpy(shifted)), dtype=np.float64))
+            wanted[:, column] = (totals[0] - totals[1]) / 0.02
+        assert np.all(np.linalg.norm(wanted, axis=0) > 0)
+        assert np.linalg.norm(found - wanted) <= 2e-3 * np.linalg.norm(wanted), name
+
+        direction = rng.normal(size=found.shape).astype(np.float32)
+        other = Surfels.from_numpy(raw)
+        dr.enable_grad(other.raw[name])
+        dr.set_grad(other.raw[name], mi.TensorXf(direction))
+        total = dr.sum(everything(other))
+        dr.forward_to(total)
+        assert float(dr.grad(total)[0]) == pytest.approx(np.sum(found * direction), rel=1e-4, abs=1e-4)
+
+
+def test_turning_a_quaternion_longer_has_no_gradient(rng: np.random.Generator) -> None:
+    raw = raw_table(20, rng)
+    surfels = Surfels.from_numpy(raw)
+    surfels.enable_grad()
+    dr.backward(dr.sum(surfels.frame()[2].x + 2 * surfels.frame()[0].y))
+    radial = np.sum(dr.grad(surfels.raw["rotation"]).numpy() * raw["rotation"], axis=1)
+    np.testing.assert_allclose(radial, 0, atol=1e-5)
+
+
+# ---------------- rows ----------------
+
+
+def test_gather_copies_rows_and_detaches(rng: np.random.Generator) -> None:
+    raw = raw_table(5, rng)
+    surfels = Surfels.from_numpy(raw)
+    surfels.enable_grad()
+    children = surfels.gather(mi.UInt32(4, 0, 0, 2))
+    assert children.count == 4 and not dr.grad_enabled(list(children.raw.values()))
+    for name, values in children.to_numpy().items():
+        np.testing.assert_array_equal(values, raw[name][[4, 0, 0, 2]])
+
+
+def test_empty_table(rng: np.random.Generator) -> None:
+    for surfels in (
+        Surfels.from_numpy(raw_table(0, rng)),
+        Surfels.from_numpy(raw_table(3, rng)).gather(mi.UInt32()),
+    ):
+        surfels.validate()
+        assert surfels.count == 0
+        for value in (
+            surfels.position(),
+            surfels.opacity(),
+            surfels.scale(),
+            *surfels.frame(),
+            *surfels.radiance_sh(),
+        ):
+            assert dr.width(value) == 0
+        assert surfels.gather(mi.UInt32()).count == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"glitter": np.zeros((3, 1))}, "glitter: unknown channel"),
+        ({"albedo": np.zeros((3, 2))}, "albedo: 2 columns, expected 3"),
+        ({"radiance_sh": np.zeros((3, 6))}, "radiance_sh: 6 columns, expected 3 or 12 or 27 or 48"),
+        ({"opacity": np.zeros((4, 1))}, r"opacity: shape \(4, 1\), expected \(3, D\)"),
+        ({"scale": np.array([[0, 1], [np.nan, 2], [np.inf, 0]])}, "scale: 2 values are NaN"),
+    ],
+)
+def test_bad_tables_are_refused(
+    change: dict[str, np.ndarray], message: str, rng: np.random.Generator
+) -> None:
+    with pytest.raises(InputError, match=message):
+        Surfels.from_numpy(raw_table(3, rng) | change).validate()
+
+
+def test_missing_geometry_is_refused(rng: np.random.Generator) -> None:
+    raw = raw_table(3, rng)
+    del raw["rotation"]
+    with pytest.raises(InputError, match="rotation: the channel is missing"):
+        Surfels.from_numpy(raw).validate()

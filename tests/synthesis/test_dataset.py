@@ -1,0 +1,422 @@
+"""Path-traced data sets: cameras, pixels, maps and light agree with each other; folders resume."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.errors import InputError
+from mi_refgs.io.exr import read_exr_image, write_exr
+from mi_refgs.io.images import srgb_from_linear
+from mi_refgs.io.ownership import RECORD
+from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.synthesis import pathtrace
+from mi_refgs.synthesis.make_dataset import make_dataset
+from mi_refgs.synthesis.scene_file import load_scene, under_light
+from tests.scenes.integrator import sky
+
+SCENES = Path(__file__).parents[2] / "scenes"
+CENTRE, RADIUS = np.array([0.3, -0.2, 0.5]), 0.7
+SIZE = 16
+
+SCENE = f"""<scene version="3.0.0">
+    <emitter type="envmap">
+        <string name="filename" value="{SCENES / "lights" / "studio.exr"}"/>
+        <transform name="to_world"><rotate x="1" angle="90"/><rotate z="1" angle="35"/></transform>
+    </emitter>
+    <shape type="sphere">
+        <point name="center" value="{CENTRE[0]}, {CENTRE[1]}, {CENTRE[2]}"/>
+        <float name="radius" value="{RADIUS}"/>
+        <bsdf type="diffuse"/>
+    </shape>
+</scene>"""
+OPTIONS: dict[str, Any] = {
+    "views": 3,
+    "test_views": 2,
+    "size": SIZE,
+    "spp": 16,
+    "environment_height": 64,
+    "progress": False,
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of one sphere, off the origin."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("dataset")
+    (folder / "ball.xml").write_text(SCENE)
+    return make_dataset(folder / "ball.xml", folder / "out", **OPTIONS)
+
+
+@pytest.fixture
+def train(made: Path) -> Dataset:
+    return read_dataset(made, "train")
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_depth_and_normals_lie_on_the_sphere(made: Path) -> None:
+    """Through the reader's camera, so that file convention, pixel centres and maps are tested as one."""
+    for split in ("train", "test"):
+        for view in read_dataset(made, split).views:
+            assert view.depth is not None and view.normal is not None and view.alpha is not None
+            rays = np.array(view.camera().rays()).T
+            points = view.to_world[:3, 3] + rays * view.depth.reshape(-1, 1)
+            hit = view.depth.ravel() > 0
+            assert 0.6 < hit.mean() < 0.8  # π/4 · 0.95²
+            expected = (points[hit] - CENTRE) / RADIUS
+            np.testing.assert_allclose(np.linalg.norm(expected, axis=1), 1, atol=1e-4)
+            np.testing.assert_allclose(view.normal.reshape(-1, 3)[hit], expected, atol=1e-3)
+            assert not view.normal.reshape(-1, 3)[~hit].any()
+            np.testing.assert_array_equal(view.alpha.ravel()[hit] > 0, True)
+
+
+def test_png_is_the_exr_as_displayed(made: Path, train: Dataset) -> None:
+    radiance = read_dataset(made, "train", images="exr", background="black")
+    for shown, linear in zip(train.views, radiance.views, strict=True):
+        assert shown.alpha is not None and linear.alpha is not None
+        alpha = linear.alpha[..., None]
+        colour = np.clip(srgb_from_linear(linear.image / np.maximum(alpha, 1e-8)), 0, 1)
+        np.testing.assert_allclose(shown.image, alpha * colour + 1 - alpha, atol=1.01 / 255)
+        np.testing.assert_allclose(shown.alpha, linear.alpha, atol=0.51 / 255)
+        assert shown.alpha[0, 0] == 0 and shown.alpha[SIZE // 2, SIZE // 2] == 1
+
+
+def test_brightness_is_the_lit_sphere(train: Dataset) -> None:
+    """Radiance of the whole set against an independent estimate, albedo × irradiance / π."""
+    data = read_dataset(train.path, "train", images="exr", background="black")
+    check_brightness(data, data, pathtrace.environment_image(mi.load_string(SCENE), 16))
+
+
+def check_brightness(radiance: Dataset, shape: Dataset, light: np.ndarray) -> None:
+    """Views of the sphere are as bright as albedo × irradiance / π of a light (16, 32, 3), by its normals."""
+    row, column = np.divmod(np.arange(16 * 32), 32)
+    theta, phi = lobe_matrices.row_angles(16)[row], lobe_matrices.column_angles(32)[column]
+    direction = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=1)
+    weight = lobe_matrices.row_areas(16)[row] * (np.pi / 16)
+    for view, known in zip(radiance.views, shape.views, strict=True):
+        assert known.normal is not None and view.alpha is not None
+        inside = (view.alpha == 1) & np.any(known.normal != 0, axis=-1)
+        cosine = np.maximum(known.normal[inside] @ direction.T, 0)
+        expected = 0.5 / math.pi * (cosine * weight) @ light.reshape(-1, 3)
+        np.testing.assert_allclose(view.image[inside].mean(0), expected.mean(0), rtol=0.04)
+
+
+def test_environment_in_mitsuba_orientation(made: Path, train: Dataset) -> None:
+    assert train.environment == made / "environment.exr"
+    copy = mi.load_dict({"type": "scene", "e": {"type": "envmap", "filename": str(train.environment)}})
+    scene = mi.load_string(SCENE)
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    rng = np.random.default_rng(0)
+    directions = np.concatenate([axes, rng.normal(size=(2000, 3))])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    si.wi = -mi.Vector3f(directions.T)
+    seen, truth = (np.array(s.environment().eval(si)).T for s in (copy, scene))
+    # 64 rows average 128: equal but for the edges of the softboxes.
+    difference = np.abs(seen - truth).max(axis=1)
+    assert np.quantile(difference, 0.8) < 0.06
+    # The poles of the copy are a whole row each; the equator's axes are not near an edge.
+    assert difference[[0, 2, 3, 5]].max() < 0.1
+    np.testing.assert_allclose(seen.mean(axis=0), truth.mean(axis=0), rtol=0.03)
+
+
+def test_an_environment_of_that_size_comes_back_unchanged(rng: np.random.Generator) -> None:
+    image = rng.uniform(0, 5, (16, 32, 3)).astype(np.float32)
+    light = {"type": "envmap", "bitmap": mi.Bitmap(image), "scale": 2.0}
+    scene = mi.load_dict({"type": "scene", "e": light})
+    np.testing.assert_allclose(pathtrace.environment_image(scene, 16), 2 * image, rtol=1e-6)
+
+
+def test_a_turned_environment_is_shown_where_it_is(rng: np.random.Generator) -> None:
+    """A smooth light, turned to an oblique axis: the export as an `envmap` of its own, poles included."""
+    light = {"type": "envmap", "bitmap": mi.Bitmap(sky(64)), "to_world": turn(50)}
+    scene = mi.load_dict({"type": "scene", "e": light})
+    image = pathtrace.environment_image(scene, 64)
+    copy = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(image)})
+    directions = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(2000, 3))])
+    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    si.wi = -mi.Vector3f((directions / np.linalg.norm(directions, axis=1, keepdims=True)).T)
+    seen, truth = copy.eval(si).numpy(), scene.environment().eval(si).numpy()
+    np.testing.assert_allclose(seen[:, :6], truth[:, :6], rtol=2e-3)
+    np.testing.assert_allclose(seen, truth, rtol=0.02)  # beside a pole a texel is narrow
+
+
+def turn(degrees: float) -> mi.ScalarTransform4f:
+    return mi.ScalarTransform4f().rotate([0.6, 0, 0.8], degrees)
+
+
+def test_constant_environment() -> None:
+    colour = {"type": "rgb", "value": [1, 2, 3]}
+    scene = mi.load_dict({"type": "scene", "e": {"type": "constant", "radiance": colour}})
+    image = pathtrace.environment_image(scene, 4)
+    assert image.shape == (4, 8, 3)
+    np.testing.assert_allclose(image, np.broadcast_to([1, 2, 3], image.shape), rtol=1e-5)
+
+
+def test_cameras_are_seeded_and_spread() -> None:
+    def poses(seed: int) -> np.ndarray:
+        return pathtrace.camera_poses(60, CENTRE, (4.0, 4.0), (-30, 80), np.random.default_rng(seed))
+
+    first = poses(1)
+    np.testing.assert_array_equal(first, poses(1))
+    assert np.abs(first - poses(2)).max() > 0.1
+    outward = (first[:, :3, 3] - CENTRE) / 4
+    np.testing.assert_allclose(outward, -first[:, :3, 2], atol=1e-12)
+    rotation = first[:, :3, :3]
+    np.testing.assert_allclose(rotation.transpose(0, 2, 1) @ rotation - np.eye(3), 0, atol=1e-12)
+    assert np.all(np.linalg.det(rotation) > 0) and np.all(rotation[:, 2, 1] > 0)
+    elevation = np.degrees(np.arcsin(outward[:, 2]))
+    assert -30 < elevation.min() < -25 and 70 < elevation.max() < 80
+    apart = np.degrees(np.arccos(np.clip(outward @ outward.T - 2 * np.eye(60), -1, 1))).min(axis=1)
+    assert apart.min() > 7 and np.median(apart) > 15  # a perfect lattice: 22°
+
+
+@pytest.fixture
+def traced(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Seeds of the pictures that are path-traced from now on."""
+    seeds: list[int] = []
+    picture = pathtrace.Tracer.picture
+
+    def counted(self: pathtrace.Tracer, pose: np.ndarray, seed: int) -> np.ndarray:
+        seeds.append(seed)
+        return picture(self, pose, seed)
+
+    monkeypatch.setattr(pathtrace.Tracer, "picture", counted)
+    return seeds
+
+
+def test_unfinished_folder_is_continued(made: Path, traced: list[int]) -> None:
+    scene, before = made.parent / "ball.xml", files(made)
+    make_dataset(scene, made, **OPTIONS)
+    assert not traced
+    (made / "train/r_001.png").unlink()
+    (made / "test/r_000_depth.exr").write_bytes(b"cut short")
+    (made / "transforms_train.json").unlink()
+    make_dataset(scene, made, **OPTIONS)
+    assert len(traced) == 1 and files(made) == before  # a map takes no path
+
+
+def test_a_folder_of_the_version_before_gets_what_it_lacks(
+    made: Path, tmp_path: Path, traced: list[int]
+) -> None:
+    """Without materials, surface, and the settings that came later: nothing is traced again."""
+    before, old = files(made), tmp_path / "old"
+    shutil.copytree(made, old)
+    for pattern in ("*/*_albedo.exr", "*/*_roughness.exr", "*/*_metallic.exr", "surface.ply"):
+        for path in old.glob(pattern):
+            path.unlink()
+    record = json.loads((old / "dataset.json").read_text())
+    later = ("light", "light_sha256", "relight")
+    (old / "dataset.json").write_text(json.dumps({k: v for k, v in record.items() if k not in later}))
+    make_dataset(made.parent / "ball.xml", old, **OPTIONS)
+    assert not traced and files(old) == before
+
+
+def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "ball.xml"
+    scene.write_text(SCENE)
+    tiny = {**OPTIONS, "views": 1, "test_views": 1, "size": 4, "environment_height": 0}
+    out = make_dataset(scene, tmp_path / "out", **{**tiny, "views": 2})
+    with pytest.raises(InputError, match=r"dataset.json: --views: .*overwrite"):
+        make_dataset(scene, out, **tiny)
+    scene.write_text(SCENE.replace("0.7", "0.6"))
+    with pytest.raises(InputError, match=r"dataset.json: SCENE: "):
+        make_dataset(scene, out, **{**tiny, "views": 2})
+    make_dataset(scene, out, **tiny, overwrite=True)
+    assert not (out / "train/r_001.png").exists() and len(read_dataset(out, "train").views) == 1
+    (out / "dataset.json").write_text("[]")
+    with pytest.raises(InputError, match="another data set"):
+        make_dataset(scene, out, **tiny)
+    (out / "dataset.json").unlink()
+    with pytest.raises(InputError, match="another data set"):
+        make_dataset(scene, out, **tiny)
+
+
+def test_passes_average(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = mi.load_string(SCENE)
+    pose = pathtrace.camera_poses(1, CENTRE, (3.0, 3.0), (0, 30), np.random.default_rng(0))[0]
+    options: dict[str, Any] = {"size": (8, 8), "fov": 30, "spp": 64, "max_depth": 3, "near": 0.1, "far": 50}
+    whole = pathtrace.Tracer(scene, **options).picture(pose, 5)
+    monkeypatch.setattr(pathtrace, "SAMPLES_PER_LAUNCH", 8 * 8 * 16)
+    split = pathtrace.Tracer(scene, **options)
+    assert (split.passes, split.spp) == (4, 16)
+    np.testing.assert_allclose(split.picture(pose, 5).mean(), whole.mean(), rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"views": 0}, "views: 0"),
+        ({"spp": 0}, "spp"),
+        ({"elevation": (50, 20)}, "elevation"),
+        ({"fov": 200}, "fov"),
+        ({"fill": 0}, "fill"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_settings_out_of_range(made: Path, tmp_path: Path, options: dict, words: str) -> None:
+    with pytest.raises(InputError, match=f"ball.xml: {words}.*out of range"):
+        make_dataset(made.parent / "ball.xml", tmp_path / "out", **{**OPTIONS, **options})
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "missing"),
+        ("<scene", "not XML"),
+        ('<scene version="3.0.0"><shape type="blob"/></scene>', "cannot load"),
+        ('<scene version="3.0.0"><emitter type="constant"/></scene>', "shapes: the scene has none"),
+        ('<scene version="3.0.0"><shape type="sphere"/></scene>', "emitters: the scene has none"),
+    ],
+)
+def test_bad_scene(tmp_path: Path, text: str | None, words: str) -> None:
+    scene = tmp_path / "scene.xml"
+    if text is not None:
+        scene.write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        make_dataset(scene, tmp_path / "out", **OPTIONS)
+    assert str(caught.value).startswith(str(scene))
+
+
+def test_unwritable_output(made: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(InputError, match=r"file.*writable"):
+        make_dataset(made.parent / "ball.xml", tmp_path / "file" / "out", **OPTIONS)
+
+
+@pytest.mark.parametrize("name", ["mirror_ring", "patched_ball", "mixed", "diffuse", "glossy_demo"])
+def test_example_scenes(name: str) -> None:
+    """Loads in plain Mitsuba; about one unit large, around the origin; nothing from outside the folder."""
+    scene = mi.load_file(str(SCENES / f"{name}.xml"), resx=8, resy=8, spp=4)
+    image = np.array(mi.render(scene))
+    assert image.shape == (8, 8, 4) and np.isfinite(image).all()
+    assert image[0, 0, 3] == 0 and image[3:5, 3:5, 3].min() > 0.5
+    centre, radius = pathtrace.bounding_sphere(scene.shapes())
+    assert np.abs(centre).max() < 0.2 and 0.8 < radius < 1.15
+    assert scene.environment() is not None and len(scene.emitters()) == 1
+    used = {e.get("value") or "" for e in ElementTree.parse(SCENES / f"{name}.xml").iter("string")}
+    for file in (SCENES / u for u in used if "/" in u):
+        assert file.stat().st_size < 300_000
+
+
+@pytest.mark.parametrize("name", ["torus", "trefoil", "rounded_cube"])
+def test_example_meshes_are_closed_and_face_outwards(name: str) -> None:
+    mesh: Any = trimesh.load(SCENES / "meshes" / f"{name}.ply", process=False)
+    assert mesh.is_watertight and mesh.volume > 0
+    cosine = np.einsum("fi,fvi->fv", mesh.face_normals, mesh.vertex_normals[mesh.faces])
+    assert cosine.min() > 0.95
+
+
+def test_example_light_has_detail_and_range() -> None:
+    image = read_exr_image(SCENES / "lights" / "studio.exr")
+    assert image.shape == (128, 256, 3) and 5 < image.max() < 15 and image.min() > 0.01
+    saturation = (image.max(axis=-1) - image.min(axis=-1)) / image.max(axis=-1)
+    assert (saturation > 0.8).mean() > 0.01  # the coloured panels
+
+
+def test_settings_are_recorded(made: Path) -> None:
+    record = json.loads((made / "dataset.json").read_text())
+    assert record["spp"] == OPTIONS["spp"] and record["scene"] == "ball.xml"
+    frame = json.loads((made / "transforms_train.json").read_text())["frames"][0]
+    named = {"exr_path", "normal_path", "depth_path", "albedo_path", "roughness_path", "metallic_path"}
+    assert named | {"file_path", "transform_matrix"} <= frame.keys()
+    assert all((made / frame[key]).is_file() for key in named)
+
+
+# ---------------- lights ----------------
+
+
+@pytest.fixture(scope="module")
+def relit(made: Path) -> Path:
+    """A copy of the data set with two lights more: one of the scene's size, one of another, both HDR."""
+    folder = made.parent
+    write_exr(folder / "warm.exr", sky(32))
+    write_exr(folder / "cold sky.exr", 3 * sky(16)[:, ::-1, ::-1])
+    out = folder / "relit"
+    shutil.copytree(made, out)
+    lights = [folder / "warm.exr", folder / "cold sky.exr"]
+    return make_dataset(folder / "ball.xml", out, **OPTIONS, relight=lights)
+
+
+def test_lights_are_added_without_tracing_the_rest(relit: Path, made: Path, traced: list[int]) -> None:
+    folder, before = made.parent, files(relit)
+    inherited = {k: v for k, v in files(made).items() if k not in ("dataset.json", RECORD)}
+    assert before.items() >= inherited.items()
+    again = make_dataset(folder / "ball.xml", relit, **OPTIONS, relight=[folder / "warm.exr"])
+    assert not traced and files(again) == before  # the other light stays, too
+    make_dataset(folder / "ball.xml", relit, **OPTIONS)
+    assert not traced and files(relit) == before
+    assert set(json.loads(before["dataset.json"])["relight"]) == {"warm", "cold_sky"}
+
+
+def test_relit_views_have_the_cameras_and_shape_of_the_test_views(relit: Path) -> None:
+    own = read_dataset(relit, "test", images="exr", background="black")
+    other = read_dataset(relit / "relight" / "warm", "test", images="exr", background="black")
+    for a, b in zip(own.views, other.views, strict=True):
+        np.testing.assert_array_equal(a.to_world, b.to_world)
+        assert a.alpha is not None and b.alpha is not None
+        np.testing.assert_allclose(a.alpha, b.alpha, atol=0.15)
+        assert np.abs(a.image - b.image).max() > 0.1
+
+
+def test_relit_brightness_is_that_of_the_light_beside_it(relit: Path) -> None:
+    """environment.exr of each light, in Mitsuba's orientation, accounts for the pictures under it."""
+    for name in ("warm", "cold_sky"):
+        data = read_dataset(relit / "relight" / name, "test", images="exr", background="black")
+        assert data.environment is not None
+        lit = mi.load_dict({"type": "scene", "e": {"type": "envmap", "filename": str(data.environment)}})
+        check_brightness(data, read_dataset(relit, "test"), pathtrace.environment_image(lit, 16))
+
+
+def test_a_light_is_turned_as_the_scenes_own(made: Path, tmp_path: Path) -> None:
+    """The scene's own map, given as `--light`: the same pictures; and a scene without a map is z up."""
+    options = {**OPTIONS, "views": 1, "test_views": 1}
+    scene = made.parent / "ball.xml"
+    same = make_dataset(scene, tmp_path / "same", **options, light=SCENES / "lights" / "studio.exr")
+    assert (same / "environment.exr").read_bytes() == (made / "environment.exr").read_bytes()
+    record = json.loads((same / "dataset.json").read_text())
+    assert record["light"] == "studio.exr" and record["light_sha256"]
+    with pytest.raises(InputError, match="light"):
+        make_dataset(scene, same, **options)
+    (tmp_path / "plain.xml").write_text(
+        '<scene version="3.0.0"><emitter type="constant"/><emitter type="point"/>'
+        '<shape type="sphere"/></scene>'
+    )
+    light = np.full((16, 32, 3), 0.1, np.float32)
+    light[:4] = 5  # the map's y, which becomes z
+    write_exr(tmp_path / "top.exr", light)
+    changed = under_light(load_scene(tmp_path / "plain.xml"), tmp_path / "top.exr")
+    si = dr.zeros(mi.SurfaceInteraction3f, 2)
+    si.wi = -mi.Vector3f([0, 0], [0, 1], [1, 0])
+    np.testing.assert_allclose(changed.environment().eval(si).numpy()[0], [5, 0.1], rtol=1e-5)
+    assert len(changed.emitters()) == 2  # the lamp stays
+
+
+def test_lights_that_cannot_be_used(relit: Path, made: Path, tmp_path: Path) -> None:
+    scene = made.parent / "ball.xml"
+    (tmp_path / "warm.exr").write_bytes((made.parent / "cold sky.exr").read_bytes())
+    with pytest.raises(InputError, match=r"dataset.json: --relight warm: .*overwrite"):
+        make_dataset(scene, relit, **OPTIONS, relight=[tmp_path / "warm.exr"])
+    with pytest.raises(InputError, match="two have one name"):
+        make_dataset(scene, relit, **OPTIONS, relight=[tmp_path / "warm.exr", made.parent / "warm.exr"])
+    (tmp_path / "bad.exr").write_text("no picture")
+    for light in ({"light": tmp_path / "bad.exr"}, {"relight": [tmp_path / "none.exr"]}):
+        with pytest.raises(InputError, match=r"(bad|none)\.exr"):
+            make_dataset(scene, tmp_path / "out", **OPTIONS, **light)
+    assert not (tmp_path / "out").exists()

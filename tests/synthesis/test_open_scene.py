@@ -1,0 +1,228 @@
+"""Path-traced data sets of an object in a room: pictures of all, truth of the object, COLMAP's files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from mi_refgs.cli import main
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.data.region import read_region
+from mi_refgs.errors import InputError
+from mi_refgs.io.images import read_png
+from mi_refgs.synthesis.make_dataset import make_dataset
+from mi_refgs.synthesis.open_scene import REGION_MARGIN
+
+CENTRE, RADIUS = np.array([0.3, -0.2, 0.5]), 0.5
+FLOOR, WALL = 0.0, 4.0
+WIDTH, HEIGHT = 18, 32
+
+ROOM = f"""<scene version="3.0.0">
+    <emitter type="constant"><rgb name="radiance" value="0.4"/></emitter>
+    <bsdf type="diffuse" id="grey"><rgb name="reflectance" value="0.5"/></bsdf>
+    <shape type="sphere" id="ball">
+        <point name="center" value="{CENTRE[0]}, {CENTRE[1]}, {CENTRE[2]}"/>
+        <float name="radius" value="{RADIUS}"/>
+        <bsdf type="principled">
+            <rgb name="base_color" value="0.8, 0.3, 0.1"/>
+            <float name="roughness" value="0.3"/><float name="metallic" value="1"/>
+        </bsdf>
+    </shape>
+    <shape type="rectangle" id="table">
+        <transform name="to_world"><scale value="{WALL}"/></transform><ref id="grey"/>
+    </shape>
+    <shape type="cube" id="wall">
+        <transform name="to_world">
+            <scale value="0.1, {WALL}, {WALL}"/><translate x="{WALL}"/>
+        </transform>
+        <ref id="grey"/>
+    </shape>
+    <shape type="sphere" id="lamp">
+        <point name="center" value="0, 0, 5"/><emitter type="area"><rgb name="radiance" value="4"/></emitter>
+    </shape>
+</scene>"""
+OPTIONS: dict[str, Any] = {
+    "views": 6,
+    "test_views": 2,
+    "size": (WIDTH, HEIGHT),
+    "spp": 16,
+    "elevation": (20.0, 60.0),
+    "objects": ["ball"],
+    "distance": (2.0, 2.6),
+    "progress": False,
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ball on a table before a wall."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("open")
+    (folder / "room.xml").write_text(ROOM)
+    return make_dataset(folder / "room.xml", folder / "out", colmap=folder / "colmap", **OPTIONS)
+
+
+def test_pictures_show_all_and_maps_the_object(made: Path) -> None:
+    for view in read_dataset(made, "train").views:
+        assert (view.width, view.height) == (WIDTH, HEIGHT)
+        assert view.alpha is None and view.image.min() > 0
+        assert view.normal is not None and view.depth is not None
+        eye = view.to_world[:3, 3]
+        assert 2.0 <= np.linalg.norm(eye - CENTRE) <= 2.6
+        rays = np.array(view.camera().rays()).T
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        toward = CENTRE - eye
+        across = np.linalg.norm(toward - (rays @ toward)[:, None] * rays, axis=1)
+        hit = view.depth.ravel() > 0
+        np.testing.assert_array_equal(hit, across < RADIUS)  # the ball's pixels, and nobody else's
+        assert 0.05 < hit.mean() < 0.7
+        np.testing.assert_array_equal(np.any(view.normal.reshape(-1, 3) != 0, axis=1), hit)
+        for name, value in {"albedo": (0.8, 0.3, 0.1), "roughness": (0.3,), "metallic": (1.0,)}.items():
+            planes = view.materials[name].reshape(WIDTH * HEIGHT, -1)
+            np.testing.assert_allclose(planes[hit, :-1], np.tile(value, (hit.sum(), 1)), atol=1e-6)
+            np.testing.assert_array_equal(planes[:, -1], hit)
+
+
+def test_what_is_known_is_of_the_object(made: Path) -> None:
+    region = read_region(made)
+    assert region is not None
+    np.testing.assert_allclose(region.centre, CENTRE, atol=1e-6)
+    np.testing.assert_allclose(region.radius, REGION_MARGIN * RADIUS, rtol=1e-3)
+    assert not (made / "environment.exr").exists()
+    vertices = np.asarray(trimesh.load_mesh(made / "surface.ply", process=False).vertices)
+    np.testing.assert_allclose(np.linalg.norm(vertices - CENTRE, axis=1), RADIUS, rtol=1e-4)
+
+
+def test_a_lamp_is_in_the_picture(made: Path, tmp_path: Path) -> None:
+    """Seen from below: emitters are not hidden, and the background is the constant light."""
+    (tmp_path / "room.xml").write_text(ROOM)
+    low = {**OPTIONS, "views": 1, "test_views": 1, "elevation": (-60.0, -50.0), "distance": (0.7, 0.7)}
+    text = ROOM.replace('id="table"', 'id="table" ').replace(
+        f'<scale value="{WALL}"/>', '<scale value="0.01"/>'
+    )
+    (tmp_path / "room.xml").write_text(text)
+    out = make_dataset(tmp_path / "room.xml", tmp_path / "out", fov=120.0, **low)
+    view = read_dataset(out, "train", images="exr").views[0]
+    assert view.alpha is None
+    np.testing.assert_allclose(np.median(view.image[:, 0], axis=0), 0.4, atol=1e-5)
+
+
+def test_colmap_says_the_same(made: Path) -> None:
+    """Cameras, pictures and points of the text files, read by their definition."""
+    colmap = made.parent / "colmap"
+    sparse = colmap / "sparse" / "0"
+    rows = {
+        name: [line.split() for line in (sparse / f"{name}.txt").read_text().splitlines()[1:]]
+        for name in ("cameras", "images", "points3D")
+    }
+    ((number, model, *numbers),) = rows["cameras"]
+    assert (number, model) == ("1", "PINHOLE")
+    fx, fy, cx, cy = map(float, numbers[2:])
+    names = sorted(path.name for path in (colmap / "images").iterdir())
+    assert len(names) == 8 and (sparse / "test.txt").read_text().split()[0] == names[0]
+    assert len((sparse / "test.txt").read_text().split()) == 2
+    known = {}
+    for split in ("train", "test"):
+        for view, file in zip(
+            read_dataset(made, split).views, sorted((made / split).glob("r_???.png")), strict=True
+        ):
+            known[file.read_bytes()] = (split, view)
+    points = {int(row[0]): row for row in rows["points3D"]}
+    assert len(points) > 200
+    checked = 0
+    for i in range(0, len(rows["images"]), 2):
+        index, *pose, camera, name = rows["images"][i]
+        split, view = known[(colmap / "images" / name).read_bytes()]
+        assert camera == "1" and (split == "test") == (name in (sparse / "test.txt").read_text().split())
+        w, x, y, z, *translation = map(float, pose)
+        rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+        np.testing.assert_allclose(-rotation.T @ translation, view.to_world[:3, 3], atol=1e-9)
+        np.testing.assert_allclose((fx, fy, cx, cy), (view.fx, view.fy, view.cx, view.cy), rtol=1e-12)
+        seen = np.array(rows["images"][i + 1], dtype=np.float64).reshape(-1, 3)
+        for slot, (column, row, point) in enumerate(seen[:20]):
+            _, px, py, pz, r, g, b, _, *track = map(float, points[int(point)])
+            local = rotation @ [px, py, pz] + translation
+            assert local[2] > 0
+            np.testing.assert_allclose(
+                [fx * local[0] / local[2] + cx, fy * local[1] / local[2] + cy], [column, row], atol=2e-3
+            )
+            assert [float(index), slot] in np.array(track).reshape(-1, 2).tolist()
+            shown = read_png(colmap / "images" / name)[int(row), int(column)]
+            assert np.abs(shown - np.array([r, g, b]) / 255).max() < 0.15
+            on_ball = abs(np.linalg.norm([px, py, pz] - CENTRE) - RADIUS) < 1e-3
+            on_room = min(abs(pz - FLOOR), abs(px - WALL + 0.1)) < 1e-3
+            assert on_ball or on_room or np.linalg.norm(np.array([px, py, pz - 5])) < 1.01
+            checked += 1
+    assert checked > 100
+    assert json.loads((colmap / "region.json").read_text()) == json.loads((made / "region.json").read_text())
+
+
+def test_the_reader_of_colmap_finds_the_same_views(made: Path) -> None:
+    """Pictures, cameras, region and split; two of eight are more than every eighth."""
+    colmap = made.parent / "colmap"
+    for split in ("train", "test"):
+        original, copy = read_dataset(made, split), read_dataset(colmap, split)
+        assert len(original.views) == len(copy.views)
+        assert copy.region == original.region and copy.points is not None
+        for view in original.views:
+            same = [other for other in copy.views if np.array_equal(other.image, view.image)]
+            assert len(same) == 1
+            np.testing.assert_allclose(same[0].to_world, view.to_world, atol=1e-9)
+            assert (same[0].fx, same[0].cy) == pytest.approx((view.fx, view.cy))
+
+
+def test_every_eighth_picture_is_a_test_view(made: Path, tmp_path: Path) -> None:
+    """As readers of COLMAP hold them out, where the numbers are those of such a split."""
+    tiny = {**OPTIONS, "views": 8, "test_views": 2, "size": 8, "spp": 1}
+    make_dataset(made.parent / "room.xml", tmp_path / "out", colmap=tmp_path / "colmap", **tiny)
+    listed = (tmp_path / "colmap" / "sparse" / "0" / "test.txt").read_text().split()
+    assert listed == sorted(p.name for p in (tmp_path / "colmap" / "images").iterdir())[::8]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"objects": ["vase"]}, "--object: no shape has the id 'vase'.*ball, lamp, table, wall"),
+        ({"distance": (0.55, 2.0)}, "--distance: 0.5.*inside of the region"),
+        ({"distance": (6.0, 6.0)}, "--distance: something stands between"),
+        ({"distance": (3.0, 2.0)}, "distance: .*out of range"),
+        ({"relight": ["sun.exr"]}, "--relight"),
+    ],
+)
+def test_refusals(made: Path, tmp_path: Path, options: dict, words: str) -> None:
+    if "relight" in options:
+        (tmp_path / "sun.exr").write_bytes(b"")
+        options = {"relight": [tmp_path / "sun.exr"]}
+    with pytest.raises(InputError, match=words):
+        make_dataset(made.parent / "room.xml", tmp_path / "out", **{**OPTIONS, **options})
+    assert not (tmp_path / "out").exists()
+
+
+def test_sizes_on_the_command_line(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = str(made.parent / "room.xml")
+    command = [
+        "dataset",
+        scene,
+        "-o",
+        str(tmp_path / "out"),
+        "--views",
+        "1",
+        "--test-views",
+        "1",
+        "--spp",
+        "1",
+    ]
+    command += ["--object", "ball", "--distance", "2", "2.5", "--elevation", "30", "50"]
+    assert main([*command, "--size", "10x6", "--colmap", str(tmp_path / "colmap")]) == 0
+    capsys.readouterr()
+    view = read_dataset(tmp_path / "out", "train").views[0]
+    assert (view.width, view.height) == (10, 6)
+    assert main([*command, "--size", "10x"]) == 2
+    assert "WIDTHxHEIGHT" in capsys.readouterr().err
