@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from mi_refgs.relighting.relight import relight as relight
     from mi_refgs.render.pipeline import Frame as Frame
     from mi_refgs.render.pipeline import render as render_frame
-    from mi_refgs.runs.export import TrainedScene as TrainedScene
     from mi_refgs.runs.relightable import relightable as relightable
     from mi_refgs.runs.run import Run as Run
+    from mi_refgs.runs.trained_scene import TrainedScene as TrainedScene
     from mi_refgs.shade.accuracy import Accuracy as Accuracy
     from mi_refgs.shade.light.envmap import EnvironmentLight as EnvironmentLight
     from mi_refgs.shade.reflectance import Reflectance as Reflectance
@@ -83,7 +83,7 @@ _PUBLIC = {
     "Run": ("runs.run", "Run"),
     "Shading": ("shade.shading", "Shading"),
     "Surfels": ("surfels.table", "Surfels"),
-    "TrainedScene": ("runs.export", "TrainedScene"),
+    "TrainedScene": ("runs.trained_scene", "TrainedScene"),
     "Trainer": ("fitting.train", "Trainer"),
     "View": ("data.view", "View"),
     "evaluate": ("evaluation.evaluate", "evaluate"),

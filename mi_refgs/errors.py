@@ -17,7 +17,7 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def shown(value: object, limit: int = 80) -> str:
+def abbreviated(value: object, limit: int = 80) -> str:
     """A value as it may stand in a message: at most `limit` characters, whatever a file holds."""
     try:
         text = repr(value)

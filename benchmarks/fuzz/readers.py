@@ -30,8 +30,8 @@ from mi_refgs.io.resources import resource_dir
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.runs import checkpoint
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.attributes import CHANNELS
 from mi_refgs.surfels.ply import read_ply, write_ply

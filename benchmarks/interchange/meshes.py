@@ -30,9 +30,9 @@ from mi_refgs.formats import write
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.reconstruction.provenance import Source
 from mi_refgs.relighting.score import shown
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 
 OURS_SAMPLES = 4
 

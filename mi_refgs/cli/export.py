@@ -68,8 +68,9 @@ def run(args: argparse.Namespace) -> Result:
     from mi_refgs.evaluation.evaluate import load_split
     from mi_refgs.formats import FORMATS, options_of, write
     from mi_refgs.reconstruction.provenance import Source
-    from mi_refgs.runs.export import ARTEFACTS, TrainedScene, export, newest
+    from mi_refgs.runs.export import export, newest
     from mi_refgs.runs.run import Run
+    from mi_refgs.runs.trained_scene import ARTEFACTS, TrainedScene
 
     if args.limit is not None and not args.prune:
         raise InputError("--limit: limits what --prune drops; add --prune, or leave it out")

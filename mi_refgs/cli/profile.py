@@ -57,8 +57,8 @@ def run(args: argparse.Namespace) -> Result:
     """Measure, and advise. Nothing is written."""
     from mi_refgs.profiling.advice import advice
     from mi_refgs.profiling.profile import profile
-    from mi_refgs.runs.export import MODEL
     from mi_refgs.runs.run import Run
+    from mi_refgs.runs.trained_scene import MODEL
 
     if not 1 <= args.steps <= MOST_STEPS:
         raise InputError(f"--steps: {args.steps} is out of range; give 1 to {MOST_STEPS}")
@@ -85,8 +85,8 @@ def _frames(args: argparse.Namespace) -> list[FrameProfile]:
     """Pictures of a run at each size; none of a data set, or of a run that has found nothing yet."""
     from mi_refgs.profiling.frame import SIZES, aovs_of, profile_frame
     from mi_refgs.reconstruction.reconstruction import load
-    from mi_refgs.runs.export import MODEL
     from mi_refgs.runs.run import Run
+    from mi_refgs.runs.trained_scene import MODEL
 
     folder = Run(args.path)
     if not folder.exists():

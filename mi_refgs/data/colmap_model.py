@@ -17,7 +17,7 @@ import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.lens import Lens
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 
 MODELS: dict[str, tuple[int, str]] = {
     "SIMPLE_PINHOLE": (0, "f cx cy"),
@@ -135,13 +135,13 @@ def read_images(path: Path) -> list[Image]:
         length = float(np.linalg.norm(values[:4])) if np.abs(values).max() <= MAX_NUMBER else 0.0
         if not length > 0:
             raise InputError(
-                f"{path}: {shown(name)}: the pose has no usable numbers; remove the picture, or "
+                f"{path}: {abbreviated(name)}: the pose has no usable numbers; remove the picture, or "
                 "reconstruct again"
             )
         images.append(Image(name, camera, _rotation(values[:4] / length), values[4:]))
     images.sort(key=lambda image: image.name)
     if twice := [a.name for a, b in itertools.pairwise(images) if a.name == b.name]:
-        raise InputError(f"{path}: {shown(twice[0])}: the picture occurs twice; remove one of the two")
+        raise InputError(f"{path}: {abbreviated(twice[0])}: the picture occurs twice; remove one of the two")
     return images
 
 
@@ -197,7 +197,7 @@ def _camera(
     field = f"{path}: camera {number}"
     if model not in MODELS:
         raise InputError(
-            f"{field}: the lens model {shown(model)} is unknown here; undistort the pictures "
+            f"{field}: the lens model {abbreviated(model)} is unknown here; undistort the pictures "
             "(colmap image_undistorter), or use the model OPENCV"
         )
     names = MODELS[model][1].split()

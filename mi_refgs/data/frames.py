@@ -16,7 +16,7 @@ from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.readers import ReadOptions
 from mi_refgs.data.truth_maps import ALPHA, beside, block_mean, shiny_maps, unit
 from mi_refgs.data.view import View
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.files import inside, is_file
 from mi_refgs.io.images import ENDINGS, has_alpha, image_size, with_ending
@@ -91,7 +91,7 @@ class FrameReader:
         file = inside(self.transforms.parent, name)
         if file is None:
             raise InputError(
-                f"{self.transforms}: frames[{index}].{key}: {shown(name)} names no file in the "
+                f"{self.transforms}: frames[{index}].{key}: {abbreviated(name)} names no file in the "
                 "data set's folder; move the file there and give its relative path"
             )
         return file
@@ -151,7 +151,7 @@ class FrameReader:
         if value is None:
             return None
         if type(value) not in (int, float) or not abs(value) <= MAX_NUMBER:
-            raise InputError(f"{self.transforms}: {key}: {shown(value)} is not a number; correct it")
+            raise InputError(f"{self.transforms}: {key}: {abbreviated(value)} is not a number; correct it")
         return float(value)
 
     def _lens(self, frame: dict[str, Any]) -> Lens | None:
@@ -183,7 +183,7 @@ class FrameReader:
             value = self._number(frame, key)
             if value is not None and value <= 0:
                 raise InputError(
-                    f"{self.transforms}: {key}: {shown(value)} is not a positive number; correct it"
+                    f"{self.transforms}: {key}: {abbreviated(value)} is not a positive number; correct it"
                 )
             return value
 

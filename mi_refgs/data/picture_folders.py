@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import inside, is_file
 from mi_refgs.io.images import ENDINGS, with_ending
 
@@ -56,7 +56,7 @@ class PictureFolders:
             file = inside(folder, name)
             if file is None:
                 raise InputError(
-                    f"{self.root}: {shown(name)} names no file in {folder.name}; move the picture there"
+                    f"{self.root}: {abbreviated(name)} names no file in {folder.name}; move the picture there"
                 )
             if there := file if is_file(file) else with_ending(file.with_suffix("")):
                 return there, downscale // factor

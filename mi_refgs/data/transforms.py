@@ -21,7 +21,7 @@ from typing import Any
 from mi_refgs.data.frames import FrameReader
 from mi_refgs.data.point_file import read_points
 from mi_refgs.data.readers import PointCloud, ReadOptions, Recording, held_out
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import inside, read_json
 
 
@@ -103,7 +103,7 @@ def _points(transforms: Path, content: dict[str, Any]) -> PointCloud | None:
     file = inside(transforms.parent, name)
     if file is None:
         raise InputError(
-            f"{transforms}: ply_file_path: {shown(name)} names no file in the data set's folder; move "
+            f"{transforms}: ply_file_path: {abbreviated(name)} names no file in the data set's folder; move "
             "it there"
         )
     return read_points(file)

@@ -15,9 +15,9 @@ from mi_refgs.editing.expression import Expression, parse_numbers
 from mi_refgs.editing.fields import COLOUR, Fields, constant_colour
 from mi_refgs.editing.rigid import Placement, rotation_about
 from mi_refgs.editing.selection import finite
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import SH_DC, logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 
@@ -53,10 +53,10 @@ class Assignment:
         """
         found = ASSIGNMENT.fullmatch(text)
         if found is None:
-            raise InputError(f"--set: {shown(text)}: no assignment; write it like roughness=0.3")
+            raise InputError(f"--set: {abbreviated(text)}: no assignment; write it like roughness=0.3")
         if ANOTHER.search(found[3]):
             raise InputError(
-                f"--set: {shown(text)}: several assignments in one; separate them, each in its own quotes"
+                f"--set: {abbreviated(text)}: several assignments in one; quote each one separately"
             )
         return Assignment(found[1], tuple(parse_numbers(found[3])), found[2] == "*=", text.strip())
 
@@ -121,13 +121,13 @@ class Change:
         if self.rotate is None:
             return Rotation.identity()
         if isinstance(self.rotate, str) or len(self.rotate) != 2:
-            raise InputError(f"--rotate: {shown(self.rotate)}: no axis and angle; give two values, like z 90")
+            raise InputError(f"--rotate: {abbreviated(self.rotate)}: not an axis and an angle; example: z 90")
         axis = _axis(self.rotate[0])
         try:
             degrees = float(self.rotate[1])
         except (ValueError, TypeError) as error:
             raise InputError(
-                f"--rotate: {shown(self.rotate[1])}: no angle; give degrees, like z 90"
+                f"--rotate: {abbreviated(self.rotate[1])}: no angle; give degrees, like z 90"
             ) from error
         if not (np.isfinite(degrees) and np.linalg.norm(axis) > 0):
             raise InputError("--rotate: an axis without length, or an endless angle; give them like z 90")
@@ -205,7 +205,7 @@ def _assign(fields: Fields, own: dict[str, np.ndarray], chosen: np.ndarray, assi
     tints = name == COLOUR and COLOUR in fields.settable
     if assignment.name not in fields.settable:
         raise InputError(
-            f"--set: {shown(assignment.name)} cannot be set of these surfels; use one of "
+            f"--set: {abbreviated(assignment.name)} cannot be set of these surfels; use one of "
             f"{', '.join(fields.settable)}"
         )
     columns = list(range(3)) if tints else fields.columns[assignment.name][1]
@@ -246,7 +246,7 @@ def _axis(axis: Any) -> np.ndarray:
                 return finite("--rotate", [float(part) for part in axis.split(",")], 3)
             except ValueError as error:
                 raise InputError(
-                    f"--rotate: {shown(axis)}: no axis; give x, y, z, or three numbers like 0,0,1"
+                    f"--rotate: {abbreviated(axis)}: no axis; give x, y, z, or three numbers like 0,0,1"
                 ) from error
         return np.array(AXES[axis])
     return finite("--rotate", axis, 3)

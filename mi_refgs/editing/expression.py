@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 
 MAX_LENGTH = 2000
 """Characters of an expression: what a person types is far below."""
@@ -75,7 +75,7 @@ def parse_truth(text: str, where: str = "--where") -> Expression:
     """A comparison, or several; raises InputError, with `where` in the message, for anything else."""
     (found,) = _Parser(text, where).all(1)
     if not found.truth:
-        raise InputError(f"{where}: {shown(text)}: compares nothing; write it like metallic > 0.5")
+        raise InputError(f"{where}: {abbreviated(text)}: compares nothing; write it like metallic > 0.5")
     return found
 
 
@@ -83,7 +83,7 @@ def parse_numbers(text: str, where: str = "--set") -> list[Expression]:
     """Numbers with commas between them; raises InputError, with `where` in the message, for anything else."""
     found = _Parser(text, where).all(None)
     if any(expression.truth for expression in found):
-        raise InputError(f"{where}: {shown(text)}: a comparison is no number; give numbers")
+        raise InputError(f"{where}: {abbreviated(text)}: a comparison is no number; give numbers")
     return found
 
 
@@ -101,7 +101,7 @@ class _Parser:
         self.depth = 0
         self.names: set[str] = set()
         if len(text) > MAX_LENGTH:
-            raise InputError(f"{where}: {shown(text)}: longer than {MAX_LENGTH} characters; shorten it")
+            raise InputError(f"{where}: {abbreviated(text)}: longer than {MAX_LENGTH} characters; shorten it")
         self.tokens: list[tuple[str, str, int]] = []
         place = 0
         while place < len(text):
@@ -111,7 +111,9 @@ class _Parser:
             found = TOKEN.match(text, place)
             if found is None:
                 sign = text[place]
-                remedy = "use == to compare" if sign == "=" else f"{shown(sign)} has no meaning; remove it"
+                remedy = (
+                    "use == to compare" if sign == "=" else f"{abbreviated(sign)} is not allowed; remove it"
+                )
                 raise self._error(remedy, place)
             self.tokens.append((str(found.lastgroup), found[0], place))
             place = found.end()
@@ -278,4 +280,4 @@ class _Parser:
 
     def _error(self, remedy: str, place: int | None = None) -> InputError:
         place = self._place if place is None else place
-        return InputError(f"{self.where}: {shown(self.text)}: character {place + 1}: {remedy}")
+        return InputError(f"{self.where}: {abbreviated(self.text)}: character {place + 1}: {remedy}")

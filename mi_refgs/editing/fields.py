@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.evaluation.pictures import LUMINANCE
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import outward
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import CHANNELS, SH_DC, channel, sigmoid
 
 COLOUR = "colour"
@@ -79,7 +79,7 @@ class Fields(Mapping[str, np.ndarray]):
         """Raise InputError, with `where` in the message, for names that the surfels have no values of."""
         for name in sorted(names - {*self}):
             raise InputError(
-                f"{where}: {shown(name)} is no value of these surfels; use one of {', '.join(self)}"
+                f"{where}: {abbreviated(name)} is no value of these surfels; use one of {', '.join(self)}"
             )
 
     def __getitem__(self, name: str) -> np.ndarray:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from mi_refgs.editing.rigid import Placement
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import sigmoid
 
 NEIGHBOURS = 8

@@ -8,7 +8,7 @@ import numpy as np
 
 from mi_refgs.editing import follow
 from mi_refgs.errors import InputError
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.accuracy import NEED_OCCLUSION
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import CHANNELS

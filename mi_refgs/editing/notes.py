@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mi_refgs.editing.change import Change
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.reflectance.split_sum import MATERIALS
 
 CONVERT, TRACE = "; --materials makes an albedo of it", "; --materials traces it instead"

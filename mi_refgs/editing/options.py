@@ -14,8 +14,8 @@ from mi_refgs.editing.joining import join
 from mi_refgs.editing.notes import notes
 from mi_refgs.editing.selection import Selection, select
 from mi_refgs.errors import InputError
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import relightable
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera
 
 

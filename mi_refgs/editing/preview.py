@@ -8,7 +8,7 @@ import numpy as np
 
 from mi_refgs.evaluation import pictures
 from mi_refgs.render.display import displayed
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera
 
 VIEWS = 4

@@ -18,7 +18,7 @@ from mi_refgs.io.images import box_downscale, read_mask
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.render.surroundings import together
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera, splat
 
 PAINTED_SHARE = 0.5

@@ -19,8 +19,8 @@ from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.pictures import RenderedView, beside, on_white
 from mi_refgs.evaluation.surface import NO_SURFACE
 from mi_refgs.io.images import psnr_of, srgb_from_linear
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import relightable
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 

@@ -28,8 +28,9 @@ from mi_refgs.kernels.device import machine
 from mi_refgs.methods.method import Method
 from mi_refgs.progress import with_bar
 from mi_refgs.render.samples import samples_per_axis
-from mi_refgs.runs.export import TrainedScene, up_to_date
+from mi_refgs.runs.export import up_to_date
 from mi_refgs.runs.run import DATASET, Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.light_file import read_radiance
 
 FOLDER = "eval"

@@ -22,7 +22,7 @@ from mi_refgs.evaluation.speed import milliseconds
 from mi_refgs.io.images import PSNR_MAX
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import displayed
-from mi_refgs.runs.export import Pruned, TrainedScene
+from mi_refgs.runs.trained_scene import Pruned, TrainedScene
 from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels.attributes import channel, sh_columns

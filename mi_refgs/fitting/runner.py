@@ -19,8 +19,9 @@ from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.presets import PRESETS
-from mi_refgs.runs.export import MODEL, up_to_date
+from mi_refgs.runs.export import up_to_date
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import MODEL
 
 SAME_REGION = 1e-6
 """Difference of two regions, in radii, up to which they are the same: solvers differ in the last digits."""

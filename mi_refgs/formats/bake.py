@@ -26,8 +26,8 @@ from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import NORMAL_AGREEMENT, VertexSurfels
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import relightable
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.points import safe_normalize
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera

@@ -19,7 +19,7 @@ from mi_refgs.io.files import make_folder, write_json
 
 if TYPE_CHECKING:
     from mi_refgs.data.lens import Lens
-    from mi_refgs.runs.export import TrainedScene
+    from mi_refgs.runs.trained_scene import TrainedScene
 
 IMAGE_FOLDER = re.compile(r"images(_\d+)?")
 """Folders to which COLMAP's names are relative."""

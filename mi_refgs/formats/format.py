@@ -21,7 +21,7 @@ from mi_refgs.io.ownership import OutputFolder, require_no_run
 
 if TYPE_CHECKING:
     from mi_refgs.data.picture_files import FileCamera
-    from mi_refgs.runs.export import TrainedScene
+    from mi_refgs.runs.trained_scene import TrainedScene
     from mi_refgs.splat.camera import Camera
 
 

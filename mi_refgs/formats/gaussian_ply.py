@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from mi_refgs.formats.format import Format, Option, Shot
 
 if TYPE_CHECKING:
-    from mi_refgs.runs.export import TrainedScene
+    from mi_refgs.runs.trained_scene import TrainedScene
 
 DEGREE = Option("degree", 3, "degree of the spherical-harmonic colours of splats, 0 to 3")
 ALONE = Option("object", False, "the object without its surroundings; no file of splats has the background")

@@ -15,7 +15,7 @@ from mi_refgs.formats.textured import OPTIONS
 from mi_refgs.io.files import write_bytes
 
 if TYPE_CHECKING:
-    from mi_refgs.runs.export import TrainedScene
+    from mi_refgs.runs.trained_scene import TrainedScene
     from mi_refgs.splat.camera import Camera
 
 Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))

@@ -22,7 +22,7 @@ from mi_refgs.io.files import write_bytes
 if TYPE_CHECKING:
     import numpy as np
 
-    from mi_refgs.runs.export import TrainedScene
+    from mi_refgs.runs.trained_scene import TrainedScene
 
 NAME = "KHR_gaussian_splatting"
 FLOAT, POINTS, VERTICES = 5126, 0, 34962

@@ -16,11 +16,11 @@ import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import read_json
 from mi_refgs.io.ply import read_header
 from mi_refgs.methods.method import DataOptions, Method, Stage, SurfelOptions
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import CHANNELS
@@ -119,7 +119,7 @@ def _camera(path: Path, content: dict[str, Any], index: int, frame: Any) -> Came
     def number(key: str, default: float | None = None) -> float:
         value: Any = given.get(key, default)
         if type(value) not in (int, float) or not abs(value) <= MAX_NUMBER:
-            raise InputError(f"{where}.{key}: {shown(value)} is no usable number; give one")
+            raise InputError(f"{where}.{key}: {abbreviated(value)} is no usable number; give one")
         return float(value)
 
     width, height = number("w"), number("h")

@@ -15,7 +15,7 @@ from mi_refgs.formats.format import Format, Option, Shot
 from mi_refgs.formats.gaussian_ply import ALONE
 
 if TYPE_CHECKING:
-    from mi_refgs.runs.export import TrainedScene
+    from mi_refgs.runs.trained_scene import TrainedScene
 
 VIEW = Option("view", 0, "the view of an EXR file: by number, test views first")
 SAMPLES = Option("samples", 4, "samples of a pixel of an EXR file, box filtered: 4 are 2 × 2")

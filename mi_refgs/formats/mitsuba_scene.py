@@ -22,7 +22,7 @@ from mi_refgs.io.files import make_folder, write_bytes
 
 if TYPE_CHECKING:
     from mi_refgs.formats.textured import TexturedMesh
-    from mi_refgs.runs.export import TrainedScene
+    from mi_refgs.runs.trained_scene import TrainedScene
 
 MAX_DEPTH = 6
 """Edges of a path, as in `refgs dataset`."""

@@ -11,7 +11,7 @@ from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.synthesis.pathtrace import poses_around

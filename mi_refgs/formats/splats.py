@@ -31,7 +31,7 @@ from mi_refgs.formats.last_made import LastMade
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import display_image
 from mi_refgs.render.surroundings import together
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.sh import sh_basis
 from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE

@@ -18,7 +18,7 @@ from mi_refgs.io.files import replace_file
 
 if TYPE_CHECKING:
     from mi_refgs.formats.textured import TexturedMesh
-    from mi_refgs.runs.export import TrainedScene
+    from mi_refgs.runs.trained_scene import TrainedScene
     from mi_refgs.splat.camera import Camera
 
 APERTURE = 36.0

@@ -8,7 +8,7 @@ import typing
 from typing import Any, Literal
 
 from mi_refgs.constants import MAX_NUMBER
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 
 
 def build(kind: Any, value: Any, where: str) -> Any:
@@ -17,7 +17,7 @@ def build(kind: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
             raise InputError(
-                f"{where}: expected a table, found {shown(value)}; the files of variants/ show the form"
+                f"{where}: expected a table, found {abbreviated(value)}; the files of variants/ show the form"
             )
         hints = typing.get_type_hints(kind)
         for key in value:
@@ -39,25 +39,25 @@ def build(kind: Any, value: Any, where: str) -> Any:
         return build(next(option for option in arguments if option is not type(None)), value, where)
     if origin is dict:
         if not isinstance(value, dict):
-            raise InputError(f"{where}: expected a table, found {shown(value)}; write it as [name]")
+            raise InputError(f"{where}: expected a table, found {abbreviated(value)}; write it as [name]")
         return {key: build(arguments[1], inner, f"{where}.{key}") for key, inner in value.items()}
     if origin is tuple:
         if not isinstance(value, list):
-            raise InputError(f"{where}: expected a list, found {shown(value)}; write it in brackets")
+            raise InputError(f"{where}: expected a list, found {abbreviated(value)}; write it in brackets")
         return tuple(build(arguments[0], inner, where) for inner in value)
     if origin is Literal:
         if not isinstance(value, str) or value not in arguments:
             known = ", ".join(map(str, arguments))
-            raise InputError(f"{where}: {shown(value)} is not allowed; use one of {known}")
+            raise InputError(f"{where}: {abbreviated(value)} is not allowed; use one of {known}")
         return value
     if kind is Any:
         return value
     if type(value) in (int, float) and not abs(value) <= MAX_NUMBER:
-        raise InputError(f"{where}: {shown(value)} is out of range; correct the value")
+        raise InputError(f"{where}: {abbreviated(value)} is out of range; correct the value")
     if kind is float and type(value) is int:
         return float(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise InputError(f"{where}: expected {kind.__name__}, found {shown(value)}; correct the value")
+        raise InputError(f"{where}: expected {kind.__name__}, found {abbreviated(value)}; correct the value")
     return value
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import tomli_w
 
 from mi_refgs.constants import DEFAULT_PRESET
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import is_file
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.build import build, plain
@@ -220,7 +220,7 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
         return table
     if not isinstance(base, str):
         raise InputError(
-            f"{path}: extends: expected a name or a path in quotes, found {shown(base)}; correct it"
+            f"{path}: extends: expected a name or a path in quotes, found {abbreviated(base)}; correct it"
         )
     if not isinstance(dropped, list) or not all(isinstance(name, str) for name in dropped):
         raise InputError(f"{path}: drop: expected a list of keys, such as ['mesh', 'loss.alpha']; correct it")

@@ -11,7 +11,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.plugins.aovs import AOV, parse_aovs
@@ -59,7 +59,7 @@ def _choice(props: Any, name: str, default: str, options: tuple[str, ...]) -> An
 def _flag(props: Any, name: str, default: bool) -> bool:
     value = _get(props, name, default)
     if not isinstance(value, bool):
-        raise InputError(f"refgs: {name}: {shown(value)} is neither true nor false; give a boolean")
+        raise InputError(f"refgs: {name}: {abbreviated(value)} is neither true nor false; give a boolean")
     return value
 
 
@@ -76,7 +76,9 @@ def _tensor(props: Any, name: str) -> Any:
             raise TypeError("a single number")
         return tensor
     except Exception as error:  # what Dr.Jit raises depends on the type
-        raise InputError(f"refgs: {name}: {shown(value)} is no tensor; give an array of numbers") from error
+        raise InputError(
+            f"refgs: {name}: {abbreviated(value)} is not a tensor; give a number array"
+        ) from error
 
 
 def read_background(props: Any) -> Any:
@@ -95,7 +97,7 @@ def read_background(props: Any) -> Any:
         raise
     except Exception as error:
         raise InputError(
-            f"refgs: background: {shown(value)} is no colour; give an rgb value or a map"
+            f"refgs: background: {abbreviated(value)} is no colour; give an rgb value or a map"
         ) from error
 
 
@@ -170,5 +172,5 @@ def read_terms(props: Any) -> list[str]:
         if name not in TERMS or names.count(name) > 1:
             raise InputError(f"refgs: terms: '{name}' is unknown or repeated; use some of {', '.join(TERMS)}")
     if not names:
-        raise InputError(f"refgs: terms: {shown(text)} names none; use some of {', '.join(TERMS)}")
+        raise InputError(f"refgs: terms: {abbreviated(text)} names none; use some of {', '.join(TERMS)}")
     return names

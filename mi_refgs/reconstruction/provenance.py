@@ -15,9 +15,9 @@ from mi_refgs.formats import Shot
 from mi_refgs.formats.shots import shots_around, turntable_cameras
 from mi_refgs.io.files import read_json
 from mi_refgs.methods.method import Method
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.save import save
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera
 
 EDITS = "edit.json"

@@ -29,9 +29,10 @@ from mi_refgs.reconstruction.provenance import Source
 from mi_refgs.render.display import composited
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.runs.export import SCENE, TrainedScene, export, newest, up_to_date
+from mi_refgs.runs.export import export, newest, up_to_date
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import SCENE, TrainedScene
 from mi_refgs.splat import Camera
 
 CameraLike: TypeAlias = "Camera | View | int | Any"

@@ -34,9 +34,10 @@ from mi_refgs.reconstruction.provenance import Source
 from mi_refgs.relighting.score import score, shown
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import samples_per_axis
-from mi_refgs.runs.export import ARTEFACTS, TrainedScene, export, up_to_date
+from mi_refgs.runs.export import export, up_to_date
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import ARTEFACTS, TrainedScene
 from mi_refgs.splat import Camera
 
 SHEET, RESULT = "sheet.png", "relight.json"

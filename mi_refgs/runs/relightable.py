@@ -16,7 +16,7 @@ from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ambient import ambient
 from mi_refgs.shade.brdf import split_sum

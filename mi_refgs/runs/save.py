@@ -13,8 +13,9 @@ from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import make_folder
 from mi_refgs.methods.method import Method
-from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera
 
 

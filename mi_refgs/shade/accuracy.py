@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 
 MAX_RAYS = 4096
@@ -43,7 +43,7 @@ class Accuracy:
     def __post_init__(self) -> None:
         for name in ("dominant", "multiscatter", "antialias"):
             if not isinstance(getattr(self, name), bool):
-                raise InputError(f"accuracy: {name}: {shown(getattr(self, name))} is neither True nor False")
+                raise InputError(f"accuracy: {name}: {abbreviated(getattr(self, name))} is not True or False")
         for name, what, least, most in (
             ("visibility_rays", "rays", 1, MAX_RAYS),
             ("traced_bounces", "bounces", 0, MAX_RAYS),
@@ -55,7 +55,7 @@ class Accuracy:
             if type(number) is not int or not least <= number <= most:
                 some = ", ".join(str(least + i) for i in range(3))
                 raise InputError(
-                    f"accuracy: {name}: {shown(number)} is no number of {what}; use {some}, … {most}"
+                    f"accuracy: {name}: {abbreviated(number)} is no number of {what}; use {some}, … {most}"
                 )
 
     def chosen(self) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args, get_type_hints
 
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.kernels.timing import phase
 from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -38,10 +38,10 @@ class Shading:
         for name, kind in _HINTS.items():
             value, allowed = getattr(self, name), get_args(kind)
             if not (value in allowed if allowed else isinstance(value, kind)):
-                raise InputError(f"shading: {name}: {shown(value)} is not allowed; correct it")
+                raise InputError(f"shading: {name}: {abbreviated(value)} is not allowed; correct it")
         if self.reflectance not in MODELS:
             raise InputError(
-                f"shading: reflectance: {shown(self.reflectance)} is unknown; use {' or '.join(MODELS)}"
+                f"shading: reflectance: {abbreviated(self.reflectance)} is unknown; use {' or '.join(MODELS)}"
             )
         if self.model.linear:
             object.__setattr__(self, "at", "surfel")

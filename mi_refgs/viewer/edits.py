@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mi_refgs.editing import Change, Selection, apply, assignments, select
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import sigmoid
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from mi_refgs.data.region import Region
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import lacking, relightable
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.ambient import prepare
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light, RotatedLight

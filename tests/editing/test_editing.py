@@ -24,7 +24,7 @@ from mi_refgs.io.images import write_png
 from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.reflectance import MODELS

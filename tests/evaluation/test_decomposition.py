@@ -25,8 +25,9 @@ from mi_refgs.io.images import read_png
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference.camera import look_at
-from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.runs.export import export
 from mi_refgs.runs.relightable import relightable
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import SH_DC

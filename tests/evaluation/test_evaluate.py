@@ -25,8 +25,9 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import read_png
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame, render
-from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.ply import write_ply
 from tests.scenes.tiny import SETTINGS, SIZE, write_data, write_method
 
@@ -133,7 +134,7 @@ def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: 
         asked.append(aovs or normals)
         return render(*arguments, aovs=aovs, normals=normals, **others)  # type: ignore[misc]
 
-    monkeypatch.setattr("mi_refgs.runs.export.render", rendered)
+    monkeypatch.setattr("mi_refgs.runs.trained_scene.render", rendered)
     evaluate(run)
     assert asked == [True] * 4 + [False] * (WARM_UP_FRAMES + TIMED_FRAMES)
 

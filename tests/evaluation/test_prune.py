@@ -20,7 +20,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation.prune import contributions, prune
 from mi_refgs.io.ownership import RECORD
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.runs.export import Pruned, TrainedScene
+from mi_refgs.runs.trained_scene import Pruned, TrainedScene
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading

@@ -25,8 +25,8 @@ from mi_refgs.fitting.runner import begin
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb, read_png, write_png
 from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.tiny import FOCAL, METHOD, SIZE, write_data

@@ -25,7 +25,7 @@ from mi_refgs.formats.textured import TexturedMesh
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.images import linear_from_srgb, read_png
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading

@@ -21,7 +21,7 @@ from mi_refgs.formats import Shot
 from mi_refgs.formats.cameras import CAMERAS
 from mi_refgs.io.images import box_downscale, read_png, write_png
 from mi_refgs.reconstruction.provenance import Source
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from tests.data import test_colmap, test_layouts
 from tests.data.test_layouts import SHOTS
 from tests.scenes.tiny import write_data

@@ -19,8 +19,8 @@ from mi_refgs.formats import FORMATS, Format, Option, register, write
 from mi_refgs.formats.shots import shots_around, turntable_cameras
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.reconstruction.provenance import Source
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import run_python
 

@@ -22,7 +22,7 @@ from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.lookup import harmonics
 from mi_refgs.reference.pinhole import PinholeCamera
 from mi_refgs.render.display import displayed
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera

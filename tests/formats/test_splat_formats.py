@@ -24,7 +24,7 @@ from mi_refgs.io.ownership import RECORD
 from mi_refgs.render.display import display_image
 from mi_refgs.render.pipeline import render
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.sh import sh_basis
 from mi_refgs.shade.shading import Shading

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from mi_refgs import methods
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.io.exr import read_exr, write_exr
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import image_size, read_png
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.plugins.properties import read_background, read_light, read_shading, read_surfels
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.ply import read_ply
@@ -233,5 +233,5 @@ def test_shading_is_what_it_says() -> None:
 def test_what_messages_show() -> None:
     endless: list[Any] = []
     endless.append(endless)
-    assert shown("a") == "'a'" and len(shown("a" * 500)) == 81
-    assert "int" in shown(16**6000) and shown(endless) == "[[...]]"
+    assert abbreviated("a") == "'a'" and len(abbreviated("a" * 500)) == 81
+    assert "int" in abbreviated(16**6000) and abbreviated(endless) == "[[...]]"

@@ -19,7 +19,8 @@ from mi_refgs.plugins.aovs import suffixes
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.scene_xml import put
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.export import SCENE, TrainedScene, export
+from mi_refgs.runs.export import export
+from mi_refgs.runs.trained_scene import SCENE, TrainedScene
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import resample

@@ -18,8 +18,8 @@ from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.reference import occlusion as ref
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.relightable import relightable
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera

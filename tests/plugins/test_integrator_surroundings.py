@@ -16,7 +16,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.render.pipeline import render
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.export import AROUND_FILE, BACKGROUND_MAP, SCENE, TrainedScene, export
+from mi_refgs.runs.export import export
+from mi_refgs.runs.trained_scene import AROUND_FILE, BACKGROUND_MAP, SCENE, TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera

@@ -28,7 +28,7 @@ from mi_refgs.profiling.advice import advice
 from mi_refgs.profiling.frame import aovs_of, profile_frame
 from mi_refgs.profiling.profile import Profile, StageProfile, Work, count_work, profile_stage
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Blended, Camera, Footprints

@@ -17,7 +17,8 @@ FLAT = {"Float", "UInt32", "Int32", "Bool", "TensorXf", "TensorXu", "TensorXi", 
 """Arrays that Dr.Jit wraps around NumPy's memory, without a copy, where they are made of a NumPy array."""
 
 FLOORS: list[set[str]] = [
-    {"constants", "errors", "llvm", "progress"},
+    {"constants", "errors", "llvm", "progress", "types"},
+    {"registry"},
     {"kernels"},
     {"io"},
     {"surfels"},

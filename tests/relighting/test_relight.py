@@ -25,8 +25,9 @@ from mi_refgs.reconstruction.new_light import NewLight, any_light, truth_under
 from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.relighting.relight import relight
 from mi_refgs.relighting.score import common_scale, score, shown
-from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels

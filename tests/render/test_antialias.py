@@ -14,7 +14,7 @@ from mi_refgs.reference import antialias as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.antialias import widened
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading

@@ -17,7 +17,7 @@ from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.plugins import film
 from mi_refgs.render import passes
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading

@@ -21,8 +21,8 @@ from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import supersampled
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.export import TrainedScene
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera

@@ -15,7 +15,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.scene_xml import write_scene_xml
-from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.runs.export import export
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.reflectance import MODELS

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.runs.export import export
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera

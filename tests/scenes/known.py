@@ -12,8 +12,9 @@ from mi_refgs.data.dataset import read_dataset
 from mi_refgs.io.exr import write_exr
 from mi_refgs.methods.read import load
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import logit

@@ -24,9 +24,10 @@ from mi_refgs.methods.read import load
 from mi_refgs.render import passes
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.runs.export import export
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer import quality

@@ -31,8 +31,9 @@ from mi_refgs.evaluation.pictures import planes
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.methods.read import load
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.export import TrainedScene, export
+from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels

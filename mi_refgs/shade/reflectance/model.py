@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from mi_refgs.errors import InputError, shown
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.points import ShadingPoints, Terms
@@ -109,7 +109,7 @@ def register(model: Reflectance) -> Reflectance:
     """
     if not isinstance(model, Reflectance):
         raise InputError(
-            f"reflectance: {shown(model)} is no model; give an object of a subclass of Reflectance"
+            f"reflectance: {abbreviated(model)} is no model; give an object of a subclass of Reflectance"
         )
     if not model.name or model.name in MODELS:
         raise InputError(f"reflectance: '{model.name}': no name, or another model's; rename the model")
@@ -128,7 +128,7 @@ def register(model: Reflectance) -> Reflectance:
         if not {*values} <= {*allowed} or (name == "orders" and not values):
             choices = " or ".join(allowed)
             raise InputError(
-                f"reflectance: {model.name}: {name}: {shown(value)} is not allowed; use {choices}"
+                f"reflectance: {model.name}: {name}: {abbreviated(value)} is not allowed; use {choices}"
             )
     MODELS[model.name] = model
     return model

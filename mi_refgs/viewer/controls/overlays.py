@@ -6,7 +6,7 @@ from typing import Any
 
 from mi_refgs.editing.follow import without_surroundings
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.runs.export import TrainedScene
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.pose import Pose, page_rotation
 

@@ -1,0 +1,63 @@
+"""A registry of named objects that users can extend: reflectance models, primitives, attributes, formats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Generic, Protocol, TypeVar
+
+from mi_refgs.errors import InputError, abbreviated
+
+
+class Named(Protocol):
+    """What a registry contains."""
+
+    @property
+    def name(self) -> str:
+        """Unique in its registry."""
+
+
+T = TypeVar("T", bound=Named)
+
+
+class Registry(Mapping[str, T], Generic[T]):
+    """Objects of one kind by name, in the order of registration.
+
+    `check(item)` raises InputError for an item that cannot be used, so that it is refused when it is registered
+    and not at its first use.
+    """
+
+    def __init__(self, kind: str, check: Callable[[T], None] = lambda item: None) -> None:
+        self.kind = kind  # such as "reflectance model", for messages
+        self._check = check
+        self._items: dict[str, T] = {}
+
+    def register(self, item: T, first: bool = False) -> T:
+        """Add an item, which is returned; `first`: before the others.
+
+        Raises InputError for an item without a name, with the name of another one, or that `check` refuses.
+        """
+        name = getattr(item, "name", "")
+        if not name or name in self._items:
+            raise InputError(f"{self.kind}: '{name}': the name is empty or in use; choose another name")
+        self._check(item)
+        self._items = {name: item} | self._items if first else self._items | {name: item}
+        return item
+
+    def unregister(self, name: str) -> None:
+        """Remove an item."""
+        del self._items[name]
+
+    def find(self, name: str, field: str) -> T:
+        """Return an item by name; raises InputError that starts with `field` and lists the names."""
+        if name not in self._items:
+            raise InputError(f"{field}: {abbreviated(name)} is unknown; use {' or '.join(self._items)}")
+        return self._items[name]
+
+    def __getitem__(self, name: str) -> T:
+        return self._items[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._items)
+
+    def __len__(self) -> int:
+        return len(self._items)

@@ -1,0 +1,165 @@
+"""A fitted scene, and the names of the files that contain it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.io.files import read_json
+from mi_refgs.kernels.device import require_supported_variant
+from mi_refgs.methods.method import Method
+from mi_refgs.occlusion.mesh import Mesh, read_mesh
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.render.passes import in_passes
+from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.samples import samples_per_axis, supersampled
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.checkpoint import PARAMS, tensors
+from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
+from mi_refgs.shade.ambient import prepare
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.ply import read_ply
+from mi_refgs.surfels.table import Surfels
+
+SURFELS, LIGHT_MAP, MESH, SCENE, MODEL = "surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "model.json"
+AROUND_FILE, BACKGROUND_MAP = "surroundings.ply", "background.exr"
+ARTEFACTS = (SURFELS, LIGHT_MAP, MESH, AROUND_FILE, BACKGROUND_MAP, SCENE, MODEL)
+
+
+@dataclass(frozen=True)
+class Pruned:
+    """That a scene is not the whole fit, and how near its pictures are to the whole one's."""
+
+    surfels: int  # of the whole
+    limit: float  # dB that the pictures of all training views had to keep
+    psnr: float  # dB, of the worst of them
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.limit) and math.isfinite(self.psnr)):
+            raise ValueError("pruned: a number is not finite")
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedScene:
+    """What a fit has found: enough to render, and nothing that only training needs."""
+
+    surfels: Surfels
+    light: EnvironmentLight | None
+    mesh: Mesh | None
+    shading: Shading
+    iteration: int
+    seconds: float  # spent training
+    pruned: Pruned | None = None  # absent: all that the fit has found
+    surroundings: Surroundings | None = None  # of pictures without alpha
+
+    @staticmethod
+    def from_state(method: Method, state: Mapping[str, np.ndarray]) -> TrainedScene:
+        """Take the state of a `Trainer`, as a checkpoint holds it."""
+        params = tensors(state, PARAMS)
+        mesh = None
+        if len(state.get("mesh/faces", ())):
+            mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
+        iteration = int(state["iteration"])
+        _, stage = method.stage_at(max(iteration, 1))
+        return TrainedScene(
+            Surfels(channels_of(params)),
+            light_of(params),
+            mesh,
+            Shading.of(stage, mesh is not None),
+            iteration,
+            float(state["seconds"]),
+            surroundings=surroundings_of(params),
+        )
+
+    @property
+    def count(self) -> int:
+        """Surfels of the object and of what is around it."""
+        return self.surfels.count + (0 if self.surroundings is None else self.surroundings.surfels.count)
+
+    @staticmethod
+    def read(folder: Path) -> TrainedScene:
+        """Read the artefacts in a run folder; raises InputError for a file that cannot be used."""
+        note = folder / MODEL
+        try:
+            content = read_json(note)
+            shading = Shading(**content["shading"])
+            iteration, seconds = int(content["iteration"]), float(content["seconds"])
+            pruned = content.get("pruned")
+            if pruned is not None:
+                pruned = Pruned(int(pruned["surfels"]), float(pruned["limit"]), float(pruned["psnr"]))
+            if iteration < 0 or not 0 <= seconds < math.inf:
+                raise ValueError("iteration or seconds out of range")
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
+            raise InputError(
+                f"{note}: cannot be read ({error}); write it again with `refgs export {folder}`"
+            ) from error
+        light, mesh = folder / LIGHT_MAP, folder / MESH
+        around, behind = folder / AROUND_FILE, folder / BACKGROUND_MAP
+        if shading.model.light != "none" and not light.is_file():
+            raise InputError(
+                f"{light}: light: missing; restore the file, or write it again with `refgs export {folder}`"
+            )
+        fitted = TrainedScene(
+            read_ply(folder / SURFELS),
+            EnvironmentLight.from_file(light) if light.is_file() else None,
+            read_mesh(mesh) if shading.occlusion else None,
+            shading,
+            iteration,
+            seconds,
+            pruned,
+            Surroundings.read(around, behind if behind.is_file() else None) if around.is_file() else None,
+        )
+        try:
+            shading.check(fitted.surfels.raw, fitted.light is not None)
+            if fitted.surroundings is not None:
+                fitted.surroundings.check(fitted.surfels)
+        except InputError as error:
+            raise InputError(f"{folder}: {error}; or write it again with `refgs export {folder}`") from error
+        return fitted
+
+    def renderer(self, aovs: bool | Collection[str] = True, samples: int = 1) -> Callable[[Camera], Frame]:
+        """A function that renders views without derivatives, with the `aovs` of `render`, all or by name.
+
+        `samples` a pixel as in `render.samples`. Light and mesh are prepared once.
+        """
+        draw = self.drawn()
+        return lambda camera: draw(camera, aovs, samples)
+
+    def drawn(self) -> Callable[..., Frame]:
+        """`renderer`, but what it is called with is a camera, the `aovs` and, if not 1, the `samples`."""
+        require_supported_variant("TrainedScene.renderer")
+        with dr.suspend_grad():
+            light = self.shading.light_of(self.light)
+        occluder = Occluder(self.mesh)
+        prepare(occluder, self.surfels, light, self.shading.accuracy)
+
+        def draw(camera: Camera, aovs: bool | Collection[str], samples: int = 1) -> Frame:
+            def once(view: Camera) -> Frame:
+                return render(
+                    self.surfels,
+                    view,
+                    self.shading,
+                    light,
+                    occluder,
+                    aovs=aovs,
+                    normals=aovs is True,
+                    surroundings=self.surroundings,
+                    derivatives=False,
+                )
+
+            def averaged(view: Camera) -> Frame:
+                return supersampled(once, view, samples, details=bool(aovs))
+
+            factor, count = samples_per_axis(samples), self.count
+            with dr.suspend_grad():
+                return in_passes(averaged, camera, factor, self.shading.neighbours, count)
+
+        return draw

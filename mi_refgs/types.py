@@ -1,0 +1,23 @@
+"""Names of Mitsuba's and Dr.Jit's types for annotations.
+
+The types themselves exist only once a variant is set (`mi.Float` of `llvm_ad_rgb` is not that of `cuda_ad_rgb`),
+so a type checker sees `Any`; a reader sees what the value is. Shapes are written on the line of the argument:
+
+    weight: Float,  # (N,)
+    radiance: Color3f,  # (H*W,) linear, premultiplied
+"""
+
+from typing import Any
+
+Bool = Any  # mi.Bool
+Float = Any  # mi.Float
+Int32 = Any  # mi.Int32
+UInt32 = Any  # mi.UInt32
+Color3f = Any  # mi.Color3f
+Point2f = Any  # mi.Point2f
+Point3f = Any  # mi.Point3f
+Vector2f = Any  # mi.Vector2f
+Vector3f = Any  # mi.Vector3f
+Quaternion4f = Any  # mi.Quaternion4f, (x, y, z, w)
+TensorXf = Any  # mi.TensorXf
+Array = Any  # any one of the above
