@@ -22,7 +22,7 @@ T = TypeVar("T", bound=Named)
 class Registry(Mapping[str, T], Generic[T]):
     """Objects of one kind by name, in the order of registration.
 
-    `check(item)` raises InputError for an item that cannot be used, so that it is refused when it is registered
+    `check(item)` raises InputError for an item that cannot be used, so that it is refused at once
     and not at its first use.
     """
 

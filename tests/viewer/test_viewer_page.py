@@ -315,7 +315,7 @@ def test_the_roughness_slider_shows_and_saves_the_edited_scene(
 
 def test_a_selection_that_is_none_is_one_sentence_on_the_page(tab: Tab) -> None:
     """Below the field, where it may come and go while one types; no message covers the picture."""
-    for text, said in (("metallic > ", "a name or a number is missing"), ("x < {", "'{' has no meaning")):
+    for text, said in (("metallic > ", "a name or a number is missing"), ("x < {", "'{' is not allowed")):
         tab.type("Where", text)
         tab.page.get_by_text(said).wait_for(timeout=1000 * PATIENCE)
     assert tab.page.get_by_text("(still 6,000 of 6,000 surfels)").count() == 1
