@@ -46,7 +46,21 @@ def sphere_data(size: int, views: int, rng: np.random.Generator) -> Any:
         image = (inside[..., None] * colour + 1 - inside[..., None]).astype(np.float32)
         c = size / 2
         pictures.append(
-            View(f"{i}", size, size, focal, focal, c, c, to_world, image, inside, None, None, linear=False)
+            View(
+                f"{i}",
+                size,
+                size,
+                focal,
+                focal,
+                c,
+                c,
+                to_world,
+                image,
+                inside,
+                None,
+                None,
+                is_linear_radiance=False,
+            )
         )
     return Dataset(Path("sphere"), "train", tuple(pictures), np.ones(3, np.float32), False, None)
 

@@ -23,7 +23,7 @@ def measure() -> list[dict[str, Any]]:
 def _with_peak(view: Any) -> dict[str, Any]:
     image = view.image.copy()
     image[SIZE // 2, SIZE // 2] = 1e6
-    return {"image": image, "linear": True}
+    return {"image": image, "is_linear_radiance": True}
 
 
 CASES: dict[str, dict[str, Any]] = {
@@ -46,7 +46,7 @@ def fit(name: str) -> dict[str, Any]:
     case = CASES[name]
     if "view" in case:
         views = tuple(replace(view, **case["view"](view)) for view in trainer.data.views)
-        trainer.data = replace(trainer.data, views=views, linear=views[0].linear)
+        trainer.data = replace(trainer.data, views=views, is_linear_radiance=views[0].is_linear_radiance)
         trainer.targets = Targets(trainer.data, method.data)
     if "light" in case:
         raw = trainer.params[LIGHT].numpy()

@@ -48,7 +48,7 @@ def with_points(data: Dataset, folder: Path, tell: Callable[[str], None]) -> Poi
     kept in `folder` for an interrupted start. `tell` is called with what was done, or what would help.
     """
     enough = len(data.views) >= MIN_LENGTH and min(min(v.width, v.height) for v in data.views) >= LEAST_SIDE
-    if data.points is not None or not enough or data.cut_out:
+    if data.points is not None or not enough or data.has_alpha:
         return data.points
     kept, key = folder / POINTS_FILE, _key(data)
     with (
@@ -93,7 +93,7 @@ def triangulated(data: Dataset) -> PointCloud | None:
 
     Raises InputError as `read_dataset` does, and where pycolmap is missing.
     """
-    kind = "exr" if data.linear else "png"
+    kind = "exr" if data.is_linear_radiance else "png"
     factor, _, _ = fitting_downscale(data.path, kind, PIXELS)
     views = read_dataset(data.path, data.split, downscale=factor, images=kind, truth=False).views
     names = [f"{i:06}.png" for i in range(len(views))]

@@ -153,7 +153,9 @@ def _preview(before: Any, after: Any) -> Any:
     if not before.source.is_there:
         return before_and_after(before.trained, after.trained, cameras)
     views = before.views()
-    return before_and_after(before.trained, after.trained, cameras, views.background, views.linear)
+    return before_and_after(
+        before.trained, after.trained, cameras, views.background, views.is_linear_radiance
+    )
 
 
 def _require_free(out: Path) -> None:

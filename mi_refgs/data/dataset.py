@@ -46,7 +46,7 @@ class Dataset:
     split: str
     views: tuple[View, ...]
     background: np.ndarray  # (3,) float32, in the space of the targets
-    linear: bool  # as in View
+    is_linear_radiance: bool  # as in View
     environment: Path | None  # ground truth of the light: lat-long EXR in Mitsuba's orientation
     points: PointCloud | None = None  # on what is seen, where the data set has some
     region: Region | None = None  # of interest, of all splits; absent where alpha says what is the object's
@@ -55,9 +55,9 @@ class Dataset:
     """What was subtracted from all positions of the files, scene units; as `FAR` says."""
 
     @property
-    def cut_out(self) -> bool:
+    def has_alpha(self) -> bool:
         """Whether all pictures have alpha that leaves something out; decodes nothing."""
-        return all(view.cut_out for view in self.views)
+        return all(view.has_alpha for view in self.views)
 
     @cached_property
     def scene_extent(self) -> float:
@@ -125,7 +125,7 @@ def read_dataset(
     colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
     region = read_region(path)
     region = None if region is None else region.moved(-offset)
-    if region is None and not all(view.cut_out for view in views):
+    if region is None and not all(view.has_alpha for view in views):
         with contextlib.suppress(InputError):  # views that share no point have none
             region = region_of([_moved(view, offset) for view in training()])
     views = tuple(_moved(view, offset).changed(near=near) for view in views)
@@ -167,7 +167,7 @@ def _training_views(path: Path, options: ReadOptions) -> tuple[View, ...]:
 
 def _own_alpha(view: View) -> bool:
     """Whether a view has alpha, and not that of a mask."""
-    return view.cut_out and (view.file is None or view.file.mask is None)
+    return view.has_alpha and (view.file is None or view.file.mask is None)
 
 
 def _opaque(views: tuple[View, ...]) -> bool:

@@ -57,7 +57,7 @@ def fitted_gain(
     colour = view.colour(background)
     brighter = np.maximum(np.maximum(rendered, colour), SRGB_LINEAR_LIMIT)
     weight = covered[..., None] * brighter ** (1 / 2.4 - 1)
-    if not view.linear:
+    if not view.is_linear_radiance:
         weight = weight * (colour < CLIPPED)
     if where is not None:
         weight = weight * where[..., None]

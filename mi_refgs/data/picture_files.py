@@ -104,7 +104,7 @@ class PictureFile:
         changed = self.downscale > 1 or self.mask is not None or self.straight is not None
         return not changed and self.path.suffix.lower() != ".exr"
 
-    def cut_out(self) -> bool:
+    def has_alpha(self) -> bool:
         """Whether there is alpha, by the file's header."""
         if self.path.suffix.lower() == ".exr":
             return self.mask is not None or exr_has_alpha(self.path)
@@ -204,7 +204,7 @@ def make_view(
         fx, fy = fx * straight.zoom, fy * straight.zoom
         picture = replace(picture, straight=straight)
     pixels: Any = Picture(picture, options.background, decode=options.decode)
-    alpha = pixels if pixels.cut_out else None
+    alpha = pixels if pixels.has_alpha else None
     exposure = log_exposure(picture.path)
     linear = options.images == "exr"
     view = View(name, width, height, fx, fy, cx, cy, to_world, pixels, alpha, None, None, linear)

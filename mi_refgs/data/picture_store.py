@@ -76,7 +76,7 @@ class Picture:
         self.file, self.background, self.store = file, background, store
         weakref.finalize(self, store.drop, id(self)).atexit = False
         whole = store.pixels(self) if decode and store.has_room(file.largest) else None
-        self.cut_out = file.cut_out() if whole is None else whole.shape[-1] == 4
+        self.has_alpha = file.has_alpha() if whole is None else whole.shape[-1] == 4
 
     def planes(self) -> tuple[np.ndarray, np.ndarray | None]:
         """Colour and alpha, as `PictureFile.read` gives them."""

@@ -93,7 +93,7 @@ def survey(folder: Path) -> Survey:
         centre, distance = _floats(focus), (float(far.min()), float(far.max()))
     except InputError:
         missing.append("the cameras look at no common point")
-    opaque = sum(not view.cut_out for view in views)
+    opaque = sum(not view.has_alpha for view in views)
     found = Survey(
         str(folder),
         reader.name,

@@ -22,7 +22,7 @@ ALPHA_FLOOR = 1e-3
 class Pixels(Protocol):
     """Colour and alpha of a picture that is decoded when it is asked for."""
 
-    cut_out: bool
+    has_alpha: bool
     """Whether it has alpha."""
 
     def planes(self) -> tuple[np.ndarray, np.ndarray | None]:
@@ -45,7 +45,7 @@ class View:
     alpha: np.ndarray | None  # (H, W) float32; likewise
     normal: np.ndarray | None  # (H, W, 3) float32, world space, 0 off the object
     depth: np.ndarray | None  # (H, W) float32 along the viewing axis, 0 off the object
-    linear: bool  # whether `image` is linear radiance (EXR) or sRGB-encoded (PNG)
+    is_linear_radiance: bool  # whether `image` is linear radiance (EXR) or sRGB-encoded (PNG)
     materials: dict[str, np.ndarray] = field(default_factory=dict)
     """Of albedo, roughness, metallic those that are known: (H, W, C + 1) float32, the last the share of the
     pixel for which the others stand; all 0 where it is 0."""
@@ -89,13 +89,13 @@ class View:
     @property
     def displayed(self) -> np.ndarray:
         """The picture (H, W, 3) that the view is fitted to or compared with, display-encoded."""
-        return srgb_from_linear(self.image) if self.linear else self.image
+        return srgb_from_linear(self.image) if self.is_linear_radiance else self.image
 
     @property
-    def cut_out(self) -> bool:
+    def has_alpha(self) -> bool:
         """Whether the picture has alpha; decodes nothing, as `alpha` may."""
         given = self.__dict__["alpha"]
-        return given is not None and (isinstance(given, np.ndarray) or given.cut_out)
+        return given is not None and (isinstance(given, np.ndarray) or given.has_alpha)
 
     def changed(self, **fields: Any) -> View:
         """The same view with other fields; decodes nothing, as `dataclasses.replace` would."""
@@ -138,7 +138,7 @@ class View:
         loaded = self.load()
         alpha = np.float32(1) if loaded.alpha is None else loaded.alpha[..., None]
         colour = np.clip((loaded.image - (1 - alpha) * background) / np.maximum(alpha, ALPHA_FLOOR), 0, None)
-        return colour if self.linear else linear_from_srgb(np.clip(colour, 0, 1))
+        return colour if self.is_linear_radiance else linear_from_srgb(np.clip(colour, 0, 1))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Array indices (row, column), integer at pixel centres, of world points (N, 3); and if seen."""

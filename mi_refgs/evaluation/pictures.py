@@ -48,7 +48,7 @@ class RenderedView:
         normal = planes(frame.normal, *size)
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         return RenderedView(
-            planes(displayed(frame, data.background, data.linear), *size),
+            planes(displayed(frame, data.background, data.is_linear_radiance), *size),
             planes(frame.alpha, *size),
             np.where(length > 1e-6, normal / np.maximum(length, 1e-6), 0),
             RenderedView.maps_of(frame, *size),

@@ -211,7 +211,7 @@ class _Pictures:
         view = scene.renderer(aovs=False)
         for place in list(self.order):
             frame, camera = view(self.cameras[place]), self.cameras[place]
-            shown = [*displayed(frame, self.data.background, self.data.linear), frame.alpha]
+            shown = [*displayed(frame, self.data.background, self.data.is_linear_radiance), frame.alpha]
             dr.eval(shown)
             pixels = camera.width * camera.height
             yield place, np.stack([np.broadcast_to(np.array(x, np.float32), pixels) for x in shown])

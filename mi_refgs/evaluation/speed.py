@@ -28,7 +28,7 @@ def milliseconds(
         for view, times in zip(scenes, seconds, strict=True):
             dr.sync_thread()
             begin = time.perf_counter()
-            dr.eval(displayed(view(cameras[i % len(cameras)]), data.background, data.linear))
+            dr.eval(displayed(view(cameras[i % len(cameras)]), data.background, data.is_linear_radiance))
             dr.sync_thread()
             times.append(time.perf_counter() - begin)
     return [1000 * float(np.median(times[WARM_UP_FRAMES:])) for times in seconds]

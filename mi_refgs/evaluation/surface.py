@@ -117,7 +117,7 @@ def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> d
     centre = (corners.min(0) + corners.max(0)) / 2
     radius = np.linalg.norm(corners - centre, axis=1).max()
     percent = 100 / (2 * radius)
-    if views and not views[0].cut_out:
+    if views and not views[0].has_alpha:
         mesh = mesh.of_vertices(np.linalg.norm(mesh.vertices - centre, axis=1) <= NEAR_TRUTH * radius)
         if not len(mesh.faces):
             return {}

@@ -205,7 +205,7 @@ def with_gain(
 def displayed_of(frame: Frame, data: Dataset, gain: np.ndarray | None = None) -> list[Any]:
     """`displayed` with a gain that is no part of the kernel."""
     factors = None if gain is None else [dr.opaque(mi.Float, float(g)) for g in gain]
-    return displayed(frame, data.background, data.linear, factors)
+    return displayed(frame, data.background, data.is_linear_radiance, factors)
 
 
 def psnr(image: np.ndarray, view: View, where: np.ndarray | None = None) -> float:

@@ -26,7 +26,7 @@ FAR = 1e4
 
 def is_open(method: Method, data: Dataset) -> bool:
     """Whether pictures show surroundings that the method keeps apart from the object."""
-    return method.surroundings is not None and data.region is not None and not data.cut_out
+    return method.surroundings is not None and data.region is not None and not data.has_alpha
 
 
 def initial_parameters(
@@ -108,7 +108,7 @@ def initial_surfels(
         raise InputError(f"method: surfels.inside: {options.inside} is no share; give a number from 0 to 1")
     views, behind = data.views, data.background
     start: dict[str, Any] = dict(options.initial)
-    if data.cut_out:
+    if data.has_alpha:
         shape = hull.visual_hull(views, hull.camera_bounds(views))
         inner = shape.inner_points(round(options.inside * options.count), rng)
         outer, facing = shape.surface_points(options.count - len(inner), rng)

@@ -132,7 +132,7 @@ def default_method(
     # What `settings` say of a method may be of the other one.
     of_data = [text for text in methods.assignments(settings) if text.startswith("data.")]
     views = read_views(load_method(None, preset, of_data), data, "train", truth=False, decode=False)
-    if views.cut_out or views.region is None:
+    if views.has_alpha or views.region is None:
         return None
     method = methods.for_purpose(OPEN_PURPOSE)
     (progress or Progress()).say(
@@ -198,7 +198,7 @@ def _warn_of_data(method: Method, views: Dataset, progress: Progress) -> None:
     """Say what is unusual about a data set."""
     if note := few_views(len(views.views)):
         progress.warn(f"{views.path}: {note}")
-    if not views.cut_out and (method.surroundings is None or views.region is None):
+    if not views.has_alpha and (method.surroundings is None or views.region is None):
         progress.warn(
             f"{views.path}: pictures without alpha: surfels start at random, "
             "and the background becomes surfels too"

@@ -43,9 +43,9 @@ class Target:
         loaded = view.load()
         colour, opacity = loaded.image, loaded.alpha
         planes = [upload(colour[..., i]) for i in range(3)]
-        image = [srgb_from_linear(plane) for plane in planes] if view.linear else planes
+        image = [srgb_from_linear(plane) for plane in planes] if view.is_linear_radiance else planes
         alpha = None if opacity is None else upload(opacity)
-        clipped = None if view.linear else losses.saturated(image, alpha, map(float, background))
+        clipped = None if view.is_linear_radiance else losses.saturated(image, alpha, map(float, background))
         target = Target(view.camera(), image, clipped, alpha)
         dr.eval(target.image, target.clipped, target.alpha)
         return target
@@ -68,7 +68,7 @@ def objective(
     """
     width, height = target.camera.width, target.camera.height
     gain = None if log_gain is None else [dr.exp(value) for value in log_gain]
-    image = displayed(frame, data.background, data.linear, gain)
+    image = displayed(frame, data.background, data.is_linear_radiance, gain)
     share = frame.alpha if frame.share is None else frame.share
     if target.clipped is not None:
         image = losses.clip_highlights(image, target.image, target.clipped)

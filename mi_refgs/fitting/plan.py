@@ -77,11 +77,11 @@ def planned(
     method = replace(method, data=replace(method.data, downscale=factor))
     if method.iterations * width * height < WORTH:
         return method, None
-    cut_out = data.cut_out
-    speed = speed_of(method, cut_out)
+    has_alpha = data.has_alpha
+    speed = speed_of(method, has_alpha)
 
     def at(factor: int) -> Estimate:
-        return estimate(method, speed, len(data.views), (width, height), factor, cut_out)
+        return estimate(method, speed, len(data.views), (width, height), factor, has_alpha)
 
     if given or limit is None:
         return method, at(factor)
@@ -107,11 +107,11 @@ def planned(
 
 
 def estimate(
-    method: Method, speed: Speed, views: int, size: tuple[int, int], factor: int, cut_out: bool = True
+    method: Method, speed: Speed, views: int, size: tuple[int, int], factor: int, has_alpha: bool = True
 ) -> Estimate:
     """What a fit to so many pictures of `size` (width, height), read `factor` times smaller, will need.
 
-    `cut_out`: whether they have alpha.
+    `has_alpha`: whether they have alpha.
     """
     width, height = size[0] // factor, size[1] // factor
     pixels, begin, steps = width * height, 0, 0.0
@@ -121,7 +121,7 @@ def estimate(
         begin = stage.until
     meshes = 0 if method.mesh is None else method.mesh.extract.count(method.iterations)
     files = views * size[0] * size[1] * DECODING
-    steps *= GROWTH if cut_out else OPEN_GROWTH
+    steps *= GROWTH if has_alpha else OPEN_GROWTH
     seconds = START + files + steps + meshes * (speed.mesh + views * speed.mesh_view)
     return Estimate(seconds, bytes_of(method, views, pixels), width, height)
 

@@ -40,10 +40,10 @@ WARM, TIMED, REPEATS = 4, 4, 3
 which the fastest counts."""
 
 
-def speed_of(method: Method, cut_out: bool) -> Speed:
+def speed_of(method: Method, has_alpha: bool) -> Speed:
     """How fast steps of a method are here, on pictures with alpha or without: as kept, or measured."""
-    subject = machine() | {"simd_width": simd_width(), "mi_refgs": __version__, "cut_out": cut_out}
-    return cost_model.kept(subject | _cost(method), lambda: measured(method, cut_out))
+    subject = machine() | {"simd_width": simd_width(), "mi_refgs": __version__, "cut_out": has_alpha}
+    return cost_model.kept(subject | _cost(method), lambda: measured(method, has_alpha))
 
 
 def _cost(method: Method) -> dict[str, Any]:
@@ -56,17 +56,17 @@ def _cost(method: Method) -> dict[str, Any]:
     }
 
 
-def measured(method: Method, cut_out: bool) -> Speed:
+def measured(method: Method, has_alpha: bool) -> Speed:
     """Run a few steps of every stage at both sizes."""
-    (small, mesh), (large, _) = (_measured(method, cut_out, size) for size in cost_model.SIZES)
+    (small, mesh), (large, _) = (_measured(method, has_alpha, size) for size in cost_model.SIZES)
     return Speed({name: [small[name], large[name]] for name in small}, *mesh)
 
 
-def _measured(method: Method, cut_out: bool, size: int) -> tuple[dict[str, float], tuple[float, float]]:
+def _measured(method: Method, has_alpha: bool, size: int) -> tuple[dict[str, float], tuple[float, float]]:
     """Seconds of a step by stage, and of a mesh without views and of each of its views."""
     data_options = replace(method.data, coarse=())
     still = replace(method, refine=Refine(), exposure=None, select=None, data=data_options)
-    trainer = Trainer(replace(still, mesh=None), stand_in(cut_out, size))
+    trainer = Trainer(replace(still, mesh=None), stand_in(has_alpha, size))
     every = 1 if method.light is None else method.light.every
     timed = max(TIMED // every, 1) * every
     steps, mesh, begin = {}, (0.0, 0.0), 0
@@ -111,7 +111,7 @@ def _seconds(call: Callable[[], Any]) -> float:
     return clock() - begin
 
 
-def stand_in(cut_out: bool, size: int) -> Dataset:
+def stand_in(has_alpha: bool, size: int) -> Dataset:
     """Pictures of noise, of a ball that is cut out or of what is all around, from a ring of cameras."""
     rng = np.random.default_rng(0)
     y, x = (np.mgrid[0:size, 0:size] + 0.5) / size - 0.5
@@ -122,10 +122,12 @@ def stand_in(cut_out: bool, size: int) -> Dataset:
     for i, to_world in enumerate(poses_around(outward, np.zeros(3), 4.0)):
         noise = np.repeat(np.repeat(rng.random((8, 8, 3)), -(-size // 8), axis=0), -(-size // 8), axis=1)
         image = noise[:size, :size].astype(np.float32)
-        if cut_out:
+        if has_alpha:
             image = alpha[..., None] * image + 1 - alpha[..., None]
         focal, middle = 1.6 * size, size / 2
         place = (size, size, focal, focal, middle, middle, to_world)
-        views.append(View(f"{i}", *place, image, alpha if cut_out else None, None, None, linear=False))
-    region = None if cut_out else Region((0.0, 0.0, 0.0), 1.0)
+        views.append(
+            View(f"{i}", *place, image, alpha if has_alpha else None, None, None, is_linear_radiance=False)
+        )
+    region = None if has_alpha else Region((0.0, 0.0, 0.0), 1.0)
     return Dataset(Path("stand-in"), "train", tuple(views), np.ones(3, np.float32), False, None, None, region)

@@ -39,7 +39,7 @@ class Compared:
         frame_of = getattr(drawable, "frame", None)
         truth = np.clip(view.displayed, 0, 1)
         if look.what == PICTURE and frame_of is not None:
-            shown = displayed(frame_of(view.camera()), self.data.background, self.data.linear)
+            shown = displayed(frame_of(view.camera()), self.data.background, self.data.is_linear_radiance)
             ours = planes(shown, view.height, view.width)
             self.tell(metrics.psnr(ours, truth))
             drawn = to_8_bits(ours)

@@ -103,7 +103,7 @@ def test_cameras_see_the_points(kind: str, place: str, tmp_path: Path) -> None:
         for view in dataset.views:
             shot = next(shot for shot in SHOTS if shot.name == view.name)
             check(view, shot)
-            assert view.alpha is None and not view.linear
+            assert view.alpha is None and not view.is_linear_radiance
             np.testing.assert_allclose(view.to_world[:3, 3], shot.camera_to_world[:3, 3], atol=1e-9)
     assert train.points is not None and train.points.colour is not None and not train.notes
     np.testing.assert_allclose(train.points.position, POINTS)

@@ -63,7 +63,12 @@ def test_png_is_composited_as_displayed(folder: Path) -> None:
         pixels = np.asarray(Image.open(folder / "train/r_3.png")) / 255
         expected = pixels[..., 3:] * pixels[..., :3] + (1 - pixels[..., 3:]) * value
         view = data.views[3]
-        assert (view.name, view.width, view.height, view.linear) == ("train/r_3", WIDTH, HEIGHT, False)
+        assert (view.name, view.width, view.height, view.is_linear_radiance) == (
+            "train/r_3",
+            WIDTH,
+            HEIGHT,
+            False,
+        )
         assert view.image.dtype == np.float32 and view.alpha is not None
         np.testing.assert_allclose(view.image, expected, atol=1e-6)
         np.testing.assert_allclose(view.alpha, pixels[..., 3], atol=1e-6)
@@ -73,7 +78,7 @@ def test_png_is_composited_as_displayed(folder: Path) -> None:
 def test_exr_is_linear_and_premultiplied(folder: Path) -> None:
     view = read_dataset(folder, "train", images="exr").views[2]
     pixels = read_exr_image(folder / "train/r_2.exr")
-    assert view.linear and view.image.max() > 1
+    assert view.is_linear_radiance and view.image.max() > 1
     np.testing.assert_allclose(view.image, pixels[..., :3] + 1 - pixels[..., 3:], atol=1e-6)
 
 
@@ -196,7 +201,7 @@ def test_extension_may_be_given(folder: Path) -> None:
     views = read_dataset(folder, "train").views
     assert [v.name for v in views[:2]] == ["train/r_0", "train/take.1"]
     (folder / "train/take.1.exr").write_bytes((folder / "train/r_1.exr").read_bytes())
-    assert read_dataset(folder, "train", images="exr").views[1].linear
+    assert read_dataset(folder, "train", images="exr").views[1].is_linear_radiance
 
 
 def test_ground_truth_maps(folder: Path, rng: np.random.Generator) -> None:

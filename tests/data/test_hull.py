@@ -34,7 +34,19 @@ def sphere_views(
         middle = size / 2
         views.append(
             View(
-                "", size, size, focal, focal, middle, middle, to_world, image, alpha, None, None, linear=True
+                "",
+                size,
+                size,
+                focal,
+                focal,
+                middle,
+                middle,
+                to_world,
+                image,
+                alpha,
+                None,
+                None,
+                is_linear_radiance=True,
             )
         )
     return views

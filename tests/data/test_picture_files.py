@@ -139,22 +139,22 @@ def test_alpha_that_leaves_nothing_out_is_none(images: str, tmp_path: Path) -> N
     data = write_data(tmp_path / "ball", truth=False)
     for path in data.glob("*/*.png"):
         write_exr(path.with_suffix(".exr"), read_png(path))
-    assert all(read_dataset(data, split, images=images).cut_out for split in ("train", "test"))
+    assert all(read_dataset(data, split, images=images).has_alpha for split in ("train", "test"))
     filled(data)
     for split in ("train", "test"):
         found = read_dataset(data, split, images=images)
-        assert not found.cut_out and all(view.alpha is None for view in found.views)
+        assert not found.has_alpha and all(view.alpha is None for view in found.views)
         assert found.region is not None and "no pixel is transparent" in found.notes[-1]
     assert survey(data).alpha == "none"
     if images == "png":
         for path in data.glob("*/r_?.png"):
             write_png(path, read_png(path)[..., :3])
             write_png(path.with_name(f"{path.stem}_alpha.png"), np.ones((20, 20, 3)))
-        assert read_dataset(data, "train").cut_out
+        assert read_dataset(data, "train").has_alpha
 
 
 def test_one_image_that_is_full_is_still_masked(tmp_path: Path) -> None:
     """What alpha means is a matter of the data set: others leave something out."""
     data = filled(write_data(tmp_path / "ball", truth=False), but="r_2")
     for split in ("train", "test"):
-        assert read_dataset(data, split).cut_out
+        assert read_dataset(data, split).has_alpha

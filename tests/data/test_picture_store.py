@@ -56,7 +56,7 @@ def test_a_picture_is_the_same_however_often_it_is_decoded(
         picture = Picture(file, 0.75, store)
         expected, opacity = file.read(0.75)
         assert (
-            picture.cut_out
+            picture.has_alpha
             == (opacity is not None)
             == (name in ("rgba.png", "rgba.exr", "averaged", "masked"))
         )
@@ -196,11 +196,11 @@ def test_a_view_says_whether_it_has_alpha_without_decoding(
     monkeypatch.setattr(picture_store.STORE, "budget", 0)
     monkeypatch.setattr(PictureFile, "decode", lambda file: pytest.fail("decoded"))
     view = read_dataset(tmp_path / "data", "train", truth=False).views[0]
-    assert not view.cut_out and view.alpha is None and view.changed(near=2.0).near == 2.0
+    assert not view.has_alpha and view.alpha is None and view.changed(near=2.0).near == 2.0
     view = ball().views[0]
-    assert view.cut_out and view.alpha is not None
+    assert view.has_alpha and view.alpha is not None
     other = dataclasses.replace(view, image=view.image * 0.5, alpha=None)
-    assert not other.cut_out and np.array_equal(other.image, view.image * 0.5)
+    assert not other.has_alpha and np.array_equal(other.image, view.image * 0.5)
 
 
 def test_a_loaded_view_decodes_once(

@@ -68,7 +68,20 @@ def random_view(seed: int) -> tuple[RenderedView, View, np.ndarray]:
         for name, c in (("albedo", 3), ("roughness", 1), ("metallic", 1))
     }
     view = View(
-        "a", W, H, 9, 9, 4, 4, np.eye(4), colour, alpha, normal, alpha, linear=False, materials=materials
+        "a",
+        W,
+        H,
+        9,
+        9,
+        4,
+        4,
+        np.eye(4),
+        colour,
+        alpha,
+        normal,
+        alpha,
+        is_linear_radiance=False,
+        materials=materials,
     )
     return RenderedView(colour, alpha, normal, {}), view, rng.random((H, W)) > 0.5
 
@@ -162,7 +175,9 @@ def around(count: int = 8) -> list[View]:
         angle = 2 * np.pi * i / count
         origin = 6 * np.array([np.cos(angle), np.sin(angle), np.sin(3 * angle)])
         pose = look_at(origin, np.zeros(3))
-        views.append(View(f"{i}", 16, 16, 16, 16, 8, 8, pose, blank, None, None, None, linear=False))
+        views.append(
+            View(f"{i}", 16, 16, 16, 16, 8, 8, pose, blank, None, None, None, is_linear_radiance=False)
+        )
     return views
 
 

@@ -83,7 +83,7 @@ def test_the_numbers_are_those_of_the_trainer(run: Run, folder: Path) -> None:
     views = dataset.read_dataset(folder / "ball", "test")
     scores = []
     for view in views.views:
-        planes = displayed(trainer.view(view.camera()), views.background, views.linear)
+        planes = displayed(trainer.view(view.camera()), views.background, views.is_linear_radiance)
         image = np.stack([np.array(plane).reshape(SIZE, SIZE) for plane in planes], axis=-1)
         scores.append(metrics.psnr(image, view.image))
     assert math.isclose(result["psnr"], np.mean(scores), abs_tol=1e-4)

@@ -57,13 +57,13 @@ def view_of(image: np.ndarray, alpha: np.ndarray | None, linear: bool) -> View:
 
 
 @pytest.mark.parametrize("linear", [False, True])
-@pytest.mark.parametrize("cut_out", [False, True])
+@pytest.mark.parametrize("has_alpha", [False, True])
 def test_a_gain_is_found_beside_clipped_pixels(
-    linear: bool, cut_out: bool, picture: tuple[np.ndarray, np.ndarray]
+    linear: bool, has_alpha: bool, picture: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """An 8-bit picture clips what the gain makes brighter than white."""
     radiance, alpha = picture
-    if not cut_out:
+    if not has_alpha:
         radiance, alpha = radiance / np.maximum(alpha, 1e-9)[..., None], np.ones_like(alpha)
     image = shown(radiance, alpha, linear, GAINS)
     if not linear:
@@ -72,7 +72,7 @@ def test_a_gain_is_found_beside_clipped_pixels(
         )
         assert np.any(clipped < image - 0.05)
         image = clipped
-    view = view_of(image, alpha if cut_out else None, linear)
+    view = view_of(image, alpha if has_alpha else None, linear)
     found = fitted_gain(radiance, alpha, view, BACKGROUND)
     np.testing.assert_allclose(found, GAINS, rtol=2e-3)
     half = np.indices(alpha.shape)[0] < HEIGHT // 2

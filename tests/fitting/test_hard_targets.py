@@ -23,8 +23,8 @@ STEPS = 14
 
 def changed(change: Callable[[View], dict[str, Any]], linear: bool = False, views: int = 6) -> Dataset:
     data = ball(views=views)
-    found = tuple(dataclasses.replace(view, **change(view), linear=linear) for view in data.views)
-    return dataclasses.replace(data, views=found, linear=linear)
+    found = tuple(dataclasses.replace(view, **change(view), is_linear_radiance=linear) for view in data.views)
+    return dataclasses.replace(data, views=found, is_linear_radiance=linear)
 
 
 def radiance(view: View, peak: float) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def test_only_the_objects_own_colour_is_a_highlight() -> None:
 def test_a_floater_brighter_than_a_white_background_costs(covered: float) -> None:
     """Over the background it does, over a highlight of the object it does not."""
     image, alpha = np.ones((4, 4, 3), np.float32), np.full((4, 4), covered, np.float32)
-    view = View("a", 4, 4, 4, 4, 2, 2, np.eye(4), image, alpha, None, None, linear=False)
+    view = View("a", 4, 4, 4, 4, 2, 2, np.eye(4), image, alpha, None, None, is_linear_radiance=False)
     target = Target.of(view, np.ones(3))
     radiance = [mi.Float(np.full(16, 3.0)) for _ in range(3)]
     dr.enable_grad(radiance)

@@ -50,7 +50,7 @@ def test_an_estimate_is_the_sum_of_the_stages(method: Method) -> None:
     around = dataclasses.replace(method, surroundings=SurroundingsOptions(max_count=50))
     more = plan.estimate(around, SPEED, 7, (20, 20), 1).bytes - whole.bytes
     assert more == pytest.approx(50 * memory.PER_SURFEL)
-    scene = plan.estimate(method, SPEED, 7, (20, 20), 1, cut_out=False)
+    scene = plan.estimate(method, SPEED, 7, (20, 20), 1, has_alpha=False)
     assert whole.seconds - scene.seconds == pytest.approx((plan.GROWTH - plan.OPEN_GROWTH) * at_400)
     tiny = plan.estimate(method, SPEED, 7, (1, 1), 1)
     assert tiny.seconds == pytest.approx(others + 7 * plan.DECODING + 0.5 * at_100)  # never next to nothing
@@ -160,7 +160,7 @@ def test_a_speed_is_measured_once_and_stays_on_a_busy_machine(
     speed = speeds.speed_of(method, True)
     calls: list[Method] = []
 
-    def measured(method: Method, cut_out: bool) -> cost_model.Speed:
+    def measured(method: Method, has_alpha: bool) -> cost_model.Speed:
         calls.append(method)
         return expected
 
@@ -168,9 +168,9 @@ def test_a_speed_is_measured_once_and_stays_on_a_busy_machine(
     assert speed == expected and machine.meshes[:2] == [speeds.VIEWS, speeds.VIEWS]
     [file] = cache.glob("speed-*.json")
 
-    def measurements(wanted: Method = method, cut_out: bool = True) -> int:
+    def measurements(wanted: Method = method, has_alpha: bool = True) -> int:
         calls.clear()
-        assert speeds.speed_of(wanted, cut_out) == expected
+        assert speeds.speed_of(wanted, has_alpha) == expected
         return len(calls)
 
     assert measurements() == 0

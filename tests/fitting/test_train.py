@@ -80,7 +80,21 @@ def ball(size: int = SIZE, views: int = 6) -> Dataset:
         image = (alpha[..., None] * colour + 1 - alpha[..., None]).clip(0, 1).astype(np.float32)
         c = size / 2
         pictures.append(
-            View(f"{i}", size, size, focal, focal, c, c, to_world, image, alpha, None, None, linear=False)
+            View(
+                f"{i}",
+                size,
+                size,
+                focal,
+                focal,
+                c,
+                c,
+                to_world,
+                image,
+                alpha,
+                None,
+                None,
+                is_linear_radiance=False,
+            )
         )
     return Dataset(Path("ball"), "train", tuple(pictures), np.ones(3, np.float32), False, None)
 
