@@ -68,8 +68,8 @@ class Setup(setup.Setup):
         at = setup.shading_points(points, self.surface)
         if not rule.rays:
             return at
-        around = TraceContext(self.occluder, self.surfels, self.light, self.origin, -points.view)
-        return reflection(at, around, "irradiance", rule.accuracy())
+        context = TraceContext(self.occluder, self.surfels, self.light, self.origin, -points.view)
+        return reflection(at, context, "irradiance", rule.accuracy())
 
     def shaded(self, points: Points, rule: Rule) -> Any:
         """Outgoing radiance (mi.Color3f)."""

@@ -66,7 +66,7 @@ class AdaptiveControl:
             draws = fit.schedule.rng(iteration, "relocate")
             for table in self.tables:
                 table.adopt(relocate(table.surfels, options.relocate, table.max_count, draws))
-            fit.occluder.around = None
+            fit.occluder.vertex_surfels = None
         if options.reset is not None and options.reset.due(iteration):
             floors = {name: surfels.start(name) for name in options.reset_raise}
             # Surroundings keep theirs: without, the background takes their place, blurred.
@@ -118,7 +118,7 @@ class AdaptiveControl:
             edits = exchanged(inner, outer, fit.method, fit.data.region, draws)
             for table, edit in zip(self.tables, edits, strict=True):
                 table.adopt(edit)
-        fit.occluder.around = None
+        fit.occluder.vertex_surfels = None
         self.clear()
 
     def wander(self, iteration: int) -> None:
@@ -138,7 +138,7 @@ class AdaptiveControl:
     def remove(self, rows: np.ndarray, table: Table | None = None) -> None:
         """Take surfels out of a table, by default the object's; raises InputError if none would be left."""
         (table or self.table).remove(rows)
-        self.trainer.occluder.around = None
+        self.trainer.occluder.vertex_surfels = None
 
     def restart(self, names: tuple[str, ...], iteration: int) -> None:
         """Channels and the light back to their initial values, without history."""

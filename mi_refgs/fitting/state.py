@@ -50,8 +50,10 @@ def packed(trainer: Trainer) -> dict[str, np.ndarray]:
             "mesh/faces": mesh.faces,
             "mesh/voxel": np.array(mesh.voxel),
         }
-    if trainer.occluder.around is not None:
-        state |= {f"{MESH}{name}": values for name, values in trainer.occluder.around.arrays().items()}
+    if trainer.occluder.vertex_surfels is not None:
+        state |= {
+            f"{MESH}{name}": values for name, values in trainer.occluder.vertex_surfels.arrays().items()
+        }
     if trainer.occluder.ambient is not None:
         state["mesh/ambient"] = trainer.occluder.ambient.numpy()
     return state
@@ -73,7 +75,7 @@ def occluder_of(state: dict[str, np.ndarray]) -> Occluder:
         occluder.update(mesh)
         if "mesh/surfels" in state:
             count = len(state[f"{PARAMS}position"])
-            occluder.around = VertexSurfels.restored(mesh, count, part(state, MESH))
+            occluder.vertex_surfels = VertexSurfels.restored(mesh, count, part(state, MESH))
         if "mesh/ambient" in state:
             occluder.ambient = VertexColours.of(mesh, state["mesh/ambient"])
     return occluder

@@ -12,7 +12,7 @@ from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import render_depth
-from mi_refgs.shade.ambient import prepare
+from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
@@ -52,7 +52,7 @@ def surface_of(
     return extract_mesh(volume)
 
 
-def supply(
+def update_missing_caches(
     occluder: Occluder, surfels: Surfels, environment: EnvironmentLight | None, shading: Shading
 ) -> None:
     """Give an occluder what the shading asks for and what it lacks: all of it for a new mesh, the surfels of
@@ -60,6 +60,6 @@ def supply(
     """
     accuracy = shading.accuracy
     if accuracy.ambient_rays and occluder.ambient is None:
-        prepare(occluder, surfels, shading.light_of(environment), accuracy)
-    if accuracy.traced_bounces and occluder.around is None:
+        update_occluder_caches(occluder, surfels, shading.light_of(environment), accuracy)
+    if accuracy.traced_bounces and occluder.vertex_surfels is None:
         occluder.set_materials(surfels)

@@ -26,7 +26,7 @@ from mi_refgs.fitting.optim import Adam
 from mi_refgs.fitting.rates import Group
 from mi_refgs.fitting.schedule import Schedule
 from mi_refgs.fitting.state import decisions_of, occluder_of, packed, require_fit
-from mi_refgs.fitting.surface import supply, surface_of
+from mi_refgs.fitting.surface import surface_of, update_missing_caches
 from mi_refgs.fitting.targets import Targets, require_memory
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.timing import phase
@@ -130,7 +130,7 @@ class Trainer:
         """Render a view of the present state, without derivatives; `alone`: without the surroundings."""
         with dr.suspend_grad():
             shading = self.shading()
-            supply(self.occluder, self.surfels, self.light, shading)
+            update_missing_caches(self.occluder, self.surfels, self.light, shading)
             return render(
                 self.surfels,
                 camera,
@@ -245,7 +245,7 @@ class Trainer:
         shift = mi.Point2f(dr.opaque(mi.Float, 0, rows), dr.opaque(mi.Float, 0, rows))
         dr.enable_grad(shift)
         shading = self._shading(stage)
-        supply(self.occluder, self.surfels, self.light, shading)
+        update_missing_caches(self.occluder, self.surfels, self.light, shading)
         light = self.window.light(self.light, shading)
         view = partial(
             render,

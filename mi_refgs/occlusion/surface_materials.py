@@ -132,7 +132,7 @@ class VertexSurfels:
 class Surface:
     """A mesh with materials, to look up at hits."""
 
-    around: VertexSurfels
+    vertex_surfels: VertexSurfels
     rows: Any  # mi.Float (8 V): albedo, metallic, roughness, normal
 
     def at(self, triangle: mi.UInt32, barycentric: mi.Point2f, active: mi.Bool) -> SurfaceSample:
@@ -141,12 +141,12 @@ class Surface:
         near, far = mi.Vector4f(0), mi.Vector4f(0)
         closest, largest = mi.UInt32(0), mi.Float(-1)
         for corner, share in enumerate(shares):
-            vertex = dr.gather(mi.UInt32, self.around.faces, 3 * triangle + corner, active)
+            vertex = dr.gather(mi.UInt32, self.vertex_surfels.faces, 3 * triangle + corner, active)
             near += share * dr.gather(mi.Vector4f, self.rows, 2 * vertex, active)
             far += share * dr.gather(mi.Vector4f, self.rows, 2 * vertex + 1, active)
             closest = dr.select(share > largest, vertex, closest)
             largest = dr.maximum(share, largest)
-        surfel = dr.gather(mi.UInt32, self.around.surfel[0], closest, active)
+        surfel = dr.gather(mi.UInt32, self.vertex_surfels.surfel[0], closest, active)
         normal = mi.Vector3f(far.y, far.z, far.w)
         return SurfaceSample(mi.Color3f(near.x, near.y, near.z), near.w, far.x, normal, surfel)
 

@@ -49,7 +49,9 @@ class Occluder:
         self._scene: Any = None
         self._params: Any = None
         self._variant: str | None = None
-        self.around: VertexSurfels | None = None  # of this mesh; None also where rows of the table have moved
+        self.vertex_surfels: VertexSurfels | None = (
+            None  # of this mesh; None also where rows of the table have moved
+        )
         self.ambient: VertexColours | None = None  # share of diffuse light that arrives, of this mesh
         if mesh is not None:
             self.update(mesh)
@@ -60,7 +62,7 @@ class Occluder:
 
     def update(self, mesh: Mesh) -> None:
         """Replace the mesh. Vertex and face counts may change, to zero too; compiled kernels stay valid."""
-        self._mesh, self.around, self.ambient = mesh, None, None
+        self._mesh, self.vertex_surfels, self.ambient = mesh, None, None
         if not len(mesh.faces):
             return
         if self._scene is None or self._variant != mi.variant():
@@ -82,18 +84,18 @@ class Occluder:
         To be called again after `update`, and whenever surfels move or their number changes; new values of
         their materials need no call. Raises InputError without surfels or without their material channels.
         """
-        self.around = None
+        self.vertex_surfels = None
         if self._mesh is not None and not self.empty:
-            self.around = VertexSurfels.of(self._mesh, surfels)
+            self.vertex_surfels = VertexSurfels.of(self._mesh, surfels)
 
     def surface(self, surfels: Surfels) -> Surface:
         """The mesh with the present materials of `surfels`, to look up where `closest` hits it.
 
         Raises InputError without a `set_materials` for this mesh and this number of surfels.
         """
-        if self.around is None:
+        if self.vertex_surfels is None:
             raise InputError("occluder: materials: none are set; call Occluder.set_materials after update")
-        return self.around.surface(surfels)
+        return self.vertex_surfels.surface(surfels)
 
     def visible(self, origin: Any, direction: Any, normal: Any = None, active: Any = True) -> Any:
         """1 where the ray leaves the scene freely, 0 where the mesh stops it.

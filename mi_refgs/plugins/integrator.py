@@ -23,7 +23,7 @@ from mi_refgs.plugins.surroundings import Around
 from mi_refgs.plugins.unusable import UnusableValues
 from mi_refgs.render.display import composited
 from mi_refgs.render.pipeline import Frame, render
-from mi_refgs.shade.ambient import prepare
+from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import CHANNELS
@@ -180,7 +180,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.around = Around.of(props, self.surfels)
         self.aovs = read_aovs(props)
         self.filtered = FilteredOnce()
-        self.prepared = False  # what rays meet is as the parameters say
+        self.caches_valid = False  # occluder materials and ambient ratios are up to date
         self.check()
         self.unusable = UnusableValues(self.around.values(self.surfels, self.light))
 
@@ -204,8 +204,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.check()
         self.unusable.changed = True
         self.filtered.forget()
-        self.prepared = self.prepared and not self.shading.accuracy.ambient_rays
-        self.prepared = self.prepared and {*keys}.isdisjoint(self.surfels.primitive.widths) and bool(keys)
+        self.caches_valid = self.caches_valid and not self.shading.accuracy.ambient_rays
+        self.caches_valid = (
+            self.caches_valid and {*keys}.isdisjoint(self.surfels.primitive.widths) and bool(keys)
+        )
 
     def aov_names(self) -> list[str]:
         return [channel for aov in self.aovs for channel in aov.channels()]
@@ -269,10 +271,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         """One sample per pixel of an image with these types of AOVs, `around` the object being that."""
         asked = {*aovs} | {*(self.terms if len(self.terms) < len(TERMS) else ())}
         light = self.filtered.of(self.shading, self.light, self.light_rotation, scene, derivatives)
-        if self.occluder is not None and not self.prepared:
-            prepare(self.occluder, self.surfels.detach(), light, self.shading.accuracy)
+        if self.occluder is not None and not self.caches_valid:
+            update_occluder_caches(self.occluder, self.surfels.detach(), light, self.shading.accuracy)
             # No one is told when a light of the scene changes.
-            self.prepared = self.light is not None or not self.shading.accuracy.ambient_rays
+            self.caches_valid = self.light is not None or not self.shading.accuracy.ambient_rays
         frame = render(
             Surfels(self.surfels.raw, screened=True),
             camera,

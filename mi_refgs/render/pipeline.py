@@ -24,7 +24,7 @@ from mi_refgs.render.antialias import widened
 from mi_refgs.render.gbuffer import GBuffer, inverse_alpha
 from mi_refgs.render.surroundings import AROUND, OBJECT, Surroundings, joined_slots, together
 from mi_refgs.shade.light.light import Light
-from mi_refgs.shade.points import TERMS, ShadingPoints, Terms, safe_normalize
+from mi_refgs.shade.points import TERMS, RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera, splat
@@ -46,7 +46,7 @@ class Frame:
     depth: Any  # expected camera-z depth, 0 where nothing is seen; None if not asked for
     normal: Any  # mi.Vector3f: blended world normal towards the camera, not normalised; None if not asked for
     radiance: Any  # mi.Color3f, over black
-    terms: Terms | None = None  # diffuse, specular, indirect, whose sum it is, where known apart
+    terms: RadianceTerms | None = None  # diffuse, specular, indirect, whose sum it is, where known apart
     maps: dict[str, Any] = field(default_factory=dict)  # by channel (such as albedo), visibility, where known
     background: Any = None  # mi.Color3f: linear, seen through 1 - alpha; only with surroundings
     share: Any = None  # opacity of the object alone, where it is known and not alpha
@@ -129,7 +129,9 @@ def _in_raster_order(frame: Frame, places: Places | None) -> Frame:
         return frame
     dr.eval(frame.alpha, frame.depth, frame.normal, frame.radiance, frame.terms, frame.maps, frame.share)
     raster = places.to_raster
-    terms = frame.terms and Terms(**{name: raster(term) for name, term in frame.terms.known().items()})
+    terms = frame.terms and RadianceTerms(
+        **{name: raster(term) for name, term in frame.terms.known().items()}
+    )
     return replace(
         frame,
         alpha=raster(frame.alpha),
@@ -248,7 +250,7 @@ def _shade_at_surfels(scene: _Scene) -> tuple[Frame, GBuffer]:
         others = {"radiance": around.radiance} | ({"normal": around.normal} if normals else {})
     buffer = scene.blend(slots, others)
     blended = buffer.slots
-    known = Terms(**{"diffuse": None} | {name: blended[name] for name in apart}).filled()
+    known = RadianceTerms(**{"diffuse": None} | {name: blended[name] for name in apart}).filled()
     frame = Frame(
         alpha=buffer.alpha,
         depth=buffer.depth,
@@ -285,7 +287,7 @@ def _shade_at_pixels(scene: _Scene) -> tuple[Frame, GBuffer]:
         points = shading.model.trace(points, meets, shading)
         maps["visibility"] = points.visibility
     shaded = shade(points, scene.light, shading)
-    terms = Terms(**{name: term * alpha for name, term in shaded.known().items()}).filled()
+    terms = RadianceTerms(**{name: term * alpha for name, term in shaded.known().items()}).filled()
     frame = Frame(
         alpha=buffer.alpha,
         depth=buffer.depth,

@@ -14,7 +14,7 @@ from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.errors import InputError
 from mi_refgs.render.gbuffer import inverse_alpha
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.shade.points import Terms
+from mi_refgs.shade.points import RadianceTerms
 from mi_refgs.splat.camera import Camera
 
 
@@ -68,7 +68,7 @@ def supersampled(
         distance = by_alpha(ray_distance(fine.depth, fine_camera))
     terms = None
     if fine.terms is not None:
-        terms = Terms(**{name: mean(term) for name, term in fine.terms.known().items()})
+        terms = RadianceTerms(**{name: mean(term) for name, term in fine.terms.known().items()})
     return replace(
         fine,
         alpha=alpha,

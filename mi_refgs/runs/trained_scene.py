@@ -22,7 +22,7 @@ from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.checkpoint import PARAMS, tensors
 from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
-from mi_refgs.shade.ambient import prepare
+from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
@@ -139,7 +139,7 @@ class TrainedScene:
         with dr.suspend_grad():
             light = self.shading.light_of(self.light)
         occluder = Occluder(self.mesh)
-        prepare(occluder, self.surfels, light, self.shading.accuracy)
+        update_occluder_caches(occluder, self.surfels, light, self.shading.accuracy)
 
         def draw(camera: Camera, aovs: bool | Collection[str], samples: int = 1) -> Frame:
             def once(view: Camera) -> Frame:

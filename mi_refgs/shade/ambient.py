@@ -40,7 +40,9 @@ BRIGHTEST = 4.0
 """Largest ratio: a mirror that sends a lamp to one of a few rays makes a vertex shine otherwise."""
 
 
-def prepare(occluder: Occluder, surfels: Surfels, light: Light | None, accuracy: Accuracy) -> None:
+def update_occluder_caches(
+    occluder: Occluder, surfels: Surfels, light: Light | None, accuracy: Accuracy
+) -> None:
     """Give a mesh what `accuracy` asks for: materials if its hits are shaded, and ambient ratios.
 
     To be called again when mesh, surfels or light have changed; nothing is done where nothing is asked for.
@@ -60,7 +62,7 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, accuracy: Accura
     mesh = occluder.mesh()
     assert mesh is not None
     place = mi.Point3f(mesh.vertices.T)
-    normal = safe_normalize(occluder.surface(surfels).around.normal)
+    normal = safe_normalize(occluder.surface(surfels).vertex_surfels.normal)
     occluder.ambient = None  # all light arrives, in the first round
     for _ in range(BOUNCES):
         scene = MeshRadiance.of(occluder, surfels, light, replace(accuracy, traced_bounces=1), "irradiance")
@@ -109,7 +111,7 @@ def ambient_of_pixels(occluder: Occluder, origin: Any, ray: Any, covered: Any) -
         return mi.Color3f(1)
     if occluder.ambient is None:
         raise InputError(
-            "occluder: ambient: not found for this mesh; call shade.ambient.prepare after update"
+            "occluder: ambient: none for this mesh; call shade.ambient.update_occluder_caches after update"
         )
     with dr.suspend_grad():
         hit = occluder.closest(origin, ray, None, covered)

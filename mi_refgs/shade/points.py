@@ -54,7 +54,7 @@ class ShadingPoints:
 
 
 @dataclass(frozen=True)
-class Terms:
+class RadianceTerms:
     """Outgoing radiance (mi.Color3f) by cause, None where there is no such term; the picture is their sum."""
 
     diffuse: Any
@@ -69,9 +69,9 @@ class Terms:
         """Sum of the terms."""
         return sum(self.known().values(), mi.Color3f(0))
 
-    def filled(self) -> Terms:
+    def filled(self) -> RadianceTerms:
         """The same, with zeros for the terms that there are not."""
-        return Terms(**{name: dr.zeros(mi.Color3f, 1) for name in TERMS} | self.known())
+        return RadianceTerms(**{name: dr.zeros(mi.Color3f, 1) for name in TERMS} | self.known())
 
 
 TERMS = ("diffuse", "specular", "indirect")

@@ -28,7 +28,7 @@ CLAMP_MAX_ALPHA = 1 / 3
 
 
 def reflection(
-    points: ShadingPoints, around: TraceContext, diffuse: Diffuse, accuracy: Accuracy
+    points: ShadingPoints, context: TraceContext, diffuse: Diffuse, accuracy: Accuracy
 ) -> ShadingPoints:
     """`points` with the visibility (mi.Float, 0 … 1, detached) and indirect light that `accuracy` asks for.
 
@@ -37,7 +37,7 @@ def reflection(
     gradient goes to the light and to the materials of the surfels around all hits, in both modes; rays, hits
     and the clamp are detached, and so is what the pixel's own roughness does to the rays.
     """
-    occluder, origin, ray, covered = around.occluder, around.origin, around.ray, around.covered
+    occluder, origin, ray, covered = context.occluder, context.origin, context.ray, context.covered
     normal = dr.detach(points.normal)
     if accuracy.visibility_rays == 1 and not accuracy.traced_bounces:
         visibility = mirror_visibility(occluder, origin, ray, normal, points.view, covered)
@@ -46,12 +46,12 @@ def reflection(
         return points.replaced(visibility=dr.full(mi.Float, 1, dr.width(ray)), indirect=None)
     scene = None
     if accuracy.traced_bounces:
-        scene = MeshRadiance.of(occluder, around.surfels, around.light, accuracy, diffuse)
+        scene = MeshRadiance.of(occluder, context.surfels, context.light, accuracy, diffuse)
     with dr.suspend_grad():
         point, facing, seen = start_on_mesh(occluder, origin, ray, normal, covered)
     if accuracy.visibility_rays > 1:
         with dr.suspend_grad():
-            lobe = Lobe.of(facing, points.view, points.roughness, base_reflectance(points), around.pixel)
+            lobe = Lobe.of(facing, points.view, points.roughness, base_reflectance(points), context.pixel)
             open_ = None if scene is None else scene.light_from(facing, points.view, points.roughness)
         visibility, indirect = _average(
             occluder, scene, lobe, accuracy.visibility_rays, point, facing, seen, open_

@@ -12,7 +12,7 @@ from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.light.lobe_matrices import Levels
-from mi_refgs.shade.points import ShadingPoints, Terms
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import MODELS, Reflectance
 from mi_refgs.shade.split_sum import Diffuse
 
@@ -43,7 +43,7 @@ class Shading:
             raise InputError(
                 f"shading: reflectance: {abbreviated(self.reflectance)} is unknown; use {' or '.join(MODELS)}"
             )
-        if self.model.linear:
+        if self.model.order_independent:
             object.__setattr__(self, "at", "surfel")
         elif self.at not in self.model.orders:
             order = self.model.orders[0]
@@ -146,6 +146,6 @@ _HINTS = get_type_hints(Shading)
 
 
 @phase("shade forward")
-def shade(points: ShadingPoints, light: Light | None, shading: Shading) -> Terms:
+def shade(points: ShadingPoints, light: Light | None, shading: Shading) -> RadianceTerms:
     """Outgoing radiance towards the camera, by cause, of the shading's model."""
     return shading.model.shade(points, light, shading)

@@ -17,7 +17,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.shade.accuracy import PLAIN, Accuracy
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light.light import Light
-from mi_refgs.shade.points import ShadingPoints, Terms, reflect, safe_normalize
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 
 Diffuse = Literal["sh", "irradiance"]
 """Diffuse radiance as fitted (spherical harmonics), or of the albedo and the light."""
@@ -77,7 +77,7 @@ def shade(
     light: Light,
     diffuse: Diffuse = "sh",
     accuracy: Accuracy = PLAIN,
-) -> Terms:
+) -> RadianceTerms:
     """Outgoing radiance towards the camera, by cause.
 
     With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected direction
@@ -113,7 +113,7 @@ def shade(
         specular *= visibility
         if blocking is not None:
             indirect = (1 - visibility) * blocking * reflectance
-    return Terms(_diffuse(points, normal, light, diffuse, reflectance), specular, indirect)
+    return RadianceTerms(_diffuse(points, normal, light, diffuse, reflectance), specular, indirect)
 
 
 def _diffuse(points: ShadingPoints, normal: Any, light: Light, diffuse: Diffuse, reflectance: Any) -> Any:

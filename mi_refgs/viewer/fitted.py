@@ -16,7 +16,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.runs.relightable import lacking, relightable
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.ambient import prepare
+from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.points import TERMS
@@ -173,7 +173,7 @@ class Fitted:
         light = self.light
         with dr.suspend_grad():
             if self._stale and (settled or self._never):
-                prepare(self._occluder, self.scene.surfels, light, self.scene.shading.accuracy)
+                update_occluder_caches(self._occluder, self.scene.surfels, light, self.scene.shading.accuracy)
                 self._stale = False
             return render(
                 self.scene.surfels,
@@ -191,7 +191,7 @@ class Fitted:
         """Whether the mesh lacks what the shading asks for altogether."""
         accuracy = self.scene.shading.accuracy
         wanted = bool(accuracy.ambient_rays), bool(accuracy.traced_bounces)
-        there = self._occluder.ambient is not None, self._occluder.around is not None
+        there = self._occluder.ambient is not None, self._occluder.vertex_surfels is not None
         return not self._occluder.empty and any(w and not t for w, t in zip(wanted, there, strict=True))
 
     def draw(self, sample: Sample) -> Sampled:

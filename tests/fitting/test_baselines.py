@@ -20,7 +20,7 @@ from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import ConstantLight, RotatedLight
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
-from mi_refgs.shade.points import ShadingPoints, Terms
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import MODELS, TraceContext
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat.camera import Camera
@@ -173,12 +173,12 @@ def test_derivative_of_the_light(name: str, rng: np.random.Generator) -> None:
     points, weight = points_of(scene(name, rng)), vector(rng.normal(size=(N, 3)))
     raw, direction = EnvironmentLight.from_radiance(MAP).raw, rng.normal(size=MAP.shape)
     dr.enable_grad(raw)
-    total = Terms(*shaded(name, points, EnvironmentLight(raw))).total()
+    total = RadianceTerms(*shaded(name, points, EnvironmentLight(raw))).total()
     dr.backward(dr.dot(mi.Vector3f(total), weight))
     gradient, slope = dr.grad(raw).numpy().astype(np.float64), -np.expm1(-MAP)
 
     def loss(map_: np.ndarray) -> float:
-        total = Terms(*shaded(name, points, EnvironmentLight.from_radiance(map_))).total()
+        total = RadianceTerms(*shaded(name, points, EnvironmentLight.from_radiance(map_))).total()
         return float((total.numpy().astype(np.float64) * weight.numpy()).sum())
 
     difference = (loss(MAP + 0.02 * direction) - loss(MAP - 0.02 * direction)) / 0.04
@@ -186,7 +186,7 @@ def test_derivative_of_the_light(name: str, rng: np.random.Generator) -> None:
     leaf = mi.TensorXf(raw)
     dr.enable_grad(leaf)
     dr.set_grad(leaf, mi.TensorXf((direction / slope).astype(np.float32)))
-    total = Terms(*shaded(name, points, EnvironmentLight(leaf))).total()
+    total = RadianceTerms(*shaded(name, points, EnvironmentLight(leaf))).total()
     found = dr.dot(mi.Vector3f(total), weight)
     dr.forward_to(found)
     assert float(dr.sum(dr.grad(found))[0]) == pytest.approx(difference, rel=1e-2, abs=0.05)
@@ -204,7 +204,7 @@ def test_degenerate_points_stay_finite(name: str) -> None:
     points, raw = points_of(values), EnvironmentLight.from_radiance(MAP).raw
     arrays = [part for n in values if n != "free" for part in flat(getattr(points, n))]
     dr.enable_grad(arrays, raw)
-    total = Terms(*shaded(name, points, EnvironmentLight(raw))).total()
+    total = RadianceTerms(*shaded(name, points, EnvironmentLight(raw))).total()
     dr.backward(total)
     for array in (total, dr.grad(raw).array, *map(dr.grad, arrays)):
         assert dr.all(dr.isfinite(array), axis=None)
@@ -297,9 +297,9 @@ def test_the_hemisphere_is_blocked_where_a_mesh_stands() -> None:
     normal = vector(np.tile([0, 1.0, 0], (n, 1)))
     points = ShadingPoints(normal, normal)
     place = mi.Point3f(vector(np.linspace(0, 0.5, n)[:, None] * [1.0, 0, 0]))
-    around = TraceContext(occluder, table(), None, place, normal)
+    context = TraceContext(occluder, table(), None, place, normal)
     shading = CASES["monte_carlo, occluded"]
-    free = np.array(shading.model.trace(points, around, shading).free)
+    free = np.array(shading.model.trace(points, context, shading).free)
     directions = baselines.hemisphere(DIRECTIONS, np.array([0, 1.0, 0]))
     blocked = directions[:, 0] * 50 > 1  # the wall is as good as infinite
     assert 0 < blocked.sum() < DIRECTIONS

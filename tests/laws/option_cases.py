@@ -51,7 +51,7 @@ def shadings() -> list[str]:
     for name, at, diffuse in found:
         model = MODELS[name]
         split = model.channels(DIFFUSE[0]) != model.channels(DIFFUSE[1])
-        order = "surfel" if model.linear else at
+        order = "surfel" if model.order_independent else at
         every[f"{name}/{order}/{diffuse if split else DIFFUSE[0]}"] = None
     return [*every]
 

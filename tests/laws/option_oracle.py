@@ -24,7 +24,7 @@ from mi_refgs.render.pipeline import render
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.shade import brdf
-from mi_refgs.shade.ambient import prepare
+from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import ConstantLight, RotatedLight
@@ -161,7 +161,7 @@ class Oracle:
             light = chosen.light_of(EnvironmentLight.from_radiance(map_of(case, values)))
             light = RotatedLight(light, mi.Matrix3f(rotation(case).T.astype(np.float32)))
         occluder = Occluder(mesh())
-        prepare(occluder, surfels, light, chosen.accuracy)
+        update_occluder_caches(occluder, surfels, light, chosen.accuracy)
         view = Camera.from_pose(
             camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.to_world, NEAR
         )

@@ -115,8 +115,8 @@ def seen(
     if occluder is None:
         occluder = Occluder(corner()) if surfels is None else with_materials(corner(), surfels)
     table: Any = surfels
-    around = TraceContext(occluder, table, light, mi.Point3f(eye), vector(place - eye))
-    return reflection(points, around, diffuse, accuracy)
+    context = TraceContext(occluder, table, light, mi.Point3f(eye), vector(place - eye))
+    return reflection(points, context, diffuse, accuracy)
 
 
 def wall_blocks(place: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -56,12 +56,12 @@ def test_ratios_against_rays_one_by_one() -> None:
     mesh, surfels = parted_corner(), wall_surfels(metallic=LOGIT["metallic"], roughness=LOGIT["roughness"])
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
     occluder = Occluder(mesh)
-    ambient.prepare(occluder, surfels, light, Accuracy(ambient_rays=RAYS))
+    ambient.update_occluder_caches(occluder, surfels, light, Accuracy(ambient_rays=RAYS))
     assert occluder.ambient is not None
     found = occluder.ambient.numpy()
 
     levels, table = level_maps(light), brdf.table().astype(np.float64)
-    normals = occluder.surface(surfels).around.normal.numpy().T.astype(np.float64)
+    normals = occluder.surface(surfels).vertex_surfels.normal.numpy().T.astype(np.float64)
     share = {name: 1 / (1 + np.exp(-np.array(value))) for name, value in LOGIT.items()}
 
     def outgoing(normal: np.ndarray, view: np.ndarray, free: bool, ratio: np.ndarray) -> np.ndarray:
@@ -106,7 +106,7 @@ def test_a_white_furnace_stays_white() -> None:
     """Between two plates of albedo 1 nothing is lost: what is blocked comes back from the other plate."""
     mesh, surfels = parted_corner(), wall_surfels(albedo=np.full((400, 3), 9.0), metallic=-9.0, roughness=3.0)
     occluder = Occluder(mesh)
-    ambient.prepare(
+    ambient.update_occluder_caches(
         occluder, surfels, EnvironmentLight.constant(1.0, 8).prefilter(), Accuracy(ambient_rays=9)
     )
     assert occluder.ambient is not None
@@ -142,7 +142,7 @@ def test_what_is_convex_gets_all_light() -> None:
     x, y, z = raw["position"].T
     raw["rotation"] = np.stack([-y, x, 0 * x, 1 + z], 1)  # without noise
     occluder, surfels = Occluder(ball()), Surfels.from_numpy(raw)
-    ambient.prepare(
+    ambient.update_occluder_caches(
         occluder, surfels, EnvironmentLight.from_radiance(sky()).prefilter(), Accuracy(ambient_rays=9)
     )
     assert occluder.ambient is not None
@@ -157,7 +157,7 @@ def test_pixels_read_what_the_mesh_holds() -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     mesh = Mesh(vertices, np.array([[0, 1, 2]], np.uint32), 1e-3)
     occluder = Occluder(mesh)
-    with pytest.raises(InputError, match="prepare"):
+    with pytest.raises(InputError, match="update_occluder_caches"):
         ambient.ambient_of_pixels(occluder, mi.Point3f(0, 0, 1), mi.Vector3f(0, 0, -1), True)
     colours = np.array([[0.1, 0.2, 0.3], [0.9, 0.4, 0.5], [0.6, 0.7, 0.8]])
     occluder.ambient = ambient.VertexColours.of(mesh, colours)

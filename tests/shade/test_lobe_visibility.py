@@ -151,8 +151,8 @@ def test_convex_shapes_are_free_and_one_ray_is_the_mirror_ray() -> None:
     )
     for rays in (1, 2, 8):
         accuracy = Accuracy(visibility_rays=rays)
-        around = TraceContext(occluder, None, None, eye, vector(-2 * view))  # type: ignore[arg-type]
-        free = reflection(points, around, "irradiance", accuracy)
+        context = TraceContext(occluder, None, None, eye, vector(-2 * view))  # type: ignore[arg-type]
+        free = reflection(points, context, "irradiance", accuracy)
         assert dr.width(free.visibility) == n
         assert float(dr.mean(free.visibility)[0]) > 0.999 and float(dr.min(free.visibility)[0]) > 0.8
     place, points = floor_points(0.5)

@@ -16,7 +16,7 @@ import pytest
 
 from mi_refgs.cli import main
 from mi_refgs.shade import reflectance
-from mi_refgs.shade.points import ShadingPoints, Terms, reflect, safe_normalize
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance import Reflectance, SurfelView
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels import attributes as channels
@@ -41,10 +41,10 @@ class Phong(Reflectance):
     def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
         return {name: surfels.value(name) for name in self.channels(shading.diffuse)}
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
         normal, view = safe_normalize(points.normal), safe_normalize(points.view)
         lobe = light.specular(reflect(view, normal), 1 - points.shininess)
-        return Terms(points.albedo * light.irradiance(normal), SHARE * lobe)
+        return RadianceTerms(points.albedo * light.irradiance(normal), SHARE * lobe)
 
 
 METHOD = """

@@ -14,7 +14,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.methods.read import load
 from mi_refgs.render.pipeline import render
 from mi_refgs.shade.accuracy import Accuracy
-from mi_refgs.shade.points import ShadingPoints, Terms
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import Reflectance, SurfelView, register, unregister
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
@@ -168,8 +168,8 @@ class Complete(Reflectance):
     def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
         return {"albedo": surfels.albedo()}
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
-        return Terms(points.albedo)
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
+        return RadianceTerms(points.albedo)
 
 
 INCOMPLETE: dict[str, tuple[dict[str, Any], str]] = {

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from mi_refgs.io.images import SRGB_ENCODED_LIMIT
-from mi_refgs.shade.points import ShadingPoints, Terms
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
 from mi_refgs.surfels.table import Surfels
 
@@ -33,8 +33,8 @@ class Displayed(Reflectance):
     def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
         return {"radiance": seen.harmonic_colour(surfels.value("radiance_sh"))}
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
         encoded = points.radiance
         straight = encoded <= SRGB_ENCODED_LIMIT
         curve = dr.power((dr.select(straight, 1, encoded) + 0.055) / 1.055, 2.4)
-        return Terms(dr.select(straight, encoded / 12.92, curve))
+        return RadianceTerms(dr.select(straight, encoded / 12.92, curve))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from mi_refgs.shade.brdf import split_sum
-from mi_refgs.shade.points import ShadingPoints, Terms, reflect, safe_normalize
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
 from mi_refgs.surfels.table import Surfels
 
@@ -39,9 +39,9 @@ class GaussianShader(Reflectance):
             "tint": surfels.value("tint"),
         }
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
         normal, view = safe_normalize(points.normal), safe_normalize(points.view)
         scale, bias = split_sum(dr.dot(normal, view), points.roughness)
         diffuse = points.radiance + (1 - points.tint) * light.irradiance(normal)
         reflected = light.specular(reflect(view, normal), points.roughness)
-        return Terms(diffuse, dr.fma(points.tint, scale, bias) * reflected)
+        return RadianceTerms(diffuse, dr.fma(points.tint, scale, bias) * reflected)

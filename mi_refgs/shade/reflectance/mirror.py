@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mi_refgs.shade.points import ShadingPoints, Terms, reflect, safe_normalize
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
 from mi_refgs.surfels.table import Surfels
 
@@ -25,7 +25,7 @@ class Mirror(Reflectance):
         radiance = seen.harmonic_colour(surfels.value("radiance_sh"))
         return {"radiance": radiance, "metallic": surfels.value("metallic")}
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
         mirror = reflect(safe_normalize(points.view), safe_normalize(points.normal))
         share = points.metallic
-        return Terms((1 - share) * points.radiance, share * light.radiance(mirror))
+        return RadianceTerms((1 - share) * points.radiance, share * light.radiance(mirror))

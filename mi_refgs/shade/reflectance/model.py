@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.accuracy import Accuracy
-from mi_refgs.shade.points import ShadingPoints, Terms
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.shade.visibility import mirror_visibility
 from mi_refgs.surfels.table import Surfels
@@ -59,7 +59,7 @@ class Reflectance:
 
     name: str = ""
     orders: tuple[Order, ...] = ("pixel", "surfel")  # where it may be shaded, the usual one first
-    linear: bool = False  # both orders give the same picture, so that surfels are shaded, which blends less
+    order_independent: bool = False  # both orders give the same image; surfels are shaded, which blends less
     light: Lookup = "filtered"  # lookups: none, `radiance` alone, all
     encoded: bool = False  # its radiance_sh are colours as a display shows them, and blended as such
     visibility: Rays = "none"  # rays: none, of pixels in mirrors, by `trace`
@@ -81,18 +81,18 @@ class Reflectance:
         """
         raise NotImplementedError
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
         """Outgoing radiance of points with the attributes, under a `light.Light`.
 
         Finite for every finite input.
         """
         raise NotImplementedError
 
-    def trace(self, points: ShadingPoints, around: TraceContext, shading: Shading) -> ShadingPoints:
+    def trace(self, points: ShadingPoints, context: TraceContext, shading: Shading) -> ShadingPoints:
         """The points with what rays find, where `shading.occlusion` asks for it: here the visibility of the
         mirror direction."""
         visibility = mirror_visibility(
-            around.occluder, around.origin, around.ray, points.normal, points.view, around.covered
+            context.occluder, context.origin, context.ray, points.normal, points.view, context.covered
         )
         return points.replaced(visibility=visibility)
 

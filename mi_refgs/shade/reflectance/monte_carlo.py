@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import GOLDEN_ANGLE
-from mi_refgs.shade.points import ShadingPoints, Terms, safe_normalize
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, TraceContext
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
@@ -56,13 +56,13 @@ class MonteCarlo(Reflectance):
             values["incident"] = surfels.value("indirect_sh")
         return values
 
-    def trace(self, points: ShadingPoints, around: TraceContext, shading: Shading) -> ShadingPoints:
+    def trace(self, points: ShadingPoints, context: TraceContext, shading: Shading) -> ShadingPoints:
         """The points with `free` (mi.UInt64, detached): bit j says that light arrives from direction j."""
         count = dr.opaque(mi.UInt32, shading.accuracy.directions)
-        normal, position = dr.detach(safe_normalize(points.normal)), dr.detach(around.origin)
+        normal, position = dr.detach(safe_normalize(points.normal)), dr.detach(context.origin)
 
         def body(index: Any, free: Any) -> tuple[Any, Any]:
-            seen = around.occluder.visible(position, _direction(index, count, normal)[0], normal)
+            seen = context.occluder.visible(position, _direction(index, count, normal)[0], normal)
             bit = dr.select(seen > 0, mi.UInt64(1), mi.UInt64(0)) << mi.UInt64(index)
             return index + 1, free | bit
 
@@ -72,7 +72,7 @@ class MonteCarlo(Reflectance):
             dr.eval(free)  # now, once: every kernel of the adjoint that reads it would trace the rays again
         return points.replaced(free=free)
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
         count = dr.opaque(mi.UInt32, shading.accuracy.directions)
         normal = dr.detach(safe_normalize(points.normal))
         free = points.get("free")
@@ -101,7 +101,7 @@ class MonteCarlo(Reflectance):
         end = dr.while_loop(
             start, lambda index, *_: index < count, body, max_iterations=-1, label="hemisphere"
         )
-        return Terms(*end[1])
+        return RadianceTerms(*end[1])
 
 
 def _direction(index: Any, count: Any, normal: Any) -> tuple[Any, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mi_refgs.shade.points import ShadingPoints, Terms
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
 from mi_refgs.surfels.table import Surfels
 
@@ -16,7 +16,7 @@ class Radiance(Reflectance):
     """c = max(0, ½ + Σ c Y(d)), as it is."""
 
     name = "radiance"
-    linear = True
+    order_independent = True
     light = "none"
 
     def channels(self, diffuse: str) -> tuple[str, ...]:
@@ -25,5 +25,5 @@ class Radiance(Reflectance):
     def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
         return {"radiance": seen.harmonic_colour(surfels.value("radiance_sh"))}
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
-        return Terms(points.radiance)
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
+        return RadianceTerms(points.radiance)

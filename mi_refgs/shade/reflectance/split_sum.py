@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from mi_refgs.shade import split_sum
 from mi_refgs.shade.ambient import ambient_of_pixels
-from mi_refgs.shade.points import ShadingPoints, Terms, reflect
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, TraceContext
 from mi_refgs.shade.reflection import reflection
 from mi_refgs.shade.sh import clamp_positive, eval_sh
@@ -48,12 +48,12 @@ class SplitSum(Reflectance):
             values["indirect"] = clamp_positive(eval_sh(surfels.value("indirect_sh"), mirrored))
         return values
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> Terms:
+    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
         return split_sum.shade(points, light, shading.diffuse, shading.accuracy)
 
-    def trace(self, points: ShadingPoints, around: TraceContext, shading: Shading) -> ShadingPoints:
-        points = reflection(points, around, shading.diffuse, shading.accuracy)
+    def trace(self, points: ShadingPoints, context: TraceContext, shading: Shading) -> ShadingPoints:
+        points = reflection(points, context, shading.diffuse, shading.accuracy)
         if not shading.accuracy.ambient_rays:
             return points
-        ratio = ambient_of_pixels(around.occluder, around.origin, around.ray, around.covered)
+        ratio = ambient_of_pixels(context.occluder, context.origin, context.ray, context.covered)
         return points.replaced(ambient=ratio)
