@@ -1,19 +1,55 @@
-"""What several tests need: vectors, light levels, fresh processes, imports of a source."""
+"""Helpers of several tests: refused input, vectors, light levels, fresh processes, imports of a source."""
 
 from __future__ import annotations
 
 import ast
+import contextlib
+import io
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
+import pytest
+
+from mi_refgs.cli import main
+from mi_refgs.errors import InputError
 
 ROOT = Path(__file__).parents[1]
+
+
+def refused(
+    action: Sequence[object] | Callable[[], object], *words: object, error: type[Exception] = InputError
+) -> str:
+    """Require that a command or a call refuses its input; return the message, which contains all `words`.
+
+    A command (its arguments) exits with code 2, prints nothing on stdout, and ends stderr with one sentence
+    that names the remedy. A call raises `error`, or an error of Mitsuba that it caused.
+    """
+    if callable(action):
+        with pytest.raises(Exception) as info:
+            action()
+        causes: list[BaseException] = [info.value]
+        while causes[-1].__cause__ is not None:
+            causes.append(causes[-1].__cause__)
+        assert any(isinstance(cause, error) or error.__name__ in str(cause) for cause in causes), causes
+        assert not any(isinstance(cause, MemoryError) for cause in causes), causes
+        message = " ← ".join(map(str, causes))
+    else:
+        out, err = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code = main([str(argument) for argument in action])
+        assert code == 2 and not out.getvalue() and "Traceback" not in err.getvalue(), err.getvalue()
+        lines = [line for line in err.getvalue().splitlines() if line.startswith("refgs: ")]
+        message = next(line for line in reversed(lines) if "warning" not in line)
+        assert "; " in message or "such as" in message, message
+    for word in words:
+        assert str(word) in message, message
+    return message
 
 
 def unit(d: np.ndarray) -> np.ndarray:

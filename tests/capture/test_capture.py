@@ -28,6 +28,7 @@ from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import read_png
+from tests.helpers import refused
 from tests.scenes import photographed as scene
 
 COUNT = 9
@@ -299,12 +300,12 @@ def test_a_capture_removes_what_the_last_one_wrote(tmp_path: Path, monkeypatch: 
 
 
 @needs_colmap
-def test_a_folder_that_is_read_is_not_written(captured: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_is_read_is_not_written(captured: Path) -> None:
     data, photographs = captured / "data", captured / "photographs"
     before = sorted(data.rglob("*"))
     for arguments in [(data / "images", "-o", data), (photographs, "-o", captured)]:
-        assert "are read, and lie in it; choose another" in _refused(capsys, *arguments)
-    assert "are read" in _refused(capsys, photographs, "-o", data, "--masks", data / "masks")
+        refused(["capture", *arguments], "are read, and lie in it; choose another")
+    refused(["capture", photographs, "-o", data, "--masks", data / "masks"], "are read")
     assert sorted(data.rglob("*")) == before
 
 
@@ -318,11 +319,6 @@ def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
 
 
 # ---------- The sentences ----------
-
-
-def _refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    assert main(["capture", *map(str, arguments)]) == 2
-    return capsys.readouterr().err.splitlines()[-1]
 
 
 def _flat(i: int, pictures: list[np.ndarray]) -> np.ndarray:
@@ -359,11 +355,11 @@ def _one_place(i: int, pictures: list[np.ndarray]) -> np.ndarray:
     ids=["flat", "blurred", "unrelated", "one place", "all alike"],
 )
 def test_a_set_that_cannot_be_placed_says_what_to_do(
-    make: object, words: str, pictures: list[np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    make: object, words: str, pictures: list[np.ndarray], tmp_path: Path
 ) -> None:
     for i in range(5):
         scene.save(tmp_path / "photographs" / f"{i}.png", make(i, pictures))  # type: ignore[operator]
-    message = _refused(capsys, tmp_path / "photographs", "-o", tmp_path / "data")
+    message = refused(["capture", tmp_path / "photographs", "-o", tmp_path / "data"])
     assert words in message and str(tmp_path / "photographs") in message, message
     assert not (tmp_path / "data" / "sparse").exists()
 
@@ -374,40 +370,36 @@ def test_groups_that_share_nothing_are_counted(tmp_path: Path) -> None:
     failure.check_placed(tmp_path, 8, [["a"] * 4, ["b"] * 3], "c.jpg")
 
 
-def test_pictures_that_are_none_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     photographs = _made(tmp_path / "photographs")
-    assert "no such folder" in _refused(capsys, tmp_path / "none", "-o", tmp_path / "data")
+    refused(["capture", tmp_path / "none", "-o", tmp_path / "data"], "no such folder")
     for name in ("a.HEIC", "b.HEIC", "c.heic"):
         (photographs / name).write_bytes(b"0")
-    assert "convert its .HEIC files to JPEG" in _refused(capsys, photographs, "-o", tmp_path / "data")
+    refused(["capture", photographs, "-o", tmp_path / "data"], "convert its .HEIC files to JPEG")
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         (photographs / name).write_bytes(b"0")
-    assert "a.jpg: pixels: not a readable image" in _refused(capsys, photographs, "-o", tmp_path / "data")
-    assert "unknown lens model" in _refused(capsys, photographs, "-o", tmp_path / "data", "--camera", "PIG")
+    refused(["capture", photographs, "-o", tmp_path / "data"], "a.jpg: pixels: not a readable image")
+    refused(["capture", photographs, "-o", tmp_path / "data", "--camera", "PIG"], "unknown lens model")
     for numbers in ((0, 0, 0, -1), (0, 0, float("nan"), 1), (0, 1e30, 0, 1), (0, 0, 0, 0)):
-        said = _refused(capsys, photographs, "-o", tmp_path, "--region", *numbers)
+        said = refused(["capture", photographs, "-o", tmp_path, "--region", *numbers])
         assert "--region: centre, radius: not three numbers and a positive one" in said
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         scene.save(photographs / name, np.zeros((8, 8, 3), dtype=np.uint8))
-    assert "choose another" in _refused(capsys, photographs, "-o", photographs)
+    refused(["capture", photographs, "-o", photographs], "choose another")
     for width in range(9, 13):
         scene.save(photographs / f"{width}.jpg", np.zeros((8, width, 3), dtype=np.uint8))
-    assert "5 different sizes, such as 10 × 8 (10.jpg)" in _refused(capsys, photographs, "-o", tmp_path)
+    refused(["capture", photographs, "-o", tmp_path], "5 different sizes, such as 10 × 8 (10.jpg)")
     for width in range(9, 13):
         (photographs / f"{width}.jpg").unlink()
     (_made(tmp_path / "other") / "file").touch()
-    assert "not empty" in _refused(capsys, photographs, "-o", tmp_path / "other")
-    assert "no such folder" in _refused(
-        capsys, photographs, "-o", tmp_path / "data", "--masks", tmp_path / "no"
-    )
+    refused(["capture", photographs, "-o", tmp_path / "other"], "not empty")
+    refused(["capture", photographs, "-o", tmp_path / "data", "--masks", tmp_path / "no"], "no such folder")
 
 
-def test_a_missing_library_says_how_to_install_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_library_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
-    assert 'pip install "mi_refgs[capture]"' in _refused(capsys, tmp_path, "-o", tmp_path / "data")
+    refused(["capture", tmp_path, "-o", tmp_path / "data"], 'pip install "mi_refgs[capture]"')
 
 
 # ---------- The parts ----------

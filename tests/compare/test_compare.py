@@ -26,6 +26,7 @@ from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import read_png
 from mi_refgs.methods import load, names
 from mi_refgs.runs.run import Run
+from tests.helpers import refused
 from tests.scenes.tiny import SETTINGS, write_data, write_method
 
 SIX = [setting for setting in SETTINGS if "preview" not in setting]
@@ -343,16 +344,10 @@ def test_other_settings_are_refused(
     ball: Path,
     variants: tuple[Path, Path],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     folder = Path(shutil.copytree(compared[0], tmp_path / "copy"))
     for path in folder.rglob("job.json"):
         path.write_text(json.dumps(json.loads(path.read_text()) | {"folder": str(path.parent)}))
-
-    def refused(arguments: list[str], *words: str) -> None:
-        assert main(arguments) == 2
-        said = capsys.readouterr().err.strip()
-        assert len(said.splitlines()) == 1 and all(word in said for word in words), said
 
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "compare.json", "--set", "loss.ssim=0.1")
     refused([*command(ball, folder, variants[1]), "--preset", "standard"], "--preset", "quick", "standard")

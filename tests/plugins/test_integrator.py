@@ -20,6 +20,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import refused
 from tests.scenes.integrator import (
     COUNT,
     HEIGHT,
@@ -28,7 +29,6 @@ from tests.scenes.integrator import (
     integrator,
     plane_mesh,
     raw_channels,
-    refused,
     scene,
     sensor,
     sky,
@@ -223,13 +223,13 @@ def test_missing_channels_are_refused() -> None:
     channels = integrator()
     del channels["light"]
     dark = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor()})
-    refused("light: there is none", lambda: image(dark))
+    refused(lambda: image(dark), "light: there is none")
 
 
 def test_nesting_in_stock_integrators_is_refused() -> None:
     nested = {"type": "aov", "aovs": "d:depth", "inner": integrator()}
     outer = mi.load_dict({"type": "scene", "integrator": nested, "sensor": sensor()})
-    refused("whole images only", lambda: image(outer))
+    refused(lambda: image(outer), "whole images only")
 
 
 @pytest.mark.parametrize("factor", [1 - 1e-3, 1, 1 + 1e-3])

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from mi_refgs.constants import tile_size
+from tests.helpers import refused
 from tests.scenes.integrator import (
     HEIGHT,
     WIDTH,
     image,
     plane_mesh,
-    refused,
     scene,
     sensor,
 )
@@ -126,4 +126,4 @@ def test_other_sensors_are_refused(kind: str) -> None:
     if kind == "batch":
         del camera["to_world"]
         camera["a"] = sensor()
-    refused("use a `perspective` sensor", lambda: image(scene(camera)))
+    refused(lambda: image(scene(camera)), "use a `perspective` sensor")

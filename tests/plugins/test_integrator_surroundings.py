@@ -23,8 +23,9 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import refused
 from tests.plugins.test_integrator_derivatives import check_derivatives
-from tests.scenes.integrator import HEIGHT, WIDTH, image, raw_channels, refused, scene, sensor, sky
+from tests.scenes.integrator import HEIGHT, WIDTH, image, raw_channels, scene, sensor, sky
 
 PREFIX = "surroundings_"
 
@@ -108,7 +109,7 @@ def test_refusals(tmp_path: Path) -> None:
         ("none.exr", {"background": str(tmp_path / "none.exr")}),
         ("shape (5, 8, 3)", {"background": mi.TensorXf(np.ones((5, 8, 3), np.float32))}),
     ):
-        refused(words, partial(scene, **changes))
+        refused(partial(scene, **changes), words)
 
 
 def fitted() -> TrainedScene:

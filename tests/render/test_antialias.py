@@ -21,7 +21,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.integrator import refused
+from tests.helpers import refused
 
 SIZE = (9, 7)
 """Width and height of the maps."""
@@ -130,4 +130,4 @@ def test_one_sample_comes_closer_to_many() -> None:
 
 
 def test_it_needs_pixels() -> None:
-    refused("antialias: needs shade_at = pixel", lambda: Shading("surfel", accuracy=Accuracy(antialias=True)))
+    refused(lambda: Shading("surfel", accuracy=Accuracy(antialias=True)), "antialias: needs shade_at = pixel")

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
-import pytest
 import trimesh
 
 from mi_refgs.kernels.device import upload_tensor
@@ -85,18 +83,6 @@ def scene(
 
 def image(of: mi.Scene, **arguments: object) -> np.ndarray:
     return mi.render(of, **arguments).numpy()
-
-
-def refused(words: str, action: Callable[[], object]) -> None:
-    """Mitsuba wraps what a plugin raises while it renders; the reason must stand in the chain."""
-    with pytest.raises(Exception) as info:
-        action()
-    error: BaseException | None = info.value
-    reasons = []
-    while error is not None:
-        reasons.append(str(error))
-        error = error.__cause__
-    assert words in " ← ".join(reasons)
 
 
 def plane_mesh(folder: Path) -> str:
