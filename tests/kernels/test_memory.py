@@ -13,7 +13,8 @@ from mi_refgs.cli import build_parser, main
 from mi_refgs.errors import InputError
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.kernels import memory
-from tests.scenes.integrator import refused, scene, sensor
+from tests.helpers import refused
+from tests.scenes.integrator import scene, sensor
 from tests.scenes.tiny import train_command
 
 BOUNDED = {
@@ -79,14 +80,14 @@ def test_images_are_refused_and_rendered_again_where_they_fit(monkeypatch: pytes
     monkeypatch.setattr(memory, "resident", lambda: 0.1e9)
     monkeypatch.setattr(memory, "available", lambda: 0.2e9)
     sentence = "image: 600 × 500 pixels of 24 surfels: needs 0.44 GB of memory, 0.3 GB are available; ask for"
-    refused(sentence, lambda: mi.render(of, spp=1).numpy())
+    refused(lambda: mi.render(of, spp=1).numpy(), sentence)
     monkeypatch.setattr(memory, "available", lambda: 0.37e9)
     params = mi.traverse(of)
     dr.enable_grad(params["integrator.albedo"])
     image = mi.render(of, params, spp=1)
     assert image.shape == (500, 600, 3)
     sentence = "24 surfels: needs 0.5 GB of memory, 0.47 GB are available"
-    refused(sentence, lambda: dr.backward(dr.sum(image, axis=None)))
+    refused(lambda: dr.backward(dr.sum(image, axis=None)), sentence)
 
 
 def test_the_least_of_machine_and_control_groups_is_available(
