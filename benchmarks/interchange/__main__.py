@@ -38,12 +38,12 @@ def measured(run: Path, node: Path, views: list[int], names: list[str]) -> dict[
     """What each program makes of the files of a run."""
     from mi_refgs.formats import write
     from mi_refgs.formats.splats import gaussians
-    from mi_refgs.reconstruction.provenance import Source
+    from mi_refgs.reconstruction.provenance import Provenance
     from mi_refgs.render.display import display_image
 
     made = mi_refgs.load(run)
     trained = made.trained
-    shots = Source.of(mi_refgs.Run(run)).shots(trained, "test", "train")
+    shots = Provenance.of(mi_refgs.Run(run)).shots(trained, "test", "train")
     found: dict[str, Any] = {"run": str(run), "surfels": trained.surfels.count}
     with tempfile.TemporaryDirectory() as name:
         files = write(trained, ["3dgs-ply", "gltf-splats"], Path(name), shots)

@@ -28,7 +28,7 @@ from mi_refgs.evaluation.metrics import psnr
 from mi_refgs.evaluation.pictures import planes
 from mi_refgs.formats import write
 from mi_refgs.io.exr import read_exr_image
-from mi_refgs.reconstruction.provenance import Source
+from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.relighting.score import shown
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
@@ -58,7 +58,7 @@ def measured(folder: Path, out: Path, args: Any) -> dict[str, Any]:
     run = Run(folder)
     views = load_split(run, run.method(), "test", None)
     trained = TrainedScene.read(folder)
-    shots = Source.of(run).shots(trained, "test", "train")
+    shots = Provenance.of(run).shots(trained, "test", "train")
     files = write(trained, ["mitsuba", "gltf-mesh", "usd"], out, shots, {"faces": args.faces})
     found: dict[str, Any] = {"run": folder.name, "usd": usd_errors(files["usd"][0])}
     if args.node is not None:

@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> Result:
     if args.where is not None:
         parse_truth(args.where)
     whole = load(args.run_folder, write=False)
-    whole = replace(whole, source=whole.source.with_data(args.data))
+    whole = replace(whole, provenance=whole.provenance.with_data(args.data))
     join = None if args.join is None else load(args.join, write=False)
     options = {name: getattr(args, name) for name in OPTIONS}
     if isinstance(args.view, Path):
@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> Result:
     except InputError as error:
         runs = " + ".join(str(path) for path in (args.run_folder, args.join) if path is not None)
         raise InputError(f"{runs}: {error}") from error
-    entry = edited.source.edits[-1]
+    entry = edited.provenance.edits[-1]
     for note in entry["notes"]:
         say(f"note: {note}")
     sheet = _preview(whole, edited) if args.preview else None
@@ -150,7 +150,7 @@ def _preview(before: Any, after: Any) -> Any:
     from mi_refgs.editing.preview import before_and_after
 
     cameras = before.cameras()
-    if not before.source.is_there:
+    if not before.provenance.has_data:
         return before_and_after(before.trained, after.trained, cameras)
     views = before.views()
     return before_and_after(

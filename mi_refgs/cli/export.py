@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> Result:
     """Export."""
     from mi_refgs.evaluation.evaluate import load_split
     from mi_refgs.formats import FORMATS, options_of, write
-    from mi_refgs.reconstruction.provenance import Source
+    from mi_refgs.reconstruction.provenance import Provenance
     from mi_refgs.runs.export import export, newest
     from mi_refgs.runs.run import Run
     from mi_refgs.runs.trained_scene import ARTEFACTS, TrainedScene
@@ -83,8 +83,8 @@ def run(args: argparse.Namespace) -> Result:
     method = folder.method()
     state = folder.load_checkpoint()
     fitted = newest(folder, method) if state is None else TrainedScene.from_state(method, state)
-    source = Source.of(folder).with_data(args.data)
-    if source.data is not None and not source.is_there:
+    source = Provenance.of(folder).with_data(args.data)
+    if source.data is not None and not source.has_data:
         say(f"note: {source.data} is gone; cameras are around the object, or give its folder with --data")
     shots = source.shots(fitted, "test", "train")
     target = args.output or folder.path

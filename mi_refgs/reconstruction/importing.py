@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mi_refgs.formats.incoming import method_of, read_splats
 from mi_refgs.kernels.device import require_supported_variant
-from mi_refgs.reconstruction.provenance import Source
+from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.reconstruction.reconstruction import Reconstruction
 
 
@@ -21,4 +21,4 @@ def import_splats(path: str | Path, *, linear: bool = False) -> Reconstruction:
     require_supported_variant("mi_refgs.import_splats")
     file = Path(path)
     trained = read_splats(file, linear)
-    return Reconstruction(trained, Source(method_of(trained, file.stem)))
+    return Reconstruction(trained, Provenance(method_of(trained, file.stem)))

@@ -24,7 +24,7 @@ EDITS = "edit.json"
 
 
 @dataclass(frozen=True)
-class Source:
+class Provenance:
     """A method and, where it is known, the data set that it was fitted to, with its region of interest."""
 
     method: Method
@@ -33,7 +33,7 @@ class Source:
     edits: tuple[dict[str, Any], ...] = ()  # what was done since, in order: `editing.Edited.record`
 
     @staticmethod
-    def of(run: Run) -> Source:
+    def of(run: Run) -> Provenance:
         """That of a run folder; raises InputError if it is none, or records a region that cannot be used."""
         method = run.method()
         try:
@@ -42,14 +42,14 @@ class Source:
             data = None
         record = run.path / EDITS
         edits = read_json(record).get("edits", []) if record.is_file() else []
-        return Source(method, data, run.region(), tuple(edits))
+        return Provenance(method, data, run.region(), tuple(edits))
 
     def save(self, trained: TrainedScene, folder: Path, camera: Camera) -> None:
         """Write a run folder of a scene (`runs.save`); raises InputError as that does."""
         records = {EDITS: {"edits": self.edits}} if self.edits else None
         save(trained, folder, self.method, camera, data=self.data, region=self.region, records=records)
 
-    def with_data(self, folder: Path | None) -> Source:
+    def with_data(self, folder: Path | None) -> Provenance:
         """The same with another data set, or this for None; raises InputError for what is no folder."""
         if folder is None:
             return self
@@ -58,13 +58,13 @@ class Source:
         return replace(self, data=folder)
 
     @property
-    def is_there(self) -> bool:
+    def has_data(self) -> bool:
         """Whether the folder of the data set is."""
         return self.data is not None and self.data.is_dir()
 
     def views(self, split: str, decode: bool = True) -> Dataset:
         """A split of the data set; raises InputError where that is unknown, gone or unreadable."""
-        if self.data is None or not self.is_there:
+        if self.data is None or not self.has_data:
             gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
             raise InputError(f"views: {split}: {gone}; use cameras(), or bring the data set back")
         found = read_views(self.method, self.data, split, decode=decode)
@@ -75,7 +75,7 @@ class Source:
 
         Decodes no picture. Raises InputError for a data set that is there and cannot be read.
         """
-        if not self.is_there:
+        if not self.has_data:
             return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
         return [shot for split in splits for shot in self._shots_of(split)]
 

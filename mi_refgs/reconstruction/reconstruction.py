@@ -25,7 +25,7 @@ from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
 from mi_refgs.plugins.aovs import aov_values, suffixes
 from mi_refgs.reconstruction.new_light import AnyLight, any_light
-from mi_refgs.reconstruction.provenance import Source
+from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.render.display import composited
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.pipeline import Frame
@@ -47,7 +47,7 @@ class Reconstruction:
     """
 
     trained: TrainedScene
-    source: Source
+    provenance: Provenance
     folder: Path | None = None  # the run folder that holds exactly this; None: only in memory
     _keeper: Any = field(default=None, repr=False)  # of a temporary folder, removed with the last user
     _renderers: dict[Any, Callable[[Camera], Frame]] = field(default_factory=dict, init=False, repr=False)
@@ -70,25 +70,25 @@ class Reconstruction:
     @property
     def method(self) -> Method:
         """What was fitted, and how."""
-        return self.source.method
+        return self.provenance.method
 
     def views(self, split: str = "test") -> Dataset:
         """The "test" or "train" views of the data set: each of `.views` has `.image` (H, W, 3).
 
         Raises InputError where the data set is unknown, gone or unreadable.
         """
-        return self.source.views(split)
+        return self.provenance.views(split)
 
     def cameras(self, split: str = "test") -> list[Camera]:
         """Cameras of the data set's "test" or "train" views; where it is not there, cameras all around.
 
         Raises InputError for a data set that is there and cannot be read.
         """
-        return [shot.camera for shot in self.source.shots(self.trained, split)]
+        return [shot.camera for shot in self.provenance.shots(self.trained, split)]
 
     def turntable(self, count: int) -> list[Camera]:
         """Cameras on a circle around the object, z up, like the test views in lens, distance and height."""
-        return self.source.turntable(self.trained, count)
+        return self.provenance.turntable(self.trained, count)
 
     def camera(
         self, camera: CameraLike = 0, size: int | tuple[int, int] | None = None, split: str = "test"
@@ -124,16 +124,16 @@ class Reconstruction:
         *,
         size: int | tuple[int, int] | None = None,
         samples: int = 1,
-        alone: bool = False,
+        object_only: bool = False,
     ) -> np.ndarray:
         """The picture (H, W, 4) of a camera: linear RGB, premultiplied by alpha, and alpha.
 
-        samples: of a pixel, 4 are 2 × 2 and box filtered, 1 is its centre, as in training. alone: the object
-        without its surroundings. What has surroundings has alpha 1 otherwise. Raises InputError as `camera`
-        does.
+        samples: samples per pixel; 4 are 2 × 2, box filtered, 1 is the pixel centre, as in training.
+        object_only: render without the background Gaussians; alpha is 1 everywhere with them. Raises
+        InputError as `camera` does.
         """
         seen = self.camera(camera, size)
-        frame = self._frame(seen, samples, alone, aovs=False)
+        frame = self._frame(seen, samples, object_only, aovs=False)
         radiance, alpha = composited(frame)
         return planes([*radiance, alpha], seen.height, seen.width)
 
@@ -144,7 +144,7 @@ class Reconstruction:
         *,
         size: int | tuple[int, int] | None = None,
         samples: int = 1,
-        alone: bool = False,
+        object_only: bool = False,
     ) -> dict[str, np.ndarray]:
         """Maps (H, W, 3) or (H, W, 1) of a camera by name, as the `refgs` integrator's AOVs are.
 
@@ -158,7 +158,7 @@ class Reconstruction:
             if name not in kinds:
                 raise InputError(f"aovs: {name}: unknown; use some of {', '.join(kinds)}")
         seen = self.camera(camera, size)
-        frame = self._frame(seen, samples, alone, aovs=True)
+        frame = self._frame(seen, samples, object_only, aovs=True)
         found = {}
         for name in names:
             try:
@@ -168,11 +168,11 @@ class Reconstruction:
             found[name] = planes(values, seen.height, seen.width)
         return found
 
-    def _frame(self, camera: Camera, samples: int, alone: bool, aovs: bool) -> Frame:
+    def _frame(self, camera: Camera, samples: int, object_only: bool, aovs: bool) -> Frame:
         """A frame of a renderer that is made once."""
-        key = mi.variant(), samples, alone, aovs
+        key = mi.variant(), samples, object_only, aovs
         if key not in self._renderers:
-            scene = replace(self.trained, surroundings=None) if alone else self.trained
+            scene = replace(self.trained, surroundings=None) if object_only else self.trained
             self._renderers[key] = scene.renderer(aovs=aovs, samples=samples)
         return self._renderers[key](camera)
 
@@ -183,7 +183,7 @@ class Reconstruction:
         cameras: CameraLike | Sequence[CameraLike] = 0,
         *,
         aovs: Sequence[str] = (),
-        alone: bool = False,
+        object_only: bool = False,
     ) -> Any:
         """A `mi.Scene` whose integrator has this reconstruction, and a sensor for each of the cameras.
 
@@ -196,7 +196,7 @@ class Reconstruction:
         first, *more = (self.camera(one) for one in several)
         with tempfile.TemporaryDirectory(prefix="refgs_") as folder:
             export(self.trained, Path(folder), first, more)
-            return load_scene(Path(folder) / SCENE, aovs, alone)
+            return load_scene(Path(folder) / SCENE, aovs, object_only)
 
     def save(self, folder: str | Path) -> Reconstruction:
         """Write a run folder without checkpoints, which every command that takes a run reads; returns that.
@@ -204,7 +204,7 @@ class Reconstruction:
         `load` of it renders the same pictures, bit for bit. Raises InputError for a folder that holds a run,
         has a foreign file in the way or cannot be written.
         """
-        self.source.save(self.trained, Path(folder), self.cameras()[0])
+        self.provenance.save(self.trained, Path(folder), self.cameras()[0])
         return load(folder)
 
     def export(self, form: str, path: str | Path, *, overwrite: bool = False, **options: Any) -> list[Path]:
@@ -214,7 +214,7 @@ class Reconstruction:
         folder, only `overwrite` replaces foreign files. Raises InputError for an unknown format or option, a
         scene that the format cannot hold, a package that is missing, and a path that cannot be written.
         """
-        shots = self.source.shots(self.trained, "test", "train")
+        shots = self.provenance.shots(self.trained, "test", "train")
         return formats.write(self.trained, [form], Path(path), shots, options, self.folder, overwrite)[form]
 
     # ---------------- changes ----------------
@@ -246,7 +246,7 @@ class Reconstruction:
         join: Reconstruction | str | Path | None = None,
         **options: Unpack[editing.Options],
     ) -> Reconstruction:
-        """The same with some surfels changed, as by `refgs edit`; `source.edits[-1]` then says how many.
+        """The same with some surfels changed, as by `refgs edit`; `provenance.edits[-1]` then says how many.
 
         options: `EditOptions`, such as where="metallic > 0.5", set={"roughness": 0.3}; a `mask` is of a
         `view`. join: what is added under the light of this; selected and changed is then that. Raises
@@ -257,8 +257,8 @@ class Reconstruction:
         into = None if join is None else self.trained
         edited = editing.edit(of.trained, camera=camera, into=into, **options)
         record = {"run" if join is None else "join": of.folder and str(of.folder), **edited.record}
-        source = replace(self.source, edits=(*self.source.edits, record))
-        return replace(self.changed(edited.scene), source=source)
+        provenance = replace(self.provenance, edits=(*self.provenance.edits, record))
+        return replace(self.changed(edited.scene), provenance=provenance)
 
     def changed(self, trained: TrainedScene) -> Reconstruction:
         """Another scene of the same method and data, in memory."""
@@ -290,10 +290,10 @@ def load(run: str | Path, *, write: bool = True) -> Reconstruction:
     """
     require_supported_variant("mi_refgs.load")
     folder = Run(run)
-    source = Source.of(folder)
+    provenance = Provenance.of(folder)
 
     def first(fresh: TrainedScene) -> Camera:
-        return source.shots(fresh, "test")[0].camera
+        return provenance.shots(fresh, "test")[0].camera
 
-    trained = up_to_date(folder, source.method, first) if write else newest(folder, source.method)
-    return Reconstruction(trained, source, folder.path)
+    trained = up_to_date(folder, provenance.method, first) if write else newest(folder, provenance.method)
+    return Reconstruction(trained, provenance, folder.path)

@@ -30,7 +30,7 @@ from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.methods.method import Method
 from mi_refgs.progress import with_bar
 from mi_refgs.reconstruction.new_light import NewLight, truth_under
-from mi_refgs.reconstruction.provenance import Source
+from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.relighting.score import score, shown
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import samples_per_axis
@@ -75,7 +75,7 @@ def relight(
     The scene becomes materials alone (`runs.relightable`): diffuse light is the new light's irradiance, with
     the mesh's shadows and bounces; mirrors are traced. The views are the test views of the run's data set,
     or of `data`; with `turntable`, so many cameras on a circle around the object instead. Without a data set
-    both are of cameras around the object (`Source.shots`). If the data set has the truth under this light
+    both are of cameras around the object (`Provenance.shots`). If the data set has the truth under this light
     (`truth_under`), the test views are compared with it.
 
     Raises InputError for a run without light or materials, a light or a data set that cannot be read, and a
@@ -84,8 +84,8 @@ def relight(
     """
     if turntable < 0:
         raise InputError(f"--turntable: {turntable} is out of range; give a number of views from 1")
-    source = Source.of(run).with_data(data)
-    views = source.views("test") if source.is_there else None
+    source = Provenance.of(run).with_data(data)
+    views = source.views("test") if source.has_data else None
     asked = light
     known = None if turntable or views is None else truth_under(light, views.path)
     light = light if known is None else known[1]

@@ -625,15 +625,15 @@ def test_a_reconstruction_is_edited_alike(finished: Path, tmp_path: Path) -> Non
     both = red.edit(join=whole, keep=True, where="x < 0").edit(
         mask=np.ones((20, 20), bool), view=whole.camera(1), cut=True
     )
-    assert whole.source.edits == () and red.folder is None
-    first, second, third = both.source.edits
+    assert whole.provenance.edits == () and red.folder is None
+    first, second, third = both.provenance.edits
     assert (first["where"], second["where"], third.get("where")) == ("x > 0", "x < 0", None)
     assert second["of"] == whole.trained.surfels.count == first["of"]
     assert first["selected"] + second["selected"] <= first["of"]
     assert third["of"] == second["surfels"] == first["of"] + second["selected"]
     assert both.trained.surfels.count == third["of"] - third["selected"]
     again = both.save(tmp_path / "new")
-    assert list(again.source.edits) == json.loads(json.dumps(both.source.edits))
+    assert list(again.provenance.edits) == json.loads(json.dumps(both.provenance.edits))
     with pytest.raises(InputError, match="camera: 2: test has 2; give 0 to 1"):
         whole.edit(mask=np.ones((20, 20), bool), view=2, cut=True)
 

@@ -20,7 +20,7 @@ from mi_refgs.fitting.job import load_method
 from mi_refgs.formats import Shot
 from mi_refgs.formats.cameras import CAMERAS
 from mi_refgs.io.images import box_downscale, read_png, write_png
-from mi_refgs.reconstruction.provenance import Source
+from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.trained_scene import TrainedScene
 from tests.data import test_colmap, test_layouts
 from tests.data.test_layouts import SHOTS
@@ -112,7 +112,7 @@ def test_exported_cameras_are_those_of_the_files(reader: str, kind: str, tmp_pat
     images = "exr" if kind == "exr" else "png"
     method = load_method(None, "quick", ["data.downscale=2", f"data.images='{images}'"])
     trained = cast(TrainedScene, None)
-    shots = Source(method, data).shots(trained, "test", "train")
+    shots = Provenance(method, data).shots(trained, "test", "train")
     out = tmp_path / "out"
     CAMERAS.write(trained, out, shots)
     names = [f.split()[-1] for f in (out / "sparse/0/images.txt").read_text().splitlines()[1::2]]

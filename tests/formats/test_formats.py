@@ -18,7 +18,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.formats import FORMATS, Format, Option, register, write
 from mi_refgs.formats.shots import shots_around, turntable_cameras
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.reconstruction.provenance import Source
+from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.table import Surfels
@@ -150,7 +150,7 @@ def test_a_run_without_data_has_cameras_around_its_surfels(
     if record is not None:
         (run / "dataset.json").write_text(record)
     trained = TrainedScene.read(run)
-    shots = Source.of(Run(run)).shots(trained, "test", "train")
+    shots = Provenance.of(Run(run)).shots(trained, "test", "train")
     assert len(shots) == 64 and shots[0].split == "test"
     position = trained.surfels.to_numpy()["position"]
     for shot in shots[::7]:

@@ -26,7 +26,7 @@ from mi_refgs.formats import FORMATS, Shot
 from mi_refgs.io.exr import read_exr
 from mi_refgs.methods import read
 from mi_refgs.plugins.aovs import suffixes
-from mi_refgs.reconstruction.provenance import Source
+from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.save import save
@@ -166,13 +166,13 @@ GEOMETRY = ("normal", "depth", "alpha", "visibility", "diffuse", "specular", "in
 
 
 def by_reconstruction(case: Case) -> Maps:
-    options: Any = {"samples": case.samples, "alone": case.alone}
+    options: Any = {"samples": case.samples, "object_only": case.alone}
     view = sensor(case.crop)
     return {IMAGE: case.made.render(view, **options)} | case.made.aovs(view, case.names, **options)
 
 
 def by_its_mitsuba_scene(case: Case) -> Maps:
-    scene = case.made.scene(sensor(), aovs=case.names, alone=case.alone)
+    scene = case.made.scene(sensor(), aovs=case.names, object_only=case.alone)
     return of_mitsuba(scene, sensor(case.crop), case)
 
 
@@ -414,7 +414,7 @@ def test_every_route_gives_one_image(
     alone = row["around"] == "surroundings, left out"
     around = "surroundings and a map" if alone else row["around"]
     scene = trained(shading, primitive, around, row["meshed"], bare=row["state"] is through_a_ply)
-    made = Reconstruction(scene, Source(read.load("ref_gaussian", "quick")))
+    made = Reconstruction(scene, Provenance(read.load("ref_gaussian", "quick")))
     state, folder = row["state"](made, tmp_path)
     crop_sensor_of(folder / SCENE, row["crop"])
     case = Case(state, folder, row["samples"], row["crop"], alone, tmp_path, part)

@@ -99,7 +99,7 @@ def test_aovs_are_the_known_materials(balls: Reconstruction) -> None:
 
 
 def test_surroundings_make_a_picture_opaque(folder: Path, balls: Reconstruction) -> None:
-    """What is behind the object shows through, and `alone` leaves it out."""
+    """What is behind the object shows through, and `object_only` leaves it out."""
     from dataclasses import replace
 
     from mi_refgs.render.surroundings import Surroundings, nothing_around
@@ -107,7 +107,7 @@ def test_surroundings_make_a_picture_opaque(folder: Path, balls: Reconstruction)
     behind = mi_refgs.EnvironmentLight.constant(0.25, height=8)
     around = Surroundings(nothing_around(balls.trained.surfels), behind)
     open_scene = balls.changed(replace(balls.trained, surroundings=around))
-    whole, alone = open_scene.render(0), open_scene.render(0, alone=True)
+    whole, alone = open_scene.render(0), open_scene.render(0, object_only=True)
     np.testing.assert_allclose(alone, balls.render(0), atol=1e-6)
     np.testing.assert_allclose(whole[..., :3], alone[..., :3] + 0.25 * (1 - alone[..., 3:]), atol=1e-5)
     assert (whole[..., 3] == 1).all()
@@ -160,7 +160,7 @@ def test_what_is_saved_renders_the_same_bits(balls: Reconstruction, tmp_path: Pa
         (relit, relit.save(tmp_path / "relit")),
     ):
         np.testing.assert_array_equal(before.render(1), after.render(1))
-    assert again.source == balls.source
+    assert again.provenance == balls.provenance
 
 
 def test_commands_take_what_is_saved(
