@@ -50,7 +50,7 @@ def fit(folder: Path, seed: int) -> dict[str, float]:
     """PSNR and normal error on the test views after a fit."""
     from mi_refgs import methods
     from mi_refgs.data import dataset
-    from mi_refgs.evaluation import metrics, pictures
+    from mi_refgs.evaluation import images, metrics
     from mi_refgs.fitting.train import Trainer
 
     method = methods.load("ref_gaussian", "quick", [*SETTINGS, f"seed={seed}"])
@@ -59,7 +59,7 @@ def fit(folder: Path, seed: int) -> dict[str, float]:
     test: Any = dataset.read_dataset(folder, "test")
     scores: list[dict[str, Any]] = []
     for view in test.views:
-        shot = pictures.RenderedView.of(trainer.view(view.camera()), test, view)
+        shot = images.RenderedView.of(trainer.view(view.camera()), test, view)
         psnr = metrics.psnr(shot.image, view.displayed)
         scores.append({"psnr": psnr} | metrics.normal_mae_deg(shot.normal, view.normal, view.alpha))
     means = {key: float(np.mean([s[key] for s in scores])) for key in ("psnr", "normal_mae_deg")}

@@ -24,8 +24,8 @@ import numpy as np
 from benchmarks.common.command import plain_parser
 from benchmarks.interchange.programs import validated
 from mi_refgs.evaluation.evaluate import load_split
+from mi_refgs.evaluation.images import image_array
 from mi_refgs.evaluation.metrics import psnr
-from mi_refgs.evaluation.pictures import planes
 from mi_refgs.formats import write
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.reconstruction.provenance import Provenance
@@ -78,7 +78,7 @@ def measured(folder: Path, out: Path, args: Any) -> dict[str, Any]:
             return shown(rgba, views.background)
 
         def ours(frame: Any, height: int = view.height, width: int = view.width) -> np.ndarray:
-            return displayed(planes([*frame.radiance, frame.alpha], height, width))
+            return displayed(image_array([*frame.radiance, frame.alpha], height, width))
 
         stock, first = displayed(read_exr_image(picture)), ours(whole(view.camera()))
         second, truth = ours(alone(view.camera())), view.displayed

@@ -15,7 +15,7 @@ from mi_refgs.compare.table import Row, Scene
 from mi_refgs.compare.worker import CURVE
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import render_names
-from mi_refgs.evaluation.pictures import sheet
+from mi_refgs.evaluation.images import contact_sheet
 from mi_refgs.fitting.runner import read_views
 from mi_refgs.io.files import write_bytes
 from mi_refgs.io.images import read_png, write_png
@@ -127,7 +127,7 @@ def write_crops(folder: Path, scene: Scene, path: Path) -> Region | None:
         (title, picture[y : y + side, x : x + side])
         for title, picture in zip(["ground truth", *(row.variant for row in rows)], pictures, strict=True)
     ]
-    write_png(path, sheet([dict(cells[i : i + ROW]) for i in range(0, len(cells), ROW)]))
+    write_png(path, contact_sheet([dict(cells[i : i + ROW]) for i in range(0, len(cells), ROW)]))
     return Region(views[index].name, y, x, side)
 
 

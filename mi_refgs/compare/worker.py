@@ -95,8 +95,8 @@ class Curve:
         self.due = [point for point in points if point > begin]
 
     def __call__(self, trainer: Any) -> None:
+        from mi_refgs.evaluation.images import RenderedView
         from mi_refgs.evaluation.metrics import psnr
-        from mi_refgs.evaluation.pictures import RenderedView
 
         while trainer.notices:
             print(f"refgs: warning: {trainer.notices.pop(0)}", file=sys.stderr)

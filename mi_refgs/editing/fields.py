@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from mi_refgs.errors import InputError, abbreviated
-from mi_refgs.evaluation.pictures import LUMINANCE
+from mi_refgs.evaluation.images import LUMINANCE
 from mi_refgs.runs.relightable import outward
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import CHANNELS, SH_DC, channel, sigmoid

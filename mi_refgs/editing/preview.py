@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mi_refgs.evaluation import pictures
+from mi_refgs.evaluation import images
 from mi_refgs.render.display import displayed
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera
@@ -30,5 +30,5 @@ def before_and_after(
     for camera in (cameras[i] for i in some):
         shots = {title: displayed(view(camera), background, linear) for title, view in renderers.items()}
         size = camera.height, camera.width
-        rows.append({title: np.clip(pictures.planes(x, *size), 0, 1) for title, x in shots.items()})
-    return pictures.sheet(rows)
+        rows.append({title: np.clip(images.image_array(x, *size), 0, 1) for title, x in shots.items()})
+    return images.contact_sheet(rows)

@@ -16,7 +16,7 @@ import numpy as np
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
-from mi_refgs.evaluation.pictures import RenderedView, beside, on_white
+from mi_refgs.evaluation.images import RenderedView, on_white, side_by_side
 from mi_refgs.evaluation.surface import NO_SURFACE
 from mi_refgs.io.images import psnr_of, srgb_from_linear
 from mi_refgs.runs.relightable import relightable
@@ -167,7 +167,7 @@ def panels(
         pairs[name] = tuple(on_white(x, a) for x, a in zip(shown, shares, strict=True))
     found = {}
     for name, pictures in pairs.items():
-        found[f"{name}: ours{' | true' if len(pictures) > 1 else ''}"] = beside(pictures)
+        found[f"{name}: ours{' | true' if len(pictures) > 1 else ''}"] = side_by_side(pictures)
     if concave is not None:
         found["concave"] = on_white(np.repeat(0.75 * concave[..., None], 3, axis=-1) * [1, 0.4, 0], covered)
     return {title: np.clip(picture, 0, 1) for title, picture in found.items()}

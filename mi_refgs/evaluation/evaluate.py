@@ -17,7 +17,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import region_pixels
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation import decomposition, metrics, pictures
+from mi_refgs.evaluation import decomposition, images, metrics
 from mi_refgs.evaluation.speed import milliseconds
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
@@ -120,7 +120,7 @@ def evaluate(
     materials = decomposition.material_maps(fitted, samples)
     for index, truth in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         frame = view(truth.camera())
-        shot = pictures.RenderedView.of(frame, views, truth)
+        shot = images.RenderedView.of(frame, views, truth)
         gain, gained = with_gain(frame, truth, views)
         goal = truth.displayed
         scores: dict[str, Any] = {
@@ -148,9 +148,9 @@ def evaluate(
         errors.add(shot, maps, truth, concave)
         write_png(run.path / renders[index], shot.image)
         if index in shown:
-            found = pictures.panels(shot, truth)
+            found = images.panels(shot, truth)
             if object_view is not None:
-                found["object alone"] = pictures.RenderedView.of(
+                found["object alone"] = images.RenderedView.of(
                     object_view(truth.camera()), views, truth
                 ).image
             rows.append(found)
@@ -194,9 +194,9 @@ def evaluate(
             for scores in per_view
         ],
     }
-    write_png(run.path / SHEET, pictures.sheet(rows, light_panels))
+    write_png(run.path / SHEET, images.contact_sheet(rows, light_panels))
     rows = [decomposition.panels(s, m, v, errors.scale(), c) for s, m, v, c in kept]
-    write_png(run.path / DECOMPOSITION, pictures.sheet(rows, light_panels))
+    write_png(run.path / DECOMPOSITION, images.contact_sheet(rows, light_panels))
     run.write_json(METRICS, result)
     return result
 
@@ -237,9 +237,9 @@ def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[st
     tensor = fitted.light.radiance()
     light = np.array(tensor, dtype=np.float32).reshape(tensor.shape)
     if data.environment is None:
-        return nothing | {"env_reason": "the data set has no environment.exr"}, pictures.lights(light)
+        return nothing | {"env_reason": "the data set has no environment.exr"}, images.light_panels(light)
     truth = read_radiance(data.environment, len(light))
-    return metrics.environment(light, truth) | {"env_reason": None}, pictures.lights(light, truth)
+    return metrics.environment(light, truth) | {"env_reason": None}, images.light_panels(light, truth)
 
 
 def _mean(per_view: list[dict[str, Any]], name: str) -> float | None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.evaluation import pictures
+from mi_refgs.evaluation import images
 from mi_refgs.fitting.progress import Progress
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import write_png
@@ -28,12 +28,12 @@ class Previews(Progress):
         if trainer.run is None or trainer.iteration % trainer.method.preview_every:
             return
         view = trainer.data.views[0]
-        shot = pictures.RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data, view)
+        shot = images.RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data, view)
         light = None
         if trainer.light is not None:
             radiance = trainer.light.radiance()
-            light = pictures.lights(np.array(radiance, dtype=np.float32).reshape(radiance.shape))
-        image = pictures.sheet([pictures.panels(shot, view)], light)
+            light = images.light_panels(np.array(radiance, dtype=np.float32).reshape(radiance.shape))
+        image = images.contact_sheet([images.panels(shot, view)], light)
         write_png(trainer.run.output.own(f"previews/{trainer.iteration:07d}.png"), image)
 
 

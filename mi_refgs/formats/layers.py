@@ -31,7 +31,7 @@ def write(
 
     import numpy as np
 
-    from mi_refgs.evaluation.pictures import planes
+    from mi_refgs.evaluation.images import image_array
     from mi_refgs.io.exr import write_exr_layers
     from mi_refgs.plugins.aovs import aov_values, suffixes
     from mi_refgs.surfels.attributes import CHANNELS
@@ -45,7 +45,7 @@ def write(
     camera = shots[view].camera
     frame = trained.renderer(samples=samples)(camera)
     size = camera.height, camera.width
-    radiance, alpha = planes(frame.radiance, *size), planes(frame.alpha, *size)
+    radiance, alpha = image_array(frame.radiance, *size), image_array(frame.alpha, *size)
     found = dict(zip("RGB", np.moveaxis(radiance, -1, 0), strict=True)) | {"A": alpha}
     for name, letters in suffixes().items():
         if name == "alpha" or (name in CHANNELS and name not in frame.maps):
@@ -53,10 +53,11 @@ def write(
         values = [frame.depth] if name == "depth" else aov_values(name, frame, camera)
         letters = LETTERS.get(name, "V" if len(letters) == 1 else letters)
         found |= {
-            f"{name}.{letter}": planes(plane, *size) for letter, plane in zip(letters, values, strict=True)
+            f"{name}.{letter}": image_array(plane, *size)
+            for letter, plane in zip(letters, values, strict=True)
         }
     if frame.background is not None:
-        behind = planes(frame.background, *size)
+        behind = image_array(frame.background, *size)
         found |= {f"background.{letter}": behind[..., i] for i, letter in enumerate("RGB")}
     write_exr_layers(target, found)
     return [target]

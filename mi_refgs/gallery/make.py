@@ -12,7 +12,7 @@ from mi_refgs import methods
 from mi_refgs.editing import Options
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import evaluate as evaluation
-from mi_refgs.evaluation.pictures import sheet
+from mi_refgs.evaluation.images import contact_sheet
 from mi_refgs.gallery.exhibits import EXHIBITS, Exhibit
 from mi_refgs.gallery.frames import write_still, write_turntable
 from mi_refgs.gallery.page import DECOMPOSITION, EDITS, RELIT, TURNTABLE, page
@@ -161,7 +161,7 @@ def _pictures(name: str, exhibit: Exhibit, run: Reconstruction, out: Path, size:
             options: Options = {**how, "materials": True}
             made[title] = run.edit(**options)
         rows = [{title: _shown(scene, view, size) for title, scene in made.items()} for view in EDIT_VIEWS]
-        write_still(out / EDITS, sheet(rows))
+        write_still(out / EDITS, contact_sheet(rows))
 
 
 def _shown(run: Reconstruction, camera: Any, size: int) -> np.ndarray:

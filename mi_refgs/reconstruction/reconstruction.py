@@ -20,7 +20,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError, counted
 from mi_refgs.evaluation import evaluate as evaluation
-from mi_refgs.evaluation.pictures import planes
+from mi_refgs.evaluation.images import image_array
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
 from mi_refgs.plugins.aovs import aov_values, suffixes
@@ -135,7 +135,7 @@ class Reconstruction:
         seen = self.camera(camera, size)
         frame = self._frame(seen, samples, object_only, aovs=False)
         radiance, alpha = composited(frame)
-        return planes([*radiance, alpha], seen.height, seen.width)
+        return image_array([*radiance, alpha], seen.height, seen.width)
 
     def aovs(
         self,
@@ -165,7 +165,7 @@ class Reconstruction:
                 values = aov_values(name, frame, seen)
             except KeyError:
                 raise InputError(f"aovs: {name}: the surfels have no such channel; leave it out") from None
-            found[name] = planes(values, seen.height, seen.width)
+            found[name] = image_array(values, seen.height, seen.width)
         return found
 
     def _frame(self, camera: Camera, samples: int, object_only: bool, aovs: bool) -> Frame:

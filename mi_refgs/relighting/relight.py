@@ -21,7 +21,7 @@ import numpy as np
 
 from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation import pictures
+from mi_refgs.evaluation import images
 from mi_refgs.formats.shots import turntable_cameras
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
@@ -193,7 +193,7 @@ def _render(
     found = []
     for name, camera in with_bar(jobs, "relight", unit="view", disable=not progress):
         frame = renderer(camera)
-        rgba = pictures.planes([*frame.radiance, frame.alpha], camera.height, camera.width)
+        rgba = images.image_array([*frame.radiance, frame.alpha], camera.height, camera.width)
         write_exr((folder / name).with_suffix(".exr"), rgba)
         write_png(folder / name, straight_srgb(rgba))
         found.append(rgba)
@@ -251,5 +251,5 @@ def _write_sheet(
             for i, part in enumerate(parts)
         ]
     tensor = scene.light.radiance()
-    panorama = pictures.lights(np.array(tensor, dtype=np.float32).reshape(tensor.shape))
-    write_png(path, pictures.sheet(rows, {"light": next(iter(panorama.values()))}))
+    panorama = images.light_panels(np.array(tensor, dtype=np.float32).reshape(tensor.shape))
+    write_png(path, images.contact_sheet(rows, {"light": next(iter(panorama.values()))}))

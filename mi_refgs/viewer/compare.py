@@ -10,7 +10,7 @@ import numpy as np
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.evaluation import metrics
-from mi_refgs.evaluation.pictures import planes
+from mi_refgs.evaluation.images import image_array
 from mi_refgs.io.images import to_8_bits
 from mi_refgs.render.display import displayed
 from mi_refgs.viewer.develop import PICTURE, Look, shown_planes, to_bytes
@@ -40,7 +40,7 @@ class Compared:
         truth = np.clip(view.displayed, 0, 1)
         if look.what == PICTURE and frame_of is not None:
             shown = displayed(frame_of(view.camera()), self.data.background, self.data.is_linear_radiance)
-            ours = planes(shown, view.height, view.width)
+            ours = image_array(shown, view.height, view.width)
             self.tell(metrics.psnr(ours, truth))
             drawn = to_8_bits(ours)
         else:

@@ -20,7 +20,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation import surface
 from mi_refgs.evaluation.decomposition import Decomposition
 from mi_refgs.evaluation.evaluate import DECOMPOSITION, evaluate
-from mi_refgs.evaluation.pictures import RenderedView
+from mi_refgs.evaluation.images import RenderedView
 from mi_refgs.io.images import read_png
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder

@@ -18,7 +18,7 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.compare import plots
 from mi_refgs.data import dataset
-from mi_refgs.evaluation import metrics, pictures
+from mi_refgs.evaluation import images, metrics
 from mi_refgs.evaluation.evaluate import evaluate, render_names
 from mi_refgs.evaluation.speed import TIMED_FRAMES, WARM_UP_FRAMES
 from mi_refgs.fitting.train import Trainer
@@ -153,7 +153,7 @@ def test_an_export_without_light_or_mesh_leaves_no_stale_one(run: Run, folder: P
 def test_pictures_of_the_run(run: Run) -> None:
     evaluate(run)
     sheet = read_png(run.path / "contact_sheet.png")
-    assert sheet.shape[0] > 2 * pictures.CELL_MIN and sheet.shape[1] > 6 * pictures.CELL_MIN
+    assert sheet.shape[0] > 2 * images.CELL_MIN and sheet.shape[1] > 6 * images.CELL_MIN
     assert sorted(path.name for path in (run.path / "eval").iterdir()) == ["test_r_0.png", "test_r_1.png"]
 
 
@@ -161,8 +161,8 @@ def test_panels_show_what_there_is(run: Run, folder: Path) -> None:
     trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
     views = dataset.read_dataset(folder / "ball", "test")
     view = views.views[0]
-    shot = pictures.RenderedView.of(trainer.view(view.camera()), views, view)
-    panels = pictures.panels(shot, view)
+    shot = images.RenderedView.of(trainer.view(view.camera()), views, view)
+    panels = images.panels(shot, view)
     assert list(panels) == [
         "ground truth", "render", "true normals", "normals", "albedo", "metallic", "roughness", "visibility"
     ]  # fmt: skip
@@ -174,15 +174,15 @@ def test_panels_show_what_there_is(run: Run, folder: Path) -> None:
 
 def test_lights_are_shown_at_one_exposure(rng: np.random.Generator) -> None:
     truth = rng.uniform(0.1, 5, (8, 16, 3))
-    shown = pictures.lights(truth * [0.5, 2, 1], truth)
+    shown = images.light_panels(truth * [0.5, 2, 1], truth)
     np.testing.assert_allclose(shown["recovered light"], shown["true light"], atol=1e-6)
-    dark = pictures.lights(np.zeros((8, 16, 3)))
+    dark = images.light_panels(np.zeros((8, 16, 3)))
     assert np.all(dark["recovered light"] == 0)
 
 
 def test_a_sheet_holds_rows_of_different_length() -> None:
     black, white = np.zeros((10, 30, 3)), np.ones((10, 30, 3))
-    sheet = pictures.sheet([{"a": black, "b": white}, {"a": black}], {"light": np.zeros((8, 16, 3))})
+    sheet = images.contact_sheet([{"a": black, "b": white}, {"a": black}], {"light": np.zeros((8, 16, 3))})
     assert sheet.ndim == 3 and sheet.shape[2] == 3
     assert (sheet[:, :, 0] == 0).sum() >= 2 * (13 * 10) * (13 * 30)
 

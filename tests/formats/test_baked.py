@@ -14,7 +14,7 @@ import trimesh
 
 from mi_refgs.cli import main
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.pictures import planes
+from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats import Shot, gltf_mesh, write
 from mi_refgs.formats import usd as usd_format
 from mi_refgs.formats.bake import bake
@@ -224,10 +224,10 @@ def test_plain_mitsuba_shows_what_we_show(exported: Exported, tmp_path: Path, va
     view = exported.trained.renderer(samples=4)
     for shot, picture in zip(exported.shots[:2], theirs, strict=True):
         frame = view(shot.camera)
-        ours = planes([*frame.radiance, frame.alpha], SIZE, SIZE)
+        ours = image_array([*frame.radiance, frame.alpha], SIZE, SIZE)
         np.testing.assert_allclose(picture[..., 3].mean(), ours[..., 3].mean(), rtol=0.02)
         inside = (ours[..., 3] > 0.99) & (picture[..., 3] > 0.99)
-        mirror = inside & (planes(frame.maps["metallic"], SIZE, SIZE) > 0.9)
+        mirror = inside & (image_array(frame.maps["metallic"], SIZE, SIZE) > 0.9)
         assert mirror.sum() > 500
         error, size = np.abs(ours - picture)[..., :3], ours[..., :3]
         assert error[inside].mean() < 0.35 * size[inside].mean()

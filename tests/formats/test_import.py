@@ -14,7 +14,7 @@ from mi_refgs.cli import main
 from mi_refgs.constants import GAUSSIAN_LOW_PASS
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.pictures import planes
+from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats.incoming import read_cameras, read_splats
 from mi_refgs.io.exr import read_exr
 from mi_refgs.io.images import read_png
@@ -112,7 +112,7 @@ def test_a_file_is_shown_by_its_own_formula(name: str, tmp_path: Path, rng: np.r
         SIZE, SIZE, camera.fx, camera.fy, camera.cx, camera.cy, camera.to_world, camera.near
     )
     frame = scene.renderer()(seen)
-    shown = planes(displayed(frame, BACKGROUND, False), SIZE, SIZE)
+    shown = image_array(displayed(frame, BACKGROUND, False), SIZE, SIZE)
     assert goal.max() > 1 and goal.std() > 0.1 and band.mean() < 0.2
     assert np.abs(shown - goal)[~band].max() < 2e-4
     assert GAUSSIAN_LOW_PASS == 0.3  # theirs
@@ -133,10 +133,10 @@ def test_the_command_makes_a_run_that_is_shown_the_same(
     camera = made.camera(0)
     frame = TrainedScene.read(run).renderer()(camera)
     size = camera.height, camera.width
-    encoded = planes(displayed(frame, np.zeros(3), False), *size)
+    encoded = image_array(displayed(frame, np.zeros(3), False), *size)
     picture = read_png(tmp_path / "out.png")
     assert picture.shape == (*size, 4) and encoded.max() > 0.5
-    goal = np.minimum(encoded, planes(frame.alpha, *size)[..., None])  # 8 bits end at white
+    goal = np.minimum(encoded, image_array(frame.alpha, *size)[..., None])  # 8 bits end at white
     assert np.abs(picture[..., :3] * picture[..., 3:] - goal).max() < 3 / 255
     assert main(["export", str(run)]) == 0
     assert main(["import", str(theirs), "-o", str(run)]) == 2

@@ -15,7 +15,7 @@ import pytest
 
 from mi_refgs.cli import main
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.pictures import planes
+from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats import Shot, write
 from mi_refgs.formats.shots import shots_around
 from mi_refgs.formats.splats import THIN, gaussians
@@ -82,13 +82,13 @@ def encoded(scene: TrainedScene, camera: Camera, alone: bool = False) -> np.ndar
     scene = replace(scene, surroundings=None) if alone else scene
     frame = scene.renderer(aovs=False)(camera)
     shown = display_image(list(frame.radiance), frame.alpha, [0.0] * 3)
-    return planes([*shown, frame.alpha], camera.height, camera.width)
+    return image_array([*shown, frame.alpha], camera.height, camera.width)
 
 
 def their_picture(table: Surfels, camera: Camera) -> np.ndarray:
     """The formula of 3DGS (H, W, 4): colours blended as they are."""
     frame = render(table, camera, Shading("surfel", "radiance"), normals=False)
-    return planes([*frame.radiance, frame.alpha], camera.height, camera.width)
+    return image_array([*frame.radiance, frame.alpha], camera.height, camera.width)
 
 
 def db(a: np.ndarray, b: np.ndarray) -> float:
@@ -270,13 +270,13 @@ def test_the_exr_file_has_every_layer(scene: TrainedScene, shots: list[Shot], tm
     layers = read_exr(file)
     frame = scene.renderer()(shots[1].camera)
     for i, letter in enumerate("RGB"):
-        np.testing.assert_allclose(layers[letter], planes(frame.radiance, SIZE, SIZE)[..., i], atol=1e-6)
+        np.testing.assert_allclose(layers[letter], image_array(frame.radiance, SIZE, SIZE)[..., i], atol=1e-6)
         terms = sum(layers[f"{name}.{letter}"] for name in ("diffuse", "specular", "indirect"))
         np.testing.assert_allclose(terms, layers[letter], atol=1e-5)
-        albedo = planes(frame.maps["albedo"], SIZE, SIZE)[..., i]
+        albedo = image_array(frame.maps["albedo"], SIZE, SIZE)[..., i]
         np.testing.assert_allclose(layers[f"albedo.{letter}"], albedo, atol=1e-6)
-    np.testing.assert_allclose(layers["A"], planes(frame.alpha, SIZE, SIZE), atol=1e-6)
-    np.testing.assert_allclose(layers["depth.Z"], planes(frame.depth, SIZE, SIZE), atol=1e-6)
+    np.testing.assert_allclose(layers["A"], image_array(frame.alpha, SIZE, SIZE), atol=1e-6)
+    np.testing.assert_allclose(layers["depth.Z"], image_array(frame.depth, SIZE, SIZE), atol=1e-6)
     solid = layers["A"] > 0.99
     normal = np.stack([layers[f"normal.{letter}"] for letter in "XYZ"], axis=-1)
     np.testing.assert_allclose(np.linalg.norm(normal[solid], axis=-1), 1, atol=1e-5)

@@ -21,7 +21,7 @@ import pytest
 from mi_refgs import Reconstruction, import_splats, load
 from mi_refgs.cli import main
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
-from mi_refgs.evaluation.pictures import planes
+from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats import FORMATS, Shot
 from mi_refgs.io.exr import read_exr
 from mi_refgs.methods import read
@@ -281,7 +281,7 @@ def of_viewer(case: Case, drawable: Drawable) -> Maps:
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(fine, "GRID", round(case.samples**0.5))
                 shown = drawable.fine(pose, WIDTH, HEIGHT, look)
-        found[IMAGE if what == PICTURE else what] = planes(seen_of(shown, look), HEIGHT, WIDTH)
+        found[IMAGE if what == PICTURE else what] = image_array(seen_of(shown, look), HEIGHT, WIDTH)
     return case.of_whole(found)
 
 

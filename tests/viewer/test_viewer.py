@@ -17,7 +17,7 @@ import pytest
 from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.pictures import planes
+from mi_refgs.evaluation.images import image_array
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.methods.read import load
@@ -123,8 +123,8 @@ def test_a_page_that_looks_as_a_test_view_does_sees_its_picture(scene: TrainedSc
     back = Pose.of_page(page_rotation(pose), pose.position, pose.fov, pose.aspect, view.near)
     assert np.abs(back.to_world - view.to_world).max() < 1e-12
     draw = scene.renderer(aovs=False)
-    wanted = planes(draw(view.camera()).radiance, view.height, view.width)
-    found = planes(draw(back.camera(view.width, view.height)).radiance, view.height, view.width)
+    wanted = image_array(draw(view.camera()).radiance, view.height, view.width)
+    found = image_array(draw(back.camera(view.width, view.height)).radiance, view.height, view.width)
     assert wanted.max() > 0.1
     assert np.abs(found - wanted).max() < 1e-5
 
@@ -488,7 +488,7 @@ def test_what_is_saved_has_surroundings_or_is_transparent(surrounded: TrainedSce
     assert np.allclose(found["surroundings"][0, 0, :3], 0.2, rtol=1e-3)
     assert found["grey"][..., 3].min() == 0 and found["grey"][..., 3].max() > 0.9
     alone = replace(surrounded, surroundings=None).renderer(aovs=False, samples=16)(pose.camera(32, 20))
-    assert np.abs(found["grey"] - planes([*alone.radiance, alone.alpha], 20, 32)).max() < 1e-5
+    assert np.abs(found["grey"] - image_array([*alone.radiance, alone.alpha], 20, 32)).max() < 1e-5
 
 
 def test_a_scene_file_with_surroundings_is_shown_with_them_or_without(
@@ -541,7 +541,7 @@ def test_views_are_saved_under_the_next_number_with_their_camera(scene: TrainedS
         (tmp_path / f"transforms_{split}.json").write_bytes((tmp_path / "view_000.json").read_bytes())
     view = read_dataset(tmp_path, "train").views[0]
     assert np.abs(view.to_world - pose.to_world).max() < 1e-6
-    wanted = planes(scene.renderer(aovs=False, samples=16)(view.camera()).alpha, 20, 32)
+    wanted = image_array(scene.renderer(aovs=False, samples=16)(view.camera()).alpha, 20, 32)
     assert wanted.max() > 0.9
     assert view.alpha is not None and np.abs(view.alpha - wanted).max() < 0.51 / 255
 
@@ -601,7 +601,7 @@ def test_a_saved_picture_is_that_of_sixteen_samples(
     path = write_view(Fitted(scene), pose, (32, 20), Look(), tmp_path, ".exr")
     monkeypatch.setattr(passes, "PASS_SAMPLES", 1 << 20)
     frame = scene.renderer(aovs=False, samples=16)(pose.camera(32, 20))
-    assert np.abs(read_exr_image(path) - planes([*frame.radiance, frame.alpha], 20, 32)).max() < 1e-5
+    assert np.abs(read_exr_image(path) - image_array([*frame.radiance, frame.alpha], 20, 32)).max() < 1e-5
 
 
 # ---------------- bad input ----------------

@@ -27,7 +27,7 @@ from PIL import Image
 
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.editing import Change, Selection, apply, assignments, select
-from mi_refgs.evaluation.pictures import planes
+from mi_refgs.evaluation.images import image_array
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.methods.read import load
 from mi_refgs.render.surroundings import Surroundings
@@ -276,7 +276,7 @@ def camera_of(path: Path) -> Camera:
 def rendered(scene: TrainedScene, camera: Camera) -> np.ndarray:
     """Linear RGBA (H, W, 4) of 16 samples."""
     frame = scene.renderer(aovs=False, samples=16)(camera)
-    return planes([*frame.radiance, frame.alpha], camera.height, camera.width)
+    return image_array([*frame.radiance, frame.alpha], camera.height, camera.width)
 
 
 def test_the_page_shows_the_object_and_the_light_turns_on_it(tab: Tab) -> None:

@@ -45,11 +45,11 @@ class RenderedView:
     def of(frame: Frame, data: Dataset, view: View) -> RenderedView:
         """Copy a frame of one of the data set's views; waits for the device."""
         size = view.height, view.width
-        normal = planes(frame.normal, *size)
+        normal = image_array(frame.normal, *size)
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         return RenderedView(
-            planes(displayed(frame, data.background, data.is_linear_radiance), *size),
-            planes(frame.alpha, *size),
+            image_array(displayed(frame, data.background, data.is_linear_radiance), *size),
+            image_array(frame.alpha, *size),
             np.where(length > 1e-6, normal / np.maximum(length, 1e-6), 0),
             RenderedView.maps_of(frame, *size),
         )
@@ -57,13 +57,13 @@ class RenderedView:
     @staticmethod
     def maps_of(frame: Frame, height: int, width: int) -> dict[str, np.ndarray]:
         """The maps of a frame alone."""
-        return {name: planes(m, height, width) for name, m in frame.maps.items()}
+        return {name: image_array(m, height, width) for name, m in frame.maps.items()}
 
 
-def planes(array: Any, height: int, width: int) -> np.ndarray:
+def image_array(array: Any, height: int, width: int) -> np.ndarray:
     """An array over pixels as (H, W), one of colours or vectors as (H, W, 3), float32."""
     if isinstance(array, list) or dr.depth_v(array) > 1:
-        return np.stack([planes(part, height, width) for part in array], axis=-1)
+        return np.stack([image_array(part, height, width) for part in array], axis=-1)
     values = np.array(array, dtype=np.float32).ravel()
     return np.broadcast_to(values, height * width).reshape(height, width)
 
@@ -83,7 +83,7 @@ def panels(shot: RenderedView, view: View) -> dict[str, np.ndarray]:
     return {title: np.clip(picture, 0, 1) for title, picture in shown.items()}
 
 
-def lights(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """A recovered lat-long light (h, w, 3), linear, and the true one at one exposure, by title.
 
     The recovered one is first brought to the true one by a least-squares scale per channel.
@@ -101,7 +101,9 @@ def tonemap(radiance: np.ndarray, exposure: float) -> np.ndarray:
     return np.clip(srgb_from_linear(scaled / (1 + scaled)), 0, 1)
 
 
-def sheet(rows: Sequence[dict[str, np.ndarray]], footer: dict[str, np.ndarray] | None = None) -> np.ndarray:
+def contact_sheet(
+    rows: Sequence[dict[str, np.ndarray]], footer: dict[str, np.ndarray] | None = None
+) -> np.ndarray:
     """A contact sheet: a row of titled pictures a view, and `footer` (lights) across the foot."""
     titles = list(dict.fromkeys(title for row in rows for title in row))
     factor = -(-CELL_MIN // min(next(iter(rows[0].values())).shape[:2]))
@@ -154,7 +156,7 @@ def _fit_width(picture: np.ndarray, width: int) -> np.ndarray:
     return np.stack([np.asarray(plane.resize(size, Image.Resampling.BOX)) for plane in planes], axis=-1)
 
 
-def beside(pictures: Sequence[np.ndarray]) -> np.ndarray:
+def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
     """Pictures of one height side by side."""
     gap = np.ones((pictures[0].shape[0], MARGIN // 2, 3))
     parts = [part for picture in pictures for part in (gap, picture)]
