@@ -14,7 +14,7 @@ from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.picture_files import PictureFile
 from mi_refgs.data.readers import PointCloud
-from mi_refgs.data.region import REGION_FILE, Region
+from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.evaluation.progress import Bar
@@ -23,35 +23,21 @@ from mi_refgs.fitting.initial import initial_parameters, is_open
 from mi_refgs.fitting.job import default_method
 from mi_refgs.fitting.runner import begin
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.io.images import linear_from_srgb, read_png, write_png
+from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.tiny import FOCAL, METHOD, SIZE, write_data
+from tests.scenes.tiny import METHOD, REGION, write_data, write_open_data
 
-REGION = Region((0.0, 0.0, 0.0), 0.7)
 STEPS = 12
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Eight views of the tiny ball in front of a coloured sky, without alpha."""
-    folder = write_data(tmp_path_factory.mktemp("open"), views=8, truth=False)
-    offset = (np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL
-    x, y = np.meshgrid(offset, -offset)
-    for split in ("train", "test"):
-        for frame in json.loads((folder / f"transforms_{split}.json").read_text())["frames"]:
-            pose = np.array(frame["transform_matrix"])
-            ray = np.stack([x, y, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
-            ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-            path = folder / f"{frame['file_path']}.png"
-            rgba = read_png(path)
-            alpha = rgba[..., 3:]
-            write_png(path, alpha * rgba[..., :3] + (1 - alpha) * (0.5 + 0.3 * ray))
-    (folder / REGION_FILE).write_text(json.dumps({"centre": REGION.centre, "radius": REGION.radius}))
-    return read_dataset(folder, "train")
+    return read_dataset(write_open_data(tmp_path_factory.mktemp("open") / "data"), "train")
 
 
 @pytest.fixture(scope="module")

@@ -8,14 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
+from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.io.exr import write_exr
-from mi_refgs.io.images import write_png
+from mi_refgs.io.images import read_png, write_png
 from mi_refgs.methods.presets import PRESETS
 from mi_refgs.reference.camera import look_at
 
 SIZE = 20
 FOCAL = 24.0  # pixels
 RADIUS, DISTANCE = 0.5, 1.5
+REGION = Region((0.0, 0.0, 0.0), 0.7)
+"""Of `write_open_data`."""
 
 METHOD = f"""
 iterations = {PRESETS["quick"].iterations}
@@ -78,13 +81,29 @@ def write_data(folder: Path, views: int = 3, truth: bool = True) -> Path:
     return folder
 
 
-def _ball(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Alpha (H, W) and normals (H, W, 3) of the ball at the pixel centres; `pose` has OpenGL axes."""
+def write_open_data(folder: Path) -> Path:
+    """Eight views of the ball in front of a coloured sky, without alpha, with a region of interest."""
+    write_data(folder, views=8, truth=False)
+    for split in ("train", "test"):
+        for frame in json.loads((folder / f"transforms_{split}.json").read_text())["frames"]:
+            path = folder / f"{frame['file_path']}.png"
+            rgba, sky = read_png(path), 0.5 + 0.3 * _rays(np.array(frame["transform_matrix"]))
+            write_png(path, rgba[..., 3:] * rgba[..., :3] + (1 - rgba[..., 3:]) * sky)
+    (folder / REGION_FILE).write_text(json.dumps({"centre": REGION.centre, "radius": REGION.radius}))
+    return folder
+
+
+def _rays(pose: np.ndarray) -> np.ndarray:
+    """Directions (H, W, 3) through the pixel centres; `pose` has OpenGL axes."""
     offset = (np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL
     x, y = np.meshgrid(offset, -offset)
     ray = np.stack([x, y, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    origin = pose[:3, 3]
+    return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
+
+
+def _ball(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Alpha (H, W) and normals (H, W, 3) of the ball at the pixel centres; `pose` has OpenGL axes."""
+    ray, origin = _rays(pose), pose[:3, 3]
     along = ray @ origin
     discriminant = along**2 - origin @ origin + RADIUS**2
     hit = discriminant > 0
