@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mi_refgs.data.dataset import read_dataset as read_dataset
     from mi_refgs.data.readers import register as register_reader
     from mi_refgs.data.view import View as View
-    from mi_refgs.editing.options import Options as EditOptions
+    from mi_refgs.editing.edit import EditOptions as EditOptions
     from mi_refgs.errors import InputError as InputError
     from mi_refgs.evaluation.evaluate import evaluate as evaluate
     from mi_refgs.fitting.progress import Progress as Progress
@@ -68,7 +68,7 @@ _PUBLIC = {
     "Camera": ("splat.camera", "Camera"),
     "Channel": ("surfels.attributes", "Channel"),
     "Dataset": ("data.dataset", "Dataset"),
-    "EditOptions": ("editing.options", "Options"),
+    "EditOptions": ("editing.edit", "EditOptions"),
     "EnvironmentLight": ("shade.light.envmap", "EnvironmentLight"),
     "Frame": ("render.pipeline", "Frame"),
     "InputError": ("errors", "InputError"),

@@ -113,7 +113,7 @@ def view(text: str) -> int | Path:
 def run(args: argparse.Namespace) -> Result:
     """Edit."""
     from mi_refgs.editing import assignments
-    from mi_refgs.editing.expression import parse_truth
+    from mi_refgs.editing.expression import parse_condition
     from mi_refgs.formats.incoming import read_cameras
     from mi_refgs.io.images import write_png
     from mi_refgs.reconstruction.reconstruction import load
@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> Result:
     _require_free(args.output)
     assignments(args.set)  # what is no formula is said before the run is read, which takes seconds
     if args.where is not None:
-        parse_truth(args.where)
+        parse_condition(args.where)
     whole = load(args.run_folder, write=False)
     whole = replace(whole, provenance=whole.provenance.with_data(args.data))
     join = None if args.join is None else load(args.join, write=False)

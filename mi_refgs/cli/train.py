@@ -95,9 +95,9 @@ def run(args: argparse.Namespace) -> Result:
 
 def _watched(port: int) -> Bar:
     """The bar of a fit with a page; raises InputError as `refgs view` does."""
-    from mi_refgs.viewer.live import Live
+    from mi_refgs.viewer.training import TrainingViewer
 
-    return Live(HOST, port)
+    return TrainingViewer(HOST, port)
 
 
 def variant_of(variant: str | None, purpose: str | None) -> str | None:

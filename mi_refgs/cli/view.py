@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> Result:
 
     require_viser()
     require_free(args.host, args.port)
-    page = _page_of_run(args) if args.scene.is_dir() else _page_of_scene(args)
+    page = _serve_run(args) if args.scene.is_dir() else _serve_scene(args)
     say(f"open {page.url} in a browser; Ctrl-C ends it")
     try:
         page.loop.run()
@@ -55,18 +55,18 @@ def run(args: argparse.Namespace) -> Result:
     return Result({"url": page.url, "pictures": page.loop.pictures}, f"{page.loop.pictures} pictures shown")
 
 
-def _page_of_run(args: argparse.Namespace) -> Page:
+def _serve_run(args: argparse.Namespace) -> Page:
     from mi_refgs.runs.run import Run
-    from mi_refgs.viewer.view import page_of_run
+    from mi_refgs.viewer.serve import serve_run
 
-    return page_of_run(Run(args.scene), args.host, args.port, args.output, args.data, say)
+    return serve_run(Run(args.scene), args.host, args.port, args.output, args.data, say)
 
 
-def _page_of_scene(args: argparse.Namespace) -> Page:
+def _serve_scene(args: argparse.Namespace) -> Page:
     from mi_refgs.render.load_scene import load_scene
-    from mi_refgs.viewer.view import page_of_scene
+    from mi_refgs.viewer.serve import serve_scene
 
     if args.data is not None:
         raise InputError(f"--data: {args.data}: a scene has no data set; give the run, or drop --data")
     scene = load_scene(scene_file(args.scene), [])
-    return page_of_scene(scene, args.scene, args.host, args.port, args.output, say)
+    return serve_scene(scene, args.scene, args.host, args.port, args.output, say)

@@ -71,7 +71,7 @@ class Expression:
             return np.asarray(self.compute(values))
 
 
-def parse_truth(text: str, where: str = "--where") -> Expression:
+def parse_condition(text: str, where: str = "--where") -> Expression:
     """A comparison, or several; raises InputError, with `where` in the message, for anything else."""
     (found,) = _Parser(text, where).all(1)
     if not found.truth:

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
-from mi_refgs.editing.expression import parse_truth
+from mi_refgs.editing.expression import parse_condition
 from mi_refgs.editing.fields import Fields
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, read_mask
@@ -47,7 +47,7 @@ def select(scene: TrainedScene, selection: Selection) -> np.ndarray:
     chosen = np.ones(count, bool)
     position = scene.surfels.to_numpy()["position"].astype(np.float64)
     if selection.where is not None:
-        condition, fields = parse_truth(selection.where), Fields(scene)
+        condition, fields = parse_condition(selection.where), Fields(scene)
         fields.check(condition.names, "--where")
         chosen &= condition.of(fields)
     if selection.box is not None:

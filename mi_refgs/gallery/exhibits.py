@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mi_refgs.editing import Options
+    from mi_refgs.editing import EditOptions
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Exhibit:
     """A scene, and what is done to it."""
 
     caption: str
-    edits: Mapping[str, Options]  # by title: keywords of `Reconstruction.edit`, on materials alone
+    edits: Mapping[str, EditOptions]  # by title: keywords of `Reconstruction.edit`, on materials alone
     samples: int = 64  # a pixel of the path-traced pictures
 
 

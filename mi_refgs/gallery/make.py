@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs import methods
-from mi_refgs.editing import Options
+from mi_refgs.editing import EditOptions
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.evaluation.images import contact_sheet
@@ -158,7 +158,7 @@ def _pictures(name: str, exhibit: Exhibit, run: Reconstruction, out: Path, size:
     if not is_file(out / EDITS):
         made = {"as fitted": run}
         for title, how in exhibit.edits.items():
-            options: Options = {**how, "materials": True}
+            options: EditOptions = {**how, "materials": True}
             made[title] = run.edit(**options)
         rows = [{title: _shown(scene, view, size) for title, scene in made.items()} for view in EDIT_VIEWS]
         write_still(out / EDITS, contact_sheet(rows))

@@ -244,7 +244,7 @@ class Reconstruction:
         view: CameraLike = 0,
         split: str = "test",
         join: Reconstruction | str | Path | None = None,
-        **options: Unpack[editing.Options],
+        **options: Unpack[editing.EditOptions],
     ) -> Reconstruction:
         """The same with some surfels changed, as by `refgs edit`; `provenance.edits[-1]` then says how many.
 

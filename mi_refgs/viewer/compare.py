@@ -13,9 +13,9 @@ from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.io.images import to_8_bits
 from mi_refgs.render.display import displayed
-from mi_refgs.viewer.develop import PICTURE, Look, shown_planes, to_bytes
-from mi_refgs.viewer.drawable import Drawable, Sample
 from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, shown_planes, to_bytes
+from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
 
 AROUND = 0.12
 """Display-encoded brightness beside the two pictures."""
@@ -33,18 +33,18 @@ class Compared:
     data: Dataset
     tell: Callable[[float | None], None]  # told the PSNR of each picture that is drawn, None of a variable
 
-    def picture(self, drawable: Drawable, look: Look, window: tuple[int, int]) -> np.ndarray:
+    def picture(self, drawable: ViewerScene, look: DisplayOptions, window: tuple[int, int]) -> np.ndarray:
         """Both, as large as they fit into a window: 8-bit RGB of the window's shape."""
         view = self.view
         frame_of = getattr(drawable, "frame", None)
         truth = np.clip(view.displayed, 0, 1)
-        if look.what == PICTURE and frame_of is not None:
+        if look.what == IMAGE and frame_of is not None:
             shown = displayed(frame_of(view.camera()), self.data.background, self.data.is_linear_radiance)
             ours = image_array(shown, view.height, view.width)
             self.tell(metrics.psnr(ours, truth))
             drawn = to_8_bits(ours)
         else:
-            sample = Sample(
+            sample = SampleRequest(
                 Pose.of_view(view), view.width, view.height, look, settled=True, exact=view.camera()
             )
             self.tell(None)

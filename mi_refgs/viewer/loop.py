@@ -18,41 +18,41 @@ import drjit as dr
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.viewer import quality
+from mi_refgs.viewer import resolution
 from mi_refgs.viewer.compare import Compared
-from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
-from mi_refgs.viewer.drawable import Drawable, Sample, Sampled
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.quality import COARSE, DONE, LARGE, NOTHING, SHOWN_AT
+from mi_refgs.viewer.resolution import COARSE, DONE, LARGE, NOTHING, SHOWN_AT
+from mi_refgs.viewer.tonemap import DisplayOptions, shown_planes, to_bytes
+from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
 
 FAR = 160.0
 """Depth that pages can show at most, scene units: viser packs it into 24 bits of 1e-5."""
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class DeliveredImage:
     """A picture for a page."""
 
     image: np.ndarray  # (H, W, 3) uint8
-    shown: int  # how good it is, from quality.COARSE to quality.DONE
+    shown: int  # how good it is, from resolution.COARSE to resolution.DONE
     seconds: float  # that its last sample took
     depth: np.ndarray | None = None  # (H, W) float32, where the page asked for it
     samples: int = 1  # of a pixel
 
 
 @dataclass(eq=False)
-class Visitor:
+class Client:
     """One page: what it looks at, and how far its picture is."""
 
-    deliver: Callable[[Shown], None]
+    deliver: Callable[[DeliveredImage], None]
     pose: Pose | None = None
     window: tuple[int, int] = (0, 0)  # pixels
-    look: Look = field(default_factory=Look)
-    largest: int = quality.FINEST  # rung while nothing moves, at most
+    look: DisplayOptions = field(default_factory=DisplayOptions)
+    largest: int = resolution.FINEST  # rung while nothing moves, at most
     fixed: int | None = None  # rung while something moves; None: by the time that pictures take
     depth: bool = False  # whether it wants depth
     compared: Compared | None = None  # a test view that it shows beside its picture
-    side: int = quality.COARSEST  # rung of the next small picture
+    side: int = resolution.COARSEST  # rung of the next small picture
     changed: float = -math.inf  # when its view or the scene changed last
     version: int = 0  # of both
     shown: int = DONE
@@ -62,15 +62,15 @@ class Visitor:
         """Pixels of a rung in the shape of its window; if they are `square`, in exactly that shape."""
         width, height = self.window
         exact = max(width, 1) / max(height, 1)
-        return quality.size_of(side, exact if square else quality.shape_of(width, height))
+        return resolution.size_of(side, exact if square else resolution.shape_of(width, height))
 
 
-class Loop:
+class RenderLoop:
     """Draws a scene for visitors; `step` and `run` belong to the thread that renders, the rest to any."""
 
-    def __init__(self, drawable: Drawable, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, drawable: ViewerScene, clock: Callable[[], float] = time.monotonic) -> None:
         self.drawable, self.clock = drawable, clock
-        self.visitors: dict[int, Visitor] = {}
+        self.visitors: dict[int, Client] = {}
         self.failed: Callable[[str], None] = lambda message: None  # told of what fails, in one sentence
         self.pictures = 0  # that were sent
         self.smooth = True  # whether pictures that stay are averaged over samples
@@ -114,11 +114,11 @@ class Loop:
                 self._restart(visitor)
             self._wake.notify()
 
-    def _restart(self, visitor: Visitor) -> None:
+    def _restart(self, visitor: Client) -> None:
         visitor.changed, visitor.shown, visitor.sums = self.clock(), NOTHING, []
         visitor.version += 1
 
-    def enter(self, number: int, visitor: Visitor) -> None:
+    def enter(self, number: int, visitor: Client) -> None:
         """A page is open."""
         with self._wake:
             self.visitors[number] = visitor
@@ -157,7 +157,7 @@ class Loop:
             self._guarded(note)
         now = self.clock()
         waiting = [
-            (quality.due(v.shown if self.smooth or v.shown < LARGE else DONE, now - v.changed), v.shown, v)
+            (resolution.due(v.shown if self.smooth or v.shown < LARGE else DONE, now - v.changed), v.shown, v)
             for v in tuple(self.visitors.values())
             if v.pose is not None
         ]
@@ -187,7 +187,7 @@ class Loop:
             return True
         return False
 
-    def _advance(self, visitor: Visitor) -> None:
+    def _advance(self, visitor: Client) -> None:
         """Draw a visitor's next sample and send the picture, unless it is old by then."""
         with self._wake:
             version, shown, pose, compared = visitor.version, visitor.shown, visitor.pose, visitor.compared
@@ -197,7 +197,7 @@ class Loop:
         if compared is not None:
             image, depth, reached = compared.picture(self.drawable, visitor.look, visitor.window), None, DONE
         else:
-            still = quality.still_side(*visitor.window, visitor.largest)
+            still = resolution.still_side(*visitor.window, visitor.largest)
             moving = visitor.fixed or min(visitor.side, still)
             side = moving if shown == NOTHING else still
             reached = shown + 1 if shown >= LARGE else (LARGE if side >= still else COARSE)
@@ -215,7 +215,7 @@ class Loop:
         taken = self.clock() - begin
         with self._wake:
             if compared is None and shown == NOTHING and visitor.fixed is None:
-                visitor.side = quality.moving_side(side, taken, still)
+                visitor.side = resolution.moving_side(side, taken, still)
             if visitor.version == version:
                 visitor.shown, visitor.sums = reached, sums if LARGE < reached < DONE else []
             elif shown != NOTHING:  # a small picture is shown all the same: else nothing is while it moves
@@ -223,18 +223,18 @@ class Loop:
         if image is not None:
             self.pictures += 1
             samples = 1 if compared is not None else max(reached - LARGE, 1)
-            visitor.deliver(Shown(image, reached, taken, depth, samples))
+            visitor.deliver(DeliveredImage(image, reached, taken, depth, samples))
 
-    def _sample(self, visitor: Visitor, pose: Pose, side: int, reached: int) -> Sample:
+    def _sample(self, visitor: Client, pose: Pose, side: int, reached: int) -> SampleRequest:
         width, height = visitor.size(side, self.drawable.square_pixels)
         aspect = visitor.window[0] / max(visitor.window[1], 1)
         index = max(reached - LARGE - 1, 0)
-        offset = quality.offsets()[index] if reached > LARGE else (0.0, 0.0)
+        offset = resolution.offsets()[index] if reached > LARGE else (0.0, 0.0)
         pose = replace(pose, aspect=aspect)
         settled = reached >= LARGE
-        return Sample(pose, width, height, visitor.look, offset, index, settled, depth=visitor.depth)
+        return SampleRequest(pose, width, height, visitor.look, offset, index, settled, depth=visitor.depth)
 
-    def _depth(self, visitor: Visitor, sampled: Sampled, sample: Sample) -> np.ndarray | None:
+    def _depth(self, visitor: Client, sampled: SampleResult, sample: SampleRequest) -> np.ndarray | None:
         if not visitor.depth or sampled.depth is None:
             return None
         depth = dr.select(sampled.depth > 0, sampled.depth, FAR) + dr.zeros(

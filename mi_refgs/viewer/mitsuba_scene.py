@@ -13,12 +13,11 @@ from mi_refgs.errors import InputError
 from mi_refgs.plugins.aovs import suffixes
 from mi_refgs.plugins.surroundings import Around
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of, planes_of
-from mi_refgs.viewer.drawable import Sample, Sampled
-from mi_refgs.viewer.fine import fine_planes
-from mi_refgs.viewer.fitted import around_box, box_of, variables_of
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.quality import SAMPLES
+from mi_refgs.viewer.reconstruction_view import around_box, box_of, variables_of
+from mi_refgs.viewer.resolution import SAMPLES
+from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, backdrops_of, planes_of
+from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, fine_planes
 
 CLIP = 1e-3, 1e4
 """Near and far plane, in radii of the scene."""
@@ -44,7 +43,7 @@ class MitsubaScene:
             self.variables = variables_of(integrator.surfels, integrator.shading)
         else:
             prefixes = dict.fromkeys(name.partition(".")[0] for name in integrator.aov_names())
-            self.variables = (PICTURE, *(name for name in prefixes if name in suffixes()))
+            self.variables = (IMAGE, *(name for name in prefixes if name in suffixes()))
         self._around = integrator.around if self._surfels else ALONE
         surrounded = any(part is not None for part in vars(self._around).values())
         self.backdrops = backdrops_of(surrounded, light=False)
@@ -90,22 +89,22 @@ class MitsubaScene:
         near = float(params["near_clip"]) if self._surfels else 0.0
         return Pose(matrix, 2 * math.atan(across * height / width), width / height, near)
 
-    def draw(self, sample: Sample) -> Sampled:
-        """See `Drawable`."""
+    def draw(self, sample: SampleRequest) -> SampleResult:
+        """See `ViewerScene`."""
         if self._surfels:
             camera, integrator = sample.camera(), self.scene.integrator()
-            around = ALONE if sample.look.alone else self._around
+            around = ALONE if sample.look.object_only else self._around
             with dr.suspend_grad():
                 frame = integrator.frame(self.scene, False, sample.asked, around, camera)
-                return Sampled(planes_of(frame, camera, sample.look, None), frame.depth)
-        return Sampled(
+                return SampleResult(planes_of(frame, camera, sample.look, None), frame.depth)
+        return SampleResult(
             self._planes(
                 sample.pose, sample.width, sample.height, sample.look, sample.index, 1, sample.offset
             )
         )
 
-    def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
-        """See `Drawable`."""
+    def fine(self, pose: Pose, width: int, height: int, look: DisplayOptions) -> list[Any]:
+        """See `ViewerScene`."""
         if self._surfels:
             of = self.scene.integrator()
             count = of.around.count(of.surfels)
@@ -117,7 +116,7 @@ class MitsubaScene:
         pose: Pose,
         width: int,
         height: int,
-        look: Look,
+        look: DisplayOptions,
         seed: int,
         spp: int,
         offset: tuple[float, float] = (0.0, 0.0),
@@ -147,7 +146,7 @@ class MitsubaScene:
         names = [channel.name for channel in sensor.film().bitmap().struct_()]
         index = dr.arange(mi.UInt32, width * height) * len(names)
         planes = {name: dr.gather(mi.Float, image.array, index + i) for i, name in enumerate(names)}
-        if look.what == PICTURE:
+        if look.what == IMAGE:
             return [planes[name] for name in "RGBA"]
         alpha = planes["A"]
         values = [planes[f"{look.what}.{suffix}"] for suffix in suffixes()[look.what]]

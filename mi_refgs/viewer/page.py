@@ -1,4 +1,4 @@
-"""The page: a viser server whose background is drawn by a `Loop`, and the controls beside it."""
+"""The page: a viser server whose background is drawn by a `RenderLoop`, and the controls beside it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.viewer import quality
-from mi_refgs.viewer.develop import Look
-from mi_refgs.viewer.drawable import Drawable
-from mi_refgs.viewer.loop import Loop, Shown, Visitor
+from mi_refgs.viewer import resolution
+from mi_refgs.viewer.loop import Client, DeliveredImage, RenderLoop
 from mi_refgs.viewer.pose import Pose, up_of
+from mi_refgs.viewer.tonemap import DisplayOptions
+from mi_refgs.viewer.viewer_scene import ViewerScene
 
 MOVING_JPEG, STILL_JPEG = 70, 92
 """JPEG qualities of pictures that are soon replaced, and of those that stay until a smooth one, a PNG."""
@@ -83,7 +83,7 @@ class Page:
 
     def __init__(
         self,
-        drawable: Drawable,
+        drawable: ViewerScene,
         views: Views,
         title: str,
         host: str,
@@ -98,13 +98,13 @@ class Page:
         require_free(host, port)
         self.drawable, self.views, self.views_folder = drawable, views, views_folder
         self.begin = begin
-        self.loop = Loop(drawable)
+        self.loop = RenderLoop(drawable)
         self.loop.failed = self.complain
-        self.look = Look(backdrop=drawable.backdrops[0], depths=self._depths())
+        self.look = DisplayOptions(backdrop=drawable.backdrops[0], depths=self._depths())
         self.fixed: int | None = None
-        self.largest = quality.FINEST
+        self.largest = resolution.FINEST
         self.depth = False
-        self.side = quality.COARSEST
+        self.side = resolution.COARSEST
         self.status: Callable[[str], None] = lambda text: None
         self.looked: Callable[[], None] = lambda: None  # `look` has changed
         self.moved: Callable[[int, Pose], None] = lambda number, pose: None
@@ -168,7 +168,7 @@ class Page:
         self.server.on_client_disconnect(self._left)
 
     async def _connected(self, client: Any) -> None:
-        visitor = Visitor(lambda shown: self._deliver(client, shown))
+        visitor = Client(lambda shown: self._deliver(client, shown))
         visitor.look, visitor.fixed, visitor.largest = self.look, self.fixed, self.largest
         visitor.depth, visitor.side = self.depth, self.side
         self.loop.enter(client.client_id, visitor)
@@ -189,12 +189,12 @@ class Page:
         self.moved(number, pose)
         self.loop.look(number, pose, window)
 
-    def _deliver(self, client: Any, shown: Shown) -> None:
-        smooth = shown.shown == quality.DONE
+    def _deliver(self, client: Any, shown: DeliveredImage) -> None:
+        smooth = shown.shown == resolution.DONE
         client.scene.set_background_image(
             shown.image,
             format="png" if smooth else "jpeg",
-            jpeg_quality=MOVING_JPEG if shown.shown == quality.COARSE else STILL_JPEG,
+            jpeg_quality=MOVING_JPEG if shown.shown == resolution.COARSE else STILL_JPEG,
             depth=shown.depth,
         )
         client.flush()
@@ -213,7 +213,7 @@ class Page:
     # ---------------- what controls use ----------------
 
     def set(self, **fields: Any) -> None:
-        """Set what all pages, and those to come, are shown: `fixed`, `largest`, `depth` or fields of Look."""
+        """Set what every page displays: `fixed`, `largest`, `depth` or fields of `DisplayOptions`."""
         own = {name: value for name, value in fields.items() if name in ("fixed", "largest", "depth")}
         for name, value in own.items():
             setattr(self, name, value)

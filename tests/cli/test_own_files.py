@@ -21,7 +21,7 @@ from mi_refgs.io.ownership import RECORD, OutputFolder
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.relighting.relight import relight
 from mi_refgs.runs.run import RUN_FILES, Run
-from mi_refgs.viewer.controls.saving import write_view
+from mi_refgs.viewer.saving import write_view
 from tests.helpers import refused
 from tests.scenes.tiny import train_command
 
@@ -216,7 +216,7 @@ def run(case: Case, place: Place) -> int:
     planes = [np.full(4, 0.5, np.float32)] * 4
     drawable: Any = SimpleNamespace(fine=lambda *_: planes)
     pose: Any = SimpleNamespace(transforms=lambda *_: {})
-    look: Any = SimpleNamespace(what="picture", exposure=0.0)
+    look: Any = SimpleNamespace(what="image", exposure=0.0)
     for suffix in (".json", ".exr"):
         write_view(drawable, pose, (2, 2), look, place / "views", suffix)
     return 0

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mi_refgs.editing import assignments
-from mi_refgs.editing.expression import MAX_DEPTH, parse_numbers, parse_truth
+from mi_refgs.editing.expression import MAX_DEPTH, parse_condition, parse_numbers
 from mi_refgs.errors import InputError
 
 VALUES = {
@@ -50,7 +50,7 @@ def by_python(text: str, row: int) -> Any:
     ],
 )
 def test_values_are_those_of_python(text: str) -> None:
-    found = np.broadcast_to(parse_truth(text).of(VALUES), 4)
+    found = np.broadcast_to(parse_condition(text).of(VALUES), 4)
     assert found.dtype == bool
     assert found.tolist() == [by_python(text, row) for row in range(4)]
 
@@ -64,8 +64,8 @@ def test_numbers_with_commas() -> None:
 
 def test_what_is_not_defined_compares_as_false() -> None:
     for text in ("a / 0 * 0 > 0", "sqrt(-1) < 1", "(0/0) == (0/0)", "10**10**10 < 1"):
-        assert not np.any(parse_truth(text).of(VALUES)), text
-    assert np.all(parse_truth("10**10**10 > 1").of(VALUES))
+        assert not np.any(parse_condition(text).of(VALUES)), text
+    assert np.all(parse_condition("10**10**10 > 1").of(VALUES))
 
 
 HOSTILE = [
@@ -129,16 +129,16 @@ HOSTILE = [
 @pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
 def test_hostile_expressions_are_one_sentence(text: str) -> None:
     with pytest.raises(InputError) as caught:
-        parse_truth(text)
+        parse_condition(text)
     assert str(caught.value).startswith("--where: ") and "\n" not in str(caught.value)
     assert len(str(caught.value)) < 300
 
 
 def test_long_chains_and_nearly_too_deep_ones_are_computed() -> None:
-    assert np.all(parse_truth("+".join(["1"] * 900) + " == 900").of(VALUES))
+    assert np.all(parse_condition("+".join(["1"] * 900) + " == 900").of(VALUES))
     inside = MAX_DEPTH - 1
-    assert np.all(parse_truth("(" * inside + "a" + ")" * inside + " == a").of(VALUES))
-    assert np.all(parse_truth(" and ".join(["a == a"] * 150)).of(VALUES))
+    assert np.all(parse_condition("(" * inside + "a" + ")" * inside + " == a").of(VALUES))
+    assert np.all(parse_condition(" and ".join(["a == a"] * 150)).of(VALUES))
 
 
 WORDS = ["a", "b", "c.x", "1", "2.5", ".5", "1e3", "(", ")", ",", "+", "-", "*", "/", "**", "<", "<=", ">"]
@@ -147,7 +147,7 @@ WORDS += [">=", "==", "!=", "and", "or", "not", "abs", "min(", "max(", "sqrt(", 
 
 @given(st.lists(st.sampled_from(WORDS), max_size=25).map(" ".join) | st.text(max_size=60))
 def test_any_text_is_a_value_of_every_surfel_or_a_sentence(text: str) -> None:
-    for parse in (parse_truth, parse_numbers):
+    for parse in (parse_condition, parse_numbers):
         try:
             parsed = parse(text)
         except InputError as error:

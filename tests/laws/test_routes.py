@@ -38,12 +38,12 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer import fine
-from mi_refgs.viewer.develop import PICTURE, SURROUNDINGS, Look, seen_of
-from mi_refgs.viewer.drawable import Drawable, Sample
-from mi_refgs.viewer.fitted import Fitted
+from mi_refgs.viewer import viewer_scene
 from mi_refgs.viewer.mitsuba_scene import MitsubaScene
 from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.reconstruction_view import ReconstructionView
+from mi_refgs.viewer.tonemap import BACKGROUND, IMAGE, DisplayOptions, seen_of
+from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
 from tests.plugins.test_integrator_surroundings import behind, far_channels
 from tests.render.test_scene_xml import OTHER
 from tests.scenes.integrator import raw_channels, sky
@@ -57,7 +57,6 @@ TOLERANCE = 1e-5
 
 Maps = dict[str, np.ndarray]
 """The image (H, W, 4) as IMAGE, linear and premultiplied, and AOVs (H, W, C) by type."""
-IMAGE = "image"
 
 
 # ---------------- what is rendered ----------------
@@ -202,7 +201,7 @@ def by_command_with_a_camera(case: Case) -> Maps:
 
 
 def by_viewer_of_a_run(case: Case) -> Maps:
-    return of_viewer(case, Fitted(case.made.trained))
+    return of_viewer(case, ReconstructionView(case.made.trained))
 
 
 def by_viewer_of_a_scene(case: Case) -> Maps:
@@ -264,24 +263,24 @@ def of_layers(layers: dict[str, np.ndarray], names: Sequence[str]) -> Maps:
     return {name: np.stack(values, axis=-1) for name, values in found.items()}
 
 
-def of_viewer(case: Case, drawable: Drawable) -> Maps:
+def of_viewer(case: Case, drawable: ViewerScene) -> Maps:
     """The planes that a page shows at one sample per pixel, and those that it saves at several."""
     view = Camera.from_sensor(sensor())
     pose = Pose(view.pose(), 2 * np.arctan(HEIGHT / 2 / -view.fy[0]), WIDTH / HEIGHT, NEAR)
     around = not case.alone and case.made.trained.surroundings is not None
-    backdrop = SURROUNDINGS if around else "white"
+    backdrop = BACKGROUND if around else "white"
     assert backdrop in drawable.backdrops
     found = {}
-    pictures = [PICTURE, *drawable.variables[1 + case.part :: 3]]
+    pictures = [IMAGE, *drawable.variables[1 + case.part :: 3]]
     for what in pictures:
-        look = Look(what, backdrop=backdrop)
+        look = DisplayOptions(what, backdrop=backdrop)
         if case.samples == 1:
-            shown = drawable.draw(Sample(pose, WIDTH, HEIGHT, look, settled=True)).planes
+            shown = drawable.draw(SampleRequest(pose, WIDTH, HEIGHT, look, settled=True)).planes
         else:
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(fine, "GRID", round(case.samples**0.5))
+                patch.setattr(viewer_scene, "GRID", round(case.samples**0.5))
                 shown = drawable.fine(pose, WIDTH, HEIGHT, look)
-        found[IMAGE if what == PICTURE else what] = image_array(seen_of(shown, look), HEIGHT, WIDTH)
+        found[what] = image_array(seen_of(shown, look), HEIGHT, WIDTH)
     return case.of_whole(found)
 
 

@@ -30,19 +30,19 @@ from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer import quality
+from mi_refgs.viewer import resolution
 from mi_refgs.viewer.compare import AROUND, GAP, side_by_side
 from mi_refgs.viewer.controls.light import light_of
-from mi_refgs.viewer.controls.saving import write_view
-from mi_refgs.viewer.develop import Look, shown_planes, to_bytes
-from mi_refgs.viewer.drawable import Drawable, Sample, Sampled
 from mi_refgs.viewer.edits import mean_of, selected, with_material
-from mi_refgs.viewer.fitted import Fitted
-from mi_refgs.viewer.live import Training, TrainingPage, read_log
-from mi_refgs.viewer.loop import Loop, Shown, Visitor
+from mi_refgs.viewer.loop import Client, DeliveredImage, RenderLoop
 from mi_refgs.viewer.mitsuba_scene import MitsubaScene
 from mi_refgs.viewer.pose import Pose, page_rotation
-from mi_refgs.viewer.quality import COARSE, DONE, LARGE, NOTHING
+from mi_refgs.viewer.reconstruction_view import ReconstructionView
+from mi_refgs.viewer.resolution import COARSE, DONE, LARGE, NOTHING
+from mi_refgs.viewer.saving import write_view
+from mi_refgs.viewer.tonemap import DisplayOptions, shown_planes, to_bytes
+from mi_refgs.viewer.training import Training, TrainingPage, read_log
+from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
 from tests.helpers import ROOT
 from tests.scenes.known import CLAY, known_scene
 from tests.scenes.tiny import SETTINGS
@@ -68,46 +68,46 @@ def test_the_name_of_an_uploaded_light_is_nothing_but_a_name(name: str) -> None:
 
 
 def test_sizes_are_few_and_of_the_area_that_they_are_named_for() -> None:
-    assert quality.size_of(800, 1.0) == (800, 800)
-    for side, shape in itertools.product(quality.SIDES, quality.SHAPES):
-        width, height = quality.size_of(side, shape)
-        assert width % quality.MULTIPLE == height % quality.MULTIPLE == 0
+    assert resolution.size_of(800, 1.0) == (800, 800)
+    for side, shape in itertools.product(resolution.SIDES, resolution.SHAPES):
+        width, height = resolution.size_of(side, shape)
+        assert width % resolution.MULTIPLE == height % resolution.MULTIPLE == 0
         assert width * height == pytest.approx(side * side, rel=0.04)
         assert width / height == pytest.approx(shape, rel=0.04)
 
 
 def test_a_window_gets_the_nearest_shape_and_the_nearest_area() -> None:
-    assert [quality.shape_of(*w) for w in ((1280, 800), (1920, 1000), (800, 800), (400, 900))] == [
+    assert [resolution.shape_of(*w) for w in ((1280, 800), (1920, 1000), (800, 800), (400, 900))] == [
         1.6,
         1.6,
         1.0,
         0.625,
     ]
-    assert quality.still_side(800, 800) == 800
-    assert quality.still_side(300, 200) == 283
-    assert quality.still_side(3840, 2160) == quality.FINEST
-    assert quality.still_side(3840, 2160, 400) == 400
+    assert resolution.still_side(800, 800) == 800
+    assert resolution.still_side(300, 200) == 283
+    assert resolution.still_side(3840, 2160) == resolution.FINEST
+    assert resolution.still_side(3840, 2160, 400) == 400
 
 
 def test_moving_pictures_get_as_large_as_there_is_time_for() -> None:
-    assert quality.moving_side(283, 0.1, 1131) == 200
-    assert quality.moving_side(283, 0.03, 1131) == 283
-    assert quality.moving_side(283, 0.005, 1131) == 400
-    assert quality.moving_side(quality.COARSEST, 9.0, 1131) == quality.COARSEST
-    assert quality.moving_side(566, 0.001, 566) == 566
+    assert resolution.moving_side(283, 0.1, 1131) == 200
+    assert resolution.moving_side(283, 0.03, 1131) == 283
+    assert resolution.moving_side(283, 0.005, 1131) == 400
+    assert resolution.moving_side(resolution.COARSEST, 9.0, 1131) == resolution.COARSEST
+    assert resolution.moving_side(566, 0.001, 566) == 566
 
 
 def test_pictures_are_due_at_once_then_when_it_is_still_then_until_they_are_smooth() -> None:
-    assert quality.due(NOTHING, 0.0) == 0
-    assert quality.due(COARSE, 0.05) == pytest.approx(quality.STILL_AFTER - 0.05)
-    assert quality.due(COARSE, 1.0) == 0
-    assert quality.due(LARGE, 0.1) == pytest.approx(quality.SMOOTH_AFTER - 0.1)
-    assert quality.due(LARGE + 3, 1.0) == 0
-    assert quality.due(DONE, 99.0) == math.inf
+    assert resolution.due(NOTHING, 0.0) == 0
+    assert resolution.due(COARSE, 0.05) == pytest.approx(resolution.STILL_AFTER - 0.05)
+    assert resolution.due(COARSE, 1.0) == 0
+    assert resolution.due(LARGE, 0.1) == pytest.approx(resolution.SMOOTH_AFTER - 0.1)
+    assert resolution.due(LARGE + 3, 1.0) == 0
+    assert resolution.due(DONE, 99.0) == math.inf
 
 
 def test_samples_are_a_raster_of_which_each_four_lie_in_all_quarters() -> None:
-    places = np.array(quality.offsets())
+    places = np.array(resolution.offsets())
     grid = (np.arange(4) + 0.5) / 4 - 0.5
     assert {tuple(p) for p in places} == set(itertools.product(grid, grid))
     for four in places.reshape(4, 4, 2):
@@ -162,24 +162,24 @@ def test_an_offset_moves_the_sample_that_way() -> None:
 class Plain:
     """A scene of one grey, which says what it was asked for."""
 
-    variables: tuple[str, ...] = ("picture",)
+    variables: tuple[str, ...] = ("image",)
     backdrops: tuple[str, ...] = ("white",)
     centre, radius, square_pixels = np.zeros(3), 1.0, False
 
     def __init__(self) -> None:
-        self.samples: list[Sample] = []
+        self.samples: list[SampleRequest] = []
         self.grey = 0.25
         self.during: Any = None
 
     def fine(self, *_: Any) -> list[Any]:
         raise NotImplementedError
 
-    def draw(self, sample: Sample) -> Sampled:
+    def draw(self, sample: SampleRequest) -> SampleResult:
         self.samples.append(sample)
         if self.during is not None:
             self.during()
         one = mi.Float(1)
-        return Sampled([one * self.grey] * 3 + [one])
+        return SampleResult([one * self.grey] * 3 + [one])
 
 
 class Clock:
@@ -192,11 +192,11 @@ class Clock:
 
 
 @pytest.fixture
-def running() -> Iterator[tuple[Loop, Plain, Clock, list[Shown]]]:
+def running() -> Iterator[tuple[RenderLoop, Plain, Clock, list[DeliveredImage]]]:
     """A loop with one visitor, who looks at nothing yet."""
     drawable, clock, seen = Plain(), Clock(), []  # type: ignore[var-annotated]
-    loop = Loop(drawable, clock)
-    loop.enter(7, Visitor(seen.append))
+    loop = RenderLoop(drawable, clock)
+    loop.enter(7, Client(seen.append))
     yield loop, drawable, clock, seen
 
 
@@ -208,18 +208,21 @@ def test_the_loop_waits_draws_small_then_large_then_smooth(running: Any) -> None
     assert loop.step() == math.inf
     loop.look(7, POSE, (640, 400))
     assert loop.step() == 0
-    assert loop.step() == pytest.approx(quality.STILL_AFTER)
-    clock.now += quality.STILL_AFTER + 1e-6
+    assert loop.step() == pytest.approx(resolution.STILL_AFTER)
+    clock.now += resolution.STILL_AFTER + 1e-6
     assert loop.step() == 0
-    assert loop.step() == pytest.approx(quality.SMOOTH_AFTER - quality.STILL_AFTER, abs=1e-5)
+    assert loop.step() == pytest.approx(resolution.SMOOTH_AFTER - resolution.STILL_AFTER, abs=1e-5)
     clock.now += 1
-    for _ in range(quality.SAMPLES):
+    for _ in range(resolution.SAMPLES):
         assert loop.step() == 0
     assert loop.step() == math.inf
     assert [s.shown for s in seen] == [COARSE, LARGE, LARGE + 4, DONE]
-    small, large = quality.size_of(quality.COARSEST, 1.6), quality.size_of(quality.still_side(640, 400), 1.6)
+    small, large = (
+        resolution.size_of(resolution.COARSEST, 1.6),
+        resolution.size_of(resolution.still_side(640, 400), 1.6),
+    )
     assert [s.image.shape[1::-1] for s in seen] == [small, large, large, large]
-    assert [sample.offset for sample in drawable.samples[2:]] == list(quality.offsets())
+    assert [sample.offset for sample in drawable.samples[2:]] == list(resolution.offsets())
     assert [sample.settled for sample in drawable.samples] == [False] + [True] * 17
 
 
@@ -300,7 +303,7 @@ def test_a_failure_is_told_and_the_others_go_on(running: Any, capsys: pytest.Cap
     """Of a note and of a picture; a picture that fails is tried again only after a change."""
     loop, drawable, _, seen = running
     told: list[str] = []
-    other: list[Shown] = []
+    other: list[DeliveredImage] = []
     loop.failed = told.append
 
     def broken() -> None:
@@ -315,7 +318,7 @@ def test_a_failure_is_told_and_the_others_go_on(running: Any, capsys: pytest.Cap
     assert all(message.startswith("out of memory; ") and "\n" not in message for message in told)
     assert capsys.readouterr().err.count("RuntimeError: out of memory\nand much more") == 2
     drawable.during = None
-    loop.enter(8, Visitor(other.append))
+    loop.enter(8, Client(other.append))
     loop.look(8, POSE, (640, 400))
     loop.step()
     assert (seen, [s.shown for s in other]) == ([], [COARSE])
@@ -340,11 +343,11 @@ def test_a_picture_that_fails_after_a_change_is_drawn_anew(running: Any) -> None
 
 def test_who_sees_least_goes_first_and_who_left_is_forgotten(running: Any) -> None:
     loop, _, clock, seen = running
-    other: list[Shown] = []
+    other: list[DeliveredImage] = []
     loop.look(7, POSE, (640, 400))
     loop.step()
     clock.now += 1
-    loop.enter(8, Visitor(other.append))
+    loop.enter(8, Client(other.append))
     loop.look(8, POSE, (640, 400))
     loop.step()
     assert (len(seen), len(other)) == (1, 1)
@@ -362,17 +365,17 @@ FROM_THE_FRONT = np.array([0.5**0.5, -(0.5**0.5), 0, 0])
 """Towards +y, z up: a page's camera looks along +z, y down, when it is not turned."""
 
 
-def shown(drawable: Drawable, look: Look, size: int = 40) -> np.ndarray:
+def shown(drawable: ViewerScene, look: DisplayOptions, size: int = 40) -> np.ndarray:
     """A picture of the tiny scene from a side."""
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.0)
-    sample = Sample(pose, size, size, look, settled=True)
+    sample = SampleRequest(pose, size, size, look, settled=True)
     return to_bytes(shown_planes(drawable.draw(sample).planes, look), size, size).astype(int)
 
 
 def test_every_variable_that_a_scene_has_is_drawn(scene: TrainedScene) -> None:
-    drawable = Fitted(scene)
+    drawable = ReconstructionView(scene)
     assert drawable.variables == (
-        "picture",
+        "image",
         "albedo",
         "metallic",
         "roughness",
@@ -385,34 +388,34 @@ def test_every_variable_that_a_scene_has_is_drawn(scene: TrainedScene) -> None:
         "indirect",
     )
     for name in drawable.variables:
-        picture = shown(drawable, Look(name, depths=(2.0, 4.0)))
+        picture = shown(drawable, DisplayOptions(name, depths=(2.0, 4.0)))
         assert picture.shape == (40, 40, 3), name
         assert name == "indirect" or np.ptp(picture) > 0, name  # the balls have no such channel
 
 
 def test_the_light_turns_by_the_angle_that_is_asked_for(scene: TrainedScene) -> None:
-    drawable = Fitted(scene)
-    before = shown(drawable, Look())
+    drawable = ReconstructionView(scene)
+    before = shown(drawable, DisplayOptions())
     drawable.set_turn(90)
     # Directions of the world are turned back by the angle before the map is asked.
     x = drawable.light.radiance(mi.Vector3f(0, 1, 0)).numpy()  # type: ignore[union-attr]
     assert np.allclose(x, scene.light.prefilter().radiance(mi.Vector3f(1, 0, 0)).numpy(), rtol=1e-4)  # type: ignore[union-attr]
-    assert np.abs(shown(drawable, Look()) - before).max() > 3
+    assert np.abs(shown(drawable, DisplayOptions()) - before).max() > 3
     drawable.set_turn(0)
-    assert np.array_equal(shown(drawable, Look()), before)
+    assert np.array_equal(shown(drawable, DisplayOptions()), before)
     drawable.set_light(EnvironmentLight.constant(3.0, 8))
-    assert np.abs(shown(drawable, Look()) - before).max() > 3
+    assert np.abs(shown(drawable, DisplayOptions()) - before).max() > 3
     drawable.set_light(None)
-    assert np.array_equal(shown(drawable, Look()), before)
+    assert np.array_equal(shown(drawable, DisplayOptions()), before)
 
 
 def test_materials_alone_are_those_of_relight_and_changes_stay_on_them(scene: TrainedScene) -> None:
-    drawable = Fitted(scene)
-    before = shown(drawable, Look())
+    drawable = ReconstructionView(scene)
+    before = shown(drawable, DisplayOptions())
     drawable.set_relit(True)
-    again = Fitted(relightable(scene))
-    assert np.array_equal(shown(drawable, Look()), shown(again, Look()))
-    assert not np.array_equal(shown(drawable, Look()), before)
+    again = ReconstructionView(relightable(scene))
+    assert np.array_equal(shown(drawable, DisplayOptions()), shown(again, DisplayOptions()))
+    assert not np.array_equal(shown(drawable, DisplayOptions()), before)
 
     def black(given: TrainedScene) -> TrainedScene:
         raw = given.surfels.to_numpy()
@@ -420,11 +423,11 @@ def test_materials_alone_are_those_of_relight_and_changes_stay_on_them(scene: Tr
         return replace(given, surfels=Surfels.from_numpy(raw))
 
     drawable.set_changes([black])
-    assert shown(drawable, Look("albedo", backdrop="black")).max() == 0
+    assert shown(drawable, DisplayOptions("albedo", backdrop="black")).max() == 0
     drawable.set_relit(False)
-    assert shown(drawable, Look("albedo", backdrop="black")).max() == 0
+    assert shown(drawable, DisplayOptions("albedo", backdrop="black")).max() == 0
     drawable.set_changes([])
-    assert np.array_equal(shown(drawable, Look()), before)
+    assert np.array_equal(shown(drawable, DisplayOptions()), before)
 
 
 def test_a_slider_sets_a_material_of_what_is_selected(scene: TrainedScene) -> None:
@@ -434,19 +437,28 @@ def test_a_slider_sets_a_material_of_what_is_selected(scene: TrainedScene) -> No
     assert mean_of(rough, mask, "roughness") == pytest.approx(0.9, abs=1e-5)
     assert mean_of(rough, mask, "metallic") == pytest.approx(0.2, abs=1e-5)
     assert mean_of(rough, ~mask, "roughness") == pytest.approx(CLAY["roughness"], abs=1e-5)
-    drawable = Fitted(scene)
+    drawable = ReconstructionView(scene)
     drawable.set_changes([lambda given: with_material(given, mask, {"roughness": 0.9, "metallic": 0.2})])
-    assert np.array_equal(shown(drawable, Look()), shown(Fitted(rough), Look()))
-    assert np.abs(shown(drawable, Look()) - shown(Fitted(scene), Look())).max() > 20
+    assert np.array_equal(
+        shown(drawable, DisplayOptions()), shown(ReconstructionView(rough), DisplayOptions())
+    )
+    assert (
+        np.abs(shown(drawable, DisplayOptions()) - shown(ReconstructionView(scene), DisplayOptions())).max()
+        > 20
+    )
 
 
 def test_exposure_and_backdrop_are_what_they_say(scene: TrainedScene) -> None:
-    drawable = Fitted(scene)
-    corner = [shown(drawable, Look(backdrop=name))[0, 0].tolist() for name in ("white", "grey", "black")]
+    drawable = ReconstructionView(scene)
+    corner = [
+        shown(drawable, DisplayOptions(backdrop=name))[0, 0].tolist() for name in ("white", "grey", "black")
+    ]
     assert corner == [[255] * 3, [64] * 3, [0] * 3]
-    light = shown(drawable, Look(backdrop="light"))[0, 0]
+    light = shown(drawable, DisplayOptions(backdrop="environment map"))[0, 0]
     assert 0 < light.max()
-    dark, bright = (shown(drawable, Look(exposure=e, backdrop="black"))[20, 14].max() for e in (-3.0, 0.0))
+    dark, bright = (
+        shown(drawable, DisplayOptions(exposure=e, backdrop="black"))[20, 14].max() for e in (-3.0, 0.0)
+    )
     assert 0 < dark < bright
 
 
@@ -464,28 +476,37 @@ def surrounded(scene: TrainedScene) -> TrainedScene:
 
 
 def test_a_photographed_object_is_shown_in_its_surroundings_or_alone(surrounded: TrainedScene) -> None:
-    drawable, alone = Fitted(surrounded), Fitted(replace(surrounded, surroundings=None))
-    assert drawable.backdrops == ("surroundings", "white", "grey", "black", "light")
-    assert alone.backdrops == ("white", "grey", "black", "light")
-    whole = shown(drawable, Look(backdrop="surroundings"))
+    drawable, alone = (
+        ReconstructionView(surrounded),
+        ReconstructionView(replace(surrounded, surroundings=None)),
+    )
+    assert drawable.backdrops == ("background", "white", "grey", "black", "environment map")
+    assert alone.backdrops == ("white", "grey", "black", "environment map")
+    whole = shown(drawable, DisplayOptions(backdrop="background"))
     assert whole[0, 0].tolist() == [124] * 3  # 0.2 as sRGB
     assert np.ptp(whole[:, 24:]) > 20  # the other ball
     for backdrop in alone.backdrops:
-        assert np.array_equal(shown(drawable, Look(backdrop=backdrop)), shown(alone, Look(backdrop=backdrop)))
+        assert np.array_equal(
+            shown(drawable, DisplayOptions(backdrop=backdrop)),
+            shown(alone, DisplayOptions(backdrop=backdrop)),
+        )
     for name in ("alpha", "depth"):  # of what is shown
-        some = Look(name, backdrop="black", depths=(2.0, 4.0))
+        some = DisplayOptions(name, backdrop="black", depths=(2.0, 4.0))
         assert np.array_equal(shown(drawable, some), shown(alone, some))
-        assert not np.array_equal(shown(drawable, replace(some, backdrop="surroundings")), shown(alone, some))
+        assert not np.array_equal(shown(drawable, replace(some, backdrop="background")), shown(alone, some))
 
 
 def test_what_is_saved_has_surroundings_or_is_transparent(surrounded: TrainedScene, tmp_path: Path) -> None:
-    drawable, pose = Fitted(surrounded), Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6)
+    drawable, pose = (
+        ReconstructionView(surrounded),
+        Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6),
+    )
     found = {}
-    for backdrop in ("surroundings", "grey"):
-        path = write_view(drawable, pose, (32, 20), Look(backdrop=backdrop), tmp_path, ".exr")
+    for backdrop in ("background", "grey"):
+        path = write_view(drawable, pose, (32, 20), DisplayOptions(backdrop=backdrop), tmp_path, ".exr")
         found[backdrop] = read_exr_image(path)
-    assert found["surroundings"][..., 3].min() == 1
-    assert np.allclose(found["surroundings"][0, 0, :3], 0.2, rtol=1e-3)
+    assert found["background"][..., 3].min() == 1
+    assert np.allclose(found["background"][0, 0, :3], 0.2, rtol=1e-3)
     assert found["grey"][..., 3].min() == 0 and found["grey"][..., 3].max() > 0.9
     alone = replace(surrounded, surroundings=None).renderer(aovs=False, samples=16)(pose.camera(32, 20))
     assert np.abs(found["grey"] - image_array([*alone.radiance, alone.alpha], 20, 32)).max() < 1e-5
@@ -496,10 +517,13 @@ def test_a_scene_file_with_surroundings_is_shown_with_them_or_without(
 ) -> None:
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.0)
     export(surrounded, tmp_path, pose.camera(24, 24))
-    drawable, own = MitsubaScene(load_scene(tmp_path / "scene.xml"), "scene.xml"), Fitted(surrounded)
-    assert drawable.backdrops == ("surroundings", "white", "grey", "black")
+    drawable, own = (
+        MitsubaScene(load_scene(tmp_path / "scene.xml"), "scene.xml"),
+        ReconstructionView(surrounded),
+    )
+    assert drawable.backdrops == ("background", "white", "grey", "black")
     for backdrop in drawable.backdrops:
-        look = Look(backdrop=backdrop)
+        look = DisplayOptions(backdrop=backdrop)
         assert np.abs(shown(drawable, look) - shown(own, look)).max() <= 2, backdrop
 
 
@@ -508,12 +532,12 @@ def test_a_watched_fit_shows_its_object_alone_too(
 ) -> None:
     trainer = Trainer(load(str(method), "quick", SETTINGS), read_dataset(data, "train"))
     drawable = Training(trainer)
-    assert "surroundings" not in drawable.backdrops
-    before = shown(drawable, Look())
+    assert "background" not in drawable.backdrops
+    before = shown(drawable, DisplayOptions())
     monkeypatch.setattr(Trainer, "surroundings", surrounded.surroundings)
-    assert drawable.backdrops == ("surroundings", "white", "grey", "black")
-    assert np.array_equal(shown(drawable, Look()), before)
-    assert np.abs(shown(drawable, Look(backdrop="surroundings")) - before).max() > 50
+    assert drawable.backdrops == ("background", "white", "grey", "black")
+    assert np.array_equal(shown(drawable, DisplayOptions()), before)
+    assert np.abs(shown(drawable, DisplayOptions(backdrop="background")) - before).max() > 50
 
 
 def test_truth_and_picture_stand_side_by_side_in_the_shape_of_the_window() -> None:
@@ -532,9 +556,10 @@ def test_truth_and_picture_stand_side_by_side_in_the_shape_of_the_window() -> No
 
 def test_views_are_saved_under_the_next_number_with_their_camera(scene: TrainedScene, tmp_path: Path) -> None:
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6)
-    drawable, window = Fitted(scene), (32, 20)
+    drawable, window = ReconstructionView(scene), (32, 20)
     paths = [
-        write_view(drawable, pose, window, Look(), tmp_path, suffix) for suffix in (".png", ".exr", ".json")
+        write_view(drawable, pose, window, DisplayOptions(), tmp_path, suffix)
+        for suffix in (".png", ".exr", ".json")
     ]
     assert [path.name for path in paths] == ["view_000.png", "view_001.exr", "view_002.json"]
     for split in ("train", "test"):
@@ -560,7 +585,7 @@ def test_a_saved_view_overwrites_no_file_and_takes_a_short_number(
     ]
     for name in others:
         (tmp_path / name).write_text(name)
-    pose, drawable = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6), Fitted(scene)
+    pose, drawable = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6), ReconstructionView(scene)
     (tmp_path / "view_010.json").symlink_to(tmp_path / "nowhere")
     listed, late = Path.iterdir, tmp_path / "view_011.json"
 
@@ -570,7 +595,7 @@ def test_a_saved_view_overwrites_no_file_and_takes_a_short_number(
         return iter(found)
 
     monkeypatch.setattr(Path, "iterdir", listed_before_another_came)
-    saved = write_view(drawable, pose, (32, 20), Look(), tmp_path, ".png")
+    saved = write_view(drawable, pose, (32, 20), DisplayOptions(), tmp_path, ".png")
     monkeypatch.undo()
     assert saved.name == "view_012.png" and saved.with_suffix(".json").is_file()
     for name in (*others, late.name):
@@ -579,7 +604,9 @@ def test_a_saved_view_overwrites_no_file_and_takes_a_short_number(
 
     for name in ("view_999999.png", "view_1000000.png"):
         (tmp_path / name).touch()
-    assert write_view(drawable, pose, (32, 20), Look(), tmp_path, ".json").name == "view_1000001.json"
+    assert (
+        write_view(drawable, pose, (32, 20), DisplayOptions(), tmp_path, ".json").name == "view_1000001.json"
+    )
 
     def full(*_: Any) -> list[Any]:
         raise MemoryError
@@ -587,7 +614,7 @@ def test_a_saved_view_overwrites_no_file_and_takes_a_short_number(
     before = sorted(tmp_path.iterdir())
     monkeypatch.setattr(drawable, "fine", full)
     with pytest.raises(MemoryError):
-        write_view(drawable, pose, (32, 20), Look(), tmp_path, ".png")
+        write_view(drawable, pose, (32, 20), DisplayOptions(), tmp_path, ".png")
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -598,7 +625,7 @@ def test_a_saved_picture_is_that_of_sixteen_samples(
     """Whole, and in passes of two rows."""
     monkeypatch.setattr(passes, "PASS_SAMPLES", samples)
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6)
-    path = write_view(Fitted(scene), pose, (32, 20), Look(), tmp_path, ".exr")
+    path = write_view(ReconstructionView(scene), pose, (32, 20), DisplayOptions(), tmp_path, ".exr")
     monkeypatch.setattr(passes, "PASS_SAMPLES", 1 << 20)
     frame = scene.renderer(aovs=False, samples=16)(pose.camera(32, 20))
     assert np.abs(read_exr_image(path) - image_array([*frame.radiance, frame.alpha], 20, 32)).max() < 1e-5
@@ -658,17 +685,23 @@ def test_without_viser_the_remedy_is_named(
 
 def test_a_mitsuba_scene_of_a_run_is_drawn_like_the_run(finished: Path) -> None:
     drawable = MitsubaScene(load_scene(finished / "scene.xml", []), "scene.xml")
-    own = Fitted(TrainedScene.read(finished))
+    own = ReconstructionView(TrainedScene.read(finished))
     assert drawable.variables == own.variables
     pose = drawable.start()
-    for name in ("picture", "normal", "roughness", "depth", "specular"):
+    for name in ("image", "normal", "roughness", "depth", "specular"):
         found, wanted = (
-            to_bytes(shown_planes(each.draw(Sample(pose, 24, 24, Look(name))).planes, Look(name)), 24, 24)
+            to_bytes(
+                shown_planes(
+                    each.draw(SampleRequest(pose, 24, 24, DisplayOptions(name))).planes, DisplayOptions(name)
+                ),
+                24,
+                24,
+            )
             for each in (drawable, own)
         )
         assert np.abs(found.astype(int) - wanted).max() <= 2, name
         assert np.ptp(wanted) > 0, name
-    assert len(drawable.fine(pose, 12, 10, Look())) == 4
+    assert len(drawable.fine(pose, 12, 10, DisplayOptions())) == 4
 
 
 def test_the_environment_of_a_path_traced_scene_turns() -> None:
@@ -691,12 +724,12 @@ def test_the_environment_of_a_path_traced_scene_turns() -> None:
         }
     )
     drawable = MitsubaScene(loaded, "ball.xml")
-    assert drawable.lit and drawable.variables == ("picture",)
+    assert drawable.lit and drawable.variables == ("image",)
     assert drawable.radius == pytest.approx(3**0.5, rel=1e-3) and np.abs(drawable.centre).max() < 1e-3
     bright = []
     for degrees in (0.0, 90.0, 180.0, 360.0):
         drawable.set_turn(degrees)
-        planes_found = drawable.fine(drawable.start(), 16, 16, Look())
+        planes_found = drawable.fine(drawable.start(), 16, 16, DisplayOptions())
         bright.append(np.array(planes_found[0]).reshape(16, 16)[:, :8].sum())
     assert bright[0] == pytest.approx(bright[3], rel=0.05)
     assert max(bright) > 1.5 * min(bright)
@@ -712,10 +745,10 @@ def test_a_fit_draws_only_for_those_who_look_and_a_share_of_its_time(
     trainer = Trainer(load(str(method), "quick", SETTINGS), views)
     clock = Clock()
     page = TrainingPage(trainer, Run(tmp_path), "127.0.0.1", 0, clock)
-    drawn: list[Sample] = []
+    drawn: list[SampleRequest] = []
     draw = page.page.drawable.draw
 
-    def slow(sample: Sample) -> Sampled:
+    def slow(sample: SampleRequest) -> SampleResult:
         drawn.append(sample)
         clock.now += 0.5
         return draw(sample)
@@ -726,8 +759,8 @@ def test_a_fit_draws_only_for_those_who_look_and_a_share_of_its_time(
             clock.now += 0.1
             page.step()
         assert drawn == []
-        seen: list[Shown] = []
-        page.page.loop.enter(1, Visitor(seen.append))
+        seen: list[DeliveredImage] = []
+        page.page.loop.enter(1, Client(seen.append))
         page.page.loop.look(1, Pose.of_view(views.views[0]), (640, 400))
         for _ in range(100):
             clock.now += 0.1

@@ -27,10 +27,11 @@ from websockets.sync.client import ClientConnection, connect
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.viewer import guard as guard_module
-from mi_refgs.viewer.controls import light, look, materials, overlays, saving, truth
-from mi_refgs.viewer.fitted import Fitted
+from mi_refgs.viewer import saving
+from mi_refgs.viewer.controls import light, look, materials, overlays, truth
 from mi_refgs.viewer.guard import SIDE, TEXT, UPLOAD, VALUES, Guard
 from mi_refgs.viewer.page import Page, Views
+from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from tests.scenes.known import known_scene
 from tests.scenes.tiny import write_data
 
@@ -39,14 +40,14 @@ WAIT = 20.0
 
 
 @pytest.fixture(scope="module")
-def fitted() -> Fitted:
+def fitted() -> ReconstructionView:
     """What the pages show."""
     mi.set_variant("llvm_ad_rgb")
-    return Fitted(known_scene())
+    return ReconstructionView(known_scene())
 
 
 @contextlib.contextmanager
-def serving(fitted: Fitted, host: str, folder: Path) -> Iterator[Page]:
+def serving(fitted: ReconstructionView, host: str, folder: Path) -> Iterator[Page]:
     """A page with every panel, that nothing is drawn for."""
     views = Views(test=read_dataset(write_data(folder / "data"), "test"))
     page = Page(fitted, views, "a page", host, 0, folder / "views")
@@ -62,14 +63,14 @@ def serving(fitted: Fitted, host: str, folder: Path) -> Iterator[Page]:
 
 
 @pytest.fixture(scope="module")
-def page(fitted: Fitted, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+def page(fitted: ReconstructionView, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """One for this machine only."""
     with serving(fitted, "127.0.0.1", tmp_path_factory.mktemp("page")) as page:
         yield page
 
 
 @pytest.fixture(scope="module")
-def open_page(fitted: Fitted, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+def open_page(fitted: ReconstructionView, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """One for other machines, too."""
     with serving(fitted, "0.0.0.0", tmp_path_factory.mktemp("open_page")) as page:
         yield page
@@ -420,7 +421,7 @@ def test_a_message_beyond_the_largest_ends_its_connection(client: Client) -> Non
 
 
 def test_a_viser_that_goes_past_the_guard_is_stopped(
-    fitted: Fitted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fitted: ReconstructionView, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stopped = []
 

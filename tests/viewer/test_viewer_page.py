@@ -333,7 +333,7 @@ def test_another_variable_is_shown_and_saved(tab: Tab, server: tuple[Server, Pat
     path = saved_view(server[1], ".png", known)
     png = np.asarray(Image.open(path).convert("RGB"), np.int16)
     assert png.std() > 10 and picture.std() > 10
-    tab.choose("Show", "picture")
+    tab.choose("Show", "image")
     tab.until(lambda picture: bool(np.abs(picture - before).mean() < 0.5), "the picture")
 
 
@@ -421,7 +421,7 @@ def test_a_photographed_object_is_shown_in_its_surroundings_first_then_alone(
     tab.press("EXR")
     assert read_exr_image(saved_view(folder, ".exr", known))[..., 3].min() == 0
     tab.row("Mesh").first.uncheck(force=True)
-    tab.choose("Backdrop", "surroundings")
+    tab.choose("Backdrop", "background")
     tab.until(lambda picture: bool(np.abs(picture - before).mean() < 0.5), "the surroundings")
 
 

@@ -9,8 +9,8 @@ from typing import Any, Protocol
 from mi_refgs.errors import InputError
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.viewer.fitted import Fitted
 from mi_refgs.viewer.page import Page
+from mi_refgs.viewer.reconstruction_view import ReconstructionView
 
 IMAGES = ".exr,.hdr"
 """Endings that the page offers; a PNG or JPEG file is read too."""
@@ -51,12 +51,12 @@ def add(page: Page, scene: Turning) -> None:
     with folder:
         turn = gui.add_slider("Turn", 0.0, 360.0, 1.0, 0.0, hint="Degrees about the vertical axis.")
     turn.on_update(lambda _: page.loop.ask("turn", lambda: scene.set_turn(turn.value)))
-    if isinstance(scene, Fitted):
+    if isinstance(scene, ReconstructionView):
         with folder:
             _add_swap(page, scene, turn)
 
 
-def _add_swap(page: Page, scene: Fitted, turn: Any) -> None:
+def _add_swap(page: Page, scene: ReconstructionView, turn: Any) -> None:
     """What another light takes, and the way back."""
     gui = page.server.gui
     upload = gui.add_upload_button(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mi_refgs.viewer import quality
+from mi_refgs.viewer import resolution
 from mi_refgs.viewer.page import Page
 
 STOPS = 6.0
@@ -27,13 +27,13 @@ def add(page: Page) -> None:
             page.drawable.backdrops,
             hint="What is seen behind the object; it is shown alone on all but its surroundings.",
         )
-        sizes = {f"{side}²": side for side in quality.SIDES}
+        sizes = {f"{side}²": side for side in resolution.SIDES}
         moving = gui.add_dropdown(
             "Moving",
             (AUTOMATIC, *sizes),
             hint="Pixels while something moves: as many as can be drawn 20 times a second, or these.",
         )
-        finest = f"{quality.FINEST}²"
+        finest = f"{resolution.FINEST}²"
         still = gui.add_dropdown("Still", tuple(sizes), initial_value=finest, hint="Most pixels at rest.")
 
     what.on_update(lambda _: page.set(what=what.value))

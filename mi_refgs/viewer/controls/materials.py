@@ -9,15 +9,15 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.viewer.edits import mean_of, selected, with_material
-from mi_refgs.viewer.fitted import Change, Fitted
 from mi_refgs.viewer.page import Page
+from mi_refgs.viewer.reconstruction_view import Change, ReconstructionView
 
 STEP = 0.01
 PUNCTUATION = re.compile(r"([\\`*_{}\[\]<>#])")
 """What has a meaning in Markdown."""
 
 
-def add(page: Page, scene: Fitted) -> None:
+def add(page: Page, scene: ReconstructionView) -> None:
     """Add the controls; nothing for a scene without materials."""
     if scene.materials:
         Materials(page, scene)
@@ -31,7 +31,7 @@ def escaped(text: str) -> str:
 class Materials:
     """The selection, and what is set on it; what was set on earlier ones stays."""
 
-    def __init__(self, page: Page, scene: Fitted) -> None:
+    def __init__(self, page: Page, scene: ReconstructionView) -> None:
         self.page, self.scene = page, scene
         self.done: list[Change] = []  # of earlier selections
         self.values: dict[str, float] = {}  # of the present one

@@ -52,7 +52,7 @@ def follows(page: Page, box: Any, scene: TrainedScene) -> None:
     nodes: dict[bool, Any] = {}
 
     def show() -> None:
-        alone = page.look.alone and scene.surroundings is not None
+        alone = page.look.object_only and scene.surroundings is not None
         if box.value and alone not in nodes:
             mesh = without_surroundings(scene) if alone else scene.mesh
             if mesh is None or not len(mesh.faces):

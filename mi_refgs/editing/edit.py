@@ -19,7 +19,7 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera
 
 
-class Options(TypedDict, total=False):
+class EditOptions(TypedDict, total=False):
     """Keywords of `Reconstruction.edit`, options of `refgs edit`: which surfels, and what is done to them.
 
     Selected are the surfels that meet every condition which is given, without any all of them. What is done
@@ -59,7 +59,7 @@ class Options(TypedDict, total=False):
 
 DOES = ("cut", "keep", "move", "rotate", "scale", "duplicate")
 """Options that are fields of `Change` as they are."""
-RECORDED = tuple(name for name in Options.__annotations__ if name not in ("mask", "set"))
+RECORDED = tuple(name for name in EditOptions.__annotations__ if name not in ("mask", "set"))
 """Options that a record has as they are given."""
 
 
@@ -77,7 +77,7 @@ def edit(
     *,
     camera: Camera | None = None,
     into: TrainedScene | None = None,
-    **options: Unpack[Options],
+    **options: Unpack[EditOptions],
 ) -> Edited:
     """Change surfels of a scene, and then add it `into` another scene, if there is one.
 
@@ -85,8 +85,10 @@ def edit(
     InputError for what makes no sense, an unknown option, a selection of nothing, and if there is nothing to
     do.
     """
-    for name in options.keys() - Options.__annotations__:
-        raise InputError(f"edit: {name}: unknown option; use some of {', '.join(Options.__annotations__)}")
+    for name in options.keys() - EditOptions.__annotations__:
+        raise InputError(
+            f"edit: {name}: unknown option; use some of {', '.join(EditOptions.__annotations__)}"
+        )
     which = Selection(
         options.get("where"),
         options.get("box"),
@@ -112,7 +114,7 @@ def edit(
     return Edited(changed, tuple(told), {**_asked(options, change), **counts, "notes": told})
 
 
-def _asked(options: Options, change: Change) -> dict[str, Any]:
+def _asked(options: EditOptions, change: Change) -> dict[str, Any]:
     """The options that were given, as JSON has them."""
     given = {name: value for name, value in options.items() if name in RECORDED}
     record = {name: _plain(value) for name, value in given.items() if not _unset(name, value)}

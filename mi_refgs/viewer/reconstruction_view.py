@@ -23,10 +23,9 @@ from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import CHANNELS
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of, planes_of
-from mi_refgs.viewer.drawable import Sample, Sampled
-from mi_refgs.viewer.fine import fine_planes
 from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, backdrops_of, planes_of
+from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, fine_planes
 
 OUTLIERS = 2.0
 """Percent of the surfels along each axis and side that do not count as the object."""
@@ -58,10 +57,10 @@ def variables_of(surfels: Surfels, shading: Shading) -> tuple[str, ...]:
     maps = [name for name in surfels.raw if CHANNELS[name].aov]
     traced = ["visibility"] if shading.occlusion else []
     terms = () if shading.model.light == "none" else TERMS if traced else TERMS[:2]
-    return (PICTURE, *maps, "normal", "depth", "alpha", *traced, *terms)
+    return (IMAGE, *maps, "normal", "depth", "alpha", *traced, *terms)
 
 
-class Fitted:
+class ReconstructionView:
     """A `TrainedScene` of which parts change. What costs time is made again only where it has to be."""
 
     square_pixels = False
@@ -82,12 +81,12 @@ class Fitted:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """See `Drawable`."""
+        """See `ViewerScene`."""
         return variables_of(self.scene.surfels, self.scene.shading)
 
     @property
     def backdrops(self) -> tuple[str, ...]:
-        """See `Drawable`."""
+        """See `ViewerScene`."""
         return backdrops_of(self.scene.surroundings is not None, self.lit)
 
     @property
@@ -194,14 +193,14 @@ class Fitted:
         there = self._occluder.ambient is not None, self._occluder.vertex_surfels is not None
         return not self._occluder.empty and any(w and not t for w, t in zip(wanted, there, strict=True))
 
-    def draw(self, sample: Sample) -> Sampled:
-        """See `Drawable`."""
+    def draw(self, sample: SampleRequest) -> SampleResult:
+        """See `ViewerScene`."""
         camera = sample.camera()
-        frame = self.frame(camera, sample.asked, sample.settled, sample.look.alone)
+        frame = self.frame(camera, sample.asked, sample.settled, sample.look.object_only)
         with dr.suspend_grad():
-            return Sampled(planes_of(frame, camera, sample.look, self.light), frame.depth)
+            return SampleResult(planes_of(frame, camera, sample.look, self.light), frame.depth)
 
-    def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
-        """See `Drawable`."""
+    def fine(self, pose: Pose, width: int, height: int, look: DisplayOptions) -> list[Any]:
+        """See `ViewerScene`."""
         scene = self.scene
         return fine_planes(self.draw, pose, width, height, look, scene.shading, scene.count)

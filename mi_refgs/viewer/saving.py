@@ -14,10 +14,10 @@ from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import cannot_write, make_folder
 from mi_refgs.io.images import straight_srgb, write_png
 from mi_refgs.shade.points import TERMS
-from mi_refgs.viewer.develop import PICTURE, Look, seen_of, shown_planes
-from mi_refgs.viewer.drawable import Drawable
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, seen_of, shown_planes
+from mi_refgs.viewer.viewer_scene import ViewerScene
 
 NUMBERED = re.compile(r"view_\d{3,6}", re.ASCII)
 """Names of views. The number after a longer one may be too long for the name of a file."""
@@ -56,7 +56,12 @@ def add(page: Page) -> None:
 
 
 def write_view(
-    drawable: Drawable, pose: Pose, window: tuple[int, int], look: Look, folder: Path, suffix: str
+    drawable: ViewerScene,
+    pose: Pose,
+    window: tuple[int, int],
+    look: DisplayOptions,
+    folder: Path,
+    suffix: str,
 ) -> Path:
     """Write the next numbered view in a folder, and its camera; returns the path of the picture, or of that.
 
@@ -97,12 +102,12 @@ def write_camera(folder: Path, content: Callable[[str], str]) -> Path:
         return path
 
 
-def write_picture(path: Path, planes: list[Any], window: tuple[int, int], look: Look) -> None:
+def write_picture(path: Path, planes: list[Any], window: tuple[int, int], look: DisplayOptions) -> None:
     """Write planes of `develop.planes_of` as PNG, as they are shown, or as EXR, linear."""
-    straight = look.what == PICTURE and len(planes) == 4  # nothing of its own behind it
+    straight = look.what == IMAGE and len(planes) == 4  # nothing of its own behind it
     if path.suffix == ".exr":
         values, coverage = seen_of(planes, look), planes[-1]
-        if look.what == PICTURE:
+        if look.what == IMAGE:
             planes = values
         elif look.what in (*TERMS, "alpha"):
             planes = [*values, coverage]

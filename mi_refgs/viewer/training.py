@@ -17,12 +17,11 @@ import numpy as np
 from mi_refgs.evaluation.progress import Bar
 from mi_refgs.runs.run import LOG, Run
 from mi_refgs.viewer.controls import look, overlays
-from mi_refgs.viewer.develop import PICTURE, Look, backdrops_of, planes_of
-from mi_refgs.viewer.drawable import Sample, Sampled
-from mi_refgs.viewer.fine import fine_planes
-from mi_refgs.viewer.fitted import bounds_of, variables_of
 from mi_refgs.viewer.page import Page, Views, require_free, require_viser
 from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.reconstruction_view import bounds_of, variables_of
+from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, backdrops_of, planes_of
+from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, fine_planes
 
 if TYPE_CHECKING:
     from mi_refgs.fitting.train import Trainer
@@ -48,29 +47,29 @@ class Training:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """See `Drawable`; those that the fit has from its first stage on."""
+        """See `ViewerScene`; those that the fit has from its first stage on."""
         shading = self.trainer.shading()
         return tuple(name for name in variables_of(self.trainer.surfels, shading) if name != "visibility")
 
     @property
     def backdrops(self) -> tuple[str, ...]:
-        """See `Drawable`."""
+        """See `ViewerScene`."""
         return backdrops_of(self.trainer.surroundings is not None, light=False)
 
-    def draw(self, sample: Sample) -> Sampled:
-        """See `Drawable`."""
+    def draw(self, sample: SampleRequest) -> SampleResult:
+        """See `ViewerScene`."""
         camera = sample.camera()
-        frame = self.trainer.view(camera, sample.look.what != PICTURE, sample.look.alone)
+        frame = self.trainer.view(camera, sample.look.what != IMAGE, sample.look.object_only)
         with dr.suspend_grad():
-            return Sampled(planes_of(frame, camera, sample.look, None), frame.depth)
+            return SampleResult(planes_of(frame, camera, sample.look, None), frame.depth)
 
-    def fine(self, pose: Pose, width: int, height: int, look: Look) -> list[Any]:
-        """See `Drawable`."""
+    def fine(self, pose: Pose, width: int, height: int, look: DisplayOptions) -> list[Any]:
+        """See `ViewerScene`."""
         trainer = self.trainer
         return fine_planes(self.draw, pose, width, height, look, trainer.shading(), trainer.surfels.count)
 
 
-class Live(Bar):
+class TrainingViewer(Bar):
     """The progress bar of a fit, and its page."""
 
     def __init__(self, host: str, port: int) -> None:

@@ -16,53 +16,53 @@ from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
 
-PICTURE = "picture"
+IMAGE = "image"
 """What is shown unless a variable is asked for."""
 BACKDROPS = {"white": 1.0, "grey": 0.25, "black": 0.0}
 """Display-encoded brightness behind the object, by name."""
-LIGHT_BEHIND = "light"
+ENVIRONMENT = "environment map"
 """The backdrop that is the light."""
-SURROUNDINGS = "surroundings"
+BACKGROUND = "background"
 """The backdrop that is what the object was photographed in; all others show the object alone."""
 
 
 def backdrops_of(surroundings: bool, light: bool) -> tuple[str, ...]:
     """The backdrops of a scene that has these or not; a page begins with the first."""
-    return (*((SURROUNDINGS,) if surroundings else ()), *BACKDROPS, *((LIGHT_BEHIND,) if light else ()))
+    return (*((BACKGROUND,) if surroundings else ()), *BACKDROPS, *((ENVIRONMENT,) if light else ()))
 
 
 @dataclass(frozen=True)
-class Look:
+class DisplayOptions:
     """What of the scene is shown, and how."""
 
-    what: str = PICTURE  # or a type of `plugins.aovs`
+    what: str = IMAGE  # or a type of `plugins.aovs`
     exposure: float = 0.0  # stops
     backdrop: str = "white"  # one of `backdrops_of`
     depths: tuple[float, float] = (0.0, 1.0)  # distances that are shown as white and as black
 
     @property
-    def alone(self) -> bool:
+    def object_only(self) -> bool:
         """Whether the object is shown without its surroundings."""
-        return self.backdrop != SURROUNDINGS
+        return self.backdrop != BACKGROUND
 
 
-def planes_of(frame: Frame, camera: Camera, look: Look, light: Light | None) -> list[Any]:
+def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light | None) -> list[Any]:
     """What is averaged over samples: the planes of the picture or variable, premultiplied, and alpha.
 
     For a picture with surroundings or the light behind it, three planes of that follow, times 1 - alpha.
     """
-    if look.what == PICTURE:
+    if look.what == IMAGE:
         behind = frame.background
-        if behind is None and look.backdrop == LIGHT_BEHIND and light is not None:
+        if behind is None and look.backdrop == ENVIRONMENT and light is not None:
             behind = light.radiance(dr.normalize(camera.rays()))
         through = () if behind is None else (1 - frame.alpha) * mi.Color3f(behind)
         return [*frame.radiance, frame.alpha, *through]
     return aov_planes(look.what, frame, camera)
 
 
-def seen_of(planes: list[Any], look: Look) -> list[Any]:
+def seen_of(planes: list[Any], look: DisplayOptions) -> list[Any]:
     """Channels of an image from the mean of `planes_of`: linear RGBA, or those of the variable's AOV."""
-    if look.what != PICTURE:
+    if look.what != IMAGE:
         return values_of_planes(look.what, planes)
     radiance, alpha, behind = planes[:3], planes[3], planes[4:]
     if not behind:
@@ -70,10 +70,10 @@ def seen_of(planes: list[Any], look: Look) -> list[Any]:
     return [*(plane + value for plane, value in zip(radiance, behind, strict=True)), mi.Float(1)]
 
 
-def shown_planes(planes: list[Any], look: Look) -> list[Any]:
+def shown_planes(planes: list[Any], look: DisplayOptions) -> list[Any]:
     """Three display-encoded planes of the mean of `planes_of`, not clipped."""
     backdrop = BACKDROPS.get(look.backdrop, 1.0)
-    if look.what == PICTURE:
+    if look.what == IMAGE:
         gain = dr.opaque(mi.Float, 2.0**look.exposure)
         *seen, alpha = seen_of(planes, look)
         radiance = [plane * gain for plane in seen]
