@@ -34,8 +34,8 @@ from mi_refgs.io.resources import resource_dir
 from mi_refgs.reconstruction import fit as reconstruct
 from mi_refgs.runs.run import LOCK, Run
 from mi_refgs.synthesis import make_dataset
+from tests.scenes.sphere import SCENE
 from tests.scenes.tiny import METHOD, SETTINGS, train_command
-from tests.synthesis.test_dataset import SCENE
 
 
 @dataclass(frozen=True)

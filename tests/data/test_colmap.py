@@ -11,91 +11,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refgs.data.colmap_model import MODELS, read_cameras, read_images, read_points
+from mi_refgs.data.colmap_model import read_cameras, read_images, read_points
 from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
 from mi_refgs.data.lens import Lens
 from mi_refgs.data.region import region_of
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, linear_from_srgb, read_png, write_png
-from tests.scenes.dots import COLOURS, POINTS, Shot, check
+from tests.scenes.dots import COLOURS, POINTS, check
+from tests.scenes.layouts import (
+    SHOTS,
+    VALUES,
+    WRITERS,
+    write_binary,
+    write_colmap,
+    write_text,
+)
 
-SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]
-MODEL, VALUES = "PINHOLE", (110.0, 104.0, 50.3, 34.6)
 KINDS = ("txt", "bin")
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """w, x, y, z, by the eigenvector of Bar-Itzhack's matrix."""
-    m = rotation
-    k = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [0, m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[2, 0] + m[0, 2]],
-            [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[2, 1] + m[1, 2]],
-            [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(k, UPLO="U")[1][:, -1]
-
-
-def write_text(
-    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
-) -> None:
-    """Cameras, images and points as COLMAP writes them as text."""
-    model.mkdir(parents=True, exist_ok=True)
-    size = f"{shots[0].width} {shots[0].height}"
-    (model / "cameras.txt").write_text(f"# comment\n7 {camera} {size} {' '.join(map(repr, values))}\n")
-    lines = ["# Image list with two lines of data per image:"]
-    for i, shot in enumerate(shots):
-        pose = " ".join(map(repr, [*quaternion(shot.rotation).tolist(), *shot.translation.tolist()]))
-        seen = "1.5 2.5 3 10.0 20.0 -1" if i % 2 else ""
-        lines += [f"{i + 1} {pose} 7 {shot.name}", seen]
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    lines = [
-        f"{i} {' '.join(map(repr, p.tolist()))} {' '.join(map(str, c))} 0.5 1 0 2 0 3 {i}"
-        for i, (p, c) in enumerate(zip(POINTS, COLOURS, strict=True))
-    ]
-    (model / "points3D.txt").write_text("# points\n\n" + "\n".join(lines) + "\n")
-
-
-def write_binary(
-    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
-) -> None:
-    """The same in COLMAP's binary records."""
-    model.mkdir(parents=True, exist_ok=True)
-    size = (shots[0].width, shots[0].height)
-    record = struct.pack("<iiQQ", 7, MODELS[camera][0] if camera in MODELS else 7, *size)
-    (model / "cameras.bin").write_bytes(
-        struct.pack("<Q", 1) + record + struct.pack(f"<{len(values)}d", *values)
-    )
-    data = struct.pack("<Q", len(shots))
-    for i, shot in enumerate(shots):
-        data += struct.pack("<i7di", i + 1, *quaternion(shot.rotation), *shot.translation, 7)
-        data += shot.name.encode() + b"\0"
-        data += struct.pack("<Qddqddq", 2, 1.5, 2.5, 3, 10, 20, -1) if i % 2 else struct.pack("<Q", 0)
-    (model / "images.bin").write_bytes(data)
-    data = struct.pack("<Q", len(POINTS))
-    for i, (point, colour) in enumerate(zip(POINTS, COLOURS, strict=True)):
-        data += struct.pack("<Q3d3BdQ6i", i, *point, *colour.tolist(), 0.5, 3, 1, 0, 2, 0, 3, i)
-    (model / "points3D.bin").write_bytes(data)
-
-
-WRITERS = {"txt": write_text, "bin": write_binary}
-
-
-def write(
-    folder: Path, kind: str = "bin", shots: list[Shot] = SHOTS, place: str = "sparse/0", **camera: object
-) -> Path:
-    for shot in shots:
-        shot.write(folder / "images")
-    WRITERS[kind](folder / place, shots, **camera)  # type: ignore[arg-type]
-    return folder
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0"])
 def test_cameras_see_the_points(kind: str, place: str, tmp_path: Path) -> None:
-    data = write(tmp_path, kind, place=place)
+    data = write_colmap(tmp_path, kind, place=place)
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
     assert [view.name for view in test.views] == ["a.png", "i.png"]
     assert [view.name for view in train.views] == [shot.name for shot in SHOTS[1:8]]
@@ -131,14 +69,14 @@ def test_every_lens_is_undone(model: str, kind: str, tmp_path: Path) -> None:
     values, lens = LENSES[model]
     focal = (107.0, 107.0) if values[0] == 107.0 else (110.0, 104.0)
     shots = [replace(shot, lens=lens, focal=focal) for shot in SHOTS[:3]]
-    views = read_dataset(write(tmp_path, kind, shots, camera=model, values=values), "train").views
+    views = read_dataset(write_colmap(tmp_path, kind, shots, camera=model, values=values), "train").views
     for view, shot in zip(views, shots[1:], strict=True):
         check(view, shot, tolerance=0.06)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_lenses_that_are_unknown(kind: str, tmp_path: Path) -> None:
-    data = write(tmp_path, kind, SHOTS[:2], camera="FOV", values=(*VALUES, 0.01))
+    data = write_colmap(tmp_path, kind, SHOTS[:2], camera="FOV", values=(*VALUES, 0.01))
     with pytest.raises(InputError, match=rf"cameras\.{kind}: camera 7: the lens model .*undistort"):
         read_dataset(data, "train")
     rational = (*VALUES, 0.1, 0, 0, 0, 0, 0.2, 0, 0)
@@ -156,7 +94,7 @@ def copies(folder: Path, factor: int, ending: str = ".png") -> None:
 
 def test_smaller_copies_serve_where_they_divide(tmp_path: Path) -> None:
     """The copies here are half as bright, so that a picture tells its file."""
-    data = write(tmp_path)
+    data = write_colmap(tmp_path)
     copies(data, 2)
     copies(data, 4, ".PNG")
     for downscale, bright in ((1, True), (2, False), (3, True), (4, False), (8, False)):
@@ -174,7 +112,7 @@ def test_smaller_copies_serve_where_they_divide(tmp_path: Path) -> None:
 def test_a_copy_of_rounded_size(tmp_path: Path) -> None:
     """97 × 73 pixels whose copy has 49 × 37: intrinsics follow the file."""
     shots = [replace(shot, width=97, height=73) for shot in SHOTS[:2]]
-    data = write(tmp_path, shots=shots)
+    data = write_colmap(tmp_path, shots=shots)
     (data / "images_2").mkdir()
     for shot in shots:
         across, down = 49 / 97, 37 / 73
@@ -186,7 +124,7 @@ def test_a_copy_of_rounded_size(tmp_path: Path) -> None:
 
 
 def test_masks_are_alpha(tmp_path: Path) -> None:
-    data = write(tmp_path)
+    data = write_colmap(tmp_path)
     copies(data, 2)
     (data / "masks").mkdir()
     for i, shot in enumerate(SHOTS):
@@ -203,7 +141,7 @@ def test_masks_are_alpha(tmp_path: Path) -> None:
 
 
 def test_points_of_wrong_matches_are_left_out(tmp_path: Path) -> None:
-    data = write(tmp_path, "txt")
+    data = write_colmap(tmp_path, "txt")
     rng = np.random.default_rng(0)
     lines = []
     for i in range(150):
@@ -226,7 +164,7 @@ def notes(data: Path) -> tuple[str, ...]:
 
 
 def test_cameras_and_pictures_without_each_other(tmp_path: Path) -> None:
-    data = write(tmp_path)
+    data = write_colmap(tmp_path)
     SHOTS[0].write(data / "images/more")
     (data / "images/c.png").unlink()
     (data / "sparse/1").mkdir()
@@ -245,7 +183,7 @@ def test_cameras_and_pictures_without_each_other(tmp_path: Path) -> None:
 
 
 def test_names_stay_in_the_folder(tmp_path: Path) -> None:
-    data = write(tmp_path / "data")
+    data = write_colmap(tmp_path / "data")
     SHOTS[0].write(tmp_path)
     for name in ("../a.png", str(tmp_path / "a.png"), "."):
         write_binary(data / "sparse/0", [replace(SHOTS[0], name=name), *SHOTS[1:]])
@@ -268,7 +206,7 @@ def test_names_stay_in_the_folder(tmp_path: Path) -> None:
     ],
 )
 def test_images_that_make_no_sense(line: str, said: str, tmp_path: Path) -> None:
-    data = write(tmp_path, "txt")
+    data = write_colmap(tmp_path, "txt")
     (data / "sparse/0/images.txt").write_text(line)
     with pytest.raises(InputError, match=rf"images\.txt: .*{said}"):
         read_dataset(data, "test")
@@ -279,7 +217,7 @@ def test_images_that_make_no_sense(line: str, said: str, tmp_path: Path) -> None
              "7 PINHOLE 96 72 inf 2 3 4", "7 PINHOLE 96 72 1 2 3 nan", f"7 PINHOLE {'9' * 5000} 1 1 1 1 1"]
 )  # fmt: skip
 def test_cameras_that_make_no_sense(line: str, tmp_path: Path) -> None:
-    data = write(tmp_path, "txt")
+    data = write_colmap(tmp_path, "txt")
     (data / "sparse/0/cameras.txt").write_text(line)
     with pytest.raises(InputError, match=r"cameras\.txt: "):
         read_dataset(data, "test")
@@ -287,7 +225,7 @@ def test_cameras_that_make_no_sense(line: str, tmp_path: Path) -> None:
 
 def test_both_splits_mean_the_region_of_the_training_cameras(tmp_path: Path) -> None:
     """Also a split of one view, whose camera alone looks at no point."""
-    data = write(tmp_path)
+    data = write_colmap(tmp_path)
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
     assert train.region is not None and test.region == train.region
     assert train.region == region_of(train.views) != region_of(test.views)
@@ -297,7 +235,7 @@ def test_both_splits_mean_the_region_of_the_training_cameras(tmp_path: Path) -> 
 
 
 def test_a_focal_length_that_no_camera_has(tmp_path: Path) -> None:
-    data = write(tmp_path, "txt")
+    data = write_colmap(tmp_path, "txt")
     for focal in ("1e-30", "1e-10"):
         (data / "sparse/0/cameras.txt").write_text(f"7 PINHOLE 96 72 {focal} 104 50 34")
         with pytest.raises(InputError, match=r"images\.txt: .*camera 7: focal length: .* out of range"):
@@ -306,7 +244,7 @@ def test_a_focal_length_that_no_camera_has(tmp_path: Path) -> None:
 
 def test_a_picture_of_another_shape_is_refused(tmp_path: Path) -> None:
     """As turned upright by its EXIF data, after COLMAP saw it."""
-    data = write(tmp_path)
+    data = write_colmap(tmp_path)
     replace(SHOTS[1], width=72, height=96).write(data / "images")
     with pytest.raises(InputError, match=r"b\.png: size: 72 × 96 pixels are no copy of 96 × 72"):
         read_dataset(data, "train")
@@ -314,7 +252,7 @@ def test_a_picture_of_another_shape_is_refused(tmp_path: Path) -> None:
 
 def test_binary_files_that_end_anywhere(tmp_path: Path) -> None:
     """Every length of each file but the whole one is one sentence, at once."""
-    model = write(tmp_path, shots=SHOTS[:3]) / "sparse/0"
+    model = write_colmap(tmp_path, shots=SHOTS[:3]) / "sparse/0"
     for name, read in (("cameras", read_cameras), ("images", read_images), ("points3D", read_points)):
         path = model / f"{name}.bin"
         whole = path.read_bytes()

@@ -17,33 +17,10 @@ from mi_refgs.data.dataset import fitting_downscale, read_dataset
 from mi_refgs.data.lens import Lens
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, linear_from_srgb, read_png, write_png
-from tests.scenes.dots import COLOURS, POINTS, Shot, check
-
-SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV's axes
-
+from tests.scenes.dots import COLOURS, POINTS, check
+from tests.scenes.layouts import SHOTS, change_transforms, write_glossy, write_llff, write_nerfstudio
 
 # ---------------- nerfstudio and instant-ngp ----------------
-
-
-def nerfstudio(folder: Path, shots: list[Shot] = SHOTS, **content: Any) -> Path:
-    """`transforms.json` with intrinsics for the whole file, but for those of one frame."""
-    frames = []
-    for shot in shots:
-        shot.write(folder / "images")
-        pose = (shot.camera_to_world @ OPENGL).tolist()
-        frames.append({"file_path": f"images/{shot.name}", "transform_matrix": pose})
-        frames[-1] |= {"colmap_im_id": shot.index, "fl_x": shot.focal[0], "fl_y": shot.focal[1]}
-        frames[-1] |= {"cx": shot.centre[0], "cy": shot.centre[1], "w": shot.width, "h": shot.height}
-    whole = {"camera_model": "OPENCV", "fl_x": 1.0, "fl_y": 1.0, "cx": 1.0, "cy": 1.0} | content
-    (folder / "transforms.json").write_text(json.dumps(whole | {"frames": frames}))
-    return folder
-
-
-def mended(data: Path, change: Any) -> None:
-    content = json.loads((data / "transforms.json").read_text())
-    change(content)
-    (data / "transforms.json").write_text(json.dumps(content))
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
@@ -54,7 +31,7 @@ def test_nerfstudio_with_intrinsics_of_every_frame(fisheye: bool, tmp_path: Path
         for shot in SHOTS[:4]
     ]
     model = "OPENCV_FISHEYE" if fisheye else "OPENCV"
-    data = nerfstudio(tmp_path, shots, camera_model=model, k1=0.05, k2=-0.02, p1=0.0, p2=0.0)
+    data = write_nerfstudio(tmp_path, shots, camera_model=model, k1=0.05, k2=-0.02, p1=0.0, p2=0.0)
     views = read_dataset(data, "train").views
     for view, shot in zip(views, shots[1:], strict=True):
         check(view, shot, tolerance=0.06)
@@ -79,7 +56,7 @@ def write_ply(path: Path, kind: str) -> None:
 def test_points_that_a_file_names(kind: str, tmp_path: Path) -> None:
     """Poses and points share a frame: `applied_transform` was applied to both."""
     moved = np.eye(4)[[0, 2, 1, 3]][:3].tolist()
-    data = nerfstudio(tmp_path, ply_file_path="sparse_pc.ply", applied_transform=moved)
+    data = write_nerfstudio(tmp_path, ply_file_path="sparse_pc.ply", applied_transform=moved)
     write_ply(data / "sparse_pc.ply", kind)
     found = read_dataset(data, "train")
     assert found.points is not None and found.points.colour is not None
@@ -94,30 +71,32 @@ def test_points_that_a_file_names(kind: str, tmp_path: Path) -> None:
 )
 def test_points_that_are_not_there(name: Any, said: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=said):
-        read_dataset(nerfstudio(tmp_path, ply_file_path=name), "train")
+        read_dataset(write_nerfstudio(tmp_path, ply_file_path=name), "train")
 
 
 def test_a_mask_that_a_frame_names(tmp_path: Path) -> None:
-    data = nerfstudio(tmp_path)
+    data = write_nerfstudio(tmp_path)
     mask = np.zeros((72, 96, 3))
     mask[36:] = 1
     write_png(data / "mask.png", mask)
-    mended(data, lambda content: [frame.update(mask_path="mask.png") for frame in content["frames"]])
+    change_transforms(
+        data, lambda content: [frame.update(mask_path="mask.png") for frame in content["frames"]]
+    )
     view = read_dataset(data, "train", downscale=2, background="black").views[0]
     assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
     assert not view.image[:18].any() and view.image[18:].any()
 
 
 def test_splits_that_a_file_names(tmp_path: Path) -> None:
-    data = nerfstudio(tmp_path, test_filenames=["images/c.png"], val_filenames=["images/d.png"])
+    data = write_nerfstudio(tmp_path, test_filenames=["images/c.png"], val_filenames=["images/d.png"])
     names = {split: [v.name for v in read_dataset(data, split).views] for split in ("train", "test")}
     assert names["test"] == ["images/c"] and len(names["train"]) == 7
-    mended(data, lambda content: content.update(train_filenames=["images/a.png", "images/b.png"]))
+    change_transforms(data, lambda content: content.update(train_filenames=["images/a.png", "images/b.png"]))
     assert [v.name for v in read_dataset(data, "train").views] == ["images/a", "images/b"]
-    mended(data, lambda content: content.update(test_filenames=["images/no.png"]))
+    change_transforms(data, lambda content: content.update(test_filenames=["images/no.png"]))
     with pytest.raises(InputError, match="zero test views"):
         read_dataset(data, "test")
-    mended(data, lambda content: content.update(test_filenames=[3]))
+    change_transforms(data, lambda content: content.update(test_filenames=[3]))
     with pytest.raises(InputError, match="test_filenames: not a list of paths"):
         read_dataset(data, "test")
 
@@ -126,13 +105,15 @@ def test_splits_that_a_file_names(tmp_path: Path) -> None:
 @pytest.mark.parametrize("written", [True, False])
 def test_a_file_path_finds_its_file_by_any_ending(name: str, written: bool, tmp_path: Path) -> None:
     """With the file's ending, in other letters or of another kind, or without; a dot may be in the name."""
-    data = nerfstudio(tmp_path)
+    data = write_nerfstudio(tmp_path)
     stem = name.rpartition(".")[0] or name
     (data / "images/b.png").rename(data / "images" / (name if name != stem else f"{stem}.jpg"))
     named = f"images/{stem}.png" if written else f"images/{stem}"
-    mended(data, lambda content: content["frames"][1].update(file_path=named))
+    change_transforms(data, lambda content: content["frames"][1].update(file_path=named))
     (data / "images/a.png").unlink(missing_ok=True)
-    mended(data, lambda content: content.update(frames=[content["frames"][2], content["frames"][1]]))
+    change_transforms(
+        data, lambda content: content.update(frames=[content["frames"][2], content["frames"][1]])
+    )
     [view] = read_dataset(data, "test" if named < "images/c.png" else "train").views
     check(view, SHOTS[1])
 
@@ -202,22 +183,11 @@ def test_shiny_disparity_of_16_bits_and_broken(tmp_path: Path) -> None:
 # ---------------- LLFF ----------------
 
 
-def llff(folder: Path, factor: int = 1) -> Path:
-    rows = []
-    for shot in SHOTS:
-        same = replace(shot, focal=(107.0, 107.0), centre=(48.0, 36.0))
-        same.write(folder / "images")
-        right, down, forward, position = same.camera_to_world[:3].T
-        size = np.array([72 * factor, 96 * factor, 107.0 * factor])
-        matrix = np.stack([down, right, -forward, position, size], axis=-1)
-        rows.append([*matrix.ravel(), 1.0, 9.0])
-    np.save(folder / "poses_bounds.npy", np.array(rows))
-    return folder
-
-
 @pytest.mark.parametrize("factor", [1, 4])
 def test_llff(factor: int, tmp_path: Path) -> None:
-    data = llff(tmp_path, factor)  # focal lengths are those of the original pictures, however small these are
+    data = write_llff(
+        tmp_path, factor
+    )  # focal lengths are those of the original pictures, however small these are
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
     assert (len(train.views), [view.name for view in test.views]) == (7, ["a.png", "i.png"])
     for view in train.views:
@@ -233,7 +203,7 @@ def test_llff(factor: int, tmp_path: Path) -> None:
 
 def test_llff_masks(tmp_path: Path) -> None:
     """Of the whole pictures, so that smaller copies are left alone; all pictures have one, or none."""
-    data = llff(tmp_path)
+    data = write_llff(tmp_path)
     for folder in ("images_2", "masks"):
         (data / folder).mkdir()
     mask = np.zeros((72, 96, 3))
@@ -254,7 +224,7 @@ def saved(folder: Path, array: Any) -> None:
 
 
 def test_llff_that_makes_no_sense(tmp_path: Path) -> None:
-    data = llff(tmp_path)
+    data = write_llff(tmp_path)
     good = np.load(data / "poses_bounds.npy")
     path = data / "poses_bounds.npy"
     whole = path.read_bytes()
@@ -294,23 +264,9 @@ class Code:
 # ---------------- NeRO ----------------
 
 
-def glossy(folder: Path, protocol: int = 4) -> Path:
-    for shot in SHOTS:
-        replace(shot, name=f"{shot.index}.png").write(folder)
-        depth = np.full((72, 96), 65535, dtype=np.uint16)
-        depth[:, 32:] = round(3.0 / 15 * 65535)
-        depth[:, 64:] = round(14.6 / 15 * 65535)
-        Image.fromarray(depth).save(folder / f"{shot.index}-depth.png")
-        pose = np.concatenate([shot.rotation, shot.translation[:, None]], axis=1)
-        matrix = np.array([[110.0, 0, 50.3], [0, 104.0, 34.6], [0, 0, 1]])
-        content = [pose.astype(np.float32), np.asfortranarray(matrix)]
-        (folder / f"{shot.index}-camera.pkl").write_bytes(pickle.dumps(content, protocol))
-    return folder
-
-
 @pytest.mark.parametrize("protocol", range(5))
 def test_glossy_synthetic(protocol: int, tmp_path: Path) -> None:
-    data = glossy(tmp_path, protocol)
+    data = write_glossy(tmp_path, protocol)
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
     assert ([v.name for v in train.views], [v.name for v in test.views]) == (
         [*"1234567"], ["0", "8"],
@@ -412,7 +368,7 @@ def test_a_name_that_a_pickle_asks_for_is_not_looked_up(tmp_path: Path) -> None:
     ],
 )
 def test_cameras_that_make_no_sense(pose: Any, matrix: Any, said: str, tmp_path: Path) -> None:
-    data = glossy(tmp_path)
+    data = write_glossy(tmp_path)
     (data / "1-camera.pkl").write_bytes(pickle.dumps([pose, matrix]))
     with pytest.raises(InputError, match=rf"1-camera\.pkl: .*{said}"):
         read_dataset(data, "train")
@@ -422,7 +378,7 @@ def test_cameras_that_make_no_sense(pose: Any, matrix: Any, said: str, tmp_path:
 
 
 def test_glossy_needs_some_views(tmp_path: Path) -> None:
-    data = glossy(tmp_path)
+    data = write_glossy(tmp_path)
     for i in range(1, 9):
         (data / f"{i}-camera.pkl").unlink()
     with pytest.raises(InputError, match="zero train views"):

@@ -26,8 +26,8 @@ from mi_refgs.fitting.targets import PIXEL_BYTES, Targets
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import write_png
 from mi_refgs.methods.method import CoarsePictures, DataOptions
-from tests.fitting.test_train import ball
 from tests.helpers import ROOT
+from tests.scenes.highlight import ball
 
 VIEWS, WIDTH, HEIGHT = 24, 2000, 1500
 

@@ -13,8 +13,8 @@ from mi_refgs.data.dataset import MAX_SIZES, read_dataset
 from mi_refgs.data.survey import Survey, survey
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, read_png, write_png
-from tests.data.test_colmap import SHOTS, write
 from tests.scenes.dots import Shot
+from tests.scenes.layouts import SHOTS, write_colmap
 from tests.scenes.tiny import DISTANCE, train_command, write_data, write_method
 
 
@@ -41,7 +41,7 @@ def test_a_data_set_with_everything(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_a_reconstruction_with_gaps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data = write(tmp_path)
+    data = write_colmap(tmp_path)
     (data / "images/c.png").unlink()
     found = survey(data)
     assert (found.layout, found.views, found.points) == ("COLMAP", {"train": 7, "test": 1}, 9)
@@ -96,7 +96,7 @@ def test_pictures_of_two_sizes_are_fitted(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_pictures_of_many_sizes_are_refused(tmp_path: Path) -> None:
-    data = write(tmp_path, shots=[dataclasses.replace(shot, height=72) for shot in SHOTS])
+    data = write_colmap(tmp_path, shots=[dataclasses.replace(shot, height=72) for shot in SHOTS])
     for i in range(MAX_SIZES + 1):
         shot: Shot = SHOTS[1 + i]
         picture = box_downscale(read_png(data / "images" / shot.name), i + 1)

@@ -34,7 +34,7 @@ from mi_refgs.splat import splat
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.init import neighbour_scale
 from mi_refgs.surfels.table import Surfels
-from tests.data import test_colmap
+from tests.scenes import layouts
 from tests.scenes.integrator import COUNT, image, raw_channels, scene, sensor, sky
 from tests.scenes.tiny import write_data
 
@@ -250,9 +250,9 @@ def test_cameras_in_one_place_are_refused_in_any_unit(
 
 def test_a_far_reconstruction_keeps_its_points(tmp_path: Path) -> None:
     """They move with the cameras, before anything is float32."""
-    shots = test_colmap.SHOTS
-    near = read_dataset(test_colmap.write(tmp_path / "near", "txt"), "train")
-    data = test_colmap.write(tmp_path / "far", "txt")
+    shots = layouts.SHOTS
+    near = read_dataset(layouts.write_colmap(tmp_path / "near", "txt"), "train")
+    data = layouts.write_colmap(tmp_path / "far", "txt")
     model = data / "sparse/0"
     lines = (model / "images.txt").read_text().splitlines()
     for i, shot in enumerate(shots):

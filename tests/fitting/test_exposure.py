@@ -28,7 +28,7 @@ from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.run import Run
 from tests.fitting.image_checks import HEIGHT, STEP, WIDTH, planes
-from tests.fitting.test_train import METHOD, ball, run_folder
+from tests.scenes.highlight import METHOD, ball, run_folder
 
 BACKGROUND = np.array([1.0, 0.5, 0.25], np.float32)
 GAINS = np.array([1.4, 0.7, 0.9])

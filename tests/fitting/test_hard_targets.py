@@ -15,7 +15,7 @@ from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
-from tests.fitting.test_train import METHOD, ball
+from tests.scenes.highlight import METHOD, ball
 
 STEPS = 14
 """Into the deferred stage, with the first mesh, a reset and two rounds of densifying."""

@@ -20,7 +20,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method
 from mi_refgs.surfels.primitives.surfel import Surfel
 from mi_refgs.surfels.table import Surfels
-from tests.fitting.test_train import METHOD, ball, run_folder
+from tests.scenes.highlight import METHOD, ball, run_folder
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from mi_refgs.kernels import memory
 from mi_refgs.methods.method import CoarsePictures, DataOptions, Method, Rates
 from mi_refgs.methods.presets import PRESETS
 from mi_refgs.methods.surroundings import SurroundingsOptions
-from tests.fitting.test_train import METHOD
+from tests.scenes.highlight import METHOD
 from tests.scenes.tiny import write_data
 
 SPEED = cost_model.Speed({"initial": [1.0, 5.0], "deferred": [2.0, 10.0]}, 3.0, 0.5)

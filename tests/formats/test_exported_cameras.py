@@ -22,8 +22,8 @@ from mi_refgs.formats.cameras import CAMERAS
 from mi_refgs.io.images import box_downscale, read_png, write_png
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.trained_scene import TrainedScene
-from tests.data import test_colmap, test_layouts
-from tests.data.test_layouts import SHOTS
+from tests.scenes import layouts
+from tests.scenes.layouts import SHOTS
 from tests.scenes.tiny import write_data
 
 JPEGS = [replace(shot, name=f"{shot.index}/{shot.name[0]}.JPG") for shot in SHOTS]
@@ -37,7 +37,7 @@ def nerfstudio(folder: Path, lens: Lens = BENT) -> Path:
     given = dict(zip(("k1", "k2", "k3", "k4")[: len(lens.radial)], lens.radial, strict=True))
     given |= {} if lens.fisheye else dict(zip(("p1", "p2"), lens.tangential, strict=True))
     model = "OPENCV_FISHEYE" if lens.fisheye else "OPENCV"
-    return test_layouts.nerfstudio(
+    return layouts.write_nerfstudio(
         folder, shots, camera_model=model, test_filenames=["images/3/d.JPG"], **given
     )
 
@@ -46,17 +46,19 @@ def masked(folder: Path) -> Path:
     """Masks that frames name."""
     data = nerfstudio(folder)
     write_png(data / "mask.png", np.indices((72, 96)).sum(axis=0)[..., None].repeat(3, -1) % 2)
-    test_layouts.mended(data, lambda content: [f.update(mask_path="mask.png") for f in content["frames"]])
+    layouts.change_transforms(
+        data, lambda content: [f.update(mask_path="mask.png") for f in content["frames"]]
+    )
     return data
 
 
 def colmap(folder: Path, camera: str, values: tuple[float, ...]) -> Path:
-    return test_colmap.write(folder, shots=JPEGS, camera=camera, values=values)
+    return layouts.write_colmap(folder, shots=JPEGS, camera=camera, values=values)
 
 
 def llff(folder: Path, masks: bool = False) -> Path:
     """With smaller copies of another ending."""
-    data = test_layouts.llff(folder)
+    data = layouts.write_llff(folder)
     (data / "images_2").mkdir()
     for path in (data / "images").iterdir():
         half = np.round(255 * box_downscale(read_png(path), 2)).astype(np.uint8)
@@ -83,7 +85,7 @@ LAYOUTS: dict[str, dict[str, Callable[[Path], Path]]] = {
         "fisheye": lambda folder: colmap(folder, "OPENCV_FISHEYE", (*PINHOLE, 0.05, -0.02, 0, 0)),
     },
     "LLFF": {"copies": llff, "masks": lambda folder: llff(folder, True)},
-    "NeRO Glossy Synthetic": {"depths": test_layouts.glossy},
+    "NeRO Glossy Synthetic": {"depths": layouts.write_glossy},
 }
 """Ways to write a data set, by the name of the reader; a new reader adds its own."""
 CASES = [pytest.param(name, kind, id=f"{name}-{kind}") for name, kinds in LAYOUTS.items() for kind in kinds]

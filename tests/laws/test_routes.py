@@ -44,10 +44,14 @@ from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.tonemap import BACKGROUND, IMAGE, DisplayOptions, seen_of
 from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
-from tests.plugins.test_integrator_surroundings import behind, far_channels
-from tests.render.test_scene_xml import OTHER
-from tests.scenes.integrator import raw_channels, sky
-from tests.splat.test_shown import mesh
+from tests.scenes.integrator import (
+    OTHER_OPTIONS,
+    background_light,
+    far_channels,
+    raw_channels,
+    sky,
+    two_balls,
+)
 
 WIDTH, HEIGHT, FOV, NEAR = 16, 12, 40.0, 0.05
 CROP = (4, 3, 9, 7)
@@ -74,7 +78,9 @@ def shadings() -> list[tuple[Shading, str]]:
             found[Shading(order, name), "surfel"] = None
         plain = Shading(model.orders[0], name, diffuse="irradiance")
         traced = replace(plain, occlusion=plain.traceable)
-        options = {key: OTHER[key] for key in model.honours if traced.occlusion or key not in NEED_OCCLUSION}
+        options = {
+            key: OTHER_OPTIONS[key] for key in model.honours if traced.occlusion or key not in NEED_OCCLUSION
+        }
         if options:
             found[replace(traced, accuracy=Accuracy(**options)), "surfel"] = None
     return [*found]
@@ -122,11 +128,11 @@ def trained(shading: Shading, primitive: str, around: str, meshed: bool, bare: b
             table["scale"] = np.concatenate([table["scale"], table["scale"][:, :1] - 1], axis=1)
     if bare:
         raw = {name: raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
-    map_behind = behind() if around == "surroundings and a map" else None
+    map_behind = background_light() if around == "surroundings and a map" else None
     return TrainedScene(
         Surfels.from_numpy(raw),
         EnvironmentLight.from_radiance(sky()) if "albedo" in raw else None,
-        mesh() if meshed or shading.occlusion else None,
+        two_balls() if meshed or shading.occlusion else None,
         shading,
         7,
         1.5,

@@ -22,7 +22,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.presets import scaled
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.surfels.table import Surfels
-from tests.fitting.test_train import ball
+from tests.scenes.highlight import ball
 
 
 @pytest.mark.parametrize("variant", methods.names())

@@ -12,6 +12,7 @@ import pytest
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from tests.helpers import refused
 from tests.scenes.integrator import (
+    check_derivatives,
     image,
     integrator,
     plane_mesh,
@@ -20,56 +21,6 @@ from tests.scenes.integrator import (
     sensor,
     sky,
 )
-
-STEPS = (2e-3, 2e-4)
-"""Widths of differences; the better one counts: rounding spoils the small one, curvature the large one."""
-JUMP = 0.1
-"""Part of the root mean square of the differences: where the two sides differ by more, a surfel has crossed
-the cut at α = 1/255, another surfel of its tile, or the kink of a lookup: there is no derivative."""
-MAX_LEFT_OUT = 0.2
-"""Share of the seen pixels in which that may happen; observed up to 2 % at the better step."""
-TANGENT_TOLERANCE = 5e-3  # relative L2; observed 8e-5 … 3e-3
-
-
-def check_derivatives(of: mi.Scene, key: str, spp: int = 1) -> None:
-    """Forward mode against central differences of mi.render, and reverse mode against forward mode."""
-    rng = np.random.default_rng(3)
-    params = mi.traverse(of)
-    base = params[key].numpy().copy()  # a view: the parameter is about to be overwritten in place
-    v = (rng.uniform(0.5, 1, base.shape) * rng.choice([-1, 1], base.shape)).astype(np.float32)
-
-    def at(t: object) -> mi.TensorXf:
-        params[key] = mi.TensorXf(base) + t * mi.TensorXf(v)
-        params.update()
-        return mi.render(of, params, spp=spp)
-
-    t = mi.Float(0)
-    dr.enable_grad(t)
-    rendered = at(t)
-    dr.set_grad(t, 1)
-    tangent = dr.forward_to(rendered).numpy()
-    errors = []
-    for step in STEPS:
-        before, middle, after = (at(mi.Float(t)).numpy().astype(np.float64) for t in (-step, 0, step))
-        left, right = (middle - before) / step, (after - middle) / step
-        difference, seen = (left + right) / 2, np.any(middle != 0, axis=2)
-        typical = np.sqrt(np.mean(difference[seen] ** 2))
-        assert typical > 1e-3, f"{key}: no influence on the image"
-        smooth = np.all(np.abs(right - left) < JUMP * (typical + np.abs(difference)), axis=2)
-        if np.mean(~smooth[seen]) <= MAX_LEFT_OUT:
-            error = np.linalg.norm((tangent - difference)[smooth])
-            errors.append(error / np.linalg.norm(difference[smooth]))
-    assert errors, f"{key}: too many jumps at every step"
-    assert min(errors) < TANGENT_TOLERANCE, f"{key}: {min(errors):.1e} from central differences"
-
-    leaf = mi.TensorXf(base)
-    dr.enable_grad(leaf)
-    params[key] = leaf
-    params.update()
-    weight = rng.normal(size=tangent.shape).astype(np.float32)
-    dr.backward(dr.sum(mi.render(of, params, spp=spp) * mi.TensorXf(weight), axis=None))
-    reverse, forward = np.sum(dr.grad(leaf).numpy() * v), np.sum(weight * tangent)
-    assert abs(reverse - forward) < 1e-5 * np.linalg.norm(weight) * np.linalg.norm(tangent)
 
 
 @pytest.mark.parametrize("key", [*(name for name in raw_channels() if name != "indirect_sh"), "light"])

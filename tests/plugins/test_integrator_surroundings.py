@@ -24,26 +24,20 @@ from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
-from tests.plugins.test_integrator_derivatives import check_derivatives
-from tests.scenes.integrator import HEIGHT, WIDTH, image, raw_channels, scene, sensor, sky
-
-PREFIX = "surroundings_"
-
-
-def far_channels(count: int = 30) -> dict[str, np.ndarray]:
-    """Discs around the object, some of them before it, with radiance alone."""
-    raw = raw_channels(count, seed=4)
-    raw["position"] = 1.7 * raw["position"]
-    return {name: raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
-
-
-def behind() -> EnvironmentLight:
-    return EnvironmentLight.from_radiance(0.3 + sky(16))
-
-
-def open_scene(camera: dict | None = None, **changes: Any) -> mi.Scene:
-    around = {PREFIX + name: mi.TensorXf(values) for name, values in far_channels().items()}
-    return scene(camera, **{**around, "background": behind().raw, **changes})
+from tests.scenes.integrator import (
+    HEIGHT,
+    PREFIX,
+    WIDTH,
+    background_light,
+    check_derivatives,
+    far_channels,
+    image,
+    open_scene,
+    raw_channels,
+    scene,
+    sensor,
+    sky,
+)
 
 
 def camera() -> Camera:
@@ -65,7 +59,7 @@ def test_the_picture_is_that_of_the_renderer() -> None:
     rgba = sensor(film={"pixel_format": "rgba"})
     seen = image(open_scene(rgba))
     surfels, light = Surfels.from_numpy(raw_channels()), EnvironmentLight.from_radiance(sky())
-    around = Surroundings(Surfels.from_numpy(far_channels()), behind())
+    around = Surroundings(Surfels.from_numpy(far_channels()), background_light())
     shading = Shading()
     frame = render(surfels, camera(), shading, shading.light_of(light), surroundings=around)
     expected = frame.radiance + (1 - frame.alpha) * frame.background
@@ -78,7 +72,7 @@ def test_the_picture_is_that_of_the_renderer() -> None:
 def test_one_of_the_two_is_enough() -> None:
     """A background alone is opaque; surroundings alone stay transparent where nothing is."""
     rgba = sensor(film={"pixel_format": "rgba"})
-    plain, before = image(scene(rgba)), image(scene(rgba, background=behind().raw))
+    plain, before = image(scene(rgba)), image(scene(rgba, background=background_light().raw))
     np.testing.assert_array_equal(before[..., 3], 1)
     empty = plain[..., 3] == 0
     assert empty.any() and (before[empty][:, :3] > 0.3).all()
@@ -113,7 +107,7 @@ def test_refusals(tmp_path: Path) -> None:
 
 
 def fitted() -> TrainedScene:
-    around = Surroundings(Surfels.from_numpy(far_channels()), behind())
+    around = Surroundings(Surfels.from_numpy(far_channels()), background_light())
     light, surfels = EnvironmentLight.from_radiance(sky()), Surfels.from_numpy(raw_channels())
     return TrainedScene(surfels, light, None, Shading(), 7, 1.5, surroundings=around)
 

@@ -23,8 +23,19 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.plugins.test_integrator_surroundings import behind, far_channels, open_scene
-from tests.scenes.integrator import HEIGHT, WIDTH, hollow_mesh, plane_mesh, raw_channels, scene, sensor, sky
+from tests.scenes.integrator import (
+    HEIGHT,
+    WIDTH,
+    background_light,
+    far_channels,
+    hollow_mesh,
+    open_scene,
+    plane_mesh,
+    raw_channels,
+    scene,
+    sensor,
+    sky,
+)
 
 FEW = 512
 """Samples of a pass in these tests: two rows of pixels or more of 4 × 4 samples."""
@@ -58,7 +69,7 @@ def test_a_frame_in_passes_is_the_whole_frame(
     name: str, around: bool, samples: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shading = SHADINGS[name]
-    beside = Surroundings(Surfels.from_numpy(far_channels()), behind()) if around else None
+    beside = Surroundings(Surfels.from_numpy(far_channels()), background_light()) if around else None
     mesh = read_mesh(Path(hollow_mesh(tmp_path))) if shading.occlusion else None
     light, surfels = EnvironmentLight.from_radiance(sky()), Surfels.from_numpy(raw_channels())
     view = TrainedScene(surfels, light, mesh, shading, 1, 0.0, surroundings=beside).renderer(samples=samples)

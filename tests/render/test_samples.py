@@ -28,8 +28,17 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
-from tests.plugins.test_integrator_surroundings import behind, far_channels, open_scene
-from tests.scenes.integrator import HEIGHT, WIDTH, raw_channels, scene, sensor, sky
+from tests.scenes.integrator import (
+    HEIGHT,
+    WIDTH,
+    background_light,
+    far_channels,
+    open_scene,
+    raw_channels,
+    scene,
+    sensor,
+    sky,
+)
 from tests.scenes.tiny import SETTINGS, SIZE, write_data, write_method
 
 POSE = look_at(np.array([0.5, 1.5, 3.0]), np.zeros(3), up=(0, 1, 0))
@@ -135,7 +144,7 @@ def test_aovs_of_several_samples_are_premultiplied_means_divided_once(
     eye, factor = Camera.from_sensor(of.sensors()[0]), round(spp**0.5)
     fine_eye = eye.supersampled(factor)
     surfels, light = Surfels.from_numpy(raw), EnvironmentLight.from_radiance(sky())
-    beside = Surroundings(Surfels.from_numpy(far_channels()), behind()) if around else None
+    beside = Surroundings(Surfels.from_numpy(far_channels()), background_light()) if around else None
     shading = Shading(at=at)  # type: ignore[arg-type]
     made = TrainedScene(surfels, light, None, shading, 1, 0.0, surroundings=beside)
     frame, fine = made.renderer(samples=spp)(eye), made.renderer()(fine_eye)

@@ -24,25 +24,23 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.visibility import mirror_visibility
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.integrator import HEIGHT, WIDTH, hollow_mesh, image, plane_mesh, raw_channels, sensor, sky
-
-OTHER: dict[str, Any] = {
-    "dominant": True,
-    "multiscatter": True,
-    "visibility_rays": 3,
-    "traced_bounces": 1,
-    "ambient_rays": 16,
-    "light_levels": 2,
-    "directions": 5,
-    "antialias": True,
-}
-"""A value for each option that is not its default."""
+from tests.scenes.integrator import (
+    HEIGHT,
+    OTHER_OPTIONS,
+    WIDTH,
+    hollow_mesh,
+    image,
+    plane_mesh,
+    raw_channels,
+    sensor,
+    sky,
+)
 
 
 def shading_with(option: str) -> Shading:
-    """A shading whose model honours the option, with OTHER's value."""
+    """A shading whose model honours the option, with OTHER_OPTIONS's value."""
     name = next(name for name, model in MODELS.items() if option in model.honours)
-    accuracy = Accuracy(**{option: OTHER[option]})
+    accuracy = Accuracy(**{option: OTHER_OPTIONS[option]})
     return Shading(MODELS[name].orders[0], name, diffuse="irradiance", occlusion=True, accuracy=accuracy)
 
 

@@ -24,26 +24,11 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from tests.benchmarks.benchmark_runs import ROOT  # first: it lets `benchmarks` be found
+from tests.scenes.integrator import scattered_discs
 
 assert ROOT
-OTHERS = 30
 CASES = [("pixel", "sh"), ("surfel", "irradiance")]
 MAPS = ("radiance", "alpha", "depth", "normal", "share", "albedo", "metallic", "roughness", "background")
-
-
-def around(seed: int = 4) -> dict[str, np.ndarray]:
-    """Discs behind, beside and before the object of the plain case."""
-    rng = np.random.default_rng(seed)
-    direction = rng.normal(size=(OTHERS, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    raw = {
-        "position": direction * rng.uniform(0.4, 2.0, (OTHERS, 1)),
-        "rotation": rng.normal(size=(OTHERS, 4)),
-        "scale": np.log(rng.uniform(0.2, 0.5, (OTHERS, 2))),
-        "opacity": rng.uniform(-1, 1, (OTHERS, 1)),
-        "radiance_sh": 0.2 * rng.normal(size=(OTHERS, 12)),
-    }
-    return {name: values.astype(np.float32) for name, values in raw.items()}
 
 
 @dataclass(frozen=True)
@@ -63,13 +48,17 @@ class Pair:
         """Every parameter (float32) by name, as in a fit."""
         rng = np.random.default_rng(9)
         found = {name: np.asarray(x, np.float32) for name, x in self.case.raw.items()}
-        found |= {f"surroundings/{name}": x for name, x in around().items()}
+        found |= {f"surroundings/{name}": x for name, x in scattered_discs().items()}
         background = rng.normal(size=(8, 16, 3)).astype(np.float32)
         return found | {"light": np.asarray(self.case.light, np.float32), "background": background}
 
     @cached_property
     def order(self) -> np.ndarray:
-        raw = {n: np.concatenate([self.case.raw[n], x]) for n, x in around().items() if n != "radiance_sh"}
+        raw = {
+            n: np.concatenate([self.case.raw[n], x])
+            for n, x in scattered_discs().items()
+            if n != "radiance_sh"
+        }
         pixels = np.arange(self.case.camera.width * self.case.camera.height)
         colour = np.zeros((len(raw["scale"]), 3))
         return measure.product_order(replace(self.case, raw=raw | {"radiance_sh": colour}), pixels)
@@ -78,12 +67,12 @@ class Pair:
         case = replace(self.case, raw={n: values[n] for n in self.case.raw})
         pixels = np.arange(case.camera.width * case.camera.height)
         scene = measure.scene_of(case, pixels, self.order, measure.light_of(values["light"]))
-        others = {name: values[f"surroundings/{name}"] for name in around()}
+        others = {name: values[f"surroundings/{name}"] for name in scattered_discs()}
         return oracle.render(oracle.OpenScene(scene, others, values["background"]))
 
     def frame(self, params: dict[str, Any], eye: Camera | None = None) -> Frame:
         surfels = Surfels({name: params[name] for name in self.case.raw})
-        others = Surfels({name: params[f"surroundings/{name}"] for name in around()})
+        others = Surfels({name: params[f"surroundings/{name}"] for name in scattered_discs()})
         behind = Surroundings(others, EnvironmentLight(params["background"]))
         light = EnvironmentLight(params["light"]).prefilter()
         shading = Shading(self.at, "split_sum", self.diffuse)  # type: ignore[arg-type]
@@ -203,7 +192,7 @@ def test_an_empty_table_shows_nothing_and_a_screened_one_leaves_rows_out() -> No
     pair = Pair("pixel", "sh")
     params = {name: upload_tensor(x) for name, x in pair.values.items()}
     own = {name: params[name] for name in pair.case.raw}
-    others = {name: np.array(x) for name, x in around().items()}
+    others = {name: np.array(x) for name, x in scattered_discs().items()}
     light = EnvironmentLight(params["light"]).prefilter()
     eye, shading = measure.fast_camera(pair.case), Shading("pixel", "split_sum", "sh")
 

@@ -17,9 +17,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
-from tests.render.test_surroundings import around
-from tests.scenes.integrator import image, raw_channels, sky
-from tests.splat.test_shown import camera_at, mesh
+from tests.scenes.integrator import camera_at, image, raw_channels, scattered_discs, sky, two_balls
 
 TOLERANCE = 1e-5
 
@@ -30,10 +28,10 @@ def scenes() -> dict[str, TrainedScene]:
     raw["scale"] = raw["scale"] - 1
     light = EnvironmentLight.from_radiance(sky())
     traced = Shading("pixel", "split_sum", "sh", occlusion=True)
-    deferred = TrainedScene(Surfels.from_numpy(raw), light, mesh(), traced, 7, 1.5)
+    deferred = TrainedScene(Surfels.from_numpy(raw), light, two_balls(), traced, 7, 1.5)
     at_surfels = replace(deferred, mesh=None, shading=Shading("surfel", "split_sum", "irradiance"))
     thick = raw | {"scale": np.concatenate([raw["scale"], raw["scale"][:, :1] - 0.5], axis=1)}
-    near = around()
+    near = scattered_discs()
     near["position"] = near["position"] * 3
     return {
         "deferred": deferred,

@@ -22,7 +22,7 @@ from mi_refgs.shade.points import reflect
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.split_sum import multiple_scattering, shade
 from tests.helpers import check_slopes, level_maps, unit, vector
-from tests.shade.test_models import N, points_of, scene
+from tests.scenes.shading_points import N, points_of, shading_values
 
 OPTIONS = (Accuracy(dominant=True), Accuracy(multiscatter=True), Accuracy(dominant=True, multiscatter=True))
 CASES = [(options, "irradiance", "open") for options in OPTIONS] + [(OPTIONS[2], "sh", "indirect")]
@@ -33,7 +33,7 @@ def radiance() -> np.ndarray:
     return np.random.default_rng(3).uniform(0.1, 3, (16, 32, 3))
 
 
-def oracle(
+def exact_terms(
     values: dict[str, Any], levels: list[np.ndarray], diffuse: str, options: Accuracy, k: int
 ) -> np.ndarray:
     one: dict[str, Any] = {name: None if x is None else x[k] for name, x in values.items()}
@@ -54,7 +54,7 @@ def oracle(
 def test_everything_is_off_by_default(radiance: np.ndarray, rng: np.random.Generator) -> None:
     """Same bits as without the argument; each option changes the picture."""
     assert Shading().accuracy == Accuracy() == Accuracy(False, False, 1, 0)
-    points = points_of(scene(rng, "open"))
+    points = points_of(shading_values(rng, "open"))
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     plain, same = shade(points, light), shade(points, light, "sh", Accuracy())
     np.testing.assert_array_equal(plain.total().numpy(), same.total().numpy())
@@ -94,9 +94,9 @@ def test_terms_against_the_oracle(
     options: Accuracy, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
     light = EnvironmentLight.from_radiance(radiance).prefilter()
-    levels, values = level_maps(light), scene(rng, occlusion)
+    levels, values = level_maps(light), shading_values(rng, occlusion)
     terms = shade(points_of(values), light, diffuse, options)
-    expected = np.array([oracle(values, levels, diffuse, options, k) for k in range(N)])
+    expected = np.array([exact_terms(values, levels, diffuse, options, k) for k in range(N)])
     for n, term in enumerate(vars(terms.filled()).values()):
         got = np.broadcast_to(term.numpy().T, (N, 3))
         np.testing.assert_allclose(got, expected[:, n], rtol=2e-4, atol=5e-5)
@@ -109,7 +109,7 @@ def test_derivatives_of_the_points(
     """Every input of every point against one-sided differences of the oracle, with random weights; where the
     two sides disagree, a kink of the lookup is near."""
     light = EnvironmentLight.from_radiance(radiance).prefilter()
-    levels, values = level_maps(light), scene(rng, occlusion)
+    levels, values = level_maps(light), shading_values(rng, occlusion)
     points, weight = points_of(values), rng.normal(size=(N, 3, 3))
     used = {name: getattr(points, name) for name, x in values.items() if x is not None}
     dr.enable_grad(list(used.values()))
@@ -124,7 +124,7 @@ def test_derivatives_of_the_points(
         changed = dict(values)
         changed[name] = np.array(values[name], np.float64)
         changed[name][k] = x
-        return float((oracle(changed, levels, diffuse, options, k) * weight[k]).sum())
+        return float((exact_terms(changed, levels, diffuse, options, k) * weight[k]).sum())
 
     for name, array in used.items():
         gradient = np.array(dr.grad(array)).reshape(-1, N).T
@@ -135,7 +135,7 @@ def test_derivatives_of_the_points(
 @pytest.mark.parametrize("options", OPTIONS)
 def test_derivative_of_the_light(options: Accuracy, radiance: np.ndarray, rng: np.random.Generator) -> None:
     """Outgoing radiance is linear in radiance: any step will do."""
-    points = points_of(scene(rng, "visibility"))
+    points = points_of(shading_values(rng, "visibility"))
     weight = vector(rng.normal(size=(N, 3)))
     raw = EnvironmentLight.from_radiance(radiance).raw
     dr.enable_grad(raw)
@@ -241,7 +241,7 @@ def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -
 
 def test_a_white_metal_loses_nothing(rng: np.random.Generator) -> None:
     """The furnace: A + B with one bounce, 1 with all of them, at any angle and roughness."""
-    values = scene(rng, "open")
+    values = shading_values(rng, "open")
     values["albedo"], values["metallic"] = np.ones((N, 3)), np.ones(N)
     light = EnvironmentLight.constant(1.0, 16).prefilter()
     total = shade(points_of(values), light, "irradiance", OPTIONS[1]).total().numpy()
@@ -288,7 +288,7 @@ def test_the_walks_first_bounce_is_the_brute_force_integral(rng: np.random.Gener
 def test_a_point_seen_from_behind_keeps_its_mirror_direction(radiance: np.ndarray) -> None:
     """With roughness 0 the dominant direction is the mirror direction, wherever the camera is."""
     rng = np.random.default_rng(5)
-    values = scene(rng, "open")
+    values = shading_values(rng, "open")
     values["roughness"] = np.zeros(N)
     values["normal"] = unit(rng.normal(size=(N, 3)))
     light = EnvironmentLight.from_radiance(radiance).prefilter()

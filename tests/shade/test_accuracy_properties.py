@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.shade.accuracy import Accuracy
-from tests.plugins.test_integrator_derivatives import check_derivatives
-from tests.scenes.integrator import image, integrator, plane_mesh, raw_channels, scene
+from tests.scenes.integrator import check_derivatives, image, integrator, plane_mesh, raw_channels, scene
 
 
 def test_properties_of_the_plugin(tmp_path: Path) -> None:

@@ -12,45 +12,14 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.reference import shade as reference
 from mi_refgs.shade import brdf
-from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.points import ShadingPoints, reflect, safe_normalize
+from mi_refgs.shade.points import reflect, safe_normalize
 from mi_refgs.shade.split_sum import shade
 from tests.helpers import check_slopes, level_maps, unit
+from tests.scenes.shading_points import N, exact_terms, points_of, shading_values
 
-N = 50
 CASES = [(d, o) for d in ("sh", "irradiance") for o in ("open", "visibility", "indirect")]
 CASES += [("irradiance", "ambient")]
-
-
-def scene(rng: np.random.Generator, occlusion: str) -> dict[str, Any]:
-    """Points whose normals face the camera, away from the clamps; normals and views need not have unit
-    length."""
-    view = unit(rng.normal(size=(N, 3)))
-    normal = unit(unit(rng.normal(size=(N, 3))) + 1.3 * view)
-    return {
-        "normal": normal * rng.uniform(0.5, 2, (N, 1)),
-        "view": view * rng.uniform(0.5, 2, (N, 1)),
-        "albedo": rng.uniform(0.1, 0.9, (N, 3)),
-        "metallic": rng.uniform(0.1, 0.9, N),
-        "roughness": rng.uniform(0.05, 0.95, N),
-        "radiance": rng.uniform(0.1, 2, (N, 3)),
-        "visibility": None if occlusion == "open" else rng.uniform(0, 1, N),
-        "indirect": rng.uniform(0.1, 1, (N, 3)) if occlusion == "indirect" else None,
-        "ambient": rng.uniform(0, 2, (N, 3)) if occlusion == "ambient" else None,
-    }
-
-
-def points_of(values: dict[str, Any]) -> ShadingPoints:
-    def array(x: Any) -> Any:
-        if x is None:
-            return None
-        return mi.Float(x.astype(np.float32)) if x.ndim == 1 else mi.Vector3f(x.T.astype(np.float32))
-
-    arrays = {name: array(x) for name, x in values.items()}
-    for name in ("albedo", "radiance", "indirect", "ambient"):
-        arrays[name] = None if arrays.get(name) is None else mi.Color3f(arrays[name])
-    return ShadingPoints(**arrays)
 
 
 @pytest.fixture(scope="module")
@@ -58,21 +27,14 @@ def radiance() -> np.ndarray:
     return np.random.default_rng(3).uniform(0.1, 3, (16, 32, 3))
 
 
-def oracle(values: dict[str, Any], levels: list[np.ndarray], diffuse: str, k: int) -> np.ndarray:
-    one: dict[str, Any] = {name: None if x is None else x[k] for name, x in values.items()}
-    return reference.shade(
-        brdf.table().astype(np.float64), levels, lobe_matrices.LEVEL_ROUGHNESS, diffuse=diffuse, **one
-    )
-
-
 @pytest.mark.parametrize(("diffuse", "occlusion"), CASES)
 def test_terms_against_the_oracle(
     diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
     light = EnvironmentLight.from_radiance(radiance).prefilter()
-    levels, values = level_maps(light), scene(rng, occlusion)
+    levels, values = level_maps(light), shading_values(rng, occlusion)
     terms = shade(points_of(values), light, diffuse)
-    expected = np.array([oracle(values, levels, diffuse, k) for k in range(N)])
+    expected = np.array([exact_terms(values, levels, diffuse, k) for k in range(N)])
     for n, term in enumerate(vars(terms.filled()).values()):
         np.testing.assert_allclose(np.broadcast_to(term.numpy(), (3, N)).T, expected[:, n], atol=2e-4)
     np.testing.assert_allclose(terms.total().numpy().T, expected.sum(1), atol=4e-4)
@@ -85,7 +47,7 @@ def test_derivatives_of_each_parameter(
     """Random weights per point, term and colour; differences of the oracle that straddle a texel or a level
     are left out."""
     light = EnvironmentLight.from_radiance(radiance).prefilter()
-    levels, values = level_maps(light), scene(rng, occlusion)
+    levels, values = level_maps(light), shading_values(rng, occlusion)
     points = points_of(values)
     used = {n: getattr(points, n) for n, x in values.items() if x is not None}
     for array in used.values():
@@ -102,7 +64,7 @@ def test_derivatives_of_each_parameter(
         changed = dict(values)
         changed[name] = np.array(values[name], np.float64)
         changed[name][k] = x
-        return float((oracle(changed, levels, diffuse, k) * weight[k]).sum())
+        return float((exact_terms(changed, levels, diffuse, k) * weight[k]).sum())
 
     for name, array in used.items():
         gradient = np.array(dr.grad(array)).reshape(-1, N).T
@@ -117,7 +79,7 @@ def test_derivative_of_the_light(
 ) -> None:
     """Through activation, prefilter, lookup and reflectance: outgoing radiance is linear in radiance, so any
     step will do."""
-    points = points_of(scene(rng, occlusion))
+    points = points_of(shading_values(rng, occlusion))
     weight = mi.Vector3f(rng.normal(size=(3, N)).astype(np.float32))
     raw = EnvironmentLight.from_radiance(radiance).raw
     dr.enable_grad(raw)
@@ -146,7 +108,7 @@ def test_derivative_of_the_light(
 def test_white_furnace(rng: np.random.Generator) -> None:
     """Under constant light 1 a white metal returns A + B ≤ 1: what single scattering keeps."""
     light = EnvironmentLight.constant(1.0, 16).prefilter()
-    values = scene(rng, "open")
+    values = shading_values(rng, "open")
     values["albedo"], values["metallic"] = np.ones((N, 3)), np.ones(N)
     points = points_of(values)
     total = shade(points, light, "irradiance").total().numpy()
@@ -161,7 +123,7 @@ def test_white_furnace(rng: np.random.Generator) -> None:
 def test_the_diffuse_base_gets_what_the_specular_layer_leaves(rng: np.random.Generator) -> None:
     """Whatever its visibility; a white dielectric in the furnace returns 1."""
     light = EnvironmentLight.constant(1.0, 16).prefilter()
-    values = scene(rng, "visibility")
+    values = shading_values(rng, "visibility")
     values["albedo"], values["metallic"] = np.ones((N, 3)), np.zeros(N)
     points = points_of(values)
     free = shade(points.replaced(visibility=None), light, "irradiance")
@@ -174,7 +136,7 @@ def test_visibility_selects_between_light_and_indirect(
     radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
     light = EnvironmentLight.from_radiance(radiance).prefilter()
-    points = points_of(scene(rng, "indirect"))
+    points = points_of(shading_values(rng, "indirect"))
     free = shade(points.replaced(visibility=None, indirect=None), light).specular.numpy()
     visible = shade(points.replaced(visibility=mi.Float(np.ones(N, np.float32))), light)
     np.testing.assert_allclose(visible.specular.numpy(), free, rtol=1e-6)
@@ -242,7 +204,7 @@ def test_degenerate_points_stay_finite(diffuse: Any, radiance: np.ndarray) -> No
 
 def test_bad_arguments(radiance: np.ndarray, rng: np.random.Generator) -> None:
     light = EnvironmentLight.from_radiance(radiance).prefilter()
-    points = points_of(scene(rng, "open"))
+    points = points_of(shading_values(rng, "open"))
     with pytest.raises(InputError, match="unknown"):
         shade(points, light, "lambert")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="missing"):

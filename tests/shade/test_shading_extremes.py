@@ -12,7 +12,7 @@ from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight
 from mi_refgs.shade.split_sum import shade
 from tests.helpers import level_maps, unit
-from tests.shade.test_models import oracle, points_of
+from tests.scenes.shading_points import exact_terms, points_of
 
 N = 24
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -105,7 +105,7 @@ def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.rand
         dr.enable_grad(*leaves.values())
         terms = shade(made, prefiltered, diffuse)
         found = np.stack([np.broadcast_to(getattr(terms, t).numpy(), (3, N)).T for t in TERMS], 1)
-        expected = np.array([oracle(values, levels, diffuse, k) for k in range(N)])
+        expected = np.array([exact_terms(values, levels, diffuse, k) for k in range(N)])
         limit = 1e-4 * max(np.abs(expected).max(), 1e-3)
         np.testing.assert_allclose(found, expected, atol=limit, rtol=1e-4, err_msg=f"{name}, {light}")
         dr.backward(terms.total())
@@ -119,7 +119,9 @@ def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.rand
                 for step in (5e-3, -5e-3):
                     moved = {n: x.copy() for n, x in values.items()}
                     moved[key].reshape(N, -1)[:, column] += step
-                    slopes.append(np.array([oracle(moved, levels, diffuse, k).sum() for k in range(0, N, 8)]))
+                    slopes.append(
+                        np.array([exact_terms(moved, levels, diffuse, k).sum() for k in range(0, N, 8)])
+                    )
                 slope = 100 * (slopes[0] - slopes[1])
                 scale = max(np.abs(slope).max(), 1e-3)
                 np.testing.assert_allclose(

@@ -9,10 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import trimesh
 
 from mi_refgs import splat
-from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Frame, render
@@ -24,26 +22,10 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.splat.lanes import Grid, Lanes, Places
 from mi_refgs.surfels.table import Surfels
-from tests.render.test_surroundings import around
-from tests.scenes.integrator import image, raw_channels, scene, sky
+from tests.scenes.integrator import camera_at, image, raw_channels, scattered_discs, scene, sky, two_balls
 
 MAPS = ("albedo", "metallic", "roughness", "visibility")
 ALL = {*MAPS, *TERMS, "normal", "depth"}
-
-
-def camera_at(focal: float, offset: tuple[int, int] = (0, 0)) -> Camera:
-    """A view with the tiles of its focal length, from as much farther away."""
-    pose = look_at(np.array([1.0, 1.5, 3.0]) * focal / 30, np.zeros(3), up=(0, 1, 0))
-    return replace(Camera.from_pose(45, 38, -focal, -focal, 20.0, 22.0, pose), offset=offset)
-
-
-def mesh() -> Mesh:
-    """A ball below the discs, and one that stands beside it in the way of its mirror rays."""
-    balls = [trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.8, 1.2)]
-    vertices = [np.asarray(ball.vertices, np.float32) for ball in balls]
-    faces = np.asarray(balls[0].faces, np.uint32)
-    both = np.concatenate([vertices[0], vertices[1] + np.array([-1.8, 1.2, 0.8], np.float32)])
-    return Mesh(both, np.concatenate([faces, faces + len(vertices[0])]).astype(np.uint32), 0.05)
 
 
 def things(gaussians: bool = False) -> Surfels:
@@ -57,7 +39,7 @@ def things(gaussians: bool = False) -> Surfels:
 def both(surfels: Surfels, view: Camera, shading: Shading, **more: Any) -> list[Frame]:
     """Frames with everything: with derivatives, and without."""
     light = EnvironmentLight.from_radiance(sky())
-    given = (surfels, view, shading, shading.light_of(light), Occluder(mesh()))
+    given = (surfels, view, shading, shading.light_of(light), Occluder(two_balls()))
     return [render(*given, aovs=True, derivatives=derivatives, **more) for derivatives in (True, False)]
 
 
@@ -101,7 +83,7 @@ def test_the_picture_is_the_same_in_both_orders(at: Any, gaussians: bool) -> Non
 @pytest.mark.parametrize("at", ["surfel", "pixel"])
 def test_the_picture_is_the_same_among_surroundings(at: Any) -> None:
     light = EnvironmentLight.from_radiance(sky())
-    near = around()
+    near = scattered_discs()
     near["position"] = near["position"] * 3
     others = Surroundings(Surfels.from_numpy(near), light)
     shading = Shading(at, "split_sum", "irradiance")
@@ -157,7 +139,7 @@ def test_a_frame_has_what_is_asked_for(at: Any, name: str, monkeypatch: pytest.M
     monkeypatch.setattr(splat, "blend_shown", counted)
     light = EnvironmentLight.from_radiance(sky())
     shading = Shading(at, "split_sum", "sh", occlusion=at == "pixel")
-    given = (things(), camera_at(30.0), shading, shading.light_of(light), Occluder(mesh()))
+    given = (things(), camera_at(30.0), shading, shading.light_of(light), Occluder(two_balls()))
     asked = {name} - {""}
     found = values(render(*given, aovs=asked, derivatives=False))
     has = {*TERMS} if name in TERMS else {name} - {""}

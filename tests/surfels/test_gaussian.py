@@ -26,8 +26,7 @@ from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.primitives.gaussian import GaussianAdjoint
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.tiny import train_command, write_data, write_method
-from tests.splat.test_splat import (
+from tests.scenes.splats import (
     PARAMETERS,
     Mutation,
     Scene,
@@ -39,6 +38,7 @@ from tests.splat.test_splat import (
     make_scene,
     outside_band,
 )
+from tests.scenes.tiny import train_command, write_data, write_method
 
 IMAGE_TOLERANCE = 1e-5  # observed 2e-6
 GRADIENT_TOLERANCE = 1e-3  # relative L2

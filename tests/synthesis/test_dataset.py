@@ -25,22 +25,11 @@ from mi_refgs.synthesis import pathtrace
 from mi_refgs.synthesis.make_dataset import make_dataset
 from mi_refgs.synthesis.scene_file import load_scene, under_light
 from tests.scenes.integrator import sky
+from tests.scenes.sphere import CENTRE, RADIUS, SCENE
 
 SCENES = Path(__file__).parents[2] / "scenes"
-CENTRE, RADIUS = np.array([0.3, -0.2, 0.5]), 0.7
 SIZE = 16
 
-SCENE = f"""<scene version="3.0.0">
-    <emitter type="envmap">
-        <string name="filename" value="{SCENES / "lights" / "studio.exr"}"/>
-        <transform name="to_world"><rotate x="1" angle="90"/><rotate z="1" angle="35"/></transform>
-    </emitter>
-    <shape type="sphere">
-        <point name="center" value="{CENTRE[0]}, {CENTRE[1]}, {CENTRE[2]}"/>
-        <float name="radius" value="{RADIUS}"/>
-        <bsdf type="diffuse"/>
-    </shape>
-</scene>"""
 OPTIONS: dict[str, Any] = {
     "views": 3,
     "test_views": 2,

@@ -1,0 +1,139 @@
+"""Data sets of dots in the layouts of other programs: COLMAP, nerfstudio, LLFF, NeRO."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import struct
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from mi_refgs.data.colmap_model import MODELS
+from tests.scenes.dots import COLOURS, POINTS, Shot
+
+SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]
+
+
+MODEL, VALUES = "PINHOLE", (110.0, 104.0, 50.3, 34.6)
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """w, x, y, z, by the eigenvector of Bar-Itzhack's matrix."""
+    m = rotation
+    k = np.array(
+        [
+            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [0, m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[2, 0] + m[0, 2]],
+            [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[2, 1] + m[1, 2]],
+            [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]],
+        ]
+    )
+    return np.linalg.eigh(k, UPLO="U")[1][:, -1]
+
+
+def write_text(
+    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
+) -> None:
+    """Cameras, images and points as COLMAP writes them as text."""
+    model.mkdir(parents=True, exist_ok=True)
+    size = f"{shots[0].width} {shots[0].height}"
+    (model / "cameras.txt").write_text(f"# comment\n7 {camera} {size} {' '.join(map(repr, values))}\n")
+    lines = ["# Image list with two lines of data per image:"]
+    for i, shot in enumerate(shots):
+        pose = " ".join(map(repr, [*quaternion(shot.rotation).tolist(), *shot.translation.tolist()]))
+        seen = "1.5 2.5 3 10.0 20.0 -1" if i % 2 else ""
+        lines += [f"{i + 1} {pose} 7 {shot.name}", seen]
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    lines = [
+        f"{i} {' '.join(map(repr, p.tolist()))} {' '.join(map(str, c))} 0.5 1 0 2 0 3 {i}"
+        for i, (p, c) in enumerate(zip(POINTS, COLOURS, strict=True))
+    ]
+    (model / "points3D.txt").write_text("# points\n\n" + "\n".join(lines) + "\n")
+
+
+def write_binary(
+    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
+) -> None:
+    """The same in COLMAP's binary records."""
+    model.mkdir(parents=True, exist_ok=True)
+    size = (shots[0].width, shots[0].height)
+    record = struct.pack("<iiQQ", 7, MODELS[camera][0] if camera in MODELS else 7, *size)
+    (model / "cameras.bin").write_bytes(
+        struct.pack("<Q", 1) + record + struct.pack(f"<{len(values)}d", *values)
+    )
+    data = struct.pack("<Q", len(shots))
+    for i, shot in enumerate(shots):
+        data += struct.pack("<i7di", i + 1, *quaternion(shot.rotation), *shot.translation, 7)
+        data += shot.name.encode() + b"\0"
+        data += struct.pack("<Qddqddq", 2, 1.5, 2.5, 3, 10, 20, -1) if i % 2 else struct.pack("<Q", 0)
+    (model / "images.bin").write_bytes(data)
+    data = struct.pack("<Q", len(POINTS))
+    for i, (point, colour) in enumerate(zip(POINTS, COLOURS, strict=True)):
+        data += struct.pack("<Q3d3BdQ6i", i, *point, *colour.tolist(), 0.5, 3, 1, 0, 2, 0, 3, i)
+    (model / "points3D.bin").write_bytes(data)
+
+
+WRITERS = {"txt": write_text, "bin": write_binary}
+
+
+def write_colmap(
+    folder: Path, kind: str = "bin", shots: list[Shot] = SHOTS, place: str = "sparse/0", **camera: object
+) -> Path:
+    for shot in shots:
+        shot.write(folder / "images")
+    WRITERS[kind](folder / place, shots, **camera)  # type: ignore[arg-type]
+    return folder
+
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV's axes
+
+
+def write_nerfstudio(folder: Path, shots: list[Shot] = SHOTS, **content: Any) -> Path:
+    """`transforms.json` with intrinsics for the whole file, but for those of one frame."""
+    frames = []
+    for shot in shots:
+        shot.write(folder / "images")
+        pose = (shot.camera_to_world @ OPENGL).tolist()
+        frames.append({"file_path": f"images/{shot.name}", "transform_matrix": pose})
+        frames[-1] |= {"colmap_im_id": shot.index, "fl_x": shot.focal[0], "fl_y": shot.focal[1]}
+        frames[-1] |= {"cx": shot.centre[0], "cy": shot.centre[1], "w": shot.width, "h": shot.height}
+    whole = {"camera_model": "OPENCV", "fl_x": 1.0, "fl_y": 1.0, "cx": 1.0, "cy": 1.0} | content
+    (folder / "transforms.json").write_text(json.dumps(whole | {"frames": frames}))
+    return folder
+
+
+def change_transforms(data: Path, change: Any) -> None:
+    content = json.loads((data / "transforms.json").read_text())
+    change(content)
+    (data / "transforms.json").write_text(json.dumps(content))
+
+
+def write_llff(folder: Path, factor: int = 1) -> Path:
+    rows = []
+    for shot in SHOTS:
+        same = replace(shot, focal=(107.0, 107.0), centre=(48.0, 36.0))
+        same.write(folder / "images")
+        right, down, forward, position = same.camera_to_world[:3].T
+        size = np.array([72 * factor, 96 * factor, 107.0 * factor])
+        matrix = np.stack([down, right, -forward, position, size], axis=-1)
+        rows.append([*matrix.ravel(), 1.0, 9.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    return folder
+
+
+def write_glossy(folder: Path, protocol: int = 4) -> Path:
+    for shot in SHOTS:
+        replace(shot, name=f"{shot.index}.png").write(folder)
+        depth = np.full((72, 96), 65535, dtype=np.uint16)
+        depth[:, 32:] = round(3.0 / 15 * 65535)
+        depth[:, 64:] = round(14.6 / 15 * 65535)
+        Image.fromarray(depth).save(folder / f"{shot.index}-depth.png")
+        pose = np.concatenate([shot.rotation, shot.translation[:, None]], axis=1)
+        matrix = np.array([[110.0, 0, 50.3], [0, 104.0, 34.6], [0, 0, 1]])
+        content = [pose.astype(np.float32), np.asfortranarray(matrix)]
+        (folder / f"{shot.index}-camera.pkl").write_bytes(pickle.dumps(content, protocol))
+    return folder
