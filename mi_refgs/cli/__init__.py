@@ -23,7 +23,6 @@ from mi_refgs.cli import (
     edit,
     evaluate,
     export,
-    gallery,
     import_splats,
     profile,
     relight,
@@ -61,7 +60,6 @@ def build_parser() -> Parser:
         import_splats,
         profile,
         view,
-        gallery,
         completion,
     ):
         module.add(commands)

@@ -40,12 +40,6 @@ def add(commands: Any) -> None:
         help="folder of the comparison; the same command goes on where it stopped",
     )
     parser.add_argument(
-        "--paper-table",
-        type=int,
-        metavar="N",
-        help="print the paper's table N with those of the folder's runs, and name the data that is missing",
-    )
-    parser.add_argument(
         "--variants", nargs="+", metavar="V", help="methods: names or .toml files, by spaces or commas"
     )
     parser.add_argument("--seeds", nargs="+", metavar="K", help="as in 0,1 (default 0)")
@@ -70,8 +64,6 @@ def run(args: argparse.Namespace) -> Result:
     """Do what is left to do, then make the table of all runs in the folder."""
     from mi_refgs.compare import cluster, execute, jobs, results
 
-    if args.paper_table is not None:
-        return _paper_table(args)
     if args.output is None:
         raise InputError("-o: none given; name the folder of the comparison")
     if args.data:
@@ -110,19 +102,6 @@ def _plan(args: argparse.Namespace, workers: int, threads: int | None) -> list[J
     )
     results.begin(args.output, planned, workers, sys.argv[1:])
     return planned
-
-
-def _paper_table(args: argparse.Namespace) -> Result:
-    from mi_refgs.compare import paper_table, results
-    from mi_refgs.compare.paper import Figures
-
-    figures = Figures.read()
-    if args.data:
-        raise InputError("--paper-table: prints what -o holds and fits nothing; drop DATA")
-    _require_unused(args, "--paper-table: prints what -o holds and fits nothing; drop the option")
-    ours = None if args.output is None else results.table(args.output)
-    found = paper_table.compared(args.paper_table, ours, figures)
-    return Result(dataclasses.asdict(found), paper_table.text(found, figures))
 
 
 def _require_unused(args: argparse.Namespace, reason: str) -> None:

@@ -1,12 +1,161 @@
-"""`refgs doctor`: what is installed, or what is in a data set."""
+"""`refgs doctor`: state of the installation or of a data set, problems, and the command that solves each."""
 
 from __future__ import annotations
 
 import argparse
+import importlib.metadata
+import os
+import platform
+import re
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from mi_refgs import __version__, llvm
 from mi_refgs.cli.command import Result, add_command
+
+PROBE_TIMEOUT = 60.0
+"""Time limit of the trial kernel in seconds; it usually takes half a second."""
+
+EXTRAS = {
+    "lpips": "lpips",
+    "flip": "flip-evaluator",
+    "capture": "pycolmap",
+    "view": "viser",
+    "export": "xatlas",
+    "completion": "shtab",
+}
+"""Extra of pyproject.toml that a command requires → a distribution that it installs."""
+
+# Runs in a separate process, because an LLVM that cannot compile this kernel aborts instead of raising.
+_PROBE = """
+import mi_refgs, drjit as dr, mitsuba as mi
+from mi_refgs.kernels.device import simd_width
+mi.set_variant("llvm_ad_rgb")
+assert dr.minimum(dr.arange(mi.Float, 64), dr.opaque(mi.Float, 2))[63] == 2
+print(simd_width())
+"""
+
+
+@dataclass(frozen=True)
+class Report:
+    """State of the installation; versions are None for missing parts."""
+
+    mi_refgs: str
+    python: str
+    platform: str
+    mitsuba: str | None
+    drjit: str | None
+    llvm_version: str | None
+    llvm_path: str | None
+    cuda: bool
+    threads: int
+    simd_width: int | None
+    kernel_cache: str
+    speeds: list[str]
+    extras: dict[str, str | None]
+    problems: tuple[llvm.Problem, ...]
+
+    @property
+    def usable(self) -> bool:
+        """Whether fitting and rendering can run here."""
+        return not self.problems
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the report in types of JSON."""
+        return {"usable": self.usable, **asdict(self)}
+
+    def to_text(self) -> str:
+        """Return the report as text: one line per part, then the problems."""
+        found = {
+            "mi_refgs": self.mi_refgs,
+            "Python": f"{self.python} on {self.platform}",
+            "Mitsuba": self.mitsuba or "missing",
+            "Dr.Jit": self.drjit or "missing",
+            "LLVM": f"{self.llvm_version} ({self.llvm_path})" if self.llvm_version else "missing",
+            "CUDA": "available" if self.cuda else "not available (not needed)",
+            "threads": str(self.threads),
+            "SIMD width": f"{self.simd_width} floats" if self.simd_width else "unknown",
+            "kernel cache": self.kernel_cache,
+            "speeds": "; ".join(self.speeds) or "none measured yet",
+        }
+        for name, version in self.extras.items():
+            found[name] = version or f'not installed (optional: pip install "mi_refgs[{name}]")'
+        lines = [f"{name:<13}{value}" for name, value in found.items()]
+        if self.usable:
+            lines.append("Everything that is needed is here.")
+        for problem in self.problems:
+            lines.append(f"PROBLEM: {problem.what}\n  type:  {problem.remedy}")
+        return "\n".join(lines)
+
+
+def examine() -> Report:
+    """Examine the installation; runs one small kernel in a separate process (about 0.5 s)."""
+    import drjit as dr
+
+    from mi_refgs.fitting import cost_model
+
+    problems: list[llvm.Problem] = []
+    cuda = bool(dr.has_backend(dr.JitBackend.CUDA))
+    version = dr.detail.llvm_version()
+    width = None
+    llvm_problem = llvm.problem()
+    if llvm_problem is None:
+        width, failure = _probe()
+        if failure:
+            what = f"a trial kernel failed under LLVM {version[0]}: {failure}"
+            problems.append(llvm.Problem(what, llvm.REMEDY))
+    elif not cuda:
+        problems.append(llvm_problem)
+    return Report(
+        mi_refgs=__version__,
+        python=platform.python_version(),
+        platform=f"{platform.system()} {platform.machine()}",
+        mitsuba=_version("mitsuba"),
+        drjit=_version("drjit"),
+        llvm_version=".".join(str(part) for part in version) if version[0] > 0 else None,
+        llvm_path=_loaded_library(),
+        cuda=cuda,
+        threads=int(dr.thread_count()),
+        simd_width=width,
+        kernel_cache=os.environ.get("DRJIT_CACHE_DIR", str(Path.home() / ".drjit")),
+        speeds=cost_model.summary(),
+        extras={name: _version(distribution) for name, distribution in EXTRAS.items()},
+        problems=tuple(problems),
+    )
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _loaded_library() -> str | None:
+    """Return the libLLVM of this process from its memory map (Linux), else the one in the environment."""
+    maps = Path("/proc/self/maps")
+    if maps.exists():
+        found = re.findall(r"/\S*libLLVM[^\s/]*", maps.read_text())
+        named = os.path.realpath(os.environ.get(llvm.ENVIRONMENT_VARIABLE, ""))
+        return named if named in found else next(iter(found), None)
+    return os.environ.get(llvm.ENVIRONMENT_VARIABLE)
+
+
+def _probe() -> tuple[int | None, str | None]:
+    """Run one kernel in a new process; returns the SIMD width in floats and the failure, None each."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=PROBE_TIMEOUT, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return None, f"it took longer than {PROBE_TIMEOUT:.0f} s"
+    if done.returncode == 0:
+        return int(done.stdout), None
+    last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    return None, f"exit status {done.returncode}, {last}"
 
 
 def add(commands: Any) -> None:
@@ -25,7 +174,5 @@ def run(args: argparse.Namespace) -> Result:
 
         found = survey(args.data)
         return Result(found.to_dict(), found.to_text())
-    from mi_refgs.doctor import examine
-
     report = examine()
     return Result(report.to_dict(), report.to_text(), 0 if report.usable else 1)

@@ -8,7 +8,7 @@ from html import escape
 
 from mi_refgs.compare.plots import Region, write_crops, write_curves
 from mi_refgs.compare.table import Row, Scene, Table
-from mi_refgs.compare.text import NOTHING, cell, columns_of, header, heading, paper_cells, remarks
+from mi_refgs.compare.text import cell, columns_of, header, heading, remarks
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import write_bytes
 from mi_refgs.io.ownership import OutputFolder
@@ -22,7 +22,7 @@ h1, h2 { line-height: 1.2; } h2 { margin-top: 2.5rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; white-space: nowrap; }
 th, td { padding: .25rem .6rem; border-bottom: 1px solid var(--line); text-align: right; }
 th:first-child, td:first-child { text-align: left; }
-tr.published { opacity: .75; font-style: italic; } tr.failed td { background: #c002; }
+tr.failed td { background: #c002; }
 .best { font-weight: 700; } .sd, .remark { opacity: .75; }
 img { max-width: 100%; background: #fff; border-radius: 4px; }
 figure { margin: 1rem 0; } figcaption { font-size: .9em; opacity: .8; }
@@ -91,10 +91,7 @@ def _crop_caption(region: Region) -> str:
 
 def _table(scene: Scene) -> str:
     columns = columns_of(scene)
-    published = [c for c in columns if any(c.key in row.paper for row in scene.rows)]
     heads = ["method", *map(header, columns)]
-    for column in published:
-        heads += [f"{column.title}, paper", "ours − paper"]
     lines = ["<tr>" + "".join(f'<th scope="col">{escape(head)}</th>' for head in heads) + "</tr>"]
     best = {c.key: _best(scene, c.key, c.higher) for c in columns if c.higher is not None}
     for row in scene.rows:
@@ -103,15 +100,8 @@ def _table(scene: Scene) -> str:
             number = row.numbers.get(column.key)
             mark = ' class="best"' if number and number.mean == best.get(column.key) else ""
             cells.append(f"<td{mark}>{escape(cell(column, number))}</td>")
-        for column in published:
-            cells += [f"<td>{escape(text)}</td>" for text in paper_cells(column, row)]
         mark = ' class="failed"' if row.failed else ""
         lines.append(f"<tr{mark}>{''.join(cells)}</tr>")
-    for system, figures in scene.published.items():
-        cells = [f"<td>{escape(system)} (published)</td>"]
-        cells += [f"<td>{c.text(figures[c.key]) if c.key in figures else NOTHING}</td>" for c in columns]
-        cells += ["<td></td>"] * (2 * len(published))
-        lines.append(f'<tr class="published">{"".join(cells)}</tr>')
     return "<table>\n" + "\n".join(lines) + "\n</table>"
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs.compare.jobs import FAILED, Job, finished, require_one_size
-from mi_refgs.compare.paper import Figures, Place, place_of
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.io.files import read_json
@@ -60,14 +59,6 @@ class Statistic:
         return Statistic(statistics.fmean(values), sd, tuple(values))
 
 
-@dataclass(frozen=True)
-class Published:
-    """The paper's figure for a row's system, and ours minus it."""
-
-    value: float
-    difference: float | None
-
-
 @dataclass
 class Row:
     """A method on a scene."""
@@ -82,7 +73,6 @@ class Row:
     unfinished: list[int] = field(default_factory=list)
     footnotes: list[int] = field(default_factory=list)  # deviations from the original, numbered from 1
     paper_row: str = ""  # the paper's name for the method
-    paper: dict[str, Published] = field(default_factory=dict)  # by a column's key
 
 
 @dataclass
@@ -95,9 +85,6 @@ class Scene:
     image_size: list[int] = field(default_factory=list)
     downscale: int | None = None  # of the files' pixels; None: not recorded
     test_views: int = 0
-    place: Place | None = None  # in the paper
-    note: str = ""  # what to keep in mind when comparing with the paper
-    published: dict[str, dict[str, float]] = field(default_factory=dict)  # other systems → key → figure
 
 
 @dataclass
@@ -121,7 +108,6 @@ def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
 
     Raises InputError for runs on one data set that were measured on images of different sizes.
     """
-    figures = Figures.read()
     table = Table(about=about)
     scenes: dict[str, Scene] = {}
     rows: dict[tuple[str, str], Row] = {}
@@ -160,9 +146,6 @@ def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
         require_one_size(str(folder), found, "remove the runs of one size, and fit them again in the other")
     for (path, _), row in rows.items():
         _fill(row, metrics[path, row.variant])
-        _compare_with_paper(row, scenes[path], figures)
-    for scene in scenes.values():
-        _add_published(scene, figures)
     table.scenes = list(scenes.values())
     return table
 
@@ -187,31 +170,6 @@ def _fill(row: Row, found: list[dict[str, Any]]) -> None:
         reasons = [m.get(column.reason) for m in found if m[column.key] is None]
         if reasons and reasons[0]:
             row.missing[column.key] = str(reasons[0])
-
-
-def _compare_with_paper(row: Row, scene: Scene, figures: Figures) -> None:
-    scene.place = place_of(Path(scene.path))
-    if scene.place is None:
-        return
-    for key, value in figures.of(scene.place, row.paper_row).items():
-        ours = row.numbers.get(key)
-        row.paper[key] = Published(value, None if ours is None else ours.mean - value)
-
-
-def _add_published(scene: Scene, figures: Figures) -> None:
-    """The paper's figures for systems that no row stands for, and a note where pictures differ in size."""
-    if scene.place is None:
-        return
-    rows = {row.paper_row for row in scene.rows}
-    for system in figures.systems(scene.place):
-        if system not in rows:
-            scene.published[system] = figures.of(scene.place, system)
-    size, published = scene.image_size, scene.place.size
-    if size and published and size != list(published):
-        scene.note = (
-            f"the paper's pictures have {published[0]} × {published[1]} pixels, these {size[0]} × {size[1]}: "
-            "the differences are no reproduction"
-        )
 
 
 def rows_or_error(table: Table) -> Table:

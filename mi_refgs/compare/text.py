@@ -40,11 +40,6 @@ def remarks(scene: Scene) -> list[str]:
         reasons = [row.missing[column.key] for row in scene.rows if column.key in row.missing]
         if reasons and column not in columns_of(scene):
             said.append(f"{column.title}: none: {reasons[0]}.")
-    if scene.place is not None:
-        place = f"{scene.place.data_set}, {scene.place.scene}"
-        said.append(f"“Published” are the paper's own figures for {place}, which the folder is named after.")
-    if scene.note:
-        said.append(f"{scene.note[0].upper()}{scene.note[1:]}.")
     return said
 
 
@@ -66,14 +61,6 @@ def cell(column: Column, number: Statistic | None) -> str:
     return mean if number.sd is None else f"{mean} ± {column.text(number.sd)}"
 
 
-def paper_cells(column: Column, row: Row) -> tuple[str, str]:
-    """The paper's figure and ours minus it."""
-    if (figure := row.paper.get(column.key)) is None:
-        return NOTHING, NOTHING
-    difference = NOTHING if figure.difference is None else format(figure.difference, f"+{column.form}")
-    return column.text(figure.value), difference
-
-
 def label(row: Row) -> str:
     """The row's name with the numbers of its footnotes."""
     marks = f" [{','.join(map(str, row.footnotes))}]" if row.footnotes else ""
@@ -83,21 +70,10 @@ def label(row: Row) -> str:
 
 def _table(scene: Scene) -> list[str]:
     columns = columns_of(scene)
-    published = [c for c in columns if any(c.key in row.paper for row in scene.rows)]
-    titles = ["method", *map(header, columns)]
-    for column in published:
-        titles += [f"{column.title}, paper", "ours − paper"]
-    body = []
-    for row in scene.rows:
-        cells = [label(row), *(cell(column, row.numbers.get(column.key)) for column in columns)]
-        for column in published:
-            cells += paper_cells(column, row)
-        body.append(cells)
-    for system, figures in scene.published.items():
-        cells = [f"{system} (published)"]
-        cells += [c.text(figures[c.key]) if c.key in figures else NOTHING for c in columns]
-        body.append(cells + [""] * (2 * len(published)))
-    return aligned(titles, body)
+    body = [
+        [label(row), *(cell(column, row.numbers.get(column.key)) for column in columns)] for row in scene.rows
+    ]
+    return aligned(["method", *map(header, columns)], body)
 
 
 def aligned(titles: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from mi_refgs import doctor, llvm
+from mi_refgs import llvm
+from mi_refgs.cli import doctor
 from mi_refgs.fitting import cost_model
 
 

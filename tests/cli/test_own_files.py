@@ -150,20 +150,6 @@ CASES = [
         (),
         ("views/view_000.png", "views/view_000.json", "views/view_001.exr"),
     ),
-    Case(
-        "gallery",
-        lambda place: [
-            "gallery",
-            "-o",
-            str(place / "out"),
-            "--work",
-            str(place / "work"),
-            "--scenes",
-            "mirror_ring",
-        ],
-        (),
-        ("out/README.md", "out/gallery.json", "out/mirror_ring/turntable.webp"),
-    ),
 ]
 
 

@@ -28,7 +28,6 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import cost_model, plan
 from mi_refgs.fitting.progress import Progress
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.gallery.make import RECORD
 from mi_refgs.io.files import BusyError
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.reconstruction import fit as reconstruct
@@ -110,7 +109,6 @@ KEPT: dict[str, dict[str, Row]] = {
     "compare": {
         "data": refused("{elsewhere}", word="DATA"),
         "--output": WHERE,
-        "--paper-table": Refused(("--paper-table", "1"), ("--paper-table", "DATA")),
         "--variants": refused("--variants", "{other}"),
         "--seeds": Shows(("--seeds", "0,1"), "has_two_seeds"),
         "--preset": refused("--preset", "standard"),
@@ -118,15 +116,6 @@ KEPT: dict[str, dict[str, Row]] = {
         "--workers": HOW,
         "--cluster": HOW,
         "--mitsuba-variant": Free("kept: see test_a_comparison_keeps_its_mitsuba_variant"),
-    },
-    "gallery": {
-        "--output": WHERE,
-        "--scenes": Free("adds scenes to the page: see test_gallery"),
-        "--work": Free("where the runs are, which have their own settings"),
-        "--views": refused("--views", "5"),
-        "--size": refused("--size", "25"),
-        "--preset": refused("--preset", "paper"),
-        "--set": refused("--set", "loss.ssim=0.4"),
     },
     "capture": {
         **dict.fromkeys(("photographs", "--masks", "--camera"), HASHED),
@@ -247,13 +236,7 @@ def began(
         assert main(argv) == 3  # nothing is fitted
         return argv
 
-    def gallery() -> list[str]:
-        out.mkdir()
-        settings = {"views": 4, "size": 24, "preset": "quick", "set": []}
-        (out / RECORD).write_text(json.dumps({"settings": settings, "scenes": {}}))
-        return ["gallery", "-o", str(out), "--views", "4", "--size", "24", "--preset", "quick"]
-
-    made = {"train": train, "demo": demonstration, "dataset": dataset, "compare": compare, "gallery": gallery}
+    made = {"train": train, "demo": demonstration, "dataset": dataset, "compare": compare}
     return lambda command: (made[command](), out)
 
 
@@ -377,9 +360,8 @@ def test_a_comparison_keeps_its_mitsuba_variant(began: Began) -> None:
 def test_a_table_that_is_made_again_takes_no_option_of_a_fit(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for more in ([], ["--paper-table", "1"]):
-        assert main(["compare", "-o", str(tmp_path), option, *more]) == 2
-        assert option.split("=")[0] in capsys.readouterr().err
+    assert main(["compare", "-o", str(tmp_path), option]) == 2
+    assert option.split("=")[0] in capsys.readouterr().err
 
 
 # ---------------- commands that do everything again ----------------

@@ -33,7 +33,6 @@ BOUNDED = {
 UNBOUNDED = {
     "demo": "dataset, train and render, one after the other",
     "compare": "train and eval in processes of their own",
-    "gallery": "train, render and relight, one after the other",
     "capture": "COLMAP, which keeps to memory itself, and one photograph at a time",
     "doctor": "reads headers",
     "completion": "prints a script",

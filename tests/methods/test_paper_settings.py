@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 
 from mi_refgs import methods
-from mi_refgs.compare import paper
 from mi_refgs.errors import InputError
 from mi_refgs.io.resources import resource_dir
+from tests.helpers import ROOT
 
 FOLDER = resource_dir("scenes")
 FILES = sorted(path.relative_to(FOLDER) for path in (FOLDER / "paper").rglob("*.toml"))
 NAMES = [str(path.with_suffix("")) for path in FILES]
 SMOOTH = {"ball": 1.0, "helmet": 1.0, "tbell": 1.0, "gardenspheres": 0.45}
 DOWNSCALE = {"gardenspheres": 4, "toycar": 4, "sedan": 8}
-TABLES = json.loads((Path(paper.__file__).parent / "paper.json").read_text())["data_sets"]
+TABLES = json.loads((ROOT / "benchmarks" / "paper_tables.json").read_text())["data_sets"]
 
 
 @pytest.mark.parametrize("name", NAMES)

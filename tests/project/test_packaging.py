@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 import mi_refgs
-from mi_refgs.doctor import EXTRAS
+from mi_refgs.cli.doctor import EXTRAS
 from mi_refgs.errors import InputError
 from mi_refgs.io.resources import resource_dir
 from tests.helpers import ROOT, imported_packages

@@ -1,18 +1,33 @@
-"""A table of the paper with our figures below its own, and the data that is missing for the others."""
+"""The tables that the paper prints, with figures of a comparison below its own.
+
+    refgs compare data/ball data/car --methods ref_gaussian -o runs/paper
+    python -m benchmarks.paper_tables 1 -o runs/paper
+
+The figures of paper_tables.json are the paper's: nothing here measured them. A data set counts as a scene of
+the paper by the name of its folder.
+"""
 
 from __future__ import annotations
 
+import argparse
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 from statistics import fmean
+from typing import Any
 
-from mi_refgs.compare.paper import Figures, PaperTable, Place
+from mi_refgs.compare.results import table as table_of
 from mi_refgs.compare.table import Row, Scene, Table
 from mi_refgs.compare.text import NOTHING, aligned
 from mi_refgs.errors import InputError
+from mi_refgs.io.files import read_json
 
+FILE = Path(__file__).with_suffix(".json")
+OTHER_WORDS = {"blender", "synthetic", "ref", "scene", "data", "dataset"}
+"""Words that may be part of a folder's name beside the scene, its data set and numbers."""
 UNNAMED = ("Shiny Blender", "Glossy Synthetic")
-"""Over these ours are averaged where the paper names no data set: its synthetic glossy ones."""
+"""Data sets of averages for which the paper names none."""
 TITLES = {
     "psnr": ("PSNR (dB)", ".2f"),
     "ssim": ("SSIM", ".3f"),
@@ -24,7 +39,91 @@ TITLES = {
     "train_hours": ("training (h)", ".2f"),
     "fps": ("frames per second", "g"),
 }
-"""Metric of paper.json → title and form. What this package does not measure has no figure of ours."""
+"""Metric → title and format."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A scene of the paper."""
+
+    data_set: str
+    scene: str
+    size: tuple[int, int] | None = None  # of the paper's images: width, height
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """A table of the paper: metrics → systems → a figure for each column, a (data set, scene) pair.
+
+    A column without a scene is an average over its data set, or, without a data set, over some that the
+    paper does not name.
+    """
+
+    number: int
+    caption: str
+    columns: tuple[Place, ...]
+    metrics: dict[str, dict[str, list[float]]]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """All tables, and the data sets that they are about."""
+
+    source: str
+    data_sets: dict[str, dict[str, Any]]  # name → of, folder, words, size, scenes → folder names
+    tables: dict[int, PaperTable]
+
+    @staticmethod
+    def read() -> Figures:
+        """Read paper_tables.json."""
+        content = read_json(FILE)
+        tables = {
+            table["table"]: PaperTable(
+                table["table"],
+                table["caption"],
+                tuple(Place(*column) for column in table["columns"]),
+                table["metrics"],
+            )
+            for table in content["tables"]
+        }
+        return Figures(content["source"], content["data_sets"], tables)
+
+    def of(self, place: Place, system: str) -> dict[str, float]:
+        """Return metric → figure of a system on a scene, from every table that has it."""
+        found: dict[str, float] = {}
+        for table in self.tables.values():
+            for i, column in enumerate(table.columns):
+                if (column.data_set, column.scene) == (place.data_set, place.scene):
+                    for metric, systems in table.metrics.items():
+                        if system in systems:
+                            found.setdefault(metric, systems[system][i])
+        return found
+
+
+def place_of(folder: Path, figures: Figures) -> Place | None:
+    """Return the scene of the paper after which a folder is named; None for none, and where it could be two.
+
+    The folder's name is the scene's, with nothing but numbers and the data set's words beside it: `ball`,
+    `chair_400`, `teapot_glossy`. Where two data sets have a scene of that name, a word of one of them must
+    stand in the folder's name or in its parent's.
+    """
+    tokens = {token for token in re.split(r"[^a-z0-9]+", folder.name.lower()) if token}
+    found = []
+    for name, about in figures.data_sets.items():
+        for scene, aliases in about["scenes"].items():
+            rest = tokens - set(aliases)
+            if rest != tokens and all(
+                token.isdecimal() or token in OTHER_WORDS or token in about["words"] for token in rest
+            ):
+                found.append(Place(name, scene, tuple(about["size"]) if about["size"] else None))
+    if len(found) > 1:
+        above = f"{folder.parent.name} {folder.name}".lower()
+        found = [
+            place
+            for place in found
+            if any(word in above for word in figures.data_sets[place.data_set]["words"])
+        ]
+    return found[0] if len(found) == 1 else None
 
 
 @dataclass(frozen=True)
@@ -47,16 +146,16 @@ class Comparison:
 
 
 def compared(number: int, ours: Table | None, figures: Figures) -> Comparison:
-    """Table `number` of the paper beside the finished runs of `ours`; raises InputError if there is none."""
+    """Compare table `number` with the finished runs of `ours`; raises InputError for an unknown number."""
     if number not in figures.tables:
         known = ", ".join(map(str, figures.tables))
-        raise InputError(f"--paper-table: {number}: no such table in the paper; give one of {known}")
+        raise InputError(f"table {number}: not in the paper; give one of {known}")
     table = figures.tables[number]
     result = Comparison(table)
     scenes = {
-        (scene.place.data_set, scene.place.scene): scene
+        (found.data_set, found.scene): scene
         for scene in (ours.scenes if ours else [])
-        if scene.place is not None and any(row.seeds for row in scene.rows)
+        if (found := place_of(Path(scene.path), figures)) and any(row.seeds for row in scene.rows)
     }
     for column in table.columns:
         for place in _places(column, figures):
@@ -83,7 +182,7 @@ def compared(number: int, ours: Table | None, figures: Figures) -> Comparison:
 
 
 def text(found: Comparison, figures: Figures) -> str:
-    """The comparison as Markdown."""
+    """Return the comparison as Markdown."""
     table = found.table
     lines = [f"### Table {table.number}: {table.caption}", "", f"Published figures: {figures.source}."]
     heads = [_head(column, table.columns) for column in table.columns]
@@ -105,14 +204,14 @@ def text(found: Comparison, figures: Figures) -> str:
 
 
 def missing(name: str, scenes: Iterable[str], figures: Figures) -> str:
-    """What data is missing, and the names of the folders that it belongs into."""
+    """Return a sentence on missing data: scenes, and names of their folders."""
     about = figures.data_sets[name]
     folders = ", ".join(f"{about['folder']}/{about['scenes'][scene][0]}" for scene in scenes)
     return f"Missing: {name} ({about['of']}): {', '.join(scenes)}. Its folders: {folders}; name them as DATA."
 
 
 def _places(column: Place, figures: Figures) -> list[tuple[str, str]]:
-    """The scenes that a column stands for."""
+    """Return the (data set, scene) pairs of a column."""
     if column.scene:
         return [(column.data_set, column.scene)]
     names = [column.data_set] if column.data_set else UNNAMED
@@ -122,14 +221,14 @@ def _places(column: Place, figures: Figures) -> list[tuple[str, str]]:
 def _ours(
     metric: str, variant: str, places: list[tuple[str, str]], scenes: dict[tuple[str, str], Scene]
 ) -> tuple[float | None, bool]:
-    """Our mean over the scenes that have it, and whether all have."""
+    """Return our mean over the scenes that have it, and whether all have."""
     rows = [row for p in places if p in scenes for row in scenes[p].rows if row.variant == variant]
     values = [value for row in rows if (value := _figure(metric, row)) is not None]
     return (fmean(values) if values else None), len(values) == len(places)
 
 
 def _figure(metric: str, row: Row) -> float | None:
-    """A row's mean in the paper's unit."""
+    """Return the mean of a row in the paper's unit."""
     key = {"train_hours": "train_seconds", "fps": "ms_per_frame"}.get(metric, metric)
     number = row.numbers.get(key)
     if number is None:
@@ -138,7 +237,7 @@ def _figure(metric: str, row: Row) -> float | None:
 
 
 def _head(column: Place, columns: tuple[Place, ...]) -> str:
-    """A column's title: with its data set where two have a scene of one name."""
+    """Return the title of a column: with its data set where two have scenes of one name."""
     if not column.scene:
         return f"mean, {column.data_set}" if column.data_set else "mean"
     twice = sum(other.scene == column.scene for other in columns) > 1
@@ -147,3 +246,20 @@ def _head(column: Place, columns: tuple[Place, ...]) -> str:
 
 def _number(value: float | None, form: str, signed: bool) -> str:
     return NOTHING if value is None else format(value, f"+{form}" if signed else form)
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("table", type=int, metavar="N", help="number of the table in the paper")
+    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="folder of `refgs compare`")
+    args = parser.parse_args()
+    figures = Figures.read()
+    ours = None if args.output is None else table_of(args.output)
+    print(text(compared(args.table, ours, figures), figures))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,313 @@
+"""Make docs/gallery: data, fit, scores and images of scenes of the package. A tool of maintainers.
+
+`python docs/gallery_maker.py --out docs/gallery` continues where an interrupted call stopped; files that
+exist are not made again.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from PIL import Image
+
+from mi_refgs import __version__, methods
+from mi_refgs.editing import EditOptions
+from mi_refgs.errors import InputError
+from mi_refgs.evaluation import evaluate as evaluation
+from mi_refgs.evaluation.images import contact_sheet
+from mi_refgs.io.files import is_file, read_json, write_bytes, write_json
+from mi_refgs.io.images import read_png, to_8_bits
+from mi_refgs.io.ownership import OutputFolder
+from mi_refgs.io.resources import resource_dir
+from mi_refgs.progress import say
+from mi_refgs.reconstruction.fit import fit
+from mi_refgs.reconstruction.new_light import NewLight
+from mi_refgs.reconstruction.reconstruction import Reconstruction
+from mi_refgs.relighting import relight as relighting
+from mi_refgs.relighting.score import shown
+from mi_refgs.runs.run import Run
+from mi_refgs.synthesis.make_dataset import make_dataset
+
+RECORD, PAGE = "gallery.json", "README.md"
+PURPOSE = "relighting"
+"""Purpose of the method by which the scenes are fitted."""
+LIGHT = "sky.exr"
+"""A map of scenes/lights under which no scene of the gallery is fitted."""
+TEST_VIEWS = 20
+SAMPLES = 4
+"""Samples per pixel, 2 × 2."""
+TURN, TURN_SECONDS = 30, 3.0
+"""Frames of a turntable, and seconds per turn."""
+EDIT_VIEWS = (0, TEST_VIEWS // 2)
+"""Test views of the edited scenes."""
+TURNTABLE, DECOMPOSITION, RELIT, EDITS = "turntable.webp", "decomposition.webp", "relit.webp", "edits.webp"
+"""Image files of an exhibit, in its folder."""
+HEAD = """\
+| scene | PSNR | normals | albedo | roughness error | metallic error | relit |
+|---|---|---|---|---|---|---|"""
+QUALITY = 75
+"""WebP quality, 0 to 100: fine texture stays, and a sheet is a tenth of its PNG."""
+EFFORT = 6
+"""Effort of the WebP encoder, 0 to 6."""
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """A scene of the package, and the edits displayed of it."""
+
+    caption: str
+    edits: Mapping[str, EditOptions]  # by title: keywords of `Reconstruction.edit`, on materials alone
+    samples: int = 64  # per pixel of the path-traced images
+
+
+EXHIBITS: dict[str, Exhibit] = {
+    "mirror_ring": Exhibit(
+        "A gold ring around a steel ball, both of roughness 0.1: a near-mirror that reflects itself.",
+        {
+            "brushed": {"set": ["roughness=0.45"]},
+            "copper": {"set": ["albedo=0.93,0.48,0.34"]},
+            "red glaze": {"set": ["metallic=0", "albedo=0.5,0.03,0.03", "roughness=0.1"]},
+        },
+        samples=128,
+    ),
+    "plastic_hollows": Exhibit(
+        "A block of green plastic, roughness 0.22, with bowls and a hole: a dielectric with cavities.",
+        {
+            "red": {"set": ["albedo=0.6,0.05,0.04"]},
+            "matte": {"set": ["roughness=0.9"]},
+            "gold": {"set": ["metallic=1", "albedo=1.0,0.77,0.34", "roughness=0.2"]},
+        },
+    ),
+    "gold_cavities": Exhibit(
+        "A gold shell with six windows, roughness 0.15, around a ball of clay: concave metal.",
+        {
+            "silver": {"where": "metallic > 0.5", "set": ["albedo=0.95,0.93,0.88"]},
+            "polished": {"where": "metallic > 0.5", "set": ["roughness=0.05"]},
+            "empty": {"where": "metallic < 0.5", "cut": True},
+        },
+    ),
+    "studded": Exhibit(
+        "Three matte building bricks, open below.",
+        {
+            "red": {"set": ["albedo=0.6,0.05,0.04"]},
+            "gold": {"set": ["metallic=1", "albedo=1.0,0.77,0.34", "roughness=0.15"]},
+            "two": {"duplicate": [0.0, 0.0, 0.7]},
+        },
+    ),
+}
+"""The exhibits by scene, in the order of the page."""
+
+
+def make_gallery(
+    out: Path = Path("docs/gallery"),
+    work: Path = Path("runs/gallery"),
+    scenes: tuple[str, ...] = (*EXHIBITS,),
+    views: int = 100,
+    size: int = 200,
+    preset: str = "standard",
+    set: tuple[str, ...] = (),
+) -> None:
+    """Make the gallery of some exhibits in the folder `out`; exhibits made before stay on the page.
+
+    Args:
+        out: Folder of the page and its images.
+        work: Folder of the data sets and runs.
+        scenes: Names of exhibits.
+        views: Training views per scene.
+        size: Pixels per side.
+        preset: Preset of the fits.
+        set: Changes of the method, as in `loss.ssim=0.1`.
+
+    Raises:
+        InputError: for an unknown exhibit, a gallery of other settings, and a folder that cannot be written.
+    """
+    for name in scenes:
+        if name not in EXHIBITS:
+            raise InputError(f"--scenes: {name}: not in the gallery; use some of {', '.join(EXHIBITS)}")
+    settings = {"views": views, "size": size, "preset": preset, "set": [*set]}
+    record = read_json(out / RECORD) if is_file(out / RECORD) else {"settings": settings, "scenes": {}}
+    if record["settings"] != settings:
+        raise InputError(
+            f"{out / RECORD}: the gallery was made with {record['settings']}, not {settings}; repeat "
+            "that, or choose another --out"
+        )
+    files = (DECOMPOSITION, RELIT, TURNTABLE, EDITS)
+    output = OutputFolder(out, "gallery", (RECORD, PAGE, *(f"*/{file}" for file in files)), marker=RECORD)
+    output.claim(RECORD, PAGE, *(f"{name}/{file}" for name in scenes for file in files))
+    found = dict(record["scenes"])
+    for number, name in enumerate(scenes):
+        say(f"{number + 1} of {len(scenes)}: {name}")
+        run, found[name] = _fitted(name, work / name, settings)
+        _write_images(EXHIBITS[name], run, out / name, size)
+        made = {name: found[name] for name in EXHIBITS if name in found}
+        write_json(out / RECORD, {"settings": settings, "scenes": made})
+        write_bytes(out / PAGE, page(settings, made).encode())
+
+
+def _fitted(name: str, work: Path, settings: dict[str, Any]) -> tuple[Reconstruction, dict[str, Any]]:
+    """Fit, evaluate and relight an exhibit where that is missing; returns the run and its scores."""
+    scenes = resource_dir("scenes")
+    light = scenes / "lights" / LIGHT
+    data = make_dataset(
+        scenes / f"{name}.xml",
+        work / "data",
+        views=settings["views"],
+        test_views=TEST_VIEWS,
+        size=settings["size"],
+        spp=EXHIBITS[name].samples,
+        relight=[light],
+        progress=True,
+    )
+    method = methods.for_purpose(PURPOSE)
+    folder = Run(work / "run")
+    run = fit(
+        data,
+        method,
+        preset=settings["preset"],
+        settings=settings["set"],
+        output=folder.path,
+        resume=True,
+        progress=True,
+    )
+    metrics = evaluation.read_metrics(folder)
+    if metrics is None or metrics.get("iterations") != run.trained.iteration:
+        metrics = evaluation.evaluate(folder, progress=True)
+    record = folder.path / "relight" / Path(LIGHT).stem / relighting.RESULT
+    if not is_file(record):
+        relighting.relight(folder, NewLight(light), samples=SAMPLES, progress=True)
+    keys = (
+        "psnr",
+        "normal_mae_deg",
+        "albedo_psnr",
+        "roughness_mae",
+        "metallic_mae",
+        "surfels",
+        "train_seconds",
+    )
+    return run, {key: metrics[key] for key in keys} | {"relit_psnr": read_json(record)["psnr_scaled"]}
+
+
+def _write_images(exhibit: Exhibit, run: Reconstruction, out: Path, size: int) -> None:
+    """Write the images of an exhibit that are missing."""
+    assert run.folder is not None
+    sheets = {
+        DECOMPOSITION: run.folder / evaluation.DECOMPOSITION,
+        RELIT: run.folder / "relight" / Path(LIGHT).stem / relighting.SHEET,
+    }
+    for target, source in sheets.items():
+        if not is_file(out / target):
+            write_still(out / target, read_png(source))
+    if not is_file(out / TURNTABLE):
+        other = run.relight(resource_dir("scenes") / "lights" / LIGHT)
+        frames = [
+            np.concatenate([_shown(scene, camera, size) for scene in (run, other)], axis=1)
+            for camera in run.turntable(TURN)
+        ]
+        write_turntable(out / TURNTABLE, frames, TURN_SECONDS)
+    if not is_file(out / EDITS):
+        made = {"as fitted": run}
+        for title, how in exhibit.edits.items():
+            options: EditOptions = {**how, "materials": True}
+            made[title] = run.edit(**options)
+        rows = [{title: _shown(scene, view, size) for title, scene in made.items()} for view in EDIT_VIEWS]
+        write_still(out / EDITS, contact_sheet(rows))
+
+
+def _shown(run: Reconstruction, camera: Any, size: int) -> np.ndarray:
+    """Render a camera (size, size, 3) on a white background, display-encoded."""
+    return shown(run.render(camera, size=size, samples=SAMPLES), np.ones(3))
+
+
+# ---------- Image files ----------
+
+
+def write_still(path: Path, image: np.ndarray) -> None:
+    """Write an image (H, W, 3) in [0, 1], display-encoded; raises InputError where that is impossible."""
+    _write(path, [image])
+
+
+def write_turntable(path: Path, frames: Sequence[np.ndarray], seconds: float) -> None:
+    """Write images of one size as an endless animation that takes `seconds` per turn."""
+    _write(path, frames, duration=round(1000 * seconds / len(frames)), loop=0)
+
+
+def _write(path: Path, frames: Sequence[np.ndarray], **options: Any) -> None:
+    first, *others = (Image.fromarray(to_8_bits(frame)) for frame in frames)
+    buffer = io.BytesIO()
+    first.save(
+        buffer, "WEBP", save_all=bool(others), append_images=others, quality=QUALITY, method=EFFORT, **options
+    )
+    write_bytes(path, buffer.getvalue())
+
+
+# ---------- README.md ----------
+
+
+def page(settings: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+    """Return the Markdown of the page from the settings of the gallery and the scores of each exhibit."""
+    options = {"scenes": [*found], **settings}
+    command = " ".join(
+        f"--{name} {' '.join(value) if isinstance(value, list) else value}"
+        for name, value in options.items()
+        if value
+    )
+    text = [
+        "# Gallery",
+        f"Made by `python docs/gallery_maker.py {command}`, version {__version__}: scenes of the package, "
+        f"path-traced from {settings['views']} sides at {settings['size']}², fitted with the method for "
+        f"relighting at the preset `{settings['preset']}`, and rendered by the fit. All views displayed are "
+        "test views.",
+        "\n".join([HEAD, *(_row(name, found[name]) for name in found)]),
+        "Normal errors are means over the foreground. Albedo and relit images are compared after per-channel "
+        "scaling.",
+    ]
+    for name in found:
+        edits = "; ".join(f"*{title}*: `{_words(edit)}`" for title, edit in EXHIBITS[name].edits.items())
+        text += [
+            f"## {name}",
+            f"{EXHIBITS[name].caption} [The scene](../../scenes/README.md).",
+            f"![{name} turning, under the estimated environment map and under another]({name}/{TURNTABLE})",
+            "Left: the estimated environment map. Right: one that the fit has not seen.",
+            f"![Images and materials of {name} compared with ground truth]({name}/{DECOMPOSITION})",
+            f"![{name} under another environment map, compared with the path tracer]({name}/{RELIT})",
+            f"![{name} edited]({name}/{EDITS})",
+            f"Edits: {edits}.",
+        ]
+    return "\n\n".join(text) + "\n"
+
+
+def _row(name: str, scores: Mapping[str, Any]) -> str:
+    cells = [
+        f"[{name}](#{name})",
+        _number(scores["psnr"], "{:.1f} dB"),
+        _number(scores["normal_mae_deg"], "{:.1f}°"),
+        _number(scores["albedo_psnr"], "{:.1f} dB"),
+        _number(scores["roughness_mae"], "{:.2f}"),
+        _number(scores["metallic_mae"], "{:.2f}"),
+        _number(scores["relit_psnr"], "{:.1f} dB"),
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else form.format(value)
+
+
+def _words(edit: Mapping[str, Any]) -> str:
+    """An edit as options of `refgs edit`."""
+    words = ["--set " + " ".join(edit["set"])] if "set" in edit else []
+    words += [f'--where "{edit["where"]}"'] if "where" in edit else []
+    for name, value in edit.items():
+        if name not in ("set", "where"):
+            words.append(f"--{name}" + ("" if value is True else f" {' '.join(map(str, value))}"))
+    return " ".join(words)
+
+
+if __name__ == "__main__":
+    tyro.cli(make_gallery)

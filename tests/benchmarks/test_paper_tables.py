@@ -1,0 +1,123 @@
+"""The tables of the paper: its figures agree with each other, ours stand below them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import paper_tables
+from benchmarks.paper_tables import Figures, Place, place_of
+from mi_refgs.compare.table import Row, Scene, Statistic, Table
+from mi_refgs.errors import InputError
+from mi_refgs.methods import load, names
+from tests.benchmarks.benchmark_runs import run_benchmark
+
+
+@pytest.mark.parametrize(
+    ("folder", "place"),
+    [
+        ("data/ball", ("Shiny Blender", "ball")),
+        ("data/chair_400", ("NeRF-Synthetic", "chair")),
+        ("ref_real/gardenspheres", ("Ref-Real", "garden")),
+        ("glossy_synthetic/teapot", ("Glossy Synthetic", "teapot")),
+        ("ShinyBlender/teapot", ("Shiny Blender", "teapot")),
+        ("data/teapot_glossy", ("Glossy Synthetic", "teapot")),
+        ("data/Angel_blender", ("Glossy Synthetic", "angel")),
+        ("data/teapot", None),
+        ("data/balls", None),
+        ("data/glass_ball", None),
+        ("data/glossy", None),
+    ],
+)
+def test_scenes_are_recognised_by_their_folders(folder: str, place: tuple[str, str] | None) -> None:
+    found = place_of(Path(folder), Figures.read())
+    assert (found and (found.data_set, found.scene)) == place
+
+
+def test_the_figures_of_the_paper_agree_with_each_other() -> None:
+    """Averages that its smaller tables print are those of Table 1, up to what the paper rounds."""
+    figures = Figures.read()
+    for table in figures.tables.values():
+        for systems in table.metrics.values():
+            assert {len(values) for values in systems.values()} == {len(table.columns)}
+    first = figures.tables[1]
+    assert len(first.columns) == 17 and len(first.metrics["psnr"]) == 8
+
+    def mean(metric: str, system: str, data_set: str) -> float:
+        values = first.metrics[metric][system]
+        return float(
+            np.mean([v for v, c in zip(values, first.columns, strict=True) if c.data_set == data_set])
+        )
+
+    assert mean("psnr", "Ref-Gaussian", "Shiny Blender") == pytest.approx(35.04, abs=0.006)
+    assert mean("ssim", "Ref-Gaussian", "Shiny Blender") == pytest.approx(0.973, abs=6e-4)
+    assert mean("lpips", "Ref-Gaussian", "Shiny Blender") == pytest.approx(0.056, abs=6e-4)
+    assert mean("psnr", "Ref-Gaussian", "Glossy Synthetic") == pytest.approx(30.33, abs=0.04)
+    assert mean("lpips", "Ref-Gaussian", "Glossy Synthetic") == pytest.approx(0.049, abs=6e-4)
+    for system, values in figures.tables[7].metrics["psnr"].items():
+        if system in first.metrics["psnr"]:
+            assert values == first.metrics["psnr"][system][: len(values)], system
+    assert figures.tables[3].metrics["normal_mae_deg_full"]["Ref-Gaussian"] == [2.15]
+    assert figures.tables[4].metrics["psnr"]["w/o Deferred rendering"] == [28.85]
+    assert figures.tables[5].metrics["fps"]["NeRO"] == [0.11]
+    assert figures.tables[6].metrics["psnr"]["NDE"] == [35.48]
+    assert figures.of(Place("NeRF-Synthetic", "ship"), "3DGS") == {
+        "psnr": 31.43,
+        "ssim": 0.906,
+        "lpips": 0.111,
+    }
+    assert figures.of(Place("Shiny Blender", "teapot"), "w/o 2DGS") == {"psnr": 44.25}
+
+
+def test_variants_name_rows_of_the_paper() -> None:
+    figures = Figures.read()
+    known = {s for t in figures.tables.values() for systems in t.metrics.values() for s in systems}
+    rows = {name: load(name).about.paper_row for name in names()}
+    assert rows["ref_gaussian"] == "Ref-Gaussian" and set(rows.values()) <= known | {""}
+    for name, row in rows.items():  # a row that a file inherits is another method's
+        assert load(name).about.name.startswith("w/o") == row.startswith("w/o"), name
+
+
+def scene_of(name: str, psnr: float, seconds: float) -> Scene:
+    """A scene of the paper with one finished row."""
+    row = Row("mine", "Mine", seeds=[0], runs=["run"], paper_row="Ref-Gaussian")
+    row.numbers = {"psnr": Statistic.of([psnr]), "train_seconds": Statistic.of([seconds])}
+    return Scene(name, name, rows=[row])
+
+
+def test_a_table_of_the_paper_with_our_figures() -> None:
+    figures = Figures.read()
+    ours = Table([scene_of("ball", 36.0, 1800), scene_of("car", 30.0, 5400)])
+    found = paper_tables.compared(1, ours, figures)
+    lines = {line.title: line for line in found.lines["psnr"]}
+    assert lines["  ours: mine"].values == (36.0, 30.0, *[None] * 15)
+    assert lines["  ours − paper"].values[:2] == pytest.approx((36.0 - 37.01, 30.0 - 31.04))
+    assert found.missing["Shiny Blender"] == ["coffee", "helmet", "teapot", "toaster"]
+    assert len(found.missing["Glossy Synthetic"]) == 8 and len(found.missing["Ref-Real"]) == 3
+    assert [line.title for line in found.lines["ssim"] if "ours" in line.title] == []
+    text = paper_tables.text(found, figures)
+    assert (
+        "shiny_blender/toaster" in text
+        and "shiny_blender/ball" not in text
+        and "−1.01" in text.replace("-", "−")
+    )
+    assert "Ref-NeRF (published)" in text
+
+    means = paper_tables.compared(6, ours, figures)
+    by_title = {line.title: line.values for line in means.lines["psnr"]}
+    assert by_title["  ours: mine"] == (33.0,) and by_title["  ours − paper"] == (None,) and means.partial
+    hours = {line.title: line.values for line in paper_tables.compared(2, ours, figures).lines["train_hours"]}
+    assert hours["  ours: mine"] == (1.0,)
+
+
+def test_the_command_prints_a_table_without_runs() -> None:
+    done = run_benchmark("paper_tables", "5")
+    assert (
+        "NeRO (published)" in done.stdout
+        and "29.73" in done.stdout
+        and "glossy_synthetic/tbell" in done.stdout
+    )
+    with pytest.raises(InputError, match="give one of 1, 2"):
+        paper_tables.compared(9, None, Figures.read())
