@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mi_refgs  # isort: skip  # noqa: F401  (chooses the LLVM before Mitsuba is imported)
+import mitsuba as mi
 import numpy as np
 import tyro
 from PIL import Image
@@ -127,6 +129,7 @@ def make_gallery(
     Raises:
         InputError: for an unknown exhibit, a gallery of other settings, and a folder that cannot be written.
     """
+    mi.set_variant("llvm_ad_rgb")
     for name in scenes:
         if name not in EXHIBITS:
             raise InputError(f"--scenes: {name}: not in the gallery; use some of {', '.join(EXHIBITS)}")
