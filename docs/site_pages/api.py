@@ -30,8 +30,8 @@ def page() -> str:
 def by_package() -> dict[str, list[tuple[str, str]]]:
     """First name below `mi_refgs` → public names, and where each is defined."""
     found: dict[str, list[tuple[str, str]]] = {}
-    for name, (module, inner) in mi_refgs._PUBLIC.items():
-        found.setdefault(module.partition(".")[0], []).append((name, f"mi_refgs.{module}.{inner}"))
+    for name, (module, inner) in mi_refgs.PUBLIC.items():
+        found.setdefault(module.split(".")[1], []).append((name, f"{module}.{inner}"))
     return dict(sorted(found.items(), key=lambda item: (item[0] not in FIRST, item[0])))
 
 

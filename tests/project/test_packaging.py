@@ -170,7 +170,7 @@ def test_wheel_holds_every_module_and_data_file(wheel: Path) -> None:
         for path in (ROOT / "scenes").rglob("*")
         if path.suffix in {".toml", ".xml", ".ply", ".exr"}
     }
-    assert expected | {"mi_refgs/py.typed"} <= packed
+    assert expected | {"mi_refgs/py.typed", "mi_refgs/__init__.pyi"} <= packed
 
 
 def test_wheel_holds_nothing_else(wheel: Path) -> None:
