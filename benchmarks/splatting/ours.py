@@ -12,8 +12,8 @@ from benchmarks.splatting.workload import Workload
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.timing import listening, phase
-from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.profiling.phases import phase_times
+from mi_refgs.profiling.profile import Counts, count
 from mi_refgs.splat import Blended, Camera, list_by_tile, project, splat
 from mi_refgs.surfels.table import Surfels
 

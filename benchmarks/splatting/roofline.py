@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from benchmarks.common.timing import once
-from mi_refgs.profiling.counts import Counts
+from mi_refgs.profiling.profile import Counts
 from mi_refgs.surfels.primitives.surfel import Surfel
 
 FLOPS = {"forward": 60, "both": 260}

@@ -33,8 +33,8 @@ def run(args: argparse.Namespace) -> Result:
     """Import."""
     from mi_refgs.formats.incoming import read_cameras
     from mi_refgs.reconstruction.importing import import_splats
+    from mi_refgs.runs.export import save
     from mi_refgs.runs.run import Run
-    from mi_refgs.runs.save import save
 
     Run(args.output).require_none()
     made = import_splats(args.file, linear=args.linear)

@@ -13,8 +13,7 @@ from mi_refgs.errors import InputError
 
 if TYPE_CHECKING:
     from mi_refgs.fitting.train import Trainer
-    from mi_refgs.profiling.frame import FrameProfile
-    from mi_refgs.profiling.profile import Profile
+    from mi_refgs.profiling.profile import FrameProfile, Profile
 
 DEFAULT_STEPS = 15
 MOST_STEPS = 1000
@@ -83,7 +82,7 @@ def run(args: argparse.Namespace) -> Result:
 
 def _frames(args: argparse.Namespace) -> list[FrameProfile]:
     """Pictures of a run at each size; none of a data set, or of a run that has found nothing yet."""
-    from mi_refgs.profiling.frame import SIZES, aovs_of, profile_frame
+    from mi_refgs.profiling.profile import SIZES, aovs_of, profile_frame
     from mi_refgs.reconstruction.reconstruction import load
     from mi_refgs.runs.run import Run
     from mi_refgs.runs.trained_scene import MODEL
@@ -104,8 +103,9 @@ def _frames(args: argparse.Namespace) -> list[FrameProfile]:
 def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
     """The trainer of a run or of a fresh fit, and the stages of the schedule to look at."""
     from mi_refgs.evaluation.evaluate import load_split
-    from mi_refgs.fitting.job import load_method
-    from mi_refgs.fitting.runner import read_views, sized
+    from mi_refgs.fitting.plan import sized
+    from mi_refgs.fitting.runner import load_method
+    from mi_refgs.fitting.targets import read_views
     from mi_refgs.fitting.train import Trainer
     from mi_refgs.runs.run import Run
 

@@ -12,7 +12,8 @@ from typing import Any
 
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
-from mi_refgs.fitting.runner import read_views, sized
+from mi_refgs.fitting.plan import sized
+from mi_refgs.fitting.targets import read_views
 from mi_refgs.io.files import read_json
 from mi_refgs.methods.difference import differences
 from mi_refgs.methods.method import DataOptions, Method

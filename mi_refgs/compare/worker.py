@@ -67,7 +67,8 @@ def fit_and_measure(job: Job) -> None:
 
     from mi_refgs.capture.triangulate import with_points
     from mi_refgs.evaluation.evaluate import evaluate
-    from mi_refgs.fitting.runner import begin, finish, read_views
+    from mi_refgs.fitting.runner import begin, finish
+    from mi_refgs.fitting.targets import read_views
 
     run, data = job.run, Path(job.data)
     method = run.method() if run.exists() else job.method()
@@ -84,7 +85,7 @@ class Curve:
     """PSNR on a few test views in the course of a fit, measured between its steps, off its clock."""
 
     def __init__(self, job: Job, method: Method, begin: int) -> None:
-        from mi_refgs.fitting.runner import read_views
+        from mi_refgs.fitting.targets import read_views
 
         self.run = job.run
         self.data = read_views(method, Path(job.data), "test", truth=False)

@@ -21,7 +21,8 @@ from mi_refgs.evaluation import decomposition, images, metrics
 from mi_refgs.evaluation.speed import milliseconds
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
-from mi_refgs.fitting.runner import of_run, read_views
+from mi_refgs.fitting.runner import of_run
+from mi_refgs.fitting.targets import read_views
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import write_png
 from mi_refgs.kernels.device import machine

@@ -22,8 +22,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.exposure import MAX_GAIN, fitted_gain
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.optim import Adam
-from mi_refgs.fitting.rates import Group
+from mi_refgs.fitting.optim import Adam, Group
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import GAIN, ExposureOptions

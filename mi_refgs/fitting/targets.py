@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from pathlib import Path
 
-from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.picture_store import BUDGET as PICTURE_BYTES
 from mi_refgs.fitting.objective import Target
 from mi_refgs.kernels.memory import of_fit, require
@@ -30,6 +31,23 @@ def require_memory(method: Method, data: Dataset) -> None:
     what = f"fit: images of {pixels:,} pixels, {method.surfels.max_count:,} surfels at most"
     remedy = "read them smaller with --set data.downscale=N, or lower surfels.max_count"
     require(bytes_of(method, len(data.views), pixels), what, remedy)
+
+
+def read_views(method: Method, path: Path, split: str, truth: bool = True, decode: bool = True) -> Dataset:
+    """A split of the data set at `path` as the method asks for its pictures; the others as in `read_dataset`.
+
+    Raises InputError as `read_dataset` does.
+    """
+    options = method.data
+    return read_dataset(
+        path,
+        split,
+        downscale=options.downscale,
+        background=options.background,
+        images=options.images,
+        truth=truth,
+        decode=decode,
+    )
 
 
 class Targets:

@@ -20,11 +20,9 @@ from mi_refgs.fitting import health
 from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.exposure import Exposure
 from mi_refgs.fitting.initial import initial_parameters, is_open
-from mi_refgs.fitting.light_window import LightWindow
 from mi_refgs.fitting.objective import objective
-from mi_refgs.fitting.optim import Adam
-from mi_refgs.fitting.rates import Group
-from mi_refgs.fitting.schedule import Schedule
+from mi_refgs.fitting.optim import Adam, Group
+from mi_refgs.fitting.schedule import LightWindow, Schedule
 from mi_refgs.fitting.state import decisions_of, occluder_of, packed, require_fit
 from mi_refgs.fitting.surface import surface_of, update_missing_caches
 from mi_refgs.fitting.targets import Targets, require_memory
@@ -36,9 +34,8 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, part, tensors
+from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, channels_of, light_of, part, surroundings_of, tensors
 from mi_refgs.runs.interrupt import held_interrupts
-from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,11 +16,139 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Refine
-from mi_refgs.profiling.counts import Counts, count
 from mi_refgs.profiling.phases import phase_times
+from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.shading import Shading
-from mi_refgs.splat import list_by_tile, project
+from mi_refgs.splat import Camera, Footprints, TileLists, list_by_tile, project
+from mi_refgs.splat.lanes import advance
 from mi_refgs.surfels.attributes import sigmoid
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What the splatter has to do for one view, in numbers of things."""
+
+    surfels: int
+    pixels: int
+    tile_pixels: int  # of a tile
+    pairs: int  # surfel-tile pairs listed
+    visited: int  # of these, those that a tile came to before all of its pixels had ended
+    contributing: int  # surfel-pixel pairs with α ≥ ALPHA_MIN, before the pixel's end
+    covered: int  # pixels with a contribution
+    pixels_of_surfel: Any  # mi.UInt32 (N,): at how many pixels a surfel contributes
+
+    @property
+    def evaluated(self) -> int:
+        """Surfel-pixel evaluations: a visited pair is evaluated at every pixel of its tile at once."""
+        return self.visited * self.tile_pixels
+
+    @property
+    def share(self) -> float:
+        """Share of the evaluated pairs that contribute."""
+        return self.contributing / max(self.evaluated, 1)
+
+
+def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
+    """Walk the lists as `splat.blend` does, and count; waits for the device."""
+    columns = [dr.detach(column) for column in footprints.columns]
+    surfels = dr.width(columns[0])
+    pixels_of_surfel = dr.zeros(mi.UInt32, surfels)
+    pixels = camera.width * camera.height
+    width, height = camera.tile
+    if not lists.pairs:
+        return Counts(surfels, pixels, width * height, 0, 0, 0, 0, pixels_of_surfel)
+    lane = dr.arange(mi.UInt32, lists.tiles_x * lists.tiles_y * width * height)
+    tile, local = lane // (width * height), lane % (width * height)
+    x = (tile % lists.tiles_x) * width + local % width - camera.tile_offset[0]
+    y = (tile // lists.tiles_x) * height + local // width - camera.tile_offset[1]
+    pixel = mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5)
+    begin = dr.gather(mi.UInt32, lists.pair_begin, tile)
+    end = dr.gather(mi.UInt32, lists.pair_end, tile)
+
+    def condition(pair: Any, active: Any, transmittance: Any, steps: Any, hits: Any) -> Any:
+        return active & (pair < end)
+
+    def body(pair: Any, active: Any, transmittance: Any, steps: Any, hits: Any) -> Any:
+        surfel = dr.gather(mi.UInt32, lists.surfel_from_pair, pair, active)
+        row = [dr.gather(mi.Float, column, surfel, active) for column in columns]
+        sample = footprints.primitive.evaluate(row, pixel, camera.near)
+        weight, after, goes_on = advance(sample, active, transmittance)
+        hit = weight > 0
+        dr.scatter_add(pixels_of_surfel, mi.UInt32(1), surfel, hit)
+        hits = hits + dr.select(hit, mi.UInt32(1), mi.UInt32(0))
+        return pair + 1, goes_on, after, steps + 1, hits
+
+    inside = (x < camera.width) & (y < camera.height)
+    state = (begin, inside, mi.Float(1), mi.UInt32(0), mi.UInt32(0))
+    _, _, _, steps, hits = dr.while_loop(state, condition, body, label="count")
+    dr.eval(steps, hits, pixels_of_surfel)
+    # A tile goes on until the last of its pixels has ended.
+    visited = dr.sum(dr.block_reduce(dr.ReduceOp.Max, steps, width * height))
+    return Counts(
+        surfels=surfels,
+        pixels=pixels,
+        tile_pixels=width * height,
+        pairs=lists.pairs,
+        visited=int(visited[0]),
+        contributing=int(dr.sum(hits)[0]),
+        covered=int(dr.count(hits > 0)[0]),
+        pixels_of_surfel=pixels_of_surfel,
+    )
+
+
+SIZES = (200, 400, 800)
+"""Pixels along the longer side of a picture."""
+ROUNDS = 9
+"""Pictures of each kind that are timed, one after the other in turns: what else the machine does then slows
+all kinds alike."""
+FRAME_WARM_UP = 2
+"""Rounds before the first that counts: they compile kernels."""
+
+Draw = Callable[[Camera, Collection[str]], Frame]
+"""Renders a view with the AOVs of these names."""
+
+
+@dataclass(frozen=True)
+class FrameProfile:
+    """Pictures of one size."""
+
+    width: int
+    height: int
+    frame_ms: float  # radiance and alpha alone, median
+    aovs_ms: dict[str, float]  # what each AOV alone adds, median of the differences in a round
+
+
+def aovs_of(frame: Frame) -> list[str]:
+    """The AOVs that a frame with all of them has, apart from alpha, which every frame has."""
+    # A term that the model does not have is a single zero.
+    terms = {} if frame.terms is None else frame.terms.known()
+    return [*frame.maps, "normal", "depth", *(name for name, term in terms.items() if dr.width(term) > 1)]
+
+
+def profile_frame(draw: Draw, names: Collection[str], camera: Camera, rounds: int = ROUNDS) -> FrameProfile:
+    """Time the picture of a camera alone and with each of the named AOVs, in turns."""
+    plain: list[float] = []
+    more: dict[str, list[float]] = {name: [] for name in names}
+    for _ in range(FRAME_WARM_UP + rounds):
+        plain.append(_seconds(draw, camera, ()))
+        for name, found in more.items():
+            found.append(_seconds(draw, camera, (name,)) - plain[-1])
+    return FrameProfile(
+        camera.width, camera.height, _median(plain), {name: _median(found) for name, found in more.items()}
+    )
+
+
+def _median(seconds: list[float]) -> float:
+    return 1e3 * float(np.median(seconds[FRAME_WARM_UP:]))
+
+
+def _seconds(draw: Draw, camera: Camera, names: Collection[str]) -> float:
+    begin = time.perf_counter()
+    frame = draw(camera, names)
+    dr.eval(frame.radiance, frame.alpha, frame.depth, frame.normal, frame.terms, frame.maps, frame.background)
+    dr.sync_thread()
+    return time.perf_counter() - begin
+
 
 WARM_UP = 4
 """Steps before the first that counts: they compile kernels."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from mi_refgs.capture.triangulate import with_points
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.progress import Bar, Previews
-from mi_refgs.fitting import job
+from mi_refgs.fitting import runner
 from mi_refgs.fitting.progress import Progress
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
@@ -24,7 +24,7 @@ def fit(
     *,
     preset: str | None = None,
     minutes: float | None = None,
-    settings: job.Settings = (),
+    settings: runner.Settings = (),
     output: str | Path | None = None,
     resume: bool = False,
     progress: bool | Progress = True,
@@ -53,7 +53,7 @@ def fit(
         listener.say(f"{folder}: the run, removed with its last Reconstruction; `save` keeps one")
     named = str(method) if isinstance(method, Path) else method
     try:
-        job.fit(
+        runner.fit(
             Path(data),
             folder,
             named,

@@ -10,13 +10,13 @@ from typing import Any
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.runner import read_views
+from mi_refgs.fitting.targets import read_views
 from mi_refgs.formats import Shot
 from mi_refgs.formats.shots import shots_around, turntable_cameras
 from mi_refgs.io.files import read_json
 from mi_refgs.methods.method import Method
+from mi_refgs.runs.export import save
 from mi_refgs.runs.run import Run
-from mi_refgs.runs.save import save
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera
 
@@ -45,7 +45,7 @@ class Provenance:
         return Provenance(method, data, run.region(), tuple(edits))
 
     def save(self, trained: TrainedScene, folder: Path, camera: Camera) -> None:
-        """Write a run folder of a scene (`runs.save`); raises InputError as that does."""
+        """Write a run folder of a scene (`runs.export.save`); raises InputError as that does."""
         records = {EDITS: {"edits": self.edits}} if self.edits else None
         save(trained, folder, self.method, camera, data=self.data, region=self.region, records=records)
 

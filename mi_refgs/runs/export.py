@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import BusyError, read_json, write_json
+from mi_refgs.io.files import BusyError, make_folder, read_json, write_json
 from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import read_mesh, write_mesh
@@ -156,3 +157,38 @@ def up_to_date(run: Run, method: Method, camera: Camera | Callable[[TrainedScene
     elif not (run.path / MODEL).is_file():
         raise _no_artefacts(run)
     return TrainedScene.read(run.path)
+
+
+def save(
+    trained: TrainedScene,
+    folder: Path,
+    method: Method,
+    camera: Camera,
+    *,
+    more: Sequence[Camera] = (),
+    data: Path | None = None,
+    region: Region | None = None,
+    records: Mapping[str, Any] | None = None,
+) -> list[Path]:
+    """Write a scene as a run folder, which every command that takes a run reads; returns its artefacts.
+
+    `camera` and `more` become the sensors of scene.xml; `data` is the data set of its test views, and
+    `region` that of interest; `records` are JSON files by name. config.toml is written last: where it is, the
+    folder is complete. Raises InputError for a folder that holds a run, has a foreign file in the way or
+    cannot be written, and for a value that is not finite.
+    """
+    run = Run(folder)
+    if run.exists():
+        raise InputError(
+            f"{folder}: holds a run already, which nothing is written into; choose another folder"
+        )
+    make_folder(folder)
+    with run.alone():
+        run.output.require_free()
+        written = export(trained, folder, camera, more)
+        if data is not None:
+            run.write_dataset(str(data.resolve()), region)
+        for name, content in (records or {}).items():
+            run.write_json(name, content)
+        run.write_method(method)
+    return written

@@ -20,8 +20,7 @@ from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.checkpoint import PARAMS, tensors
-from mi_refgs.runs.parameters import channels_of, light_of, surroundings_of
+from mi_refgs.runs.checkpoint import PARAMS, channels_of, light_of, surroundings_of, tensors
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading

@@ -22,7 +22,7 @@ from benchmarks.splatting.workload import Workload, sphere
 from benchmarks.stability import measure
 from benchmarks.stability.case import Case, sky
 from benchmarks.stability.measure import product_order, scene_of
-from mi_refgs.profiling.counts import Counts
+from mi_refgs.profiling.profile import Counts
 from mi_refgs.reference import picture as oracle
 from mi_refgs.reference.pinhole import rotation_matrix
 from mi_refgs.splat import list_by_tile, project

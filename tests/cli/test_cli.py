@@ -16,8 +16,8 @@ import pytest
 
 from mi_refgs.cli import demo, main
 from mi_refgs.fitting import cost_model, plan
-from mi_refgs.fitting.job import load_method
-from mi_refgs.fitting.runner import sized
+from mi_refgs.fitting.plan import sized
+from mi_refgs.fitting.runner import load_method
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr
 from mi_refgs.io.images import read_png, srgb_from_linear, write_png

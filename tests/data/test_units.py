@@ -18,8 +18,7 @@ from mi_refgs.data.region import Region, write_region
 from mi_refgs.data.survey import require_several_sides, survey
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.initial import initial_surfels
-from mi_refgs.fitting.optim import Adam
-from mi_refgs.fitting.rates import Group
+from mi_refgs.fitting.optim import Adam, Group
 from mi_refgs.fitting.schedule import Schedule
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points

@@ -14,8 +14,7 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import health
-from mi_refgs.fitting.optim import Adam
-from mi_refgs.fitting.skips import Skipped
+from mi_refgs.fitting.optim import Adam, Skipped
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method
 from mi_refgs.surfels.primitives.surfel import Surfel

@@ -18,10 +18,9 @@ from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.evaluation.progress import Bar
-from mi_refgs.fitting import exchange
+from mi_refgs.fitting.control import exchanged
 from mi_refgs.fitting.initial import initial_parameters, is_open
-from mi_refgs.fitting.job import default_method
-from mi_refgs.fitting.runner import begin
+from mi_refgs.fitting.runner import begin, default_method
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
@@ -122,7 +121,7 @@ def test_surfels_that_cross_the_border_change_tables(method: Method) -> None:
     inner = table(method.surfels.names, [0.2, 0.9, 1.01, 1.2, 5.0], 1)
     around = SurroundingsOptions(degree=0).names("surfel")
     outer = table(around, [2.0, 0.5, 0.99, 1.5], 0)
-    own, other = exchange.exchanged(inner, outer, method, REGION, rng)
+    own, other = exchanged(inner, outer, method, REGION, rng)
     distance = own.surfels.to_numpy()["position"][:, 0] / REGION.radius
     np.testing.assert_allclose(distance, [0.2, 0.9, 1.01, 0.5], rtol=1e-5)
     np.testing.assert_allclose(
@@ -139,9 +138,9 @@ def test_surfels_that_cross_the_border_change_tables(method: Method) -> None:
     assert 1 / (1 + np.exp(-entered["metallic"][3, 0])) == pytest.approx(method.surfels.start("metallic"))
 
     full = replace(method, surfels=replace(method.surfels, max_count=5))
-    assert exchange.exchanged(inner, outer, full, REGION, rng)[0].surfels.count == 3
+    assert exchanged(inner, outer, full, REGION, rng)[0].surfels.count == 3
     gone = table(method.surfels.names, [2.0, 3.0], 1)
-    assert exchange.exchanged(gone, outer, method, REGION, rng)[0].surfels.count == 2  # one left, one came
+    assert exchanged(gone, outer, method, REGION, rng)[0].surfels.count == 2  # one left, one came
 
 
 def test_resume_repeats_a_straight_run_bit_for_bit(data: Dataset, method: Method, one_thread: None) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.optim import Adam
-from mi_refgs.fitting.rates import Group
+from mi_refgs.fitting.optim import Adam, Group
 from mi_refgs.reference import losses as reference
 
 

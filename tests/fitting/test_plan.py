@@ -13,7 +13,6 @@ from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.data.picture_files import PictureFile
 from mi_refgs.fitting import cost_model, plan
-from mi_refgs.fitting import speed as speeds
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels import memory
 from mi_refgs.methods.method import CoarsePictures, DataOptions, Method, Rates
@@ -121,8 +120,8 @@ class Machine:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.busy, self.steps, self.cpu, self.wall = 1.0, 0, 0.0, 0.0
         self.meshes: list[int] = []
-        monkeypatch.setattr(speeds.time, "thread_time", lambda: self.cpu)
-        monkeypatch.setattr(speeds.time, "perf_counter", lambda: self.wall)
+        monkeypatch.setattr(plan.time, "thread_time", lambda: self.cpu)
+        monkeypatch.setattr(plan.time, "perf_counter", lambda: self.wall)
         monkeypatch.setattr(Trainer, "step", lambda trainer: self.step(trainer))
         monkeypatch.setattr(Trainer, "extract_mesh", lambda trainer: self.extract(trainer))
 
@@ -157,20 +156,20 @@ def test_a_speed_is_measured_once_and_stays_on_a_busy_machine(
     machine = Machine(monkeypatch)
     expected = cost_model.Speed({"initial": [101.0, 401.0], "deferred": [102.0, 402.0]}, 3.0, 0.5)
     machine.busy = 3.0
-    speed = speeds.speed_of(method, True)
+    speed = plan.speed_of(method, True)
     calls: list[Method] = []
 
     def measured(method: Method, has_alpha: bool) -> cost_model.Speed:
         calls.append(method)
         return expected
 
-    monkeypatch.setattr(speeds, "measured", measured)
-    assert speed == expected and machine.meshes[:2] == [speeds.VIEWS, speeds.VIEWS]
+    monkeypatch.setattr(plan, "measured", measured)
+    assert speed == expected and machine.meshes[:2] == [plan.VIEWS, plan.VIEWS]
     [file] = cache.glob("speed-*.json")
 
     def measurements(wanted: Method = method, has_alpha: bool = True) -> int:
         calls.clear()
-        assert speeds.speed_of(wanted, has_alpha) == expected
+        assert plan.speed_of(wanted, has_alpha) == expected
         return len(calls)
 
     assert measurements() == 0
@@ -191,22 +190,22 @@ def test_a_speed_is_measured_once_and_stays_on_a_busy_machine(
         file.write_text(damage)
         assert measurements() == 1 and json.loads(file.read_text()) == kept
     assert any("3 measured with" in text for text in cost_model.summary())
-    machines = speeds.machine()
+    machines = plan.machine()
     for name, value in {"threads": 99, "cpu": "another", "mitsuba": "0"}.items():
-        monkeypatch.setattr(speeds, "machine", lambda name=name, value=value: machines | {name: value})
+        monkeypatch.setattr(plan, "machine", lambda name=name, value=value: machines | {name: value})
         assert measurements() == 1
-    monkeypatch.setattr(speeds, "machine", lambda: machines)
-    monkeypatch.setattr(speeds, "simd_width", lambda: 99)
+    monkeypatch.setattr(plan, "machine", lambda: machines)
+    monkeypatch.setattr(plan, "simd_width", lambda: 99)
     assert measurements() == 1
 
 
 def test_a_cache_that_cannot_be_written_is_no_error(
     method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(speeds, "measured", lambda *_: SPEED)
+    monkeypatch.setattr(plan, "measured", lambda *_: SPEED)
     (tmp_path / "file").write_text("")
     monkeypatch.setenv(cost_model.FOLDER_VARIABLE, str(tmp_path / "file" / "cache"))
-    assert speeds.speed_of(method, True) == SPEED and cost_model.summary() == []
+    assert plan.speed_of(method, True) == SPEED and cost_model.summary() == []
 
 
 def test_real_steps_are_measured(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,13 +214,13 @@ def test_real_steps_are_measured(method: Method, monkeypatch: pytest.MonkeyPatch
     around = SurroundingsOptions(count=60, max_count=60, height=8)
     method = dataclasses.replace(method, surroundings=around)
     begin = time.thread_time()
-    speed = speeds.measured(method, False)
+    speed = plan.measured(method, False)
     taken = time.thread_time() - begin
     assert {*speed.stages} == {"initial", "deferred"}
     each = [seconds for both in speed.stages.values() for seconds in both]
     assert min(each) > 1e-4  # a kernel alone takes longer
-    meshes = speeds.REPEATS * (speed.mesh + speeds.VIEWS * speed.mesh_view)
-    assert speeds.REPEATS * speeds.TIMED * sum(each) + meshes < taken
+    meshes = plan.REPEATS * (speed.mesh + plan.VIEWS * speed.mesh_view)
+    assert plan.REPEATS * plan.TIMED * sum(each) + meshes < taken
 
 
 def test_tests_keep_away_from_the_users_cache() -> None:

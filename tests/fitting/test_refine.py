@@ -11,8 +11,7 @@ import pytest
 
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import refine
-from mi_refgs.fitting.optim import Adam
-from mi_refgs.fitting.rates import Group
+from mi_refgs.fitting.optim import Adam, Group
 from mi_refgs.methods.method import Propagation, Refine
 from mi_refgs.methods.window import Window
 from mi_refgs.surfels.attributes import logit, sigmoid

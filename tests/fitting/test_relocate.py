@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.fitting import relocate
+from mi_refgs.fitting import refine
 from mi_refgs.methods.method import Relocation
 from mi_refgs.methods.window import Window
 from mi_refgs.reference import relocation as reference
@@ -37,7 +37,7 @@ def table(count: int, idle: int, rng: np.random.Generator, scale: float = 0.05) 
 @pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9])
 @pytest.mark.parametrize("number", [1, 2, 5, 20])
 def test_the_correction_is_that_of_the_paper(opacity: float, number: int) -> None:
-    new, factor = relocate.shared(np.array([0.5, opacity]), np.array([1, number]))
+    new, factor = refine.shared(np.array([0.5, opacity]), np.array([1, number]))
     expected = reference.shared(opacity, number)
     np.testing.assert_allclose([new[1], factor[1]], expected, rtol=1e-9)
     np.testing.assert_allclose([new[0], factor[0]], [0.5, 1], rtol=1e-12)
@@ -50,7 +50,7 @@ def test_the_correction_is_that_of_the_paper(opacity: float, number: int) -> Non
 
 def test_idle_surfels_go_where_others_are_seen(rng: np.random.Generator) -> None:
     surfels = table(30, 6, rng)
-    edit = relocate.relocate(surfels, IDLE, 100, rng)
+    edit = refine.relocate(surfels, IDLE, 100, rng)
     before, after = surfels.to_numpy(), edit.surfels.to_numpy()
     moved = np.arange(24, 30)
     assert np.array_equal(edit.parent[:24], np.arange(24)) and np.all(edit.parent[moved] < 24)
@@ -70,7 +70,7 @@ def test_idle_surfels_go_where_others_are_seen(rng: np.random.Generator) -> None
 def test_opaque_surfels_are_drawn_more_often(rng: np.random.Generator) -> None:
     raw = table(1000, 998, rng).to_numpy()
     raw["opacity"][:2, 0] = logit(np.array([0.2, 0.8]))
-    edit = relocate.relocate(Surfels.from_numpy(raw), IDLE, 1000, rng)
+    edit = refine.relocate(Surfels.from_numpy(raw), IDLE, 1000, rng)
     assert np.mean(edit.parent[2:] == 1) == pytest.approx(0.8, abs=0.05)
 
 
@@ -79,7 +79,7 @@ def test_a_relocation_hardly_changes_the_picture(rng: np.random.Generator) -> No
     raw = table(400, 100, rng).to_numpy()
     raw["opacity"][300:] = -20  # idle ones cover nothing
     surfels = Surfels.from_numpy(raw)
-    edit = relocate.relocate(surfels, IDLE, 400, rng)
+    edit = refine.relocate(surfels, IDLE, 400, rng)
     copied = surfels.gather(mi.UInt32(edit.parent))
     camera = Camera.from_pose(64, 64, 90.0, 90.0, 32.0, 32.0, look_at(np.array([0, 0, 3.0]), np.zeros(3)))
     alpha = [np.array(splat(rows, [], camera).alpha) for rows in (surfels, edit.surfels, copied)]
@@ -92,14 +92,14 @@ def test_a_relocation_hardly_changes_the_picture(rng: np.random.Generator) -> No
 def test_the_table_grows_up_to_the_limit(rng: np.random.Generator) -> None:
     surfels = table(40, 0, rng)
     grow = Relocation(WHEN, grow=0.25)
-    assert relocate.relocate(surfels, grow, 100, rng).surfels.count == 50
-    assert relocate.relocate(surfels, grow, 43, rng).surfels.count == 43
-    same = relocate.relocate(surfels, IDLE, 100, rng)
+    assert refine.relocate(surfels, grow, 100, rng).surfels.count == 50
+    assert refine.relocate(surfels, grow, 43, rng).surfels.count == 43
+    same = refine.relocate(surfels, IDLE, 100, rng)
     assert same.surfels is surfels and not same.fresh.any()
 
 
 def test_all_idle_stay_where_they_are(rng: np.random.Generator) -> None:
-    edit = relocate.relocate(table(5, 5, rng), IDLE, 100, rng)
+    edit = refine.relocate(table(5, 5, rng), IDLE, 100, rng)
     assert edit.parent.tolist() == [0, 1, 2, 3, 4]
 
 
@@ -107,7 +107,7 @@ def test_only_transparent_surfels_wander_within_their_plane(rng: np.random.Gener
     """Steps are η λ σ² / (1 + exp(100 (o - threshold))) of normal deviates along each tangent."""
     surfels = table(20_000, 10_000, rng)
     options, rate, extent = Relocation(WHEN, opacity=0.01, noise=100.0), 0.1, 2.0
-    moved = relocate.wander(surfels, rate, extent, options, 3, 0).numpy() - surfels.to_numpy()["position"]
+    moved = refine.wander(surfels, rate, extent, options, 3, 0).numpy() - surfels.to_numpy()["position"]
     raw = surfels.to_numpy()
     axes, σ = surfels.primitive.extent(raw)
     normal = np.array(surfels.frame()[2]).T
@@ -127,7 +127,7 @@ def test_steps_follow_from_seed_and_iteration_and_scale_with_the_scene(rng: np.r
     large = Surfels.from_numpy(raw | {"position": 8 * raw["position"], "scale": raw["scale"] + np.log(8)})
 
     def step(surfels: Surfels, extent: float, iteration: int, seed: int) -> np.ndarray:
-        moved = relocate.wander(surfels, 0.1, extent, IDLE, iteration, seed).numpy()
+        moved = refine.wander(surfels, 0.1, extent, IDLE, iteration, seed).numpy()
         return moved - surfels.to_numpy()["position"]
 
     first = step(small, 1.0, 5, 0)

@@ -20,8 +20,8 @@ from mi_refgs.cli import main
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import select
-from mi_refgs.fitting.branch import branched
 from mi_refgs.fitting.runner import begin
+from mi_refgs.fitting.select import branched
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.method import LIGHT, Method

@@ -16,7 +16,7 @@ from PIL import Image
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.lens import Lens
 from mi_refgs.data.readers import READERS, reader_of
-from mi_refgs.fitting.job import load_method
+from mi_refgs.fitting.runner import load_method
 from mi_refgs.formats import Shot
 from mi_refgs.formats.cameras import CAMERAS
 from mi_refgs.io.images import box_downscale, read_png, write_png

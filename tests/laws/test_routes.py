@@ -29,7 +29,7 @@ from mi_refgs.plugins.aovs import suffixes
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.save import save
+from mi_refgs.runs.export import save
 from mi_refgs.runs.trained_scene import SCENE, TrainedScene
 from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight

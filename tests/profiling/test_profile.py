@@ -25,8 +25,15 @@ from mi_refgs.kernels import timing
 from mi_refgs.methods.method import LightOptions, Method
 from mi_refgs.profiling import phases
 from mi_refgs.profiling.advice import advice
-from mi_refgs.profiling.frame import aovs_of, profile_frame
-from mi_refgs.profiling.profile import Profile, StageProfile, Work, count_work, profile_stage
+from mi_refgs.profiling.profile import (
+    Profile,
+    StageProfile,
+    Work,
+    aovs_of,
+    count_work,
+    profile_frame,
+    profile_stage,
+)
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import PrefilteredLight
