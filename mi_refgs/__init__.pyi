@@ -28,6 +28,8 @@ from mi_refgs.reconstruction.reconstruction import Reconstruction as Reconstruct
 from mi_refgs.reconstruction.reconstruction import load as load
 from mi_refgs.relighting.relight import relight as relight
 from mi_refgs.render.pipeline import Frame as Frame
+from mi_refgs.render.pipeline import Request as Request
+from mi_refgs.render.pipeline import SurfelScene as SurfelScene
 from mi_refgs.runs.relightable import relightable as relightable
 from mi_refgs.runs.run import Run as Run
 from mi_refgs.runs.trained_scene import TrainedScene as TrainedScene

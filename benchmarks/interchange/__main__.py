@@ -78,10 +78,10 @@ def _picture(planes: Any, camera: Any) -> np.ndarray:
 
 def _blended(table: Any, camera: Any) -> np.ndarray:
     """The formula of 3DGS, by our own splatter."""
-    from mi_refgs.render.pipeline import render
+    from mi_refgs.render.pipeline import SurfelScene, render
     from mi_refgs.shade.shading import Shading
 
-    return _picture(render(table, camera, Shading("surfel", "radiance"), normals=False).radiance, camera)
+    return _picture(render(SurfelScene(table, Shading("surfel", "radiance")), camera).radiance, camera)
 
 
 if __name__ == "__main__":

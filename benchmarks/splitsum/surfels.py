@@ -19,7 +19,7 @@ from benchmarks.common.setup import ALBEDO, covering
 from benchmarks.common.view import Points, rows
 from benchmarks.splitsum.exact import Exact, split_sum
 from mi_refgs.constants import COVERAGE_FLOOR
-from mi_refgs.render.pipeline import render
+from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels.table import Surfels
@@ -59,7 +59,7 @@ def budget(setup: Exact) -> dict[str, Any]:
     surfels = sphere_surfels(settings.surfels)
     camera = Camera.from_sensor(setup.sensor.inner)
     shading = Shading(at="pixel", reflectance="split_sum", diffuse="irradiance")
-    shipped = setup.points.of_image(rows(render(surfels, camera, shading, light).radiance))
+    shipped = setup.points.of_image(rows(render(SurfelScene(surfels, shading, light), camera).radiance))
 
     group = mi.Float(band(surfels.to_numpy()["position"][:, 1]).astype(np.float32))
     blended = splat(surfels, [*surfels.frame()[2], group], camera)

@@ -18,7 +18,7 @@ from mi_refgs.reference import occlusion as trace
 from mi_refgs.reference import picture as oracle
 from mi_refgs.reference import surfel
 from mi_refgs.render.depth_normals import normals_from_depth
-from mi_refgs.render.pipeline import render
+from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -120,7 +120,8 @@ def product(case: Case, weights: dict[str, Array]) -> Found:
     shading: Any = Shading(case.at, case.reflectance, case.diffuse, case.mesh is not None)  # type: ignore[arg-type]
     occluder = occluder_of(case)
     used = light.prefilter() if case.reflectance == "split_sum" else None
-    frame = render(surfels, camera, shading, used, occluder, aovs=case.reflectance == "split_sum")
+    scene = SurfelScene(surfels, shading, used, occluder)
+    frame = render(scene, camera, Request(scene.all_aovs if used is not None else ("normal",)))
     planes: dict[str, list[Any]] = {
         "radiance": list(frame.radiance),
         "alpha": [frame.alpha],

@@ -19,7 +19,7 @@ from benchmarks.visibility.scenes import Concave
 from benchmarks.visibility.settings import METALLIC, VOXEL, Rule, Settings
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.pipeline import render
+from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.reflection import reflection
@@ -108,4 +108,5 @@ class Setup(setup.Setup):
         """The product's own frame: the surfels splatted, visibility, shading."""
         camera = Camera.from_sensor(self.timing_sensor.inner)
         shading = Shading(diffuse="irradiance", occlusion=rule.rays > 0, accuracy=rule.accuracy())
-        return lambda: render(self.surfels, camera, shading, self.light, self.occluder).radiance
+        scene = SurfelScene(self.surfels, shading, self.light, self.occluder)
+        return lambda: render(scene, camera).radiance

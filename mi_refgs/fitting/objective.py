@@ -69,7 +69,6 @@ def objective(
     width, height = target.camera.width, target.camera.height
     gain = None if log_gain is None else [dr.exp(value) for value in log_gain]
     image = displayed(frame, data.background, data.is_linear_radiance, gain)
-    share = frame.alpha if frame.share is None else frame.share
     if target.clipped is not None:
         image = losses.clip_highlights(image, target.image, target.clipped)
     loss = (1 - weights.ssim) * losses.l1(image, target.image)
@@ -80,16 +79,15 @@ def objective(
     if weights.normal and iteration > weights.normal_start:
         weight = _risen(weights.normal, iteration - weights.normal_start, weights.normal_rise)
         depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, target.camera)
-        of_normal = share if frame.own_normal else frame.alpha
-        loss += weight * losses.normal_consistency(frame.normal, depth_normal, valid, of_normal)
+        loss += weight * losses.normal_consistency(frame.normal, depth_normal, valid, frame.normal_alpha)
     if weights.smooth and iteration <= weights.smooth_until:
         loss += weights.smooth * losses.smoothness(list(frame.normal), target.image, width, height)
     if weights.half_metal and "metallic" in frame.maps and iteration > weights.half_metal_start:
         since = iteration - weights.half_metal_start
         weight = _risen(weights.half_metal, since, weights.half_metal_rise)
-        loss += weight * losses.half_metal(frame.maps["metallic"], share)
+        loss += weight * losses.half_metal(frame.maps["metallic"], frame.object_alpha)
     if weights.materials and {*MATERIALS} <= {*frame.maps}:
-        maps = [dr.detach(share) * frame.maps[name] for name in MATERIALS]
+        maps = [dr.detach(frame.object_alpha) * frame.maps[name] for name in MATERIALS]
         loss += weights.materials * losses.smoothness(maps, target.image, width, height, MATERIAL_EDGE)
     if weights.light_colour and light is not None:
         loss += weights.light_colour * losses.light_colour(light)

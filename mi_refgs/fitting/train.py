@@ -31,7 +31,7 @@ from mi_refgs.kernels.timing import phase
 from mi_refgs.methods.method import GAIN, Method, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, channels_of, light_of, part, surroundings_of, tensors
@@ -128,17 +128,10 @@ class Trainer:
         with dr.suspend_grad():
             shading = self.shading()
             update_missing_caches(self.occluder, self.surfels, self.light, shading)
-            return render(
-                self.surfels,
-                camera,
-                shading,
-                shading.light_of(self.light),
-                self.occluder,
-                sh_degree=self.schedule.sh_degree(self.iteration),
-                aovs=aovs,
-                normals=aovs,
-                surroundings=None if alone else self.surroundings,
-            )
+            light, surroundings = shading.light_of(self.light), None if alone else self.surroundings
+            scene = SurfelScene(self.surfels, shading, light, self.occluder, surroundings)
+            asked = scene.all_aovs if aovs else ()
+            return render(scene, camera, Request(asked, sh_degree=self.schedule.sh_degree(self.iteration)))
 
     # ---------------- the loop ----------------
 
@@ -239,22 +232,18 @@ class Trainer:
         target = self.targets.at(iteration, index)
         camera, surfels, around = target.camera, self.surfels, self.surroundings
         rows = surfels.count + (0 if around is None else around.surfels.count)
-        shift = mi.Point2f(dr.opaque(mi.Float, 0, rows), dr.opaque(mi.Float, 0, rows))
-        dr.enable_grad(shift)
+        offset = mi.Point2f(dr.opaque(mi.Float, 0, rows), dr.opaque(mi.Float, 0, rows))
+        dr.enable_grad(offset)
         shading = self._shading(stage)
         update_missing_caches(self.occluder, self.surfels, self.light, shading)
         light = self.window.light(self.light, shading)
-        view = partial(
-            render,
-            surfels,
-            shading=shading,
-            light=light,
-            occluder=self.occluder,
+        scene = SurfelScene(surfels, shading, light, self.occluder, around)
+        request = Request(
+            ("normal",) if self.method.loss.uses_normals else (),
             sh_degree=self.schedule.sh_degree(iteration),
-            shift=shift,
-            normals=self.method.loss.uses_normals,
-            surroundings=around,
+            screen_offset=offset,
         )
+        view = partial(render, scene, request=request)
         frame = supersampled(view, camera, stage.samples, details=self.method.loss.uses_maps)
         gain = self.exposure.log_gain(index)
         loss, self.error = objective(frame, target, self.data, self.method.loss, iteration, light, gain)
@@ -263,8 +252,8 @@ class Trainer:
         if self.schedule.light_learns(iteration):
             self.window.close()
 
-        fine = camera.supersampled(samples_per_axis(stage.samples))  # whose pixels the shift is in
-        self.control.observe(dr.grad(shift), fine, iteration)
+        fine = camera.supersampled(samples_per_axis(stage.samples))  # whose pixels the offset is in
+        self.control.observe(dr.grad(offset), fine, iteration)
         if iteration % self.method.log_every == 0:
             dr.schedule(self.loss, self.error)
         self.optimiser.stage = stage.rates

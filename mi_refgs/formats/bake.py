@@ -104,7 +104,7 @@ def _grown(mesh: Mesh, views: Sequence[Camera], renderer: Callable[[Camera], Fra
 
     Expected depths, of which it was made, lie behind the first surfels that they average.
     """
-    wanted = [frame.share if frame.share is not None else frame.alpha for frame in map(renderer, views)]
+    wanted = [frame.object_alpha for frame in map(renderer, views)]
     covered = sum(float(dr.sum(share)[0]) for share in wanted)
     normals = _normals(mesh)
 

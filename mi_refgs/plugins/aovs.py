@@ -102,19 +102,18 @@ PREMULTIPLIED = (*TERMS, "alpha", "normal")
 
 def _weighted(kind: str, frame: Frame, camera: Camera) -> tuple[list[Any], Any]:
     """The channels of one type as the frame has them, and the opacity of what they are of."""
-    of_object = frame.alpha if frame.share is None else frame.share
     if kind in CHANNELS:
         value = frame.maps[kind]
-        return [*value] if len(CHANNELS[kind].aov) > 1 else [value], of_object
+        return [*value] if len(CHANNELS[kind].aov) > 1 else [value], frame.object_alpha
     if kind == "normal":
-        return [*frame.normal], of_object if frame.own_normal else frame.alpha
+        return [*frame.normal], frame.normal_alpha
     if kind == "depth":
         return [ray_distance(frame.depth, camera) if frame.distance is None else frame.distance], frame.alpha
     if kind == "alpha":
         return [frame.alpha], frame.alpha
     if kind == "visibility":
-        return [frame.maps.get("visibility", mi.Float(1))], of_object
-    return [*getattr(frame.terms, kind)], of_object
+        return [frame.maps.get("visibility", mi.Float(1))], frame.object_alpha
+    return [*getattr(frame.terms, kind)], frame.object_alpha
 
 
 def _finished(kind: str, values: list[Any], weight: Any) -> list[Any]:

@@ -22,7 +22,7 @@ from mi_refgs.plugins.properties import read_aovs, read_light, read_shading, rea
 from mi_refgs.plugins.surroundings import Around
 from mi_refgs.plugins.unusable import UnusableValues
 from mi_refgs.render.display import composited
-from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
@@ -275,17 +275,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             update_occluder_caches(self.occluder, self.surfels.detach(), light, self.shading.accuracy)
             # No one is told when a light of the scene changes.
             self.caches_valid = self.light is not None or not self.shading.accuracy.ambient_rays
-        frame = render(
-            Surfels(self.surfels.raw, screened=True),
-            camera,
-            self.shading,
-            light,
-            self.occluder,
-            aovs=asked,
-            normals=False,
-            surroundings=around.splatted(self.surfels),
-            derivatives=derivatives,
-        )
+        surfels, surroundings = Surfels(self.surfels.raw, screened=True), around.splatted(self.surfels)
+        rendered = SurfelScene(surfels, self.shading, light, self.occluder, surroundings)
+        frame = render(rendered, camera, Request(asked, forward_only=not derivatives))
         if len(self.terms) < len(TERMS):  # of the object alone
             radiance = sum((getattr(frame.terms, name) for name in self.terms), start=mi.Color3f(0))
             frame = replace(frame, radiance=radiance)

@@ -46,7 +46,7 @@ def render(open_scene: OpenScene) -> tuple[dict[str, Array], Array]:
     sums = np.concatenate([blend.weight[:count].T @ values, depth[:, None], share[:, None]], axis=1)
     resolve = Resolve(scene, features, x, y, sums)
     maps = resolve.named(resolve(sums, []).real)
-    maps["share"], maps["own_normal"] = share[:, None], maps["normal"]
+    maps["object_alpha"], maps["object_normal"] = share[:, None], maps["normal"]
     maps["alpha"] = alpha[:, None]
     seen = alpha > c.COVERAGE_FLOOR
     maps["depth"] = np.where(seen, depth / np.where(seen, alpha, 1), 0)[:, None]

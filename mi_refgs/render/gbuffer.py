@@ -13,6 +13,9 @@ from mi_refgs.splat import Blended, Camera, Shown, splat, splat_shown
 from mi_refgs.splat.lanes import Places
 from mi_refgs.surfels.table import Surfels
 
+OBJECT = "object"
+"""Slot of the object's opacity; where it is blended, slots are divided by it."""
+
 
 @dataclass(frozen=True)
 class GBuffer:
@@ -24,7 +27,7 @@ class GBuffer:
     alpha: Any  # accumulated opacity
     depth: Any  # expected camera-z depth, 0 where nothing is seen; None where it was not asked for
     slots: dict[str, Any]  # premultiplied by alpha, each of the type that was blended
-    inverse: Any  # 1/alpha, or 1/share, where that is seen, else 0
+    inverse: Any  # 1/alpha, or 1/object alpha, where that is seen, else 0
     places: Places | None = None
 
     @staticmethod
@@ -32,34 +35,32 @@ class GBuffer:
         surfels: Surfels,
         slots: Mapping[str, Any],
         camera: Camera,
-        shift: Any = None,
-        share: str = "",
-        alone: bool = False,
+        screen_offset: Any = None,
+        forward_only: bool = False,
         depth: bool = True,
     ) -> GBuffer:
         """Blend values of width N by name: mi.Float, or an array of several such as mi.Color3f.
 
-        Every component is a feature, which costs time in every surfel-tile pair. `shift`: see
-        `splat.project`. `share` names a slot that values are `divided` by in place of alpha: the opacity of
-        the rows that have them. For a picture `alone` there is no derivative, and `depth` only on demand.
+        Every component is a feature, which costs time in every surfel-tile pair. `screen_offset`: see
+        `splat.project`. `forward_only`: no derivatives, and no depth unless `depth`.
         """
         features = [part for value in slots.values() for part in parts(value)]
         blended: Blended | Shown
-        if alone:
+        if forward_only:
             blended = splat_shown(surfels, features, camera, depth)
         else:
-            blended = splat(surfels, features, camera, shift)
+            blended = splat(surfels, features, camera, screen_offset)
         rest, maps = list(blended.features), {}
         for name, value in slots.items():
             width = len(parts(value))
             maps[name], rest = of_parts(value, rest[:width]), rest[width:]
         inverse = inverse_alpha(blended.alpha)
-        own = inverse_alpha(maps[share]) if share else inverse
+        own = inverse_alpha(maps[OBJECT]) if OBJECT in maps else inverse
         mean_depth = None if blended.depth is None else blended.depth * inverse
         return GBuffer(blended.alpha, mean_depth, maps, own, getattr(blended, "places", None))
 
     def divided(self, name: str) -> Any:
-        """A slot divided by alpha, or by the share: the mean over what is seen, 0 where nothing is."""
+        """A slot divided by alpha or the object's opacity: the mean of what is seen, 0 where nothing is."""
         value = self.slots[name]
         return of_parts(value, [part * self.inverse for part in parts(value)])
 

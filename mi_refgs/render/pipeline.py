@@ -1,10 +1,10 @@
-"""Surfels to image, in the two orders that every method is made of.
+"""Render surfels to an image, in the two orders that every method is made of.
 
-    shade at surfels:  attributes ─ shade ─► radiance channel ─ blend ─► image
-    shade at pixels:   attributes ─ blend ─► G-buffer ─ shade ─► image
+    forward shading:   attributes ─ shade ─► radiance ─ blend ─► image      (`Shading.at` is "surfel")
+    deferred shading:  attributes ─ blend ─► G-buffer ─ shade ─► image      (`Shading.at` is "pixel")
 
-The same `splat` and the same `shade` serve both. Everything is traced by Dr.Jit; derivatives are left out of
-visibility, the side to which a normal is turned, the camera, and those that `splat.blend` lists.
+The same splatter and the same `shade` serve both. Everything is traced by Dr.Jit. No derivative: visibility,
+the side to which a normal is turned, the camera, and those that `mi_refgs.splat.blend` lists.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.kernels.timing import boundary
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.antialias import widened
-from mi_refgs.render.gbuffer import GBuffer, inverse_alpha
-from mi_refgs.render.surroundings import AROUND, OBJECT, Surroundings, joined_slots, together
+from mi_refgs.render.gbuffer import OBJECT, GBuffer, inverse_alpha
+from mi_refgs.render.surroundings import AROUND, Surroundings, joined_slots, together
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import TERMS, RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
@@ -32,102 +32,102 @@ from mi_refgs.splat.lanes import Places
 from mi_refgs.surfels.attributes import channel
 from mi_refgs.surfels.primitives import primitive_of, widths_of
 from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
+from mi_refgs.types import Color3f, Float, Point2f, Vector3f
+
+
+@dataclass(frozen=True)
+class SurfelScene:
+    """Surfels, how they are shaded, and what lights, occludes and surrounds them."""
+
+    surfels: Surfels
+    shading: Shading
+    light: Light | None = None  # as `Shading.light_of` returns it; required unless the model uses none
+    occluder: Occluder | None = None  # `traced_bounces` requires that it knows the surfels' materials
+    surroundings: Surroundings | None = None
+
+    @property
+    def all_aovs(self) -> frozenset[str]:
+        """Names of all AOVs that a frame of this scene may have."""
+        materials = {name for name in self.surfels.raw if channel(name).aov}
+        return frozenset({*materials, *TERMS, "visibility", "normal", "depth"})
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a render."""
+
+    aovs: Collection[str] = ()  # materials, terms of the radiance, "visibility", "normal", "depth", by name
+    forward_only: bool = False  # without derivatives: faster, equal to rounding
+    sh_degree: int | None = None  # highest SH degree of the radiance, for coarse-to-fine schedules
+    screen_offset: Point2f | None = None  # (N,) zeros that receive the gradient of a screen translation
+
+
+RADIANCE = Request()
+"""Radiance and alpha, with derivatives."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One rendered view: mi arrays of H·W values in raster order.
+    """One rendered view: arrays of H·W values in raster order.
 
     Radiance and its terms are linear and premultiplied by alpha; maps are divided by it and 0 where nothing
-    is seen. With `Surroundings`, alpha, depth and radiance are of both, terms and maps of the object.
+    is seen. With `Surroundings`, alpha, depth and radiance are of both, terms and maps of the object. AOVs
+    that were not asked for are None or missing; with derivatives, those are present that the radiance needs.
     """
 
-    alpha: Any  # accumulated opacity
-    depth: Any  # expected camera-z depth, 0 where nothing is seen; None if not asked for
-    normal: Any  # mi.Vector3f: blended world normal towards the camera, not normalised; None if not asked for
-    radiance: Any  # mi.Color3f, over black
-    terms: RadianceTerms | None = None  # diffuse, specular, indirect, whose sum it is, where known apart
-    maps: dict[str, Any] = field(default_factory=dict)  # by channel (such as albedo), visibility, where known
-    background: Any = None  # mi.Color3f: linear, seen through 1 - alpha; only with surroundings
-    share: Any = None  # opacity of the object alone, where it is known and not alpha
-    distance: Any = None  # along the ray from the near plane, mean of several samples; None of one
-    own_normal: bool = False  # `normal` is of the object alone, and premultiplied by `share`
+    alpha: Float  # accumulated opacity
+    depth: Float  # expected camera-z depth, 0 where nothing is seen
+    normal: Vector3f  # blended world normal towards the camera, premultiplied by `normal_alpha`
+    radiance: Color3f  # over black
+    terms: RadianceTerms | None = None  # diffuse, specular, indirect; they sum to the radiance of the object
+    maps: dict[str, Any] = field(default_factory=dict)  # by name: materials such as albedo, visibility
+    background: Color3f = None  # linear, seen through 1 - alpha; only with surroundings
+    object_alpha: Float = None  # opacity of the object, `alpha` itself without surroundings
+    normal_alpha: Float = None  # opacity of the surfels that `normal` is of: `alpha`, `object_alpha`
+    distance: Float = None  # mean along the ray from the near plane, of several samples per pixel
 
-    def only(self, asked: Collection[str]) -> Frame:
-        """The same frame without depth, normal, terms and maps that are not asked for by name."""
+    def only(self, aovs: Collection[str]) -> Frame:
+        """The same frame without depth, normal, terms and maps that are not named."""
         return replace(
             self,
-            depth=self.depth if "depth" in asked else None,
-            normal=self.normal if "normal" in asked else None,
-            terms=self.terms if {*TERMS}.intersection(asked) else None,
-            maps={name: value for name, value in self.maps.items() if name in asked},
+            depth=self.depth if "depth" in aovs else None,
+            normal=self.normal if "normal" in aovs else None,
+            terms=self.terms if {*TERMS}.intersection(aovs) else None,
+            maps={name: value for name, value in self.maps.items() if name in aovs},
         )
 
 
-def render(
-    surfels: Surfels,
-    camera: Camera,
-    shading: Shading,
-    light: Light | None = None,
-    occluder: Occluder | None = None,
-    sh_degree: int | None = None,
-    shift: Any = None,
-    aovs: bool | Collection[str] = False,
-    normals: bool = True,
-    surroundings: Surroundings | None = None,
-    derivatives: bool = True,
-) -> Frame:
-    """Render a view.
+def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> Frame:
+    """Render a view of a scene.
 
-    `light` is what `Shading.light_of` gives, needed unless the model asks for none. `sh_degree` limits the
-    degree of the radiance channel, for coarse-to-fine schedules. `aovs` asks for materials, "visibility",
-    "normal", "depth" and the terms of the radiance, by name or (True) all, even where the picture does not
-    need them per pixel; without `normals`, they are absent where it does not. `shift`: see `splat.project`;
-    with `surroundings` it is of their rows too, after the object's. Without `derivatives`, the frame has
-    radiance, alpha and what `aovs` asks for alone; images differ by rounding. `traced_bounces` needs an
-    occluder whose `set_materials` has seen these surfels. Raises InputError as `shading.check` does.
+    With surroundings, the rows of `screen_offset` are those of the object, then theirs. Raises InputError as
+    `Shading.check` does.
     """
     require_supported_variant("mi_refgs.render_frame")
-    primitive_of(widths_of(surfels.raw))
-    shading.check(surfels.raw, light is not None, occluder is not None)
-    if surfels.count == 0:
-        surfels, shift = _nothing(surfels), None
-    if surroundings is not None and surroundings.surfels.count == 0:
-        surroundings, shift = replace(surroundings, surfels=_nothing(surroundings.surfels)), None
-    seen = _seen(surfels, camera, sh_degree)
-    attributes = shading.model.attributes(surfels, seen, shading)
-    around = None if surroundings is None else _Around.of(surroundings, surfels, camera, sh_degree)
-    asked = _asked(surfels, aovs) | ({"normal"} if normals and derivatives else frozenset())
-    alone = not derivatives and not shading.accuracy.antialias  # whose neighbours are those of the image
-    scene = _Scene(surfels, camera, shading, light, occluder, seen, attributes, shift, around, asked, alone)
-    frame, buffer = _shade_at_surfels(scene) if shading.at == "surfel" else _shade_at_pixels(scene)
-    if not derivatives:
-        frame = _in_raster_order(frame.only(asked), buffer.places)
+    primitive_of(widths_of(scene.surfels.raw))
+    scene.shading.check(scene.surfels.raw, scene.light is not None, scene.occluder is not None)
+    view = _View.of(*_without_empty_tables(scene, request), camera)
+    frame, buffer = _shade_at_surfels(view) if scene.shading.at == "surfel" else _shade_at_pixels(view)
+    if request.forward_only:
+        frame = _in_raster_order(frame.only(request.aovs), buffer.places)
     return boundary(frame, "shade backward")
 
 
-def render_depth(surfels: Surfels, camera: Camera, around: Surfels | None = None) -> tuple[Any, Any]:
-    """Expected camera-z depth (0 where nothing is seen) and alpha of a view, and nothing else.
-
-    `around`: of the surfels and of these, which surround them, together.
-    """
-    if around is not None:
-        surfels = together(surfels, around)
+def render_depth(
+    surfels: Surfels, camera: Camera, surroundings: Surfels | None = None
+) -> tuple[Float, Float]:
+    """Expected camera-z depth (0 where nothing is seen) and alpha of surfels, with their surroundings."""
+    if surroundings is not None:
+        surfels = together(surfels, surroundings)
     blended = splat(surfels, [], camera)
     return blended.depth * inverse_alpha(blended.alpha), blended.alpha
-
-
-def _asked(surfels: Surfels, aovs: bool | Collection[str]) -> frozenset[str]:
-    if isinstance(aovs, bool):
-        materials = (name for name in surfels.raw if channel(name).aov)
-        return frozenset({*materials, *TERMS, "visibility", "normal", "depth"} if aovs else ())
-    return frozenset(aovs)
 
 
 def _in_raster_order(frame: Frame, places: Places | None) -> Frame:
     if places is None:
         return frame
-    dr.eval(frame.alpha, frame.depth, frame.normal, frame.radiance, frame.terms, frame.maps, frame.share)
+    alphas = frame.alpha, frame.object_alpha, frame.normal_alpha
+    dr.eval(frame.depth, frame.normal, frame.radiance, frame.terms, frame.maps, *alphas)
     raster = places.to_raster
     terms = frame.terms and RadianceTerms(
         **{name: raster(term) for name, term in frame.terms.known().items()}
@@ -140,82 +140,83 @@ def _in_raster_order(frame: Frame, places: Places | None) -> Frame:
         radiance=raster(frame.radiance),
         terms=terms,
         maps={name: raster(value) for name, value in frame.maps.items()},
-        share=raster(frame.share),
+        object_alpha=raster(frame.object_alpha),
+        normal_alpha=raster(frame.normal_alpha),
     )
 
 
-def _nothing(surfels: Surfels) -> Surfels:
-    """One surfel that no camera sees, with the channels of an empty table: Dr.Jit refuses empty arrays."""
-    unseen = {"opacity": -LOGIT_LIMIT}
-    return Surfels(
-        {n: dr.full(mi.TensorXf, unseen.get(n, 0), (1, int(x.shape[1]))) for n, x in surfels.raw.items()}
-    )
+def _without_empty_tables(scene: SurfelScene, request: Request) -> tuple[SurfelScene, Request]:
+    """Put one unseen surfel into tables without any, since Dr.Jit refuses empty arrays."""
+
+    def unseen(surfels: Surfels) -> Surfels:
+        raw = {name: (-LOGIT_LIMIT if name == "opacity" else 0, x) for name, x in surfels.raw.items()}
+        return Surfels(
+            {n: dr.full(mi.TensorXf, value, (1, int(x.shape[1]))) for n, (value, x) in raw.items()}
+        )
+
+    surroundings = scene.surroundings
+    if scene.surfels.count == 0:
+        scene, request = replace(scene, surfels=unseen(scene.surfels)), replace(request, screen_offset=None)
+    if surroundings is not None and surroundings.surfels.count == 0:
+        surroundings = replace(surroundings, surfels=unseen(surroundings.surfels))
+        scene, request = replace(scene, surroundings=surroundings), replace(request, screen_offset=None)
+    return scene, request
 
 
 # ---------------- the two orders ----------------
 
 
 @dataclass(frozen=True)
-class _Scene:
-    """What both orders start from."""
+class _View:
+    """A scene, as a camera sees its surfels: what both orders start from."""
 
-    surfels: Surfels
+    scene: SurfelScene
+    request: Request
     camera: Camera
-    shading: Shading
-    light: Any
-    occluder: Any
-    seen: SurfelView
-    attributes: dict[str, Any]  # of the model, by name
-    shift: Any
-    around: _Around | None
-    asked: frozenset[str]  # what the frame has beside radiance and alpha
-    alone: bool  # for a picture alone, without derivatives
+    points: ShadingPoints  # the object's surfels, with the model's attributes
+    others: dict[str, Any]  # radiance and normals of the surroundings' surfels; empty without any
+    geometry: Surfels  # of the object, then of the surroundings
+    background: Color3f  # pixel by pixel; None without surroundings
+
+    @staticmethod
+    def of(scene: SurfelScene, request: Request, camera: Camera) -> _View:
+        surfels, surroundings = scene.surfels, scene.surroundings
+        seen = _seen(surfels, camera, request.sh_degree)
+        attributes = {**scene.shading.model.attributes(surfels, seen, scene.shading)}
+        normal = attributes.pop("normal", seen.normal)  # the model's own, or the surfels'
+        others: dict[str, Any] = {}
+        geometry, background = surfels, None
+        if surroundings is not None:
+            beside = _seen(surroundings.surfels, camera, request.sh_degree)
+            radiance = beside.harmonic_colour(surroundings.surfels.value("radiance_sh"))
+            others = {"radiance": radiance, "normal": beside.normal}
+            geometry, background = together(surfels, surroundings.surfels), surroundings.behind(camera)
+        points = ShadingPoints(normal, -seen.direction, attributes)
+        return _View(scene, request, camera, points, others, geometry, background)
 
     @property
-    def normal(self) -> Any:
-        """The model's own normals (mi.Vector3f), or the surfels'."""
-        return self.attributes.get("normal", self.seen.normal)
-
-    @property
-    def named(self) -> dict[str, Any]:
-        """The attributes but the normal."""
-        return {name: value for name, value in self.attributes.items() if name != "normal"}
+    def asked(self) -> frozenset[str]:
+        """Names of the requested AOVs."""
+        return frozenset(self.request.aovs)
 
     def materials(self) -> dict[str, Any]:
-        """Activated channels that are asked for, by name."""
-        return {name: self.surfels.value(name) for name in self.surfels.raw if name in self.asked}
+        """Requested attributes of the surfels, activated, by name."""
+        surfels = self.scene.surfels
+        return {name: surfels.value(name) for name in surfels.raw if name in self.asked}
 
     def presence(self) -> dict[str, Any]:
         """The slot of the object's opacity, where alpha is not that."""
-        return {} if self.around is None else {OBJECT: dr.full(mi.Float, 1, self.surfels.count)}
+        return {OBJECT: dr.full(mi.Float, 1, self.scene.surfels.count)} if self.others else {}
 
     def blend(self, slots: dict[str, Any], others: dict[str, Any]) -> GBuffer:
-        """Slots of the object's rows, and those that the surroundings have, if there are any, in one sort."""
-        table, share = self.surfels, ""
-        if self.around is not None:
-            table, share = self.around.table, OBJECT if OBJECT in slots else ""
-            slots = joined_slots(slots, others, (self.surfels.count, self.around.count))
-        depth = not self.alone or "depth" in self.asked
-        return GBuffer.blend(table, slots, self.camera, self.shift, share, self.alone, depth)
-
-
-@dataclass(frozen=True)
-class _Around:
-    """Surroundings in a camera."""
-
-    table: Surfels  # geometry of the object and of them
-    count: int  # their rows
-    normal: Any  # mi.Vector3f of width `count`, towards the camera
-    radiance: Any  # mi.Color3f of width `count`
-    background: Any  # mi.Color3f, pixel by pixel
-
-    @staticmethod
-    def of(surroundings: Surroundings, surfels: Surfels, camera: Camera, sh_degree: int | None) -> _Around:
-        others = surroundings.surfels
-        seen = _seen(others, camera, sh_degree)
-        radiance = seen.harmonic_colour(others.value("radiance_sh"))
-        table = together(surfels, others)
-        return _Around(table, others.count, seen.normal, radiance, surroundings.behind(camera))
+        """Blend slots of the object's surfels together with those of the surroundings, in one sort."""
+        if self.others:
+            own = self.scene.surfels.count
+            slots = joined_slots(slots, others, (own, self.geometry.count - own))
+        # Antialiasing reads neighbours in the image.
+        compact = self.request.forward_only and not self.scene.shading.accuracy.antialias
+        depth = not compact or "depth" in self.asked
+        return GBuffer.blend(self.geometry, slots, self.camera, self.request.screen_offset, compact, depth)
 
 
 def _seen(surfels: Surfels, camera: Camera, sh_degree: int | None) -> SurfelView:
@@ -232,23 +233,26 @@ def _seen(surfels: Surfels, camera: Camera, sh_degree: int | None) -> SurfelView
     return SurfelView(direction, facing, sh_degree)
 
 
-def _shade_at_surfels(scene: _Scene) -> tuple[Frame, GBuffer]:
-    shading, direction, normals = scene.shading, scene.seen.direction, "normal" in scene.asked
-    points = ShadingPoints(scene.normal, -direction, scene.named)
-    if shading.occlusion:
-        centre = scene.surfels.position()
-        meets = TraceContext(scene.occluder, scene.surfels, scene.light, centre, direction)
-        points = shading.model.trace(points, meets, shading)
-    terms, around = shade(points, scene.light, shading), scene.around
-    # A feature costs time in every pair, so what is not asked for is not blended.
-    slots = {"radiance": terms.total()} | ({"normal": scene.normal} if normals else {})
-    materials, others = scene.materials(), {}
-    apart = {name: term for name, term in terms.known().items() if name in scene.asked}
-    if scene.asked - {"normal"}:
-        slots |= apart | materials | scene.presence()
-    if around is not None:
-        others = {"radiance": around.radiance} | ({"normal": around.normal} if normals else {})
-    buffer = scene.blend(slots, others)
+def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
+    """Forward shading: shade the surfels, then blend their radiance."""
+    scene, points, asked = view.scene, view.points, view.asked
+    # Radiance of each surfel.
+    if scene.shading.occlusion:
+        assert scene.occluder is not None  # by `Shading.check`
+        position = scene.surfels.position()
+        context = TraceContext(scene.occluder, scene.surfels, scene.light, position, -points.view)
+        points = scene.shading.model.trace(points, context, scene.shading)
+    terms = shade(points, scene.light, scene.shading)
+
+    # Blend it with the requested AOVs only: each slot costs time in every surfel-tile pair.
+    slots = {"radiance": terms.total()} | ({"normal": points.normal} if "normal" in asked else {})
+    others = {name: value for name, value in view.others.items() if name in slots}
+    materials = view.materials()
+    apart = {name: term for name, term in terms.known().items() if name in asked}
+    if asked - {"normal"}:
+        slots |= apart | materials | view.presence()
+    buffer = view.blend(slots, others)
+
     blended = buffer.slots
     known = RadianceTerms(**{"diffuse": None} | {name: blended[name] for name in apart}).filled()
     frame = Frame(
@@ -256,47 +260,55 @@ def _shade_at_surfels(scene: _Scene) -> tuple[Frame, GBuffer]:
         depth=buffer.depth,
         normal=blended.get("normal"),
         radiance=blended["radiance"],
-        terms=known if scene.asked & {*TERMS} else None,
+        terms=known if asked & {*TERMS} else None,
         maps={name: buffer.divided(name) for name in materials},
-        background=None if around is None else around.background,
-        share=blended.get(OBJECT),
+        background=view.background,
+        object_alpha=blended.get(OBJECT, None if view.others else buffer.alpha),
+        normal_alpha=buffer.alpha,
     )
     return frame, buffer
 
 
-def _shade_at_pixels(scene: _Scene) -> tuple[Frame, GBuffer]:
-    shading, camera = scene.shading, scene.camera
-    slots, around = {"normal": scene.normal} | scene.named, scene.around
-    slots |= {name: value for name, value in scene.materials().items() if name not in slots}
-    others = {} if around is None else {AROUND: around.radiance}
-    buffer = scene.blend(slots | scene.presence(), others)
-
+def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
+    """Deferred shading: blend the attributes of the surfels, then shade the pixels."""
+    scene, camera, shading = view.scene, view.camera, view.scene.shading
+    # G-buffer: the model's attributes and the requested ones.
+    slots = {"normal": view.points.normal} | view.points.attributes
+    slots |= {name: value for name, value in view.materials().items() if name not in slots}
+    others = {AROUND: view.others["radiance"]} if view.others else {}
+    buffer = view.blend(slots | view.presence(), others)
     values = {name: buffer.divided(name) for name in slots if name != "normal"}
-    normal = buffer.slots["normal"]
+    normal, alpha = buffer.slots["normal"], buffer.slots.get(OBJECT, buffer.alpha)
+
+    # Points to shade.
     pixel = None if buffer.places is None else buffer.places.raster
     ray, index = camera.rays(pixel), camera.image_index(pixel)
-    alpha = buffer.slots.get(OBJECT, buffer.alpha)
-    attributes = {name: values[name] for name in scene.named}
+    attributes = {name: values[name] for name in view.points.attributes}
     if shading.accuracy.antialias:
         attributes["roughness"] = widened(attributes["roughness"], normal, alpha, camera)
     points = ShadingPoints(normal, -dr.normalize(ray), attributes)
     maps = {name: values[name] for name in scene.surfels.raw if name in values}
+
+    # Visibility along the mirror direction, where there is something to reflect.
     if shading.occlusion:
+        assert scene.occluder is not None  # by `Shading.check`
         covered = dr.detach(alpha) > COVERAGE_FLOOR
-        meets = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered, index)
-        points = shading.model.trace(points, meets, shading)
+        context = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered, index)
+        points = shading.model.trace(points, context, shading)
         maps["visibility"] = points.visibility
+
+    # Radiance, premultiplied.
     shaded = shade(points, scene.light, shading)
     terms = RadianceTerms(**{name: term * alpha for name, term in shaded.known().items()}).filled()
     frame = Frame(
         alpha=buffer.alpha,
         depth=buffer.depth,
         normal=normal,
-        radiance=terms.total() if around is None else terms.total() + buffer.slots[AROUND],
+        radiance=terms.total() + buffer.slots[AROUND] if view.others else terms.total(),
         terms=terms,
         maps=maps,
-        background=None if around is None else around.background,
-        share=buffer.slots.get(OBJECT),
-        own_normal=around is not None,
+        background=view.background,
+        object_alpha=alpha,
+        normal_alpha=alpha,
     )
     return frame, buffer

@@ -55,10 +55,12 @@ def supersampled(
     def maybe(value: Any) -> Any:
         return None if value is None else mean(value)
 
-    alpha, share = mean(fine.alpha), maybe(fine.share)
+    alphas: dict[int, Any] = {}  # two or all of the three may be one array
+    for value in (fine.alpha, fine.object_alpha, fine.normal_alpha):
+        if id(value) not in alphas:
+            alphas[id(value)] = maybe(value)
+    alpha, object_alpha = alphas[id(fine.alpha)], alphas[id(fine.object_alpha)]
     inverse = inverse_alpha(alpha)
-    of_object = inverse if share is None else inverse_alpha(share)
-    by = fine.alpha if share is None else fine.share
 
     def by_alpha(value: Any) -> Any:
         return mean(value * fine.alpha) * inverse
@@ -76,9 +78,13 @@ def supersampled(
         normal=maybe(fine.normal),
         radiance=mean(fine.radiance),
         terms=terms,
-        maps={name: mean(value * by) * of_object for name, value in fine.maps.items()},
+        maps={
+            name: mean(value * fine.object_alpha) * inverse_alpha(object_alpha)
+            for name, value in fine.maps.items()
+        },
         background=None if fine.background is None else mean_behind(mean, fine.background, fine.alpha),
-        share=share,
+        object_alpha=object_alpha,
+        normal_alpha=alphas[id(fine.normal_alpha)],
         distance=distance,
     )
 

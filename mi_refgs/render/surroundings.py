@@ -22,8 +22,8 @@ from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
 
-OBJECT, AROUND = "object", "surroundings"
-"""Slots of the object's opacity and of the radiance of the surroundings."""
+AROUND = "surroundings"
+"""Slot of the radiance of the surroundings."""
 
 
 @dataclass(frozen=True)

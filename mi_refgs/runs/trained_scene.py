@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import drjit as dr
@@ -17,7 +18,7 @@ from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.passes import in_passes
-from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.checkpoint import PARAMS, channels_of, light_of, surroundings_of, tensors
@@ -125,7 +126,7 @@ class TrainedScene:
         return fitted
 
     def renderer(self, aovs: bool | Collection[str] = True, samples: int = 1) -> Callable[[Camera], Frame]:
-        """A function that renders views without derivatives, with the `aovs` of `render`, all or by name.
+        """A function that renders views without derivatives, with these AOVs, all or by name.
 
         `samples` a pixel as in `render.samples`. Light and mesh are prepared once.
         """
@@ -140,19 +141,11 @@ class TrainedScene:
         occluder = Occluder(self.mesh)
         update_occluder_caches(occluder, self.surfels, light, self.shading.accuracy)
 
+        scene = SurfelScene(self.surfels, self.shading, light, occluder, self.surroundings)
+
         def draw(camera: Camera, aovs: bool | Collection[str], samples: int = 1) -> Frame:
-            def once(view: Camera) -> Frame:
-                return render(
-                    self.surfels,
-                    view,
-                    self.shading,
-                    light,
-                    occluder,
-                    aovs=aovs,
-                    normals=aovs is True,
-                    surroundings=self.surroundings,
-                    derivatives=False,
-                )
+            asked = aovs if not isinstance(aovs, bool) else scene.all_aovs if aovs else ()
+            once = partial(render, scene, request=Request(asked, forward_only=True))
 
             def averaged(view: Camera) -> Frame:
                 return supersampled(once, view, samples, details=bool(aovs))

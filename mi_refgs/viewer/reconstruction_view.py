@@ -13,7 +13,7 @@ import numpy as np
 
 from mi_refgs.data.region import Region
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.runs.relightable import lacking, relightable
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.ambient import update_occluder_caches
@@ -174,16 +174,9 @@ class ReconstructionView:
             if self._stale and (settled or self._never):
                 update_occluder_caches(self._occluder, self.scene.surfels, light, self.scene.shading.accuracy)
                 self._stale = False
-            return render(
-                self.scene.surfels,
-                camera,
-                self.scene.shading,
-                light,
-                self._occluder,
-                aovs=aovs,
-                surroundings=None if alone else self.scene.surroundings,
-                derivatives=False,
-            )
+            surroundings = None if alone else self.scene.surroundings
+            scene = SurfelScene(self.scene.surfels, self.scene.shading, light, self._occluder, surroundings)
+            return render(scene, camera, Request(aovs, forward_only=True))
 
     @property
     def _never(self) -> bool:

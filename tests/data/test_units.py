@@ -26,7 +26,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.depth_normals import normals_from_depth
-from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import splat
@@ -73,7 +73,8 @@ def rendered(scale: float, shading: Shading) -> tuple[Surfels, Frame, Any, Any]:
     surfels = Surfels.from_numpy(scaled(raw_channels(), scale))
     surfels.enable_grad()
     light = EnvironmentLight.from_radiance(sky()).prefilter()
-    frame = render(surfels, camera(scale), shading, light, Occluder(wall(scale)))
+    scene = SurfelScene(surfels, shading, light, Occluder(wall(scale)))
+    frame = render(scene, camera(scale), Request(("normal",)))
     return surfels, frame, *normals_from_depth(frame.depth, frame.alpha, camera(scale))
 
 

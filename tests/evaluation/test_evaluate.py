@@ -24,7 +24,7 @@ from mi_refgs.evaluation.speed import TIMED_FRAMES, WARM_UP_FRAMES
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import read_png
 from mi_refgs.render.display import displayed
-from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -130,9 +130,9 @@ def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: 
     """Test views are rendered with materials and normals, also for the albedo; the timed frames without."""
     asked: list[bool] = []
 
-    def rendered(*arguments: Any, aovs: bool, normals: bool, **others: Any) -> Frame:
-        asked.append(aovs or normals)
-        return render(*arguments, aovs=aovs, normals=normals, **others)  # type: ignore[misc]
+    def rendered(scene: SurfelScene, camera: Any, request: Request) -> Frame:
+        asked.append(bool(request.aovs))
+        return render(scene, camera, request)
 
     monkeypatch.setattr("mi_refgs.runs.trained_scene.render", rendered)
     evaluate(run)

@@ -14,7 +14,7 @@ from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import baselines
 from mi_refgs.reference import shade as reference
-from mi_refgs.render.pipeline import render
+from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.shade import brdf
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -277,7 +277,8 @@ def test_every_channel_of_a_picture_gets_its_gradient(name: str) -> None:
     pose[2, 3] = -4
     camera = Camera.from_pose(24, 24, 30.0, 30.0, 12, 12, pose)
     shading = Shading(model.orders[0], name)
-    frame = render(surfels, camera, shading, shading.light_of(light), aovs=True)
+    scene = SurfelScene(surfels, shading, shading.light_of(light))
+    frame = render(scene, camera, Request(scene.all_aovs))
     assert frame.terms is not None
     np.testing.assert_allclose(frame.terms.total().numpy(), frame.radiance.numpy(), atol=1e-5)
     dr.backward(dr.sum(frame.radiance.x * frame.radiance.y + frame.radiance.z))

@@ -127,17 +127,17 @@ def test_the_screen_gradient_is_in_half_pictures(
     """Normalised device coordinates: what densification compares then has no unit."""
     initial = dataclasses.replace(method.stage["initial"], samples=samples)
     method = dataclasses.replace(method, stage=method.stage | {"initial": initial})
-    shifts, original = [], train.render
+    offsets, original = [], train.render
 
-    def render(*arguments: Any, **named: Any) -> Any:
-        shifts.append(named["shift"])
-        assert arguments[1].width == SIZE // 3 * factor  # coarse, and each pixel of as many samples
-        return original(*arguments, **named)
+    def render(scene: Any, camera: Any, request: Any) -> Any:
+        offsets.append(request.screen_offset)
+        assert camera.width == SIZE // 3 * factor  # coarse, and each pixel of as many samples
+        return original(scene, camera, request)
 
     monkeypatch.setattr(train, "render", render)
     trainer = Trainer(method, ball())
     trainer.step()
-    expected = 0.5 * (SIZE // 3) * factor * np.linalg.norm(np.array(dr.grad(shifts[0])), axis=0)
+    expected = 0.5 * (SIZE // 3) * factor * np.linalg.norm(np.array(dr.grad(offsets[0])), axis=0)
     assert expected.max() > 0
     np.testing.assert_allclose(trainer.control.table.gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
 
@@ -309,9 +309,9 @@ def test_pictures_begin_coarse(method: Method, monkeypatch: pytest.MonkeyPatch) 
     trainer, widths, steps = Trainer(method, ball()), [], []
     real = train.render
 
-    def rendered(surfels: Any, camera: Any, *args: Any, **kwargs: Any) -> Any:
+    def rendered(scene: Any, camera: Any, request: Any) -> Any:
         widths.append(camera.width)
-        return real(surfels, camera, *args, **kwargs)
+        return real(scene, camera, request)
 
     monkeypatch.setattr(train, "render", rendered)
     for _ in range(13):

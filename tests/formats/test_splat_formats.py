@@ -22,7 +22,7 @@ from mi_refgs.formats.splats import THIN, gaussians
 from mi_refgs.io.exr import read_exr
 from mi_refgs.io.ownership import RECORD
 from mi_refgs.render.display import display_image
-from mi_refgs.render.pipeline import render
+from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -87,7 +87,7 @@ def encoded(scene: TrainedScene, camera: Camera, alone: bool = False) -> np.ndar
 
 def their_picture(table: Surfels, camera: Camera) -> np.ndarray:
     """The formula of 3DGS (H, W, 4): colours blended as they are."""
-    frame = render(table, camera, Shading("surfel", "radiance"), normals=False)
+    frame = render(SurfelScene(table, Shading("surfel", "radiance")), camera)
     return image_array([*frame.radiance, frame.alpha], camera.height, camera.width)
 
 

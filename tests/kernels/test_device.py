@@ -87,7 +87,8 @@ def test_what_was_made_under_another_variant_is_not_rendered() -> None:
     camera, shading = mi_refgs.Camera.look_at([3, 0, 0], size=8), mi_refgs.Shading("surfel", "radiance")
     made = mi_refgs.TrainedScene(surfels, None, None, shading, 1, 1.0)
     mi.set_variant("scalar_rgb")
-    for draw in (lambda: mi_refgs.render_frame(surfels, camera, shading), lambda: made.renderer()(camera)):
+    scene = mi_refgs.SurfelScene(surfels, shading)
+    for draw in (lambda: mi_refgs.render_frame(scene, camera), lambda: made.renderer()(camera)):
         with pytest.raises(InputError, match="variant: 'scalar_rgb' is not supported"):
             draw()
 

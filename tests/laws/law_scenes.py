@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference.camera import look_at
-from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
@@ -115,8 +115,8 @@ def light() -> Any:
 
 def draw(scene: Scene, shading: Shading = SHADINGS[0], by: Any = None) -> dict[str, np.ndarray]:
     """Every map of the scene's picture, (pixels, channels) each."""
-    surfels = Surfels.from_numpy(scene.raw)
-    return maps_of(render(surfels, scene.view.camera(), shading, by or light(), aovs=True))
+    drawn = SurfelScene(Surfels.from_numpy(scene.raw), shading, by or light())
+    return maps_of(render(drawn, scene.view.camera(), Request(drawn.all_aovs)))
 
 
 def maps_of(frame: Frame) -> dict[str, np.ndarray]:
@@ -142,7 +142,7 @@ def gradients(
     surfels.enable_grad()
     loss = mi.Float(0)
     for view in views or (scene.view,):
-        frame = render(surfels, view.camera(), shading, light())
+        frame = render(SurfelScene(surfels, shading, light()), view.camera(), Request(("normal",)))
         values = [*frame.radiance, *frame.normal, frame.depth, frame.alpha]
         loss += sum((dr.sum(v * upload(w)) for v, w in zip(values, weight, strict=True)), mi.Float(0))
     dr.backward(loss)

@@ -20,7 +20,7 @@ from mi_refgs.reference.lookup import Light
 from mi_refgs.reference.models import Options
 from mi_refgs.reference.pinhole import PinholeCamera, rotation_axes
 from mi_refgs.reference.primitives import primitive_of
-from mi_refgs.render.pipeline import render
+from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.shade import brdf
@@ -137,13 +137,13 @@ class Oracle:
         if accuracy.antialias and "variance" not in self._kept:
             maps, _ = surroundings.render(surroundings.OpenScene(scene, around, background))
             shape = camera.height, camera.width
-            normal, share = maps["own_normal"].reshape(*shape, 3), maps["share"].reshape(shape)
+            normal, share = maps["object_normal"].reshape(*shape, 3), maps["object_alpha"].reshape(shape)
             self._kept["variance"] = antialias.widened(np.zeros(shape), normal, share).ravel() ** 4
         scene = replace(scene, variance=self._kept.get("variance"))
         maps, band = surroundings.render(surroundings.OpenScene(scene, around, background))
         if chosen.occlusion and chosen.model.visibility == "mirror":
             maps["visibility"] = self._kept["visible"][:, None]
-        floor = np.abs(maps["share"] - c.COVERAGE_FLOOR)[:, 0] < 0.5 * c.COVERAGE_FLOOR
+        floor = np.abs(maps["object_alpha"] - c.COVERAGE_FLOOR)[:, 0] < 0.5 * c.COVERAGE_FLOOR
         floor |= np.abs(maps["alpha"] - c.COVERAGE_FLOOR)[:, 0] < 0.5 * c.COVERAGE_FLOOR
         self._keep("band", lambda: np.logical_or(self.band, band | floor, out=self.band))
         return maps
@@ -167,18 +167,19 @@ class Oracle:
         )
         (left, right), (top, bottom) = (map(int, ends) for ends in camera.borders)
         view = replace(view, offset=(-left, -top), film=(right - left, bottom - top))
-        frame = render(surfels, view, chosen, light, occluder, aovs=True, surroundings=open_)
+        drawn = SurfelScene(surfels, chosen, light, occluder, open_)
+        frame = render(drawn, view, Request(drawn.all_aovs))
         assert frame.terms is not None
         found = {
             "radiance": frame.radiance, "alpha": frame.alpha, "depth": frame.depth, "normal": frame.normal,
             "diffuse": frame.terms.diffuse, "specular": frame.terms.specular,
             "indirect": frame.terms.indirect, **frame.maps,
-        } | ({} if frame.share is None else {"share": frame.share}) \
+        } | ({} if frame.object_alpha is frame.alpha else {"object_alpha": frame.object_alpha}) \
           | ({} if behind is None else {"background": frame.background})  # fmt: skip
         count = len(self.pixels)
         maps = {name: np.atleast_2d(np.array(x, np.float64)).T for name, x in found.items()}
         maps = {name: np.broadcast_to(x, (count, x.shape[1])) for name, x in maps.items()}
-        return {"share": maps["alpha"]} | maps
+        return {"object_alpha": maps["alpha"]} | maps
 
     # ---------------- the film ----------------
 
@@ -207,7 +208,7 @@ class Oracle:
 
     def _aov(self, kind: str, maps: dict[str, Array]) -> Array:
         """One AOV (H, W, n): means over the samples of premultiplied values, divided once."""
-        alpha, share = self._blocks(maps["alpha"]), self._blocks(maps["share"])
+        alpha, share = self._blocks(maps["alpha"]), self._blocks(maps["object_alpha"])
         if kind == "alpha":
             return alpha
         if kind in picture.TERMS:
@@ -220,7 +221,7 @@ class Oracle:
             along = (maps["depth"] - NEAR) * self._ray_lengths()  # distances, which are averaged
             distance = self._blocks(along * maps["alpha"]) / np.where(alpha > 0, alpha, 1)
             return np.where(alpha > c.COVERAGE_FLOOR, distance, 0)
-        by = maps["share"]
+        by = maps["object_alpha"]
         value = maps.get("visibility", np.ones_like(by)) if kind == "visibility" else maps[kind]
         mean = self._blocks(value * by) / np.where(share > 0, share, 1)
         return np.where(share > c.COVERAGE_FLOOR, mean, 0)

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from mi_refgs.render.pipeline import render
+from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.splat import Camera
@@ -201,7 +201,7 @@ class Losses:
         camera = Camera.from_sensor(self.scene.sensors()[0])
         light = of.shading.light_of(of.light)
         around = of.around.splatted(of.surfels)
-        frame = render(of.surfels, camera, of.shading, light, of.occluder, surroundings=around)
+        frame = render(SurfelScene(of.surfels, of.shading, light, of.occluder, around), camera)
         weight = self.weight.array
         values = [*frame.radiance, frame.alpha, frame.depth]
         rows = dr.arange(mi.UInt32, dr.width(frame.alpha))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_refgs.constants import TILE_SIZES, tile_size
 from mi_refgs.reference.camera import look_at
-from mi_refgs.render.pipeline import render
+from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
@@ -60,7 +60,7 @@ def test_exported_scene_renders_the_same_view(tmp_path: Path) -> None:
     loaded = mi.load_file(str(tmp_path / "scene.xml"))
     occluder = loaded.integrator().occluder
     light = EnvironmentLight.from_radiance(sky()).prefilter()
-    frame = render(surfels, camera, Shading(occlusion=True), light, occluder)
+    frame = render(SurfelScene(surfels, Shading(occlusion=True), light, occluder), camera)
     expected = np.concatenate([frame.radiance.numpy(), frame.alpha.numpy()[None]]).T.reshape(HEIGHT, WIDTH, 4)
     result = image(loaded)
     assert expected[..., 3].max() > 0.5

@@ -14,7 +14,7 @@ import pytest
 from mi_refgs.cli import main
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import read_exr_image
-from mi_refgs.render.pipeline import render
+from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import export
 from mi_refgs.runs.trained_scene import AROUND_FILE, BACKGROUND_MAP, SCENE, TrainedScene
@@ -61,7 +61,7 @@ def test_the_picture_is_that_of_the_renderer() -> None:
     surfels, light = Surfels.from_numpy(raw_channels()), EnvironmentLight.from_radiance(sky())
     around = Surroundings(Surfels.from_numpy(far_channels()), background_light())
     shading = Shading()
-    frame = render(surfels, camera(), shading, shading.light_of(light), surroundings=around)
+    frame = render(SurfelScene(surfels, shading, shading.light_of(light), surroundings=around), camera())
     expected = frame.radiance + (1 - frame.alpha) * frame.background
     np.testing.assert_allclose(seen[..., :3].reshape(-1, 3), expected.numpy().T, atol=1e-5)
     np.testing.assert_array_equal(seen[..., 3], 1)
@@ -118,7 +118,7 @@ def test_a_runs_files_hold_both_and_lose_them(tmp_path: Path) -> None:
     files = {path.name for path in export(made, tmp_path, camera())}
     assert {AROUND_FILE, BACKGROUND_MAP} <= files
     frame, again = made.renderer()(camera()), TrainedScene.read(tmp_path).renderer()(camera())
-    for name in ("radiance", "alpha", "background", "share"):
+    for name in ("radiance", "alpha", "background", "object_alpha"):
         np.testing.assert_allclose(getattr(again, name), getattr(frame, name), atol=1e-5)
     expected = (frame.radiance + (1 - frame.alpha) * frame.background).numpy().T.reshape(HEIGHT, WIDTH, 3)
     seen = image(mi.load_file(str(tmp_path / SCENE)))

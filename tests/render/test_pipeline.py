@@ -14,7 +14,7 @@ from mi_refgs.reference import shade as reference
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.reference.pinhole import rotation_matrix
-from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -98,7 +98,7 @@ def test_pixels_are_shaded_by_the_oracle(at: Any, diffuse: Any) -> None:
     to_world = look_at(np.array([3.0, 1, 2]), np.zeros(3))
     view = oracle.PinholeCamera(WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, to_world, near=0.01)
     camera = Camera.from_pose(WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, to_world, near=0.01)
-    frame = render(Surfels.from_numpy(raw), camera, Shading(at=at, diffuse=diffuse), light)
+    frame = render(SurfelScene(Surfels.from_numpy(raw), Shading(at=at, diffuse=diffuse), light), camera)
 
     values = attributes(raw, to_world[:3, 3])
     points = [{name: column[i] for name, column in values.items()} for i in range(len(raw["position"]))]
@@ -131,7 +131,9 @@ def test_normals_are_turned_to_the_camera_unless_they_only_lean_away(degrees: fl
     """A surfel turned about +y; up to 14° (a cosine of ¼) behind the silhouette its normal stays."""
     half = np.radians(degrees) / 2
     turned = discs(rotation=np.array([[0, np.sin(half), 0, np.cos(half)]]))
-    normal = channel(render(turned, seen_from(0, 0, 4.0), COLOUR), "normal")[0]
+    normal = channel(
+        render(SurfelScene(turned, COLOUR), seen_from(0, 0, 4.0), Request(("normal",))), "normal"
+    )[0]
     outward = np.array([np.sin(2 * half), 0, np.cos(2 * half)])
     expected = -outward if outward[2] < -0.25 else outward
     assert np.linalg.norm(normal) > 0.1
@@ -143,7 +145,7 @@ def test_colour_of_harmonics_up_to_a_degree(degree: int | None, rng: np.random.G
     coefficients = 0.3 * rng.normal(size=(1, 48))
     origin = np.array([1.0, -2.0, 3.0])
     camera = seen_from(*origin)
-    frame = render(discs(radiance_sh=coefficients), camera, COLOUR, sh_degree=degree)
+    frame = render(SurfelScene(discs(radiance_sh=coefficients), COLOUR), camera, Request(sh_degree=degree))
     basis = reference.sh_basis(-origin / np.linalg.norm(origin), 3)
     basis[(4 if degree is None else degree + 1) ** 2 :] = 0
     expected = np.maximum(0.5 + basis @ coefficients.reshape(16, 3), 0)
@@ -155,8 +157,8 @@ def test_opacity_and_the_size_on_screen_have_their_bounds() -> None:
     """An opaque surfel covers 0.99; one far smaller than a pixel is a Gaussian of the pixel's variance."""
     camera = seen_from(0, 0, 4.0, size=4)
     large, small = (discs(scale=np.full((1, 2), np.log(scale))) for scale in (10.0, 1e-4))
-    assert channel(render(large, camera, COLOUR), "alpha") == pytest.approx(0.99)
-    alpha = channel(render(small, camera, COLOUR), "alpha").reshape(4, 4)
+    assert channel(render(SurfelScene(large, COLOUR), camera), "alpha") == pytest.approx(0.99)
+    alpha = channel(render(SurfelScene(small, COLOUR), camera), "alpha").reshape(4, 4)
     # The four pixels in the middle have their centres half a pixel from it along each axis.
     assert alpha[1:3, 1:3] == pytest.approx(np.exp(-0.5 * 12 * 0.5))
     assert np.count_nonzero(alpha) == 4
@@ -165,7 +167,7 @@ def test_opacity_and_the_size_on_screen_have_their_bounds() -> None:
 def test_layers_show_down_to_the_least_transmittance() -> None:
     """Each layer halves the light; the 13th is the last before 1e-4."""
     layers = discs(opacity=np.zeros((20, 1)), scale=np.full((20, 2), np.log(100.0)))
-    alpha = channel(render(layers, seen_from(0, 0, 4.0), COLOUR), "alpha")
+    alpha = channel(render(SurfelScene(layers, COLOUR), seen_from(0, 0, 4.0)), "alpha")
     assert 1 - alpha == pytest.approx(2.0**-13, rel=1e-2)
 
 
@@ -181,7 +183,7 @@ def test_samples_before_the_near_plane_are_cut() -> None:
             12, 12, -8.0, -8.0, 6, 6, look_at(np.array([0, 0, 4.0]), np.zeros(3), up=(0, 1, 0)), near
         )
         expected = oracle.splat(raw, np.zeros((1, 0)), view)
-        alpha = channel(render(leaning, camera, COLOUR), "alpha").reshape(12, 12)
+        alpha = channel(render(SurfelScene(leaning, COLOUR), camera), "alpha").reshape(12, 12)
         np.testing.assert_allclose(alpha[~expected.band], expected.alpha[~expected.band], atol=1e-5)
         covered.append(np.count_nonzero(alpha))
     assert 0.2 * covered[0] < covered[1] < 0.8 * covered[0]
@@ -200,6 +202,6 @@ def test_normals_are_blended_only_where_something_needs_them(monkeypatch: pytest
     monkeypatch.setattr(splat, "blend", counted)
     surfels = discs(radiance_sh=np.full((3, 3), 0.2))
     camera = seen_from(0, 0, 4.0, size=12)
-    frames = [render(surfels, camera, COLOUR, normals=normals) for normals in (True, False)]
+    frames = [render(SurfelScene(surfels, COLOUR), camera, Request(aovs)) for aovs in (("normal",), ())]
     assert features == [6, 3] and frames[1].normal is None
     np.testing.assert_array_equal(*(frame.radiance.numpy() for frame in frames))

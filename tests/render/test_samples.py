@@ -154,7 +154,7 @@ def test_aovs_of_several_samples_are_premultiplied_means_divided_once(
     plugin = dict(zip(kinds, np.split(image[..., 4:], np.cumsum(widths)[:-1], axis=-1), strict=True))
     samples = {kind: planes(wide(aov_values(kind, fine, fine_eye), factor), factor) for kind in kinds}
     alpha = samples["alpha"]
-    own = alpha if fine.share is None else planes(fine.share, factor)
+    own = planes(fine.object_alpha, factor)
     coverage, own_coverage = block_means(alpha, factor), block_means(own, factor)
     assert (
         np.mean((own_coverage > 0.01) & (block_means((own < 1e-3) * 1.0, factor) > 0)) > 0.03

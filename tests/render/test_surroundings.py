@@ -16,7 +16,7 @@ from benchmarks.stability.case import camera, plain
 from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.reference import surroundings as oracle
 from mi_refgs.render.display import displayed, srgb_from_linear
-from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.samples import box_mean, supersampled
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -28,7 +28,17 @@ from tests.scenes.integrator import scattered_discs
 
 assert ROOT
 CASES = [("pixel", "sh"), ("surfel", "irradiance")]
-MAPS = ("radiance", "alpha", "depth", "normal", "share", "albedo", "metallic", "roughness", "background")
+MAPS = (
+    "radiance",
+    "alpha",
+    "depth",
+    "normal",
+    "object_alpha",
+    "albedo",
+    "metallic",
+    "roughness",
+    "background",
+)
 
 
 @dataclass(frozen=True)
@@ -77,7 +87,8 @@ class Pair:
         light = EnvironmentLight(params["light"]).prefilter()
         shading = Shading(self.at, "split_sum", self.diffuse)  # type: ignore[arg-type]
         eye = eye or measure.fast_camera(self.case)
-        return render(surfels, eye, shading, light, aovs=True, surroundings=behind)
+        scene = SurfelScene(surfels, shading, light, surroundings=behind)
+        return render(scene, eye, Request(scene.all_aovs))
 
     def planes(self, params: dict[str, Any]) -> dict[str, list[Any]]:
         frame = self.frame(params)
@@ -106,10 +117,10 @@ def test_the_picture_is_that_of_float64(pair: Pair) -> None:
     """Radiance, alpha and depth of both; share and materials of the object; the background by its rays."""
     maps, band = pair.truth(pair.values)
     planes = pair.planes({name: upload_tensor(x) for name, x in pair.values.items()})
-    assert np.mean(~band) > 0.9 and 0.1 < np.mean(maps["share"] / maps["alpha"].clip(1e-3) > 0.5) < 0.9
+    assert np.mean(~band) > 0.9 and 0.1 < np.mean(maps["object_alpha"] / maps["alpha"].clip(1e-3) > 0.5) < 0.9
     for name in MAPS:
         found = np.stack([np.broadcast_to(np.array(x), len(band)) for x in planes[name]], 1)
-        keep = ~band & (np.abs(maps["share"][:, 0] - 1e-3) > 5e-4)  # COVERAGE_FLOOR
+        keep = ~band & (np.abs(maps["object_alpha"][:, 0] - 1e-3) > 5e-4)  # COVERAGE_FLOOR
         np.testing.assert_allclose(
             found[keep], maps[name][keep], atol=2e-4 * np.abs(maps[name]).max(), err_msg=name
         )
@@ -179,9 +190,9 @@ def test_a_pixel_is_the_mean_of_its_samples() -> None:
     def mean(value: Any) -> np.ndarray:
         return np.array(box_mean(value, eye, 2))
 
-    np.testing.assert_allclose(np.array(frame.share), mean(fine.share), rtol=1e-6)
-    seen = mean(fine.share) > 0.01
-    rough = mean(fine.maps["roughness"] * fine.share)[seen] / mean(fine.share)[seen]
+    np.testing.assert_allclose(np.array(frame.object_alpha), mean(fine.object_alpha), rtol=1e-6)
+    seen = mean(fine.object_alpha) > 0.01
+    rough = mean(fine.maps["roughness"] * fine.object_alpha)[seen] / mean(fine.object_alpha)[seen]
     np.testing.assert_allclose(np.array(frame.maps["roughness"])[seen], rough, rtol=1e-4)
     for plane, samples in zip(frame.background, fine.background, strict=True):
         seen_behind = mean((1 - fine.alpha) * samples)
@@ -197,7 +208,7 @@ def test_an_empty_table_shows_nothing_and_a_screened_one_leaves_rows_out() -> No
     eye, shading = measure.fast_camera(pair.case), Shading("pixel", "split_sum", "sh")
 
     def radiance(surroundings: Surroundings | None) -> np.ndarray:
-        frame = render(Surfels(own), eye, shading, light, surroundings=surroundings)
+        frame = render(SurfelScene(Surfels(own), shading, light, surroundings=surroundings), eye)
         return np.array(frame.radiance)
 
     alone = radiance(None)

@@ -16,7 +16,7 @@ from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
 from mi_refgs.reference import shade as reference
 from mi_refgs.reference.ambient import ambient as exact
-from mi_refgs.render.pipeline import render
+from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade import ambient, brdf
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ggx_sampling import lobe_turn
@@ -180,7 +180,7 @@ def test_the_diffuse_term_is_multiplied_and_nothing_else(tmp_path: Path) -> None
 
     def terms(rays: int) -> Any:
         shading = Shading(diffuse="irradiance", occlusion=True, accuracy=Accuracy(ambient_rays=rays))
-        return render(surfels, camera, shading, light, occluder).terms
+        return render(SurfelScene(surfels, shading, light, occluder), camera).terms
 
     plain = terms(0)
     occluder.ambient = ambient.VertexColours.of(mesh, np.full(mesh.vertices.shape, [0.5, 0.25, 2.0]))

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from mi_refgs.errors import InputError
 from mi_refgs.methods.read import load
-from mi_refgs.render.pipeline import render
+from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.light.light import ConstantLight
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import Reflectance, SurfelView, register, unregister
 from mi_refgs.shade.shading import Shading
@@ -112,14 +113,14 @@ def test_what_is_not_allowed_together_is_refused(options: dict, words: str) -> N
 
 def test_rendering_without_what_it_needs_is_refused() -> None:
     surfels = Surfels.from_numpy(raw_channels())
-    camera = Camera.from_pose(4, 4, -4, -4, 2, 2, np.eye(4))
+    camera, light = Camera.from_pose(4, 4, -4, -4, 2, 2, np.eye(4)), ConstantLight(mi.Color3f(1))
     with pytest.raises(InputError, match="light: reflectance = split_sum needs one"):
-        render(surfels, camera, Shading())
+        render(SurfelScene(surfels, Shading()), camera)
     with pytest.raises(InputError, match="there is no mesh to trace"):
-        render(surfels, camera, Shading(occlusion=True), SimpleNamespace())
+        render(SurfelScene(surfels, Shading(occlusion=True), light), camera)
     del surfels.raw["metallic"]
     with pytest.raises(InputError, match="metallic: the surfels have no such channel"):
-        render(surfels, camera, Shading(), SimpleNamespace())
+        render(SurfelScene(surfels, Shading(), light), camera)
 
 
 def test_every_mode_that_is_not_refused_renders() -> None:

@@ -13,7 +13,7 @@ import pytest
 from mi_refgs import splat
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference.camera import look_at
-from mi_refgs.render.pipeline import Frame, render
+from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -36,17 +36,20 @@ def things(gaussians: bool = False) -> Surfels:
     return Surfels.from_numpy(raw)
 
 
-def both(surfels: Surfels, view: Camera, shading: Shading, **more: Any) -> list[Frame]:
+def both(
+    surfels: Surfels, view: Camera, shading: Shading, surroundings: Surroundings | None = None
+) -> list[Frame]:
     """Frames with everything: with derivatives, and without."""
     light = EnvironmentLight.from_radiance(sky())
-    given = (surfels, view, shading, shading.light_of(light), Occluder(two_balls()))
-    return [render(*given, aovs=True, derivatives=derivatives, **more) for derivatives in (True, False)]
+    scene = SurfelScene(surfels, shading, shading.light_of(light), Occluder(two_balls()), surroundings)
+    return [render(scene, view, Request(scene.all_aovs, forward_only)) for forward_only in (False, True)]
 
 
 def values(frame: Frame) -> dict[str, np.ndarray]:
     terms = {} if frame.terms is None else frame.terms.known()
+    unlike = {} if frame.background is None else {"object_alpha": frame.object_alpha}
     named = {"radiance": frame.radiance, "alpha": frame.alpha, "depth": frame.depth, "normal": frame.normal}
-    every = named | {"share": frame.share, "background": frame.background} | terms | frame.maps
+    every = named | {"background": frame.background} | unlike | terms | frame.maps
     return {name: np.array(value) for name, value in every.items() if value is not None}
 
 
@@ -104,9 +107,10 @@ def test_antialiasing_sees_the_neighbours_in_the_image() -> None:
 
 def test_nothing_in_view_is_black() -> None:
     behind = replace(camera_at(30.0), origin=mi.Point3f(-9, -15, -30))
+    scene = SurfelScene(things(), Shading(reflectance="radiance"))
     for frame in (
-        render(things(), behind, Shading(reflectance="radiance"), aovs=True, derivatives=False),
-        render(things().gather(mi.UInt32()), behind, Shading(reflectance="radiance"), derivatives=False),
+        render(scene, behind, Request(scene.all_aovs, forward_only=True)),
+        render(replace(scene, surfels=things().gather(mi.UInt32())), behind, Request(forward_only=True)),
     ):
         assert dr.width(frame.alpha) == 45 * 38 and not np.array(frame.alpha).any()
         assert not np.array(frame.radiance).any()
@@ -122,7 +126,8 @@ def test_nothing_in_view_is_looked_for_once(name: str, monkeypatch: pytest.Monke
         return made(*given)
 
     monkeypatch.setattr(splat, name, counted)
-    frame = render(things(), behind, Shading(reflectance="radiance"), aovs=["depth"], derivatives=False)
+    scene = SurfelScene(things(), Shading(reflectance="radiance"))
+    frame = render(scene, behind, Request(["depth"], forward_only=True))
     assert calls == [name] and not np.array(frame.depth).any()
 
 
@@ -139,9 +144,9 @@ def test_a_frame_has_what_is_asked_for(at: Any, name: str, monkeypatch: pytest.M
     monkeypatch.setattr(splat, "blend_shown", counted)
     light = EnvironmentLight.from_radiance(sky())
     shading = Shading(at, "split_sum", "sh", occlusion=at == "pixel")
-    given = (things(), camera_at(30.0), shading, shading.light_of(light), Occluder(two_balls()))
+    scene = SurfelScene(things(), shading, shading.light_of(light), Occluder(two_balls()))
     asked = {name} - {""}
-    found = values(render(*given, aovs=asked, derivatives=False))
+    found = values(render(scene, camera_at(30.0), Request(asked, forward_only=True)))
     has = {*TERMS} if name in TERMS else {name} - {""}
     nothing = {"visibility"} if at == "surfel" else set()  # is traced
     assert {*found} == {"radiance", "alpha"} | (has - nothing)
@@ -172,7 +177,7 @@ def test_another_view_is_no_other_kernel() -> None:
     def frame(distance: float) -> None:
         pose = look_at(np.array([1.0, 1.5, 3.0]) * distance, np.zeros(3), up=(0, 1, 0))
         view = Camera.from_pose(45, 38, -30.0, -30.0, 20.0, 22.0, pose)
-        dr.eval(render(things(), view, shading, derivatives=False).radiance)
+        dr.eval(render(SurfelScene(things(), shading), view, Request(forward_only=True)).radiance)
         dr.sync_thread()
 
     frame(1.0)

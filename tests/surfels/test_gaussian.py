@@ -20,7 +20,7 @@ from mi_refgs.reference import picture
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.blend import differentiate
 from mi_refgs.reference.footprint import Rules
-from mi_refgs.render.pipeline import Shading, render
+from mi_refgs.render.pipeline import Request, Shading, SurfelScene, render
 from mi_refgs.splat import blend, list_by_tile, project
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.ply import read_ply, write_ply
@@ -271,7 +271,8 @@ def test_a_3dgs_file_of_ours_is_rendered_as_the_oracle_has_it(tmp_path: Path) ->
     write_ply(tmp_path / "3dgs.ply", Surfels.from_numpy(raw))
     surfels, scene = read_ply(tmp_path / "3dgs.ply"), gaussians(15)
     camera = scene.camera
-    frame = render(surfels, scene.fast_camera(), Shading(at="surfel", reflectance="radiance"))
+    drawn = SurfelScene(surfels, Shading(at="surfel", reflectance="radiance"))
+    frame = render(drawn, scene.fast_camera(), Request(("normal",)))
     double = {name: values.astype(np.float64) for name, values in surfels.to_numpy().items()}
     pixels = np.arange(camera.width * camera.height)
     key = exact.sort_key(double, camera, pixels, (0, 0))
