@@ -147,7 +147,7 @@ def run(args: argparse.Namespace) -> Result:
 
 def _preview(before: Any, after: Any) -> Any:
     """Test views before and after; of cameras around the object where the data set is not there."""
-    from mi_refgs.editing.preview import before_and_after
+    from mi_refgs.editing import before_and_after
 
     cameras = before.cameras()
     if not before.provenance.has_data:

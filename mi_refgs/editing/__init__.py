@@ -1,21 +1,19 @@
-"""Edits of a trained scene: which surfels, what is done to them, two scenes as one, the run folder of it."""
+"""Edits of a trained scene: selection, changes, union of two scenes."""
 
-from mi_refgs.editing.change import Assignment, Change, apply, assignments
-from mi_refgs.editing.edit import Edited, EditOptions, edit
+from mi_refgs.editing.change import Change, apply, assignments
+from mi_refgs.editing.edit import Edited, EditOptions, before_and_after, edit
 from mi_refgs.editing.joining import join
-from mi_refgs.editing.selection import Selection, painted, painted_pixels, select
+from mi_refgs.editing.selection import Selection, select
 
 __all__ = [
-    "Assignment",
     "Change",
     "EditOptions",
     "Edited",
     "Selection",
     "apply",
     "assignments",
+    "before_and_after",
     "edit",
     "join",
-    "painted",
-    "painted_pixels",
     "select",
 ]

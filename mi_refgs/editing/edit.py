@@ -1,4 +1,4 @@
-"""One edit of a scene from selection to notes."""
+"""An edit of a scene, from the selection to the notes for the user, and images before and after."""
 
 from __future__ import annotations
 
@@ -10,57 +10,60 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 
 from mi_refgs.editing.change import Assignments, Change, Rotate, apply, assignments
+from mi_refgs.editing.expression import COLOUR
 from mi_refgs.editing.joining import join
-from mi_refgs.editing.notes import notes
 from mi_refgs.editing.selection import Selection, select
 from mi_refgs.errors import InputError
+from mi_refgs.evaluation.images import contact_sheet, image_array
+from mi_refgs.render.display import displayed
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.shade.reflectance.split_sum import MATERIALS
 from mi_refgs.splat import Camera
+
+PREVIEWS = 4
+"""Views of `before_and_after`, spread evenly over the cameras."""
+WHITE = np.ones(3, np.float32)
+WHICH = {"where", "box", "nearest", "mask", "invert"}
+"""Options that select surfels."""
 
 
 class EditOptions(TypedDict, total=False):
     """Keywords of `Reconstruction.edit`, options of `refgs edit`: which surfels, and what is done to them.
 
-    Selected are the surfels that meet every condition which is given, without any all of them. What is done
-    is done in the order below. Lengths are in scene units.
+    The surfels that meet every given condition are selected, without a condition all of them. Changes are
+    applied in the order below. Lengths are in scene units.
     """
 
     where: str | None
-    """An expression such as "metallic > 0.5 and z < 0", of activated values: x y z, opacity, size (the
-    largest standard deviation), normal.x … .z (outwards), the shares of the run such as albedo.r, roughness
-    and metallic, colour.r … .b (of fitted radiance, what is the same from everywhere), luminance; with
-    + - * / **, comparisons, and or not, abs sqrt min max."""
+    """An expression such as "metallic > 0.5 and z < 0" of activated values: x y z, opacity, size (the largest
+    standard deviation), normal.x … .z (outwards), the run's materials such as albedo.r, roughness and
+    metallic, colour.r … .b (the fitted radiance, its SH term of degree 0), luminance; with + - * / **,
+    comparisons, and or not, abs sqrt min max."""
     box: Sequence[float] | None
     """(6,): two opposite corners, between which centres lie."""
     nearest: Sequence[float] | None
     """(x, y, z, r): centres within r of the surfel that is nearest to the point."""
     mask: np.ndarray | str | Path | None
-    """(H, W) bool, or a picture painted white: what the view shows there, and not what is behind."""
+    """(H, W) bool, or an image painted white: the surfels that the view shows there, not those behind."""
     invert: bool
     """Select the others instead."""
     materials: bool
-    """First make materials alone of the whole scene, so that nothing stays as fitted to its light."""
+    """First replace the fitted colours of the whole scene by materials, which follow the light."""
     set: Assignments
     """{"roughness": 0.3, "albedo": (0.9, 0.6, "0.5 * albedo.b")}, or texts such as "roughness*=0.5"."""
     scale: float
-    """Factor of the size, about the mean of the selected positions by opacity."""
+    """Factor of the size, about the mean of the selected positions weighted by opacity."""
     rotate: Rotate | None
-    """("z", degrees): a turn about an axis through there, counter-clockwise; or three numbers for it."""
+    """("z", degrees), or three numbers for z: counter-clockwise rotation about an axis through that mean."""
     move: Sequence[float] | None
     """(3,)."""
     duplicate: Sequence[float] | None
-    """(3,): do all that to a copy, which is moved so far; what was there stays."""
+    """(3,): change a copy instead, which is moved by this vector; the original stays."""
     cut: bool
     """Remove the selected surfels."""
     keep: bool
     """Remove the others."""
-
-
-DOES = ("cut", "keep", "move", "rotate", "scale", "duplicate")
-"""Options that are fields of `Change` as they are."""
-RECORDED = tuple(name for name in EditOptions.__annotations__ if name not in ("mask", "set"))
-"""Options that a record has as they are given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,70 +71,107 @@ class Edited:
     """A scene after an edit."""
 
     scene: TrainedScene
-    notes: tuple[str, ...]  # what a person should know: what stayed as fitted, whose light shines
+    notes: tuple[str, ...]  # for the user: what stayed as fitted, which light is kept
     record: dict[str, Any]  # for JSON: the options given, `selected` surfels `of` so many, `surfels` now
 
 
 def edit(
     scene: TrainedScene,
     *,
-    camera: Camera | None = None,
-    into: TrainedScene | None = None,
+    camera: Camera | None = None,  # of the view that a mask was painted in
+    into: TrainedScene | None = None,  # a scene that the result is joined to
     **options: Unpack[EditOptions],
 ) -> Edited:
-    """Change surfels of a scene, and then add it `into` another scene, if there is one.
+    """Change surfels of a scene; `materials` applies to both scenes.
 
-    `camera` is that of the view which a mask was painted in; `materials` makes those of both scenes. Raises
-    InputError for what makes no sense, an unknown option, a selection of nothing, and if there is nothing to
-    do.
+    Raises InputError for bad values, an unknown option, an empty selection, and if there is nothing to do.
     """
-    for name in options.keys() - EditOptions.__annotations__:
-        raise InputError(
-            f"edit: {name}: unknown option; use some of {', '.join(EditOptions.__annotations__)}"
-        )
-    which = Selection(
-        options.get("where"),
-        options.get("box"),
-        options.get("nearest"),
-        options.get("mask"),
-        camera,
-        options.get("invert", False),
-    )
-    does = {name: options[name] for name in DOES if name in options}  # type: ignore[literal-required]
-    change = Change(set=assignments(options.get("set", ())), **does)
-    materials = options.get("materials", False)
-    if change.nothing and not materials and into is None:
+    known = EditOptions.__annotations__
+    for name in options.keys() - known:
+        raise InputError(f"edit: {name}: unknown option; use some of {', '.join(known)}")
+    given: dict[str, Any] = {**options}
+    materials = given.pop("materials", False)
+    which = {name: given.pop(name) for name in WHICH & given.keys()}
+    change = Change(**given | {"set": assignments(given.get("set", ()))})
+    if change.is_empty and not materials and into is None:
         raise InputError("edit: nothing to do; give --set, --cut, --move or another change")
     if materials:
         scene, into = relightable(scene), None if into is None else relightable(into)
-    chosen = select(scene, which)
-    told = notes(scene, change, into is not None)
-    changed = scene if change.nothing else apply(scene, chosen, change)
+    chosen = select(scene, Selection(camera=camera, **which))
+    notes = notes_of(scene, change, into is not None)
+    changed = scene if change.is_empty else apply(scene, chosen, change)
     if into is not None:
         changed, more = join(into, changed)
-        told += more
+        notes += more
     counts = {"selected": int(chosen.sum()), "of": len(chosen), "surfels": changed.surfels.count}
-    return Edited(changed, tuple(told), {**_asked(options, change), **counts, "notes": told})
+    return Edited(changed, tuple(notes), {**_recorded(options, change), **counts, "notes": notes})
 
 
-def _asked(options: EditOptions, change: Change) -> dict[str, Any]:
-    """The options that were given, as JSON has them."""
-    given = {name: value for name, value in options.items() if name in RECORDED}
-    record = {name: _plain(value) for name, value in given.items() if not _unset(name, value)}
-    if isinstance(options.get("mask"), str | Path):
-        record["mask"] = str(options["mask"])
-    if change.set:
-        record["set"] = [assignment.text for assignment in change.set]
-    return record
-
-
-def _unset(name: str, value: Any) -> bool:
-    """Whether an option has the value that it has when it is left out; a value may be an array."""
-    return value is None or value is False or (name == "scale" and value == 1)
+def _recorded(options: EditOptions, change: Change) -> dict[str, Any]:
+    """Return the options that differ from their defaults, as JSON values."""
+    found: dict[str, Any] = {}
+    for name, value in options.items():
+        if name == "set" and change.set:
+            found[name] = [assignment.text for assignment in change.set]
+        elif name == "mask" and isinstance(value, str | Path):
+            found[name] = str(value)
+        elif name not in ("set", "mask") and not (
+            value is None or value is False or (name == "scale" and value == 1)
+        ):
+            found[name] = _plain(value)
+    return found
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON has it."""
+    """Return a value as JSON has it."""
     if isinstance(value, str | bool):
         return value
     return [_plain(part) for part in value] if isinstance(value, Iterable) else float(value)
+
+
+def notes_of(scene: TrainedScene, change: Change, joined: bool = False) -> list[str]:
+    """Return what of a fit does not follow a change: values that depend on its light and its place."""
+    shading, surfels = scene.shading, scene.surfels
+    names = [assignment.name.partition(".")[0] for assignment in change.set]
+    placed = joined or change.moves
+    indirect = shading.occlusion and surfels.has("indirect_sh") and not shading.accuracy.traced_bounces
+    read = {*shading.model.channels(shading.diffuse), *surfels.primitive.widths}
+    read |= {"indirect_sh"} if indirect else set()
+    notes = [
+        f"{name}: no image of this run depends on it "
+        f"(its shading is {shading.reflectance}, {shading.diffuse})"
+        for name in names
+        if ("radiance_sh" if name == COLOUR else name) not in read
+    ]
+    lit = shading.model.light != "none" and "radiance_sh" in read
+    has_materials = scene.light is not None and all(surfels.has(name) for name in MATERIALS)
+    convert = "; --materials computes an albedo instead" if has_materials and lit else ""
+    if lit and {*names} & {"albedo", "metallic"}:
+        notes.append(
+            "the diffuse colour was fitted to the light as radiance_sh and stays so: albedo and metallic "
+            f"change what is reflected, colour= changes it{convert}"
+        )
+    if placed and "radiance_sh" in read:
+        notes.append(f"the colour radiance_sh keeps the light of the place where it was fitted{convert}")
+    if indirect and (placed or change.cut or change.keep or {*names} - {"roughness"}):
+        trace = "; --materials traces it instead" if has_materials else ""
+        notes.append(f"interreflections, indirect_sh, stay as they were fitted{trace}")
+    return notes
+
+
+def before_and_after(
+    before: TrainedScene,
+    after: TrainedScene,
+    cameras: Sequence[Camera],
+    background: np.ndarray = WHITE,  # (3,) display-encoded
+    linear: bool = False,
+) -> np.ndarray:
+    """Return a contact sheet (H, W, 3) of both scenes, one row per camera, display-encoded (`displayed`)."""
+    some = np.unique(np.linspace(0, len(cameras) - 1, PREVIEWS).round().astype(int))
+    renderers = {"before": before.renderer(aovs=False), "after": after.renderer(aovs=False)}
+    rows = []
+    for camera in (cameras[i] for i in some):
+        shots = {title: displayed(view(camera), background, linear) for title, view in renderers.items()}
+        size = camera.height, camera.width
+        rows.append({title: np.clip(image_array(x, *size), 0, 1) for title, x in shots.items()})
+    return contact_sheet(rows)

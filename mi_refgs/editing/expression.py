@@ -1,283 +1,270 @@
-"""Expressions over the surfels' values, such as `metallic > 0.5 and roughness < 0.2`: parsed by a grammar of
-our own, never by Python.
+"""Expressions over surfel attributes, such as `metallic > 0.5 and roughness < 0.2`, and the values they use.
 
-    truth       := both ("or" both)*            both    := not ("and" not)*
-    not         := "not" not | comparison       compared by < <= > >= == !=, in chains: 0 < x < 1
-    sum         := product (("+" | "-") product)*
-    product     := signed (("*" | "/") signed)*
-    signed      := ("+" | "-") signed | power
-    power       := atom ["**" signed]
-    atom        := number | name | function "(" sum ("," sum)* ")" | "(" truth ")"
-
-Names are those of `fields`; functions are abs and sqrt of one, min and max of one or more. What is compared
-and computed are float64 numbers; a number that is not defined, such as 0 / 0, compares as false.
+The syntax is a subset of Python's: numbers, names of `SurfelValues`, + - * / **, comparisons also in chains
+(0 < x < 1), and, or, not, and the functions abs, sqrt, min, max. Python parses the text; only the nodes
+below are evaluated, in float64. A number that is not defined, such as 0 / 0, compares as false.
 """
 
 from __future__ import annotations
 
+import ast
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import reduce
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache, partial, reduce
 from typing import Any
 
 import numpy as np
 
 from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.evaluation.images import LUMINANCE
+from mi_refgs.runs.relightable import outward
+from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.surfels.attributes import CHANNELS, SH_DC, sigmoid
 
 MAX_LENGTH = 2000
-"""Characters of an expression: what a person types is far below."""
+"""Characters of an expression: bounds the work of Python's parser."""
 MAX_DEPTH = 30
-"""Brackets, signs and powers within each other: each takes some ten calls of Python's stack of 1,000."""
+"""Operations within each other: each takes a few calls of Python's stack of 1,000."""
 TOKEN = re.compile(
-    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
-    r"|(?P<name>[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*)"
-    r"|(?P<sign>\*\*|[<>=!]=|[-+*/()<>,])",
+    r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?!\w)"  # numbers, but not 1_000, 0x10, 1j
+    r"|[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
+    r"|\*\*|[<>=!]=|[-+*/()<>,\s]",
     re.ASCII,
 )
-FUNCTIONS: dict[str, tuple[Any, bool]] = {
-    "abs": (np.abs, False),
-    "sqrt": (np.sqrt, False),
-    "min": (np.minimum, True),
-    "max": (np.maximum, True),
+FUNCTIONS: dict[str, Callable[..., Any]] = {
+    "abs": np.abs,
+    "sqrt": np.sqrt,
+    "min": lambda *numbers: reduce(np.minimum, numbers),
+    "max": lambda *numbers: reduce(np.maximum, numbers),
 }
-"""Functions by name, and whether they take several arguments."""
-COMPARISONS: dict[str, Any] = {
-    "<": np.less,
-    "<=": np.less_equal,
-    ">": np.greater,
-    ">=": np.greater_equal,
-    "==": np.equal,
-    "!=": np.not_equal,
+OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
+    ast.Pow: np.power,
+    ast.UAdd: np.positive,
+    ast.USub: np.negative,
+    ast.Lt: np.less,
+    ast.LtE: np.less_equal,
+    ast.Gt: np.greater,
+    ast.GtE: np.greater_equal,
+    ast.Eq: np.equal,
+    ast.NotEq: np.not_equal,
 }
-ARITHMETIC: dict[str, Any] = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}
-WORDS = ("and", "or", "not")
-
-Values = Mapping[str, np.ndarray]
-
-
-@dataclass(frozen=True)
-class Expression:
-    """A parsed expression: a number, or a truth, of every surfel."""
-
-    text: str
-    truth: bool
-    names: frozenset[str]
-    compute: Callable[[Values], Any]
-
-    def of(self, values: Values) -> np.ndarray:
-        """The value of every surfel, from those of the `names`; float64, or bool for a truth."""
-        with np.errstate(all="ignore"):
-            return np.asarray(self.compute(values))
+COLOUR = "colour"
+"""The SH term of degree 0 of radiance_sh, ½ + c Y₀: linear radiance."""
+AXES = "xyz"
 
 
 def parse_condition(text: str, where: str = "--where") -> Expression:
-    """A comparison, or several; raises InputError, with `where` in the message, for anything else."""
-    (found,) = _Parser(text, where).all(1)
-    if not found.truth:
+    """Parse a comparison, or several; raises InputError, with `where` in the message, for anything else."""
+    found = Expression(_Source(text, where))
+    if not found.is_condition:
         raise InputError(f"{where}: {abbreviated(text)}: compares nothing; write it like metallic > 0.5")
     return found
 
 
 def parse_numbers(text: str, where: str = "--set") -> list[Expression]:
-    """Numbers with commas between them; raises InputError, with `where` in the message, for anything else."""
-    found = _Parser(text, where).all(None)
-    if any(expression.truth for expression in found):
+    """Parse numbers between commas; raises InputError, with `where` in the message, for anything else."""
+    source = _Source(text, where)
+    parts = source.tree.elts if isinstance(source.tree, ast.Tuple) else [source.tree]
+    found = [Expression(source, part) for part in parts]
+    if not found or any(expression.is_condition for expression in found):
         raise InputError(f"{where}: {abbreviated(text)}: a comparison is no number; give numbers")
     return found
 
 
-@dataclass(frozen=True)
-class _Node:
-    truth: bool
-    compute: Callable[[Values], Any]
-
-
-class _Parser:
-    """Recursive descent over the tokens of one text."""
+class _Source:
+    """A text and its syntax tree."""
 
     def __init__(self, text: str, where: str) -> None:
+        """Parse a text with Python; raises InputError for characters and syntax outside the language."""
         self.text, self.where = text, where
-        self.depth = 0
-        self.names: set[str] = set()
         if len(text) > MAX_LENGTH:
             raise InputError(f"{where}: {abbreviated(text)}: longer than {MAX_LENGTH} characters; shorten it")
-        self.tokens: list[tuple[str, str, int]] = []
         place = 0
         while place < len(text):
-            if text[place] in " \t\n\r":
-                place += 1
-                continue
-            found = TOKEN.match(text, place)
-            if found is None:
-                sign = text[place]
-                remedy = (
-                    "use == to compare" if sign == "=" else f"{abbreviated(sign)} is not allowed; remove it"
+            token, sign = TOKEN.match(text, place), text[place]
+            if token is None:
+                raise self.error(
+                    place,
+                    "use == to compare" if sign == "=" else f"{abbreviated(sign)} is not allowed; remove it",
                 )
-                raise self._error(remedy, place)
-            self.tokens.append((str(found.lastgroup), found[0], place))
-            place = found.end()
-        self.tokens.append(("end", "", len(text)))
-        self.next = 0
+            place = token.end()
+        line = re.sub(r"\s", " ", text).lstrip()
+        self.indent = len(text) - len(line)  # which Python refuses
+        try:
+            self.tree = ast.parse(line, mode="eval").body
+        except SyntaxError as error:
+            if not error.offset:  # the end of the line
+                raise self.error(len(text), "a name or a number is missing; write one") from error
+            open_bracket = "never closed" in error.msg
+            remedy = "the bracket is not closed; write )" if open_bracket else "not understood; correct it"
+            raise self.error(error.offset - 1 + self.indent, remedy) from error
+        except (RecursionError, MemoryError) as error:
+            raise self.error(0, "too many operations within each other; simplify it") from error
 
-    def all(self, count: int | None) -> list[Expression]:
-        """The expressions between commas, `count` of them where that is given."""
-        found = []
-        while True:
-            self.names = set()
-            node = self._truth()
-            found.append(Expression(self.text, node.truth, frozenset(self.names), node.compute))
-            if len(found) == count or not self._take(","):
-                break
-        if self._kind != "end":
-            raise self._error("write an operator before it, or remove it")
-        return found
+    def error(self, place: int | ast.expr, remedy: str) -> InputError:
+        """Return the error at an index of the text, or at a node of its tree."""
+        index = place if isinstance(place, int) else place.col_offset + self.indent
+        return InputError(f"{self.where}: {abbreviated(self.text)}: character {index + 1}: {remedy}")
 
-    # ---------------- the grammar ----------------
 
-    def _truth(self) -> _Node:
-        return self._joined("or", lambda: self._joined("and", self._not, np.logical_and), np.logical_or)
+class _Names(dict[str, Any]):
+    """Records the names that are looked up; each has the value 1."""
 
-    def _joined(self, word: str, part: Callable[[], _Node], function: Any) -> _Node:
-        place, first = self._place, part()
-        parts = [first]
-        while self._take(word):
-            parts.append(part())
-        if len(parts) == 1:
-            return first
-        if not all(node.truth for node in parts):
-            raise self._error(f"'{word}' stands between comparisons; write them like metallic > 0.5", place)
-        return _Node(True, lambda values: reduce(function, [node.compute(values) for node in parts]))
+    def __missing__(self, name: str) -> Any:
+        return self.setdefault(name, np.float64(1))
 
-    def _not(self) -> _Node:
-        place = self._place
-        if not self._take("not"):
-            return self._comparison()
-        inner = self._deeper(self._not)
-        if not inner.truth:
-            raise self._error("'not' stands before a comparison; write one like metallic > 0.5", place)
-        return _Node(True, lambda values: np.logical_not(inner.compute(values)))
 
-    def _comparison(self) -> _Node:
-        place, first = self._place, self._sum()
-        parts, signs = [first], []
-        while (sign := self._any_of(COMPARISONS)) is not None:
-            signs.append(COMPARISONS[sign])
-            parts.append(self._sum())
-        if not signs:
-            return first
-        self._numbers(parts, place)
+class Expression:
+    """A number or a condition per surfel."""
 
-        def compute(values: Values) -> Any:
-            found = [node.compute(values) for node in parts]
-            pairs = zip(signs, found, found[1:], strict=False)
-            return reduce(np.logical_and, [sign(a, b) for sign, a, b in pairs])
+    def __init__(self, source: _Source, node: ast.expr | None = None) -> None:
+        """Check a syntax tree, or a part of it; raises InputError for what the language does not have."""
+        self.source, self.node = source, node or source.tree
+        names = _Names()
+        self.is_condition = self.evaluate(names).dtype == bool  # else a number
+        self.names = frozenset(names)  # that it needs values of
 
-        return _Node(True, compute)
+    def evaluate(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the value per surfel, (N,), or () if it has no names: bool or float64."""
+        with np.errstate(all="ignore"):
+            return np.asarray(self._value(self.node, values, 0))
 
-    def _sum(self) -> _Node:
-        return self._chain(("+", "-"), lambda: self._chain(("*", "/"), self._signed))
+    def _value(self, node: ast.expr, values: Mapping[str, np.ndarray], depth: int) -> Any:
+        """Return the value of a node that `depth` others contain."""
+        if depth > MAX_DEPTH:
+            raise self.source.error(node, f"more than {MAX_DEPTH} operations within each other; simplify it")
 
-    def _chain(self, signs: tuple[str, ...], part: Callable[[], _Node]) -> _Node:
-        place, first = self._place, part()
-        rest: list[tuple[Any, _Node]] = []
-        while (sign := self._any_of(signs)) is not None:
-            rest.append((ARITHMETIC[sign], part()))
-        if not rest:
-            return first
-        self._numbers([first, *(node for _, node in rest)], place)
+        def numbers(*nodes: ast.expr) -> list[Any]:
+            found = [self._value(each, values, depth + 1) for each in nodes]
+            if any(value.dtype == bool for value in found):
+                remedy = "a comparison is no number; put 'and' or 'or' between comparisons"
+                raise self.source.error(node, remedy)
+            return found
 
-        def compute(values: Values) -> Any:
-            return reduce(lambda a, b: b[0](a, b[1].compute(values)), rest, first.compute(values))
+        def conditions(word: str, *nodes: ast.expr) -> list[Any]:
+            found = [self._value(each, values, depth + 1) for each in nodes]
+            if not all(value.dtype == bool for value in found):
+                raise self.source.error(node, f"'{word}' needs comparisons; write them like metallic > 0.5")
+            return found
 
-        return _Node(False, compute)
+        match node:
+            case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
+                if value > sys.float_info.max:
+                    raise self.source.error(node, "the number is too large; give a smaller one")
+                return np.float64(value)
+            case ast.Name() | ast.Attribute():
+                return values[ast.unparse(node)]
+            case ast.BoolOp(op=ast.And()):
+                return reduce(np.logical_and, conditions("and", *node.values))
+            case ast.BoolOp():
+                return reduce(np.logical_or, conditions("or", *node.values))
+            case ast.UnaryOp(op=ast.Not()):
+                return np.logical_not(*conditions("not", node.operand))
+            case ast.UnaryOp():
+                return OPERATORS[type(node.op)](*numbers(node.operand))
+            case ast.BinOp():
+                # a + b + … nests to the left as deep as it is long: a loop instead of recursion.
+                chain = [node]
+                while isinstance(chain[-1].left, ast.BinOp):
+                    chain.append(chain[-1].left)
+                found, *rest = numbers(chain[-1].left, *(each.right for each in reversed(chain)))
+                for each, right in zip(reversed(chain), rest, strict=True):
+                    found = OPERATORS[type(each.op)](found, right)
+                return found
+            case ast.Compare() if all(type(sign) in OPERATORS for sign in node.ops):
+                found = numbers(node.left, *node.comparators)
+                pairs = zip(node.ops, found, found[1:], strict=False)
+                return reduce(np.logical_and, [OPERATORS[type(sign)](a, b) for sign, a, b in pairs])
+            case ast.Call(func=ast.Name(id=name), args=[_, *more], keywords=[]):
+                if name not in FUNCTIONS:
+                    remedy = f"'{name}' is no function here; use one of {', '.join(FUNCTIONS)}"
+                    raise self.source.error(node, remedy)
+                if more and name in ("abs", "sqrt"):
+                    raise self.source.error(node, f"'{name}' takes one argument; give one")
+                return FUNCTIONS[name](*numbers(*node.args))
+        raise self.source.error(
+            node, "not understood; use numbers, names, + - * / **, comparisons, and or not"
+        )
 
-    def _signed(self) -> _Node:
-        place, sign = self._place, self._any_of(("+", "-"))
-        if sign is None:
-            return self._power()
-        inner = self._deeper(self._signed)
-        self._numbers([inner], place)
-        return inner if sign == "+" else _Node(False, lambda values: np.negative(inner.compute(values)))
 
-    def _power(self) -> _Node:
-        place, base = self._place, self._atom()
-        if not self._take("**"):
-            return base
-        exponent = self._deeper(self._signed)
-        self._numbers([base, exponent], place)
-        return _Node(False, lambda values: np.power(base.compute(values), exponent.compute(values)))
+class SurfelValues(Mapping[str, np.ndarray]):
+    """The activated attributes of a scene's surfels, (N,) float64 by name, computed when they are read.
 
-    def _atom(self) -> _Node:
-        kind, word, place = self.tokens[self.next]
-        if self._take("("):
-            inner = self._deeper(self._truth)
-            self._close()
-            return inner
-        if kind == "number":
-            self.next += 1
-            number = np.float64(word)
-            if not np.isfinite(number):
-                raise self._error("the number is too large; give a smaller one", place)
-            return _Node(False, lambda values: number)
-        if kind != "name" or word in WORDS:
-            raise self._error("a name or a number is missing; write one", place)
-        self.next += 1
-        if self._take("("):
-            return self._call(word, place)
-        self.names.add(word)
-        return _Node(False, lambda values: values[word])
+    Names: single columns, such as `roughness`, `albedo.r`, `position.x` or `x`; `size`, the largest standard
+    deviation (scene units); `normal.x` … `.z`, outwards as in `runs.relightable.outward`; `colour.r` … `.b`
+    (COLOUR); `luminance` of the colour, or of the albedo where the diffuse term is computed from that; and
+    each of the two, `colour.luminance` and `albedo.luminance`.
+    """
 
-    def _call(self, name: str, place: int) -> _Node:
-        if name not in FUNCTIONS:
-            raise self._error(f"'{name}' is no function here; use one of {', '.join(FUNCTIONS)}", place)
-        function, several = FUNCTIONS[name]
-        arguments = [self._deeper(self._sum)]
-        while self._take(","):
-            arguments.append(self._deeper(self._sum))
-        self._close()
-        self._numbers(arguments, place)
-        if several:
-            return _Node(False, lambda values: reduce(function, [node.compute(values) for node in arguments]))
-        if len(arguments) > 1:
-            raise self._error(f"'{name}' takes one argument; give one", place)
-        return _Node(False, lambda values: function(arguments[0].compute(values)))
+    def __init__(self, scene: TrainedScene) -> None:
+        self.raw = scene.surfels.to_numpy()
+        self.columns: dict[str, tuple[str, list[int]]] = {}  # attribute, or COLOUR, and its columns by name
+        for name, table in self.raw.items():
+            declared, width = CHANNELS[name], table.shape[1]
+            if not declared.harmonics and declared.activation not in ("quaternion", "exp"):
+                letters = declared.aov.lower() if len(declared.aov) == width else AXES
+                self._add(name, name, width, letters)
+        self.columns |= {axis: ("position", [i]) for i, axis in enumerate(AXES)}
+        has_colour = "radiance_sh" in self.raw
+        if has_colour:
+            self._add(COLOUR, COLOUR, 3, "rgb")
 
-    # ---------------- tokens ----------------
+        @cache
+        def normals() -> np.ndarray:
+            return outward(scene.surfels, scene.mesh)[0].astype(np.float64)
+
+        self._compute: dict[str, Callable[[], np.ndarray]] = {
+            name: partial(lambda of, column: self.activated(of)[:, column], of, columns[0])
+            for name, (of, columns) in self.columns.items()
+            if len(columns) == 1
+        }
+        self._compute["size"] = lambda: scene.surfels.primitive.extent(self.raw)[1].max(axis=1).astype(float)
+        for i, axis in enumerate(AXES):
+            self._compute[f"normal.{axis}"] = partial(lambda i: normals()[:, i], i)
+        bright = [name for name in ("albedo", COLOUR) if name in self.columns]
+        for name in bright:
+            self._compute[f"{name}.luminance"] = partial(lambda name: self.activated(name) @ LUMINANCE, name)
+        if bright:
+            fitted = "radiance_sh" in scene.shading.model.channels(scene.shading.diffuse)
+            shaded = COLOUR if fitted and has_colour else "albedo"
+            self._compute["luminance"] = lambda: self[f"{shaded}.luminance"]
+
+    def _add(self, name: str, of: str, width: int, letters: str) -> None:
+        self.columns[name] = of, list(range(width))
+        if width > 1:
+            self.columns |= {f"{name}.{letter}": (of, [i]) for i, letter in enumerate(letters)}
 
     @property
-    def _kind(self) -> str:
-        return self.tokens[self.next][0]
+    def settable(self) -> list[str]:
+        """The names that can be given other values, of all columns of an attribute or of one."""
+        return [
+            n for n, (of, _) in self.columns.items() if of == COLOUR or CHANNELS[of].activation == "sigmoid"
+        ]
 
-    @property
-    def _place(self) -> int:
-        return self.tokens[self.next][2]
+    def activated(self, name: str) -> np.ndarray:
+        """Return an attribute with a linear or sigmoid activation, or the COLOUR, (N, D) float64."""
+        if name == COLOUR:
+            return 0.5 + SH_DC * self.raw["radiance_sh"][:, :3].astype(np.float64)
+        values = self.raw[name].astype(np.float64)
+        return sigmoid(values) if CHANNELS[name].activation == "sigmoid" else values
 
-    def _take(self, word: str) -> bool:
-        """Go past the next token if it is this one."""
-        found = self.tokens[self.next][1] == word
-        self.next += found
-        return found
+    def require(self, names: frozenset[str], where: str) -> None:
+        """Raise InputError, with `where` in the message, for names that the surfels have no values of."""
+        for name in sorted(names - {*self}):
+            raise InputError(
+                f"{where}: {abbreviated(name)} is no value of these surfels; use one of {', '.join(self)}"
+            )
 
-    def _any_of(self, words: Any) -> str | None:
-        return next((word for word in words if self._take(word)), None)
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self._compute[name]()
 
-    def _close(self) -> None:
-        if not self._take(")"):
-            raise self._error("a bracket is not closed; write ) or an operator")
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._compute)
 
-    def _deeper(self, part: Callable[[], _Node]) -> _Node:
-        self.depth += 1
-        if self.depth > MAX_DEPTH:
-            raise self._error(f"more than {MAX_DEPTH} brackets within each other; simplify it")
-        node = part()
-        self.depth -= 1
-        return node
-
-    def _numbers(self, nodes: list[_Node], place: int) -> None:
-        if any(node.truth for node in nodes):
-            raise self._error("a comparison is no number; put 'and' or 'or' between comparisons", place)
-
-    def _error(self, remedy: str, place: int | None = None) -> InputError:
-        place = self._place if place is None else place
-        return InputError(f"{self.where}: {abbreviated(self.text)}: character {place + 1}: {remedy}")
+    def __len__(self) -> int:
+        return len(self._compute)

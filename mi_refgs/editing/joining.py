@@ -1,4 +1,4 @@
-"""Two scenes as one: surfels in one table, meshes as one occluder, under the light of the first."""
+"""Union of two scenes: one surfel model, one mesh, the light of the first."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mi_refgs.editing import follow
+from mi_refgs.editing.placement import joined_mesh, object_mesh
 from mi_refgs.errors import InputError
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.accuracy import NEED_OCCLUSION
@@ -16,18 +16,18 @@ from mi_refgs.surfels.table import Surfels
 
 
 def join(first: TrainedScene, second: TrainedScene) -> tuple[TrainedScene, list[str]]:
-    """Both scenes, the surfels of `first` before those of `second`; and what a person should be told.
+    """Return both scenes as one, the surfels of `first` before those of `second`, and notes for the user.
 
-    Light, surroundings and shading options are those of the first; of the second are the light where the
-    first has none, and the options that only rays of a mesh need where the first traces none. Harmonics that
-    one of them lacks, such as what it reflects of itself, are zero there, which changes none of its pictures.
-    The meshes of both are traced: each shades and mirrors the other.
+    Light, background and shading options are those of the first. Of the second are the light if the first has
+    none, and the options for rays if the first traces none. SH that one of them lacks, such as indirect_sh,
+    are zero there, which changes none of its images. The meshes of both occlude and reflect each other.
 
     Raises InputError for scenes of different primitives, reflectance or diffuse terms: one would look wrong.
     """
-    if first.surfels.primitive is not second.surfels.primitive:
-        names = first.surfels.primitive.name, second.surfels.primitive.name
-        raise InputError(f"--join: one has {names[0]}s, the other {names[1]}s; join runs of one primitive")
+    primitives = first.surfels.primitive, second.surfels.primitive
+    if primitives[0] is not primitives[1]:
+        one, other = (primitive.name for primitive in primitives)
+        raise InputError(f"--join: one has {one}s, the other {other}s; join runs of one primitive")
     for what in ("reflectance", "diffuse", "at"):
         pair = getattr(first.shading, what), getattr(second.shading, what)
         if pair[0] != pair[1]:
@@ -43,14 +43,23 @@ def join(first: TrainedScene, second: TrainedScene) -> tuple[TrainedScene, list[
         first,
         surfels=Surfels.from_numpy(raw),
         light=first.light or second.light,
-        mesh=follow.together(first.mesh, follow.without_surroundings(second)),
+        mesh=joined_mesh(first.mesh, object_mesh(second)),
         shading=joined_shading(first.shading, second.shading),
     )
-    return joined, _notes(first, second, joined)
+    notes = []
+    if joined.light is not None:
+        whose = "RUN" if first.light is not None else "the joined run, RUN has none"
+        notes.append(f"the light is that of {whose}")
+    if second.surroundings is not None:
+        notes.append("the background of the joined run is left out")
+    for whose, scene in (("RUN", first), ("the joined run", second)):
+        if joined.shading.occlusion and scene.mesh is None:
+            notes.append(f"{whose} has no mesh: it casts no shadows on the other and is not reflected in it")
+    return joined, notes
 
 
 def joined_shading(first: Shading, second: Shading) -> Shading:
-    """The options of the first; rays are traced if one of the two traces them, as that one does."""
+    """Return the options of the first; if only the second traces rays, with its options for rays."""
     if first.occlusion or not second.occlusion:
         return first
     rays = {name: getattr(second.accuracy, name) for name in NEED_OCCLUSION}
@@ -58,28 +67,13 @@ def joined_shading(first: Shading, second: Shading) -> Shading:
 
 
 def _columns(name: str, tables: list[dict[str, np.ndarray]]) -> list[np.ndarray]:
-    """A channel of both tables, as wide as the wider one; raises InputError for materials that one lacks."""
+    """Return an attribute of both, padded to one width; raises InputError for materials that one lacks."""
     width = max(table[name].shape[1] for table in tables if name in table)
     found = []
     for table in tables:
         values = table.get(name)
         if values is None and not CHANNELS[name].harmonics:
-            raise InputError(f"--join: {name}: one of the runs has no such channel; fit both by one method")
+            raise InputError(f"--join: {name}: one of the runs has no such attribute; fit both by one method")
         values = np.zeros((len(table["position"]), 0), np.float32) if values is None else values
         found.append(np.pad(values, ((0, 0), (0, width - values.shape[1]))))
     return found
-
-
-def _notes(first: TrainedScene, second: TrainedScene, joined: TrainedScene) -> list[str]:
-    notes = []
-    if joined.light is not None:
-        whose = "RUN" if first.light is not None else "the joined run, RUN has none"
-        notes.append(f"the light is that of {whose}")
-    if second.surroundings is not None:
-        notes.append("the surroundings of the joined run are left out")
-    for whose, scene in (("RUN", first), ("the joined run", second)):
-        if joined.shading.occlusion and scene.mesh is None:
-            notes.append(
-                f"{whose} has no mesh: it casts no shadows on the other and is in none of its mirrors"
-            )
-    return notes

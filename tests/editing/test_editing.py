@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.editing import Change, Selection, apply, assignments, edit, join, select
-from mi_refgs.editing.fields import Fields
+from mi_refgs.editing.expression import SurfelValues
 from mi_refgs.editing.joining import joined_shading
-from mi_refgs.editing.rigid import rotated_harmonics
+from mi_refgs.editing.placement import rotated_sh
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import write_png
 from mi_refgs.reconstruction.reconstruction import load
@@ -101,7 +101,7 @@ def test_known_rows_are_selected(scene: TrainedScene, selection: Selection, coun
 
 
 def test_names_are_the_activated_values(scene: TrainedScene) -> None:
-    fields, raw = Fields(scene), scene.surfels.to_numpy()
+    fields, raw = SurfelValues(scene), scene.surfels.to_numpy()
     ball = np.arange(2 * HALF) % 2
     outward = (raw["position"] - CENTRES[ball]) / RADII[ball, None]
     for i, axis in enumerate("xyz"):
@@ -150,11 +150,11 @@ def test_a_painted_mask_selects_what_is_in_front(scene: TrainedScene) -> None:
 
 
 def test_new_values_are_exact_and_others_stay_bit_for_bit(scene: TrainedScene) -> None:
-    before, fields = scene.surfels.to_numpy(), Fields(scene)
+    before, fields = scene.surfels.to_numpy(), SurfelValues(scene)
     given = {"roughness": 0.25, "metallic": 0, "albedo": (0.9, 0.6, "0.5 * albedo.b"), "opacity": "opacity"}
     edited = edit(scene, where=METAL_BALL, set=given)
     assert (edited.record["selected"], edited.record["of"]) == (HALF, 2 * HALF)
-    after, now = edited.scene.surfels.to_numpy(), Fields(edited.scene)
+    after, now = edited.scene.surfels.to_numpy(), SurfelValues(edited.scene)
     chosen = before["position"][:, 0] < 0
     for name in before:
         np.testing.assert_array_equal(before[name][~chosen], after[name][~chosen])
@@ -169,8 +169,8 @@ def test_new_values_are_exact_and_others_stay_bit_for_bit(scene: TrainedScene) -
 
 
 def test_products_and_single_columns(scene: TrainedScene) -> None:
-    fields = Fields(scene)
-    now = Fields(edit(scene, set=["albedo*=1,0.5,0", "roughness*=3", "albedo.r=0.125"]).scene)
+    fields = SurfelValues(scene)
+    now = SurfelValues(edit(scene, set=["albedo*=1,0.5,0", "roughness*=3", "albedo.r=0.125"]).scene)
     np.testing.assert_allclose(now["albedo.r"], 0.125, rtol=1e-6)
     np.testing.assert_allclose(now["albedo.g"], 0.5 * fields["albedo.g"], rtol=1e-5)
     np.testing.assert_allclose(now["roughness"], np.minimum(3 * fields["roughness"], 1), rtol=1e-5)
@@ -269,7 +269,7 @@ def test_harmonics_turn_exactly(rng: np.random.Generator) -> None:
     turn = Rotation.from_rotvec([0.7, -1.1, 2.2])
     for degree in range(4):
         raw = harmonics(1, degree, 5, 1.0)
-        turned = rotated_harmonics(raw, turn)
+        turned = rotated_sh(raw, turn)
 
         def at(coefficients: np.ndarray, d: np.ndarray) -> np.ndarray:
             colours = [mi.Color3f(*map(float, row)) for row in coefficients.reshape(-1, 3)]
@@ -338,7 +338,7 @@ def test_a_turned_normal_offset_and_a_zero_quaternion(scene: TrainedScene) -> No
 
 def test_a_turn_and_its_opposite_leave_everything_as_it_was(scene: TrainedScene) -> None:
     there = edit(scene, where="z > 0.1", rotate=("1,2,3", 77), scale=2.0, move=(1, 0, 0)).scene
-    chosen = Fields(scene)["z"] > 0.1
+    chosen = SurfelValues(scene)["z"] > 0.1
     back = apply(there, chosen, Change(rotate=("1,2,3", -77), scale=0.5, move=(-1, 0, 0)))
     for name, table in scene.surfels.to_numpy().items():
         now = back.surfels.to_numpy()[name]
@@ -401,7 +401,7 @@ def test_surroundings_stay_with_their_triangles() -> None:
     assert moved.surroundings is wall and moved.mesh is not None
     joined, told = join(replace(whole, mesh=None), scene)
     assert joined.mesh is not None and len(joined.mesh.faces) == len(scene.mesh.faces) / 2
-    assert joined.surroundings is None and "the surroundings of the joined run are left out" in told
+    assert joined.surroundings is None and "the background of the joined run is left out" in told
     high = moved.mesh.vertices[:, 2] > 5
     assert high.sum() == len(scene.mesh.vertices) / 2
     np.testing.assert_array_equal(np.sort(moved.mesh.vertices[~high], axis=0), np.sort(of_wall, axis=0))
@@ -424,7 +424,7 @@ def test_a_duplicate_takes_the_changes_and_the_original_stays(scene: TrainedScen
     assert edited.record["selected"] == HALF and edited.scene.surfels.count == 3 * HALF
     for name in before:
         np.testing.assert_array_equal(before[name], after[name][: 2 * HALF])
-    np.testing.assert_allclose(Fields(edited.scene)["roughness"][2 * HALF :], 0.75, rtol=1e-6)
+    np.testing.assert_allclose(SurfelValues(edited.scene)["roughness"][2 * HALF :], 0.75, rtol=1e-6)
     np.testing.assert_allclose(after["position"][2 * HALF :].mean(axis=0), (-0.5, 5, 0), atol=5e-3)
     assert edited.scene.mesh is not None and scene.mesh is not None
     assert len(edited.scene.mesh.faces) == 1.5 * len(scene.mesh.faces)
@@ -505,7 +505,7 @@ def test_runs_that_do_not_fit_together_are_refused(scene: TrainedScene) -> None:
     with pytest.raises(InputError, match="one has surfels, the other gaussians"):
         join(other, replace(other, surfels=Surfels.from_numpy(gaussians)))
     tinted = {**raw, "tint": raw["albedo"]}
-    with pytest.raises(InputError, match="tint: one of the runs has no such channel"):
+    with pytest.raises(InputError, match="tint: one of the runs has no such attribute"):
         join(other, replace(other, surfels=Surfels.from_numpy(tinted)))
 
 
@@ -526,7 +526,7 @@ def test_what_stays_as_fitted_is_said(scene: TrainedScene) -> None:
     moved = edit(scene, where=METAL_BALL, move=(1, 0, 0)).notes
     assert any("keeps the light of the place" in note for note in moved)
     plain = balls(reflectance="radiance", occlusion=False)
-    assert any("metallic: no picture of this run depends" in n for n in edit(plain, set=["metallic=1"]).notes)
+    assert any("metallic: no image of this run depends" in n for n in edit(plain, set=["metallic=1"]).notes)
     assert edit(balls(diffuse="irradiance", occlusion=False), set=["metallic=1"]).notes == ()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mi_refgs.editing.follow import without_surroundings
+from mi_refgs.editing.placement import object_mesh
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.viewer.page import Page
@@ -54,7 +54,7 @@ def follows(page: Page, box: Any, scene: TrainedScene) -> None:
     def show() -> None:
         alone = page.look.object_only and scene.surroundings is not None
         if box.value and alone not in nodes:
-            mesh = without_surroundings(scene) if alone else scene.mesh
+            mesh = object_mesh(scene) if alone else scene.mesh
             if mesh is None or not len(mesh.faces):
                 return
             nodes[alone] = add_mesh(page, f"/mesh_{'object' if alone else 'all'}", mesh)
