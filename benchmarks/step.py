@@ -84,7 +84,7 @@ def step_times(surfels: int, size: int, steps: int, variant: str = METHOD) -> di
     trainer, method = make_trainer(surfels, sphere_data(size, 8, np.random.default_rng(0)), variant)
     result = {}
     for name, stage in method.stages():
-        if stage.at == "pixel" and method.mesh is not None:
+        if stage.shading.at == "pixel" and method.mesh is not None:
             trainer.extract_mesh()
         found = profile_stage(trainer, name, steps)
         with held_in_stage(trainer, name) as prepare:

@@ -33,8 +33,8 @@ from mi_refgs.render.pipeline import SurfelScene as SurfelScene
 from mi_refgs.runs.relightable import relightable as relightable
 from mi_refgs.runs.run import Run as Run
 from mi_refgs.runs.trained_scene import TrainedScene as TrainedScene
-from mi_refgs.shade.accuracy import Accuracy as Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight as EnvironmentLight
+from mi_refgs.shade.options import ShadingOptions as ShadingOptions
 from mi_refgs.shade.points import RadianceTerms as RadianceTerms
 from mi_refgs.shade.points import ShadingPoints as ShadingPoints
 from mi_refgs.shade.reflectance import Reflectance as Reflectance

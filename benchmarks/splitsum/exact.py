@@ -16,8 +16,8 @@ from benchmarks.common.montecarlo import Estimate
 from benchmarks.common.setup import ALBEDO, Setup, path_tracer, shading_points
 from benchmarks.common.view import Points
 from benchmarks.splitsum.settings import SHAPES, Settings, shape
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.split_sum import shade
 
 SHIPPED = "shipped"
@@ -37,13 +37,17 @@ LEVEL_SETS = {
 }
 """Filtered levels; the map itself is one more."""
 
-OPTIONS = {"": Accuracy(), "dominant": Accuracy(dominant=True), "multiscatter": Accuracy(multiscatter=True)}
+OPTIONS = {
+    "": ShadingOptions(diffuse="irradiance"),
+    "dominant": ShadingOptions(diffuse="irradiance", dominant=True),
+    "multiscatter": ShadingOptions(diffuse="irradiance", multiscatter=True),
+}
 """Settings of `shade` that concern a surface that nothing shadows."""
 
 
 def split_sum(points: Points, material: dict[str, Any], light: Any, option: str = "") -> Any:
     """Outgoing radiance (mi.Color3f) as the product shades it."""
-    return shade(shading_points(points, material), light, "irradiance", OPTIONS[option]).total()
+    return shade(shading_points(points, material), light, OPTIONS[option]).total()
 
 
 @dataclass(frozen=True)

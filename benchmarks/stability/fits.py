@@ -54,7 +54,7 @@ def fit(name: str) -> dict[str, Any]:
         trainer.optimiser.reset(LIGHT)
     losses = []
     for _, stage in method.stages():
-        if stage.at == "pixel":
+        if stage.shading.at == "pixel":
             trainer.extract_mesh()
         for _ in range(STEPS):
             trainer.step()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from mi_refgs.shade.accuracy import Accuracy
+from mi_refgs.shade.options import ShadingOptions
 
 METALLIC = 1.0
 """A metal has no diffuse term: the whole picture is the specular one."""
@@ -81,10 +81,13 @@ class Rule:
         bounces = f", {self.bounces} bounce{'s' * (self.bounces > 1)}" if self.bounces else ""
         return base + bounces + ", dominant" * self.dominant
 
-    def accuracy(self) -> Accuracy:
+    def options(self) -> ShadingOptions:
         """As the product is told."""
-        return Accuracy(
-            dominant=self.dominant, visibility_rays=max(self.rays, 1), traced_bounces=self.bounces
+        return ShadingOptions(
+            diffuse="irradiance",
+            dominant=self.dominant,
+            visibility_rays=max(self.rays, 1),
+            traced_bounces=self.bounces,
         )
 
 

@@ -69,18 +69,18 @@ class Setup(setup.Setup):
         if not rule.rays:
             return at
         context = TraceContext(self.occluder, self.surfels, self.light, self.origin, -points.view)
-        return reflection(at, context, "irradiance", rule.accuracy())
+        return reflection(at, context, rule.options())
 
     def shaded(self, points: Points, rule: Rule) -> Any:
         """Outgoing radiance (mi.Color3f)."""
-        return shade(self.seen(points, rule), self.light, "irradiance", rule.accuracy()).total()
+        return shade(self.seen(points, rule), self.light, rule.options()).total()
 
     def picture(self, rule: Rule, indirect: np.ndarray | None = None) -> np.ndarray:
         """(P, 3); with indirect light (P, 3) of blocked rays in place of the rule's own."""
         at = self.seen(self.points, rule)
         if indirect is not None:
             at = at.replaced(indirect=mi.Color3f(np.ascontiguousarray(indirect.T, np.float32)))
-        shaded = shade(at, self.light, "irradiance", rule.accuracy())
+        shaded = shade(at, self.light, rule.options())
         return rows(shaded.total())
 
     def reference(self, depth: int) -> np.ndarray:
@@ -107,6 +107,6 @@ class Setup(setup.Setup):
     def frame_call(self, rule: Rule) -> Callable[[], Any]:
         """The product's own frame: the surfels splatted, visibility, shading."""
         camera = Camera.from_sensor(self.timing_sensor.inner)
-        shading = Shading(diffuse="irradiance", occlusion=rule.rays > 0, accuracy=rule.accuracy())
+        shading = Shading.resolve(rule.options(), mesh=rule.rays > 0)
         scene = SurfelScene(self.surfels, shading, self.light, self.occluder)
         return lambda: render(scene, camera).radiance

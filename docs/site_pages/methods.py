@@ -78,7 +78,9 @@ def section(path: Path, method: dict[str, Any]) -> str:
     source = path.read_text(encoding="utf-8").rstrip()
     remark = [line[1:].strip() for line in source.splitlines() if line.startswith("#")]
     resolved = load(path.stem, "standard")
-    stages = "; then ".join(f"{stage.reflectance} at {stage.at}s" for _, stage in resolved.stages())
+    stages = "; then ".join(
+        f"{stage.shading.reflectance} at {stage.shading.at}s" for _, stage in resolved.stages()
+    )
     facts = [
         f"Splats {resolved.surfels.primitive}s with {', '.join(resolved.surfels.channels)}; shades {stages}."
     ]

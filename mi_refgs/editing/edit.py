@@ -134,8 +134,8 @@ def notes_of(scene: TrainedScene, change: Change, joined: bool = False) -> list[
     shading, surfels = scene.shading, scene.surfels
     names = [assignment.name.partition(".")[0] for assignment in change.set]
     placed = joined or change.moves
-    indirect = shading.occlusion and surfels.has("indirect_sh") and not shading.accuracy.traced_bounces
-    read = {*shading.model.channels(shading.diffuse), *surfels.primitive.widths}
+    indirect = shading.occlusion and surfels.has("indirect_sh") and not shading.traced_bounces
+    read = {*shading.channels, *surfels.primitive.widths}
     read |= {"indirect_sh"} if indirect else set()
     notes = [
         f"{name}: no image of this run depends on it "

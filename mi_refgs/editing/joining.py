@@ -9,7 +9,7 @@ import numpy as np
 from mi_refgs.editing.placement import joined_mesh, object_mesh
 from mi_refgs.errors import InputError
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.accuracy import NEED_OCCLUSION
+from mi_refgs.shade.options import TRACED
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import CHANNELS
 from mi_refgs.surfels.table import Surfels
@@ -28,7 +28,7 @@ def join(first: TrainedScene, second: TrainedScene) -> tuple[TrainedScene, list[
     if primitives[0] is not primitives[1]:
         one, other = (primitive.name for primitive in primitives)
         raise InputError(f"--join: one has {one}s, the other {other}s; join runs of one primitive")
-    for what in ("reflectance", "diffuse", "at"):
+    for what in ("reflectance", "diffuse", "order"):
         pair = getattr(first.shading, what), getattr(second.shading, what)
         if pair[0] != pair[1]:
             raise InputError(
@@ -62,8 +62,8 @@ def joined_shading(first: Shading, second: Shading) -> Shading:
     """Return the options of the first; if only the second traces rays, with its options for rays."""
     if first.occlusion or not second.occlusion:
         return first
-    rays = {name: getattr(second.accuracy, name) for name in NEED_OCCLUSION}
-    return replace(first, occlusion=True, accuracy=replace(first.accuracy, **rays))
+    rays = {name: getattr(second, name) for name in TRACED}
+    return replace(first, occlusion=True, **rays)
 
 
 def _columns(name: str, tables: list[dict[str, np.ndarray]]) -> list[np.ndarray]:

@@ -105,8 +105,7 @@ def evaluate(
     run.output.require_free([*renders, SHEET, DECOMPOSITION, METRICS])
     fitted = up_to_date(run, method, views.views[0].camera())
     if antialias:
-        accuracy = dataclasses.replace(fitted.shading.accuracy, antialias=True)
-        shading = dataclasses.replace(fitted.shading, accuracy=accuracy)
+        shading = dataclasses.replace(fitted.shading, antialias=True)
         fitted = dataclasses.replace(fitted, shading=shading)
     view = fitted.renderer(samples=samples)
     alone = None if fitted.surroundings is None else dataclasses.replace(fitted, surroundings=None)
@@ -179,7 +178,7 @@ def evaluate(
         "surfels": fitted.surfels.count,
         "pruned": None if fitted.pruned is None else dataclasses.asdict(fitted.pruned),
         "samples": samples_per_axis(samples) ** 2,
-        "antialias": fitted.shading.accuracy.antialias,
+        "antialias": fitted.shading.antialias,
         "ms_per_frame": milliseconds(
             [fitted.renderer(aovs=False, samples=samples)], [v.camera() for v in views.views], views
         )[0],

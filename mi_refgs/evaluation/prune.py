@@ -23,7 +23,7 @@ from mi_refgs.io.images import PSNR_MAX
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import displayed
 from mi_refgs.runs.trained_scene import Pruned, TrainedScene
-from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
+from mi_refgs.shade.options import TRACED, ShadingOptions
 from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels.attributes import channel, sh_columns
 from mi_refgs.surfels.ply import encode_ply
@@ -116,11 +116,11 @@ def _drop_terms(search: _Search, limit: float) -> None:
     """Try the scene without tracing, without each channel that it can do without, with fewer harmonics."""
     shading = search.scene.shading
     if shading.occlusion:
-        defaults = {name: getattr(Accuracy(), name) for name in NEED_OCCLUSION}
-        untraced = replace(shading, occlusion=False, accuracy=replace(shading.accuracy, **defaults))
+        defaults = {name: getattr(ShadingOptions, name) for name in TRACED}
+        untraced = replace(shading, occlusion=False, **defaults)
         search.attempt("mesh", replace(search.scene, mesh=None, shading=untraced), limit)
     surfels = search.scene.surfels
-    needed = {*surfels.primitive.widths, *shading.model.channels(shading.diffuse)}
+    needed = {*surfels.primitive.widths, *shading.channels}
     for name in [name for name in surfels.raw if name not in needed]:
         raw = {other: values for other, values in search.scene.surfels.raw.items() if other != name}
         search.attempt(name, search.with_surfels(Surfels(raw)), limit)

@@ -58,8 +58,7 @@ def update_missing_caches(
     """Give an occluder what the shading asks for and what it lacks: all of it for a new mesh, the surfels of
     its vertices also after an edit of the table. It stays as it is until the next of these.
     """
-    accuracy = shading.accuracy
-    if accuracy.ambient_rays and occluder.ambient is None:
-        update_occluder_caches(occluder, surfels, shading.light_of(environment), accuracy)
-    if accuracy.traced_bounces and occluder.vertex_surfels is None:
+    if shading.ambient_rays and occluder.ambient is None:
+        update_occluder_caches(occluder, surfels, shading.light_of(environment), shading)
+    if shading.traced_bounces and occluder.vertex_surfels is None:
         occluder.set_materials(surfels)

@@ -261,7 +261,7 @@ class Trainer:
         self.control.wander(iteration)
 
     def _shading(self, stage: Stage) -> Shading:
-        return Shading.of(stage, not self.occluder.empty)
+        return Shading.resolve(stage.shading, not self.occluder.empty)
 
     # ---------------- state ----------------
 

@@ -64,7 +64,7 @@ def method_of(trained: TrainedScene, name: str) -> Method:
         surfels.count,
         degree={"radiance_sh": surfels.sh_degree()},
     )
-    stage = Stage(1, shading.at, shading.reflectance, shading.diffuse)
+    stage = Stage(1, shading)
     return Method(
         1,
         {"imported": stage},

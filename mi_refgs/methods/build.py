@@ -5,10 +5,15 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
+from dataclasses import MISSING
 from typing import Any, Literal
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.shade.options import NOT_A_SETTING
+
+FLAT = {"flat": True}
+"""Metadata of a field, a dataclass, whose settings are keys of the table that contains it."""
 
 
 def build(kind: Any, value: Any, where: str) -> Any:
@@ -19,20 +24,23 @@ def build(kind: Any, value: Any, where: str) -> Any:
             raise InputError(
                 f"{where}: expected a table, found {abbreviated(value)}; the files of variants/ show the form"
             )
-        hints = typing.get_type_hints(kind)
+        hints = settings(kind)
         for key in value:
             if key not in hints:
                 raise InputError(f"{where}: unknown key '{key}'; use one of {', '.join(hints)}")
-        needed = [
-            f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING
-        ]
-        missing = [name for name in needed if name not in value]
-        if missing:
-            raise InputError(f"{where}: missing key '{missing[0]}'; add it")
-        make: Any = kind
-        fields = {key: build(hints[key], inner, f"{where}: {key}") for key, inner in value.items()}
+        for required in dataclasses.fields(kind):
+            if required.default is required.default_factory is MISSING and required.name not in value:
+                raise InputError(f"{where}: missing key '{required.name}'; add it")
+        found = {key: build(hints[key], inner, f"{where}: {key}") for key, inner in value.items()}
+        for flat in (one for one in dataclasses.fields(kind) if one.metadata == FLAT):
+            inner = typing.get_type_hints(kind)[flat.name]
+            given = {key: found.pop(key) for key in settings(inner) if key in found}
+            try:
+                found[flat.name] = inner(**given)
+            except InputError as error:
+                raise InputError(f"{where}: {error}") from error
         try:
-            return make(**fields)
+            return typing.cast(Any, kind)(**found)
         except ValueError as error:
             raise InputError(f"{where}: {error}") from error
     if origin in (types.UnionType, typing.Union):
@@ -61,10 +69,29 @@ def build(kind: Any, value: Any, where: str) -> Any:
     return value
 
 
+def settings(kind: Any) -> dict[str, Any]:
+    """Keys of a dataclass in a file, with their types; those of FLAT fields are keys of the same table."""
+    hints = typing.get_type_hints(kind)
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(kind):
+        if field.metadata == FLAT:
+            found |= settings(hints[field.name])
+        elif field.metadata != NOT_A_SETTING:
+            found[field.name] = hints[field.name]
+    return found
+
+
 def plain(value: Any) -> Any:
+    """What `build` reads back: dictionaries, lists and values, without those that are None."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        pairs = ((f.name, getattr(value, f.name)) for f in dataclasses.fields(value))
-        return {name: plain(inner) for name, inner in pairs if inner is not None}
+        found: dict[str, Any] = {}
+        for field in dataclasses.fields(value):
+            inner = plain(getattr(value, field.name))
+            if field.metadata == FLAT:
+                found |= inner
+            elif field.metadata != NOT_A_SETTING and inner is not None:
+                found[field.name] = inner
+        return found
     if isinstance(value, dict):
         return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, tuple):

@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from mi_refgs.methods.build import FLAT
 from mi_refgs.methods.surroundings import BACKGROUND, SurroundingsOptions
 from mi_refgs.methods.weights import LossWeights
 from mi_refgs.methods.window import ITERATIONS, Window
-from mi_refgs.shade.accuracy import DIRECTIONS, MAX_LEVELS
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE, channel
 from mi_refgs.surfels.primitives import primitive_named
 
@@ -86,16 +87,8 @@ class Stage:
     """One stretch of the schedule with its own way to shade, up to and including iteration `until`."""
 
     until: int = field(metadata=ITERATIONS)
-    at: Literal["surfel", "pixel"] = "pixel"
-    reflectance: str = "split_sum"  # a model of `shade.reflectance`
-    diffuse: Literal["sh", "irradiance"] = "sh"
-    antialias: bool = False  # roughness widened by how much normals turn within a pixel
-    samples: int = 1  # of a pixel, k × k, in the steps of a fit
-    visibility_rays: int = 1  # of the lobe, where there is a mesh; 1: the mirror ray
-    traced_bounces: int = 0  # that blocked rays are followed, where there is a mesh, in place of indirect_sh
-    ambient_rays: int = 0  # of a vertex, where there is a mesh, for diffuse = irradiance
-    light_levels: int = MAX_LEVELS  # of roughness, that the light is filtered to
-    directions: int = DIRECTIONS  # of the hemisphere, for models that sum light over it
+    shading: ShadingOptions = field(default_factory=ShadingOptions, metadata=FLAT)  # keys of the stage itself
+    samples: int = 1  # per pixel, k × k, in the steps of a fit
     restart: tuple[str, ...] = ()  # channels, and `light`, that start anew when the stage begins
     rates: dict[str, float] = field(default_factory=dict)  # factors of the rates of channels, and of `light`
 

@@ -128,7 +128,9 @@ def _checked(method: Method, where: str) -> Method:
         raise InputError(f"{where}: data.coarse: a block of {too_small[0]} averages nothing; give 2 or more")
     for name, stage in method.stages():
         try:
-            Shading.of(stage, method.mesh is not None).check(channels, method.light is not None)
+            Shading.resolve(stage.shading, method.mesh is not None).require_inputs(
+                channels, method.light is not None
+            )
             samples_per_axis(stage.samples)
         except InputError as error:
             raise InputError(f"{where}: stage.{name}: {error}") from error
@@ -157,7 +159,7 @@ def _checked(method: Method, where: str) -> Method:
 
 def _check_priors(method: Method, where: str) -> None:
     """Raise InputError for a prior on what the method does not have."""
-    loss, pixels = method.loss, any(stage.at == "pixel" for _, stage in method.stages())
+    loss, pixels = method.loss, any(stage.shading.at == "pixel" for _, stage in method.stages())
     for name, needed in (("half_metal", {"metallic"}), ("materials", {"metallic", "roughness"})):
         if getattr(loss, name) and not (pixels and needed <= {*method.surfels.channels}):
             raise InputError(

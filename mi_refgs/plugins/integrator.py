@@ -188,7 +188,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         """Raise InputError for shapes that do not fit and for channels that are needed but absent."""
         Surfels(self.surfels.raw)  # checks shapes; values are checked where a file is read
         primitive_of(widths_of(self.surfels.raw))
-        self.shading.check(self.surfels.raw)
+        self.shading.require_inputs(self.surfels.raw)
         for name in (aov.type for aov in self.aovs if aov.type in CHANNELS):
             if not self.surfels.has(name):
                 raise InputError(f"refgs: {name}: the surfels have no such channel; add it, or do without it")
@@ -204,7 +204,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.check()
         self.unusable.changed = True
         self.filtered.forget()
-        self.caches_valid = self.caches_valid and not self.shading.accuracy.ambient_rays
+        self.caches_valid = self.caches_valid and not self.shading.ambient_rays
         self.caches_valid = (
             self.caches_valid and {*keys}.isdisjoint(self.surfels.primitive.widths) and bool(keys)
         )
@@ -272,9 +272,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         asked = {*aovs} | {*(self.terms if len(self.terms) < len(TERMS) else ())}
         light = self.filtered.of(self.shading, self.light, self.light_rotation, scene, derivatives)
         if self.occluder is not None and not self.caches_valid:
-            update_occluder_caches(self.occluder, self.surfels.detach(), light, self.shading.accuracy)
+            update_occluder_caches(self.occluder, self.surfels.detach(), light, self.shading)
             # No one is told when a light of the scene changes.
-            self.caches_valid = self.light is not None or not self.shading.accuracy.ambient_rays
+            self.caches_valid = self.light is not None or not self.shading.ambient_rays
         surfels, surroundings = Surfels(self.surfels.raw, screened=True), around.splatted(self.surfels)
         rendered = SurfelScene(surfels, self.shading, light, self.occluder, surroundings)
         frame = render(rendered, camera, Request(asked, forward_only=not derivatives))

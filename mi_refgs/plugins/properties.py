@@ -5,7 +5,7 @@ No Mitsuba class is defined here, so that this module need not be reloaded when 
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,11 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.plugins.aovs import AOV, parse_aovs
 from mi_refgs.plugins.light import own_light
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.options import DIFFUSE, QUALITY, ShadingOptions
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.reflectance import MODELS
-from mi_refgs.shade.shading import DIFFUSE, Shading
+from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import CHANNELS
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
@@ -152,16 +152,12 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     mesh = _path(props, "mesh")
     shading = Shading(at, reflectance, diffuse)
     occlusion = _flag(props, "occlusion", mesh is not None and shading.traceable)
-    shading = replace(shading, occlusion=occlusion, accuracy=_accuracy(props))
-    shading.check(surfels.raw, mesh=mesh is not None)
+    quality = {name: _get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
+    shading = replace(shading, occlusion=occlusion, **quality)
+    shading.require_inputs(surfels.raw, mesh=mesh is not None)
     if not (occlusion and mesh):
         return shading, None
     return shading, Occluder(read_mesh(mesh))
-
-
-def _accuracy(props: Any) -> Accuracy:
-    """The options that buy accuracy; `Accuracy` refuses what is no bool or no number."""
-    return Accuracy(**{option.name: _get(props, option.name, option.default) for option in fields(Accuracy)})
 
 
 def read_terms(props: Any) -> list[str]:

@@ -216,7 +216,7 @@ def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
     found = []
     for name in names:
         mesh = trainer.method.mesh
-        traced = Shading.of(trainer.method.stage[name], mesh=True).occlusion
+        traced = Shading.resolve(trainer.method.stage[name].shading, mesh=True).occlusion
         if traced and mesh is not None and trainer.occluder.mesh() is None:
             trainer.extract_mesh()
         found.append(profile_stage(trainer, name, steps))

@@ -101,13 +101,13 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     """Render a view of a scene.
 
     With surroundings, the rows of `screen_offset` are those of the object, then theirs. Raises InputError as
-    `Shading.check` does.
+    `Shading.require_inputs` does.
     """
     require_supported_variant("mi_refgs.render_frame")
     primitive_of(widths_of(scene.surfels.raw))
-    scene.shading.check(scene.surfels.raw, scene.light is not None, scene.occluder is not None)
+    scene.shading.require_inputs(scene.surfels.raw, scene.light is not None, scene.occluder is not None)
     view = _View.of(*_without_empty_tables(scene, request), camera)
-    frame, buffer = _shade_at_surfels(view) if scene.shading.at == "surfel" else _shade_at_pixels(view)
+    frame, buffer = _shade_at_surfels(view) if scene.shading.order == "surfel" else _shade_at_pixels(view)
     if request.forward_only:
         frame = _in_raster_order(frame.only(request.aovs), buffer.places)
     return boundary(frame, "shade backward")
@@ -214,7 +214,7 @@ class _View:
             own = self.scene.surfels.count
             slots = joined_slots(slots, others, (own, self.geometry.count - own))
         # Antialiasing reads neighbours in the image.
-        compact = self.request.forward_only and not self.scene.shading.accuracy.antialias
+        compact = self.request.forward_only and not self.scene.shading.antialias
         depth = not compact or "depth" in self.asked
         return GBuffer.blend(self.geometry, slots, self.camera, self.request.screen_offset, compact, depth)
 
@@ -238,7 +238,7 @@ def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
     scene, points, asked = view.scene, view.points, view.asked
     # Radiance of each surfel.
     if scene.shading.occlusion:
-        assert scene.occluder is not None  # by `Shading.check`
+        assert scene.occluder is not None  # by `Shading.require_inputs`
         position = scene.surfels.position()
         context = TraceContext(scene.occluder, scene.surfels, scene.light, position, -points.view)
         points = scene.shading.model.trace(points, context, scene.shading)
@@ -284,14 +284,14 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
     pixel = None if buffer.places is None else buffer.places.raster
     ray, index = camera.rays(pixel), camera.image_index(pixel)
     attributes = {name: values[name] for name in view.points.attributes}
-    if shading.accuracy.antialias:
+    if shading.antialias:
         attributes["roughness"] = widened(attributes["roughness"], normal, alpha, camera)
     points = ShadingPoints(normal, -dr.normalize(ray), attributes)
     maps = {name: values[name] for name in scene.surfels.raw if name in values}
 
     # Visibility along the mirror direction, where there is something to reflect.
     if shading.occlusion:
-        assert scene.occluder is not None  # by `Shading.check`
+        assert scene.occluder is not None  # by `Shading.require_inputs`
         covered = dr.detach(alpha) > COVERAGE_FLOOR
         context = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered, index)
         points = shading.model.trace(points, context, shading)

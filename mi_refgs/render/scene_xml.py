@@ -63,8 +63,8 @@ def write_scene_xml(
     put(integrator, "string", "reflectance", shading.reflectance)
     put(integrator, "string", "diffuse", shading.diffuse)
     put(integrator, "boolean", "occlusion", str(shading.occlusion).lower())
-    for name in shading.accuracy.chosen():
-        value = getattr(shading.accuracy, name)
+    for name in shading.chosen():
+        value = getattr(shading, name)
         put(integrator, "boolean" if isinstance(value, bool) else "integer", name, str(value).lower())
     if mesh is not None:
         put(integrator, "string", "mesh", mesh)

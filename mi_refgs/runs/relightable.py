@@ -17,10 +17,10 @@ from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ambient import ambient
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance.split_sum import MATERIALS
 from mi_refgs.shade.sh import sh_basis
 from mi_refgs.shade.shading import Shading
@@ -72,10 +72,16 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     if scene.shading.diffuse == "sh":
         surfels = albedo_from_radiance(surfels, scene.light.prefilter(), mesh)
     kept = {name: raw for name, raw in surfels.raw.items() if name not in ("radiance_sh", "indirect_sh")}
-    accuracy = scene.shading.accuracy if scene.shading.reflectance == "split_sum" else Accuracy()
     rays, bounces, ambient_rays = (1, 0, 0) if mesh is None else (RELIGHT_RAYS, RELIGHT_BOUNCES, AMBIENT_RAYS)
-    accuracy = replace(accuracy, visibility_rays=rays, traced_bounces=bounces, ambient_rays=ambient_rays)
-    shading = Shading("pixel", "split_sum", "irradiance", mesh is not None, accuracy)
+    shading = replace(
+        scene.shading if scene.shading.reflectance == "split_sum" else Shading(),
+        at="pixel",
+        diffuse="irradiance",
+        occlusion=mesh is not None,
+        visibility_rays=rays,
+        traced_bounces=bounces,
+        ambient_rays=ambient_rays,
+    )
     return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, surroundings=None)
 
 
@@ -121,7 +127,7 @@ def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> S
         # Light from other parts of the object has their albedo: that without shadows is near enough for it.
         occluder = Occluder(mesh)
         occluder.set_materials(found)
-        ratios = ambient(occluder, found, light, Accuracy(ambient_rays=AMBIENT_RAYS)).numpy()
+        ratios = ambient(occluder, found, light, ShadingOptions(ambient_rays=AMBIENT_RAYS)).numpy()
         return with_shadows(ratios[vertex])
 
 

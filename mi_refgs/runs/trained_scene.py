@@ -73,7 +73,7 @@ class TrainedScene:
             Surfels(channels_of(params)),
             light_of(params),
             mesh,
-            Shading.of(stage, mesh is not None),
+            Shading.resolve(stage.shading, mesh is not None),
             iteration,
             float(state["seconds"]),
             surroundings=surroundings_of(params),
@@ -90,7 +90,7 @@ class TrainedScene:
         note = folder / MODEL
         try:
             content = read_json(note)
-            shading = Shading(**content["shading"])
+            shading = Shading.from_json(content["shading"])
             iteration, seconds = int(content["iteration"]), float(content["seconds"])
             pruned = content.get("pruned")
             if pruned is not None:
@@ -118,7 +118,7 @@ class TrainedScene:
             Surroundings.read(around, behind if behind.is_file() else None) if around.is_file() else None,
         )
         try:
-            shading.check(fitted.surfels.raw, fitted.light is not None)
+            shading.require_inputs(fitted.surfels.raw, fitted.light is not None)
             if fitted.surroundings is not None:
                 fitted.surroundings.check(fitted.surfels)
         except InputError as error:
@@ -139,7 +139,7 @@ class TrainedScene:
         with dr.suspend_grad():
             light = self.shading.light_of(self.light)
         occluder = Occluder(self.mesh)
-        update_occluder_caches(occluder, self.surfels, light, self.shading.accuracy)
+        update_occluder_caches(occluder, self.surfels, light, self.shading)
 
         scene = SurfelScene(self.surfels, self.shading, light, occluder, self.surroundings)
 

@@ -1,6 +1,6 @@
 """How much of a diffuse surface's light the object itself takes away, and what it sends back instead.
 
-`light.irradiance` is that of a surface that sees all of its hemisphere. `Accuracy.ambient_rays` rays from
+`light.irradiance` is that of a surface that sees all of its hemisphere. `options.ambient_rays` rays from
 every vertex of the occluding mesh, cosine-weighted, say what it sees instead:
 
     ratio = Σ (free ? L(ω) : B(ω)) / Σ L(ω)
@@ -26,9 +26,9 @@ import mitsuba as mi
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.vertex_colours import VertexColours
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ggx_sampling import lobe_point, lobe_turn
 from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import safe_normalize
 from mi_refgs.shade.traced_light import MeshRadiance
 from mi_refgs.surfels.table import Surfels
@@ -41,23 +41,23 @@ BRIGHTEST = 4.0
 
 
 def update_occluder_caches(
-    occluder: Occluder, surfels: Surfels, light: Light | None, accuracy: Accuracy
+    occluder: Occluder, surfels: Surfels, light: Light | None, options: ShadingOptions
 ) -> None:
-    """Give a mesh what `accuracy` asks for: materials if its hits are shaded, and ambient ratios.
+    """Give a mesh what `options` asks for: materials if its hits are shaded, and ambient ratios.
 
     To be called again when mesh, surfels or light have changed; nothing is done where nothing is asked for.
     Raises InputError as `Occluder.set_materials` does.
     """
     if occluder.empty:
         return
-    if accuracy.traced_bounces or accuracy.ambient_rays:
+    if options.traced_bounces or options.ambient_rays:
         occluder.set_materials(surfels)
-    if accuracy.ambient_rays and light is not None:
+    if options.ambient_rays and light is not None:
         with dr.suspend_grad():
-            occluder.ambient = ambient(occluder, surfels, light, accuracy)
+            occluder.ambient = ambient(occluder, surfels, light, options)
 
 
-def ambient(occluder: Occluder, surfels: Surfels, light: Light, accuracy: Accuracy) -> VertexColours:
+def ambient(occluder: Occluder, surfels: Surfels, light: Light, options: ShadingOptions) -> VertexColours:
     """The ratios of all vertices of a mesh whose materials are set; see the head of this file. Detached."""
     mesh = occluder.mesh()
     assert mesh is not None
@@ -65,8 +65,10 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, accuracy: Accura
     normal = safe_normalize(occluder.surface(surfels).vertex_surfels.normal)
     occluder.ambient = None  # all light arrives, in the first round
     for _ in range(BOUNCES):
-        scene = MeshRadiance.of(occluder, surfels, light, replace(accuracy, traced_bounces=1), "irradiance")
-        ratio = _round(scene, place, normal, accuracy.ambient_rays)
+        scene = MeshRadiance.of(
+            occluder, surfels, light, replace(options, traced_bounces=1, diffuse="irradiance")
+        )
+        ratio = _round(scene, place, normal, options.ambient_rays)
         occluder.ambient = found = VertexColours.of(mesh, ratio.numpy().T)
     return found
 

@@ -1,8 +1,8 @@
 """What pixels see in their mirrors: is the light free there, and what stands in its way?
 
-The paper's rule traces one mirror ray for the whole lobe and leaves what it hits to the indirect channel.
-`Accuracy.visibility_rays` averages over rays of the lobe instead, and `Accuracy.traced_bounces` shades what
-blocked rays hit.
+The paper traces one mirror ray for the whole lobe and leaves what it hits to the indirect attribute. The
+option `visibility_rays` averages over samples of the lobe instead, and `traced_bounces` shades what blocked
+rays hit.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ggx_sampling import Lobe
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints, reflect
 from mi_refgs.shade.reflectance.model import TraceContext
-from mi_refgs.shade.split_sum import Diffuse, base_reflectance
+from mi_refgs.shade.split_sum import base_reflectance
 from mi_refgs.shade.traced_light import MeshRadiance
 from mi_refgs.shade.visibility import mirror_visibility, start_on_mesh
 
@@ -27,39 +27,37 @@ CLAMP_MAX_ALPHA = 1 / 3
 0.09, and adds up to 15 % at 0.36."""
 
 
-def reflection(
-    points: ShadingPoints, context: TraceContext, diffuse: Diffuse, accuracy: Accuracy
-) -> ShadingPoints:
-    """`points` with the visibility (mi.Float, 0 … 1, detached) and indirect light that `accuracy` asks for.
+def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
+    """`points` with the visibility (mi.Float, 0 … 1, detached) and indirect light that `options` asks for.
 
-    `points.indirect` (of the indirect channel) stays unless `accuracy.traced_bounces` replaces it by the mean
+    `points.indirect` (of the indirect channel) stays unless `options.traced_bounces` replaces it by the mean
     radiance of what blocked rays hit (`MeshRadiance`), single bright ones clamped (`_firefly_clamp`). Its
     gradient goes to the light and to the materials of the surfels around all hits, in both modes; rays, hits
     and the clamp are detached, and so is what the pixel's own roughness does to the rays.
     """
     occluder, origin, ray, covered = context.occluder, context.origin, context.ray, context.covered
     normal = dr.detach(points.normal)
-    if accuracy.visibility_rays == 1 and not accuracy.traced_bounces:
+    if options.visibility_rays == 1 and not options.traced_bounces:
         visibility = mirror_visibility(occluder, origin, ray, normal, points.view, covered)
         return points.replaced(visibility=visibility)
     if occluder.empty:
         return points.replaced(visibility=dr.full(mi.Float, 1, dr.width(ray)), indirect=None)
     scene = None
-    if accuracy.traced_bounces:
-        scene = MeshRadiance.of(occluder, context.surfels, context.light, accuracy, diffuse)
+    if options.traced_bounces:
+        scene = MeshRadiance.of(occluder, context.surfels, context.light, options)
     with dr.suspend_grad():
         point, facing, seen = start_on_mesh(occluder, origin, ray, normal, covered)
-    if accuracy.visibility_rays > 1:
+    if options.visibility_rays > 1:
         with dr.suspend_grad():
             lobe = Lobe.of(facing, points.view, points.roughness, base_reflectance(points), context.pixel)
             open_ = None if scene is None else scene.light_from(facing, points.view, points.roughness)
         visibility, indirect = _average(
-            occluder, scene, lobe, accuracy.visibility_rays, point, facing, seen, open_
+            occluder, scene, lobe, options.visibility_rays, point, facing, seen, open_
         )
     else:
         assert scene is not None
         mirror = dr.detach(reflect(view=points.view, normal=facing))
-        hit = scene.trace(point, mirror, facing, seen, accuracy.traced_bounces)
+        hit = scene.trace(point, mirror, facing, seen, options.traced_bounces)
         dr.eval(hit)  # now, once, as for the visibility alone
         visibility = dr.select(hit.valid, mi.Float(0), mi.Float(1))
         indirect = dr.select(hit.valid, scene.radiance(hit, mirror), 0)
@@ -91,7 +89,7 @@ def _average(
             if scene is None:
                 stopped = occluder.visible(point, direction, facing, weight > 0) == 0
             else:
-                hit = scene.trace(point, direction, facing, weight > 0, scene.accuracy.traced_bounces)
+                hit = scene.trace(point, direction, facing, weight > 0, scene.options.traced_bounces)
                 stopped = hit.valid
         if scene is not None:
             found = dr.select(stopped, weight * scene.radiance(hit, direction), 0)

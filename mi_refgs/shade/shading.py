@@ -1,103 +1,108 @@
-"""How a method turns surfels into radiance, as data, and what is not allowed together."""
+"""Shading options that fit together, and the light and attributes that they require."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, get_args, get_type_hints
+from dataclasses import dataclass, fields
+from typing import Any
 
-from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.errors import InputError
 from mi_refgs.kernels.timing import phase
-from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.light.lobe_matrices import Levels
+from mi_refgs.shade.options import DIFFUSE, TRACED, Diffuse, Order, ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import MODELS, Reflectance
-from mi_refgs.shade.split_sum import Diffuse
 
 
 @dataclass(frozen=True)
-class Shading:
-    """How a method turns surfels into radiance: data, chosen per stage. The one place of its rules.
-
-    A model whose radiance is blended linearly is the same in the two orders; `at` is then "surfel", which
-    blends less. Raises InputError for what is not allowed together.
-    """
-
-    at: Literal["surfel", "pixel"] = "pixel"  # shade before or after blending
-    reflectance: str = "split_sum"  # a name in `reflectance.MODELS`
-    diffuse: Diffuse = "sh"  # view-dependent SH colour, or of albedo and light
-    occlusion: bool = False  # trace visibility, and fill with what the model has for blocked rays
-    accuracy: Accuracy = field(default_factory=Accuracy)  # what to pay for less error; rays need occlusion
+class Shading(ShadingOptions):
+    """Shading options that are allowed together; raises InputError with a remedy for any others."""
 
     def __post_init__(self) -> None:
-        """Raise InputError, or TypeError for an unknown key of `accuracy`, for what JSON may hold."""
-        if isinstance(self.accuracy, Mapping):  # as JSON keeps it
-            object.__setattr__(self, "accuracy", Accuracy(**self.accuracy))
-        for name, kind in _HINTS.items():
-            value, allowed = getattr(self, name), get_args(kind)
-            if not (value in allowed if allowed else isinstance(value, kind)):
-                raise InputError(f"shading: {name}: {abbreviated(value)} is not allowed; correct it")
-        if self.reflectance not in MODELS:
-            raise InputError(
-                f"shading: reflectance: {abbreviated(self.reflectance)} is unknown; use {' or '.join(MODELS)}"
-            )
-        if self.model.order_independent:
-            object.__setattr__(self, "at", "surfel")
-        elif self.at not in self.model.orders:
-            order = self.model.orders[0]
-            raise InputError(f"shading: reflectance: {self.reflectance} needs shade_at = {order}; set it")
-        if self.occlusion and not self.traceable:
-            mirrors = " or ".join(name for name, model in MODELS.items() if model.visibility == "mirror")
-            raise InputError(
-                f"shading: occlusion: needs shade_at = pixel and reflectance = {mirrors}; set these"
-            )
-        if self.accuracy.ambient_rays and self.diffuse != "irradiance":
-            raise InputError("shading: ambient_rays: need diffuse = irradiance; set it")
-        chosen = self.accuracy.chosen()
-        if not self.occlusion and {*chosen} & {*NEED_OCCLUSION}:
-            raise InputError(f"shading: {', '.join(NEED_OCCLUSION)}: need occlusion; trace a `mesh`")
-        if self.accuracy.antialias and self.at != "pixel":
-            raise InputError("shading: antialias: needs shade_at = pixel; set it, or leave it out")
+        super().__post_init__()
+        model, chosen = MODELS.find(self.reflectance, "shading: reflectance"), self.chosen()
+        mirrors = " or ".join(name for name, other in MODELS.items() if other.visibility == "mirror")
+        # (what is not allowed, the message)
+        rules = [
+            (
+                self.order not in model.orders,
+                f"reflectance: {self.reflectance} needs shade_at = {model.orders[0]}; set it",
+            ),
+            (
+                self.occlusion and not self.traceable,
+                f"occlusion: needs shade_at = pixel and reflectance = {mirrors}; set these",
+            ),
+            (
+                self.ambient_rays > 0 and self.diffuse != "irradiance",
+                "ambient_rays: need diffuse = irradiance; set it",
+            ),
+            (
+                not self.occlusion and bool({*chosen} & {*TRACED}),
+                f"{', '.join(TRACED)}: need occlusion; trace a `mesh`",
+            ),
+            (
+                self.antialias and self.order != "pixel",
+                "antialias: needs shade_at = pixel; set it, or leave it out",
+            ),
+        ]
         for name in chosen:
-            if name not in self.model.honours:
-                able = " or ".join(other for other, model in MODELS.items() if name in model.honours)
-                raise InputError(f"shading: {name}: needs reflectance = {able}; set it")
+            able = " or ".join(other for other in MODELS if name in MODELS[other].honours)
+            rules.append((name not in model.honours, f"{name}: needs reflectance = {able}; set it"))
+        for refused, message in rules:
+            if refused:
+                raise InputError(f"shading: {message}")
 
     @staticmethod
-    def of(stage: Any, mesh: bool) -> Shading:
-        """The shading of a stage by its fields of the same names, those of `Accuracy` among them.
-
-        It is occluded if there is a `mesh` and the model can trace it in this order.
+    def resolve(options: ShadingOptions, mesh: bool) -> Shading:
+        """Resolve what a stage asks for: it is occluded if there is a `mesh` and the model can trace it in
+        this order; TRACED options count only then.
         """
-        given: dict[str, Any] = {
-            option.name: getattr(stage, option.name, option.default) for option in fields(Accuracy)
-        }
-        free = {name: value for name, value in given.items() if name not in NEED_OCCLUSION}
-        shading = Shading(stage.at, stage.reflectance, stage.diffuse, accuracy=Accuracy(**free))
-        if not (mesh and shading.traceable):
-            return shading
-        return replace(shading, occlusion=True, accuracy=Accuracy(**given))
+        given = {option.name: getattr(options, option.name) for option in fields(ShadingOptions)}
+        untraced = Shading(**given | {name: getattr(ShadingOptions, name) for name in ("occlusion", *TRACED)})
+        return Shading(**given | {"occlusion": True}) if mesh and untraced.traceable else untraced
 
     @staticmethod
-    def default_reflectance(channels: Collection[str]) -> str:
-        """The first model whose channels are there, with either diffuse; else the one that needs fewest."""
-        needs = {name: min((model.channels(d) for d in DIFFUSE), key=len) for name, model in MODELS.items()}
-        able = (name for name, needed in needs.items() if {*needed} <= {*channels})
+    def from_json(note: Mapping[str, Any]) -> Shading:
+        """Read what `dataclasses.asdict` has written; raises InputError, or TypeError for an unknown key.
+
+        Files of version 0.1 have a table `accuracy` of the options that now stand beside it.
+        """
+        options = dict(note)
+        return Shading(**options.pop("accuracy", {}), **options)
+
+    @staticmethod
+    def default_reflectance(attributes: Collection[str]) -> str:
+        """The first model whose attributes are available, with either diffuse; else the one of fewest."""
+        needs = {
+            name: min((model.channels(ShadingOptions(diffuse=d)) for d in DIFFUSE), key=len)
+            for name, model in MODELS.items()
+        }
+        able = (name for name, needed in needs.items() if {*needed} <= {*attributes})
         return next(able, min(needs, key=lambda name: len(needs[name])))
 
     @staticmethod
-    def default_diffuse(reflectance: str, channels: Collection[str]) -> Diffuse:
-        """The first diffuse whose channels are there; else the one that needs fewest."""
-        needs: dict[Diffuse, set[str]] = {d: {*MODELS[reflectance].channels(d)} for d in DIFFUSE}
-        able = (diffuse for diffuse in DIFFUSE if needs[diffuse] <= {*channels})
+    def default_diffuse(reflectance: str, attributes: Collection[str]) -> Diffuse:
+        """The first diffuse whose attributes are available; else the one of fewest."""
+        needs = {d: {*MODELS[reflectance].channels(ShadingOptions(diffuse=d))} for d in DIFFUSE}
+        able = (diffuse for diffuse in DIFFUSE if needs[diffuse] <= {*attributes})
         return next(able, min(DIFFUSE, key=lambda diffuse: len(needs[diffuse])))
 
     @property
     def model(self) -> Reflectance:
         """The reflectance model."""
         return MODELS[self.reflectance]
+
+    @property
+    def order(self) -> Order:
+        """Where it is shaded: `at`, but "surfel", which blends less, where both give the same image."""
+        return "surfel" if self.model.order_independent else self.at
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Attributes beside the geometry that the surfels must have."""
+        return self.model.channels(self)
 
     @property
     def traceable(self) -> bool:
@@ -107,10 +112,10 @@ class Shading:
     @property
     def neighbours(self) -> int:
         """Pixels along each axis that a pixel's colour depends on."""
-        return int(self.accuracy.antialias)
+        return int(self.antialias)
 
     def light_of(self, environment: EnvironmentLight | None) -> Light | None:
-        """The light as the model looks it up, under AD; None if there is none, or it asks for none."""
+        """The light as the model looks it up, under AD; None without one, or if the model uses none."""
         if environment is None or self.model.light == "none":
             return None
         return (
@@ -119,13 +124,13 @@ class Shading:
 
     @property
     def levels(self) -> Levels:
-        """The levels of roughness that a light is filtered to."""
-        return Levels.some(self.accuracy.light_levels)
+        """The levels of roughness that a light is prefiltered to."""
+        return Levels.some(self.light_levels)
 
-    def check(self, channels: Collection[str], light: bool = True, mesh: bool = True) -> None:
-        """Raise InputError if surfels with these channels, and what is there beside them, lack something."""
-        for name in self.model.channels(self.diffuse):
-            if name not in channels:
+    def require_inputs(self, attributes: Collection[str], light: bool = True, mesh: bool = True) -> None:
+        """Raise InputError if an attribute, the light or the mesh that the model needs is missing."""
+        for name in self.channels:
+            if name not in attributes:
                 raise InputError(
                     f"shading: {name}: the surfels have no such channel; add it, or do without it"
                 )
@@ -139,13 +144,7 @@ class Shading:
             raise InputError("shading: occlusion: there is no mesh to trace; give one, or trace nothing")
 
 
-DIFFUSE: tuple[Diffuse, ...] = get_args(Diffuse)
-"""Choices of `Shading.diffuse`."""
-
-_HINTS = get_type_hints(Shading)
-
-
 @phase("shade forward")
-def shade(points: ShadingPoints, light: Light | None, shading: Shading) -> RadianceTerms:
-    """Outgoing radiance towards the camera, by cause, of the shading's model."""
+def shade(points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
+    """Outgoing radiance towards the camera, as separate terms; `light` is None if the model uses none."""
     return shading.model.shade(points, light, shading)

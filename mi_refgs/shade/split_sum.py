@@ -8,19 +8,16 @@ roughness (mi.Float, 0 … 1, α = roughness²); for diffuse="sh" also radiance 
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
-from mi_refgs.shade.accuracy import PLAIN, Accuracy
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
-
-Diffuse = Literal["sh", "irradiance"]
-"""Diffuse radiance as fitted (spherical harmonics), or of the albedo and the light."""
 
 DIELECTRIC_F0 = 0.04
 """Reflectance at normal incidence of a surface that is not metal (index of refraction 1.5)."""
@@ -52,11 +49,11 @@ def dominant_direction(normal: mi.Vector3f, mirror: mi.Vector3f, roughness: mi.F
 
 
 def lookup_direction(
-    normal: mi.Vector3f, view: mi.Vector3f, roughness: mi.Float, accuracy: Accuracy
+    normal: mi.Vector3f, view: mi.Vector3f, roughness: mi.Float, options: ShadingOptions
 ) -> mi.Vector3f:
     """Where the prefiltered light is looked up: mirror direction, or the dominant one. Unit vectors in."""
     mirror = reflect(view, normal)
-    return dominant_direction(normal, mirror, roughness) if accuracy.dominant else mirror
+    return dominant_direction(normal, mirror, roughness) if options.dominant else mirror
 
 
 def multiple_scattering(f0: mi.Color3f, single: mi.Color3f, energy: mi.Float) -> mi.Color3f:
@@ -75,8 +72,7 @@ def multiple_scattering(f0: mi.Color3f, single: mi.Color3f, energy: mi.Float) ->
 def shade(
     points: ShadingPoints,
     light: Light,
-    diffuse: Diffuse = "sh",
-    accuracy: Accuracy = PLAIN,
+    options: ShadingOptions,
 ) -> RadianceTerms:
     """Outgoing radiance towards the camera, by cause.
 
@@ -86,7 +82,7 @@ def shade(
     the points have none). n·v is clamped to [0, 1]: a point seen from behind keeps its mirror direction, with
     the reflectance at grazing incidence.
 
-    `accuracy.dominant` turns r to `dominant_direction`; with `accuracy.multiscatter` and M of
+    `options.dominant` turns r to `dominant_direction`; with `options.multiscatter` and M of
     `multiple_scattering`, specular = V (L(r, roughness) S + irradiance(n) M),
     indirect = (1 - V) L_indirect (S + M), and diffuse has the factor 1 - S - M.
 
@@ -95,15 +91,15 @@ def shade(
     as 1 - S depends on the view and not on the light. A fitted radiance ("sh") is outgoing and is not scaled.
 
     Differentiable in everything but the branches of the clamps. Finite for every finite input.
-    Raises InputError for an unknown `diffuse`, or "sh" without a radiance.
+    Raises InputError for "sh" without a radiance.
     """
     normal, view = safe_normalize(points.normal), safe_normalize(points.view)
     f0 = base_reflectance(points)
     scale, bias = split_sum(dr.dot(normal, view), points.roughness)
     reflectance = dr.fma(f0, scale, bias)
-    direction = lookup_direction(normal, view, points.roughness, accuracy)
+    direction = lookup_direction(normal, view, points.roughness, options)
     specular = light.specular(direction, points.roughness) * reflectance
-    if accuracy.multiscatter:
+    if options.multiscatter:
         further = multiple_scattering(f0, reflectance, scale + bias)
         specular += light.irradiance(normal) * further
         reflectance += further
@@ -113,11 +109,13 @@ def shade(
         specular *= visibility
         if blocking is not None:
             indirect = (1 - visibility) * blocking * reflectance
-    return RadianceTerms(_diffuse(points, normal, light, diffuse, reflectance), specular, indirect)
+    return RadianceTerms(_diffuse(points, normal, light, options, reflectance), specular, indirect)
 
 
-def _diffuse(points: ShadingPoints, normal: Any, light: Light, diffuse: Diffuse, reflectance: Any) -> Any:
-    if diffuse == "irradiance":
+def _diffuse(
+    points: ShadingPoints, normal: Any, light: Light, options: ShadingOptions, reflectance: Any
+) -> Any:
+    if options.diffuse == "irradiance":
         # The table, extrapolated, exceeds 1 by up to 1e-4: no negative light from that.
         left = dr.maximum(1 - reflectance, 0)
         arriving = light.irradiance(normal)
@@ -125,8 +123,6 @@ def _diffuse(points: ShadingPoints, normal: Any, light: Light, diffuse: Diffuse,
         if share is not None:
             arriving *= share
         return left * (1 - points.metallic) * points.albedo * arriving
-    if diffuse != "sh":
-        raise InputError(f'shade: diffuse: "{diffuse}" is unknown; choose "sh" or "irradiance"')
     if points.get("radiance") is None:
         raise InputError('shade: radiance: missing; diffuse="sh" needs it, diffuse="irradiance" does not')
     return (1 - points.metallic) * points.radiance

@@ -11,11 +11,11 @@ import mitsuba as mi
 from mi_refgs.constants import FACING_TOLERANCE
 from mi_refgs.occlusion.surface_materials import Surface, SurfaceSample
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.sh import clamp_positive, eval_sh
-from mi_refgs.shade.split_sum import Diffuse, lookup_direction, shade
+from mi_refgs.shade.split_sum import lookup_direction, shade
 from mi_refgs.surfels.table import Surfels
 
 
@@ -37,7 +37,7 @@ class MeshRadiance:
     Its specular light must arrive along its own mirror direction, which is traced once more: without that, a
     hit deep in a bowl shines as if it lay in the open, and the picture is worse than with no indirect light
     at all (relMSE 4.7 against 1.0, at roughness 0.3; with it 0.2 at 0.4). What blocks it is another hit,
-    shaded likewise, `accuracy.traced_bounces` times in all; what is blocked at the last is dark. (No closing
+    shaded likewise, `options.traced_bounces` times in all; what is blocked at the last is dark. (No closing
     term was better in every concave scene: with 64 rays, 2 bounces and roughness 0.1, relMSE in a bowl is
     0.10 with none, 0.98 with the unblocked light and 3.8 with the irradiance.) The recursion is unrolled:
     every number of bounces is a kernel of its own, and its length grows with them.
@@ -50,28 +50,25 @@ class MeshRadiance:
     occluder: Occluder
     surface: Surface
     light: Light
-    accuracy: Accuracy
-    diffuse: Diffuse
+    options: ShadingOptions
     harmonics: Any  # mi.Float (3 C N): the radiance channel by rows; empty unless diffuse="sh"
     count: int  # C
 
     @staticmethod
-    def of(
-        occluder: Occluder, surfels: Surfels, light: Light, accuracy: Accuracy, diffuse: Diffuse
-    ) -> MeshRadiance:
+    def of(occluder: Occluder, surfels: Surfels, light: Light, options: ShadingOptions) -> MeshRadiance:
         """Take the present values of all arguments, and evaluate them."""
         surfels = surfels.cleaned()  # one that became unusable after `set_materials` may still be looked up
         surface = occluder.surface(surfels)
-        coefficients = surfels.radiance_sh() if diffuse == "sh" else []
+        coefficients = surfels.radiance_sh() if options.diffuse == "sh" else []
         # In rows: the adjoint of a hit's gather is then a table of its own. Columns themselves, whose adjoint
         # writes packets, must not be written to in the same kernel.
         harmonics = dr.ravel(mi.ArrayXf([x for c in coefficients for x in c])) if coefficients else mi.Float()
         dr.eval(surface.rows, harmonics)
-        return MeshRadiance(occluder, surface, light, accuracy, diffuse, harmonics, len(coefficients))
+        return MeshRadiance(occluder, surface, light, options, harmonics, len(coefficients))
 
     def light_from(self, normal: Any, view: Any, roughness: Any) -> Any:
         """Radiance (mi.Color3f) of the light as `shade` looks it up at points of unit normals and views."""
-        return self.light.specular(lookup_direction(normal, view, roughness, self.accuracy), roughness)
+        return self.light.specular(lookup_direction(normal, view, roughness, self.options), roughness)
 
     def trace(self, point: Any, direction: Any, normal: Any, active: Any, bounces: int) -> MeshHit:
         """What rays of `Occluder.visible` hit first, and what their mirror rays hit, `bounces` ≥ 1 times."""
@@ -98,7 +95,7 @@ class MeshRadiance:
             ]
             own = clamp_positive(eval_sh(coefficients, direction) + 0.5)
         ambient = None
-        if self.accuracy.ambient_rays and self.occluder.ambient is not None:
+        if self.options.ambient_rays and self.occluder.ambient is not None:
             ambient = self.occluder.ambient.at(hit.triangle, hit.barycentric, hit.valid)
         indirect = None
         if hit.next is not None:
@@ -114,7 +111,7 @@ class MeshRadiance:
             indirect=indirect,
             ambient=ambient,
         )
-        return shade(points, self.light, self.diffuse, self.accuracy).total()
+        return shade(points, self.light, self.options).total()
 
     def _facing(self, sample: SurfaceSample, direction: Any) -> Any:
         """Unit normal on the ray's side, but for one that only leans away (see `FACING_TOLERANCE`)."""

@@ -172,7 +172,7 @@ class ReconstructionView:
         light = self.light
         with dr.suspend_grad():
             if self._stale and (settled or self._never):
-                update_occluder_caches(self._occluder, self.scene.surfels, light, self.scene.shading.accuracy)
+                update_occluder_caches(self._occluder, self.scene.surfels, light, self.scene.shading)
                 self._stale = False
             surroundings = None if alone else self.scene.surroundings
             scene = SurfelScene(self.scene.surfels, self.scene.shading, light, self._occluder, surroundings)
@@ -181,8 +181,8 @@ class ReconstructionView:
     @property
     def _never(self) -> bool:
         """Whether the mesh lacks what the shading asks for altogether."""
-        accuracy = self.scene.shading.accuracy
-        wanted = bool(accuracy.ambient_rays), bool(accuracy.traced_bounces)
+        shading = self.scene.shading
+        wanted = bool(shading.ambient_rays), bool(shading.traced_bounces)
         there = self._occluder.ambient is not None, self._occluder.vertex_surfels is not None
         return not self._occluder.empty and any(w and not t for w, t in zip(wanted, there, strict=True))
 

@@ -25,8 +25,8 @@ from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.options import QUALITY, TRACED, ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.sh import eval_sh
 from mi_refgs.shade.shading import Shading
@@ -293,7 +293,7 @@ def test_a_moved_scene_is_the_view_of_the_camera_moved_back(placement: dict[str,
     rays: dict[str, Any] = (
         {"ambient_rays": 32, "visibility_rays": 4, "traced_bounces": 1} if diffuse == "irradiance" else {}
     )
-    scene = balls(diffuse=diffuse, accuracy=Accuracy(**rays))
+    scene = balls(diffuse=diffuse, **rays)
     change = Change(**placement)
     moved = apply(scene, np.ones(2 * HALF, bool), change)
     place = change.placement(scene.surfels.to_numpy())
@@ -372,8 +372,8 @@ def test_a_view_that_sees_nothing_has_nothing_painted(scene: TrainedScene) -> No
 def test_cut_removes_a_ball_and_its_shadow_and_mirror_image() -> None:
     """What is left is the picture of the other ball alone, mesh and all."""
     light = EnvironmentLight.from_radiance(sky(16))
-    accuracy = Accuracy(ambient_rays=32, visibility_rays=4, traced_bounces=1)
-    whole = balls(light, diffuse="irradiance", accuracy=accuracy)
+    rays = {"ambient_rays": 32, "visibility_rays": 4, "traced_bounces": 1}
+    whole = balls(light, diffuse="irradiance", **rays)
     left = edit(whole, where=METAL_BALL, keep=True).scene
     cut = edit(whole, where=METAL_BALL, cut=True, invert=True).scene
     assert left.surfels.count == cut.surfels.count == HALF
@@ -436,8 +436,8 @@ def test_a_duplicate_takes_the_changes_and_the_original_stays(scene: TrainedScen
 
 def test_two_halves_joined_are_the_whole() -> None:
     light = EnvironmentLight.from_radiance(sky(16))
-    accuracy = Accuracy(ambient_rays=32, visibility_rays=4, traced_bounces=1)
-    whole = balls(light, diffuse="irradiance", accuracy=accuracy)
+    rays = {"ambient_rays": 32, "visibility_rays": 4, "traced_bounces": 1}
+    whole = balls(light, diffuse="irradiance", **rays)
     first, second = (
         edit(whole, where=METAL_BALL, keep=True, invert=invert).scene for invert in (False, True)
     )
@@ -447,18 +447,19 @@ def test_two_halves_joined_are_the_whole() -> None:
     assert np.abs(picture(joined) - picture(first)).max() > 0.2
 
 
-@pytest.mark.parametrize("option", fields(Accuracy), ids=lambda option: option.name)
+@pytest.mark.parametrize(
+    "option", [f for f in fields(ShadingOptions) if f.name in QUALITY], ids=lambda option: option.name
+)
 def test_shading_options_of_joined_runs_are_those_of_the_first(option: Any) -> None:
     """Whichever of the two traces rays; the options of rays are of the one that traces."""
     model = next(model for model in MODELS.values() if option.name in model.honours)
-    of_rays = option.name in NEED_OCCLUSION
+    of_rays = option.name in TRACED
     other = not option.default if isinstance(option.default, bool) else option.default + 1
     other = option.default - 1 if option.name == "light_levels" else other
 
     def shading(occlusion: bool, value: Any) -> Shading:
         value = option.default if of_rays and not occlusion else value
-        accuracy = Accuracy(**{option.name: value})
-        return Shading(model.orders[0], model.name, "irradiance", occlusion, accuracy)
+        return Shading(model.orders[0], model.name, "irradiance", occlusion, **{option.name: value})
 
     traces = [True, False] if model.visibility != "none" else [False]
     for pair, values in product(product(traces, traces), ((option.default, other), (other, option.default))):
@@ -466,15 +467,14 @@ def test_shading_options_of_joined_runs_are_those_of_the_first(option: Any) -> N
         joined = joined_shading(first, second)
         assert joined.occlusion == any(pair)
         owner = second if of_rays and pair == (False, True) else first
-        assert getattr(joined.accuracy, option.name) == getattr(owner.accuracy, option.name)
+        assert getattr(joined, option.name) == getattr(owner, option.name)
 
 
 def test_a_joined_run_that_traces_keeps_the_options_of_the_first(scene: TrainedScene) -> None:
     first = replace(scene, mesh=None, shading=replace(scene.shading, occlusion=False))
     assert scene.shading.occlusion
-    accuracy = Accuracy(multiscatter=True, light_levels=4)
-    joined, _ = join(replace(first, shading=replace(first.shading, accuracy=accuracy)), scene)
-    assert joined.shading == replace(scene.shading, accuracy=accuracy)
+    joined, _ = join(replace(first, shading=replace(first.shading, multiscatter=True, light_levels=4)), scene)
+    assert joined.shading == replace(scene.shading, multiscatter=True, light_levels=4)
 
 
 def test_harmonics_that_one_run_lacks_change_neither(scene: TrainedScene) -> None:

@@ -351,7 +351,7 @@ def test_albedo_comes_out_of_the_fitted_radiance(data: Path, with_mesh: bool) ->
     found = relightable(scene)
     assert set(found.surfels.raw) == set(raw) - {"radiance_sh"}
     assert found.shading.diffuse == "irradiance" and found.light is light
-    assert (found.shading.accuracy.ambient_rays > 0) == with_mesh
+    assert (found.shading.ambient_rays > 0) == with_mesh
     albedo = np.array(found.surfels.albedo()).T
     far = np.abs(np.array(surfels.position()).T[:, 0]) > 0.45  # from the other ball, which shades and shines
     np.testing.assert_allclose(albedo[clay & far], truth[clay & far], atol=0.04)

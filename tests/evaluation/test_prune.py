@@ -21,7 +21,6 @@ from mi_refgs.evaluation.prune import contributions, prune
 from mi_refgs.io.ownership import RECORD
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.trained_scene import Pruned, TrainedScene
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import splat
@@ -132,11 +131,11 @@ def test_tracing_stays_where_it_shows(met: bool, train: Dataset, rng: np.random.
     """Mirror rays from the floor meet the ceiling; a mesh that no ray meets goes, with what is seen of it."""
     raw = needed(train, rng)
     raw["indirect_sh"][:, :3] = 5.0
-    shading = replace(MIRROR, accuracy=Accuracy(visibility_rays=2))
+    shading = replace(MIRROR, visibility_rays=2)
     mesh = walls(-1, 2) if met else walls(1000.0, size=0.1)
     pruned, _ = prune(replace(scene(Surfels.from_numpy(raw), shading), mesh=mesh), train)
     assert (pruned.mesh is not None) == pruned.shading.occlusion == met
-    assert pruned.shading.accuracy == (shading.accuracy if met else Accuracy())
+    assert pruned.shading == (shading if met else replace(shading, occlusion=False, visibility_rays=1))
     assert pruned.surfels.has("indirect_sh") == met and not pruned.surfels.has("radiance_sh")
     assert pruned.light is not None and pruned.surfels.has("metallic")
 

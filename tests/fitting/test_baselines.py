@@ -16,10 +16,10 @@ from mi_refgs.reference import baselines
 from mi_refgs.reference import shade as reference
 from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.shade import brdf
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import ConstantLight, RotatedLight
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import MODELS, TraceContext
 from mi_refgs.shade.shading import Shading, shade
@@ -34,10 +34,8 @@ MAP = np.random.default_rng(3).uniform(0.1, 3, (16, 32, 3))
 CASES = {
     "mirror": Shading("pixel", "mirror"),
     "gaussian_shader": Shading("surfel", "gaussian_shader"),
-    "monte_carlo": Shading("surfel", "monte_carlo", accuracy=Accuracy(directions=DIRECTIONS)),
-    "monte_carlo, occluded": Shading(
-        "surfel", "monte_carlo", occlusion=True, accuracy=Accuracy(directions=DIRECTIONS)
-    ),
+    "monte_carlo": Shading("surfel", "monte_carlo", directions=DIRECTIONS),
+    "monte_carlo, occluded": Shading("surfel", "monte_carlo", occlusion=True, directions=DIRECTIONS),
 }
 
 
@@ -271,7 +269,7 @@ def test_every_channel_of_a_picture_gets_its_gradient(name: str) -> None:
     model, light = MODELS[name], EnvironmentLight.from_radiance(MAP)
     dr.enable_grad(light.raw)
     extra = ("indirect_sh",) if name == "monte_carlo" else ()
-    surfels = table(*model.channels("sh"), *extra)
+    surfels = table(*model.channels(ShadingOptions()), *extra)
     surfels.enable_grad()
     pose = np.eye(4)
     pose[2, 3] = -4
@@ -285,9 +283,9 @@ def test_every_channel_of_a_picture_gets_its_gradient(name: str) -> None:
     for channel, tensor in (surfels.raw | {"light": light.raw}).items():
         gradient = dr.grad(tensor).numpy()
         assert np.isfinite(gradient).all() and gradient.any(), channel
-    for missing in model.channels("sh"):
+    for missing in model.channels(ShadingOptions()):
         with pytest.raises(InputError, match=missing):
-            shading.check([other for other in surfels.raw if other != missing])
+            shading.require_inputs([other for other in surfels.raw if other != missing])
 
 
 def test_the_hemisphere_is_blocked_where_a_mesh_stands() -> None:
@@ -314,8 +312,8 @@ def test_what_the_models_refuse() -> None:
     with pytest.raises(InputError, match="'lambert' is unknown; use split_sum or"):
         Shading(reflectance="lambert")
     with pytest.raises(InputError, match="directions: needs reflectance = monte_carlo"):
-        Shading(accuracy=Accuracy(directions=8))
-    with pytest.raises(InputError, match="no number of directions"):
-        Accuracy(directions=65)
+        Shading(directions=8)
+    with pytest.raises(InputError, match="directions: 65 is not allowed; use a whole number 1 … 64"):
+        ShadingOptions(directions=65)
     with pytest.raises(InputError, match="occlusion"):
         Shading("surfel", "gaussian_shader", occlusion=True)

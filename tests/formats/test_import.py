@@ -24,7 +24,7 @@ from mi_refgs.reference.pinhole import PinholeCamera
 from mi_refgs.render.display import displayed
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.points import ShadingPoints
-from mi_refgs.shade.shading import Shading
+from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera
 
 SIZE, FOCAL, COUNT = 48, 60.0, 40
@@ -219,7 +219,7 @@ def test_the_model_is_the_inverse_of_the_encoding() -> None:
     dr.enable_grad(plane)
     points = ShadingPoints(mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1), radiance=mi.Color3f(plane))
     shading = Shading("pixel", "displayed")
-    out = shading.model.shade(points, None, shading).total()
+    out = shade(points, None, shading).total()
     np.testing.assert_allclose(np.array(dr.detach(out.x)), formula, rtol=1e-5, atol=1e-7)
     dr.forward(plane)
     slope = np.where(encoded <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((encoded + 0.055) / 1.055) ** 1.4)

@@ -160,6 +160,8 @@ def test_methods_that_make_no_sense(text: str, tmp_path: Path) -> None:
         {"shading": {"accuracy": 3}},
         {"shading": {"accuracy": {"traced_bounces": 10**9}}},
         {"shading": {"accuracy": {"no": 1}}},
+        {"shading": {"traced_bounces": 10**9}},
+        {"shading": {"no": 1}},
         {"shading": [1]},
     ],
 )

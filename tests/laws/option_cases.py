@@ -6,13 +6,11 @@ another option is one more entry below.
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 from mi_refgs.methods.read import load, names
-from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
+from mi_refgs.shade.options import DIFFUSE, QUALITY, TRACED, ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
-from mi_refgs.shade.shading import DIFFUSE
 from mi_refgs.surfels.primitives import PRIMITIVES
 from tests.laws.covering import Case, Rule
 
@@ -43,14 +41,14 @@ def shadings() -> list[str]:
 
     Diffuse terms count as one where the model's channels do not differ.
     """
-    stages = [stage for method in names() for stage in load(method).stage.values()]
+    stages = [stage.shading for method in names() for stage in load(method).stage.values()]
     found = [(stage.reflectance, stage.at, stage.diffuse) for stage in stages]
     used = {reflectance for reflectance, _, _ in found}
     found += [(name, model.orders[0], DIFFUSE[0]) for name, model in MODELS.items() if name not in used]
     every: dict[str, None] = {}
     for name, at, diffuse in found:
         model = MODELS[name]
-        split = model.channels(DIFFUSE[0]) != model.channels(DIFFUSE[1])
+        split = len({model.channels(ShadingOptions(diffuse=d)) for d in DIFFUSE}) > 1
         order = "surfel" if model.order_independent else at
         every[f"{name}/{order}/{diffuse if split else DIFFUSE[0]}"] = None
     return [*every]
@@ -157,5 +155,5 @@ def spec(case: Case) -> str:
 def unlisted_accuracy() -> set[str]:
     """Options of accuracy that no dimension has."""
     traced = {name for options in OCCLUSION.values() for name in options}
-    assert traced == {*NEED_OCCLUSION}
-    return {option.name for option in fields(Accuracy)} - traced - {*ACCURACY}
+    assert traced == {*TRACED}
+    return {*QUALITY} - traced - {*ACCURACY}

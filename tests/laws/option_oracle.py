@@ -115,15 +115,14 @@ class Oracle:
             ),
         )
         chosen = shading(case)
-        accuracy = chosen.accuracy
         options = Options(
-            dominant=accuracy.dominant, multiscatter=accuracy.multiscatter, directions=accuracy.directions
+            dominant=chosen.dominant, multiscatter=chosen.multiscatter, directions=chosen.directions
         )
         if chosen.reflectance == "monte_carlo":
             normal = self._keep("normal", lambda: _facing(own, camera))
             options = replace(options, detached_normal=normal)
             if chosen.occlusion:
-                free = self._keep("free", lambda: _free(own["position"], normal, accuracy.directions))
+                free = self._keep("free", lambda: _free(own["position"], normal, chosen.directions))
                 options = replace(options, free=free)
         scene = picture.Scene(
             own, camera, self.pixels, order, chosen.at, chosen.reflectance, chosen.diffuse,
@@ -134,7 +133,7 @@ class Oracle:
                 scene, visibility=lambda n, r: self._keep("visible", lambda: _visible(camera, n, r))
             )
         background = values.get("background", np.full((8, 16, 3), -np.inf))
-        if accuracy.antialias and "variance" not in self._kept:
+        if chosen.antialias and "variance" not in self._kept:
             maps, _ = surroundings.render(surroundings.OpenScene(scene, around, background))
             shape = camera.height, camera.width
             normal, share = maps["object_normal"].reshape(*shape, 3), maps["object_alpha"].reshape(shape)
@@ -161,7 +160,7 @@ class Oracle:
             light = chosen.light_of(EnvironmentLight.from_radiance(map_of(case, values)))
             light = RotatedLight(light, mi.Matrix3f(rotation(case).T.astype(np.float32)))
         occluder = Occluder(mesh())
-        update_occluder_caches(occluder, surfels, light, chosen.accuracy)
+        update_occluder_caches(occluder, surfels, light, chosen)
         view = Camera.from_pose(
             camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.to_world, NEAR
         )

@@ -21,7 +21,6 @@ from mi_refgs.render.scene_xml import put
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import export
 from mi_refgs.runs.trained_scene import SCENE, TrainedScene
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import resample
 from mi_refgs.shade.shading import Shading
@@ -134,7 +133,7 @@ def accuracy(case: Case) -> dict[str, Any]:
 def shading(case: Case) -> Shading:
     name, at, diffuse = case["shading"].split("/")
     occluded = case["occlusion"] != "none"
-    return Shading(at, name, diffuse, occluded, Accuracy(**accuracy(case)))
+    return Shading(at, name, diffuse, occluded, **accuracy(case))
 
 
 def sensor(case: Case) -> dict[str, Any]:

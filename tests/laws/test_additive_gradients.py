@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import channel
@@ -40,12 +41,12 @@ AROUND = "surroundings_"
 # ---------------- what is rendered ----------------
 
 
-def every_channel(model: str, diffuse: str, gaussians: bool) -> dict[str, np.ndarray]:
+def every_channel(model: str, diffuse: Any, gaussians: bool) -> dict[str, np.ndarray]:
     """The geometry, and what a reflectance model needs."""
     raw, rng = raw_channels(COUNT), np.random.default_rng(5)
     if gaussians:
         raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1]], axis=1)
-    wanted = MODELS[model].channels(diffuse)
+    wanted = MODELS[model].channels(ShadingOptions(diffuse=diffuse))
     for name in wanted:
         raw.setdefault(name, rng.normal(size=(COUNT, channel(name).widths[0])).astype(np.float32))
     kept = {"position", "rotation", "scale", "opacity", *wanted}

@@ -31,8 +31,8 @@ from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import save
 from mi_refgs.runs.trained_scene import SCENE, TrainedScene
-from mi_refgs.shade.accuracy import NEED_OCCLUSION, Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.options import TRACED
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
@@ -72,17 +72,16 @@ def shadings() -> list[tuple[Shading, str]]:
     for name in read.names():
         method = read.load(name, "quick")
         for (_, stage), meshed in itertools.product(method.stages(), {False, method.mesh is not None}):
-            found[Shading.of(stage, meshed), method.surfels.primitive] = None
+            shading = Shading.resolve(stage.shading, meshed)
+            found[replace(shading, at=shading.order), method.surfels.primitive] = None
     for name, model in MODELS.items():
         for order in model.orders:
-            found[Shading(order, name), "surfel"] = None
-        plain = Shading(model.orders[0], name, diffuse="irradiance")
+            found[Shading(Shading(order, name).order, name), "surfel"] = None
+        plain = Shading(Shading(model.orders[0], name).order, name, diffuse="irradiance")
         traced = replace(plain, occlusion=plain.traceable)
-        options = {
-            key: OTHER_OPTIONS[key] for key in model.honours if traced.occlusion or key not in NEED_OCCLUSION
-        }
+        options = {key: OTHER_OPTIONS[key] for key in model.honours if traced.occlusion or key not in TRACED}
         if options:
-            found[replace(traced, accuracy=Accuracy(**options)), "surfel"] = None
+            found[replace(traced, **options), "surfel"] = None
     return [*found]
 
 
@@ -392,7 +391,7 @@ def cases() -> Iterator[Any]:
     crossed = [(*SHADINGS[i % len(SHADINGS)], ROWS[i % len(ROWS)]) for i in range(count)]
     alone = {"samples": 4, "crop": True, "around": "nothing", "meshed": False, "state": through_a_ply}
     for index, (shading, primitive, row) in enumerate([*crossed, *((*one, alone) for one in LOSSLESS)]):
-        options = "-".join(shading.accuracy.chosen())
+        options = "-".join(shading.chosen())
         rays = "traced" if shading.occlusion else "open"
         state = row["state"].__name__
         name = f"{primitive}-{shading.at}-{shading.reflectance}-{shading.diffuse}-{rays}-{options}-{state}"

@@ -40,7 +40,7 @@ def test_settings_are_those_of_the_scene(name: str) -> None:
     first, second = (stage for _, stage in method.stages())
     share = 3 / 20 if real else 18 / 50
     assert first.until == pytest.approx(share * method.iterations) and second.until == method.iterations
-    assert first.reflectance == ("radiance" if real else "split_sum")
+    assert first.shading.reflectance == ("radiance" if real else "split_sum")
     assert bool(second.restart) != real
 
 

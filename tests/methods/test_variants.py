@@ -164,9 +164,9 @@ def test_what_defines_a_method() -> None:
     assert every_metal is not None and every_metal.roughness is None and full.refine.propagate is None
     paper = methods.load("ref_gaussian_paper").refine.propagate
     assert paper is not None and (paper.metallic, paper.roughness) == (0.02, 0.1)
-    assert [stage.at for _, stage in methods.load("no_deferred").stages()] == ["surfel"] * 2
-    assert [stage.at for _, stage in methods.load("no_initial_stage").stages()] == ["pixel"]
-    assert {stage.reflectance for _, stage in methods.load("no_pbr").stages()} == {"mirror"}
+    assert [stage.shading.at for _, stage in methods.load("no_deferred").stages()] == ["surfel"] * 2
+    assert [stage.shading.at for _, stage in methods.load("no_initial_stage").stages()] == ["pixel"]
+    assert {stage.shading.reflectance for _, stage in methods.load("no_pbr").stages()} == {"mirror"}
     assert methods.load("no_interreflection").mesh is None and full.mesh is not None
 
 

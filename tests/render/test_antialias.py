@@ -15,7 +15,6 @@ from mi_refgs.reference.camera import look_at
 from mi_refgs.render.antialias import widened
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
@@ -120,7 +119,7 @@ def test_one_sample_comes_closer_to_many() -> None:
     """A ball that reflects stripes: less error than with pixel centres, and hardly any with many samples."""
     surfels, light = mirror_ball()
     plain = TrainedScene(surfels, light, None, Shading(), 1, 0.0)
-    filtered = replace(plain, shading=Shading(accuracy=Accuracy(antialias=True)))
+    filtered = replace(plain, shading=Shading(antialias=True))
     truth = radiance(plain, 144)
     errors = [np.sqrt(np.mean((radiance(made, 1) - truth) ** 2)) for made in (plain, filtered)]
     assert errors[1] < 0.6 * errors[0]
@@ -130,4 +129,4 @@ def test_one_sample_comes_closer_to_many() -> None:
 
 
 def test_it_needs_pixels() -> None:
-    refused(lambda: Shading("surfel", accuracy=Accuracy(antialias=True)), "antialias: needs shade_at = pixel")
+    refused(lambda: Shading("surfel", antialias=True), "antialias: needs shade_at = pixel")

@@ -18,7 +18,6 @@ from mi_refgs.plugins import film
 from mi_refgs.render import passes
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
@@ -44,9 +43,9 @@ SHADINGS = {
     "pixel": Shading(),
     "surfel": Shading(at="surfel"),
     "mirror rays": Shading(occlusion=True),
-    "lobe rays": Shading(occlusion=True, accuracy=Accuracy(visibility_rays=4)),
-    "antialias": Shading(accuracy=Accuracy(antialias=True)),
-    "irradiance": Shading(diffuse="irradiance", occlusion=True, accuracy=Accuracy(ambient_rays=8)),
+    "lobe rays": Shading(occlusion=True, visibility_rays=4),
+    "antialias": Shading(antialias=True),
+    "irradiance": Shading(diffuse="irradiance", occlusion=True, ambient_rays=8),
     "monte_carlo": Shading(at="surfel", reflectance="monte_carlo", occlusion=True),
 }
 

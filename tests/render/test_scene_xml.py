@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,8 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.runs.export import export
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.options import QUALITY, ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.visibility import mirror_visibility
@@ -40,12 +40,13 @@ from tests.scenes.integrator import (
 def shading_with(option: str) -> Shading:
     """A shading whose model honours the option, with OTHER_OPTIONS's value."""
     name = next(name for name, model in MODELS.items() if option in model.honours)
-    accuracy = Accuracy(**{option: OTHER_OPTIONS[option]})
-    return Shading(MODELS[name].orders[0], name, diffuse="irradiance", occlusion=True, accuracy=accuracy)
+    return Shading(
+        MODELS[name].orders[0], name, diffuse="irradiance", occlusion=True, **{option: OTHER_OPTIONS[option]}
+    )
 
 
 def fitted(folder: Path, shading: Shading) -> TrainedScene:
-    made = hollow_mesh if shading.accuracy.ambient_rays else plane_mesh
+    made = hollow_mesh if shading.ambient_rays else plane_mesh
     mesh = read_mesh(made(folder)) if shading.occlusion else None
     surfels = Surfels.from_numpy(raw_channels())
     return TrainedScene(surfels, EnvironmentLight.from_radiance(sky()), mesh, shading, 7, 1.5)
@@ -66,7 +67,7 @@ def shown(folder: Path, made: TrainedScene, camera: Camera) -> tuple[mi.Scene, n
     return scene, image(scene), expected.reshape(camera.height, camera.width, 4)
 
 
-@pytest.mark.parametrize("option", [field.name for field in fields(Accuracy)])
+@pytest.mark.parametrize("option", QUALITY)
 def test_every_option_of_accuracy_goes_round(option: str, tmp_path: Path) -> None:
     """Through scene.xml and through model.json; and the pictures are the same."""
     shading = shading_with(option)
@@ -74,7 +75,10 @@ def test_every_option_of_accuracy_goes_round(option: str, tmp_path: Path) -> Non
     scene, seen, expected = shown(tmp_path / "run", made, view())
     assert scene.integrator().shading == shading and TrainedScene.read(tmp_path / "run").shading == shading
     np.testing.assert_allclose(seen, expected, atol=1e-5)
-    plain = replace(made, shading=replace(shading, accuracy=Accuracy())).renderer()(view())
+    plain = replace(
+        made,
+        shading=replace(shading, **{option: getattr(ShadingOptions, option)}),
+    ).renderer()(view())
     assert np.abs(plain.radiance.numpy().T.reshape(HEIGHT, WIDTH, 3) - seen[..., :3]).max() > 1e-3
 
 
@@ -135,8 +139,7 @@ def test_rays_start_at_covered_pixels_only(
     options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """First hits for what is seen, mirror rays for what they hit: counted at the scene that traces them."""
-    accuracy = Accuracy(**options)
-    made = fitted(tmp_path, Shading(diffuse="irradiance", occlusion=True, accuracy=accuracy))
+    made = fitted(tmp_path, Shading(diffuse="irradiance", occlusion=True, **options))
     hits: list[int] = []
     trace = Occluder.first_hit
 

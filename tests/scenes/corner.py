@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -10,8 +11,8 @@ import numpy as np
 
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import PrefilteredLight
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.reflection import reflection
@@ -104,7 +105,7 @@ def with_materials(mesh: Mesh, surfels: Surfels) -> Occluder:
 def seen(
     points: ShadingPoints,
     place: np.ndarray,
-    accuracy: Accuracy,
+    options: ShadingOptions,
     surfels: Surfels | None = None,
     light: PrefilteredLight | None = None,
     diffuse: Any = "irradiance",
@@ -116,7 +117,7 @@ def seen(
         occluder = Occluder(corner()) if surfels is None else with_materials(corner(), surfels)
     table: Any = surfels
     context = TraceContext(occluder, table, light, mi.Point3f(eye), vector(place - eye))
-    return reflection(points, context, diffuse, accuracy)
+    return reflection(points, context, replace(options, diffuse=diffuse))
 
 
 def wall_blocks(place: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import drjit as dr
@@ -15,16 +15,18 @@ from mi_refgs.errors import InputError
 from mi_refgs.reference import lobe as exact
 from mi_refgs.reference import shade as reference
 from mi_refgs.shade import brdf
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.options import TRACED, ShadingOptions
 from mi_refgs.shade.points import reflect
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.split_sum import multiple_scattering, shade
 from tests.helpers import check_slopes, level_maps, unit, vector
 from tests.scenes.shading_points import N, points_of, shading_values
 
-OPTIONS = (Accuracy(dominant=True), Accuracy(multiscatter=True), Accuracy(dominant=True, multiscatter=True))
+DOMINANT = ShadingOptions(diffuse="irradiance", dominant=True)
+MULTISCATTER = ShadingOptions(diffuse="irradiance", multiscatter=True)
+OPTIONS = (DOMINANT, MULTISCATTER, replace(DOMINANT, multiscatter=True))
 CASES = [(options, "irradiance", "open") for options in OPTIONS] + [(OPTIONS[2], "sh", "indirect")]
 
 
@@ -34,7 +36,7 @@ def radiance() -> np.ndarray:
 
 
 def exact_terms(
-    values: dict[str, Any], levels: list[np.ndarray], diffuse: str, options: Accuracy, k: int
+    values: dict[str, Any], levels: list[np.ndarray], diffuse: str, options: ShadingOptions, k: int
 ) -> np.ndarray:
     one: dict[str, Any] = {name: None if x is None else x[k] for name, x in values.items()}
     return reference.shade(
@@ -52,20 +54,21 @@ def exact_terms(
 
 
 def test_everything_is_off_by_default(radiance: np.ndarray, rng: np.random.Generator) -> None:
-    """Same bits as without the argument; each option changes the picture."""
-    assert Shading().accuracy == Accuracy() == Accuracy(False, False, 1, 0)
+    assert not Shading().chosen()
     points = points_of(shading_values(rng, "open"))
     light = EnvironmentLight.from_radiance(radiance).prefilter()
-    plain, same = shade(points, light), shade(points, light, "sh", Accuracy())
-    np.testing.assert_array_equal(plain.total().numpy(), same.total().numpy())
+    plain = shade(points, light, ShadingOptions())
     for options in OPTIONS:
-        changed = shade(points, light, "sh", options).specular.numpy()
+        changed = shade(points, light, replace(options, diffuse="sh")).specular.numpy()
         assert np.abs(changed - plain.specular.numpy()).max() > 0.01
 
 
 def test_shading_survives_json() -> None:
-    shading = Shading(occlusion=True, accuracy=Accuracy(True, False, 8, 3))
-    assert Shading(**json.loads(json.dumps(asdict(shading)))) == shading
+    shading = Shading(occlusion=True, dominant=True, visibility_rays=8, traced_bounces=3)
+    note = json.loads(json.dumps(asdict(shading)))
+    assert Shading.from_json(note) == shading
+    accuracy = {name: note.pop(name) for name in ("dominant", "multiscatter", *TRACED)}
+    assert Shading.from_json(note | {"accuracy": accuracy}) == shading  # as version 0.1 wrote it
 
 
 @pytest.mark.parametrize(
@@ -83,7 +86,7 @@ def test_shading_survives_json() -> None:
 )
 def test_bad_settings_are_refused(bad: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=next(iter(bad))):
-        Accuracy(**bad)
+        ShadingOptions(**bad)
 
 
 # ---------------- terms and derivatives ----------------
@@ -91,11 +94,11 @@ def test_bad_settings_are_refused(bad: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(("options", "diffuse", "occlusion"), CASES)
 def test_terms_against_the_oracle(
-    options: Accuracy, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
+    options: ShadingOptions, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     levels, values = level_maps(light), shading_values(rng, occlusion)
-    terms = shade(points_of(values), light, diffuse, options)
+    terms = shade(points_of(values), light, replace(options, diffuse=diffuse))
     expected = np.array([exact_terms(values, levels, diffuse, options, k) for k in range(N)])
     for n, term in enumerate(vars(terms.filled()).values()):
         got = np.broadcast_to(term.numpy().T, (N, 3))
@@ -104,7 +107,7 @@ def test_terms_against_the_oracle(
 
 @pytest.mark.parametrize(("options", "diffuse", "occlusion"), CASES[2:])
 def test_derivatives_of_the_points(
-    options: Accuracy, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
+    options: ShadingOptions, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
     """Every input of every point against one-sided differences of the oracle, with random weights; where the
     two sides disagree, a kink of the lookup is near."""
@@ -113,7 +116,7 @@ def test_derivatives_of_the_points(
     points, weight = points_of(values), rng.normal(size=(N, 3, 3))
     used = {name: getattr(points, name) for name, x in values.items() if x is not None}
     dr.enable_grad(list(used.values()))
-    terms = shade(points, light, diffuse, options)
+    terms = shade(points, light, replace(options, diffuse=diffuse))
     loss = sum(
         dr.dot(mi.Vector3f(term), vector(weight[:, n]))
         for n, term in enumerate(vars(terms.filled()).values())
@@ -133,19 +136,21 @@ def test_derivatives_of_the_points(
 
 
 @pytest.mark.parametrize("options", OPTIONS)
-def test_derivative_of_the_light(options: Accuracy, radiance: np.ndarray, rng: np.random.Generator) -> None:
+def test_derivative_of_the_light(
+    options: ShadingOptions, radiance: np.ndarray, rng: np.random.Generator
+) -> None:
     """Outgoing radiance is linear in radiance: any step will do."""
     points = points_of(shading_values(rng, "visibility"))
     weight = vector(rng.normal(size=(N, 3)))
     raw = EnvironmentLight.from_radiance(radiance).raw
     dr.enable_grad(raw)
-    lit = shade(points, EnvironmentLight(raw).prefilter(), "irradiance", options)
+    lit = shade(points, EnvironmentLight(raw).prefilter(), options)
     dr.backward(dr.dot(mi.Vector3f(lit.total()), weight))
     gradient = dr.grad(raw).numpy() / -np.expm1(-radiance)
 
     def loss(map_: np.ndarray) -> float:
         light = EnvironmentLight.from_radiance(map_).prefilter()
-        total = shade(points, light, "irradiance", options).total()
+        total = shade(points, light, options).total()
         return float((total.numpy().astype(np.float64) * weight.numpy()).sum())
 
     for _ in range(3):
@@ -155,7 +160,7 @@ def test_derivative_of_the_light(options: Accuracy, radiance: np.ndarray, rng: n
 
 
 @pytest.mark.parametrize("options", OPTIONS)
-def test_degenerate_points_stay_finite(options: Accuracy, radiance: np.ndarray) -> None:
+def test_degenerate_points_stay_finite(options: ShadingOptions, radiance: np.ndarray) -> None:
     """Zero normals and views, from behind, roughness 0 and 1 (and beyond), colours beyond 1: finite values
     and gradients."""
     normals = [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 0, -1], [0, 1, 0], [1e-25, 0, 0], [1e15, 0, 1e15]]
@@ -178,7 +183,7 @@ def test_degenerate_points_stay_finite(options: Accuracy, radiance: np.ndarray) 
         getattr(points, name) for name in ("normal", "view", "albedo", "metallic", "roughness", "indirect")
     ]
     dr.enable_grad(raw, *inputs)
-    total = shade(points, EnvironmentLight(raw).prefilter(), "irradiance", options).total()
+    total = shade(points, EnvironmentLight(raw).prefilter(), options).total()
     dr.backward(total)
     for array in (total, dr.grad(raw).array, *map(dr.grad, inputs)):
         assert dr.all(dr.isfinite(array), axis=None)
@@ -186,9 +191,7 @@ def test_degenerate_points_stay_finite(options: Accuracy, radiance: np.ndarray) 
     leaf = mi.Float(r.astype(np.float32))
     dr.enable_grad(leaf)
     dr.set_grad(leaf, 1)
-    total = shade(
-        points.replaced(roughness=leaf), EnvironmentLight(raw).prefilter(), "irradiance", options
-    ).total()
+    total = shade(points.replaced(roughness=leaf), EnvironmentLight(raw).prefilter(), options).total()
     assert dr.all(dr.isfinite(dr.forward_to(total)), axis=None)
 
 
@@ -196,7 +199,7 @@ def test_degenerate_points_stay_finite(options: Accuracy, radiance: np.ndarray) 
 
 
 def lit_by(
-    map_: np.ndarray, cosines: list[float], roughness: float, options: Accuracy, f0: float
+    map_: np.ndarray, cosines: list[float], roughness: float, options: ShadingOptions, f0: float
 ) -> np.ndarray:
     """Specular radiance (C,) of a metal under a map, by `shade`; its normal is +x."""
     view = np.array([[c, np.sqrt(1 - c * c), 0] for c in cosines])
@@ -210,7 +213,7 @@ def lit_by(
         "indirect": None,
     }
     light = EnvironmentLight.from_radiance(map_).prefilter()
-    return shade(points_of(values), light, "irradiance", options).specular.numpy()[0].astype(np.float64)
+    return shade(points_of(values), light, options).specular.numpy()[0].astype(np.float64)
 
 
 @pytest.mark.parametrize("roughness", [0.3, 0.5, 0.7, 0.9])
@@ -233,7 +236,7 @@ def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -
     ]
     mirror, dominant = (
         np.linalg.norm(lit_by(map_, cosines, roughness, options, 0.8) - truth)
-        for options in (Accuracy(), OPTIONS[0])
+        for options in (ShadingOptions(diffuse="irradiance"), OPTIONS[0])
     )
     print(f"roughness {roughness}: mirror {mirror:.4f}, dominant {dominant:.4f}")
     assert dominant < (0.8 if roughness < 0.6 else 0.5) * mirror
@@ -244,8 +247,8 @@ def test_a_white_metal_loses_nothing(rng: np.random.Generator) -> None:
     values = shading_values(rng, "open")
     values["albedo"], values["metallic"] = np.ones((N, 3)), np.ones(N)
     light = EnvironmentLight.constant(1.0, 16).prefilter()
-    total = shade(points_of(values), light, "irradiance", OPTIONS[1]).total().numpy()
-    assert shade(points_of(values), light, "irradiance").total().numpy().min() < 0.5
+    total = shade(points_of(values), light, MULTISCATTER).total().numpy()
+    assert shade(points_of(values), light, ShadingOptions(diffuse="irradiance")).total().numpy().min() < 0.5
     np.testing.assert_allclose(total, 1, atol=2e-4)
 
 
@@ -293,8 +296,8 @@ def test_a_point_seen_from_behind_keeps_its_mirror_direction(radiance: np.ndarra
     values["normal"] = unit(rng.normal(size=(N, 3)))
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     points = points_of(values)
-    mirrored = shade(points.replaced(), light).specular.numpy()
+    mirrored = shade(points, light, ShadingOptions()).specular.numpy()
     np.testing.assert_allclose(
-        shade(points, light, "sh", OPTIONS[0]).specular.numpy(), mirrored, rtol=2e-4, atol=2e-4
+        shade(points, light, ShadingOptions(dominant=True)).specular.numpy(), mirrored, rtol=2e-4, atol=2e-4
     )
     assert dr.all(dr.isfinite(reflect(points.view, points.normal)), axis=None)

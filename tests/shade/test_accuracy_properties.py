@@ -1,4 +1,4 @@
-"""The options of accuracy as properties of the `refgs` plugin."""
+"""Shading options as properties of the `refgs` plugin."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.shade.accuracy import Accuracy
 from tests.scenes.integrator import check_derivatives, image, integrator, plane_mesh, raw_channels, scene
 
 
@@ -22,8 +21,8 @@ def test_properties_of_the_plugin(tmp_path: Path) -> None:
         "traced_bounces": 2,
     }
     of = scene(mesh=mesh, **options)
-    assert of.integrator().shading.accuracy == Accuracy(True, True, 4, 2)
-    assert scene(mesh=mesh).integrator().shading.accuracy == Accuracy()
+    assert {name: getattr(of.integrator().shading, name) for name in options} == options
+    assert not scene(mesh=mesh).integrator().shading.chosen()
     plain = image(scene(mesh=mesh, terms="specular,indirect"))
     for name, value in options.items():
         assert (

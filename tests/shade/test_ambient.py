@@ -18,10 +18,10 @@ from mi_refgs.reference import shade as reference
 from mi_refgs.reference.ambient import ambient as exact
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade import ambient, brdf
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ggx_sampling import lobe_turn
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
@@ -56,7 +56,7 @@ def test_ratios_against_rays_one_by_one() -> None:
     mesh, surfels = parted_corner(), wall_surfels(metallic=LOGIT["metallic"], roughness=LOGIT["roughness"])
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
     occluder = Occluder(mesh)
-    ambient.update_occluder_caches(occluder, surfels, light, Accuracy(ambient_rays=RAYS))
+    ambient.update_occluder_caches(occluder, surfels, light, ShadingOptions(ambient_rays=RAYS))
     assert occluder.ambient is not None
     found = occluder.ambient.numpy()
 
@@ -107,7 +107,7 @@ def test_a_white_furnace_stays_white() -> None:
     mesh, surfels = parted_corner(), wall_surfels(albedo=np.full((400, 3), 9.0), metallic=-9.0, roughness=3.0)
     occluder = Occluder(mesh)
     ambient.update_occluder_caches(
-        occluder, surfels, EnvironmentLight.constant(1.0, 8).prefilter(), Accuracy(ambient_rays=9)
+        occluder, surfels, EnvironmentLight.constant(1.0, 8).prefilter(), ShadingOptions(ambient_rays=9)
     )
     assert occluder.ambient is not None
     np.testing.assert_allclose(occluder.ambient.numpy(), 1, atol=1e-3)
@@ -143,7 +143,7 @@ def test_what_is_convex_gets_all_light() -> None:
     raw["rotation"] = np.stack([-y, x, 0 * x, 1 + z], 1)  # without noise
     occluder, surfels = Occluder(ball()), Surfels.from_numpy(raw)
     ambient.update_occluder_caches(
-        occluder, surfels, EnvironmentLight.from_radiance(sky()).prefilter(), Accuracy(ambient_rays=9)
+        occluder, surfels, EnvironmentLight.from_radiance(sky()).prefilter(), ShadingOptions(ambient_rays=9)
     )
     assert occluder.ambient is not None
     np.testing.assert_allclose(occluder.ambient.numpy(), 1, atol=1e-6)
@@ -179,7 +179,7 @@ def test_the_diffuse_term_is_multiplied_and_nothing_else(tmp_path: Path) -> None
     camera = Camera.from_pose(WIDTH, HEIGHT, -18, -18, WIDTH / 2, HEIGHT / 2, pose)
 
     def terms(rays: int) -> Any:
-        shading = Shading(diffuse="irradiance", occlusion=True, accuracy=Accuracy(ambient_rays=rays))
+        shading = Shading(diffuse="irradiance", occlusion=True, ambient_rays=rays)
         return render(SurfelScene(surfels, shading, light, occluder), camera).terms
 
     plain = terms(0)

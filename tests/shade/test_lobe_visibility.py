@@ -14,8 +14,8 @@ from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import lobe as exact
 from mi_refgs.shade import brdf
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ggx_sampling import Lobe, lobe_point, lobe_turn
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.reflection import reflection
@@ -127,7 +127,7 @@ def test_many_rays_converge_to_the_traced_fraction(roughness: float) -> None:
     assert 0.05 < truth.mean() < 0.95
     error = {}
     for rays in (1, 4, 16, 64, 1024):
-        visibility = np.array(seen(points, place, Accuracy(visibility_rays=rays)).visibility)
+        visibility = np.array(seen(points, place, ShadingOptions(visibility_rays=rays)).visibility)
         error[rays] = float(np.sqrt(np.mean((visibility - truth) ** 2)))
     print(f"roughness {roughness}: " + ", ".join(f"{k}: {e:.4f}" for k, e in error.items()))
     assert error[4] < 0.7 * error[1] and error[16] < 0.6 * error[4] and error[64] < 0.6 * error[16]
@@ -150,14 +150,14 @@ def test_convex_shapes_are_free_and_one_ray_is_the_mirror_ray() -> None:
         roughness=dr.full(mi.Float, 0.4, n),
     )
     for rays in (1, 2, 8):
-        accuracy = Accuracy(visibility_rays=rays)
+        options = ShadingOptions(visibility_rays=rays)
         context = TraceContext(occluder, None, None, eye, vector(-2 * view))  # type: ignore[arg-type]
-        free = reflection(points, context, "irradiance", accuracy)
+        free = reflection(points, context, options)
         assert dr.width(free.visibility) == n
         assert float(dr.mean(free.visibility)[0]) > 0.999 and float(dr.min(free.visibility)[0]) > 0.8
     place, points = floor_points(0.5)
     np.testing.assert_array_equal(
-        np.array(seen(points, place, Accuracy()).visibility),
+        np.array(seen(points, place, ShadingOptions()).visibility),
         ~np.array([wall_blocks(p, r)[0][0] for p, r in zip(place, mirrored(place), strict=True)]),
     )
 
@@ -168,7 +168,7 @@ def test_renders_repeat_and_more_rays_compile_and_launch_nothing() -> None:
     dr.eval(points.view, points.albedo)
 
     def visibility(rays: int) -> np.ndarray:
-        found = seen(points, place, Accuracy(visibility_rays=rays), occluder=occluder).visibility
+        found = seen(points, place, ShadingOptions(visibility_rays=rays), occluder=occluder).visibility
         return np.array(found)
 
     first = visibility(4)

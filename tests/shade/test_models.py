@@ -13,6 +13,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.reference import shade as reference
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import reflect, safe_normalize
 from mi_refgs.shade.split_sum import shade
 from tests.helpers import check_slopes, level_maps, unit
@@ -33,7 +34,7 @@ def test_terms_against_the_oracle(
 ) -> None:
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     levels, values = level_maps(light), shading_values(rng, occlusion)
-    terms = shade(points_of(values), light, diffuse)
+    terms = shade(points_of(values), light, ShadingOptions(diffuse=diffuse))
     expected = np.array([exact_terms(values, levels, diffuse, k) for k in range(N)])
     for n, term in enumerate(vars(terms.filled()).values()):
         np.testing.assert_allclose(np.broadcast_to(term.numpy(), (3, N)).T, expected[:, n], atol=2e-4)
@@ -53,7 +54,7 @@ def test_derivatives_of_each_parameter(
     for array in used.values():
         dr.enable_grad(array)
     weight = rng.normal(size=(N, 3, 3))
-    terms = shade(points, light, diffuse)
+    terms = shade(points, light, ShadingOptions(diffuse=diffuse))
     loss = sum(
         dr.dot(mi.Vector3f(term), mi.Vector3f(weight[:, n].T.astype(np.float32)))
         for n, term in enumerate(vars(terms.filled()).values())
@@ -84,12 +85,19 @@ def test_derivative_of_the_light(
     raw = EnvironmentLight.from_radiance(radiance).raw
     dr.enable_grad(raw)
     dr.backward(
-        dr.dot(mi.Vector3f(shade(points, EnvironmentLight(raw).prefilter(), diffuse).total()), weight)
+        dr.dot(
+            mi.Vector3f(
+                shade(points, EnvironmentLight(raw).prefilter(), ShadingOptions(diffuse=diffuse)).total()
+            ),
+            weight,
+        )
     )
     gradient = dr.grad(raw).numpy().astype(np.float64)
 
     def loss(map_: np.ndarray) -> float:
-        total = shade(points, EnvironmentLight.from_radiance(map_).prefilter(), diffuse).total()
+        total = shade(
+            points, EnvironmentLight.from_radiance(map_).prefilter(), ShadingOptions(diffuse=diffuse)
+        ).total()
         return float((total.numpy().astype(np.float64) * weight.numpy()).sum())
 
     slope = -np.expm1(-radiance)  # d softplus / d raw, in terms of softplus
@@ -111,7 +119,7 @@ def test_white_furnace(rng: np.random.Generator) -> None:
     values = shading_values(rng, "open")
     values["albedo"], values["metallic"] = np.ones((N, 3)), np.ones(N)
     points = points_of(values)
-    total = shade(points, light, "irradiance").total().numpy()
+    total = shade(points, light, ShadingOptions(diffuse="irradiance")).total().numpy()
     cosine = (unit(values["normal"]) * unit(values["view"])).sum(1)
     a, b = brdf.split_sum(mi.Float(cosine.astype(np.float32)), points.roughness)
     np.testing.assert_allclose(total, np.broadcast_to(np.array(a + b), (3, N)), atol=1e-4)
@@ -126,10 +134,12 @@ def test_the_diffuse_base_gets_what_the_specular_layer_leaves(rng: np.random.Gen
     values = shading_values(rng, "visibility")
     values["albedo"], values["metallic"] = np.ones((N, 3)), np.zeros(N)
     points = points_of(values)
-    free = shade(points.replaced(visibility=None), light, "irradiance")
+    free = shade(points.replaced(visibility=None), light, ShadingOptions(diffuse="irradiance"))
     np.testing.assert_allclose(free.total().numpy(), 1, atol=1e-3)
     assert free.diffuse.numpy().min() < 0.955 < free.diffuse.numpy().max()
-    np.testing.assert_array_equal(shade(points, light, "irradiance").diffuse.numpy(), free.diffuse.numpy())
+    np.testing.assert_array_equal(
+        shade(points, light, ShadingOptions(diffuse="irradiance")).diffuse.numpy(), free.diffuse.numpy()
+    )
 
 
 def test_visibility_selects_between_light_and_indirect(
@@ -137,11 +147,11 @@ def test_visibility_selects_between_light_and_indirect(
 ) -> None:
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     points = points_of(shading_values(rng, "indirect"))
-    free = shade(points.replaced(visibility=None, indirect=None), light).specular.numpy()
-    visible = shade(points.replaced(visibility=mi.Float(np.ones(N, np.float32))), light)
+    free = shade(points.replaced(visibility=None, indirect=None), light, ShadingOptions()).specular.numpy()
+    visible = shade(points.replaced(visibility=mi.Float(np.ones(N, np.float32))), light, ShadingOptions())
     np.testing.assert_allclose(visible.specular.numpy(), free, rtol=1e-6)
     assert dr.all(visible.indirect == 0, axis=None)
-    hidden = shade(points.replaced(visibility=mi.Float(np.zeros(N, np.float32))), light)
+    hidden = shade(points.replaced(visibility=mi.Float(np.zeros(N, np.float32))), light, ShadingOptions())
     assert dr.all(hidden.specular == 0, axis=None) and dr.all(hidden.indirect > 0, axis=None)
 
 
@@ -193,7 +203,7 @@ def test_degenerate_points_stay_finite(diffuse: Any, radiance: np.ndarray) -> No
         getattr(points, name) for name in ("normal", "view", "albedo", "metallic", "roughness", "indirect")
     ]
     dr.enable_grad(raw, *inputs)
-    total = shade(points, EnvironmentLight(raw).prefilter(), diffuse).total()
+    total = shade(points, EnvironmentLight(raw).prefilter(), ShadingOptions(diffuse=diffuse)).total()
     dr.backward(total)
     for array in (total, raw.array, dr.grad(raw).array, *map(dr.grad, inputs)):
         assert dr.all(dr.isfinite(array), axis=None)
@@ -205,7 +215,7 @@ def test_degenerate_points_stay_finite(diffuse: Any, radiance: np.ndarray) -> No
 def test_bad_arguments(radiance: np.ndarray, rng: np.random.Generator) -> None:
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     points = points_of(shading_values(rng, "open"))
-    with pytest.raises(InputError, match="unknown"):
-        shade(points, light, "lambert")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="is not allowed; use sh or irradiance"):
+        ShadingOptions(diffuse="lambert")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="missing"):
-        shade(points.replaced(radiance=None), light)
+        shade(points.replaced(radiance=None), light, ShadingOptions())

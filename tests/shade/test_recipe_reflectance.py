@@ -16,9 +16,9 @@ import pytest
 
 from mi_refgs.cli import main
 from mi_refgs.shade import reflectance
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance import Reflectance, SurfelView
-from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels import attributes as channels
 from mi_refgs.surfels.attributes import Channel
 from mi_refgs.surfels.ply import read_ply
@@ -35,13 +35,13 @@ class Phong(Reflectance):
 
     name = "phong"
 
-    def channels(self, diffuse: str) -> tuple[str, ...]:
+    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("albedo", "shininess")
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
-        return {name: surfels.value(name) for name in self.channels(shading.diffuse)}
+    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
+        return {name: surfels.value(name) for name in self.channels(options)}
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
+    def shade(self, points: ShadingPoints, light: Any, options: ShadingOptions) -> RadianceTerms:
         normal, view = safe_normalize(points.normal), safe_normalize(points.view)
         lobe = light.specular(reflect(view, normal), 1 - points.shininess)
         return RadianceTerms(points.albedo * light.irradiance(normal), SHARE * lobe)

@@ -8,8 +8,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.split_sum import shade
 from tests.helpers import level_maps, unit
 from tests.scenes.shading_points import exact_terms, points_of
@@ -84,7 +84,8 @@ LIGHTS = {
 
 
 @pytest.mark.parametrize(
-    ("light", "diffuse"), [("smooth", "sh"), *((light, "irradiance") for light in LIGHTS)]
+    ("light", "diffuse"),
+    [("smooth", "sh"), *((light, "irradiance") for light in LIGHTS)],
 )
 def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.random.Generator) -> None:
     """Error ≤ 1e-4 of the brightest term, and gradients of albedo, metallic and radiance to 1 %.
@@ -103,7 +104,7 @@ def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.rand
             key: getattr(made, key) for key in ("albedo", "metallic", "radiance", "roughness", "normal")
         }
         dr.enable_grad(*leaves.values())
-        terms = shade(made, prefiltered, diffuse)
+        terms = shade(made, prefiltered, ShadingOptions(diffuse=diffuse))
         found = np.stack([np.broadcast_to(getattr(terms, t).numpy(), (3, N)).T for t in TERMS], 1)
         expected = np.array([exact_terms(values, levels, diffuse, k) for k in range(N)])
         limit = 1e-4 * max(np.abs(expected).max(), 1e-3)
@@ -156,8 +157,8 @@ def test_energy_under_a_constant_light_of_1(dominant: bool, multiscatter: bool) 
         "indirect": None,
     }
     light = EnvironmentLight.constant(1.0, 16).prefilter()
-    accuracy = Accuracy(dominant=dominant, multiscatter=multiscatter)
-    terms = shade(points_of(values), light, "irradiance", accuracy)
+    options = ShadingOptions(diffuse="irradiance", dominant=dominant, multiscatter=multiscatter)
+    terms = shade(points_of(values), light, options)
     total = terms.total().numpy()[0]
     assert total.min() >= 0 and total.max() <= 1 + 1e-3
     white = (albedo == 1) & ((metallic == 0) | multiscatter & (metallic == 1))

@@ -13,8 +13,8 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.methods.read import load
 from mi_refgs.render.pipeline import SurfelScene, render
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.light import ConstantLight
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import Reflectance, SurfelView, register, unregister
 from mi_refgs.shade.shading import Shading
@@ -78,7 +78,7 @@ def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
         f"iterations = 100\n[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'"
     )
     stage = load(str(path)).stage["only"]
-    assert stage.at == "pixel" and Shading.of(stage, mesh=True) == Shading("surfel", "radiance")
+    assert stage.shading.at == "pixel" and Shading.resolve(stage.shading, mesh=True).order == "surfel"
 
 
 @pytest.mark.parametrize(
@@ -87,16 +87,16 @@ def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
         ({"at": "surfel", "occlusion": True}, "occlusion: needs shade_at = pixel"),
         ({"reflectance": "radiance", "occlusion": True}, "occlusion: needs shade_at = pixel"),
         (
-            {"reflectance": "radiance", "accuracy": Accuracy(dominant=True)},
+            {"reflectance": "radiance", "dominant": True},
             "dominant: needs reflectance",
         ),
         (
-            {"accuracy": Accuracy(visibility_rays=4)},
+            {"visibility_rays": 4},
             "visibility_rays, traced_bounces, ambient_rays: need occlusion",
         ),
-        ({"diffuse": "sh", "accuracy": {"ambient_rays": 9}}, "need diffuse = irradiance"),
+        ({"diffuse": "sh", "ambient_rays": 9}, "need diffuse = irradiance"),
         (
-            {"accuracy": {"traced_bounces": 1}},
+            {"traced_bounces": 1},
             "visibility_rays, traced_bounces, ambient_rays: need occlusion",
         ),
     ],
@@ -105,10 +105,8 @@ def test_what_is_not_allowed_together_is_refused(options: dict, words: str) -> N
     with pytest.raises(InputError, match=words):
         Shading(**options)
     keys = {"at": "shade_at"}
-    accuracy = options.pop("accuracy", {})
-    accuracy = accuracy if isinstance(accuracy, dict) else vars(accuracy)
     with pytest.raises(Exception, match=words if "occlusion" not in options else "occlusion"):
-        scene(**{keys.get(name, name): value for name, value in options.items()}, **accuracy)
+        scene(**{keys.get(name, name): value for name, value in options.items()})
 
 
 def test_rendering_without_what_it_needs_is_refused() -> None:
@@ -139,7 +137,7 @@ def needless(shading: Shading) -> set[str]:
     found = set()
     for name in (name for name in CHANNELS if not CHANNELS[name].geometry):
         try:
-            shading.check([other for other in CHANNELS if other != name])
+            shading.require_inputs([other for other in CHANNELS if other != name])
             found.add(name)
         except InputError:
             pass
@@ -151,8 +149,8 @@ def test_a_stage_says_how_many_directions(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     text = "iterations = 100\n[surfels]\nchannels = ['albedo', 'roughness']\n" + LIGHT + STAGE
     path.write_text(f"{text}at = 'surfel'\nreflectance = 'monte_carlo'\ndirections = 8")
-    shading = Shading.of(load(str(path)).stage["only"], mesh=True)
-    assert shading.occlusion and shading.accuracy == Accuracy(directions=8)
+    shading = Shading.resolve(load(str(path)).stage["only"].shading, mesh=True)
+    assert shading.occlusion and shading.chosen() == ["directions"] and shading.directions == 8
     path.write_text(f"{text}at = 'surfel'\ndiffuse = 'irradiance'\ndirections = 8")
     with pytest.raises(InputError, match="directions: needs reflectance = monte_carlo"):
         load(str(path))
@@ -163,13 +161,13 @@ class Complete(Reflectance):
 
     name = "complete"
 
-    def channels(self, diffuse: str) -> tuple[str, ...]:
+    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("albedo",)
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         return {"albedo": surfels.albedo()}
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
+    def shade(self, points: ShadingPoints, light: Any, options: ShadingOptions) -> RadianceTerms:
         return RadianceTerms(points.albedo)
 
 
@@ -182,18 +180,18 @@ INCOMPLETE: dict[str, tuple[dict[str, Any], str]] = {
     "no such lookup": ({"light": "sharp"}, "light: 'sharp' is not allowed"),
     "no order": ({"orders": ()}, "orders: () is not allowed; use pixel or surfel"),
     "a name in place of orders": ({"orders": "pixel"}, "orders: 'pixel' is not allowed"),
-    "no such option": ({"accuracy": ("speed",)}, "accuracy: ('speed',) is not allowed; use dominant"),
-    "no name": ({"name": ""}, "no name"),
-    "another's name": ({"name": "split_sum"}, "another model's"),
+    "no such option": ({"options": ("speed",)}, "options: ('speed',) is not allowed; use dominant"),
+    "no name": ({"name": ""}, "the name is empty or in use"),
+    "another's name": ({"name": "split_sum"}, "'split_sum': the name is empty or in use"),
 }
 
 
 @pytest.mark.parametrize("case", INCOMPLETE)
 def test_an_incomplete_model_is_refused_when_it_is_registered(case: str) -> None:
     changes, words = INCOMPLETE[case]
-    with pytest.raises(InputError, match=f"^reflectance: .*{re.escape(words)}"):
+    with pytest.raises(InputError, match=f"^reflectance model: .*{re.escape(words)}"):
         register(type("Incomplete", (Complete,), changes)())
-    with pytest.raises(InputError, match="no model; give an object of a subclass of Reflectance"):
+    with pytest.raises(InputError, match="give an object of a subclass of Reflectance"):
         register(Complete)  # type: ignore[arg-type]
     register(Complete())
     unregister("complete")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -17,10 +18,10 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import lobe as exact
 from mi_refgs.reference import shade as reference
 from mi_refgs.shade import brdf, reflection
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.ggx_sampling import Lobe
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.split_sum import shade
 from mi_refgs.surfels.table import Surfels
@@ -174,14 +175,16 @@ def test_traced_light_comes_closer_to_the_integral(roughness: float) -> None:
     )
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
     error = {}
-    for name, accuracy in {
-        "mirror ray": Accuracy(),
-        "8 rays": Accuracy(visibility_rays=8),
-        "traced mirror ray": Accuracy(traced_bounces=1),
-        "8 traced rays": Accuracy(visibility_rays=8, traced_bounces=1),
-        "all options": Accuracy(dominant=True, visibility_rays=64, traced_bounces=1),
+    for name, options in {
+        "mirror ray": ShadingOptions(),
+        "8 rays": ShadingOptions(visibility_rays=8),
+        "traced mirror ray": ShadingOptions(traced_bounces=1),
+        "8 traced rays": ShadingOptions(visibility_rays=8, traced_bounces=1),
+        "all options": ShadingOptions(dominant=True, visibility_rays=64, traced_bounces=1),
     }.items():
-        terms = shade(seen(points, place, accuracy, surfels, light), light, "irradiance", accuracy)
+        terms = shade(
+            seen(points, place, options, surfels, light), light, replace(options, diffuse="irradiance")
+        )
         got = (terms.filled().specular + terms.filled().indirect).numpy().T
         error[name] = float(np.mean((got - truth) ** 2 / np.square(truth)))
     print(f"relMSE at roughness {roughness}: " + ", ".join(f"{k}: {e:.4f}" for k, e in error.items()))
@@ -200,7 +203,7 @@ def test_a_traced_mirror_ray_is_shaded_as_a_pixel_is(diffuse: Any) -> None:
         surfels.raw | {"radiance_sh": mi.TensorXf(np.tile(harmonics, (400, 1)).astype(np.float32))}
     )
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
-    found = seen(points, place, Accuracy(traced_bounces=1), surfels, light, diffuse)
+    found = seen(points, place, ShadingOptions(traced_bounces=1), surfels, light, diffuse)
     indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
     assert 0 < visibility.mean() < 0.8 and (indirect[visibility == 1] == 0).all()
     levels = level_maps(light)
@@ -235,9 +238,9 @@ def test_a_hit_in_the_dark_is_dark() -> None:
     )
     place, points = floor_points(0.2)
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
-    accuracy, surfels = Accuracy(traced_bounces=1), wall_surfels(metallic=14.0)
+    options, surfels = ShadingOptions(traced_bounces=1), wall_surfels(metallic=14.0)
     open_, dark = (
-        seen(points, place, accuracy, surfels, light, occluder=occluder).indirect.numpy()
+        seen(points, place, options, surfels, light, occluder=occluder).indirect.numpy()
         for occluder in (with_materials(base, surfels), with_materials(lidded, surfels))
     )
     hits = open_[0] > 0
@@ -301,8 +304,8 @@ def test_bounces_of_a_mirror_ray_against_the_oracle(bounces: int, diffuse: Any) 
     surfels = harmonic_channel_surfels()
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
     occluder = with_materials(channel(), surfels)
-    accuracy = Accuracy(traced_bounces=bounces)
-    found = seen(points, place, accuracy, surfels, light, diffuse, occluder, LOW_EYE)
+    options = ShadingOptions(traced_bounces=bounces)
+    found = seen(points, place, options, surfels, light, diffuse, occluder, LOW_EYE)
     indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
     outgoing, mirrors = oracle_of_walls(light, surfels, diffuse), mirrored(place, LOW_EYE)[:, 0]
     for k, mirror in enumerate(mirrors):
@@ -320,9 +323,9 @@ def test_bounces_of_rays_of_the_lobe_against_the_oracle(rays: int) -> None:
     sky = gradient_sky()
     sky[1:4, 4:7] += 40.0  # a lamp
     light = EnvironmentLight.from_radiance(sky).prefilter()
-    accuracy = Accuracy(visibility_rays=rays, traced_bounces=2)
+    options = ShadingOptions(visibility_rays=rays, traced_bounces=2)
     occluder = with_materials(channel(), surfels)
-    found = seen(points, place, accuracy, surfels, light, "irradiance", occluder, LOW_EYE)
+    found = seen(points, place, options, surfels, light, "irradiance", occluder, LOW_EYE)
     indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
     lobe = Lobe.of(points.normal, points.view, points.roughness, mi.Color3f(0.8, 0.7, 0.6))
     samples = [lobe.sample(mi.UInt32(i), mi.UInt32(rays)) for i in range(rays)]
@@ -354,7 +357,7 @@ def test_bounces_add_light_and_converge(rays: int) -> None:
         seen(
             points,
             place,
-            Accuracy(visibility_rays=rays, traced_bounces=bounces),
+            ShadingOptions(visibility_rays=rays, traced_bounces=bounces),
             surfels,
             light,
             occluder=occluder,
@@ -384,14 +387,14 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
     sky = gradient_sky()
     sky[1:4, 4:7] += 20.0  # a lamp
     leaves = surfels.raw | {"light": EnvironmentLight.from_radiance(sky).raw}
-    accuracy = Accuracy(visibility_rays=rays, traced_bounces=2)
+    options = ShadingOptions(visibility_rays=rays, traced_bounces=2)
     diffuse = "sh" if name == "radiance_sh" else "irradiance"
     weight = vector(rng.normal(size=(len(place), 3)))
 
     def indirect(value: Any) -> Any:
         changed = leaves | {name: value}
         light = EnvironmentLight(changed.pop("light")).prefilter()
-        return seen(points, place, accuracy, Surfels(changed), light, diffuse, occluder, LOW_EYE).indirect
+        return seen(points, place, options, Surfels(changed), light, diffuse, occluder, LOW_EYE).indirect
 
     kept: list[Any] = []
     held_back = reflection._firefly_clamp
@@ -437,8 +440,8 @@ def test_rays_and_geometry_are_detached() -> None:
     surfels.enable_grad()
     dr.enable_grad(points.normal, points.view, points.roughness, points.albedo)
     for rays in (1, 3):
-        accuracy = Accuracy(visibility_rays=rays, traced_bounces=1)
-        found = seen(points, place, accuracy, surfels, light, occluder=occluder)
+        options = ShadingOptions(visibility_rays=rays, traced_bounces=1)
+        found = seen(points, place, options, surfels, light, occluder=occluder)
         assert not dr.grad_enabled(found.visibility)
         dr.backward(dr.sum(found.indirect.x))
         assert dr.all(dr.grad(points.roughness) == 0) and dr.all(dr.grad(points.normal) == 0, axis=None)
@@ -468,16 +471,16 @@ def test_degenerate_pixels_stay_finite() -> None:
     empty = Occluder(Mesh.empty())
     empty.set_materials(surfels)
     for occluder in (with_materials(corner(), surfels), empty):
-        for accuracy in (
-            Accuracy(visibility_rays=7),
-            Accuracy(True, True, 7, 3),
-            Accuracy(True, True, 1, 3),
+        for options in (
+            ShadingOptions(visibility_rays=7),
+            ShadingOptions(dominant=True, multiscatter=True, visibility_rays=7, traced_bounces=3),
+            ShadingOptions(dominant=True, multiscatter=True, traced_bounces=3),
         ):
             raw = mi.TensorXf(light.raw)
             dr.enable_grad(raw)
             prefiltered = EnvironmentLight(raw).prefilter()
-            found = seen(points, place, accuracy, surfels, prefiltered, occluder=occluder)
+            found = seen(points, place, options, surfels, prefiltered, occluder=occluder)
             assert dr.all((found.visibility >= 0) & (found.visibility <= 1))
-            total = shade(found, prefiltered, "irradiance", accuracy).total()
+            total = shade(found, prefiltered, replace(options, diffuse="irradiance")).total()
             dr.backward(dr.sum(total.x + total.y + total.z))
             assert dr.all(dr.isfinite(total), axis=None) and dr.all(dr.isfinite(dr.grad(raw)), axis=None)

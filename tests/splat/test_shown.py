@@ -15,7 +15,6 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.shade.accuracy import Accuracy
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
@@ -94,15 +93,13 @@ def test_the_picture_is_the_same_among_surroundings(at: Any) -> None:
 
 
 def test_rays_of_a_lobe_are_those_of_the_pixel() -> None:
-    accuracy = Accuracy(visibility_rays=4)
-    shading = Shading("pixel", "split_sum", "irradiance", occlusion=True, accuracy=accuracy)
+    shading = Shading("pixel", "split_sum", "irradiance", occlusion=True, visibility_rays=4)
     assert_same(*both(things(), camera_at(30.0), shading))
 
 
 def test_antialiasing_sees_the_neighbours_in_the_image() -> None:
     shading = Shading()
-    accuracy = replace(shading.accuracy, antialias=True)
-    assert_same(*both(things(), camera_at(30.0), replace(shading, accuracy=accuracy)))
+    assert_same(*both(things(), camera_at(30.0), replace(shading, antialias=True)))
 
 
 def test_nothing_in_view_is_black() -> None:

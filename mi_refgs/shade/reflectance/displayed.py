@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 
 from mi_refgs.io.images import SRGB_ENCODED_LIMIT
+from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
 from mi_refgs.surfels.table import Surfels
-
-if TYPE_CHECKING:
-    from mi_refgs.shade.shading import Shading
 
 
 class Displayed(Reflectance):
@@ -27,13 +26,13 @@ class Displayed(Reflectance):
     light = "none"
     encoded = True
 
-    def channels(self, diffuse: str) -> tuple[str, ...]:
+    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("radiance_sh",)
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         return {"radiance": seen.harmonic_colour(surfels.value("radiance_sh"))}
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
+    def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
         encoded = points.radiance
         straight = encoded <= SRGB_ENCODED_LIMIT
         curve = dr.power((dr.select(straight, 1, encoded) + 0.055) / 1.055, 2.4)

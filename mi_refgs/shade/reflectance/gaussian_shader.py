@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 
 from mi_refgs.shade.brdf import split_sum
+from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
 from mi_refgs.surfels.table import Surfels
-
-if TYPE_CHECKING:
-    from mi_refgs.shade.shading import Shading
 
 
 class GaussianShader(Reflectance):
@@ -25,10 +24,10 @@ class GaussianShader(Reflectance):
     name = "gaussian_shader"
     orders = ("surfel",)
 
-    def channels(self, diffuse: str) -> tuple[str, ...]:
+    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("radiance_sh", "roughness", "tint", "normal_offset")
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         turned = dr.detach(dr.dot(surfels.primitive.normal(surfels), seen.normal)) < 0
         x, y, z = surfels.value("normal_offset")
         offset = type(seen.normal)(x, y, z)
@@ -39,7 +38,7 @@ class GaussianShader(Reflectance):
             "tint": surfels.value("tint"),
         }
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
+    def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
         normal, view = safe_normalize(points.normal), safe_normalize(points.view)
         scale, bias = split_sum(dr.dot(normal, view), points.roughness)
         diffuse = points.radiance + (1 - points.tint) * light.irradiance(normal)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
 from mi_refgs.surfels.table import Surfels
-
-if TYPE_CHECKING:
-    from mi_refgs.shade.shading import Shading
 
 
 class Mirror(Reflectance):
@@ -18,14 +17,14 @@ class Mirror(Reflectance):
     name = "mirror"
     light = "radiance"
 
-    def channels(self, diffuse: str) -> tuple[str, ...]:
+    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("radiance_sh", "metallic")
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         radiance = seen.harmonic_colour(surfels.value("radiance_sh"))
         return {"radiance": radiance, "metallic": surfels.value("metallic")}
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
+    def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
         mirror = reflect(safe_normalize(points.view), safe_normalize(points.normal))
         share = points.metallic
         return RadianceTerms((1 - share) * points.radiance, share * light.radiance(mirror))

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import GOLDEN_ANGLE
+from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, TraceContext
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
-
-if TYPE_CHECKING:
-    from mi_refgs.shade.shading import Shading
-
 
 LEAST_COSINE = math.sin(math.radians(10))
 """Directions lie at least 10° above the horizon. [R3DG's code]"""
@@ -36,8 +34,8 @@ class MonteCarlo(Reflectance):
 
     f_s is GGX with α = roughness², Smith-Schlick shadowing of k = (roughness + 1)² / 8, and F0 = 0.04.
     b = 0.03 + 0.77 albedo, roughness = 0.09 + 0.9 of the channel. The directions are those of a Fibonacci
-    hemisphere about the normal, J = `accuracy.directions`; the normal is detached in all of it. V is 0 where
-    the mesh blocks the ray, which `shading.occlusion` asks for. The light of other surfaces, `indirect_sh`,
+    hemisphere about the normal, J = `options.directions`; the normal is detached in all of it. V is 0 where
+    the mesh blocks the ray, which `options.occlusion` asks for. The light of other surfaces, `indirect_sh`,
     counts where the surfels have it.
     """
 
@@ -45,20 +43,20 @@ class MonteCarlo(Reflectance):
     orders = ("surfel",)
     light = "radiance"
     visibility = "own"
-    accuracy = ("directions",)
+    options = ("directions",)
 
-    def channels(self, diffuse: str) -> tuple[str, ...]:
+    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("albedo", "roughness")
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         values = {name: surfels.value(name) for name in ("albedo", "roughness")}
         if surfels.has("indirect_sh"):
             values["incident"] = surfels.value("indirect_sh")
         return values
 
-    def trace(self, points: ShadingPoints, context: TraceContext, shading: Shading) -> ShadingPoints:
+    def trace(self, points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
         """The points with `free` (mi.UInt64, detached): bit j says that light arrives from direction j."""
-        count = dr.opaque(mi.UInt32, shading.accuracy.directions)
+        count = dr.opaque(mi.UInt32, options.directions)
         normal, position = dr.detach(safe_normalize(points.normal)), dr.detach(context.origin)
 
         def body(index: Any, free: Any) -> tuple[Any, Any]:
@@ -72,8 +70,8 @@ class MonteCarlo(Reflectance):
             dr.eval(free)  # now, once: every kernel of the adjoint that reads it would trace the rays again
         return points.replaced(free=free)
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
-        count = dr.opaque(mi.UInt32, shading.accuracy.directions)
+    def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
+        count = dr.opaque(mi.UInt32, options.directions)
         normal = dr.detach(safe_normalize(points.normal))
         free = points.get("free")
         incident = points.get("incident")

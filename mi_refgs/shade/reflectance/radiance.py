@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
 from mi_refgs.surfels.table import Surfels
-
-if TYPE_CHECKING:
-    from mi_refgs.shade.shading import Shading
 
 
 class Radiance(Reflectance):
@@ -19,11 +18,11 @@ class Radiance(Reflectance):
     order_independent = True
     light = "none"
 
-    def channels(self, diffuse: str) -> tuple[str, ...]:
+    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("radiance_sh",)
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, shading: Shading) -> dict[str, Any]:
+    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         return {"radiance": seen.harmonic_colour(surfels.value("radiance_sh"))}
 
-    def shade(self, points: ShadingPoints, light: Any, shading: Shading) -> RadianceTerms:
+    def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
         return RadianceTerms(points.radiance)

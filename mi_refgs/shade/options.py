@@ -1,0 +1,92 @@
+"""How light becomes radiance, as data: the one declaration of every shading option.
+
+To add an option, add a field here and name it in `Reflectance.options` of the models that honour it. Method
+files, the plugin's properties, `scene.xml` and `model.json` read and write it from then on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, get_args, get_type_hints
+
+from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
+
+Order = Literal["pixel", "surfel"]
+"""Deferred shading of blended attributes per pixel, or forward shading per surfel before blending."""
+
+Diffuse = Literal["sh", "irradiance"]
+"""Diffuse radiance from fitted spherical harmonics, or from albedo and the light's irradiance."""
+
+DIFFUSE: tuple[Diffuse, ...] = get_args(Diffuse)
+
+MAX_RAYS = 4096
+"""Most rays per lobe, and most bounces; more add time only, since bounces are unrolled in the kernel."""
+
+MAX_DIRECTIONS = 64
+"""Most directions per hemisphere: their visibility is one bit each of a 64-bit word."""
+
+MAX_LEVELS = len(LEVEL_ROUGHNESS)
+"""Most prefiltered levels of a light: as many as there are matrices."""
+
+NOT_A_SETTING = {"setting": False}
+"""Metadata of a field that method files do not contain, because it follows from others."""
+
+
+def number(default: int, least: int, most: int) -> Any:
+    """A field for an integer from `least` to `most`."""
+    return field(default=default, metadata={"range": (least, most)})
+
+
+@dataclass(frozen=True)
+class ShadingOptions:
+    """How light becomes radiance. All that costs extra is off by default.
+
+    Raises InputError for a value of another type or out of range; `Shading` refuses combinations.
+    """
+
+    at: Order = "pixel"
+    reflectance: str = "split_sum"  # a name in `reflectance.MODELS`
+    diffuse: Diffuse = "sh"
+    occlusion: bool = field(default=False, metadata=NOT_A_SETTING)  # trace visibility; follows from a mesh
+    dominant: bool = False  # look the light up along the lobe's dominant direction, not the mirror direction
+    multiscatter: bool = False  # add light that leaves after several bounces between microfacets
+    visibility_rays: int = number(1, 1, MAX_RAYS)  # specular-lobe samples per pixel; 1: the mirror ray
+    traced_bounces: int = number(0, 0, MAX_RAYS)  # of blocked rays, in place of the indirect SH attribute
+    ambient_rays: int = number(0, 0, MAX_RAYS)  # per mesh vertex, for the ambient visibility; 0: unoccluded
+    directions: int = number(24, 1, MAX_DIRECTIONS)  # per hemisphere; R3DG uses 64, which takes twice as long
+    light_levels: int = number(MAX_LEVELS, 2, MAX_LEVELS)  # prefiltered roughness levels of the light
+    antialias: bool = False  # widen roughness by the variance of normals within a pixel
+
+    def __post_init__(self) -> None:
+        for option in fields(ShadingOptions):
+            value, kind = getattr(self, option.name), TYPES[option.name]
+            least, most = option.metadata.get("range", (0, 0))
+            if allowed := get_args(kind):
+                fits, wanted = value in allowed, " or ".join(allowed)
+            elif kind is int:
+                fits, wanted = (
+                    type(value) is int and least <= value <= most,
+                    f"a whole number {least} … {most}",
+                )
+            else:
+                fits, wanted = type(value) is kind, "True or False" if kind is bool else "a name"
+            if not fits:
+                raise InputError(f"shading: {option.name}: {abbreviated(value)} is not allowed; use {wanted}")
+
+    def chosen(self) -> list[str]:
+        """Names of the QUALITY options that differ from their defaults."""
+        return [name for name in QUALITY if getattr(self, name) != getattr(ShadingOptions, name)]
+
+
+TYPES = get_type_hints(ShadingOptions)
+"""Type of each option by name."""
+
+QUALITY = tuple(name for name in TYPES if name not in ("at", "reflectance", "diffuse", "occlusion"))
+"""Names of the options that trade time for a smaller error."""
+
+TRACED = ("visibility_rays", "traced_bounces", "ambient_rays")
+"""Those that have no effect without occlusion."""
+
+DIRECTIONS: int = ShadingOptions.directions
+"""Default number of directions per hemisphere."""
