@@ -95,7 +95,6 @@ NOT_CLEAN_YET = {
     "benchmarks/units.py",
     "benchmarks/viewer.py",
     "benchmarks/visibility",
-    "docs/accuracy.md",
     "docs/decisions.md",
     "docs/gallery/README.md",
     "docs/releasing.md",
