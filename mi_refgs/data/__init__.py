@@ -1,14 +1,11 @@
-"""Data sets: reading folders of pictures with cameras, and path-tracing new ones."""
+"""Readers of data sets: folders of images with cameras."""
 
 from mi_refgs.data.colmap import ColmapReader
+from mi_refgs.data.dataset import register_reader
 from mi_refgs.data.glossy import GlossyReader
 from mi_refgs.data.llff import LlffReader
-from mi_refgs.data.readers import register
 from mi_refgs.data.transforms import TransformsReader
 
-# Here, so that it is there before any other: the reader that was registered last is asked first.
-# Folders that have several layouts are read by the one that says most.
-register(LlffReader())
-register(GlossyReader())
-register(ColmapReader())
-register(TransformsReader())
+# The reader registered last is asked first: the layout that says most wins in folders that have several.
+for _reader in (LlffReader(), GlossyReader(), ColmapReader(), TransformsReader()):
+    register_reader(_reader)

@@ -1,9 +1,8 @@
-"""Arrays in untrusted pickle files: nothing in the file is called, and only arrays of plain numbers result.
+"""Read arrays from untrusted pickle files: nothing in the file is called, and only plain numbers result.
 
-A pickle is a program. Here its instructions are compared with a list first; the few names of NumPy that it
-may ask for become records of what was asked; and the arrays are made of these records, after checks of our
-own. A value is hashed, compared or shown only after its type is known: tuples that share their parts take
-exponential time.
+A pickle is a program. Its instructions are compared with a list first; the few names of NumPy that it may
+use become records of the calls; and the arrays are made of these records after our own checks. A value is
+hashed, compared or shown only after its type is known: tuples that share their parts take exponential time.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ import numpy as np
 from mi_refgs.errors import InputError
 
 MAX_BYTES = 2**16
-"""Largest length of a file: a camera has a few hundred bytes."""
+"""Longest file; a camera has a few hundred bytes."""
 MAX_ITEMS = 1000
 """Largest number of arrays in a list."""
 NAMES = {
     **{(f"numpy.{core}.multiarray", "_reconstruct"): "array" for core in ("core", "_core")},
-    ("numpy", "ndarray"): "kind",
+    ("numpy", "ndarray"): "type",
     ("numpy", "dtype"): "dtype",
     ("_codecs", "encode"): "bytes",  # how protocols 0 to 2 write bytes
 }
@@ -40,7 +39,7 @@ INSTRUCTIONS = {
 
 
 class Record:
-    """A name that a pickle asks for, the arguments it is called with, and the state it is given."""
+    """A name in a pickle, the arguments of its call, and the state that is set."""
 
     __slots__ = ("arguments", "kind", "state")
 
@@ -66,16 +65,20 @@ class _Unpickler(pickle.Unpickler):
 
 
 def read_arrays(path: Path) -> list[np.ndarray]:
-    """The arrays, float64, of a pickled list of them.
+    """Read a pickled list of arrays as float64.
 
-    Raises InputError for a file that is missing, broken, or holds anything else.
+    Raises InputError for a file that is missing, broken, or contains anything else.
     """
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
         if len(data) > MAX_BYTES:
             raise ValueError("it is too long")
-        _check(data)
+        for instruction, argument, _ in pickletools.genops(io.BytesIO(data)):
+            if instruction.name not in INSTRUCTIONS:
+                raise ValueError(f"it has the instruction {instruction.name}")
+            if instruction.name.endswith("PUT") and not (argument or 0) <= len(data):
+                raise ValueError("it has more memo entries than bytes")  # each would take memory
         found = _Unpickler(io.BytesIO(data), encoding="latin1").load()
         if not isinstance(found, list | tuple) or len(found) > MAX_ITEMS:
             raise ValueError("it is no list")
@@ -86,32 +89,19 @@ def read_arrays(path: Path) -> list[np.ndarray]:
         ) from error
 
 
-def _check(data: bytes) -> None:
-    """Raise ValueError for an instruction that arrays do not need, and for places beyond memory."""
-    for instruction, argument, _ in pickletools.genops(io.BytesIO(data)):
-        if instruction.name not in INSTRUCTIONS:
-            raise ValueError(f"it has the instruction {instruction.name}")
-        if instruction.name.endswith("PUT") and not (argument or 0) <= len(data):
-            raise ValueError("it has more places than bytes")
-
-
 def _array(item: Any) -> np.ndarray:
     if not isinstance(item, Record) or item.kind != "array" or not isinstance(item.state, tuple):
-        raise ValueError("it holds something else")
+        raise ValueError("it contains something else")
     _, shape, dtype, by_columns, values = item.state
     code, order = dtype.arguments[0], dtype.state[1]
     if isinstance(values, Record):
         values = values.arguments[0].encode("latin1")
-    # Types come first: see the module's docstring.
-    if not isinstance(code, str) or not isinstance(order, str) or not isinstance(values, bytes):
-        raise ValueError("it holds no plain numbers")
-    if code not in CODES or order not in ("<", ">"):
-        raise ValueError("it holds no plain numbers")
-    if not isinstance(shape, tuple) or not all(
-        type(side) is int and 0 <= side <= MAX_BYTES for side in shape
-    ):
-        raise ValueError("an array has no shape")
-    if len(shape) > 2 or math.prod(shape) * int(code[1]) != len(values):
-        raise ValueError("an array has another size than its numbers")
+    # Types are compared before values: see the docstring of this file.
+    plain = isinstance(code, str) and isinstance(order, str) and isinstance(values, bytes)
+    if not plain or code not in CODES or order not in ("<", ">"):
+        raise ValueError("it contains no plain numbers")
+    sides = isinstance(shape, tuple) and all(type(side) is int and 0 <= side <= MAX_BYTES for side in shape)
+    if not sides or len(shape) > 2 or math.prod(shape) * int(code[1]) != len(values):
+        raise ValueError("an array's shape is not that of its numbers")
     array = np.frombuffer(values, dtype=order + code).astype(np.float64)
     return array.reshape(shape, order="F" if by_columns else "C")

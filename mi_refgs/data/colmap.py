@@ -1,9 +1,8 @@
-"""COLMAP's layout: a reconstruction in `sparse/0`, as text or binary, and pictures in `images`.
+"""Reader of COLMAP's layout: a reconstruction in `sparse/0`, as text or binary, and images in `images`.
 
-The folders `images_2`, `images_4` and `images_8` may hold smaller copies, as in the scenes of Ref-Real and
-Mip-NeRF 360; `masks` may hold what belongs to the object, as NAME.png, with the picture's ending before or
-without. Every eighth picture in the order of names is a test view, unless `test.txt` beside the
-reconstruction lists the names of those, one a line, as 3D Gaussian Splatting reads it.
+`images_2`, `images_4` and `images_8` may contain smaller copies, as in the scenes of Ref-Real and Mip-NeRF
+360; `masks` may contain masks of the object, as NAME.png with or without the image's ending before it. Every
+eighth image in the order of names is a test view, unless `test.txt` beside the reconstruction lists them.
 """
 
 from __future__ import annotations
@@ -12,25 +11,23 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.data.colmap_model import Camera, Image, Points, read_cameras, read_images, read_points
-from mi_refgs.data.picture_files import Mask, PictureFile, make_view
-from mi_refgs.data.picture_folders import PictureFolders, mask_file, mask_folder
+from mi_refgs.data.colmap_model import TEST_LIST, Camera, Image, read_cameras, read_images, read_points
+from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, held_out, make_view
+from mi_refgs.data.images import ImageFile, ImageFolders
 from mi_refgs.data.poses import from_world_to_camera
-from mi_refgs.data.readers import PointCloud, ReadOptions, Recording, held_out
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import is_file
 from mi_refgs.io.images import image_size, linear_from_srgb
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
-"""Where a reconstruction may lie, in the order in which they are tried."""
+"""Folders of a reconstruction, in the order in which they are tried."""
 ENDINGS = ("bin", "txt")
-TEST_LIST = "test.txt"
 MIN_VIEWS, MAX_ERROR = 3, 2.0
-"""A point that two pictures show lies anywhere along a line for a single wrong match; errors beyond 2 pixels
-mean such a match."""
+"""Track length and reprojection error, pixels, of points that are used: a single wrong match puts a point of
+two images anywhere on a line, and larger errors mean such a match."""
 MIN_POINTS = 100
-"""Points below which none is left out."""
+"""Number of points below which none is left out."""
 
 
 class ColmapReader:
@@ -40,107 +37,100 @@ class ColmapReader:
     looks_for = "sparse/0/cameras.bin or .txt, beside images"
 
     def recognises(self, folder: Path) -> bool:
-        """Whether the folder holds a reconstruction."""
+        """Whether the folder contains a reconstruction."""
         return _model(folder) is not None
 
     def size(self, folder: Path, images: str) -> tuple[int, int]:
-        """Width and height of the first training picture as it lies in its file."""
+        """Width and height of the first training image in its file."""
         model = Reconstruction(folder, ReadOptions(images=images))
-        return image_size(model.placed("train")[0][1])
+        return image_size(model.registered("train")[0][1])
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
-        """The views of one split, and the points that at least three pictures show."""
+        """Read the views of one split, and the reliable points."""
         model = Reconstruction(folder, options)
-        views = tuple(model.view(*placed) for placed in model.placed(split))
+        views = tuple(model.view(*image) for image in model.registered(split))
         return Recording(views, model.points(), source=model.source, notes=model.notes())
 
 
 class Reconstruction:
-    """One reconstruction with its pictures."""
+    """One reconstruction with its images."""
 
     def __init__(self, folder: Path, options: ReadOptions) -> None:
         model, ending = _model(folder) or (folder, ENDINGS[0])
         if options.images != "png":
-            raise InputError(f"{folder}: images: a reconstruction has no EXR pictures; read it as 'png'")
-        self.folder, self.options = folder, options
+            raise InputError(f"{folder}: images: a reconstruction has no EXR images; read it as 'png'")
+        self.options = options
         self.source = model / f"images.{ending}"
         self.cameras = read_cameras(model / f"cameras.{ending}")
         self.images = read_images(self.source)
         self.point_file = model / f"points3D.{ending}"
-        self.pictures = PictureFolders.of(folder, flat=True)
-        self.masks = mask_folder(folder)
-        found = {image.name: self._find(image.name) for image in self.images}
-        self.found = {name: file for name, file in found.items() if file is not None}
+        self.folders = ImageFolders.of(folder, flat=True)
+        found = {image.name: self.folders.find(image.name, options.downscale) for image in self.images}
+        self.files = {name: file for name, file in found.items() if file is not None}
 
-    def placed(self, split: str) -> list[tuple[Image, Path, int]]:
-        """The images of a split that have a file, each with it and what is left of the downscale."""
-        there = [image for image in self.images if image.name in self.found]
-        if not there:
+    def registered(self, split: str) -> list[tuple[Image, Path, int]]:
+        """The images of a split that have a file; each with that and the remaining downscale."""
+        images = [image for image in self.images if image.name in self.files]
+        if not images:
             raise InputError(
-                f"{self.source}: none of its {len(self.images)} pictures lies in {self.pictures.folders[1]}; "
+                f"{self.source}: none of its {len(self.images)} images is in {self.folders.folders[1]}; "
                 "put them there under the same names"
             )
-        named = self._test_names()
-        if named is None:
-            chosen = held_out(there, split)
+        test_list = self.source.with_name(TEST_LIST)
+        if is_file(test_list):
+            lines = test_list.read_bytes().decode("utf-8", "replace").splitlines()
+            tests = {line.strip() for line in lines}
+            chosen = [image for image in images if (image.name in tests) == (split == "test")]
+            remedy = "name some of the images in test.txt, not all"
         else:
-            chosen = [image for image in there if (image.name in named) == (split == "test")]
+            chosen, remedy = held_out(images, split), "add images"
         if not chosen:
-            remedy = "add pictures" if named is None else "name some of the pictures in test.txt, not all"
             raise InputError(f"{self.source}: zero {split} views; {remedy}")
-        return [(image, *self.found[image.name]) for image in chosen]
+        return [(image, *self.files[image.name]) for image in chosen]
 
     def view(self, image: Image, file: Path, downscale: int) -> View:
-        """The view of an image."""
+        """The view of an image; raises InputError for an unusable pose, lens, mask or size."""
         field = f"{self.source}: {image.name}"
         camera = self.cameras.get(image.camera)
         if camera is None:
             raise InputError(f"{field}: there is no camera {image.camera}; export the model again")
-        to_world = from_world_to_camera(image.rotation, image.translation, field)
-        picture = PictureFile.find(file, downscale, self._mask(image.name))
+        where = f"{field}: camera {image.camera}"
         try:
             lens = camera.lens()
         except InputError as error:
-            raise InputError(f"{field}: camera {image.camera}: {error}") from None
-        intrinsics = _intrinsics(camera, picture)
-        where = f"{field}: camera {image.camera}"
-        return make_view(image.name, picture, self.options, intrinsics, lens, to_world, where)[0]
+            raise InputError(f"{where}: {error}") from None
+        to_world = from_world_to_camera(image.rotation, image.translation, field)
+        source = ImageFile.of(file, downscale, self.folders.mask(image.name))
+        intrinsics = _intrinsics(camera, source)
+        made, _ = make_view(
+            source, self.options, where, name=image.name, intrinsics=intrinsics, lens=lens, to_world=to_world
+        )
+        return made
 
     def points(self) -> PointCloud | None:
-        """The points that are worth a start; None without any."""
+        """The reliable points, or all where only a few are reliable; None without any."""
         if not self.point_file.is_file():
             return None
         points = read_points(self.point_file)
-        good = _good(points)
+        good = (points.views >= MIN_VIEWS) & (points.error <= MAX_ERROR)
+        if np.count_nonzero(good) < MIN_POINTS:
+            good[:] = True
         if not good.any():
             return None
         colour = linear_from_srgb(points.colour[good].astype(np.float32) / 255)
         return PointCloud(points.position[good], colour)
 
     def notes(self) -> tuple[str, ...]:
-        """What a person may want to mend."""
+        """What the user may want to correct."""
         notes = []
-        names = self.pictures.names()
-        if absent := len(self.images) - len(self.found):
-            notes.append(f"{absent} of {len(self.images)} cameras have no picture and are left out")
-        if (spare := len(names) - len(self.found)) > 0:
-            notes.append(f"{spare} of {len(names)} pictures have no camera and are left out")
+        names = self.folders.names()
+        if absent := len(self.images) - len(self.files):
+            notes.append(f"{absent} of {len(self.images)} cameras have no image and are left out")
+        if (spare := len(names) - len(self.files)) > 0:
+            notes.append(f"{spare} of {len(names)} images have no camera and are left out")
         if (other := self.source.parent.with_name("1")).is_dir() and self.source.parent.name == "0":
-            notes.append(f"{other.parent.name}/1 holds another reconstruction, which is left out")
+            notes.append(f"{other.parent.name}/1 contains another reconstruction, which is left out")
         return tuple(notes)
-
-    def _test_names(self) -> set[str] | None:
-        """The names that test.txt lists; None without that file."""
-        file = self.source.with_name(TEST_LIST)
-        if not is_file(file):
-            return None
-        return {line.strip() for line in file.read_bytes().decode("utf-8", "replace").splitlines()}
-
-    def _find(self, name: str) -> tuple[Path, int] | None:
-        return self.pictures.find(name, self.options.downscale, whole=self.masks is not None)
-
-    def _mask(self, name: str) -> Mask | None:
-        return None if self.masks is None else Mask(mask_file(self.masks, name))
 
 
 def _model(folder: Path) -> tuple[Path, str] | None:
@@ -152,23 +142,17 @@ def _model(folder: Path) -> tuple[Path, str] | None:
     return None
 
 
-def _intrinsics(camera: Camera, picture: PictureFile) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels of the file, which may be a smaller copy of what was reconstructed.
+def _intrinsics(camera: Camera, image: ImageFile) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels of the file, which may be a smaller copy of the reconstructed image.
 
-    Raises InputError for one of another shape.
+    Raises InputError for another aspect ratio.
     """
-    across, down = picture.width / camera.width, picture.height / camera.height
+    across, down = image.width / camera.width, image.height / camera.height
     # Width and height of a copy are rounded by up to a pixel each.
-    if abs(picture.height - across * camera.height) > 1 + picture.height / picture.width:
+    if abs(image.height - across * camera.height) > 1 + image.height / image.width:
         raise InputError(
-            f"{picture.path}: size: {picture.width} × {picture.height} pixels are no copy of "
-            f"{camera.width} × {camera.height}, which were reconstructed; restore the picture"
+            f"{image.path}: size: {image.width} × {image.height} pixels are no copy of "
+            f"{camera.width} × {camera.height}, which were reconstructed; restore the image"
         )
     fx, fy, cx, cy = camera.intrinsics
     return fx * across, fy * down, cx * across, cy * down
-
-
-def _good(points: Points) -> np.ndarray:
-    """Which points are more than one wrong match: (P,) bool; all, where only a few are."""
-    good = (points.views >= MIN_VIEWS) & (points.error <= MAX_ERROR)
-    return good if np.count_nonzero(good) >= MIN_POINTS else np.ones(len(good), dtype=bool)

@@ -1,41 +1,159 @@
-"""A data set: the views of one split, and what is known of their scene.
+"""Data sets: the interface and registry of readers, and one split of views with what is known of their scene.
 
-Colour: PNG targets stay as displayed, sRGB-encoded, composited in that space as such data was made:
+Colour: PNG targets stay sRGB-encoded and are composited in that space, as such data are made:
 A·rgb + (1 − A)·background. EXR targets are linear and premultiplied: radiance + (1 − A)·background.
 """
 
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from mi_refgs.data.readers import PointCloud, ReadOptions, reader_of
+from mi_refgs.constants import MAX_NUMBER
+from mi_refgs.data.exposure import log_exposure
+from mi_refgs.data.images import ImageCache, ImageFile, ImageSource
+from mi_refgs.data.lens import Lens, Undistortion, undistortion
 from mi_refgs.data.region import Region, read_region, region_of
-from mi_refgs.data.view import View
+from mi_refgs.data.view import FileCamera, View
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.images import is_opaque
+from mi_refgs.registry import Registry
 
+HOLDOUT = 8
+"""Every eighth image is a test view where a data set names none (convention of LLFF, 3DGS and 2DGS)."""
 EXTENT_MARGIN = 1.1
 """Scene extent over the largest distance of a training camera to their mean (3DGS)."""
 NEAR_EXTENTS = 2e-3
-"""Depth of the near plane in scene extents, about 0.01 in the units of Blender's data sets: what is nearer
-stands in front of the lens."""
+"""Depth of the near plane in scene extents, about 0.01 in the units of Blender's data sets."""
 FAR = 1e3
 """Distance of the training cameras' mean from the world's origin, in scene extents, from which positions are
-moved: from there float32 resolves less than a ten-thousandth of the extent."""
+shifted: from there float32 resolves less than a ten-thousandth of the extent."""
 DISTINCT = 1e-11
-"""Scene extent as part of that distance below which cameras stand in one place, and nothing is moved."""
-OPAQUE = 8
-"""Images whose alpha is looked at: an object that leaves no pixel free in any of them is not cut out."""
+"""Scene extent over that distance below which all cameras are at one place, and nothing is shifted."""
+OPAQUE_CHECKED = 8
+"""Images whose alpha is examined: if none of them has a transparent pixel, alpha is ignored."""
 MAX_SIZES = 4
-"""Sizes of pictures in a data set, such as upright and lying: a fit compiles every kernel for each."""
+"""Image sizes in a data set, such as portrait and landscape: a fit compiles every kernel for each."""
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
 IMAGE_KINDS = ("png", "exr")
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How a reader returns images."""
+
+    downscale: int = 1  # side of the blocks of pixels that are averaged
+    background: float = 1.0  # 0 … 1, in the colour space of the images, where they have alpha
+    images: str = "png"  # "png": sRGB-encoded, or "exr": linear radiance
+    truth: bool = True  # read ground-truth normals, depth and materials
+    decode: bool = True  # decode images while the cache has room; else when views are loaded
+    cache: ImageCache = field(default_factory=ImageCache, compare=False)
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points on surfaces, as structure from motion finds them."""
+
+    position: np.ndarray  # (P, 3) float64, world
+    colour: np.ndarray | None = None  # (P, 3) linear, 0 … 1
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What a reader returns: the views of one split, and what is known of their scene."""
+
+    views: tuple[View, ...]
+    points: PointCloud | None = None
+    environment: Path | None = None  # ground-truth environment map: lat-long EXR in Mitsuba's orientation
+    source: Path | None = None  # the file that lists the views, for messages
+    notes: tuple[str, ...] = ()  # what the user may want to correct, such as images without a camera
+
+
+class Reader(Protocol):
+    """Reader of one layout of data sets."""
+
+    name: str
+    looks_for: str
+    """The files by which it recognises a folder, for messages."""
+
+    def recognises(self, folder: Path) -> bool:
+        """Whether the folder has this layout."""
+
+    def size(self, folder: Path, images: str) -> tuple[int, int]:
+        """Width and height of the first training image in its file."""
+
+    def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
+        """Read the views of "train" or "test"; raises InputError that names file, field and remedy."""
+
+
+READERS: Registry[Reader] = Registry("reader of data sets")
+"""All readers, in the order in which `recognises` is called."""
+
+
+def register_reader(reader: Reader) -> Reader:
+    """Add a reader, whose `recognises` is called before those of all others; returns it."""
+    return READERS.register(reader, first=True)
+
+
+def reader_of(folder: Path) -> Reader:
+    """The reader of a folder; raises InputError if there is no such folder, or none recognises it."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: data set: no such folder; give one that contains images and cameras")
+    for reader in READERS.values():
+        if reader.recognises(folder):
+            return reader
+    known = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in READERS.values())
+    raise InputError(f"{folder}: data set: no layout is recognised; complete it ({known})")
+
+
+def held_out(ordered: Sequence[Item], split: str) -> list[Item]:
+    """The items of a split if one list contains both: every eighth, from the first, is a test view."""
+    return [item for i, item in enumerate(ordered) if (i % HOLDOUT == 0) == (split == "test")]
+
+
+def make_view(
+    image: ImageFile,
+    options: ReadOptions,
+    where: str,
+    *,
+    name: str,
+    intrinsics: tuple[float, float, float, float],
+    lens: Lens | None,
+    to_world: np.ndarray,
+) -> tuple[View, Undistortion | None]:
+    """Make the view of an image; also returns how maps of the averaged image's size are undistorted.
+
+    `intrinsics` are fx, fy, cx, cy in pixels of the file; `to_world` as in `View`. Raises InputError, which
+    begins with `where`, for an impossible focal length and for a lens that cannot be undone.
+    """
+    for focal in intrinsics[:2]:
+        if not 1 / MAX_NUMBER <= focal <= MAX_NUMBER:
+            raise InputError(f"{where}: focal length: {focal:.3g} pixels is out of range; correct it")
+    file = FileCamera(image.path, image.width, image.height, intrinsics, lens, image.mask)
+    width, height = image.size
+    fx, fy, cx, cy = (value / image.downscale for value in intrinsics)
+    straight = None
+    if lens is not None:
+        try:
+            straight = undistortion(lens, width, height, fx, fy, cx, cy)
+        except InputError as error:
+            raise InputError(f"{where}: k1 … p2: {error}") from None
+        fx, fy = fx * straight.zoom, fy * straight.zoom
+        image = replace(image, undistortion=straight)
+    source: Any = ImageSource(image, options.background, options.cache, options.decode)
+    alpha = source if source.has_alpha else None
+    linear = options.images == "exr"
+    view = View(name, width, height, fx, fy, cx, cy, to_world, source, alpha, None, None, linear)
+    return view.changed(exposure=log_exposure(image.path), file=file), straight
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,25 +163,25 @@ class Dataset:
     path: Path
     split: str
     views: tuple[View, ...]
-    background: np.ndarray  # (3,) float32, in the space of the targets
-    is_linear_radiance: bool  # as in View
-    environment: Path | None  # ground truth of the light: lat-long EXR in Mitsuba's orientation
-    points: PointCloud | None = None  # on what is seen, where the data set has some
-    region: Region | None = None  # of interest, of all splits; absent where alpha says what is the object's
-    notes: tuple[str, ...] = ()  # as in Recording
+    background: np.ndarray  # (3,) float32, in the colour space of the images
+    is_linear_radiance: bool  # as in `View`
+    environment: Path | None  # ground-truth environment map: lat-long EXR in Mitsuba's orientation
+    points: PointCloud | None = None  # on surfaces, where the data set has some
+    region: Region | None = None  # of interest, for all splits; None where alpha segments the object
+    notes: tuple[str, ...] = ()  # as in `Recording`
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """What was subtracted from all positions of the files, scene units; as `FAR` says."""
+    """What was subtracted from all positions of the files, scene units; see `FAR`."""
 
     @property
     def has_alpha(self) -> bool:
-        """Whether all pictures have alpha that leaves something out; decodes nothing."""
+        """Whether all images have alpha; views need not be loaded."""
         return all(view.has_alpha for view in self.views)
 
     @cached_property
     def scene_extent(self) -> float:
         """1.1 × the largest distance of a camera to their mean, scene units (3DGS).
 
-        For a lone camera that to the world's origin; 1 if it stands there.
+        For a single camera, to the world's origin; 1 if it is there.
         """
         return _extent(self.views)
 
@@ -80,16 +198,20 @@ def read_dataset(
 ) -> Dataset:
     """Read one split ("train" or "test") of the data set in folder `path`.
 
-    `downscale` averages blocks of so many pixels squared, colour premultiplied by alpha; without it pictures
-    are read whole. Pixels at the right and the bottom that fill no block are left out. Where the data set
-    names no test views, every eighth picture, in the order of their paths, is one and no training view.
-    `truth` reads normals, depth and materials where there are any. `decode` reads images now, while memory
-    is granted (`picture_store`), so that a broken file is told here; without it `View.load` reads them. The
-    region of interest is what region.json says; without it, and without alpha, what the training cameras look
-    at, for every split. Positions far from the world's origin, as in UTM coordinates, come relative to
-    `Dataset.offset`, the same in all splits.
+    downscale: Side of the blocks of pixels that are averaged, colour premultiplied by alpha; by default 1.
+        Pixels at the right and the bottom that fill no block are left out.
+    background: "white" or "black", behind images with alpha.
+    images: "png" (sRGB-encoded 8-bit files) or "exr" (linear radiance).
+    truth: Read ground-truth normals, depth and materials where there are any.
+    decode: Decode images now while the cache has room, so that a broken file is refused now; else
+        `View.load` decodes them.
 
-    Raises InputError for anything missing, unreadable or inconsistent: file, field and remedy are named.
+    Without a list of test views, every eighth image in the order of paths is one. The region of interest is
+    that of region.json; without it and without alpha, the one that the training cameras look at. Positions
+    far from the world's origin, as in UTM coordinates, are relative to `Dataset.offset`, which is the same
+    for all splits.
+
+    Raises InputError for anything missing, unreadable or inconsistent; it names file, field and remedy.
     """
     path = Path(path)
     if background not in BACKGROUNDS:
@@ -101,58 +223,53 @@ def read_dataset(
         raise InputError(f"{path}: downscale: {downscale} is out of range; give a whole number from 1")
     options = ReadOptions(downscale, BACKGROUNDS[background], images, truth, decode)
     found = reader_of(path).read(path, split, options)
-    views = found.views
+    views, notes, points = found.views, found.notes, found.points
     sizes = {(view.width, view.height): view.name for view in views}
     if len(sizes) > MAX_SIZES:
-        shown = ", ".join(f"{width} × {height} ('{name}')" for (width, height), name in [*sizes.items()][:3])
+        some = ", ".join(f"{width} × {height} ('{name}')" for (width, height), name in [*sizes.items()][:3])
         raise InputError(
-            f"{found.source or path}: pictures: {len(sizes)} different sizes, such as {shown}; "
-            f"bring all pictures to one size, or to {MAX_SIZES} at most"
+            f"{found.source or path}: images: {len(sizes)} different sizes, such as {some}; "
+            f"bring all images to one size, or to {MAX_SIZES} at most"
         )
 
-    # What depends on the cameras depends on the training cameras, for every split: a fit and its evaluation
-    # mean the same sphere, and the same place.
+    # What depends on cameras depends on the training cameras in every split, so that a fit and its
+    # evaluation use the same region and the same offset.
     @cache
     def training() -> tuple[View, ...]:
-        return views if split == "train" else _training_views(path, options)
+        if split == "train":
+            return views
+        return reader_of(path).read(path, "train", replace(options, truth=False, decode=False)).views
 
-    notes = found.notes
+    # Alpha without a transparent pixel, as of photographs saved as RGBA, is ignored.
     if _opaque(views) and (split == "train" or _opaque(training())):
         views = tuple(view.changed(alpha=None) if _own_alpha(view) else view for view in views)
-        notes = (*notes, "images have alpha, but no pixel is transparent: they count as images without")
+        notes = (*notes, "images have alpha, but no pixel is transparent: alpha is ignored")
+
+    # Positions are shifted near the origin, and clip planes derived.
     offset = _offset(training()) if split == "train" or _may_be_far(views) else np.zeros(3)
     near = NEAR_EXTENTS * _extent(views, offset)
-    colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
     region = read_region(path)
     region = None if region is None else region.moved(-offset)
     if region is None and not all(view.has_alpha for view in views):
         with contextlib.suppress(InputError):  # views that share no point have none
             region = region_of([_moved(view, offset) for view in training()])
     views = tuple(_moved(view, offset).changed(near=near) for view in views)
-    points = found.points
+    x, y, z = map(float, offset)
     if offset.any():
         points = None if points is None else replace(points, position=points.position - offset)
-        x, y, z = (f"{value:.12g}" for value in offset)
-        notes = (*notes, f"cameras stand far from the origin: positions are relative to ({x}, {y}, {z})")
+        position = f"({x:.12g}, {y:.12g}, {z:.12g})"
+        notes = (*notes, f"cameras are far from the origin: positions are relative to {position}")
+    colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
     linear = images == "exr"
     return Dataset(
-        path,
-        split,
-        views,
-        colour,
-        linear,
-        found.environment,
-        points,
-        region,
-        notes,
-        (float(offset[0]), float(offset[1]), float(offset[2])),
+        path, split, views, colour, linear, found.environment, points, region, notes, offset=(x, y, z)
     )
 
 
 def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, int, int]:
-    """The smallest `downscale` with which the first training picture has at most so many pixels.
+    """The smallest `downscale` for which the first training image has at most `pixels` pixels.
 
-    Returns it with the picture's own width and height. Raises InputError as `read_dataset` does.
+    Also returns the width and height of that image's file. Raises InputError as `read_dataset` does.
     """
     width, height = reader_of(Path(path)).size(Path(path), images)
     factor = 1
@@ -161,19 +278,15 @@ def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, 
     return factor, width, height
 
 
-def _training_views(path: Path, options: ReadOptions) -> tuple[View, ...]:
-    return reader_of(path).read(path, "train", replace(options, truth=False, decode=False)).views
-
-
 def _own_alpha(view: View) -> bool:
-    """Whether a view has alpha, and not that of a mask."""
+    """Whether a view has alpha that is not from a mask."""
     return view.has_alpha and (view.file is None or view.file.mask is None)
 
 
 def _opaque(views: tuple[View, ...]) -> bool:
-    """Whether alpha says nothing: no pixel is transparent in OPAQUE images that have alpha, evenly chosen."""
+    """Whether images with alpha have no transparent pixel; OPAQUE_CHECKED evenly spaced ones are examined."""
     own = [view for view in views if _own_alpha(view)]
-    chosen = np.unique(np.linspace(0, len(own) - 1, OPAQUE).astype(int)) if own else ()
+    chosen = np.unique(np.linspace(0, len(own) - 1, OPAQUE_CHECKED).astype(int)) if own else ()
     return bool(own) and all(_is_opaque(own[i]) for i in chosen)
 
 
@@ -192,14 +305,13 @@ def _extent(views: tuple[View, ...], offset: np.ndarray | float = 0.0) -> float:
 
 
 def _may_be_far(views: tuple[View, ...]) -> bool:
-    """Whether it takes the training cameras to say if views stand far away: unless they are plainly near."""
+    """Whether the training cameras must be read to decide on an offset; no if views are clearly near."""
     middle = np.mean([view.to_world[:3, 3] for view in views], axis=0)
     return len(views) == 1 or float(np.linalg.norm(middle)) > 0.01 * FAR * _extent(views)
 
 
 def _offset(views: tuple[View, ...]) -> np.ndarray:
-    """What to subtract from all positions, (3,) float64: the mean of cameras that stand FAR away, in round
-    numbers; else 0."""
+    """What to subtract from all positions, (3,): the rounded mean of cameras that are FAR away, else 0."""
     middle = np.mean([view.to_world[:3, 3] for view in views], axis=0)
     distance, extent = float(np.linalg.norm(middle)), _extent(views)
     if not FAR * extent < distance < extent / DISTINCT:

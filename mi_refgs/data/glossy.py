@@ -1,8 +1,8 @@
-"""NeRO's Glossy Synthetic: for every i a picture `i.png`, its depth `i-depth.png` and camera `i-camera.pkl`.
+"""Reader of NeRO's Glossy Synthetic: per image an `i.png`, its depth `i-depth.png` and camera `i-camera.pkl`.
 
 A camera is a pickled list of the pose (3 × 4, world to camera, OpenCV's axes) and the 3 × 3 matrix K. Depths
-along the viewing axis have 16 bits for 15 units; what is nearer than 14.5 is the object. Every eighth picture
-by number is a test view, as the splits made for 3DGS-DR and Ref-Gaussian have it. [NeRO, Liu et al., SIGGRAPH
+along the viewing axis have 16 bits for 15 units; what is nearer than 14.5 is the object. Every eighth image
+by number is a test view, as in the splits made for 3DGS-DR and Ref-Gaussian. [NeRO, Liu et al., SIGGRAPH
 2023]
 """
 
@@ -15,21 +15,21 @@ import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.array_pickle import read_arrays
-from mi_refgs.data.picture_files import Mask, PictureFile, make_view
+from mi_refgs.data.dataset import ReadOptions, Recording, held_out, make_view
+from mi_refgs.data.ground_truth import block_mean
+from mi_refgs.data.images import ImageFile, Mask
 from mi_refgs.data.poses import from_world_to_camera
-from mi_refgs.data.readers import ReadOptions, Recording, held_out
-from mi_refgs.data.truth_maps import block_mean
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import image_size, read_grey
 
 CAMERA = re.compile(r"(\d{1,6})-camera\.pkl")
-DEEPEST = 15.0
-"""Units of the largest depth."""
-NUMBERS = 65535
-"""The number that stands for the largest depth in a file of 16 bits."""
-BEHIND = int(14.5 / DEEPEST * NUMBERS) + 1
-"""The least number that is background: 14.5 units."""
+MAX_DEPTH = 15.0
+"""Scene units of the largest number in a depth file."""
+MAX_CODE = 65535
+"""That number: 16 bits."""
+BACKGROUND = int(14.5 / MAX_DEPTH * MAX_CODE) + 1
+"""Smallest number of the background: 14.5 units."""
 
 
 class GlossyReader:
@@ -39,17 +39,17 @@ class GlossyReader:
     looks_for = "0-camera.pkl, beside 0.png and 0-depth.png"
 
     def recognises(self, folder: Path) -> bool:
-        """Whether the folder holds cameras."""
+        """Whether the folder contains cameras."""
         return any(CAMERA.fullmatch(path.name) for path in folder.glob("*-camera.pkl"))
 
     def size(self, folder: Path, images: str) -> tuple[int, int]:
-        """Width and height of the first training picture as it lies in its file."""
+        """Width and height of the first training image in its file."""
         return image_size(folder / f"{_numbers(folder, 'train')[0]}.png")
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
-        """The views of one split, with depths."""
+        """Read the views of one split, with depths."""
         if options.images != "png":
-            raise InputError(f"{folder}: images: the layout has no EXR pictures; read it as 'png'")
+            raise InputError(f"{folder}: images: the layout has no EXR images; read it as 'png'")
         views = tuple(_view(folder, number, options) for number in _numbers(folder, split))
         return Recording(views, source=folder)
 
@@ -58,7 +58,7 @@ def _numbers(folder: Path, split: str) -> list[int]:
     found = (CAMERA.fullmatch(path.name) for path in folder.glob("*-camera.pkl"))
     numbers = held_out(sorted({int(match[1]) for match in found if match}), split)
     if not numbers:
-        raise InputError(f"{folder}: zero {split} views; add pictures with their cameras")
+        raise InputError(f"{folder}: zero {split} views; add images with their cameras")
     return numbers
 
 
@@ -66,14 +66,16 @@ def _view(folder: Path, number: int, options: ReadOptions) -> View:
     field, depths = folder / f"{number}-camera.pkl", folder / f"{number}-depth.png"
     pose, matrix = _camera(field)
     to_world = from_world_to_camera(pose[:, :3], pose[:, 3], f"{field}: pose")
-    picture = PictureFile.find(folder / f"{number}.png", options.downscale, Mask(depths, BEHIND))
+    image = ImageFile.of(folder / f"{number}.png", options.downscale, Mask(depths, BACKGROUND))
     intrinsics = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    view, _ = make_view(str(number), picture, options, intrinsics, None, to_world, str(field))
+    view, _ = make_view(
+        image, options, str(field), name=str(number), intrinsics=intrinsics, lens=None, to_world=to_world
+    )
     if not options.truth:
         return view
     grey = read_grey(depths)[0][..., None]
-    depth = grey.astype(np.float32) * np.float32(DEEPEST / NUMBERS)
-    return view.changed(depth=block_mean(depth, grey < BEHIND, options.downscale)[0][..., 0])
+    depth = grey.astype(np.float32) * np.float32(MAX_DEPTH / MAX_CODE)
+    return view.changed(depth=block_mean(depth, grey < BACKGROUND, options.downscale)[0][..., 0])
 
 
 def _camera(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -1,37 +1,45 @@
-"""One picture of a data set with its camera, in NumPy."""
+"""One image of a data set with its camera, in NumPy."""
 
 from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mi_refgs.data.images import ImageSource, Mask
+from mi_refgs.data.lens import Lens
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, linear_from_srgb, srgb_from_linear
 
 if TYPE_CHECKING:
-    from mi_refgs.data.picture_files import FileCamera
     from mi_refgs.splat.camera import Camera
 
 ALPHA_FLOOR = 1e-3
-"""Alpha by which colour is divided at least: fainter pixels have no colour of their own in 8 bits."""
+"""Alpha by which colour is divided at least: 8 bits do not resolve the colour of fainter pixels."""
 
 
-class Pixels(Protocol):
-    """Colour and alpha of a picture that is decoded when it is asked for."""
+@dataclass(frozen=True)
+class FileCamera:
+    """An image file as it is on disk, and the lens through which it was taken."""
 
-    has_alpha: bool
-    """Whether it has alpha."""
-
-    def planes(self) -> tuple[np.ndarray, np.ndarray | None]:
-        """What `View.image` and `View.alpha` are; raises InputError for a file that cannot be read."""
+    path: Path
+    width: int  # pixels
+    height: int
+    intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels of the file
+    lens: Lens | None = None  # None: a pinhole
+    mask: Mask | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One picture and its camera."""
+    """One image and its camera.
+
+    Readers return views that are not loaded, because all images of a data set may not fit into memory: call
+    `load` before `image`, `alpha` and what depends on them, which raise RuntimeError otherwise.
+    """
 
     name: str
     width: int  # pixels
@@ -41,30 +49,47 @@ class View:
     cx: float  # principal point, pixels from the left edge; the centre is width / 2
     cy: float
     to_world: np.ndarray  # (4, 4) float64, rigid, from Mitsuba's camera frame: +z forward, +x left, +y up
-    image: np.ndarray  # (H, W, 3) float32 target, composited onto the background; given as `Pixels` or array
-    alpha: np.ndarray | None  # (H, W) float32; likewise
+    image: np.ndarray  # (H, W, 3) float32 target, composited onto the background
+    alpha: np.ndarray | None  # (H, W) float32
     normal: np.ndarray | None  # (H, W, 3) float32, world space, 0 off the object
     depth: np.ndarray | None  # (H, W) float32 along the viewing axis, 0 off the object
-    is_linear_radiance: bool  # whether `image` is linear radiance (EXR) or sRGB-encoded (PNG)
+    is_linear_radiance: bool  # of `image`: EXR; else it is sRGB-encoded
     materials: dict[str, np.ndarray] = field(default_factory=dict)
-    """Of albedo, roughness, metallic those that are known: (H, W, C + 1) float32, the last the share of the
-    pixel for which the others stand; all 0 where it is 0."""
-    exposure: float | None = None  # log(time · ISO / f-number²), where EXIF data say so
+    """Those known of albedo, roughness, metallic: (H, W, C + 1) float32, the last the fraction of the pixel
+    that the others describe; all 0 where it is 0."""
+    exposure: float | None = None  # log(time · ISO / f-number²) from EXIF data
     near: float = 0.0  # depth of the near plane, scene units; `read_dataset` derives it from all cameras
-    file: FileCamera | None = None  # that the picture was read from
+    file: FileCamera | None = None  # from which the image was read
 
     def load(self) -> View:
-        """The same view with its picture in memory: `image` and `alpha` are arrays, decoded at once.
+        """The view with its image decoded, from the data set's cache if it is there; itself if it is loaded.
 
-        Raises InputError for a file that cannot be read. Of a view of a file that is not loaded, these two
-        attributes decode it each time, and raise likewise.
+        Raises InputError for a file that cannot be read.
         """
-        given = self.__dict__["image"]
-        if isinstance(given, np.ndarray):
+        source = self.__dict__["image"]
+        if not isinstance(source, ImageSource):
             return self
-        image, alpha = given.planes()
-        own = self.__dict__["alpha"]
-        return self.changed(image=image, alpha=alpha if own is given else own)
+        image, alpha = source.read()
+        own = self.__dict__["alpha"]  # replaced by `changed`, or that of the file
+        return self.changed(image=image, alpha=alpha if own is source else own)
+
+    def changed(self, **fields: Any) -> View:
+        """The view with other values of some fields, loaded or not (`dataclasses.replace` requires it loaded)."""
+        made = copy.copy(self)
+        for name, value in fields.items():
+            object.__setattr__(made, name, value)
+        return made
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether the image has alpha; the view need not be loaded."""
+        alpha = self.__dict__["alpha"]
+        return alpha.has_alpha if isinstance(alpha, ImageSource) else alpha is not None
+
+    @property
+    def displayed(self) -> np.ndarray:
+        """The image (H, W, 3), sRGB-encoded."""
+        return srgb_from_linear(self.image) if self.is_linear_radiance else self.image
 
     def camera(self) -> Camera:
         """The splatter's camera; in Mitsuba's frame both of its focal lengths are negative."""
@@ -74,9 +99,9 @@ class View:
         return Camera.from_pose(self.width, self.height, *focal, self.cx, self.cy, self.to_world, self.near)
 
     def covered(self) -> np.ndarray:
-        """What part of each pixel the object covers, (H, W): alpha.
+        """Coverage of each pixel by the object, (H, W): alpha, or 1 where ground truth has a surface.
 
-        Without it 1 where something true is recorded of a surface, and of all pixels where nothing is.
+        It is 1 everywhere without alpha and ground truth.
         """
         if self.alpha is not None:
             return self.alpha
@@ -86,29 +111,11 @@ class View:
             return (self.depth > 0).astype(np.float32)
         return np.ones((self.height, self.width), np.float32)
 
-    @property
-    def displayed(self) -> np.ndarray:
-        """The picture (H, W, 3) that the view is fitted to or compared with, display-encoded."""
-        return srgb_from_linear(self.image) if self.is_linear_radiance else self.image
-
-    @property
-    def has_alpha(self) -> bool:
-        """Whether the picture has alpha; decodes nothing, as `alpha` may."""
-        given = self.__dict__["alpha"]
-        return given is not None and (isinstance(given, np.ndarray) or given.has_alpha)
-
-    def changed(self, **fields: Any) -> View:
-        """The same view with other fields; decodes nothing, as `dataclasses.replace` would."""
-        made = copy.copy(self)
-        for name, value in fields.items():
-            object.__setattr__(made, name, value)
-        return made
-
     def averaged(self, block: int) -> View:
-        """The same view with each square of `block` × `block` pixels as one, and without true maps.
+        """The loaded view averaged over blocks of `block` × `block` pixels, without ground-truth maps.
 
-        Pixels at the right and the bottom that fill no square are left out. Raises InputError for a picture
-        of less than one square.
+        Pixels at the right and the bottom that fill no block are left out. Raises InputError for an image
+        smaller than one block.
         """
         if min(self.width, self.height) < block:
             raise InputError(
@@ -116,17 +123,16 @@ class View:
                 f"{block}²; give a smaller one"
             )
         loaded = self.load()
-        image, alpha = loaded.image, loaded.alpha
-        alpha = None if alpha is None else box_downscale(alpha[..., None], block)[..., 0]
+        alpha = None if loaded.alpha is None else box_downscale(loaded.alpha[..., None], block)[..., 0]
         return replace(
-            self,
+            loaded,
             width=self.width // block,
             height=self.height // block,
             fx=self.fx / block,
             fy=self.fy / block,
             cx=self.cx / block,
             cy=self.cy / block,
-            image=box_downscale(image, block),
+            image=box_downscale(loaded.image, block),
             alpha=alpha,
             normal=None,
             depth=None,
@@ -134,41 +140,43 @@ class View:
         )
 
     def colour(self, background: np.ndarray) -> np.ndarray:
-        """Linear colour (H, W, 3) of the object alone, not premultiplied; `background` (3,) as in `image`."""
-        loaded = self.load()
-        alpha = np.float32(1) if loaded.alpha is None else loaded.alpha[..., None]
-        colour = np.clip((loaded.image - (1 - alpha) * background) / np.maximum(alpha, ALPHA_FLOOR), 0, None)
+        """Linear colour (H, W, 3) of the object, not premultiplied; `background` (3,) as in `image`."""
+        alpha = np.float32(1) if self.alpha is None else self.alpha[..., None]
+        colour = np.clip((self.image - (1 - alpha) * background) / np.maximum(alpha, ALPHA_FLOOR), 0, None)
         return colour if self.is_linear_radiance else linear_from_srgb(np.clip(colour, 0, 1))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Array indices (row, column), integer at pixel centres, of world points (N, 3); and if seen."""
+        """Project world points (N, 3): row, column (N,), integer at pixel centres; whether in view (N,)."""
         local = (points - self.to_world[:3, 3]) @ self.to_world[:3, :3]
         depth = np.where(local[:, 2] > 0, local[:, 2], np.inf)
         column = -self.fx * local[:, 0] / depth + self.cx - 0.5
         row = -self.fy * local[:, 1] / depth + self.cy - 0.5
-        seen = (
+        in_view = (
             (local[:, 2] > 0)
             & (abs(column - (self.width - 1) / 2) <= self.width / 2)
             & (abs(row - (self.height - 1) / 2) <= self.height / 2)
         )
-        return row, column, seen
+        return row, column, in_view
 
 
-class _Decoded:
-    """`View.image` or `View.alpha`: an array as it was given, or decoded of `Pixels`."""
+class _LoadedField:
+    """`View.image` or `View.alpha`, which raises RuntimeError for a view that is not loaded."""
 
-    def __init__(self, name: str, plane: int) -> None:
-        self.name, self.plane = name, plane
+    def __init__(self, name: str) -> None:
+        self.name = name
 
     def __get__(self, view: View | None, owner: type) -> Any:
         if view is None:
             return self
-        given = view.__dict__[self.name]
-        return given if given is None or isinstance(given, np.ndarray) else given.planes()[self.plane]
+        value = view.__dict__[self.name]
+        if isinstance(value, ImageSource):
+            raise RuntimeError(f"view '{view.name}' is not loaded; use view.load().{self.name}")
+        return value
 
-    def __set__(self, view: View, value: np.ndarray | Pixels | None) -> None:
+    def __set__(self, view: View, value: np.ndarray | ImageSource | None) -> None:
         view.__dict__[self.name] = value
 
 
-for _plane, _name in enumerate(("image", "alpha")):
-    setattr(View, _name, _Decoded(_name, _plane))
+# Set after the class is made: @dataclass would take a descriptor in its body as the field's default.
+for _name in ("image", "alpha"):
+    setattr(View, _name, _LoadedField(_name))
