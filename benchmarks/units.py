@@ -58,7 +58,7 @@ def fit(folder: Path, seed: int) -> dict[str, float]:
     trainer.train()
     test: Any = dataset.read_dataset(folder, "test")
     scores: list[dict[str, Any]] = []
-    for view in test.views:
+    for view in (view.load() for view in test.views):
         shot = images.RenderedView.of(trainer.view(view.camera()), test, view)
         psnr = metrics.psnr(shot.image, view.displayed)
         scores.append({"psnr": psnr} | metrics.normal_mae_deg(shot.normal, view.normal, view.alpha))

@@ -1,6 +1,6 @@
 # The public names, each stated once: `mi_refgs.NAME` is imported from where this file says on first use.
 
-import mi_refgs.data.readers
+import mi_refgs.data.dataset
 import mi_refgs.formats.format
 import mi_refgs.methods.read
 import mi_refgs.render.pipeline
@@ -54,7 +54,7 @@ load_method = mi_refgs.methods.read.load
 register_channel = mi_refgs.surfels.attributes.register
 register_format = mi_refgs.formats.format.register
 register_primitive = mi_refgs.surfels.primitives.register
-register_reader = mi_refgs.data.readers.register
+register_reader = mi_refgs.data.dataset.register_reader
 register_reflectance = mi_refgs.shade.reflectance.register
 render_frame = mi_refgs.render.pipeline.render
 

@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.cli import main
+from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.errors import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -66,6 +68,12 @@ def level_maps(light: Any) -> list[np.ndarray]:
     """The levels of a prefiltered light as float64 maps (h, 2h, 3)."""
     flat = np.array(light.levels, np.float64).reshape(-1, 4)[:, :3]
     return [flat[first : first + 2 * h * h].reshape(h, 2 * h, 3) for first, h in light.operator.shapes]
+
+
+def read_loaded(*arguments: Any, **options: Any) -> Dataset:
+    """`read_dataset` with all views loaded."""
+    data = read_dataset(*arguments, **options)
+    return replace(data, views=tuple(view.load() for view in data.views))
 
 
 def run_python(code: str, *arguments: object, folder: Path, package: Path = ROOT) -> str:

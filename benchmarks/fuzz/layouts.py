@@ -15,7 +15,7 @@ from mi_refgs.data.array_pickle import read_arrays
 from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.llff import read_poses
-from mi_refgs.data.point_file import read_points
+from mi_refgs.data.transforms import read_points
 from mi_refgs.io.images import read_tiff, write_png
 
 VIEWS = 3
@@ -75,7 +75,9 @@ def read_colmap(folder: Path, data: bytes) -> None:
     for name, whole in (_text() if ending == "txt" else _binary()).items():
         (model / f"{name}.{ending}").write_bytes(data[4:] if name == kind else whole)
     found = read_dataset(folder, "train")
-    values = [x for view in found.views for x in (view.image, view.to_world, np.array([view.fx, view.cy]))]
+    values = [
+        x for view in found.views for x in (view.load().image, view.to_world, np.array([view.fx, view.cy]))
+    ]
     if found.points is not None:
         values.append(found.points.position)
     assert all(np.isfinite(value).all() for value in values), "a value that is not finite"

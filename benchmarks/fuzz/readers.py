@@ -219,7 +219,7 @@ def _transforms(folder: Path) -> list[bytes]:
 
 
 def _read_transforms(path: Path) -> list[Any]:
-    views = read_dataset(path.parent, "train").views
+    views = [view.load() for view in read_dataset(path.parent, "train").views]
     cameras = [np.array([view.fx, view.fy, view.cx, view.cy]) for view in views]
     return [*cameras, *(x for v in views for x in (v.image, v.alpha, v.depth, v.to_world))]
 

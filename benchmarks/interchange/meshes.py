@@ -70,7 +70,7 @@ def measured(folder: Path, out: Path, args: Any) -> dict[str, Any]:
     )
     rows = []
     for index in args.views:
-        view, picture = views.views[index], out / f"{index}.exr"
+        view, picture = views.views[index].load(), out / f"{index}.exr"
         options = ["-m", args.mitsuba, "-s", str(index), "-D", f"spp={args.spp}", "-o", str(picture)]
         subprocess.run([command, *options, files["mitsuba"][0]], check=True, capture_output=True)
 

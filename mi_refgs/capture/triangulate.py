@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.capture import colmap
-from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
+from mi_refgs.data.dataset import Dataset, PointCloud, fitting_downscale, read_dataset
 from mi_refgs.data.poses import MITSUBA_FROM_OPENCV
-from mi_refgs.data.readers import PointCloud
 from mi_refgs.data.view import View
 from mi_refgs.io.files import write_bytes
 from mi_refgs.io.images import linear_from_srgb, write_png
@@ -103,7 +102,7 @@ def triangulated(data: Dataset) -> PointCloud | None:
         for part in (pictures, output):
             part.mkdir()
         for file, view in zip(names, views, strict=True):
-            write_png(pictures / file, view.displayed)
+            write_png(pictures / file, view.load().displayed)
         colmap.begin(database, pictures, _cameras(names, views))
         colmap.extract(database, pictures, names)
         colmap.match(database, [(names[i], names[j]) for i, j in near_pairs(views)])

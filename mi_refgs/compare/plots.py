@@ -113,7 +113,7 @@ def write_crops(folder: Path, scene: Scene, path: Path) -> Region | None:
     side = max(min(views[0].width, views[0].height) // CROP_SHARE, CROP_MIN)
     side = min(side, views[0].width, views[0].height)
     for index in chosen:
-        truth = views[index].displayed
+        truth = views[index].load().displayed
         pictures = _renders(folder, rows, names[index])
         if pictures is None or any(picture.shape != truth.shape for picture in pictures):
             continue

@@ -106,7 +106,7 @@ class Curve:
             return
         self.due = self.due[len(passed) :]  # one point for all that a trial has passed
         values = [
-            psnr(RenderedView.of(trainer.view(view.camera()), self.data, view).image, view.displayed)
+            psnr(RenderedView.of(trainer.view(view.camera()), self.data, view).image, view.load().displayed)
             for view in self.views
         ]
         line = {"iteration": trainer.iteration, "seconds": round(trainer.seconds, 3)}

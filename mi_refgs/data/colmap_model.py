@@ -288,7 +288,9 @@ def write_images(
 ) -> None:
     """Write images.txt; all sequences have one item per image."""
     rows = []
-    for i, (name, pose, camera, points) in enumerate(zip(names, poses, cameras, observations, strict=True), 1):
+    for i, (name, pose, camera, points) in enumerate(
+        zip(names, poses, cameras, observations, strict=True), 1
+    ):
         rotation = OPENCV_FROM_MITSUBA @ pose[:3, :3].T
         numbers = (*_quaternion(rotation), *(-rotation @ pose[:3, 3]))
         rows += [f"{i} {' '.join(repr(float(x)) for x in numbers)} {camera} {name}", points]

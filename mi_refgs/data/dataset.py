@@ -236,9 +236,8 @@ def read_dataset(
     # evaluation use the same region and the same offset.
     @cache
     def training() -> tuple[View, ...]:
-        if split == "train":
-            return views
-        return reader_of(path).read(path, "train", replace(options, truth=False, decode=False)).views
+        cameras_only = replace(options, truth=False, decode=False)
+        return views if split == "train" else reader_of(path).read(path, "train", cameras_only).views
 
     # Alpha without a transparent pixel, as of photographs saved as RGBA, is ignored.
     if _opaque(views) and (split == "train" or _opaque(training())):

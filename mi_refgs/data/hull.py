@@ -140,7 +140,7 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | Non
         # No view is blurred as if it were nearer to the middle than a voxel.
         distance = max(float(np.linalg.norm(middle - view.to_world[:3, 3])), float(voxel.max()))
         blur = 0.5 * float(voxel.max()) * view.fx / distance
-        mask = gaussian_filter(np.asarray(view.alpha, dtype=np.float32), blur, mode="nearest")
+        mask = gaussian_filter(np.asarray(view.load().alpha, dtype=np.float32), blur, mode="nearest")
         value = map_coordinates(mask, np.stack([row[seen], column[seen]]), order=1, mode="nearest")
         inside[alive[seen]] = np.minimum(inside[alive[seen]], value)
         witnesses[alive[seen]] += 1

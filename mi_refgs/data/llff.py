@@ -1,9 +1,9 @@
-"""Reader of LLFF's layout: `poses_bounds.npy` beside `images`, copies in `images_2` and the like, and `masks`.
+"""Reader of LLFF's layout: `poses_bounds.npy` beside `images`, smaller copies in `images_2` …, and `masks`.
 
 One row per image, in the order of their names: a 3 × 5 matrix by rows, then the nearest and the farthest
-depth. The columns of the matrix are the camera's axes in the world (down, right, backwards), its position, and
-height, width and focal length in pixels. Every eighth image is a test view. [Mildenhall et al., Local Light
-Field Fusion, SIGGRAPH 2019]
+depth. The columns of the matrix are the camera's axes in the world (down, right, backwards), its position,
+and height, width and focal length in pixels. Every eighth image is a test view. [Mildenhall et al., Local
+Light Field Fusion, SIGGRAPH 2019]
 """
 
 from __future__ import annotations

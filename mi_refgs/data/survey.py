@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.dataset import Dataset, read_dataset, reader_of
 from mi_refgs.data.hull import view_focus
-from mi_refgs.data.readers import reader_of
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 

@@ -49,8 +49,8 @@ class View:
     cx: float  # principal point, pixels from the left edge; the centre is width / 2
     cy: float
     to_world: np.ndarray  # (4, 4) float64, rigid, from Mitsuba's camera frame: +z forward, +x left, +y up
-    image: np.ndarray  # (H, W, 3) float32 target, composited onto the background
-    alpha: np.ndarray | None  # (H, W) float32
+    image: np.ndarray = field(repr=False)  # (H, W, 3) float32 target, composited onto the background
+    alpha: np.ndarray | None = field(repr=False)  # (H, W) float32
     normal: np.ndarray | None  # (H, W, 3) float32, world space, 0 off the object
     depth: np.ndarray | None  # (H, W) float32 along the viewing axis, 0 off the object
     is_linear_radiance: bool  # of `image`: EXR; else it is sRGB-encoded
@@ -74,7 +74,7 @@ class View:
         return self.changed(image=image, alpha=alpha if own is source else own)
 
     def changed(self, **fields: Any) -> View:
-        """The view with other values of some fields, loaded or not (`dataclasses.replace` requires it loaded)."""
+        """The view with other values of some fields; unlike `dataclasses.replace`, also if not loaded."""
         made = copy.copy(self)
         for name, value in fields.items():
             object.__setattr__(made, name, value)

@@ -119,6 +119,7 @@ def evaluate(
     surface, errors = TrueSurface.read(views.path, views.offset), decomposition.Decomposition()
     materials = decomposition.material_maps(fitted, samples)
     for index, truth in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
+        truth = truth.load()
         frame = view(truth.camera())
         shot = images.RenderedView.of(frame, views, truth)
         gain, gained = with_gain(frame, truth, views)

@@ -70,7 +70,7 @@ def image_array(array: Any, height: int, width: int) -> np.ndarray:
 
 def panels(shot: RenderedView, view: View) -> dict[str, np.ndarray]:
     """Everything there is to see of a view, by title."""
-    shown = {"ground truth": view.displayed, "render": shot.image}
+    shown = {"ground truth": view.load().displayed, "render": shot.image}
     if view.normal is not None:
         covered = np.linalg.norm(view.normal, axis=-1)
         shown["true normals"] = on_white(0.5 + 0.5 * view.normal, covered)

@@ -150,7 +150,7 @@ def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.nda
         cosine = np.sum(normal * ray, axis=1) / reach
         row, column, inside = view.project(position)
         better = inside & (np.abs(cosine) > best)
-        if view.alpha is None:
+        if not view.has_alpha:
             at = np.rint(np.where(inside, [row, column], 0)).astype(int)
             at = np.clip(at, 0, np.array([[view.height - 1], [view.width - 1]]))
             better &= view.covered()[*at] > 0

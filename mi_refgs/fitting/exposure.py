@@ -209,7 +209,7 @@ def displayed_of(frame: Frame, data: Dataset, gain: np.ndarray | None = None) ->
 
 def psnr(image: np.ndarray, view: View, where: np.ndarray | None = None) -> float:
     """PSNR (dB) of a display-encoded picture (H, W, 3) of a view, over the pixels in `where` (H, W)."""
-    square = np.square(np.clip(image, 0, 1) - np.clip(view.displayed, 0, 1))
+    square = np.square(np.clip(image, 0, 1) - np.clip(view.load().displayed, 0, 1))
     return psnr_of(float(square.mean() if where is None else square[where].mean() if where.any() else 0))
 
 

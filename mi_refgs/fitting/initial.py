@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.data import hull
-from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.readers import PointCloud
+from mi_refgs.data.dataset import Dataset, PointCloud
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import LIGHT, LightOptions, Method

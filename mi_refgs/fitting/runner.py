@@ -11,8 +11,7 @@ import numpy as np
 
 from mi_refgs import methods
 from mi_refgs.constants import DEFAULT_PRESET
-from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.readers import PointCloud
+from mi_refgs.data.dataset import Dataset, PointCloud
 from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.exposure import EXPOSURE_FILE

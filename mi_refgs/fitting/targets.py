@@ -6,7 +6,7 @@ from collections import OrderedDict
 from pathlib import Path
 
 from mi_refgs.data.dataset import Dataset, read_dataset
-from mi_refgs.data.picture_store import BUDGET as PICTURE_BYTES
+from mi_refgs.data.images import CACHE_BYTES
 from mi_refgs.fitting.objective import Target
 from mi_refgs.kernels.memory import of_fit, require
 from mi_refgs.methods.method import DataOptions, Method
@@ -21,7 +21,7 @@ def bytes_of(method: Method, views: int, pixels: int) -> float:
     """Memory of a fit to so many images of so many pixels each."""
     surfels = method.surfels.max_count
     surfels += method.surroundings.max_count if method.surroundings is not None else 0
-    images = min(views * pixels * 12, PICTURE_BYTES) + min(views * pixels * PIXEL_BYTES, BUDGET)
+    images = min(views * pixels * 12, CACHE_BYTES) + min(views * pixels * PIXEL_BYTES, BUDGET)
     return of_fit(pixels, surfels, images)
 
 

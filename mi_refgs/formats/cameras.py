@@ -27,7 +27,7 @@ IMAGE_FOLDER = re.compile(r"images(_\d+)?")
 
 def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Path]:
     """Write the folder `target`; see `Format.write`."""
-    from mi_refgs.data.colmap_text import write_cameras, write_images, write_points, write_test_list
+    from mi_refgs.data.colmap_model import write_cameras, write_images, write_points, write_test_list
     from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 
     sparse = target / "sparse" / "0"

@@ -20,7 +20,7 @@ from mi_refgs.io.files import cannot_write, make_folder
 from mi_refgs.io.ownership import OutputFolder, require_no_run
 
 if TYPE_CHECKING:
-    from mi_refgs.data.picture_files import FileCamera
+    from mi_refgs.data.view import FileCamera
     from mi_refgs.runs.trained_scene import TrainedScene
     from mi_refgs.splat.camera import Camera
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.data.colmap_text import write_cameras, write_images, write_points, write_test_list
-from mi_refgs.data.readers import HOLDOUT
+from mi_refgs.data.colmap_model import write_cameras, write_images, write_points, write_test_list
+from mi_refgs.data.dataset import HOLDOUT
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.io.files import replace_file
 from mi_refgs.io.images import read_png

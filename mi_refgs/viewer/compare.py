@@ -35,7 +35,7 @@ class Compared:
 
     def picture(self, drawable: ViewerScene, look: DisplayOptions, window: tuple[int, int]) -> np.ndarray:
         """Both, as large as they fit into a window: 8-bit RGB of the window's shape."""
-        view = self.view
+        view = self.view.load()
         frame_of = getattr(drawable, "frame", None)
         truth = np.clip(view.displayed, 0, 1)
         if look.what == IMAGE and frame_of is not None:

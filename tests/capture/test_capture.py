@@ -24,11 +24,10 @@ from mi_refgs.capture.pairs import EXHAUSTIVE, pairs_to_match
 from mi_refgs.capture.photographs import find_photographs
 from mi_refgs.capture.solved import Solved
 from mi_refgs.cli import main
-from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import read_png
-from tests.helpers import refused
+from tests.helpers import read_loaded, refused
 from tests.scenes import photographed as scene
 
 COUNT = 9
@@ -129,7 +128,7 @@ def test_the_data_set_holds_pictures_masks_region_and_report(
 @needs_colmap
 def test_a_fit_reads_it(captured: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Cameras, alpha from the masks, points and region, as one set that every eighth view tests."""
-    train, test = (read_dataset(captured / "data", split) for split in ("train", "test"))
+    train, test = (read_loaded(captured / "data", split) for split in ("train", "test"))
     assert [view.name for view in test.views] == [NAMES[0], NAMES[8]] and len(train.views) == COUNT - 2
     assert all(view.alpha is not None and {0.0, 1.0} == {*np.unique(view.alpha)} for view in train.views)
     assert train.region == Region((0, 0, 0), 1) and train.points is not None
@@ -245,7 +244,7 @@ def test_another_lens_makes_other_pictures(
     assert after.focal_length_x == pytest.approx(1.01 * before.focal_length_x)
     assert (data / "images" / NAMES[0]).stat().st_ino != inode and (data / "masks").is_dir()
     assert main(command) == 0 and not (data / "masks").exists()
-    assert [view.name for view in read_dataset(data, "test").views] == [NAMES[3]]
+    assert [view.name for view in read_loaded(data, "test").views] == [NAMES[3]]
 
 
 # ---------- The folder ----------

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.capture import colmap, triangulate
-from mi_refgs.data.dataset import Dataset, read_dataset
-from mi_refgs.data.readers import PointCloud
+from mi_refgs.data.dataset import Dataset, PointCloud, read_dataset
 from mi_refgs.fitting.runner import begin
 from mi_refgs.methods import load
 from mi_refgs.runs.run import Run
@@ -33,7 +32,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     content = {"fl_x": scene.FOCAL, "frames": frames}
     for split in ("train", "test"):
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
-    return read_dataset(folder, "train")
+    data = read_dataset(folder, "train")
+    return replace(data, views=tuple(view.load() for view in data.views))
 
 
 @pytest.fixture(scope="module")

@@ -98,7 +98,7 @@ def test_smaller_copies_serve_where_they_divide(tmp_path: Path) -> None:
     copies(data, 2)
     copies(data, 4, ".PNG")
     for downscale, bright in ((1, True), (2, False), (3, True), (4, False), (8, False)):
-        view = read_dataset(data, "train", downscale=downscale).views[0]
+        view = read_dataset(data, "train", downscale=downscale).views[0].load()
         assert (view.width, view.height) == (96 // downscale, 72 // downscale)
         expected = box_downscale(read_png(data / "images/b.png"), downscale)
         np.testing.assert_allclose(view.image, expected if bright else 0.5 * expected, atol=0.01)
@@ -118,7 +118,7 @@ def test_a_copy_of_rounded_size(tmp_path: Path) -> None:
         across, down = 49 / 97, 37 / 73
         small = replace(shot, width=49, height=37, focal=(110 * across, 104 * down))
         replace(small, centre=(50.3 * across, 34.6 * down)).write(data / "images_2")
-    view = read_dataset(data, "train", downscale=2).views[0]
+    view = read_dataset(data, "train", downscale=2).views[0].load()
     assert (view.width, view.height) == (49, 37)
     assert (view.fx, view.cy) == pytest.approx((110 * 49 / 97, 34.6 * 37 / 73))
 
@@ -132,7 +132,7 @@ def test_masks_are_alpha(tmp_path: Path) -> None:
         mask[:, 48:] = 1
         name = (shot.name + ".png", shot.name)[i % 2]
         write_png(data / "masks" / name, mask)
-    view = read_dataset(data, "train", downscale=2, background="black").views[0]
+    view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
     assert view.alpha is not None and view.alpha.sum() == 24 * 36
     assert not view.image[:, :24].any() and view.image[:, 24:].max() > 0.9  # not of the copies
     (data / "masks" / "b.png").unlink()
@@ -169,16 +169,16 @@ def test_cameras_and_pictures_without_each_other(tmp_path: Path) -> None:
     (data / "images/c.png").unlink()
     (data / "sparse/1").mkdir()
     assert notes(data) == (
-        "1 of 9 cameras have no picture and are left out",
-        "1 of 9 pictures have no camera and are left out",
-        "sparse/1 holds another reconstruction, which is left out",
+        "1 of 9 cameras have no image and are left out",
+        "1 of 9 images have no camera and are left out",
+        "sparse/1 contains another reconstruction, which is left out",
     )
     assert len(read_dataset(data, "train").views) == 7
     shutil.rmtree(data / "images")
     with pytest.raises(InputError, match="images: no such folder"):
         read_dataset(data, "train")
     (data / "images").mkdir()
-    with pytest.raises(InputError, match=r"images\.bin: none of its 9 pictures lies in .*images; put"):
+    with pytest.raises(InputError, match=r"images\.bin: none of its 9 images is in .*images; put"):
         read_dataset(data, "train")
 
 
@@ -201,8 +201,8 @@ def test_names_stay_in_the_folder(tmp_path: Path) -> None:
         ("1 1 0 0 0 0 0 3 7", "COLMAP: broken"),
         ("1 1 0 0 0 0 0 x 7 a.png", "COLMAP: broken"),
         ("1 1 0 0 0 0 0 3 7 a.png\n\n2 1 0 0 0 0 0 3 7 a.png", "occurs twice"),
-        ("1 1 0 0 0 0 0 3 7 a.png\n2 1 0 0 0 0 0 3 7 b.png", "no line of points"),
-        ("", "none of its 0 pictures"),
+        ("1 1 0 0 0 0 0 3 7 a.png\n2 1 0 0 0 0 0 3 7 b.png", "not followed by a line of points"),
+        ("", "none of its 0 images"),
     ],
 )
 def test_images_that_make_no_sense(line: str, said: str, tmp_path: Path) -> None:

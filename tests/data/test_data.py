@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
+from mi_refgs.data.dataset import Dataset, fitting_downscale
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.images import box_downscale, read_png, write_png
+from tests.helpers import read_loaded
 
 ANGLE = 0.7  # camera_angle_x, radians
 WIDTH, HEIGHT = 6, 4
@@ -59,7 +60,7 @@ def write(folder: Path, split: str, content: Any) -> None:
 
 def test_png_is_composited_as_displayed(folder: Path) -> None:
     for background, value in (("white", 1), ("black", 0)):
-        data = read_dataset(folder, "train", background=background)
+        data = read_loaded(folder, "train", background=background)
         pixels = np.asarray(Image.open(folder / "train/r_3.png")) / 255
         expected = pixels[..., 3:] * pixels[..., :3] + (1 - pixels[..., 3:]) * value
         view = data.views[3]
@@ -76,7 +77,7 @@ def test_png_is_composited_as_displayed(folder: Path) -> None:
 
 
 def test_exr_is_linear_and_premultiplied(folder: Path) -> None:
-    view = read_dataset(folder, "train", images="exr").views[2]
+    view = read_loaded(folder, "train", images="exr").views[2]
     pixels = read_exr_image(folder / "train/r_2.exr")
     assert view.is_linear_radiance and view.image.max() > 1
     np.testing.assert_allclose(view.image, pixels[..., :3] + 1 - pixels[..., 3:], atol=1e-6)
@@ -85,15 +86,15 @@ def test_exr_is_linear_and_premultiplied(folder: Path) -> None:
 def test_picture_without_alpha(folder: Path) -> None:
     for i in range(8):
         write_png(folder / f"train/r_{i}.png", read_png(folder / f"train/r_{i}.png")[..., :3])
-    view = read_dataset(folder, "train").views[0]
+    view = read_loaded(folder, "train").views[0]
     assert view.alpha is None
     np.testing.assert_array_equal(view.image, read_png(folder / "train/r_0.png"))
 
 
 def test_downscale_averages_composited_pixels(folder: Path) -> None:
     for images in ("png", "exr"):
-        full = read_dataset(folder, "train", images=images).views[1]
-        half = read_dataset(folder, "train", images=images, downscale=2).views[1]
+        full = read_loaded(folder, "train", images=images).views[1]
+        half = read_loaded(folder, "train", images=images, downscale=2).views[1]
         np.testing.assert_allclose(half.image, box_downscale(full.image, 2), atol=1e-6)
         assert (half.width, half.height) == (WIDTH // 2, HEIGHT // 2)
         assert half.fx == full.fx / 2 and half.cy == full.cy / 2
@@ -101,7 +102,7 @@ def test_downscale_averages_composited_pixels(folder: Path) -> None:
 
 def test_downscale_leaves_out_what_fills_no_block(folder: Path) -> None:
     """The camera then only divides: the top left corner of the picture stays where it was."""
-    full, third = (read_dataset(folder, "train", downscale=scale).views[1] for scale in (1, 3))
+    full, third = (read_loaded(folder, "train", downscale=scale).views[1] for scale in (1, 3))
     assert (third.width, third.height) == (WIDTH // 3, HEIGHT // 3) == (2, 1)
     np.testing.assert_allclose(third.image, box_downscale(full.image[:3], 3), atol=1e-6)
     np.testing.assert_allclose(
@@ -119,14 +120,14 @@ def test_the_size_that_a_budget_of_pixels_affords(folder: Path) -> None:
     for pixels, factor in ((65536, 6), (1080 * 1920, 1), (1080 * 1920 - 1, 2), (1, 961)):
         assert fitting_downscale(folder, "png", pixels) == (factor, 1080, 1920)
     assert fitting_downscale(folder, "exr", 70) == (3, 21, 30)
-    view = read_dataset(folder, "train", downscale=7).views[0]
+    view = read_loaded(folder, "train", downscale=7).views[0]
     assert (view.width, view.height) == (1080 // 7, 1920 // 7)
     assert view.cx == pytest.approx(1080 / 2 / 7) and view.cy == pytest.approx(1920 / 2 / 7)
 
 
 def test_camera_frame(folder: Path) -> None:
     """Mitsuba's frame: +z forward, +x left, +y up; what lies right of the axis lands right."""
-    view = read_dataset(folder, "train").views[1]
+    view = read_loaded(folder, "train").views[1]
     opengl = pose(0.7)
     np.testing.assert_allclose(view.to_world[:3, 2], -opengl[:3, 2])
     np.testing.assert_allclose(view.to_world[:3, 0], -opengl[:3, 0])
@@ -148,7 +149,7 @@ def test_camera_frame(folder: Path) -> None:
 
 
 def test_extent(folder: Path) -> None:
-    data = read_dataset(folder, "train")
+    data = read_loaded(folder, "train")
     origins = np.array([pose(0.7 * i)[:3, 3] for i in range(8)])
     extent = 1.1 * max(np.linalg.norm(origins - origins.mean(axis=0), axis=1))
     assert data.scene_extent == pytest.approx(extent)
@@ -162,7 +163,7 @@ def test_intrinsics_per_file_and_per_frame(folder: Path) -> None:
     content |= {"fl_x": 9.0, "fl_y": 8.0, "cx": 2.5, "cy": 1.5, "w": WIDTH, "h": HEIGHT}
     content["frames"][1] |= {"fl_x": 10.0, "cx": 3.25}
     write(folder, "train", content)
-    first, second = read_dataset(folder, "train").views[:2]
+    first, second = read_loaded(folder, "train").views[:2]
     assert (first.fx, first.fy, first.cx, first.cy) == (9, 8, 2.5, 1.5)
     assert (second.fx, second.fy, second.cx, second.cy) == (10, 8, 3.25, 1.5)
 
@@ -174,11 +175,11 @@ def test_holdout_without_a_test_file(folder: Path) -> None:
     ]
     write(folder, "train", content)
     (folder / "transforms_test.json").unlink()
-    names = {split: [v.name for v in read_dataset(folder, split).views] for split in ("train", "test")}
+    names = {split: [v.name for v in read_loaded(folder, split).views] for split in ("train", "test")}
     assert names["test"] == ["test/r_0", "train/r_6"]  # sorted: test/r_0, test/r_1, train/r_0 … train/r_7
     assert len(names["train"]) == 8 and not set(names["train"]) & set(names["test"])
     (folder / "transforms_train.json").rename(folder / "transforms.json")
-    assert [v.name for v in read_dataset(folder, "test").views] == names["test"]
+    assert [v.name for v in read_loaded(folder, "test").views] == names["test"]
 
 
 def test_names_that_turn_back_inside_the_folder(folder: Path) -> None:
@@ -188,7 +189,7 @@ def test_names_that_turn_back_inside_the_folder(folder: Path) -> None:
     (folder / "links").symlink_to(folder / "train")  # followed: whoever made the folder made it
     content["frames"][1]["file_path"] = "links/r_1.png"
     write(folder, "train", content)
-    views = read_dataset(folder, "train").views
+    views = read_loaded(folder, "train").views
     np.testing.assert_array_equal(views[0].image, views[1].image)
 
 
@@ -198,10 +199,10 @@ def test_extension_may_be_given(folder: Path) -> None:
     content["frames"][1]["file_path"] = "train/take.1"
     (folder / "train/r_1.png").rename(folder / "train/take.1.png")
     write(folder, "train", content)
-    views = read_dataset(folder, "train").views
+    views = read_loaded(folder, "train").views
     assert [v.name for v in views[:2]] == ["train/r_0", "train/take.1"]
     (folder / "train/take.1.exr").write_bytes((folder / "train/r_1.exr").read_bytes())
-    assert read_dataset(folder, "train", images="exr").views[1].is_linear_radiance
+    assert read_loaded(folder, "train", images="exr").views[1].is_linear_radiance
 
 
 def test_ground_truth_maps(folder: Path, rng: np.random.Generator) -> None:
@@ -214,14 +215,14 @@ def test_ground_truth_maps(folder: Path, rng: np.random.Generator) -> None:
     content = read(folder)
     content["frames"][0] |= {"normal_path": "n.exr", "depth_path": "d.exr"}
     write(folder, "train", content)
-    data = read_dataset(folder, "train", downscale=2)
+    data = read_loaded(folder, "train", downscale=2)
     assert data.environment == folder / "environment.exr"
     view = data.views[0]
     assert view.normal is not None and view.depth is not None and data.views[1].normal is None
     np.testing.assert_allclose(np.linalg.norm(view.normal, axis=-1), [[0, 1, 1], [1, 1, 1]], atol=1e-6)
     # The block half off the object takes the mean of its other half, column 3 alone.
     np.testing.assert_allclose(view.depth, [[0, 5, 6.5], [2.5, 4.5, 6.5]])
-    assert read_dataset(folder, "train", truth=False).views[0].normal is None
+    assert read_loaded(folder, "train", truth=False).views[0].normal is None
 
 
 def edit(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
@@ -319,7 +320,7 @@ def test_bad_input_names_file_field_and_remedy(
 ) -> None:
     damage(folder)
     with pytest.raises(InputError) as caught:
-        read_dataset(folder, "train", **options)
+        read_loaded(folder, "train", **options)
     message = str(caught.value)
     assert message.startswith(str(folder)) and "\n" not in message
     for word in words:
@@ -328,19 +329,19 @@ def test_bad_input_names_file_field_and_remedy(
 
 def test_missing_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
-        read_dataset(tmp_path / "none", "train")
+        read_loaded(tmp_path / "none", "train")
 
 
 def test_lone_picture_leaves_zero_training_views(folder: Path) -> None:
     edit(lambda c: c.update(frames=c["frames"][:1]))(folder)
     (folder / "transforms_test.json").unlink()
     with pytest.raises(InputError, match="zero training views"):
-        read_dataset(folder, "train")
+        read_loaded(folder, "train")
 
 
 def test_an_averaged_view_shows_the_same_points(folder: Path) -> None:
     """Pixels are means of blocks, and a point lands in the block of its pixel."""
-    view = read_dataset(folder, "train").views[0]
+    view = read_loaded(folder, "train").views[0]
     small = view.averaged(2)
     assert (small.width, small.height) == (WIDTH // 2, HEIGHT // 2)
     np.testing.assert_allclose(small.image[1, 2], view.image[2:4, 4:6].mean(axis=(0, 1)), atol=1e-6)

@@ -82,7 +82,7 @@ def test_a_mask_that_a_frame_names(tmp_path: Path) -> None:
     change_transforms(
         data, lambda content: [frame.update(mask_path="mask.png") for frame in content["frames"]]
     )
-    view = read_dataset(data, "train", downscale=2, background="black").views[0]
+    view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
     assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
     assert not view.image[:18].any() and view.image[18:].any()
 
@@ -146,7 +146,7 @@ def shiny(folder: Path, alpha: bool = True) -> Path:
 @pytest.mark.parametrize("alpha", [True, False])
 def test_shiny_blender_has_normals_and_depths(alpha: bool, tmp_path: Path) -> None:
     data = shiny(tmp_path, alpha)
-    view = read_dataset(data, "test").views[0]
+    view = read_dataset(data, "test").views[0].load()
     assert view.normal is not None and view.depth is not None and view.alpha is not None
     inside = view.alpha > 0
     assert 240 < inside.sum() < 260 and (view.alpha[inside] == 1).all()
@@ -157,7 +157,7 @@ def test_shiny_blender_has_normals_and_depths(alpha: bool, tmp_path: Path) -> No
     expected = np.array([column / 32 - 0.5, row / 24 - 0.5, 1])
     np.testing.assert_allclose(view.normal[row, column], expected / np.linalg.norm(expected), atol=6e-3)
     assert view.depth[row, column] == pytest.approx(3 + 0.1 * column, rel=1e-5)
-    half = read_dataset(data, "test", downscale=2).views[0]
+    half = read_dataset(data, "test", downscale=2).views[0].load()
     assert half.depth is not None and half.normal is not None and half.normal.shape == (12, 16, 3)
     assert half.depth[6, 10] == pytest.approx(3 + 0.1 * 20.5, rel=1e-5)
     assert read_dataset(data, "test", truth=False).views[0].normal is None
@@ -196,7 +196,7 @@ def test_llff(factor: int, tmp_path: Path) -> None:
     (data / "images_2").mkdir()
     for path in (data / "images").iterdir():
         write_png(data / "images_2" / path.name, 0.5 * box_downscale(read_png(path), 2))
-    view = read_dataset(data, "train", downscale=4).views[0]
+    view = read_dataset(data, "train", downscale=4).views[0].load()
     assert view.width == 24 and view.fx == pytest.approx(107 / 4) and view.image.max() <= 0.5
     assert fitting_downscale(data, "png", 2000) == (2, 96, 72)
 
@@ -211,7 +211,7 @@ def test_llff_masks(tmp_path: Path) -> None:
     for path in (data / "images").iterdir():
         write_png(data / "images_2" / path.name, box_downscale(read_png(path), 2))
         write_png(data / "masks" / path.name, mask)
-    view = read_dataset(data, "train", downscale=2, background="black").views[0]
+    view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
     assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
     assert not view.image[:18].any() and view.image[18:].any()
     (data / "masks/c.png").unlink()
@@ -240,7 +240,7 @@ def test_llff_that_makes_no_sense(tmp_path: Path) -> None:
     for array, said in (
         (np.array([Code()], dtype=object), "NumPy: cannot be read"),
         (good[:, :15], r"shape \(9, 15\)"),
-        (good[:8], "8 cameras, but images has 9 pictures"),
+        (good[:8], "8 cameras, but images has 9 images"),
         (infinite, "infinite"),
         (sheared, r"b\.png: not a rotation"),
         (flat, r"b\.png: height, width and focal length"),
@@ -271,7 +271,7 @@ def test_glossy_synthetic(protocol: int, tmp_path: Path) -> None:
     assert ([v.name for v in train.views], [v.name for v in test.views]) == (
         [*"1234567"], ["0", "8"],
     )  # fmt: skip
-    view = test.views[0]
+    view = test.views[0].load()
     assert view.alpha is not None and view.depth is not None
     expected = np.repeat([[0.0] * 32 + [1.0] * 32 + [0.0] * 32], 72, axis=0)
     np.testing.assert_array_equal(view.alpha, expected)

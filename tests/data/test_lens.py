@@ -82,7 +82,7 @@ def centroid(image: np.ndarray, u: float, v: float) -> tuple[float, float]:
 def test_points_land_where_a_pinhole_sees_them(tmp_path: Path, name: str) -> None:
     """Points of a straight line therefore land on one."""
     data = read_dataset(dataset(tmp_path, LENSES[name]), "train", images="exr")
-    view = data.views[0]
+    view = data.views[0].load()
     assert (view.width, view.height, view.cx, view.cy) == (WIDTH, HEIGHT, PINHOLE["cx"], PINHOLE["cy"])
     assert (
         view.fx / PINHOLE["fl_x"] == pytest.approx(view.fy / PINHOLE["fl_y"]) and view.fx >= PINHOLE["fl_x"]
@@ -102,7 +102,7 @@ def test_points_land_where_a_pinhole_sees_them(tmp_path: Path, name: str) -> Non
 
 def test_every_pixel_has_data(tmp_path: Path) -> None:
     """At the smallest zoom the image of one edge touches the picture's, and none leaves it."""
-    view = read_dataset(dataset(tmp_path, LENSES["pincushion"]), "train", images="exr").views[0]
+    view = read_dataset(dataset(tmp_path, LENSES["pincushion"]), "train", images="exr").views[0].load()
     x = (np.array([0.5, WIDTH - 0.5]) - view.cx) / view.fx
     y = (np.array([0.5, HEIGHT - 0.5]) - view.cy) / view.fy
     corners = np.array([seen_by(LENSES["pincushion"], a, b) for a in x for b in y])
@@ -111,7 +111,9 @@ def test_every_pixel_has_data(tmp_path: Path) -> None:
 
 
 def test_alpha_and_maps_follow_the_picture(tmp_path: Path) -> None:
-    view = read_dataset(dataset(tmp_path, LENSES["barrel"], alpha=True), "train", images="exr").views[0]
+    view = (
+        read_dataset(dataset(tmp_path, LENSES["barrel"], alpha=True), "train", images="exr").views[0].load()
+    )
     assert view.alpha is not None and view.depth is not None
     np.testing.assert_allclose(view.image[..., 0] - (1 - view.alpha), view.alpha, atol=1e-6)
     for x, y in DOTS:
@@ -123,8 +125,8 @@ def test_alpha_and_maps_follow_the_picture(tmp_path: Path) -> None:
 
 def test_a_smaller_picture_has_the_same_camera(tmp_path: Path) -> None:
     folder = dataset(tmp_path, LENSES["pincushion"])
-    full = read_dataset(folder, "train", images="exr").views[0]
-    half = read_dataset(folder, "train", images="exr", downscale=2).views[0]
+    full = read_dataset(folder, "train", images="exr").views[0].load()
+    half = read_dataset(folder, "train", images="exr", downscale=2).views[0].load()
     np.testing.assert_allclose(
         [2 * half.fx, 2 * half.cx, 2 * half.cy], [full.fx, full.cx, full.cy], rtol=3e-3
     )
@@ -135,11 +137,11 @@ def test_a_smaller_picture_has_the_same_camera(tmp_path: Path) -> None:
 
 def test_zero_coefficients_change_no_pixel(tmp_path: Path) -> None:
     folder = dataset(tmp_path, {})
-    plain = read_dataset(folder, "train").views[0]
+    plain = read_dataset(folder, "train").views[0].load()
     zeros = dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0) | {"is_fisheye": False}
     content = json.loads((folder / "transforms_train.json").read_text()) | zeros
     (folder / "transforms_train.json").write_text(json.dumps(content))
-    view = read_dataset(folder, "train").views[0]
+    view = read_dataset(folder, "train").views[0].load()
     np.testing.assert_array_equal(view.image, plain.image)
     assert (view.fx, view.fy) == (plain.fx, plain.fy)
 

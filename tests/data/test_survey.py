@@ -47,7 +47,7 @@ def test_a_reconstruction_with_gaps(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert (found.layout, found.views, found.points) == ("COLMAP", {"train": 7, "test": 1}, 9)
     assert found.alpha == "none" and found.region is not None
     text = said(capsys, str(data))
-    assert "1 of 9 cameras have no picture" in text and "NOTE: no alpha" in text and "COLMAP" in text
+    assert "1 of 9 cameras have no image" in text and "NOTE: no alpha" in text and "COLMAP" in text
 
 
 def test_folders_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,5 +101,5 @@ def test_pictures_of_many_sizes_are_refused(tmp_path: Path) -> None:
         shot: Shot = SHOTS[1 + i]
         picture = box_downscale(read_png(data / "images" / shot.name), i + 1)
         write_png(data / "images" / shot.name, picture)
-    with pytest.raises(InputError, match=r"pictures: 5 different sizes, such as .*bring all pictures to one"):
+    with pytest.raises(InputError, match=r"images: 5 different sizes, such as .*bring all images to one"):
         read_dataset(data, "train")

@@ -252,7 +252,7 @@ def test_openness_of_a_cap() -> None:
 def test_concave_pixels_are_where_the_balls_are_close(data: Path) -> None:
     truth = surface.TrueSurface.read(data)
     assert truth is not None
-    for view in read_dataset(data, "test").views:
+    for view in (view.load() for view in read_dataset(data, "test").views):
         concave = truth.concave(view)
         assert concave is not None and view.depth is not None
         assert not concave[view.depth == 0].any() and 0.02 < concave[view.depth > 0].mean() < 0.4

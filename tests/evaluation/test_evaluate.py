@@ -82,7 +82,7 @@ def test_the_numbers_are_those_of_the_trainer(run: Run, folder: Path) -> None:
     trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
     views = dataset.read_dataset(folder / "ball", "test")
     scores = []
-    for view in views.views:
+    for view in (view.load() for view in views.views):
         planes = displayed(trainer.view(view.camera()), views.background, views.is_linear_radiance)
         image = np.stack([np.array(plane).reshape(SIZE, SIZE) for plane in planes], axis=-1)
         scores.append(metrics.psnr(image, view.image))

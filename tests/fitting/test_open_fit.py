@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from mi_refgs import methods
-from mi_refgs.data.dataset import Dataset, read_dataset
-from mi_refgs.data.picture_files import PictureFile
-from mi_refgs.data.readers import PointCloud
+from mi_refgs.data.dataset import Dataset, PointCloud, read_dataset
+from mi_refgs.data.images import ImageFile
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
@@ -221,7 +220,7 @@ def test_the_method_for_photographs_is_the_default_without_alpha(
 def test_the_default_method_is_chosen_without_decoding_pictures(
     data: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(PictureFile, "decode", lambda _: pytest.fail("a picture was decoded"))
+    monkeypatch.setattr(ImageFile, "decode", lambda _: pytest.fail("a picture was decoded"))
     assert default_method(data.path) == "photographs"
 
 

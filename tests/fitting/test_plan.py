@@ -11,7 +11,7 @@ import pytest
 
 from mi_refgs import methods
 from mi_refgs.cli import main
-from mi_refgs.data.picture_files import PictureFile
+from mi_refgs.data.images import ImageFile
 from mi_refgs.fitting import cost_model, plan
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels import memory
@@ -62,7 +62,7 @@ def test_the_largest_pictures_that_fit_the_time_are_chosen(
     data = write_data(tmp_path / "data", truth=False)
     for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "LEAST": 5, "WHOLE": 399}.items():
         monkeypatch.setattr(plan, name, value)
-    monkeypatch.setattr(PictureFile, "decode", lambda file: pytest.fail("decoded"))
+    monkeypatch.setattr(ImageFile, "decode", lambda file: pytest.fail("decoded"))
     seconds = [plan.estimate(method, SPEED, 3, (20, 20), factor).seconds for factor in (1, 2, 3, 4)]
     assert sorted(seconds, reverse=True) == seconds
 

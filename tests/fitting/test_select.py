@@ -350,6 +350,9 @@ def test_linear_pictures_are_judged_as_they_are_shown(
     """The score of a picture in linear radiance is that of the same picture as a PNG."""
     trainer = Trainer(other(variant), views)
     encoded = select.held_out_psnr(trainer, views)
-    linear = tuple(replace(v, image=linear_from_srgb(v.image), is_linear_radiance=True) for v in views.views)
+    linear = tuple(
+        replace(v, image=linear_from_srgb(v.image), is_linear_radiance=True)
+        for v in (view.load() for view in views.views)
+    )
     judges = replace(views, views=linear, is_linear_radiance=False)
     assert select.held_out_psnr(trainer, judges) == pytest.approx(encoded, abs=1e-4)

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_refgs.data.dataset import read_dataset
+from mi_refgs.data.dataset import READERS, reader_of
 from mi_refgs.data.lens import Lens
-from mi_refgs.data.readers import READERS, reader_of
 from mi_refgs.fitting.runner import load_method
 from mi_refgs.formats import Shot
 from mi_refgs.formats.cameras import CAMERAS
 from mi_refgs.io.images import box_downscale, read_png, write_png
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.trained_scene import TrainedScene
+from tests.helpers import read_loaded
 from tests.scenes import layouts
 from tests.scenes.layouts import SHOTS
 from tests.scenes.tiny import write_data
@@ -103,7 +103,7 @@ def write_exr_data(folder: Path) -> Path:
 
 
 def test_every_reader_has_a_layout() -> None:
-    assert {reader.name for reader in READERS} == {*LAYOUTS}
+    assert {*READERS} == {*LAYOUTS}
 
 
 @pytest.mark.parametrize(("reader", "kind"), CASES)
@@ -129,7 +129,7 @@ def test_exported_cameras_are_those_of_the_files(reader: str, kind: str, tmp_pat
         (shutil.copytree if source == "sparse" else shutil.copy)(out / source, again / source)
         for split, read_at in (("test", 1), ("train", 2)):
             options: dict[str, Any] = {"downscale": read_at, "images": images, "truth": False}
-            before, after = (read_dataset(folder, split, **options) for folder in (data, again))
+            before, after = (read_loaded(folder, split, **options) for folder in (data, again))
             assert len(before.views) == len(after.views)
             for view, other in zip(before.views, after.views, strict=True):
                 np.testing.assert_allclose(other.to_world, view.to_world, atol=1e-6)
@@ -143,7 +143,7 @@ def test_exported_cameras_are_those_of_the_files(reader: str, kind: str, tmp_pat
 
 def test_cameras_of_no_file_have_names(tmp_path: Path) -> None:
     """Such as those of a reader that gives arrays, and those around a run without data."""
-    camera = read_dataset(write_data(tmp_path / "ball", views=1, truth=False), "train").views[0].camera()
+    camera = read_loaded(write_data(tmp_path / "ball", views=1, truth=False), "train").views[0].camera()
     shots = [Shot("a.jpg", "test", camera), Shot("train/r_0", "train", camera)]
     CAMERAS.write(cast(TrainedScene, None), tmp_path, shots)
     content = json.loads((tmp_path / "transforms.json").read_text())

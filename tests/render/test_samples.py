@@ -111,7 +111,7 @@ def test_eval_encodes_the_mean_of_linear_radiance(tmp_path: Path) -> None:
     assert abs(once["psnr"] - result["psnr"]) > 1e-3
     made, views = TrainedScene.read(run.path), dataset.read_dataset(data, "test")
     scores, encoded_first = [], []
-    for view in views.views:
+    for view in (view.load() for view in views.views):
         small = view.camera()
         large = small.supersampled(2)
         frame = made.renderer()(large)

@@ -79,6 +79,7 @@ def dots(width: int, height: int, across: np.ndarray, down: np.ndarray, sigma: f
 
 def check(view: View, shot: Shot, tolerance: float = 0.03) -> None:
     """The view's picture has the dots where the view's camera sees the points."""
+    view = view.load()
     row, column, seen = view.project(POINTS)
     assert seen.sum() >= 7
     sigma = SIGMA * view.fx / shot.focal[0]

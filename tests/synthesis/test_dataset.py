@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.images import srgb_from_linear
@@ -24,6 +24,7 @@ from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis import pathtrace
 from mi_refgs.synthesis.make_dataset import make_dataset
 from mi_refgs.synthesis.scene_file import load_scene, under_light
+from tests.helpers import read_loaded
 from tests.scenes.integrator import sky
 from tests.scenes.sphere import CENTRE, RADIUS, SCENE
 
@@ -51,7 +52,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def train(made: Path) -> Dataset:
-    return read_dataset(made, "train")
+    return read_loaded(made, "train")
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -61,7 +62,7 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_depth_and_normals_lie_on_the_sphere(made: Path) -> None:
     """Through the reader's camera, so that file convention, pixel centres and maps are tested as one."""
     for split in ("train", "test"):
-        for view in read_dataset(made, split).views:
+        for view in read_loaded(made, split).views:
             assert view.depth is not None and view.normal is not None and view.alpha is not None
             rays = np.array(view.camera().rays()).T
             points = view.to_world[:3, 3] + rays * view.depth.reshape(-1, 1)
@@ -75,7 +76,7 @@ def test_depth_and_normals_lie_on_the_sphere(made: Path) -> None:
 
 
 def test_png_is_the_exr_as_displayed(made: Path, train: Dataset) -> None:
-    radiance = read_dataset(made, "train", images="exr", background="black")
+    radiance = read_loaded(made, "train", images="exr", background="black")
     for shown, linear in zip(train.views, radiance.views, strict=True):
         assert shown.alpha is not None and linear.alpha is not None
         alpha = linear.alpha[..., None]
@@ -87,7 +88,7 @@ def test_png_is_the_exr_as_displayed(made: Path, train: Dataset) -> None:
 
 def test_brightness_is_the_lit_sphere(train: Dataset) -> None:
     """Radiance of the whole set against an independent estimate, albedo × irradiance / π."""
-    data = read_dataset(train.path, "train", images="exr", background="black")
+    data = read_loaded(train.path, "train", images="exr", background="black")
     check_brightness(data, data, pathtrace.environment_image(mi.load_string(SCENE), 16))
 
 
@@ -227,7 +228,7 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"dataset.json: SCENE: "):
         make_dataset(scene, out, **{**tiny, "views": 2})
     make_dataset(scene, out, **tiny, overwrite=True)
-    assert not (out / "train/r_001.png").exists() and len(read_dataset(out, "train").views) == 1
+    assert not (out / "train/r_001.png").exists() and len(read_loaded(out, "train").views) == 1
     (out / "dataset.json").write_text("[]")
     with pytest.raises(InputError, match="another data set"):
         make_dataset(scene, out, **tiny)
@@ -355,8 +356,8 @@ def test_lights_are_added_without_tracing_the_rest(relit: Path, made: Path, trac
 
 
 def test_relit_views_have_the_cameras_and_shape_of_the_test_views(relit: Path) -> None:
-    own = read_dataset(relit, "test", images="exr", background="black")
-    other = read_dataset(relit / "relight" / "warm", "test", images="exr", background="black")
+    own = read_loaded(relit, "test", images="exr", background="black")
+    other = read_loaded(relit / "relight" / "warm", "test", images="exr", background="black")
     for a, b in zip(own.views, other.views, strict=True):
         np.testing.assert_array_equal(a.to_world, b.to_world)
         assert a.alpha is not None and b.alpha is not None
@@ -367,10 +368,10 @@ def test_relit_views_have_the_cameras_and_shape_of_the_test_views(relit: Path) -
 def test_relit_brightness_is_that_of_the_light_beside_it(relit: Path) -> None:
     """environment.exr of each light, in Mitsuba's orientation, accounts for the pictures under it."""
     for name in ("warm", "cold_sky"):
-        data = read_dataset(relit / "relight" / name, "test", images="exr", background="black")
+        data = read_loaded(relit / "relight" / name, "test", images="exr", background="black")
         assert data.environment is not None
         lit = mi.load_dict({"type": "scene", "e": {"type": "envmap", "filename": str(data.environment)}})
-        check_brightness(data, read_dataset(relit, "test"), pathtrace.environment_image(lit, 16))
+        check_brightness(data, read_loaded(relit, "test"), pathtrace.environment_image(lit, 16))
 
 
 def test_a_light_is_turned_as_the_scenes_own(made: Path, tmp_path: Path) -> None:

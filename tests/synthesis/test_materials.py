@@ -10,12 +10,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.synthesis.make_dataset import make_dataset
 from mi_refgs.synthesis.materials import materials_at
+from tests.helpers import read_loaded
 
 BASE = (0.2, 0.5, 0.8)
 RGB: dict[str, Any] = {"type": "rgb", "value": list(BASE)}
@@ -159,7 +159,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_maps_are_those_of_the_scene(made: Path) -> None:
     """Pixel by pixel, by the position that depth gives; the reader's camera, files and scene agree."""
     seen = {"metal": 0, "clay": 0, "glass": 0}
-    for view in read_dataset(made, "train").views:
+    for view in read_loaded(made, "train").views:
         assert view.depth is not None
         rays = np.array(view.camera().rays()).T.reshape(32, 32, 3)
         point = view.to_world[:3, 3] + rays * view.depth[..., None]
@@ -185,7 +185,7 @@ def test_maps_are_those_of_the_scene(made: Path) -> None:
 
 
 def test_a_block_is_the_mean_of_what_is_known(made: Path) -> None:
-    whole, half = (read_dataset(made, "train", downscale=d).views[0] for d in (1, 2))
+    whole, half = (read_loaded(made, "train", downscale=d).views[0] for d in (1, 2))
     for name, values in whole.materials.items():
         blocks = values.reshape(16, 2, 16, 2, -1)
         share = blocks[..., -1:].mean((1, 3))
@@ -194,7 +194,7 @@ def test_a_block_is_the_mean_of_what_is_known(made: Path) -> None:
 
 
 def test_training_reads_no_materials(made: Path) -> None:
-    assert read_dataset(made, "train", truth=False).views[0].materials == {}
+    assert read_loaded(made, "train", truth=False).views[0].materials == {}
 
 
 def test_a_map_of_another_size_is_refused(made: Path, tmp_path: Path) -> None:
@@ -204,7 +204,7 @@ def test_a_map_of_another_size_is_refused(made: Path, tmp_path: Path) -> None:
     try:
         path.write_bytes((made / "test" / "r_000_roughness.exr").read_bytes())
         with pytest.raises(InputError, match=r"r_000_albedo.exr: frames\[0\].albedo_path: has shape"):
-            read_dataset(made, "test")
+            read_loaded(made, "test")
     finally:
         path.write_bytes(content)
 
@@ -215,7 +215,7 @@ def test_the_surface_is_that_of_the_shapes(made: Path) -> None:
     scene = mi.load_dict(
         {"type": "scene", "m": {"type": "ply", "filename": str(made / "surface.ply"), "face_normals": True}}
     )
-    for view in read_dataset(made, "train").views:
+    for view in read_loaded(made, "train").views:
         assert view.depth is not None and view.normal is not None
         camera = view.camera()
         hit = scene.ray_intersect(mi.Ray3f(camera.origin, camera.rays()))

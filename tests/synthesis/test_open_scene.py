@@ -13,12 +13,12 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.cli import main
-from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.region import read_region
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import read_png
 from mi_refgs.synthesis.make_dataset import make_dataset
 from mi_refgs.synthesis.open_scene import REGION_MARGIN
+from tests.helpers import read_loaded
 
 CENTRE, RADIUS = np.array([0.3, -0.2, 0.5]), 0.5
 FLOOR, WALL = 0.0, 4.0
@@ -70,7 +70,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_pictures_show_all_and_maps_the_object(made: Path) -> None:
-    for view in read_dataset(made, "train").views:
+    for view in read_loaded(made, "train").views:
         assert (view.width, view.height) == (WIDTH, HEIGHT)
         assert view.alpha is None and view.image.min() > 0
         assert view.normal is not None and view.depth is not None
@@ -109,7 +109,7 @@ def test_a_lamp_is_in_the_picture(made: Path, tmp_path: Path) -> None:
     )
     (tmp_path / "room.xml").write_text(text)
     out = make_dataset(tmp_path / "room.xml", tmp_path / "out", fov=120.0, **low)
-    view = read_dataset(out, "train", images="exr").views[0]
+    view = read_loaded(out, "train", images="exr").views[0]
     assert view.alpha is None
     np.testing.assert_allclose(np.median(view.image[:, 0], axis=0), 0.4, atol=1e-5)
 
@@ -131,7 +131,7 @@ def test_colmap_says_the_same(made: Path) -> None:
     known = {}
     for split in ("train", "test"):
         for view, file in zip(
-            read_dataset(made, split).views, sorted((made / split).glob("r_???.png")), strict=True
+            read_loaded(made, split).views, sorted((made / split).glob("r_???.png")), strict=True
         ):
             known[file.read_bytes()] = (split, view)
     points = {int(row[0]): row for row in rows["points3D"]}
@@ -168,7 +168,7 @@ def test_the_reader_of_colmap_finds_the_same_views(made: Path) -> None:
     """Pictures, cameras, region and split; two of eight are more than every eighth."""
     colmap = made.parent / "colmap"
     for split in ("train", "test"):
-        original, copy = read_dataset(made, split), read_dataset(colmap, split)
+        original, copy = read_loaded(made, split), read_loaded(colmap, split)
         assert len(original.views) == len(copy.views)
         assert copy.region == original.region and copy.points is not None
         for view in original.views:
@@ -222,7 +222,7 @@ def test_sizes_on_the_command_line(made: Path, tmp_path: Path, capsys: pytest.Ca
     command += ["--object", "ball", "--distance", "2", "2.5", "--elevation", "30", "50"]
     assert main([*command, "--size", "10x6", "--colmap", str(tmp_path / "colmap")]) == 0
     capsys.readouterr()
-    view = read_dataset(tmp_path / "out", "train").views[0]
+    view = read_loaded(tmp_path / "out", "train").views[0]
     assert (view.width, view.height) == (10, 6)
     assert main([*command, "--size", "10x"]) == 2
     assert "WIDTHxHEIGHT" in capsys.readouterr().err

@@ -1,0 +1,379 @@
+"""From image files to pixels: shrinking decoders, masks, opaque alpha, loading on request, the cache."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_refgs.data.dataset import View, read_dataset
+from mi_refgs.data.images import BAND, ImageCache, ImageFile, ImageSource, Mask, compose
+from mi_refgs.data.survey import survey
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.objective import Target
+from mi_refgs.fitting.targets import PIXEL_BYTES, Targets
+from mi_refgs.io.exr import read_exr_image, write_exr
+from mi_refgs.io.images import box_downscale, read_bytes, read_grey, read_png, write_png
+from mi_refgs.methods.method import CoarsePictures, DataOptions
+from tests.helpers import ROOT, run_python
+from tests.scenes.highlight import ball
+from tests.scenes.tiny import write_data
+
+VIEWS, WIDTH, HEIGHT = 24, 2000, 1500
+
+
+def smooth(width: int, height: int, scale: float = 20.0) -> np.ndarray:
+    """An image without detail, which JPEG compression hardly changes."""
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    waves = [np.sin(x / scale), np.cos(y / scale), np.sin((x + y) / (2 * scale))]
+    return 0.5 + 0.4 * np.stack(waves, axis=-1)
+
+
+def read(path: Path, downscale: int, mask: Mask | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+    return compose(ImageFile.of(path, downscale, mask).decode(), 0.0)
+
+
+def jpeg(path: Path, pixels: np.ndarray, **options: Any) -> Path:
+    Image.fromarray(np.round(255 * pixels).astype(np.uint8)).save(path, quality=97, subsampling=0, **options)
+    return path
+
+
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Stems of the files that are decoded."""
+    stems: list[str] = []
+    decode = ImageFile.decode
+
+    def recorded(file: ImageFile) -> np.ndarray:
+        stems.append(file.path.stem)
+        return decode(file)
+
+    monkeypatch.setattr(ImageFile, "decode", recorded)
+    return stems
+
+
+# ---------------- files ----------------
+
+
+@pytest.mark.parametrize(("downscale", "factor"), [(1, 1), (2, 2), (3, 1), (6, 2), (8, 8), (12, 4), (16, 8)])
+@pytest.mark.parametrize("size", [(160, 96), (157, 101)])
+def test_jpeg_decoder_shrinks_like_averaging(
+    downscale: int, factor: int, size: tuple[int, int], tmp_path: Path
+) -> None:
+    path = jpeg(tmp_path / "a.jpg", smooth(*size))
+    assert read_bytes(path, downscale)[1] == factor
+    image, alpha = read(path, downscale)
+    assert alpha is None and image.shape[:2] == (size[1] // downscale, size[0] // downscale)
+    expected = box_downscale(read_png(path), downscale)
+    assert np.abs(image - expected).mean() < 3e-3 and np.abs(image - expected).max() < 0.03
+
+
+def test_image_of_many_bands_equals_whole_image(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).random((3 * BAND + 5, 9, 4))
+    write_png(tmp_path / "a.png", pixels)
+    straight = read_png(tmp_path / "a.png")
+    straight[..., :3] *= straight[..., 3:]
+    for downscale in (1, 2, 7):
+        image, alpha = read(tmp_path / "a.png", downscale)
+        assert alpha is not None
+        np.testing.assert_array_equal(np.dstack([image, alpha]), box_downscale(straight, downscale))
+
+
+def test_mask_becomes_alpha(tmp_path: Path) -> None:
+    """Colour outside of the mask does not bleed in when pixels are averaged; own alpha multiplies."""
+    covered = np.zeros((8, 8))
+    covered[:, 3:] = 1
+    colour = np.where(covered[..., None] > 0, [0.2, 0.4, 0.6], [1.0, 0.0, 1.0])
+    write_png(tmp_path / "m.png", np.repeat(covered[..., None], 3, axis=-1))
+    write_png(tmp_path / "a.png", colour)
+    for path in (tmp_path / "a.png", jpeg(tmp_path / "a.jpg", smooth(8, 8))):
+        image, alpha = read(path, 2, Mask(tmp_path / "m.png"))
+        assert alpha is not None
+        np.testing.assert_allclose(alpha, np.tile([0, 0.5, 1, 1], (4, 1)), atol=1e-6)
+        if path.suffix == ".png":
+            np.testing.assert_allclose(image[:, 1], np.tile([0.1, 0.2, 0.3], (4, 1)), atol=1e-6)
+    own = np.full((8, 8, 1), 0.4)
+    own[:, 6:] = 0
+    write_png(tmp_path / "b.png", np.concatenate([colour, own], axis=-1))
+    image, alpha = read(tmp_path / "b.png", 2, Mask(tmp_path / "m.png"))
+    assert alpha is not None
+    np.testing.assert_allclose(alpha, np.tile([0, 0.2, 0.4, 0], (4, 1)), atol=1e-6)
+    np.testing.assert_allclose(image[:, 2], np.tile([0.08, 0.16, 0.24], (4, 1)), atol=1e-6)
+    write_png(tmp_path / "m.png", np.ones((6, 4, 3)))
+    with pytest.raises(InputError, match=r"m\.png: mask: 4 × 6 pixels, but a\.png has 8 × 8"):
+        read(tmp_path / "a.png", 1, Mask(tmp_path / "m.png"))
+
+
+def test_mask_formats(tmp_path: Path) -> None:
+    """8 bits, labels 0 and 1, alpha, 16 bits used in full or not; and a depth with a threshold."""
+    bits = np.array([[0, 255, 128]], dtype=np.uint8)
+    files: dict[str, tuple[Any, list[float]]] = {
+        "grey": (Image.fromarray(bits), [0, 1, 128 / 255]),
+        "labels": (Image.fromarray((bits == 255).astype(np.uint8)), [0, 1, 0]),
+        "alpha": (
+            Image.merge("LA", [Image.fromarray(np.full_like(bits, 9)), Image.fromarray(bits)]),
+            [0, 1, 128 / 255],
+        ),
+        "deep": (Image.fromarray(bits.astype(np.uint16) * 257), [0, 1, 128 / 255]),
+        "deep labels": (Image.fromarray((bits == 255).astype(np.uint16)), [0, 1, 0]),
+        "shallow": (Image.fromarray(bits.astype(np.uint16)), [0, 1, 128 / 255]),
+        "black": (Image.fromarray(0 * bits), [0, 0, 0]),
+    }
+    for name, (image, expected) in files.items():
+        image.save(tmp_path / f"{name}.png")
+        np.testing.assert_allclose(Mask(tmp_path / f"{name}.png").read(), [expected], atol=1e-6)
+    assert read_grey(tmp_path / "deep.png")[1] == 65535
+    np.testing.assert_array_equal(read_grey(tmp_path / "shallow.png")[0], bits)  # unscaled, as of depths
+    np.testing.assert_array_equal(Mask(tmp_path / "deep.png", below=128 * 257).read(), [[1, 0, 0]])
+
+
+def test_exif_orientation_is_ignored(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    plain, turned = (
+        jpeg(tmp_path / f"{name}.jpg", smooth(40, 24), **o) for name, o in (("a", {}), ("b", {"exif": exif}))
+    )
+    assert ImageFile.of(turned, 1).size == (40, 24)
+    np.testing.assert_array_equal(read(turned, 2)[0], read(plain, 2)[0])
+
+
+def make_opaque(data: Path, but: str = "") -> Path:
+    """Make the images of a data set opaque, except one stem."""
+    for kind, read_file, write_file in ((".png", read_png, write_png), (".exr", read_exr_image, write_exr)):
+        for path in [p for p in data.glob(f"t*/r_?{kind}") if p.stem != but]:
+            image = np.array(read_file(path))
+            image[..., 3] = 1
+            write_file(path, image)
+    return data
+
+
+@pytest.mark.parametrize("images", ["png", "exr"])
+def test_opaque_alpha_is_ignored(images: str, tmp_path: Path) -> None:
+    """Photographs saved as RGBA count as photographs, in both splits; an opaque mask stays a mask."""
+    data = write_data(tmp_path / "ball", truth=False)
+    for path in data.glob("*/*.png"):
+        write_exr(path.with_suffix(".exr"), read_png(path))
+    assert all(read_dataset(data, split, images=images).has_alpha for split in ("train", "test"))
+    make_opaque(data)
+    for split in ("train", "test"):
+        found = read_dataset(data, split, images=images)
+        assert not found.has_alpha and all(view.load().alpha is None for view in found.views)
+        assert found.region is not None and "no pixel is transparent" in found.notes[-1]
+    assert survey(data).alpha == "none"
+    if images == "png":
+        for path in data.glob("*/r_?.png"):
+            write_png(path, read_png(path)[..., :3])
+            write_png(path.with_name(f"{path.stem}_alpha.png"), np.ones((20, 20, 3)))
+        assert read_dataset(data, "train").has_alpha
+
+
+def test_one_opaque_image_among_others_keeps_alpha(tmp_path: Path) -> None:
+    data = make_opaque(write_data(tmp_path / "ball", truth=False), but="r_2")
+    for split in ("train", "test"):
+        assert read_dataset(data, split).has_alpha
+
+
+# ---------------- cache ----------------
+
+
+@pytest.mark.parametrize("budget", [0, 1 << 20])
+def test_cached_image_equals_decoded_image(budget: int, tmp_path: Path, rng: np.random.Generator) -> None:
+    """For every kind of file; 8-bit numbers are cached where the view shows them."""
+    for name, channels in (("rgb", 3), ("rgba", 4)):
+        write_png(tmp_path / f"{name}.png", rng.random((12, 16, channels)))
+        write_exr(tmp_path / f"{name}.exr", rng.random((12, 16, channels)).astype(np.float32))
+    Image.fromarray(rng.integers(0, 255, (12, 16), dtype=np.uint8)).save(tmp_path / "mask.png")
+    files = {
+        name: ImageFile.of(tmp_path / name, 1) for name in ("rgb.png", "rgba.png", "rgb.exr", "rgba.exr")
+    }
+    files["averaged"] = ImageFile.of(tmp_path / "rgba.png", 2)
+    files["masked"] = ImageFile.of(tmp_path / "rgb.png", 1, Mask(tmp_path / "mask.png"))
+    cache = ImageCache(budget)
+    for name, file in files.items():
+        source = ImageSource(file, 0.75, cache)
+        expected, expected_alpha = compose(file.decode(), 0.75)
+        assert source.has_alpha == (expected_alpha is not None) == file.has_alpha()
+        assert source.has_alpha == (name in ("rgba.png", "rgba.exr", "averaged", "masked"))
+        for _ in range(2):
+            image, alpha = source.read()
+            assert np.array_equal(image, expected) and image.dtype == np.float32
+            assert (alpha is None) == (expected_alpha is None)
+            assert alpha is None or expected_alpha is None or np.array_equal(alpha, expected_alpha)
+            image[:] = 0  # a copy, which the caller may change
+        assert cache.pixels(file).dtype == (np.uint8 if name in ("rgb.png", "rgba.png") else np.float32)
+        assert file.decoded_bytes >= cache.pixels(file).nbytes
+    assert cache.bytes <= budget
+
+
+def test_cache_keeps_most_recently_used_images(
+    tmp_path: Path, rng: np.random.Generator, decoded: list[str]
+) -> None:
+    for name in "abc":
+        write_png(tmp_path / f"{name}.png", rng.random((10, 10, 4)))
+    cache = ImageCache(2 * 400)
+    sources = {name: ImageSource(ImageFile.of(tmp_path / f"{name}.png", 1), 0.0, cache) for name in "abc"}
+    assert decoded == ["a", "b"]  # while there was room
+    for name in "abacabc":
+        sources[name].read()
+    assert decoded == ["a", "b", "c", "b", "c"] and cache.bytes == 800
+
+
+def test_broken_file_is_refused_when_read_or_when_loaded(tmp_path: Path, rng: np.random.Generator) -> None:
+    write_png(tmp_path / "a.png", rng.random((40, 40, 3)))
+    (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:2000])
+    file = ImageFile.of(tmp_path / "a.png", 1)
+    with pytest.raises(InputError, match=r"a\.png: pixels: not a readable image"):
+        ImageSource(file, 0.0, ImageCache())
+    late = ImageSource(file, 0.0, ImageCache(0))
+    with pytest.raises(InputError, match=r"a\.png: pixels: not a readable image"):
+        late.read()
+
+
+def test_threads_share_a_cache(tmp_path: Path, rng: np.random.Generator) -> None:
+    for i in range(6):
+        write_png(tmp_path / f"{i}.png", rng.random((20, 20, 4)))
+    size = 20 * 20 * 4
+    cache = ImageCache(2 * size)
+    sources = [ImageSource(ImageFile.of(tmp_path / f"{i}.png", 1), 0.0, cache) for i in range(6)]
+
+    def look(first: int) -> None:
+        for i in range(40):
+            assert sources[(first + i) % 6].read()[0].shape == (20, 20, 3)
+
+    in_threads([lambda i=i: look(i) for i in range(4)])
+    assert cache.bytes == sum(kept.nbytes for kept in cache._kept.values()) <= 2 * size
+
+
+def test_image_decoded_by_two_threads_counts_once(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_png(tmp_path / "a.png", rng.random((20, 20, 4)))
+    cache = ImageCache()
+    source = ImageSource(ImageFile.of(tmp_path / "a.png", 1), 0.0, cache, decode=False)
+    decode, meet = ImageFile.decode, threading.Barrier(2)
+
+    def together(file: ImageFile) -> np.ndarray:
+        meet.wait(20)
+        return decode(file)
+
+    monkeypatch.setattr(ImageFile, "decode", together)
+    in_threads([source.read] * 2)
+    assert cache.bytes == 20 * 20 * 4
+
+
+def in_threads(calls: list[Any]) -> None:
+    threads = [threading.Thread(target=call) for call in calls]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
+# ---------------- views ----------------
+
+
+def photographs(folder: Path, rng: np.random.Generator) -> Path:
+    """A ring of large images without alpha, as JPEG files with three different contents."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for i in range(VIEWS):
+        name = f"images/{i:03d}.jpg"
+        if i < 3:
+            small = rng.integers(0, 255, (HEIGHT // 50, WIDTH // 50, 3), dtype=np.uint8)
+            Image.fromarray(small).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(folder / name)
+        else:
+            (folder / name).write_bytes((folder / f"images/{i % 3:03d}.jpg").read_bytes())
+        angle = 2 * np.pi * i / VIEWS
+        cos, sin = np.cos(angle), np.sin(angle)
+        pose = [[-sin, 0, cos, 4 * cos], [cos, 0, sin, 4 * sin], [0, 1, 0, 0], [0, 0, 0, 1]]
+        frames.append({"file_path": name, "transform_matrix": pose})
+    content: dict[str, Any] = {"camera_angle_x": 0.7, "frames": frames}
+    for split in ("train", "test"):
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+    return folder
+
+
+PEAK = """
+import resource, sys
+import mi_refgs, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+from pathlib import Path
+from mi_refgs.data import images
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.fitting.targets import Targets
+from mi_refgs.methods.method import DataOptions
+images.CACHE_BYTES = int(sys.argv[2])
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+data = read_dataset(Path(sys.argv[1]), "train", truth=False)
+targets = Targets(data, DataOptions(), int(sys.argv[2]))
+for index in range(len(data.views)):
+    assert targets[index].camera.width == data.views[0].width
+    assert data.views[index].load().colour(data.background).max() > 0.5
+cache = data.views[0].__dict__["image"].cache
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before, cache.bytes)
+"""
+
+
+def test_memory_is_bounded(tmp_path: Path, rng: np.random.Generator) -> None:
+    """24 images of 3 Mpx: 216 MB in 8 bits, 864 MB as float32, 1.4 GB as targets; budgets of 60 MB each."""
+    budget = 60_000_000
+    data = photographs(tmp_path / "data", rng)
+    kilobytes, kept = map(int, run_python(PEAK, data, budget, folder=ROOT).split())
+    assert kept <= budget
+    one = 4 * 4 * WIDTH * HEIGHT  # bytes of an image as float32, of which decoding makes a few copies
+    assert kilobytes * 1024 < 2 * budget + 8 * one, f"{kilobytes / 1024:.0f} MB"
+
+
+def test_targets_are_uploaded_at_once_or_when_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both are equal and of the resolution of the iteration; the most recently used ones are kept."""
+    data = ball(24, 5)
+    options = DataOptions(coarse=(CoarsePictures(until=3, block=2),))
+    whole, one = Targets(data, options), PIXEL_BYTES * 24 * 24
+    made: list[int] = []
+    real = View.camera
+
+    def camera(view: View) -> Any:
+        made.append(int(view.name))
+        return real(view)
+
+    monkeypatch.setattr(View, "camera", camera)
+    few = Targets(data, options, 2 * one)
+    assert not made
+    for index in (0, 1, 0, 2, 0, 1):
+        assert few[index].camera.width == 24
+        assert np.array_equal(few[index].image[0], whole[index].image[0])
+        assert whole.at(3, index).camera.width == 12 and whole.at(4, index) is whole[index]
+    assert made == [0, 1, 2, 1]
+    lone = Targets(data, options, 1)
+    assert lone[3] is lone[3] and lone[4] is not lone[3] and len(lone) == 5
+
+
+def test_view_is_decoded_only_by_load(tmp_path: Path, rng: np.random.Generator, decoded: list[str]) -> None:
+    """`image` and `alpha` of a view that is not loaded raise; `has_alpha` is from the header."""
+    data = photographs(tmp_path / "data", rng)
+    view = read_dataset(data, "train", truth=False, decode=False).views[3]
+    assert not view.has_alpha and view.alpha is None and view.changed(near=2.0).near == 2.0
+    with pytest.raises(RuntimeError, match=r"view 'images/003' is not loaded; use view\.load\(\)\.image"):
+        view.image  # noqa: B018
+    assert not decoded
+    loaded = view.load()
+    assert decoded == ["003"] and loaded.load() is loaded and loaded.alpha is None
+    assert np.array_equal(loaded.image, view.load().image) and decoded == ["003"]
+    view.__dict__["image"].cache.budget = 0
+    Target.of(read_dataset(data, "train", truth=False, decode=False).views[4], np.ones(3))
+    assert decoded == ["003", "004"]
+    hidden = view.changed(alpha=np.zeros((HEIGHT, WIDTH), np.float32)).load()
+    assert hidden.alpha is not None and not hidden.alpha.any()
+
+
+def test_view_of_arrays_is_loaded() -> None:
+    view = ball().views[0]
+    assert view.load() is view and view.has_alpha and view.alpha is not None
+    other = dataclasses.replace(view, image=view.image * 0.5, alpha=None)
+    assert not other.has_alpha and np.array_equal(other.image, view.image * 0.5)
