@@ -85,9 +85,7 @@ def test_the_same_seed_gives_the_same_start(ball: dataset.Dataset) -> None:
 
 
 def test_without_alpha_surfels_fill_the_box(ball: dataset.Dataset) -> None:
-    bare = dataclasses.replace(
-        ball, views=tuple(view.changed(alpha=None) for view in ball.views)
-    )
+    bare = dataclasses.replace(ball, views=tuple(view.changed(alpha=None) for view in ball.views))
     table = start(bare, 0.5)
     assert len(table["position"]) == COUNT and np.linalg.norm(table["position"], axis=1).max() > 1.1 * RADIUS
 
