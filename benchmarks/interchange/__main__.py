@@ -37,7 +37,7 @@ def main() -> None:
 def measured(run: Path, node: Path, views: list[int], names: list[str]) -> dict[str, Any]:
     """What each program makes of the files of a run."""
     from mi_refgs.formats import write
-    from mi_refgs.formats.splats import gaussians
+    from mi_refgs.formats.gaussians import gaussians
     from mi_refgs.reconstruction.provenance import Provenance
     from mi_refgs.render.display import display_image
 

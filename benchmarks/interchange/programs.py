@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
-from mi_refgs.formats.gltf_splats import NAME
+from mi_refgs.formats.gltf import EXTENSION
 from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import read_ply
@@ -43,7 +43,7 @@ def validated(glb: Path, node: Path) -> dict[str, Any]:
         ["node", "-e", VALIDATE, str(glb.resolve())], cwd=node, capture_output=True, text=True, check=True
     )
     issues = json.loads(done.stdout)
-    foreign = [m for m in issues["messages"] if m["pointer"].split("/")[-1].startswith(NAME)]
+    foreign = [m for m in issues["messages"] if m["pointer"].split("/")[-1].startswith(EXTENSION)]
     issues["messages"] = [message for message in issues["messages"] if message not in foreign]
     issues["numErrors"] -= len(foreign)
     return issues

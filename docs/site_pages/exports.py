@@ -1,9 +1,6 @@
-"""The page of the formats of other programs, from their declarations and the docstrings of their files."""
+"""The page of the formats of other programs, from their declarations and docstrings."""
 
 from __future__ import annotations
-
-import inspect
-import sys
 
 from mi_refgs.formats import FORMATS
 from mi_refgs.formats.format import Format
@@ -34,9 +31,8 @@ def page() -> str:
 
 
 def section(name: str, form: Format) -> str:
-    """A format: what its file says of it, and its options."""
-    told = inspect.getdoc(sys.modules[form.write.__module__]) or form.summary
-    text = [f"## {name} {{#{name}}}", told]
+    """A format: its description and its options."""
+    text = [f"## {name} {{#{name}}}", form.description]
     if form.options:
         rows = [
             [f"`--{o.name.replace('_', '-')}`", "off" if o.default is False else f"`{o.default}`", o.help]

@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> Result:
     """Edit."""
     from mi_refgs.editing import assignments
     from mi_refgs.editing.expression import parse_condition
-    from mi_refgs.formats.incoming import read_cameras
+    from mi_refgs.formats.cameras import read_cameras
     from mi_refgs.io.images import write_png
     from mi_refgs.reconstruction.reconstruction import load
     from mi_refgs.runs.run import Run

@@ -47,7 +47,7 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Render."""
-    from mi_refgs.formats.incoming import read_cameras
+    from mi_refgs.formats.cameras import read_cameras
     from mi_refgs.io.ownership import require_no_run
     from mi_refgs.render.load_scene import load_scene
     from mi_refgs.render.scene_xml import sensors_of

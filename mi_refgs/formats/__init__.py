@@ -1,17 +1,63 @@
-"""Formats of other programs, one file each; importing this package registers those that ship.
+"""Files of other programs: the formats that `refgs export --to` and `Reconstruction.export` write.
 
-A new one is a file that declares a `Format`, and its line here.
+The command line reads these declarations before it runs anything, so they do not import what computes.
 """
 
-from mi_refgs.formats import cameras, gaussian_ply, gltf_mesh, gltf_splats, layers, mitsuba_scene, usd
-from mi_refgs.formats.format import FORMATS, Format, Option, Shot, options_of, register, write
+from mi_refgs.formats.format import FORMATS, Format, Option, Shot, Writer, options_of, write
 
-register(gaussian_ply.GAUSSIAN_PLY)
-register(gltf_splats.GLTF_SPLATS)
-register(gltf_mesh.GLTF_MESH)
-register(mitsuba_scene.MITSUBA)
-register(usd.USD)
-register(cameras.CAMERAS)
-register(layers.EXR)
+_DEGREE = Option("degree", 3, "SH degree of the colours of exported Gaussians, 0 to 3")
+_OBJECT = Option(
+    "object", False, "the object without its background Gaussians; splat files have no environment"
+)
+_VIEW = Option("view", 0, "the view of an EXR file, by number; test views come first")
+_SAMPLES = Option("samples", 4, "samples per pixel of an EXR file, box filtered: 4 are 2 × 2")
+_MESH = (
+    Option("faces", 50_000, "maximum number of triangles of an exported mesh"),
+    Option("texture", 1024, "texels along each side of its textures"),
+)
 
-__all__ = ["FORMATS", "Format", "Option", "Shot", "options_of", "register", "write"]
+for _format in (
+    Format(
+        "3dgs-ply",
+        "3D Gaussians with baked colours, for splat viewers",
+        ".ply",
+        Writer("gaussian_ply"),
+        (_DEGREE, _OBJECT),
+    ),
+    Format(
+        "gltf-splats",
+        "the same in binary glTF (KHR_gaussian_splatting)",
+        ".glb",
+        Writer("gltf", "write_gaussians"),
+        (_DEGREE, _OBJECT),
+    ),
+    Format(
+        "gltf-mesh",
+        "glTF 2.0: a mesh with metallic-roughness textures",
+        ".glb",
+        Writer("gltf", "write_mesh"),
+        _MESH,
+        "export",
+    ),
+    Format(
+        "mitsuba",
+        "a folder that Mitsuba renders without this package: mesh, principled, textures, envmap",
+        "",
+        Writer("mitsuba_scene"),
+        _MESH,
+        "export",
+    ),
+    Format(
+        "usd",
+        "USD: a mesh with a UsdPreviewSurface, its textures, a dome light",
+        ".usdz",
+        Writer("usd"),
+        _MESH,
+        "export",
+    ),
+    Format("cameras", "transforms.json and COLMAP's text files of the cameras", "", Writer("cameras")),
+    Format("exr", "one view with all its layers", ".exr", Writer("exr_layers"), (_VIEW, _SAMPLES, _OBJECT)),
+):
+    FORMATS.register(_format)
+
+__all__ = ["FORMATS", "Format", "Option", "Shot", "Writer", "options_of", "write"]

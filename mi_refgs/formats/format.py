@@ -1,23 +1,23 @@
-"""The seam of formats: what one declares, the cameras that it is given, and the registry of all.
-
-The command line reads the declarations before it runs anything: the files of formats import what computes
-inside their functions.
-"""
+"""Interface of the formats of other programs, their registry, and the function that writes them."""
 
 from __future__ import annotations
 
+import functools
 import importlib
+import inspect
 import os
 import tempfile
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
+from weakref import WeakKeyDictionary
 
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import cannot_write, make_folder
 from mi_refgs.io.ownership import OutputFolder, require_no_run
+from mi_refgs.registry import Registry
 
 if TYPE_CHECKING:
     from mi_refgs.data.view import FileCamera
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A camera by name."""
+    """A named camera, and the image file that was taken with it."""
 
-    name: str  # of its picture, without ending, such as "train/r_003"
+    name: str  # of the image, without ending, such as "train/r_003"
     split: str  # "train" or "test"
     camera: Camera
-    file: FileCamera | None = None  # of its picture, where there is a data set; the path is relative to that
+    file: FileCamera | None = None  # where there is a data set; its path is relative to that
 
 
 @dataclass(frozen=True)
 class Option:
-    """A choice that a format leaves to its user: `--name` on the command line, a keyword of `write`.
+    """An option of a format: `--name` on the command line, a keyword of its `write` in Python.
 
-    Formats may share one, which is then the same in all of them.
+    Formats may share an option, which is then the same in all of them.
     """
 
     name: str  # with underscores; the command line has hyphens
@@ -48,73 +48,91 @@ class Option:
 
 
 @dataclass(frozen=True)
+class Writer:
+    """A function of a module of this package, imported when it is first called."""
+
+    module: str
+    name: str = "write"
+
+    def function(self) -> Callable[..., list[Path]]:
+        """Import the function."""
+        found: Callable[..., list[Path]] = getattr(
+            importlib.import_module(f"mi_refgs.formats.{self.module}"), self.name
+        )
+        return found
+
+    def __call__(self, *arguments: Any, **options: Any) -> list[Path]:
+        return self.function()(*arguments, **options)
+
+
+@dataclass(frozen=True)
 class Format:
-    """A format that other programs read: one file of this package declares one, and `register`s it."""
+    """A format that other programs read."""
 
     name: str
     summary: str  # one line, for `--help` and for the list of formats
     suffix: str  # of its file, such as ".ply"; empty for a format that writes a folder
     write: Callable[..., list[Path]]
-    """write(trained, target, shots, **options): writes the file or the folder `target`, atomically, and
-    returns the paths of what it wrote. `shots` (a sequence of Shot, never empty) are the cameras of the fit,
-    the test views first. Raises InputError for a scene that the format cannot hold."""
+    """write(trained, target, shots, **options): writes the file or the folder `target` atomically and returns
+    the paths that it wrote. `shots` (a sequence of Shot, never empty) are the cameras of the fit, the test
+    views first. Raises InputError for a scene that the format cannot represent."""
     options: tuple[Option, ...] = ()
-    extra: str = ""  # that `pip install "mi_refgs[…]"` must have installed
+    extra: str = ""  # name of the extra that `pip install "mi_refgs[…]"` must have installed
+
+    @property
+    def description(self) -> str:
+        """The docstring of `write`, which describes the file; the documentation shows it."""
+        write = self.write.function() if isinstance(self.write, Writer) else self.write
+        return inspect.getdoc(write) or self.summary
 
 
-FORMATS: dict[str, Format] = {}
-"""Every format by name."""
-
-
-def register(made: Format) -> Format:
-    """Make a format known to `refgs export --to` and `Reconstruction.export`; returns it.
-
-    Raises InputError if another one has its name, or declares one of its options otherwise.
-    """
-    if made.name in FORMATS:
-        raise InputError(f"formats: '{made.name}': there is one of this name; rename it")
+def _require_shared_options(made: Format) -> None:
     shared = options_of(FORMATS)
     for option in made.options:
         if shared.get(option.name, option) != option:
-            raise InputError(f"formats: '{made.name}': {option.name}: another format's differs; rename it")
-    FORMATS[made.name] = made
-    return made
+            raise InputError(
+                f"format: '{made.name}': {option.name}: another format declares it differently; rename it"
+            )
 
 
-def module(name: str) -> Any:
-    """A module of the extra `export`; raises InputError that says how to install it."""
+FORMATS: Registry[Format] = Registry("format", _require_shared_options)
+"""Every format by name."""
+register = FORMATS.register
+
+
+def options_of(names: Iterable[str]) -> dict[str, Option]:
+    """Return the options of some formats by name."""
+    return {option.name: option for name in names for option in FORMATS[name].options}
+
+
+def import_extra(name: str) -> Any:
+    """Import a module of the extra `export`; raises InputError that says how to install it."""
     try:
         return importlib.import_module(name)
     except ImportError:
         raise InputError(f'--to: {name} is not installed; pip install "mi_refgs[export]"') from None
 
 
-def options_of(names: Sequence[str] | Mapping[str, Format]) -> dict[str, Option]:
-    """The options of some formats by name."""
-    return {option.name: option for name in names for option in FORMATS[name].options}
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
-def format_of(name: str) -> Format:
-    """The format of this name; raises InputError if there is none."""
-    if name not in FORMATS:
-        raise InputError(f"--to: {name}: unknown format; use one of {', '.join(FORMATS)}")
-    return FORMATS[name]
+def remember_last(
+    function: Callable[Concatenate[TrainedScene, P], R],
+) -> Callable[Concatenate[TrainedScene, P], R]:
+    """Decorate a function of a scene so that it keeps its last result per scene, as long as the scene exists.
 
-
-def place(made: Format, output: Path, several: bool) -> Path:
-    """Where a format is written: at `output`, or in it if it is a folder or several formats are written.
-
-    Raises InputError for a file name of another suffix, or a folder that cannot be made.
+    Several formats of one export require the same result.
     """
-    inner = several or output.is_dir() or (bool(made.suffix) and not output.suffix)
-    if inner:
-        target = output / f"{made.name}{made.suffix}"
-    else:
-        target = output
-        if made.suffix and target.suffix.lower() != made.suffix:
-            raise InputError(f"{output}: suffix: {made.name} writes {made.suffix}; name the file so")
-    make_folder(target.parent if made.suffix else target)
-    return target
+    results: WeakKeyDictionary[TrainedScene, tuple[Any, R]] = WeakKeyDictionary()
+
+    @functools.wraps(function)
+    def cached(scene: TrainedScene, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        if scene not in results or results[scene][0] != (args, kwargs):
+            results[scene] = (args, kwargs), function(scene, *args, **kwargs)
+        return results[scene][1]
+
+    return cached
 
 
 def write(
@@ -126,30 +144,32 @@ def write(
     source: Path | None = None,
     overwrite: bool = False,
 ) -> dict[str, list[Path]]:
-    """Write a scene in some formats: one at `output`, several in that folder; returns the files by format.
+    """Write a scene in one format at `output`, or in several in that folder; return the files by format.
 
-    `options` are keywords of the formats, each for those that declare it. The file that `output` names is
-    replaced. In a folder, only files that the same format wrote of the same `source`, a run folder, are
+    `options` are keywords of the formats; each format gets those that it declares. A file that `output` names
+    is replaced. In a folder, only files that the same format wrote for the same `source`, a run folder, are
     replaced, unless `overwrite` permits all. Raises InputError for an unknown format, an option that
-    none of them has, a scene that one cannot hold, what cannot be written, and a foreign file in the way.
+    none of them has, a scene that one cannot represent, a path that cannot be written, and a foreign file in
+    the way.
     """
-    chosen, given = [format_of(name) for name in names], dict(options or {})
+    chosen, given = [FORMATS.find(name, "--to") for name in names], dict(options or {})
     if not chosen:
         raise InputError(f"--to: no format; use one of {', '.join(FORMATS)}")
-    for name in given:
-        if name not in options_of(names):
-            able = ", ".join(f for f, made in FORMATS.items() if name in [o.name for o in made.options])
-            flag = f"--{name.replace('_', '-')}"
-            raise InputError(f"{flag}: means nothing to {', '.join(names)} ({able or 'no format'} has it)")
-    found = {}
+    for name in given.keys() - options_of(names):
+        able = ", ".join(made.name for made in FORMATS.values() if name in [o.name for o in made.options])
+        raise InputError(
+            f"--{name.replace('_', '-')}: no option of {', '.join(names)}; leave it out, or choose a format "
+            f"that has it ({able or 'none'})"
+        )
     remedy = "choose another output, or replace it with --overwrite (overwrite=True in Python)"
+    found, shots = {}, tuple(shots)
     for made in chosen:
-        target = place(made, Path(output), len(chosen) > 1)
+        target = _target(made, Path(output), len(chosen) > 1)
         owner = f"{made.name} of {source.resolve() if source else uuid.uuid4().hex}"
         own = {option.name: given.get(option.name, option.default) for option in made.options}
         if not made.suffix:
             folder = OutputFolder(target, owner, remedy=remedy, overwrite=overwrite)
-            found[made.name] = _write_folder(made, folder, trained, shots, own)
+            found[made.name] = _write_folder(folder, made, trained, shots, own)
             continue
         if target == Path(output):
             require_no_run(target)
@@ -159,16 +179,31 @@ def write(
     return found
 
 
+def _target(made: Format, output: Path, several: bool) -> Path:
+    """Return the path of a format: `output`, or a path in it if it is a folder or there are several formats.
+
+    Raises InputError for a file name of another suffix, or a folder that cannot be made.
+    """
+    target = output
+    if several or output.is_dir() or (made.suffix and not output.suffix):
+        target = output / f"{made.name}{made.suffix}"
+    elif made.suffix and target.suffix.lower() != made.suffix:
+        raise InputError(f"{output}: suffix: {made.name} writes {made.suffix}; name the file so")
+    make_folder(target.parent if made.suffix else target)
+    return target
+
+
 def _write_folder(
-    made: Format,
     output: OutputFolder,
+    made: Format,
     trained: TrainedScene,
     shots: Sequence[Shot],
     options: Mapping[str, Any],
 ) -> list[Path]:
-    """Write a format beside `output`, then move its files there; none if a foreign one is in the way.
+    """Write a format into a temporary folder, then move its files to `output`, or none if one is foreign.
 
-    Formats need not say beforehand which files they write. Raises InputError as `OutputFolder.claim` does.
+    A format need not declare beforehand which files it writes. Raises InputError as `OutputFolder.claim`
+    does.
     """
     try:
         with tempfile.TemporaryDirectory(prefix=".refgs_", dir=output.path) as name:

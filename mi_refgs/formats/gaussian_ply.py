@@ -1,36 +1,91 @@
-"""`3dgs-ply`: the PLY file of 3D Gaussian Splatting, which its viewers, editors and converters read.
+"""PLY files of 3D Gaussian Splatting and 2DGS: read as a scene, and written.
 
-    x y z  nx ny nz  f_dc_0..2  f_rest_0..  opacity  scale_0..2  rot_0..3      little-endian float32
-
-Logits, logarithms and display-encoded colours, as `surfels.ply` and `formats.splats` say.
+Files of other programs are blended in display-encoded colours (`shade.reflectance.displayed`). A 3DGS file is
+rendered by its own formula. A 2DGS file is not in two respects: its screen filter has a variance of 1/2
+pixel², here 1/12, which matters for surfels below a pixel and for those seen edge-on; and it sorts surfels by
+the depth of their centres, where we sort them by their depth per tile.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from mi_refgs.formats.format import Format, Option, Shot
+from mi_refgs.errors import InputError
+from mi_refgs.formats.format import Shot
+from mi_refgs.formats.gaussians import gaussians
+from mi_refgs.io.ply import read_header
+from mi_refgs.methods.method import DataOptions, Method, Stage, SurfelOptions
+from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.shade.shading import Shading
+from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.ply import read_ply, write_ply
+from mi_refgs.surfels.table import Surfels
 
-if TYPE_CHECKING:
-    from mi_refgs.runs.trained_scene import TrainedScene
-
-DEGREE = Option("degree", 3, "degree of the spherical-harmonic colours of splats, 0 to 3")
-ALONE = Option("object", False, "the object without its surroundings; no file of splats has the background")
+EXPECTED = "the PLY file of 3DGS or 2DGS"
+"""What messages say to give."""
 
 
 def write(
     trained: TrainedScene, target: Path, shots: Sequence[Shot], *, degree: int, object: bool
 ) -> list[Path]:
-    """Write the file; see `Format.write`."""
-    from mi_refgs.formats.splats import gaussians
-    from mi_refgs.surfels.ply import write_ply
+    """The PLY file of 3D Gaussian Splatting, which its viewers, editors and converters read.
 
+        x y z  nx ny nz  f_dc_0..2  f_rest_0..  opacity  scale_0..2  rot_0..3      little-endian float32
+
+    Logits, logarithms and display-encoded colours, as in `surfels.ply`. The colours are fitted to renders of
+    the training views.
+    """
     write_ply(target, gaussians(trained, shots, degree, object))
     return [target]
 
 
-GAUSSIAN_PLY = Format(
-    "3dgs-ply", "3D Gaussians with baked colours, for splat viewers", ".ply", write, (DEGREE, ALONE)
-)
+def read_splats(path: Path, linear: bool = False) -> TrainedScene:
+    """Read a PLY file of 3D Gaussians or surfels: positions, rotations, scales, opacities and colours.
+
+    `linear`: its colours are linear radiance, as this package writes them. Raises InputError for any other
+    file.
+    """
+    _require_splat_file(path)
+    surfels = read_ply(path)
+    if not surfels.count:
+        raise InputError(f"{path}: vertex: there are none; export the file again")
+    needed = {*surfels.primitive.widths, "radiance_sh"}
+    if others := [CHANNELS[name].properties[0] for name in surfels.raw if name not in needed]:
+        raise InputError(
+            f"{path}: {others[0]}: materials of a run, which require its light and shading; give the run "
+            "folder to the command that needs it"
+        )
+    shading = Shading("surfel", "radiance") if linear else Shading("pixel", "displayed")
+    return TrainedScene(Surfels(surfels.raw), None, None, shading, iteration=0, seconds=0.0)
+
+
+def method_of(trained: TrainedScene, name: str) -> Method:
+    """Describe a scene that was fitted elsewhere as a method, for config.toml: how it is shaded."""
+    surfels, shading = trained.surfels, trained.shading
+    count, degree = surfels.count, {"radiance_sh": surfels.sh_degree()}
+    options = SurfelOptions(surfels.primitive.name, ("radiance_sh",), count, count, degree=degree)
+    stages = {"imported": Stage(1, shading)}
+    data = DataOptions(downscale=1)
+    return Method(1, stages, surfels=options, data=data, variant=name, preset="standard")
+
+
+def _require_splat_file(path: Path) -> None:
+    """Raise InputError for PLY files of other things, by their header."""
+    try:
+        with path.open("rb") as file:
+            header = read_header(path, file, EXPECTED)
+    except OSError as error:
+        raise InputError(f"{path}: file: cannot be read ({error.strerror}); check the path") from error
+    tables = {element.name: {name for name, _ in element.fields} for element in header.elements}
+    names = tables.get("vertex", set())
+    if "packed_position" in names:
+        raise InputError(
+            f"{path}: packed_position: a compressed PLY; write it as a plain one, as `splat-transform "
+            f"{path.name} plain.ply` does"
+        )
+    if not {"opacity", "scale_0", "rot_0"} & names:
+        what = "a mesh" if tables.get("face") is not None else "points without size or opacity"
+        raise InputError(f"{path}: vertex: {what}, no Gaussians; give {EXPECTED}")
+    if not any(name.startswith("f_dc_") for name in names):
+        raise InputError(f"{path}: f_dc_0: the property is missing; export the file again with its colours")

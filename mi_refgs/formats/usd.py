@@ -1,38 +1,35 @@
-"""`usd`: a .usdz of a mesh with a UsdPreviewSurface and its textures, a dome light and a camera.
-
-USD says which axis is up: +z here, as in our world. The dome's texture is laid out as Mitsuba's `envmap`: the
-first row at +y, the middle column at +z.
-"""
+"""USD packages of textured meshes."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.formats.format import Format, Shot, module
-from mi_refgs.formats.textured import OPTIONS
+from mi_refgs.formats.baking import TexturedMesh, bake
+from mi_refgs.formats.format import Shot, import_extra
 from mi_refgs.io.files import replace_file
-
-if TYPE_CHECKING:
-    from mi_refgs.formats.textured import TexturedMesh
-    from mi_refgs.runs.trained_scene import TrainedScene
-    from mi_refgs.splat.camera import Camera
+from mi_refgs.io.images import srgb_from_linear, write_png
+from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.splat.camera import Camera
 
 APERTURE = 36.0
-"""Width of the film, tenths of a scene unit as USD has it, of cameras whose focal length is then a ratio."""
+"""Width of the film, in USD's tenths of a scene unit; the focal length is then a ratio to it."""
 TEXTURES = {"diffuseColor": "albedo", "roughness": "roughness", "metallic": "metallic"}
-"""Inputs of UsdPreviewSurface and what they are called here."""
+"""Inputs of UsdPreviewSurface, and their names here."""
 
 
 def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int, texture: int) -> list[Path]:
-    """Write the file `target`; see `Format.write`. The camera is that of the first shot."""
-    usd_utils = module("pxr.UsdUtils")
-    from mi_refgs.formats.bake import bake
-    from mi_refgs.io.images import srgb_from_linear, write_png
+    """A .usdz of a mesh with a UsdPreviewSurface and its textures, a dome light and the first view's camera.
 
+    USD declares which axis is up: +z here, as in our world. The dome's texture has the layout of Mitsuba's
+    `envmap`: the first row at +y, the middle column at +z.
+    """
+    usd_utils = import_extra("pxr.UsdUtils")
     made = bake(trained, shots, faces, texture)
     with tempfile.TemporaryDirectory(prefix="refgs_usd_") as name:
         folder = Path(name)
@@ -52,11 +49,9 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
 
 
 def _write_stage(path: Path, made: TexturedMesh, camera: Camera) -> None:
-    """Write the stage; its textures are beside it."""
-    import numpy as np
-
+    """Write the stage, whose textures are in its folder."""
     gf, sdf, usd, geom, lux, shade, vt = (
-        module(f"pxr.{name}") for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdLux", "UsdShade", "Vt")
+        import_extra(f"pxr.{name}") for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdLux", "UsdShade", "Vt")
     )
     stage = usd.Stage.CreateNew(str(path))
     geom.SetStageUpAxis(stage, geom.Tokens.z)
@@ -64,6 +59,7 @@ def _write_stage(path: Path, made: TexturedMesh, camera: Camera) -> None:
     root = geom.Xform.Define(stage, "/root")
     stage.SetDefaultPrim(root.GetPrim())
 
+    # The mesh
     mesh = geom.Mesh.Define(stage, "/root/object")
     points = vt.Vec3fArray.FromNumpy(made.vertices)
     mesh.CreatePointsAttr(points)
@@ -77,6 +73,7 @@ def _write_stage(path: Path, made: TexturedMesh, camera: Camera) -> None:
     uv = geom.PrimvarsAPI(mesh).CreatePrimvar("st", types.TexCoord2fArray, geom.Tokens.vertex)
     uv.Set(vt.Vec2fArray.FromNumpy(made.uv))
 
+    # Its material and textures
     material = shade.Material.Define(stage, "/root/material")
     reader = shade.Shader.Define(stage, "/root/material/uv")
     reader.CreateIdAttr("UsdPrimvarReader_float2")
@@ -96,6 +93,7 @@ def _write_stage(path: Path, made: TexturedMesh, camera: Camera) -> None:
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", types.Token))
     shade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
 
+    # Light and camera
     light = lux.DomeLight.Define(stage, "/root/light")
     light.CreateTextureFileAttr("./envmap.exr")
     light.CreateTextureFormatAttr(lux.Tokens.latlong)
@@ -104,9 +102,7 @@ def _write_stage(path: Path, made: TexturedMesh, camera: Camera) -> None:
 
 
 def _add_camera(prim: Any, camera: Camera, gf: Any) -> None:
-    """The camera's lens and pose; USD's looks along its −z, ours along +z with +x to the left."""
-    import numpy as np
-
+    """Set a camera's lens and pose; USD's looks along its −z, ours along +z with +x to the left."""
     fx, fy = abs(float(camera.fx[0])), abs(float(camera.fy[0]))
     prim.CreateHorizontalApertureAttr(APERTURE)
     prim.CreateFocalLengthAttr(APERTURE * fx / camera.width)
@@ -119,13 +115,3 @@ def _add_camera(prim: Any, camera: Camera, gf: Any) -> None:
     # USD's matrices multiply rows.
     pose = (camera.pose() @ np.diag([-1.0, 1.0, -1.0, 1.0])).T
     prim.AddTransformOp().Set(gf.Matrix4d(*pose.ravel().tolist()))
-
-
-USD = Format(
-    "usd",
-    "USD: a mesh with a UsdPreviewSurface, its textures, a dome light",
-    ".usdz",
-    write,
-    OPTIONS,
-    "export",
-)

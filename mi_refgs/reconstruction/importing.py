@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mi_refgs.formats.incoming import method_of, read_splats
+from mi_refgs.formats.gaussian_ply import method_of, read_splats
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.reconstruction.reconstruction import Reconstruction

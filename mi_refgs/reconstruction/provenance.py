@@ -12,7 +12,7 @@ from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.targets import read_views
 from mi_refgs.formats import Shot
-from mi_refgs.formats.shots import shots_around, turntable_cameras
+from mi_refgs.formats.orbits import shots_around, turntable_cameras
 from mi_refgs.io.files import read_json
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.export import save

@@ -22,7 +22,7 @@ import numpy as np
 from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import images
-from mi_refgs.formats.shots import turntable_cameras
+from mi_refgs.formats.orbits import turntable_cameras
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import straight_srgb, write_png

@@ -15,13 +15,11 @@ import trimesh
 from mi_refgs.cli import main
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import image_array
-from mi_refgs.formats import Shot, gltf_mesh, write
+from mi_refgs.formats import Shot, gltf, write
 from mi_refgs.formats import usd as usd_format
-from mi_refgs.formats.bake import bake
-from mi_refgs.formats.principled import base_colour, diffuse_share
-from mi_refgs.formats.shots import shots_around
-from mi_refgs.formats.surface import surface, texels, unwrap
-from mi_refgs.formats.textured import TexturedMesh
+from mi_refgs.formats.baking import TexturedMesh, bake, simplified, texels, unwrap
+from mi_refgs.formats.mitsuba_scene import base_colour, diffuse_ratio
+from mi_refgs.formats.orbits import shots_around
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.images import linear_from_srgb, read_png
 from mi_refgs.occlusion.mesh import Mesh
@@ -124,7 +122,7 @@ def check_materials(
 
 def test_charts_fill_a_texture_without_overlap(exported: Exported) -> None:
     """Areas add up to that of the covered texels: what overlaps would be counted twice."""
-    mesh = surface(exported.trained.mesh or Mesh.empty(), FACES)
+    mesh = simplified(exported.trained.mesh or Mesh.empty(), FACES)
     assert FACES / 2 < len(mesh.faces) <= FACES
     chart = unwrap(mesh, TEXTURE)
     assert chart.uv.min() >= 0 and chart.uv.max() <= 1
@@ -257,7 +255,7 @@ def test_principled_reflects_as_much_as_our_model(roughness: float) -> None:
     """Of constant light, over all directions of view: sampled weights against the split-sum table."""
     import drjit as dr
 
-    known, share = diffuse_share()
+    known, share = diffuse_ratio()
     rgb = {"type": "rgb", "value": [0.6 * float(np.interp(roughness, known, share))] * 3}
     bsdf = mi.load_dict({"type": "principled", "base_color": rgb, "roughness": roughness, "specular": 0.5})
     count = 1 << 18
@@ -356,7 +354,7 @@ def test_a_usd_camera_keeps_the_principal_point() -> None:
 
 def test_a_gltf_camera_that_loses_its_principal_point_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     for camera, said in ((off_centre(), True), (shots_around(trained_scene().surfels)[0].camera, False)):
-        gltf_mesh._add_camera({"nodes": [], "scenes": [{"nodes": []}]}, camera)
+        gltf._add_camera({"nodes": [], "scenes": [{"nodes": []}]}, camera)
         text = "8.5 pixels to the right and -7.0 below" in capsys.readouterr().err
         assert text is said
 

@@ -17,7 +17,7 @@ from mi_refgs.data.dataset import READERS, reader_of
 from mi_refgs.data.lens import Lens
 from mi_refgs.fitting.runner import load_method
 from mi_refgs.formats import Shot
-from mi_refgs.formats.cameras import CAMERAS
+from mi_refgs.formats.cameras import write as write_cameras
 from mi_refgs.io.images import box_downscale, read_png, write_png
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -116,7 +116,7 @@ def test_exported_cameras_are_those_of_the_files(reader: str, kind: str, tmp_pat
     trained = cast(TrainedScene, None)
     shots = Provenance(method, data).shots(trained, "test", "train")
     out = tmp_path / "out"
-    CAMERAS.write(trained, out, shots)
+    write_cameras(trained, out, shots)
     names = [f.split()[-1] for f in (out / "sparse/0/images.txt").read_text().splitlines()[1::2]]
     below = data / "images" if (data / "images").is_dir() else data
     assert names and all((below / name).is_file() for name in names)
@@ -145,6 +145,6 @@ def test_cameras_of_no_file_have_names(tmp_path: Path) -> None:
     """Such as those of a reader that gives arrays, and those around a run without data."""
     camera = read_loaded(write_data(tmp_path / "ball", views=1, truth=False), "train").views[0].camera()
     shots = [Shot("a.jpg", "test", camera), Shot("train/r_0", "train", camera)]
-    CAMERAS.write(cast(TrainedScene, None), tmp_path, shots)
+    write_cameras(cast(TrainedScene, None), tmp_path, shots)
     content = json.loads((tmp_path / "transforms.json").read_text())
     assert [frame["file_path"] for frame in content["frames"]] == ["a.jpg", "train/r_0.png"]

@@ -15,8 +15,8 @@ import pytest
 from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
-from mi_refgs.formats import FORMATS, Format, Option, register, write
-from mi_refgs.formats.shots import shots_around, turntable_cameras
+from mi_refgs.formats import FORMATS, Format, Option, write
+from mi_refgs.formats.orbits import shots_around, turntable_cameras
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.run import Run
@@ -35,9 +35,9 @@ def plain() -> Iterator[list[Any]]:
         target.write_text(str(level))
         return [target]
 
-    register(Format("plain", "a number", ".txt", put, (Option("level", 3, "the number"),)))
+    FORMATS.register(Format("plain", "a number", ".txt", put, (Option("level", 3, "the number"),)))
     yield calls
-    del FORMATS["plain"]
+    FORMATS.unregister("plain")
 
 
 # ---------------- the registry ----------------
@@ -77,12 +77,12 @@ def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: P
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--to", "gif", "-o", "OUT"], "--to: gif: unknown format; use one of "),
+        (["--to", "gif", "-o", "OUT"], "--to: 'gif' is unknown; use 3dgs-ply or "),
         (["--to", "plain"], "--to: names no place; say with -o"),
         (["--level", "3"], "--level: belongs to a format; name it with --to"),
         (
             ["--to", "cameras", "--level", "3", "-o", "OUT"],
-            "--level: means nothing to cameras (plain",
+            "--level: no option of cameras; leave it out, or choose a format that has it (plain)",
         ),
         (["--to", "plain", "-o", "OUT.ply"], "suffix: plain writes .txt"),
     ],
@@ -105,11 +105,11 @@ def test_an_option_is_the_same_in_all_formats(plain: list[Any]) -> None:
     def write(trained: TrainedScene, target: Path, shots: Any) -> list[Path]:
         return []
 
-    with pytest.raises(InputError, match="level: another format's differs"):
-        register(Format("other", "", ".txt", write, (Option("level", 4, "the number"),)))
+    with pytest.raises(InputError, match="level: another format declares it differently"):
+        FORMATS.register(Format("other", "", ".txt", write, (Option("level", 4, "the number"),)))
     assert "other" not in FORMATS
-    with pytest.raises(InputError, match="there is one of this name"):
-        register(FORMATS["plain"])
+    with pytest.raises(InputError, match="the name is empty or in use"):
+        FORMATS.register(FORMATS["plain"])
 
 
 # ---------------- cameras ----------------

@@ -15,7 +15,8 @@ from mi_refgs.constants import GAUSSIAN_LOW_PASS
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import image_array
-from mi_refgs.formats.incoming import read_cameras, read_splats
+from mi_refgs.formats.cameras import read_cameras
+from mi_refgs.formats.gaussian_ply import read_splats
 from mi_refgs.io.exr import read_exr
 from mi_refgs.io.images import read_png
 from mi_refgs.reference import splat as oracle
@@ -313,7 +314,7 @@ def test_cameras_of_a_transforms_file_are_those_of_the_run(theirs: Path, tmp_pat
     [
         ({"frames": []}, "frames: missing or empty"),
         ({"w": None}, "frames[0].w: None is no usable number"),
-        ({"w": 1e6}, "is no size of a picture"),
+        ({"w": 1e6}, "is no size of an image"),
         ({"fl_x": -3}, "is no focal length"),
         ({"k1": 0.1}, "frames[0].k1: no pinhole"),
         ({"frames": [{}]}, "transform_matrix: no 4 × 4 matrix"),

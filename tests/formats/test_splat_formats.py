@@ -17,8 +17,8 @@ from mi_refgs.cli import main
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats import Shot, write
-from mi_refgs.formats.shots import shots_around
-from mi_refgs.formats.splats import THIN, gaussians
+from mi_refgs.formats.gaussians import THIN, gaussians
+from mi_refgs.formats.orbits import shots_around
 from mi_refgs.io.exr import read_exr
 from mi_refgs.io.ownership import RECORD
 from mi_refgs.render.display import display_image

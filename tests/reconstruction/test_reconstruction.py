@@ -279,7 +279,7 @@ def test_settings_are_text_of_toml() -> None:
         (lambda r: r.turntable(0), "turntable: 0 is out of range"),
         (lambda r: r.relight("none.exr"), "none.exr: file: missing"),
         (lambda r: r.relight(np.ones((4, 8))), "is no lat-long map; give linear radiance"),
-        (lambda r: r.export("obj", "x.obj"), "obj: unknown format; use one of"),
+        (lambda r: r.export("obj", "x.obj"), "--to: .obj. is unknown; use"),
         (lambda r: r.edit(where="metallic > 2", cut=True), "none of the 6000 surfels is in it; choose"),
         (lambda r: r.changed(r.trained).evaluate(), "only in memory; measure what save"),
         (lambda r: Camera.look_at([0, 0, 1], up=[0, 0, 1]), "up: no direction besides that of the view"),

@@ -17,8 +17,8 @@ from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.surface import TrueSurface
-from mi_refgs.formats import shots
-from mi_refgs.formats.shots import turntable_cameras
+from mi_refgs.formats import orbits
+from mi_refgs.formats.orbits import turntable_cameras
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.images import read_png
 from mi_refgs.reconstruction.new_light import NewLight, any_light, truth_under
@@ -260,7 +260,7 @@ def test_a_run_without_data_is_relit_around_the_object(
     turntable: int,
 ) -> None:
     """A saved run that records no data set, and one whose data is gone; alike from Python."""
-    monkeypatch.setattr(shots, "SIZE", SIZE)
+    monkeypatch.setattr(orbits, "SIZE", SIZE)
     run = load(folder / "run").save(tmp_path / "run").folder
     assert run is not None
     (run / "dataset.json").unlink()

@@ -1,4 +1,4 @@
-"""Cameras around surfels: for what has no data set, and of a turntable."""
+"""Cameras around a scene: on a sphere where there is no data set, on a circle for a turntable."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from mi_refgs.synthesis.pathtrace import poses_around
 AROUND = {"test": 4, "train": 60}
 """Cameras around an object without a data set."""
 SIZE, FIELD_OF_VIEW = 512, 40.0
-"""Pixels and degrees of their square pictures."""
+"""Pixels and degrees of their square images."""
 INSIDE = 0.98
-"""Share of the surfels, by opacity, that the sphere which fills these pictures holds: strays lie far out."""
+"""Fraction of the surfels, by opacity, in the sphere that fills these images: strays lie far out."""
 
 
 def shots_around(surfels: Surfels) -> list[Shot]:
-    """Cameras on a sphere that look at the surfels' middle from 10° below to 70° above its equator, z up."""
+    """Return cameras on a sphere around the surfels, from 10° below to 70° above its equator, z up."""
     position, weight = _weighted(surfels)
     middle = np.array([_quantile(axis, weight, 0.5) for axis in position.T])
     reach = _quantile(np.linalg.norm(position - middle, axis=1), weight, INSIDE)
@@ -40,9 +40,8 @@ def shots_around(surfels: Surfels) -> list[Shot]:
         ring = np.sqrt(1 - up**2)
         outward = np.stack([ring * np.cos(turn), ring * np.sin(turn), up], axis=1)
         for i, pose in enumerate(poses_around(outward, middle, distance)):
-            camera = Camera.from_pose(
-                SIZE, SIZE, -focal, -focal, SIZE / 2, SIZE / 2, pose, near=1e-2 * distance
-            )
+            centre, near = SIZE / 2, 1e-2 * distance
+            camera = Camera.from_pose(SIZE, SIZE, -focal, -focal, centre, centre, pose, near)
             shots.append(Shot(f"{split}/r_{i:03d}", split, camera))
     return shots
 
@@ -50,18 +49,15 @@ def shots_around(surfels: Surfels) -> list[Shot]:
 def turntable_cameras(
     scene: TrainedScene, cameras: Sequence[Camera], count: int, region: Region | None = None
 ) -> list[Camera]:
-    """Cameras on a circle around the object, z up, like `cameras` in distance and (median) height.
+    """Return cameras on a circle around the object, z up, with the median distance and height of `cameras`.
 
     They have the first one's lens. The object is what lies in the `region`; without one, all of the scene but
     strays: the box of INSIDE of the surfels by opacity, or of the mesh's vertices.
     """
-    if region is not None:
-        centre = np.array(region.centre)
-    else:
-        centre = _middle(scene)
+    centre = _middle(scene) if region is None else np.array(region.centre)
     offset = np.array([camera.pose()[:3, 3] for camera in cameras]) - centre
-    distance = float(np.median(np.linalg.norm(offset, axis=1)))
-    height = float(np.median(offset[:, 2] / np.linalg.norm(offset, axis=1)))
+    length = np.linalg.norm(offset, axis=1)
+    distance, height = float(np.median(length)), float(np.median(offset[:, 2] / length))
     height = min(max(height, -0.95), 0.95)  # not from a pole, where no side is up
     angle = 2 * np.pi * np.arange(count) / count
     ring = math.sqrt(1 - height**2)
@@ -70,7 +66,7 @@ def turntable_cameras(
 
 
 def _middle(scene: TrainedScene) -> np.ndarray:
-    """The middle (3,) of the box that holds all of a scene but strays."""
+    """Return the centre (3,) of the box around all of a scene but strays."""
     if scene.mesh is None:
         position, weight = _weighted(scene.surfels)
     else:
@@ -80,7 +76,7 @@ def _middle(scene: TrainedScene) -> np.ndarray:
 
 
 def _weighted(surfels: Surfels) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 3) and opacities (N,), float64; raises InputError where there are none."""
+    """Return positions (N, 3) and opacities (N,), float64; raises InputError where there are none."""
     raw = surfels.to_numpy()
     if not len(raw["position"]):
         raise InputError("surfels: there are none; cameras have nothing to look at")
@@ -88,7 +84,7 @@ def _weighted(surfels: Surfels) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _quantile(values: np.ndarray, weight: np.ndarray, share: float) -> float:
-    """The value below which the share of the weight lies."""
+    """Return the value below which `share` of the weight lies."""
     order = np.argsort(values)
     summed = np.cumsum(weight[order])
     return float(values[order][np.searchsorted(summed, share * summed[-1])])

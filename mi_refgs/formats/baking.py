@@ -1,0 +1,321 @@
+"""Bake a scene to a textured mesh, which the mesh formats share.
+
+Materials and normals are those of rendered views: of the blended surfels, averaged over the views that see a
+point of the mesh. Points that no view sees get those of the surfels around the mesh's vertices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mi_refgs.errors import InputError, SceneError
+from mi_refgs.formats.format import Shot, import_extra, remember_last
+from mi_refgs.kernels.device import upload
+from mi_refgs.kernels.memory import BASE, PER_SHOWN_SURFEL, PER_TEXEL, require
+from mi_refgs.occlusion.mesh import Mesh, clean
+from mi_refgs.occlusion.surface_materials import NORMAL_AGREEMENT, VertexSurfels
+from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.runs.relightable import relightable
+from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.points import safe_normalize
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Float, Point2f, Point3f, UInt32, Vector3f
+
+PACKAGES = "fast_simplification", "xatlas"
+"""Packages of the extra that baking needs; trimesh calls the former."""
+FACES_MIN, TEXTURE_RANGE = 100, (16, 8192)
+SMOOTHING = 30
+"""Steps of Taubin's filter, which removes the stairs of the voxels from a surface and keeps its volume.
+[Taubin 1995, "A Signal Processing Approach to Fair Surface Design"]"""
+PADDING = 4
+"""Texels between charts, so that two mip levels, and bilinear lookup in them, see no other chart."""
+FLAT = 1e-6
+"""Voxel of the texture's plane as a mesh: its rays have length 1 and need next to no offset."""
+VIEWS = 64
+"""Rendered views, spread evenly over the cameras of the fit; about a third of them see a point."""
+VIEW_SIZE = 512
+"""Pixels along the longer side of a rendered view: four per voxel of an object of 128 voxels."""
+OUTLINES = 8
+"""Approximate number of views whose outlines show how far the mesh lies below the surface."""
+GROWTH, HALVINGS = 2.0, 6
+"""Voxels by which the mesh is moved outwards, at most, and bisection steps: to 1/32 voxel."""
+UNSEEN = 1e-2
+"""Weight of the surfels around a vertex, where each view weighs up to 1: they decide where no view sees."""
+COLUMNS = 8
+"""Columns per point: albedo (3), metallic, roughness, normal (3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedMesh:
+    """A mesh in world space, its materials, and the light. V vertices, F faces, N texels a side."""
+
+    vertices: np.ndarray  # (V, 3) float32
+    normals: np.ndarray  # (V, 3) float32, unit, outward
+    uv: np.ndarray  # (V, 2) float32 in 0 … 1, v upwards: the first row of a texture is at v = 1
+    faces: np.ndarray  # (F, 3) uint32, counter-clockwise from outside
+    albedo: np.ndarray  # (N, N, 3) float32, linear
+    metallic: np.ndarray  # (N, N) float32
+    roughness: np.ndarray  # (N, N) float32, perceptual: GGX's α is its square
+    light: EnvironmentLight
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A mesh in a square texture: V vertices after it is cut open, F faces in the order of the mesh."""
+
+    vertex: np.ndarray  # (V,) index of the mesh's vertex
+    faces: np.ndarray  # (F, 3) uint32
+    uv: np.ndarray  # (V, 2) in 0 … 1, v upwards: the first row of a texture is at v = 1
+
+
+@remember_last
+def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int) -> TexturedMesh:
+    """Bake the object to a mesh of at most about `faces` triangles with textures of texture² texels.
+
+    Background Gaussians are left out; the light is that of the fit (`runs.relightable` says which materials
+    the object gets). Raises InputError for a scene without mesh, light or materials, numbers out of range,
+    and missing packages.
+    """
+    if faces < FACES_MIN:
+        raise InputError(f"--faces: {faces} is out of range; give a number from {FACES_MIN}")
+    low, high = TEXTURE_RANGE
+    if not low <= texture <= high:
+        raise InputError(f"--texture: {texture} is out of range; give {low} to {high}")
+    memory = BASE + PER_TEXEL * texture**2 + PER_SHOWN_SURFEL * trained.count
+    require(memory, f"--texture: {texture} × {texture} texels", "bake a smaller texture")
+    for package in PACKAGES:
+        import_extra(package)
+    scene = relightable(trained)
+    if scene.mesh is None or scene.light is None:
+        raise SceneError("mesh: the run has none; fit one with occlusion, as `--for relighting` does")
+
+    # Views that show the object's materials.
+    plain = replace(scene, shading=Shading("pixel", "split_sum", "irradiance", False))
+    chosen = np.unique(np.linspace(0, len(shots) - 1, VIEWS).round().astype(int))
+    views = [shots[i].camera.resized(VIEW_SIZE) for i in chosen]
+    with dr.suspend_grad():
+        renderer = plain.renderer()
+        # The mesh, and its charts in the texture.
+        mesh = _grown(simplified(scene.mesh, faces), views[:: len(views) // OUTLINES + 1], renderer)
+        chart = unwrap(mesh, texture)
+        covered, triangle, barycentric = texels(chart, texture)
+        # Materials and normals at vertices and texels.
+        points, start = _points(mesh, scene.surfels, triangle, barycentric)
+        found = _mean_of_views(views, renderer, points, start, OFFSET_VOXELS * mesh.voxel)
+    count = len(mesh.vertices)
+    maps = _padded(covered, found[count:, :5])
+    return TexturedMesh(
+        vertices=mesh.vertices[chart.vertex],
+        normals=found[:count, 5:][chart.vertex],
+        uv=chart.uv.astype(np.float32),
+        faces=chart.faces,
+        albedo=maps[..., :3],
+        metallic=maps[..., 3],
+        roughness=maps[..., 4],
+        light=scene.light,
+    )
+
+
+# ---------------- the mesh and its texture coordinates ----------------
+
+
+def simplified(mesh: Mesh, faces: int) -> Mesh:
+    """Smooth a mesh, reduce it to at most about `faces` triangles (quadric edge collapse), remove floaters.
+
+    Raises InputError for a mesh without faces.
+    """
+    if not len(mesh.faces):
+        raise SceneError("mesh: the run has none that textures could be baked to; train it for longer")
+    low, size = mesh.vertices.min(axis=0), np.ptp(mesh.vertices, axis=0).max()
+    made = trimesh.Trimesh((mesh.vertices - low) / size, mesh.faces, process=False)
+    trimesh.smoothing.filter_taubin(made, iterations=SMOOTHING)
+    if len(made.faces) > faces:
+        made = made.simplify_quadric_decimation(face_count=faces)
+    # In a unit box `open_` keeps every part that is large; without, a part that the box of an object has cut
+    # open could count as the wall of a cavity.
+    whole = clean(np.asarray(made.vertices), np.asarray(made.faces), mesh.voxel, open_=True)
+    return Mesh((whole.vertices * size + low).astype(np.float32), whole.faces, mesh.voxel)
+
+
+def unwrap(mesh: Mesh, size: int) -> Chart:
+    """Cut a mesh into charts that fill a texture of size² texels without overlap; some are mirrored."""
+    import xatlas
+
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(mesh.vertices, mesh.faces)
+    packing = xatlas.PackOptions()
+    packing.resolution, packing.padding = size, PADDING
+    atlas.generate(xatlas.ChartOptions(), packing)
+    vertex, faces, uv = atlas[0]
+    return Chart(np.asarray(vertex), np.asarray(faces, np.uint32), np.clip(np.asarray(uv, np.float64), 0, 1))
+
+
+def texels(chart: Chart, size: int) -> tuple[np.ndarray, UInt32, Point2f]:
+    """Find the texels of a size² texture whose centre lies in a triangle.
+
+    Returns which they are (size, size) bool, the first row at v = 1, and for the T of them, row by row, the
+    triangle (T,) and the barycentric coordinates (T,) of its second and third corner.
+    """
+    flat = np.concatenate([chart.uv, np.zeros((len(chart.uv), 1))], axis=1)
+    plane = Occluder(Mesh(flat.astype(np.float32), chart.faces, FLAT))
+    row, column = np.divmod(np.arange(size * size), size)
+    above = mi.Point3f(upload((column + 0.5) / size), upload(1 - (row + 0.5) / size), mi.Float(1))
+    hit = plane.closest(above, mi.Vector3f(0, 0, -1), None)
+    covered = hit.valid.numpy()
+    found = np.flatnonzero(covered)
+    triangle = upload(hit.triangle.numpy()[found], mi.UInt32)
+    barycentric = mi.Point2f(*(upload(x.numpy()[found]) for x in hit.barycentric))
+    return covered.reshape(size, size), triangle, barycentric
+
+
+def _grown(mesh: Mesh, views: Sequence[Camera], renderer: Callable[[Camera], Frame]) -> Mesh:
+    """Move a mesh along its normals until it covers as many pixels of the views as the surfels do.
+
+    The mesh is made of expected depths, which lie behind the first of the surfels that they average.
+    """
+    covered = sum(float(dr.sum(renderer(view).object_alpha)[0]) for view in views)
+    normals = _normals(mesh)
+
+    def moved(voxels: float) -> Mesh:
+        vertices = (mesh.vertices + voxels * mesh.voxel * normals).astype(np.float32)
+        return replace(mesh, vertices=vertices)
+
+    def excess(voxels: float) -> float:
+        occluder, total = Occluder(moved(voxels)), 0.0
+        for view in views:
+            directions = view.rays()
+            origins = mi.Point3f(view.origin + dr.zeros(mi.Point3f, dr.width(directions)))
+            total += float(dr.count(occluder.first_hit(origins, directions)[1])[0])
+        return total - covered
+
+    low, high = 0.0, GROWTH
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if excess(middle) < 0 else (low, middle)
+    return moved((low + high) / 2)
+
+
+def _normals(mesh: Mesh) -> np.ndarray:
+    """Return outward unit normals (V, 3) float32 of the triangles around each vertex."""
+    # In voxels: trimesh takes triangles of less than 1e-14 square units for points.
+    scaled = (mesh.vertices - mesh.vertices[0]) / mesh.voxel
+    return np.array(trimesh.Trimesh(scaled, mesh.faces, process=False).vertex_normals, np.float32)
+
+
+# ---------------- materials and normals ----------------
+
+
+def _points(
+    mesh: Mesh,
+    surfels: Surfels,
+    triangle: UInt32,  # (T,)
+    barycentric: Point2f,  # (T,)
+) -> tuple[Point3f, list[Float]]:
+    """Return the mesh's vertices, then the points on its triangles: positions (V + T,) and their COLUMNS.
+
+    Materials are those of the surfels around the vertices, normals those of the mesh.
+    """
+    vertex_surfels = VertexSurfels.of(mesh, surfels)
+    vertices = dr.arange(mi.UInt32, len(mesh.vertices))
+    corners = [dr.gather(mi.UInt32, vertex_surfels.faces, 3 * triangle + i) for i in range(3)]
+    weights = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)
+
+    def interpolated(column: Float) -> Float:
+        mixed = sum(w * dr.gather(mi.Float, column, c) for w, c in zip(weights, corners, strict=True))
+        return dr.concat((dr.gather(mi.Float, column, vertices), mixed))
+
+    rows = vertex_surfels.surface(surfels).rows
+    materials = [dr.gather(mi.Float, rows, COLUMNS * vertices + i) for i in range(5)]
+    columns = [*materials, *(upload(column) for column in _normals(mesh).T)]
+    points = mi.Point3f(*(interpolated(upload(column)) for column in mesh.vertices.T))
+    start = [interpolated(column) for column in columns]
+    return points, [*start[:5], *safe_normalize(mi.Vector3f(*start[5:]))]
+
+
+def _mean_of_views(
+    views: Sequence[Camera],
+    renderer: Callable[[Camera], Frame],
+    points: Point3f,  # (P,)
+    start: list[Float],  # COLUMNS × (P,)
+    reach: float,  # scene units
+) -> np.ndarray:
+    """Average COLUMNS over the views that see each point: (P, COLUMNS) float32, from those at `start`.
+
+    A view weighs by its alpha and the squared cosine at which it sees the point; it sees points that are less
+    than `reach` in front of or behind its expected depth.
+    """
+    outward = mi.Vector3f(*start[5:])
+    weight = dr.full(mi.Float, UNSEEN, dr.width(points))
+    total = [UNSEEN * column for column in start]
+    for view in views:
+        own, values = _sample_view(view, renderer(view), points, outward, dr.opaque(mi.Float, reach))
+        weight += own
+        total = [a + b for a, b in zip(total, values, strict=True)]
+        dr.eval(weight, total)
+    normal = safe_normalize(mi.Vector3f(*total[5:]))
+    # At a rim pixels blend normals of two faces.
+    normal = dr.select(dr.dot(normal, outward) > NORMAL_AGREEMENT, normal, outward)
+    mean = [*(column / weight for column in total[:5]), *normal]
+    return np.stack([np.array(column, np.float32) for column in mean], axis=1)
+
+
+def _sample_view(
+    camera: Camera,
+    frame: Frame,
+    points: Point3f,  # (P,)
+    outward: Vector3f,  # (P,) unit normals
+    reach: Float,  # scene units
+) -> tuple[Float, list[Float]]:
+    """Return a view's weight at points (P,), and the weighted COLUMNS: bilinear, of pixels at their depth."""
+    # Interleaved rows of pixels: COLUMNS, alpha, depth.
+    normal = safe_normalize(frame.normal)
+    rows = [*frame.maps["albedo"], frame.maps["metallic"], frame.maps["roughness"], *normal]
+    table = dr.ravel(mi.ArrayXf([*rows, frame.alpha, frame.depth]))
+    # Raster positions of the points, and the cosines at which the view sees them.
+    local = camera.to_camera(points)
+    before = local.z > camera.near
+    inverse = dr.rcp(dr.select(before, local.z, 1))
+    x = dr.fma(local.x * inverse, camera.fx, camera.cx) - 0.5
+    y = dr.fma(local.y * inverse, camera.fy, camera.cy) - 0.5
+    left, top = mi.Int32(dr.floor(x)), mi.Int32(dr.floor(y))
+    facing = dr.maximum(-dr.dot(safe_normalize(camera.towards(points)), outward), 0)
+    # The four pixels around each position.
+    weight, total = mi.Float(0), [mi.Float(0)] * COLUMNS
+    for across, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        column, line = left + across, top + down
+        inside = before & (column >= 0) & (column < camera.width) & (line >= 0) & (line < camera.height)
+        pixel = mi.UInt32(dr.select(inside, line * camera.width + column, 0))
+        values = [dr.gather(mi.Float, table, (COLUMNS + 2) * pixel + i, inside) for i in range(COLUMNS + 2)]
+        alpha, depth = values[COLUMNS:]
+        bilinear = dr.maximum(1 - dr.abs(x - mi.Float(column)), 0) * dr.maximum(
+            1 - dr.abs(y - mi.Float(line)), 0
+        )
+        own = bilinear * alpha * facing**2
+        own = dr.select(inside & (dr.abs(depth - local.z) < reach), own, 0)
+        weight += own
+        total = [dr.fma(own, v, sum_) for v, sum_ in zip(values[:COLUMNS], total, strict=True)]
+    return weight, total
+
+
+def _padded(covered: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return textures (N, N, C) of values (T, C) of the texels that are `covered` (N, N).
+
+    Other texels get the value of the nearest covered one, so that lookups at a seam, or in a mip level, do
+    not meet a texel outside the surface.
+    """
+    from scipy import ndimage
+
+    image = np.zeros((*covered.shape, values.shape[1]), np.float32)
+    image[covered] = values
+    rows, columns = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    return np.clip(image[rows, columns], 0, 1)
