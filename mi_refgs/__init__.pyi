@@ -22,9 +22,9 @@ from mi_refgs.occlusion.mesh import read_mesh as read_mesh
 from mi_refgs.occlusion.mesh import write_mesh as write_mesh
 from mi_refgs.occlusion.visibility import Occluder as Occluder
 from mi_refgs.reconstruction.fit import fit as fit
-from mi_refgs.reconstruction.importing import import_splats as import_splats
 from mi_refgs.reconstruction.new_light import NewLight as NewLight
 from mi_refgs.reconstruction.reconstruction import Reconstruction as Reconstruction
+from mi_refgs.reconstruction.reconstruction import import_splats as import_splats
 from mi_refgs.reconstruction.reconstruction import load as load
 from mi_refgs.relighting.relight import relight as relight
 from mi_refgs.render.pipeline import Frame as Frame

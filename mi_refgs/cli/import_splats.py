@@ -32,7 +32,7 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> Result:
     """Import."""
     from mi_refgs.formats.cameras import read_cameras
-    from mi_refgs.reconstruction.importing import import_splats
+    from mi_refgs.reconstruction.reconstruction import import_splats
     from mi_refgs.runs.export import save
     from mi_refgs.runs.run import Run
 

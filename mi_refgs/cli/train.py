@@ -13,8 +13,8 @@ from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError
 
 if TYPE_CHECKING:
-    from mi_refgs.evaluation.progress import Bar
     from mi_refgs.fitting.plan import Estimate
+    from mi_refgs.reconstruction.fit import ProgressBar
 
 EXAMPLE = "refgs train data/glossy -o runs/glossy --preset quick --set loss.alpha=0.1"
 
@@ -51,10 +51,9 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> Result:
     """Fit, from the start or from the newest checkpoint."""
-    from mi_refgs.evaluation.progress import Bar
-    from mi_refgs.reconstruction.fit import fit
+    from mi_refgs.reconstruction.fit import ProgressBar, fit
 
-    progress, begin = Bar() if args.view is None else _watched(args.view), time.monotonic()
+    progress, begin = ProgressBar() if args.view is None else _watched(args.view), time.monotonic()
     fit(
         args.data,
         variant_of(args.variant, args.purpose),
@@ -93,7 +92,7 @@ def run(args: argparse.Namespace) -> Result:
     return Result(data, text)
 
 
-def _watched(port: int) -> Bar:
+def _watched(port: int) -> ProgressBar:
     """The bar of a fit with a page; raises InputError as `refgs view` does."""
     from mi_refgs.viewer.training import TrainingViewer
 

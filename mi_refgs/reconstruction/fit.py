@@ -1,21 +1,29 @@
-"""From a data set to a `Reconstruction`."""
+"""Fit a `Reconstruction` to a data set, with previews in the run folder and a bar in the terminal."""
 
 from __future__ import annotations
 
 import shutil
 import tempfile
+import warnings
 import weakref
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from mi_refgs.capture.triangulate import with_points
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.progress import Bar, Previews
+from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
 from mi_refgs.fitting import runner
 from mi_refgs.fitting.progress import Progress
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.images import write_png
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
+from mi_refgs.progress import progress_bar, say, warn
 from mi_refgs.reconstruction.reconstruction import Reconstruction, load
+
+PSNR_MEMORY = 0.9
+"""Weight of the old value in the running PSNR of the bar; single views are up to 5 dB off the mean."""
 
 
 def fit(
@@ -29,34 +37,34 @@ def fit(
     resume: bool = False,
     progress: bool | Progress = True,
 ) -> Reconstruction:
-    """Fit surfels, materials and a light to the pictures in folder `data`: `refgs train`.
+    """Fit surfels, materials and an environment map to the images in folder `data`, as `refgs train` does.
 
-    method: a method that ships with the package (`variants/`), the path of a .toml, or a `Method`; None fits
-    the full method, and to pictures without alpha the one that fits their surroundings too. preset: "quick",
-    "standard" (the default) or "paper", how long. minutes: time that the fit may take, by smaller or larger
-    pictures. settings: changes of the method, {"loss.ssim": 0.1} or ["loss.ssim=0.1"].
+    method: a method of the package (`variants/`), the path of a .toml, or a `Method`; None fits the full
+    method, and to images without alpha the one that fits background Gaussians too. preset: how long, "quick",
+    "standard" (the default) or "paper". minutes: time that the fit may take, which chooses the image size.
+    settings: changes of the method, {"loss.ssim": 0.1} or ["loss.ssim=0.1"].
 
-    output: the run folder, which is kept. Without one a temporary folder is used, which is removed when no
-    `Reconstruction` of it is left; `save` keeps what was found. resume: go on with the run in `output`, if
-    there is one; other arguments are those that it was started with, or absent. progress: True shows messages
-    and a bar on standard error, False nothing but Python's warnings; a `Progress` listens to each step.
+    output: the run folder, which is kept. Without one a temporary folder is used, which is removed with the
+    last `Reconstruction` of it; `save` keeps the result. resume: continue the run in `output`, if there is
+    one; other arguments are those that it was started with, or absent. progress: True shows messages and a
+    bar on standard error, False only Python's warnings; a `Progress` is called after each step.
 
     Raises InputError for bad input, and KeyboardInterrupt with a message that says where the checkpoints are.
     """
     require_supported_variant("mi_refgs.fit")
-    listener = progress if isinstance(progress, Progress) else Bar() if progress else Previews()
-    if output is None and resume:
-        raise InputError("resume: there is no run to go on with; give its folder as `output`")
-    keeper = _Temporary() if output is None else None
-    folder = Path(output) if output is not None else keeper.path if keeper is not None else Path()
-    if keeper is not None:
-        listener.say(f"{folder}: the run, removed with its last Reconstruction; `save` keeps one")
-    named = str(method) if isinstance(method, Path) else method
+    listener = progress if isinstance(progress, Progress) else ProgressBar() if progress else Previews()
+    temporary = None
+    if output is None:
+        if resume:
+            raise InputError("resume: there is no run to continue; give its folder as `output`")
+        temporary = _TemporaryFolder()
+        output = temporary.path
+        listener.say(f"{output}: the run, removed with its last Reconstruction; `save` keeps one")
     try:
         runner.fit(
             Path(data),
-            folder,
-            named,
+            Path(output),
+            str(method) if isinstance(method, Path) else method,
             preset=preset,
             settings=settings,
             resume=resume,
@@ -65,15 +73,65 @@ def fit(
             find_points=with_points,
         )
     except KeyboardInterrupt:
-        if keeper is not None:
-            keeper.remove.detach()  # the checkpoints stay: they are what the fit goes on from
+        if temporary is not None:
+            temporary.remove.detach()  # keeps the checkpoints, from which the fit can be resumed
         raise
-    return replace(load(folder), _keeper=keeper)
+    return replace(load(output), _temporary=temporary)
 
 
-class _Temporary:
-    """A folder that goes with this object, at the latest with the process."""
+class _TemporaryFolder:
+    """A folder that is removed with this object, at the latest when the process ends."""
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="refgs_"))
         self.remove = weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
+
+
+class Previews(Progress):
+    """Write previews/<iteration>.png into the run folder; warnings are Python's."""
+
+    def warn(self, message: str) -> None:
+        warnings.warn(message, stacklevel=2)
+
+    def step(self, trainer: Trainer) -> None:
+        """Write the first training view and the environment map, where a preview is due."""
+        if trainer.run is None or trainer.iteration % trainer.method.preview_every:
+            return
+        view = trainer.data.views[0]
+        rendered = RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data, view)
+        light = None if trainer.light is None else light_panels(trainer.light.radiance().numpy())
+        image = contact_sheet([panels(rendered, view)], light)
+        write_png(trainer.run.output.own(f"previews/{trainer.iteration:07d}.png"), image)
+
+
+class ProgressBar(Previews):
+    """Show a progress bar and messages on standard error, and write previews."""
+
+    bar: Any = None
+    psnr: float | None = None
+
+    def say(self, message: str) -> None:
+        say(message)
+
+    def warn(self, message: str) -> None:
+        warn(message)
+
+    def begin(self, trainer: Trainer) -> None:
+        super().begin(trainer)
+        # A short memory: the first steps compile kernels.
+        options: dict[str, Any] = {"initial": trainer.iteration, "smoothing": 0.05}
+        self.bar = progress_bar(trainer.method.iterations, trainer.method.variant, **options)
+
+    def step(self, trainer: Trainer) -> None:
+        if trainer.iteration % trainer.method.log_every == 0:
+            # The numbers wait for the device, as the log of this iteration did already.
+            numbers = trainer.statistics()
+            new = float(numbers["psnr"])
+            self.psnr = new if self.psnr is None else PSNR_MEMORY * self.psnr + (1 - PSNR_MEMORY) * new
+            text = f"loss {numbers['loss']:.4f}, PSNR {self.psnr:.1f} dB, {numbers['surfels']} surfels"
+            self.bar.set_postfix_str(text, refresh=False)
+        super().step(trainer)
+        self.bar.update(trainer.iteration - self.bar.n)  # the trial of a component takes many iterations
+
+    def end(self) -> None:
+        self.bar.close()

@@ -1,7 +1,7 @@
-"""What a fit has found, as one object: look at it, relight it, change it, take it elsewhere.
+"""The result of a fit as one object: render it, relight it, edit it, export it.
 
-A `Reconstruction` never changes; what changes it returns another one, which `save` writes into a run folder.
-Pictures are NumPy arrays (H, W, channels) of float32, linear radiance, their first row at the top.
+A `Reconstruction` never changes; methods that change something return another one, which `save` writes into a
+run folder. Images are NumPy arrays (H, W, channels) of float32, linear radiance, their first row at the top.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from mi_refgs.data.view import View
 from mi_refgs.errors import InputError, counted
 from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.evaluation.images import image_array
+from mi_refgs.formats.gaussian_ply import method_of, read_splats
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
 from mi_refgs.plugins.aovs import aov_values, suffixes
@@ -41,15 +42,15 @@ CameraLike: TypeAlias = "Camera | View | int | Any"
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """Surfels with materials, a light and a mesh: what a fit has found, or what became of it.
+    """Surfels with materials, an environment map and a mesh, and how they were fitted.
 
-    Made by `mi_refgs.fit` and `mi_refgs.load`.
+    Returned by `mi_refgs.fit`, `mi_refgs.load` and `mi_refgs.import_splats`.
     """
 
     trained: TrainedScene
     provenance: Provenance
-    folder: Path | None = None  # the run folder that holds exactly this; None: only in memory
-    _keeper: Any = field(default=None, repr=False)  # of a temporary folder, removed with the last user
+    folder: Path | None = None  # the run folder with exactly this content; None: only in memory
+    _temporary: Any = field(default=None, repr=False)  # keeps a temporary folder until the last user is gone
     _renderers: dict[Any, Callable[[Camera], Frame]] = field(default_factory=dict, init=False, repr=False)
 
     def __repr__(self) -> str:
@@ -69,34 +70,33 @@ class Reconstruction:
 
     @property
     def method(self) -> Method:
-        """What was fitted, and how."""
+        """The method that was fitted."""
         return self.provenance.method
 
     def views(self, split: str = "test") -> Dataset:
-        """The "test" or "train" views of the data set: each of `.views` has `.image` (H, W, 3).
+        """Read the "test" or "train" views of the data set: each of `.views` has `.image` (H, W, 3).
 
-        Raises InputError where the data set is unknown, gone or unreadable.
+        Raises InputError for a data set that is unknown, missing or unreadable.
         """
         return self.provenance.views(split)
 
     def cameras(self, split: str = "test") -> list[Camera]:
-        """Cameras of the data set's "test" or "train" views; where it is not there, cameras all around.
+        """Return the cameras of the "test" or "train" views; without a data set, cameras around the object.
 
-        Raises InputError for a data set that is there and cannot be read.
+        Raises InputError for a data set that exists and cannot be read.
         """
         return [shot.camera for shot in self.provenance.shots(self.trained, split)]
 
     def turntable(self, count: int) -> list[Camera]:
-        """Cameras on a circle around the object, z up, like the test views in lens, distance and height."""
+        """Return cameras on a circle around the object, at the distance and height of the test views."""
         return self.provenance.turntable(self.trained, count)
 
     def camera(
         self, camera: CameraLike = 0, size: int | tuple[int, int] | None = None, split: str = "test"
     ) -> Camera:
-        """A camera of whatever stands for one, with other pixels if `size` says so (`Camera.resized`).
+        """Convert a camera, a view, a Mitsuba sensor or an index of `cameras(split)` to a `Camera`.
 
-        An index counts `cameras(split)`. Raises InputError for an index that is out of range and for what
-        is no camera.
+        size: resize it (`Camera.resized`). Raises InputError for an index out of range and any other object.
         """
         if isinstance(camera, int | np.integer):
             known = self.cameras(split)
@@ -110,13 +110,13 @@ class Reconstruction:
         elif isinstance(camera, Camera):
             found = camera
         else:
+            kind = type(camera).__name__
             raise InputError(
-                f"camera: {type(camera).__name__}: no camera; give a Camera, a View, a Mitsuba sensor or the "
-                "index of a test view"
+                f"camera: {kind}: no camera; give a Camera, a View, a Mitsuba sensor or an index"
             )
         return found if size is None else found.resized(size)
 
-    # ---------------- pictures ----------------
+    # ---------------- images ----------------
 
     def render(
         self,
@@ -126,7 +126,7 @@ class Reconstruction:
         samples: int = 1,
         object_only: bool = False,
     ) -> np.ndarray:
-        """The picture (H, W, 4) of a camera: linear RGB, premultiplied by alpha, and alpha.
+        """Render a camera (H, W, 4): linear RGB, premultiplied by alpha, and alpha.
 
         samples: samples per pixel; 4 are 2 × 2, box filtered, 1 is the pixel centre, as in training.
         object_only: render without the background Gaussians; alpha is 1 everywhere with them. Raises
@@ -146,12 +146,12 @@ class Reconstruction:
         samples: int = 1,
         object_only: bool = False,
     ) -> dict[str, np.ndarray]:
-        """Maps (H, W, 3) or (H, W, 1) of a camera by name, as the `refgs` integrator's AOVs are.
+        """Render AOVs (H, W, 3) or (H, W, 1) of a camera by name, as the `refgs` integrator does.
 
-        albedo, roughness, metallic (0 … 1) and unit normals (world, towards the camera) are those of what is
-        seen; depth is the distance along the ray from the near plane, scene units; diffuse, specular and
-        indirect are premultiplied and sum to the picture over black. Raises InputError for a name that is
-        none, or that the surfels have no channel for.
+        albedo, roughness, metallic (0 … 1) and unit normals (world, towards the camera) are those of the
+        visible surface; depth is the distance along the ray from the near plane, scene units; diffuse,
+        specular and indirect are premultiplied and sum to the image over black. Raises InputError for an
+        unknown name, or an attribute that the surfels do not have.
         """
         kinds = suffixes()
         for name in names:
@@ -164,12 +164,12 @@ class Reconstruction:
             try:
                 values = aov_values(name, frame, seen)
             except KeyError:
-                raise InputError(f"aovs: {name}: the surfels have no such channel; leave it out") from None
+                raise InputError(f"aovs: {name}: the surfels have no such attribute; leave it out") from None
             found[name] = image_array(values, seen.height, seen.width)
         return found
 
     def _frame(self, camera: Camera, samples: int, object_only: bool, aovs: bool) -> Frame:
-        """A frame of a renderer that is made once."""
+        """Render a frame; each kind of renderer is made once."""
         key = mi.variant(), samples, object_only, aovs
         if key not in self._renderers:
             scene = replace(self.trained, surroundings=None) if object_only else self.trained
@@ -185,12 +185,12 @@ class Reconstruction:
         aovs: Sequence[str] = (),
         object_only: bool = False,
     ) -> Any:
-        """A `mi.Scene` whose integrator has this reconstruction, and a sensor for each of the cameras.
+        """Make a `mi.Scene` whose integrator has this reconstruction, and one sensor per camera.
 
-        `mi.traverse` of it shows the raw channels (N, D) of the surfels, such as "refgs.roughness", and the
-        raw map of the light, "refgs.light": `mi.render(scene, params)` differentiates all of them. It is what
-        `mi.load_file` makes of the scene.xml of a run. aovs: types, or name:type, appended to the picture.
-        Raises InputError for what no Mitsuba sensor shows, and for AOVs that are none.
+        `mi.traverse` of it lists the raw attributes (N, D) of the surfels, such as "refgs.roughness", and the
+        raw environment map, "refgs.light": `mi.render(scene, params)` differentiates all of them. The scene
+        is the one that `mi.load_file` reads from the scene.xml of a run. aovs: types, or name:type, appended
+        to the image. Raises InputError for a camera that no Mitsuba sensor represents, and unknown AOVs.
         """
         several = [*cameras] if isinstance(cameras, list | tuple) else [cameras]
         first, *more = (self.camera(one) for one in several)
@@ -199,10 +199,10 @@ class Reconstruction:
             return load_scene(Path(folder) / SCENE, aovs, object_only)
 
     def save(self, folder: str | Path) -> Reconstruction:
-        """Write a run folder without checkpoints, which every command that takes a run reads; returns that.
+        """Write a run folder without checkpoints, which every command reads, and load it.
 
-        `load` of it renders the same pictures, bit for bit. Raises InputError for a folder that holds a run,
-        has a foreign file in the way or cannot be written.
+        It renders the same images, bit for bit. Raises InputError for a folder that contains a run, has a
+        foreign file in the way or cannot be written.
         """
         self.provenance.save(self.trained, Path(folder), self.cameras()[0])
         return load(folder)
@@ -212,7 +212,7 @@ class Reconstruction:
 
         `mi_refgs.formats.FORMATS` lists the formats and their options, as `refgs export --help` does. In a
         folder, only `overwrite` replaces foreign files. Raises InputError for an unknown format or option, a
-        scene that the format cannot hold, a package that is missing, and a path that cannot be written.
+        scene that the format cannot represent, a missing package, and a path that cannot be written.
         """
         shots = self.provenance.shots(self.trained, "test", "train")
         return formats.write(self.trained, [form], Path(path), shots, options, self.folder, overwrite)[form]
@@ -227,12 +227,12 @@ class Reconstruction:
         rotate: float = 0.0,
         exposure: float = 0.0,
     ) -> Reconstruction:
-        """The same under another light: materials alone, shaded by it, with shadows and bounces of the mesh.
+        """Replace the light: only materials stay, with shadows and bounces of the mesh.
 
-        light: a lat-long map (EXR, HDR), linear radiance (h, w, 3) of one, or an `EnvironmentLight`. Its
-        first row is straight up, along +z, unless it is in `world` directions already, as an
-        `EnvironmentLight`, environment.exr and envmap.exr are. rotate: degrees about +z, counter-clockwise
-        seen from above. exposure: stops. Raises InputError for a reconstruction without light or materials
+        light: a lat-long map (EXR, HDR), its linear radiance (h, w, 3), or an `EnvironmentLight`. Its first
+        row is straight up, along +z, unless it is in `world` directions already, as an `EnvironmentLight`,
+        environment.exr and envmap.exr are. rotate: degrees about +z, counter-clockwise seen from above.
+        exposure: stops. Raises InputError for a reconstruction without light or materials
         (`runs.relightable`) and a light that cannot be used.
         """
         scene = replace(relightable(self.trained), light=any_light(light, world, rotate, exposure))
@@ -246,22 +246,24 @@ class Reconstruction:
         join: Reconstruction | str | Path | None = None,
         **options: Unpack[editing.EditOptions],
     ) -> Reconstruction:
-        """The same with some surfels changed, as by `refgs edit`; `provenance.edits[-1]` then says how many.
+        """Change some surfels, as `refgs edit` does; `provenance.edits[-1]` then records how many.
 
-        options: `EditOptions`, such as where="metallic > 0.5", set={"roughness": 0.3}; a `mask` is of a
-        `view`. join: what is added under the light of this; selected and changed is then that. Raises
-        InputError for what makes no sense.
+        options: `EditOptions`, such as where="metallic > 0.5", set={"roughness": 0.3}; a `mask` belongs to a
+        `view`. join: a reconstruction that is added under the light of this one; `options` then select and
+        change its surfels. Raises InputError for options that cannot be used.
         """
-        of = self if join is None else join if isinstance(join, Reconstruction) else load(join)
-        camera = None if options.get("mask") is None else of.camera(view, split=split)
+        changed = self
+        if join is not None:
+            changed = join if isinstance(join, Reconstruction) else load(join)
+        camera = None if options.get("mask") is None else changed.camera(view, split=split)
         into = None if join is None else self.trained
-        edited = editing.edit(of.trained, camera=camera, into=into, **options)
-        record = {"run" if join is None else "join": of.folder and str(of.folder), **edited.record}
+        edited = editing.edit(changed.trained, camera=camera, into=into, **options)
+        record = {"run" if join is None else "join": changed.folder and str(changed.folder), **edited.record}
         provenance = replace(self.provenance, edits=(*self.provenance.edits, record))
         return replace(self.changed(edited.scene), provenance=provenance)
 
     def changed(self, trained: TrainedScene) -> Reconstruction:
-        """Another scene of the same method and data, in memory."""
+        """Return another scene of the same method and data, in memory."""
         return replace(self, trained=trained, folder=None)
 
     def evaluate(
@@ -272,21 +274,22 @@ class Reconstruction:
         antialias: bool = False,
         progress: bool = False,
     ) -> dict[str, Any]:
-        """Measure the run on its test views, or on those of `data`: what `refgs eval` writes and prints.
+        """Measure the run on its test views, or on those of `data`, as `refgs eval` does.
 
-        Raises InputError where it is only in memory, and as `evaluation.evaluate.evaluate` does.
+        Raises InputError for a reconstruction in memory, and as `evaluation.evaluate.evaluate` does.
         """
         if self.folder is None:
             raise InputError("evaluate: folder: only in memory; measure what save(folder) returns")
-        place = None if data is None else Path(data)
-        return evaluation.evaluate(Run(self.folder), place, progress, samples, antialias)
+        data = None if data is None else Path(data)
+        return evaluation.evaluate(Run(self.folder), data, progress, samples, antialias)
 
 
 def load(run: str | Path, *, write: bool = True) -> Reconstruction:
-    """Read a run folder: the artefacts, first written unless `write` is off where a checkpoint is newer.
+    """Read a run folder.
 
-    Raises InputError for a folder that is no run, holds neither artefacts nor a checkpoint, or has a file
-    that cannot be used; and where no Mitsuba variant is set that the renderer can use.
+    Where a checkpoint is newer than the files of the scene, these are written first, unless `write` is off.
+    Raises InputError for a folder that is no run, contains neither a scene nor a checkpoint, or has a file
+    that cannot be used; and if no Mitsuba variant is set that the renderer supports.
     """
     require_supported_variant("mi_refgs.load")
     folder = Run(run)
@@ -297,3 +300,15 @@ def load(run: str | Path, *, write: bool = True) -> Reconstruction:
 
     trained = up_to_date(folder, provenance.method, first) if write else newest(folder, provenance.method)
     return Reconstruction(trained, provenance, folder.path)
+
+
+def import_splats(path: str | Path, *, linear: bool = False) -> Reconstruction:
+    """Read a PLY file of 3DGS or 2DGS into memory, as `refgs import` does; `save` writes the run folder.
+
+    linear: its colours are linear radiance, as this package fits them; otherwise they are display-encoded, as
+    3DGS and 2DGS write them. It has neither light nor mesh, and its cameras are around the object, z up.
+    Raises InputError for any other file, and if no Mitsuba variant is set that the renderer supports.
+    """
+    require_supported_variant("mi_refgs.import_splats")
+    trained = read_splats(Path(path), linear)
+    return Reconstruction(trained, Provenance(method_of(trained, Path(path).stem)))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from mi_refgs.evaluation.progress import Bar
+from mi_refgs.reconstruction.fit import ProgressBar
 from mi_refgs.runs.run import LOG, Run
 from mi_refgs.viewer.controls import look, overlays
 from mi_refgs.viewer.page import Page, Views, require_free, require_viser
@@ -69,7 +69,7 @@ class Training:
         return fine_planes(self.draw, pose, width, height, look, trainer.shading(), trainer.surfels.count)
 
 
-class TrainingViewer(Bar):
+class TrainingViewer(ProgressBar):
     """The progress bar of a fit, and its page."""
 
     def __init__(self, host: str, port: int) -> None:

@@ -16,13 +16,13 @@ from mi_refgs.data.images import ImageFile
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
-from mi_refgs.evaluation.progress import Bar
 from mi_refgs.fitting.control import exchanged
 from mi_refgs.fitting.initial import initial_parameters, is_open
 from mi_refgs.fitting.runner import begin, default_method
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
+from mi_refgs.reconstruction.fit import ProgressBar
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.lobe_matrices import map_directions
@@ -211,7 +211,7 @@ def test_a_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) ->
 def test_the_method_for_photographs_is_the_default_without_alpha(
     data: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert default_method(data.path, progress=Bar()) == "photographs"
+    assert default_method(data.path, progress=ProgressBar()) == "photographs"
     assert "without alpha" in capsys.readouterr().err
     assert default_method(write_data(tmp_path, views=3, truth=False)) is None
     assert capsys.readouterr().err == ""

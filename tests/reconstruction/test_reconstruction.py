@@ -274,7 +274,7 @@ def test_settings_are_text_of_toml() -> None:
         (lambda r: r.render(size=0), "size: .* pixels; give whole numbers from 1"),
         (lambda r: r.render(samples=0), "samples: 0 is out of range"),
         (lambda r: r.aovs(0, ["colour"]), "aovs: colour: unknown; use some of .*albedo"),
-        (lambda r: r.aovs(0, ["tint"]), "aovs: tint: the surfels have no such channel"),
+        (lambda r: r.aovs(0, ["tint"]), "aovs: tint: the surfels have no such attribute"),
         (lambda r: r.scene(aovs=["colour"]), "unknown type 'colour'"),
         (lambda r: r.turntable(0), "turntable: 0 is out of range"),
         (lambda r: r.relight("none.exr"), "none.exr: file: missing"),
