@@ -13,9 +13,9 @@ import numpy as np
 
 from benchmarks.stability.case import Array, Case, Raw, camera, facing, filled, plain, sky, sphere
 from benchmarks.stability.measure import light_of
-from mi_refgs.reference import picture as oracle
+from mi_refgs.reference import image as oracle
 from mi_refgs.reference import surfel
-from mi_refgs.reference.pinhole import camera_frame
+from mi_refgs.reference.camera import camera_frame
 
 WIDTH, HEIGHT = 48, 40
 SAMPLES = 4
@@ -78,7 +78,7 @@ def _rules(case: Case) -> Iterator[dict[str, Any]]:
     depth = camera_frame(base.raw, base.camera)[0][:, 2]
     by_centre = np.broadcast_to(np.argsort(depth, kind="stable")[:, None], base.order.shape)
     exact = oracle.render(pixel_sorted)
-    pairs: list[tuple[str, Callable[[], oracle.Picture], Callable[[], oracle.Picture]]] = [
+    pairs: list[tuple[str, Callable[[], oracle.Image], Callable[[], oracle.Image]]] = [
         ("sorted by tile → by pixel", lambda: oracle.render(base), lambda: exact),
         ("sorted by centre → by pixel", lambda: oracle.render(replace(base, order=by_centre)), lambda: exact),
     ]
@@ -98,7 +98,7 @@ def _rules(case: Case) -> Iterator[dict[str, Any]]:
         yield {"scene": case.name, "rule": name} | _difference(ours(), truth())
 
 
-def _difference(ours: oracle.Picture, truth: oracle.Picture) -> dict[str, float]:
+def _difference(ours: oracle.Image, truth: oracle.Image) -> dict[str, float]:
     a, b = ours.maps["radiance"], truth.maps["radiance"]
     mean = float(np.mean(np.abs(b)))
     return {
@@ -123,7 +123,7 @@ def _by_pixel(scene: oracle.Scene) -> Array:
     return np.argsort(oracle.sample_depth(scene), axis=0, kind="stable")
 
 
-def _supersampled(case: Case, light: oracle.Light | None) -> oracle.Picture:
+def _supersampled(case: Case, light: oracle.Light | None) -> oracle.Image:
     """Means over SAMPLES² rays a pixel, without the low-pass."""
     c = case.camera
     fine = replace(
@@ -143,7 +143,7 @@ def _supersampled(case: Case, light: oracle.Light | None) -> oracle.Picture:
             blocks = picture.maps[name].reshape(SAMPLES, c.width, SAMPLES, -1)
             found.append(blocks.mean((0, 2)))
     joined = {name: np.concatenate(found) for name, found in maps.items()}
-    return oracle.Picture(joined, np.zeros(c.width * c.height, bool), np.empty((0, 0), bool))
+    return oracle.Image(joined, np.zeros(c.width * c.height, bool), np.empty((0, 0), bool))
 
 
 def _cut(opacity: float) -> dict[str, float]:

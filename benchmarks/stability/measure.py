@@ -14,8 +14,8 @@ from benchmarks.stability import textbook
 from benchmarks.stability.case import Array, Case
 from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.reference import image as oracle
 from mi_refgs.reference import occlusion as trace
-from mi_refgs.reference import picture as oracle
 from mi_refgs.reference import surfel
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.pipeline import Request, SurfelScene, render
@@ -327,14 +327,14 @@ def _extent(position: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((position - position.mean(0)) ** 2, 1)))) or 1.0
 
 
-def _gradients(case: Case, scene: oracle.Scene, truth: oracle.Picture) -> dict[str, Array]:
+def _gradients(case: Case, scene: oracle.Scene, truth: oracle.Image) -> dict[str, Array]:
     gradients = dict(truth.gradients)
     if scene.light is not None:
         gradients["light"] = light_gradient(case.light, scene.light, gradients["light"])
     return gradients
 
 
-def _weights(truth: oracle.Picture, band: Array) -> dict[str, Array]:
+def _weights(truth: oracle.Image, band: Array) -> dict[str, Array]:
     rng = np.random.default_rng(11)
     weights = {}
     for name in LOSS_MAPS:
@@ -345,7 +345,7 @@ def _weights(truth: oracle.Picture, band: Array) -> dict[str, Array]:
     return weights
 
 
-def _flips(case: Case, scene: oracle.Scene, truth: oracle.Picture) -> Array:
+def _flips(case: Case, scene: oracle.Scene, truth: oracle.Image) -> Array:
     """Pixels (P,) at a declared discontinuity: their visibility changes when normal and ray turn by 1e-4 and
     1e-5, or with the offset of rays that a mesh made elsewhere may have."""
     flips = np.zeros(len(scene.pixels), bool)
@@ -370,7 +370,7 @@ def _flips(case: Case, scene: oracle.Scene, truth: oracle.Picture) -> Array:
 def condition(
     case: Case,
     scene: oracle.Scene,
-    truth: oracle.Picture,
+    truth: oracle.Image,
     exact: dict[str, Array],
     weights: dict[str, Array],
     band: Array,
@@ -402,7 +402,7 @@ def condition(
     return max(images), {n: max(g[n] for g in gradients) for n in gradients[0]}
 
 
-def inversion(case: Case, scene: oracle.Scene, truth: oracle.Picture) -> float:
+def inversion(case: Case, scene: oracle.Scene, truth: oracle.Image) -> float:
     """Largest relative difference of depths in the wrong order, among the surfels that a pixel shows."""
     phase = fast_camera(case).tile_offset
     key = surfel.sort_key(scene.raw, scene.camera, scene.pixels, phase)

@@ -13,9 +13,9 @@ import numpy as np
 
 from benchmarks.stability.case import Array, Case
 from mi_refgs import constants as c
-from mi_refgs.reference import lookup
-from mi_refgs.reference import picture as oracle
-from mi_refgs.reference.pinhole import rotation_axes
+from mi_refgs.reference import image as oracle
+from mi_refgs.reference import models
+from mi_refgs.reference.camera import rotation_axes
 
 NEAR = 0.2
 """Scene units; what lies nearer is dropped."""
@@ -101,7 +101,7 @@ def _features(case: Case, normal: Array) -> Array:
     direction = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), FLOOR)
     away = np.sum(normal * direction, 1, keepdims=True) > c.FACING_TOLERANCE
     normal = np.where(away, -normal, normal)
-    colour = np.maximum(lookup.harmonics(raw["radiance_sh"], direction) + f(0.5), 0).astype(f)
+    colour = np.maximum(models.harmonics(raw["radiance_sh"], direction) + f(0.5), 0).astype(f)
     materials = [1 / (1 + np.exp(-raw[n])) for n in ("albedo", "metallic", "roughness") if n in raw]
     if case.at == "surfel":
         if case.reflectance == "split_sum":
@@ -111,7 +111,7 @@ def _features(case: Case, normal: Array) -> Array:
     parts = [normal, *materials, colour]
     if case.surface is not None:
         n_v = -np.sum(normal * direction, 1, keepdims=True)
-        parts.append(np.maximum(lookup.harmonics(raw["indirect_sh"], 2 * n_v * normal + direction), 0))
+        parts.append(np.maximum(models.harmonics(raw["indirect_sh"], 2 * n_v * normal + direction), 0))
     return np.concatenate(parts, axis=1).astype(f)
 
 
@@ -150,10 +150,10 @@ def _shade(
     n_v = np.clip(np.sum(normal * view, 1, keepdims=True), 0, 1)
     albedo, metallic, roughness = materials[:, :3], materials[:, 3:4], materials[:, 4]
     f0 = f(0.04) * (1 - metallic) + albedo * metallic
-    a, b = lookup.table(light.table, n_v[:, 0], roughness)
+    a, b = models.table_lookup(light.table, n_v[:, 0], roughness).T
     reflectance = (f0 * a[:, None] + b[:, None]).astype(f)
     mirror = 2 * np.sum(normal * view, 1, keepdims=True) * normal - view
-    texel, share = lookup.specular(light, mirror.astype(f), roughness.astype(f))
+    texel, share = models.specular(light, mirror.astype(f), roughness.astype(f))
     out = reflectance * np.einsum("nk,nkc->nc", share.astype(f), light.flat()[texel])
     if visibility is not None:
         out = out * visibility[:, None]
@@ -161,7 +161,7 @@ def _shade(
         out = out + (1 - metallic) * own
     else:
         last = np.full(len(normal), len(light.levels) - 1)
-        texel, share = lookup.bilinear(light, normal, last)
+        texel, share = models.bilinear(light, normal, last)
         base = np.maximum(1 - reflectance, 0) * (1 - metallic) * albedo
         out = out + base * np.einsum("nk,nkc->nc", share.astype(f), light.flat()[texel])
     if visibility is not None and indirect is not None:

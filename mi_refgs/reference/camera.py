@@ -1,8 +1,83 @@
-"""Poses of cameras in Mitsuba's frame: +z forward, +x left, +y up."""
+"""A pinhole camera and its pose, in float64 or complex numbers, in Mitsuba's frame: +z forward, +y up."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+
+Array = np.ndarray
+QUATERNION_FLOOR = 1e-12
+"""Largest |component| below which a quaternion is the identity, with gradient 0: a rule of the table."""
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """Fields of `splat.camera.Camera` in float64."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    to_world: np.ndarray  # (4, 4)
+    near: float = 0.01
+    film: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """First and last pixel border of the film along x and y, of a crop window; None: those of the image."""
+
+    @property
+    def borders(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """`film`, or the borders of the image."""
+        return self.film or ((0, self.width), (0, self.height))
+
+
+def rotation_matrix(q: np.ndarray) -> np.ndarray:
+    """Rotation matrix of a quaternion (x, y, z, w) of any norm."""
+    x, y, z, w = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def camera_frame(raw: dict[str, Array], camera: PinholeCamera) -> tuple[Array, Array]:
+    """Centres (N, 3) and axes (N, 3, 3) — t_u, t_v, n — in the camera's frame."""
+    to_camera, origin = camera.to_world[:3, :3].T, camera.to_world[:3, 3]
+    centre = (raw["position"] - origin) @ to_camera.T
+    return centre, np.stack([axis @ to_camera.T for axis in rotation_axes(raw["rotation"])], axis=1)
+
+
+def rotation_axes(rotation: Array) -> tuple[Array, Array, Array]:
+    """Images (N, 3) of the three axes under quaternions (x, y, z, w) of any norm."""
+    largest = np.abs(rotation.real).max(axis=1, keepdims=True, initial=0)
+    valid = largest >= QUATERNION_FLOOR
+    q = np.where(valid, rotation / np.where(valid, largest, 1), np.array([0, 0, 0, 1.0]))
+    x, y, z, w = (q / np.sqrt(np.sum(q**2, axis=1, keepdims=True))).T
+    return (
+        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], axis=1),
+        np.stack([2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)], axis=1),
+        np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=1),
+    )
+
+
+def intrinsics(camera: PinholeCamera) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Focal length and centre along x, and along y."""
+    return (camera.fx, camera.cx), (camera.fy, camera.cy)
+
+
+def ray_slopes(camera: PinholeCamera, x: Array, y: Array) -> Array:
+    """Directions (3, P) through pixels, 1 along the viewing axis."""
+    return np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)])
+
+
+def sigmoid(x: Array) -> Array:
+    """Logistic sigmoid."""
+    return 1 / (1 + np.exp(-x))
+
 
 PARALLEL = 0.95
 """|cos| between the view and `up` above which another direction is taken for up."""

@@ -1,4 +1,4 @@
-"""What a footprint is to an oracle, for every primitive: a module with these functions.
+"""Interface of footprints: each primitive is a module with the functions of `Footprints`.
 
 Letters: N primitives, P pixels. Raw channels are real or, for derivatives by a complex step, complex. The
 columns of its `scale` say which primitive a table is of.
@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.pinhole import PinholeCamera
+from mi_refgs.reference.camera import PinholeCamera
 
 Array = np.ndarray
 GEOMETRY = ("position", "rotation", "scale", "opacity")

@@ -1,7 +1,7 @@
 """Footprints of 3D Gaussians in float64, by EWA. See `reference.footprint`.
 
 The screen covariance is Σ' = J W Σ Wᵀ Jᵀ + λ I, with J the derivative of the projection at the centre, whose
-slope is brought to the neighbourhood of the picture. [Zwicker 2001, eq. 31; 3DGS, Kerbl 2023, eq. 5]
+slope is clamped to the neighbourhood of the image. [Zwicker 2001, eq. 31; 3DGS, Kerbl 2023, eq. 5]
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.footprint import Rules, Sample
-from mi_refgs.reference.pinhole import (
+from mi_refgs.reference.camera import (
     PinholeCamera,
     camera_frame,
     intrinsics,
     rotation_matrix,
     sigmoid,
 )
+from mi_refgs.reference.footprint import Rules, Sample
 
 Array = np.ndarray
 
@@ -66,7 +66,7 @@ def normal(raw: dict[str, Array]) -> Array:
 
 
 def _limits(camera: PinholeCamera) -> list[tuple[float, float]]:
-    """Slopes p_x / p_z and p_y / p_z of the neighbourhood of the picture."""
+    """Slopes p_x / p_z and p_y / p_z of the neighbourhood of the image."""
     limits = []
     for (focal, middle), (first, last) in zip(intrinsics(camera), camera.borders, strict=True):
         margin = c.GAUSSIAN_SLOPE_MARGIN * (last - first)

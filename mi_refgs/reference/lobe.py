@@ -25,7 +25,7 @@ HORIZON = 1e-4
 """|cosine| below which a walk inside the microsurface counts as horizontal, and keeps its height."""
 
 
-def smith_lambda(cosine: np.ndarray, α: float) -> np.ndarray:
+def smith_lambda(cosine: float | np.ndarray, α: float) -> np.ndarray:
     """Smith's Λ of GGX; of directions below the horizon too. [Heitz et al. 2016, eq. 15 ff.]"""
     cosine = np.where(np.abs(cosine) < 1e-9, 1e-9, cosine)
     return (np.sign(cosine) * np.sqrt(1 + α**2 * (1 / np.square(cosine) - 1)) - 1) / 2

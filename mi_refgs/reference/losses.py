@@ -1,4 +1,4 @@
-"""Losses, depth normals and Adam in float64, pixel by pixel: what `render.display` and `fitting.optim` equal.
+"""Losses, depth normals, Adam, relocation and antialiased roughness in float64, pixel by pixel.
 
 Images are (H, W, 3), planes (H, W); row first. No helper is shared with the fast path.
 """
@@ -175,3 +175,44 @@ def adam(
         corrected_m, corrected_v = m / (1 - 0.9**t), v / (1 - 0.999**t)
         θ = θ - rate * corrected_m / (np.sqrt(corrected_v) + epsilon / math.sqrt(1 - 0.999**t))
     return θ
+
+
+def widened_roughness(roughness: np.ndarray, normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Maps (H, W), (H, W, 3), (H, W); as `render.antialias.widened`."""
+    height, width = alpha.shape
+    out = np.array(roughness, np.float64)
+    for y in range(height):
+        for x in range(width):
+            if alpha[y, x] <= 1e-3:
+                continue
+            own = normal[y, x] / np.linalg.norm(normal[y, x])
+            total = 0.0
+            for steps in (((-1, 0), (1, 0)), ((0, -1), (0, 1))):
+                turns = []
+                for dx, dy in steps:
+                    i, j = x + dx, y + dy
+                    if 0 <= i < width and 0 <= j < height and alpha[j, i] > 1e-3:
+                        other = normal[j, i] / np.linalg.norm(normal[j, i])
+                        turns.append(float(np.sum((own - other) ** 2)))
+                total += min(turns, default=0.0)
+            out[y, x] = min(roughness[y, x] ** 4 + min(total / 12, 0.18), 1.0) ** 0.25
+    return out
+
+
+def relocated(opacity: float, number: int) -> tuple[float, float]:
+    """Opacity of each of `number` Gaussians, and the factor of their scales: eq. 9 as printed."""
+    new = 1 - (1 - opacity) ** (1 / number)
+    total = 0.0
+    for i in range(1, number + 1):
+        for k in range(i):
+            total += math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
+    return new, opacity / total
+
+
+def line_integral(opacity: float, number: int, scale: float, steps: int = 20_000) -> float:
+    """∫ 1 - (1 - o exp(-x²/2s²))^N dx along a line through their centre, by the middles of equal steps."""
+    width, total = 20 * scale, 0.0
+    for i in range(steps):
+        x = ((i + 0.5) / steps - 0.5) * width
+        total += 1 - (1 - opacity * math.exp(-0.5 * (x / scale) ** 2)) ** number
+    return total * width / steps

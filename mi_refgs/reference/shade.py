@@ -12,6 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mi_refgs.reference.lobe import frame, reflected, schlick, smith_lambda
+
 
 def split_sum(n_dot_v: float, roughness: float, nodes: int = 1500) -> tuple[float, float]:
     """(A, B) of one pair by midpoints over the half vectors: GGX α = roughness², correlated Smith,
@@ -26,24 +28,24 @@ def split_sum(n_dot_v: float, roughness: float, nodes: int = 1500) -> tuple[floa
     n_l = 2 * v_h * n_h - n_dot_v
     lit = n_l > 0
     n_l = np.where(lit, n_l, 1)
-
-    def lam(c: float | np.ndarray) -> np.ndarray:
-        return (np.sqrt(1 + α2 * (1 / np.square(c) - 1)) - 1) / 2
-
-    value = np.where(lit, weight / (1 + lam(n_dot_v) + lam(n_l)) * v_h / (n_h * n_dot_v), 0) / len(φ)
+    g = 1 / (1 + smith_lambda(n_dot_v, roughness**2) + smith_lambda(n_l, roughness**2))
+    value = np.where(lit, weight * g * v_h / (n_h * n_dot_v), 0) / len(φ)
     schlick = (1 - v_h) ** 5
     return float((value * (1 - schlick)).sum()), float((value * schlick).sum())
 
 
 def sh_basis(direction: np.ndarray, degree: int) -> np.ndarray:
-    """Real spherical harmonics with the Condon-Shortley phase, by Legendre recursion in the polar angle from
-    +z."""
-    x, y, z = (float(c) for c in direction)
-    r = math.hypot(x, y)
-    φ = math.atan2(y, x)
-    p = {(0, 0): 1.0}
+    """Real spherical harmonics (…, (degree + 1)²) of unit directions (…, 3), with the Condon-Shortley phase.
+
+    Legendre functions over sin^m θ by recursion; complex steps give derivatives.
+    """
+    x, y, z = np.moveaxis(direction, -1, 0)
+    cos, sin = [np.ones_like(x)], [np.zeros_like(x)]  # sin^m θ cos mφ, sin^m θ sin mφ
+    for _ in range(degree):
+        cos, sin = [*cos, x * cos[-1] - y * sin[-1]], [*sin, x * sin[-1] + y * cos[-1]]
+    p = {(0, 0): np.ones_like(z)}
     for m in range(1, degree + 1):
-        p[m, m] = -(2 * m - 1) * r * p[m - 1, m - 1]
+        p[m, m] = -(2 * m - 1) * p[m - 1, m - 1]
     for m in range(degree):
         p[m + 1, m] = (2 * m + 1) * z * p[m, m]
         for n in range(m + 2, degree + 1):
@@ -53,20 +55,22 @@ def sh_basis(direction: np.ndarray, degree: int) -> np.ndarray:
         for m in range(-n, n + 1):
             k = abs(m)
             norm = math.sqrt((2 * n + 1) / (4 * math.pi) * math.factorial(n - k) / math.factorial(n + k))
-            turn = 1.0 if m == 0 else math.sqrt(2) * (math.cos(k * φ) if m > 0 else math.sin(k * φ))
-            out.append(norm * turn * p[n, k])
-    return np.array(out)
+            turn = 1 if m == 0 else math.sqrt(2) * (cos[k] if m > 0 else sin[k])
+            out.append(norm * p[n, k] * turn)
+    return np.stack(out, axis=-1)
 
 
 def bilinear(radiance: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Lat-long (h, w, 3) looked up as Mitsuba's `envmap` does: column centres at half-integers, pole rows on
-    the poles."""
+    """Look up a lat-long map (h, w, 3) in unit directions (…, 3), as Mitsuba's `envmap` does.
+
+    Column centres are at half-integers, the first and last rows on the poles.
+    """
     h, w = radiance.shape[:2]
-    x, y, z = direction
-    u = (math.atan2(x, -z) / (2 * math.pi)) % 1.0 * w - 0.5
-    v = math.acos(max(-1.0, min(1.0, y))) / math.pi * (h - 1)
-    j, i = math.floor(u), min(math.floor(v), h - 2)
-    s, t = u - j, v - i
+    x, y, z = np.moveaxis(direction, -1, 0)
+    u = np.arctan2(x, -z) / (2 * math.pi) % 1.0 * w - 0.5
+    v = np.arccos(np.clip(y, -1, 1)) / math.pi * (h - 1)
+    j, i = np.floor(u).astype(int), np.minimum(np.floor(v).astype(int), h - 2)
+    s, t = (u - j)[..., None], (v - i)[..., None]
     upper = (1 - s) * radiance[i, j % w] + s * radiance[i, (j + 1) % w]
     lower = (1 - s) * radiance[i + 1, j % w] + s * radiance[i + 1, (j + 1) % w]
     return (1 - t) * upper + t * lower
@@ -79,9 +83,7 @@ def lobe_average(
     in the tail."""
     α = roughness**2
     pole = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-    helper = np.eye(3)[np.argmin(np.abs(pole))]
-    side = np.cross(pole, helper) / np.linalg.norm(np.cross(pole, helper))
-    up = np.cross(pole, side)
+    side, up, _ = frame(pole)
     φ = (np.arange(spokes) + 0.5) * (2 * math.pi / spokes)
     around = np.cos(φ)[:, None] * side + np.sin(φ)[:, None] * up
     total, weights = np.zeros(3), 0.0
@@ -93,24 +95,9 @@ def lobe_average(
         width = α * math.cosh(t) * math.cos(half) ** 2  # dθ_h / dt
         # dω_l = 4 cosθ_h dω_h
         weight = math.cos(2 * half) * d * math.cos(half) * math.sin(half) * width
-        total += weight * bilinear_many(
-            radiance, math.cos(2 * half) * pole + math.sin(2 * half) * around
-        ).mean(0)
+        total += weight * bilinear(radiance, math.cos(2 * half) * pole + math.sin(2 * half) * around).mean(0)
         weights += weight
     return total / weights
-
-
-def bilinear_many(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """`bilinear` of directions (n, 3), for the quadratures."""
-    h, w = radiance.shape[:2]
-    u = np.mod(np.arctan2(directions[:, 0], -directions[:, 2]) / (2 * np.pi), 1.0) * w - 0.5
-    v = np.arccos(np.clip(directions[:, 1], -1, 1)) / np.pi * (h - 1)
-    j = np.floor(u).astype(int)
-    i = np.minimum(np.floor(v).astype(int), h - 2)
-    s, t = (u - j)[:, None], (v - i)[:, None]
-    return (1 - t) * ((1 - s) * radiance[i, j % w] + s * radiance[i, (j + 1) % w]) + t * (
-        (1 - s) * radiance[i + 1, j % w] + s * radiance[i + 1, (j + 1) % w]
-    )
 
 
 def specular(
@@ -127,15 +114,20 @@ def specular(
     return (1 - t) * bilinear(levels[lower], direction) + t * bilinear(levels[lower + 1], direction)
 
 
-def table_lookup(table: np.ndarray, n_dot_v: float, roughness: float) -> np.ndarray:
-    """Bilinear (A, B) in a table [roughness, N·V], texel centres, outer half texels extrapolated."""
-    n = table.shape[0]
-    x, y = min(max(n_dot_v, 0.0), 1.0) * n - 0.5, min(max(roughness, 0.0), 1.0) * n - 0.5
-    j, i = (min(max(math.floor(c), 0), n - 2) for c in (x, y))
-    s, t = x - j, y - i
-    return (1 - t) * ((1 - s) * table[i, j] + s * table[i, j + 1]) + t * (
-        (1 - s) * table[i + 1, j] + s * table[i + 1, j + 1]
-    )
+def clip(x: float | np.ndarray, low: float, high: float) -> np.ndarray:
+    """Clip real parts; complex numbers outside lose their derivative."""
+    return np.where(np.real(x) < low, low, np.where(np.real(x) > high, high, x))
+
+
+def table_lookup(table: np.ndarray, n_dot_v: float | np.ndarray, roughness: float | np.ndarray) -> np.ndarray:
+    """Bilinear (A, B) (…, 2) in a table [roughness, N·V], texel centres, outer half texels extrapolated."""
+    n = len(table)
+    x, y = clip(n_dot_v, 0, 1) * n - 0.5, clip(roughness, 0, 1) * n - 0.5
+    j, i = (np.clip(np.floor(q.real), 0, n - 2).astype(int) for q in (x, y))
+    s, t = (x - j)[..., None], (y - i)[..., None]
+    upper = (1 - s) * table[i, j] + s * table[i, j + 1]
+    lower = (1 - s) * table[i + 1, j] + s * table[i + 1, j + 1]
+    return (1 - t) * upper + t * lower
 
 
 def shade(
@@ -238,16 +230,10 @@ def specular_cosine(
     half = half / np.linalg.norm(half, axis=1, keepdims=True)
     n_h, v_h = half @ normal, half @ view
     d = α2 / (math.pi * (n_h**2 * (α2 - 1) + 1) ** 2)
-
-    def lam(c: np.ndarray) -> np.ndarray:
-        return (np.sqrt(1 + α2 * (1 / c**2 - 1)) - 1) / 2
-
-    safe = np.where(lit, n_l, 1)
-    g = 1 / (1 + lam(safe) + lam(np.array(n_v if n_v > 0 else 1)))
-    f0 = 0.04 * (1 - metallic) + albedo * metallic
-    fresnel = f0 + (1 - f0) * (1 - v_h[:, None]) ** 5
-    specular = fresnel * (d * g / (4 * safe * (n_v if n_v > 0 else 1)))[:, None]
-    return np.where(lit, n_l, 0)[:, None] * specular
+    safe, n_v = np.where(lit, n_l, 1), n_v if n_v > 0 else 1.0
+    g = 1 / (1 + smith_lambda(safe, roughness**2) + smith_lambda(n_v, roughness**2))
+    fresnel = schlick(v_h, 0.04 * (1 - metallic) + albedo * metallic)
+    return np.where(lit, n_l, 0)[:, None] * fresnel * (d * g / (4 * safe * n_v))[:, None]
 
 
 def reflected_radiance(
@@ -260,26 +246,12 @@ def reflected_radiance(
     *,
     nodes: int = 400,
 ) -> np.ndarray:
-    """∫ L f cosθ dω of a lat-long map under `brdf_cosine`, (3,), by midpoints: over half vectors drawn from
-    D cosθ for the specular term, with more nodes in the tail, and over cos²θ for the diffuse one."""
-    helper = np.eye(3)[np.argmin(np.abs(normal))]
-    side = np.cross(normal, helper) / np.linalg.norm(np.cross(normal, helper))
+    """∫ L f cosθ dω (3,) of a lat-long map under `brdf_cosine`, by midpoints: see `lobe.reflected` for the
+    specular part; the diffuse part over cos²θ."""
     s, turn = (x.ravel() for x in np.meshgrid(*[(np.arange(nodes) + 0.5) / nodes] * 2))
-    φ = (2 * math.pi * turn)[:, None]
-    around = np.cos(φ) * side + np.sin(φ) * np.cross(normal, side)
-
-    def at(cosine: np.ndarray) -> np.ndarray:
-        return cosine[:, None] * normal + np.sqrt(1 - cosine**2)[:, None] * around
-
-    lights = at(np.sqrt(s))
+    φ = 2 * math.pi * turn
+    local = np.stack([np.sqrt(1 - s) * np.cos(φ), np.sqrt(1 - s) * np.sin(φ), np.sqrt(s)], axis=1)
     base = diffuse_reflectance(albedo, metallic, roughness, float(normal @ view))
-    diffuse = base * bilinear_many(radiance, lights).mean(0)
-    α2 = roughness**4
-    n_h = s / np.sqrt(s**2 + α2 * (1 - s**2))  # 1 - s² is uniform
-    half = at(n_h)
-    v_h = half @ view
-    lights = 2 * v_h[:, None] * half - view
-    density = α2 / (math.pi * (n_h**2 * (α2 - 1) + 1) ** 2) * n_h  # of half vectors; dω_l = 4 v·h dω_h
-    specular = specular_cosine(albedo, metallic, roughness, normal, view, lights)
-    weight = (2 * s * np.where(v_h > 0, 4 * v_h, 0) / density)[:, None]
-    return diffuse + (specular * weight * bilinear_many(radiance, lights)).mean(0)
+    diffuse = base * bilinear(radiance, local @ frame(normal)).mean(0)
+    f0 = 0.04 * (1 - metallic) + albedo * metallic
+    return diffuse + reflected(lambda d: bilinear(radiance, d), normal, view, roughness, f0, nodes)

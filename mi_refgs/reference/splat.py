@@ -1,14 +1,29 @@
-"""Oracle of the splatter: one thing after another over whole images, float64."""
+"""Composite footprints front to back, pixel by pixel, and differentiate the result.
+
+`splat` is written as loops over primitives. `Blend` treats all primitives at once; derivatives of its
+footprints are complex steps, exact to the last digit: the imaginary part of f(x + ih) is h f'(x). Derivatives
+of compositing follow from its sums. Letters: N primitives, P pixels, K features.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.pinhole import PinholeCamera
-from mi_refgs.reference.primitives import primitive_of
+from mi_refgs.reference import gaussian, surfel
+from mi_refgs.reference.camera import PinholeCamera
+from mi_refgs.reference.footprint import GEOMETRY, Footprints, Rules, Sample
+
+Array = np.ndarray
+STEP = 1e-40
+
+
+def primitive_of(raw: dict[str, np.ndarray]) -> Footprints:
+    """3D Gaussians have a third standard deviation."""
+    return gaussian if raw["scale"].shape[1] == 3 else surfel
 
 
 @dataclass(frozen=True)
@@ -53,3 +68,116 @@ def splat(
         alpha += w
         transmittance = np.where(shown, after, transmittance)
     return Maps(out, depth, alpha, in_band)
+
+
+@dataclass(frozen=True)
+class Blend:
+    """Footprints (N, P) blended front to back."""
+
+    raw: dict[str, Array]
+    camera: PinholeCamera
+    rules: Rules
+    order: Array  # (N, P): rows from front to back at each pixel
+    x: Array  # (P,)
+    y: Array
+    sample: Sample
+    culled: Array  # (N,)
+    alpha: Array  # 0 where nothing is hit
+    z: Array  # 0 where nothing is hit
+    before: Array  # transmittance in front
+    after: Array  # … and behind
+    alive: Array  # the pixel has not ended before it
+    shown: Array  # it contributes
+    weight: Array
+
+    @staticmethod
+    def of(
+        raw: dict[str, Array], camera: PinholeCamera, order: Array, x: Array, y: Array, rules: Rules
+    ) -> Blend:
+        """Blend raw channels at pixel centres x, y."""
+        primitive = primitive_of(raw)
+        culled = primitive.culled(raw, camera, rules)
+        sample = primitive.footprint(raw, camera, rules, x, y)
+        alpha, z = sample.alpha.real, sample.z.real
+        hit = (alpha >= rules.alpha_min) & (z > camera.near) & ~culled[:, None]
+        alpha, z = np.where(hit, alpha, 0), np.where(hit, z, 0)
+        behind = np.take_along_axis(np.log1p(-alpha), order, 0).cumsum(0)
+        before = np.exp(np.concatenate([np.zeros((1, len(x))), behind[:-1]]))
+        ends = math.log(rules.transmittance_min) if rules.transmittance_min else -math.inf
+        alive = np.logical_and.accumulate(behind >= ends, axis=0)
+        before, alive, after = (_unsort(v, order) for v in (before, alive, np.exp(behind)))
+        shown = hit & alive
+        weight = np.where(shown, before * alpha, 0)
+        return Blend(
+            raw, camera, rules, order, x, y, sample, culled, alpha, z, before, after, alive, shown, weight
+        )
+
+    def sums(self, features: Array) -> Array:
+        """Maps (P, K + 2): features (N, K), depth, alpha."""
+        depth, alpha = np.sum(self.weight * self.z, 0), self.weight.sum(0)
+        return np.concatenate([self.weight.T @ features, depth[:, None], alpha[:, None]], axis=1)
+
+    def band(self, width: float) -> Array:
+        """Pixels (P,) with a declared discontinuity within this relative distance."""
+        rules, z = self.rules, self.sample.z.real
+        near = self.alive & ~self.culled[:, None] & np.isfinite(z)
+        found = np.any(self.shown & (self.sample.jump < width), 0)
+        for values, limit, where in (
+            (self.sample.unclamped, rules.alpha_min, near),
+            (self.sample.unclamped, rules.alpha_max, self.shown),
+            (self.after, rules.transmittance_min, self.alpha > 0),
+            (z, self.camera.near, near),
+        ):
+            found |= np.any(where & (np.abs(values - limit) < width * limit), 0)
+        return found
+
+    def adjoint(self, features: Array, δsums: Array) -> tuple[dict[str, Array], Array]:
+        """Derivatives of Σ δsums · sums by the geometry's raw channels, and by features (N, K)."""
+        value = features @ δsums[:, :-2].T + self.z * δsums[:, -2] + δsums[:, -1]
+        part = np.take_along_axis(self.weight * value, self.order, 0)
+        behind = _unsort(np.cumsum(part[::-1], axis=0)[::-1] - part, self.order)
+        δalpha = np.where(self.shown, self.before * value - behind / (1 - self.alpha), 0)
+        δz = np.where(self.shown, self.weight * δsums[:, -2], 0)
+        primitive, gradients = primitive_of(self.raw), {}
+        for name in GEOMETRY:
+            gradients[name] = np.zeros_like(self.raw[name])
+            for d in range(self.raw[name].shape[1]):
+                moved = self.raw | {name: self.raw[name].astype(complex)}
+                moved[name][:, d] += 1j * STEP
+                there = primitive.footprint(moved, self.camera, self.rules, self.x, self.y)
+                slope_alpha, slope_z = there.alpha.imag / STEP, there.z.imag / STEP
+                gradients[name][:, d] = np.sum(
+                    np.where(self.shown, δalpha * slope_alpha + δz * slope_z, 0), 1
+                )
+        return gradients, self.weight @ δsums[:, :-2]
+
+
+@dataclass(frozen=True)
+class Exact:
+    """Maps (P, K + 2) — features, depth, alpha — of a whole image, and derivatives of Σ weights · maps."""
+
+    maps: Array
+    gradients: dict[str, Array]  # as the raw channels, and "features" (N, K)
+    shown: Array  # (N, P): whether a row contributes to a pixel
+
+
+def differentiate(
+    raw: dict[str, Array], features: Array, camera: PinholeCamera, weights: Array, order: Array | None = None
+) -> Exact:
+    """Maps, and gradients for adjoints `weights` (K + 2, P) of them.
+
+    `order` (N, P) replaces the order by `sort_key`: rows from front to back.
+    """
+    pixels = np.arange(camera.width * camera.height)
+    if order is None:
+        key = primitive_of(raw).sort_key(raw, camera, pixels, (0, 0))
+        order = np.argsort(key, axis=0, kind="stable")
+    blend = Blend.of(raw, camera, order, pixels % camera.width + 0.5, pixels // camera.width + 0.5, Rules())
+    gradients, δfeatures = blend.adjoint(features, weights.T)
+    return Exact(blend.sums(features), gradients | {"features": δfeatures}, blend.weight > 0)
+
+
+def _unsort(values: Array, order: Array) -> Array:
+    out = np.empty_like(values)
+    np.put_along_axis(out, order, values, axis=0)
+    return out

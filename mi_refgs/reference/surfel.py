@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.footprint import Rules, Sample, tile_centres
-from mi_refgs.reference.pinhole import (
+from mi_refgs.reference.camera import (
     PinholeCamera,
     camera_frame,
     intrinsics,
@@ -14,6 +13,7 @@ from mi_refgs.reference.pinhole import (
     rotation_matrix,
     sigmoid,
 )
+from mi_refgs.reference.footprint import Rules, Sample, tile_centres
 
 Array = np.ndarray
 

@@ -23,8 +23,8 @@ from benchmarks.stability import measure
 from benchmarks.stability.case import Case, sky
 from benchmarks.stability.measure import product_order, scene_of
 from mi_refgs.profiling.profile import Counts
-from mi_refgs.reference import picture as oracle
-from mi_refgs.reference.pinhole import rotation_matrix
+from mi_refgs.reference import image as oracle
+from mi_refgs.reference.camera import rotation_matrix
 from mi_refgs.splat import list_by_tile, project
 from mi_refgs.surfels.table import Surfels
 from tests.benchmarks.benchmark_runs import (  # first: it lets `benchmarks` be found

@@ -12,8 +12,7 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.reference import baselines
-from mi_refgs.reference import shade as reference
+from mi_refgs.reference import models
 from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -74,27 +73,19 @@ def points_of(values: dict[str, np.ndarray]) -> ShadingPoints:
     return ShadingPoints(**arrays | colours)
 
 
-def oracle(
+def exact_terms(
     name: str, values: dict[str, np.ndarray], maps: list[np.ndarray], k: int, normal: Any
 ) -> np.ndarray:
-    """Terms (T, 3) of point k. `normal`: about which the directions of the hemisphere are."""
-    one: dict[str, Any] = {key: x[k] for key, x in values.items()}
-    if name == "mirror":
-        own = {"own": one.pop("radiance")}
-        return baselines.mirror(lambda d: reference.bilinear(maps[0], d), **one, **own)
-    if name == "gaussian_shader":
-        table = brdf.table().astype(np.float64)
-        return baselines.gaussian_shader(
-            lambda d: reference.bilinear(maps[-1], d),
-            lambda d, r: reference.specular(maps, LEVEL_ROUGHNESS, d, r),
-            lambda n_v, r: reference.table_lookup(table, n_v, r),
-            own=one.pop("radiance"),
-            **one,
-        )
-    if "free" in one:
-        one["free"] = [bool(one["free"] >> j & 1) for j in range(DIRECTIONS)]
-    directions = baselines.hemisphere(DIRECTIONS, normal / np.linalg.norm(normal))
-    return baselines.monte_carlo(lambda d: reference.bilinear(maps[0], d), directions, **one)
+    """Terms (T, 3) of point k in float64. `normal`: about which the directions of the hemisphere are."""
+    one = {key: np.asarray(x[k], np.float64).reshape(1, -1) for key, x in values.items() if key != "free"}
+    light = models.Light(maps, tuple(LEVEL_ROUGHNESS), brdf.table().astype(np.float64))
+    about = (normal / np.linalg.norm(normal))[None]
+    free = np.array([[values["free"][k] >> j & 1 for j in range(DIRECTIONS)]]) if "free" in values else None
+    options = models.Options(directions=DIRECTIONS, free=free, detached_normal=about)
+    points = models.Points(one.pop("normal"), one.pop("view"), one)
+    model = name.partition(",")[0]
+    terms = models.MODELS[model](points, light, options, [])
+    return np.concatenate(terms)[: 3 if model == "monte_carlo" else 2]
 
 
 def flat(value: Any) -> list[Any]:
@@ -112,7 +103,7 @@ def shaded(name: str, points: ShadingPoints, light: EnvironmentLight) -> list[An
 def test_terms_against_the_oracle(name: str, rng: np.random.Generator) -> None:
     light, values = EnvironmentLight.from_radiance(MAP), scene(name, rng)
     maps = level_maps(light.prefilter())
-    expected = np.array([oracle(name, values, maps, k, values["normal"][k]) for k in range(N)])
+    expected = np.array([exact_terms(name, values, maps, k, values["normal"][k]) for k in range(N)])
     terms = shaded(name, points_of(values), light)
     assert len(terms) == expected.shape[1]
     for n, term in enumerate(terms):
@@ -139,7 +130,7 @@ def test_derivatives_of_each_attribute(name: str, rng: np.random.Generator) -> N
     def value(attribute: str, k: int, x: Any) -> float:
         changed = values | {attribute: np.array(values[attribute], np.float64)}
         changed[attribute][k] = x
-        return float((oracle(name, changed, maps, k, values["normal"][k]) * weight[k]).sum())
+        return float((exact_terms(name, changed, maps, k, values["normal"][k]) * weight[k]).sum())
 
     for attribute, parts in gradients.items():
         gradient = np.stack(parts, 1).reshape(N, *values[attribute].shape[1:])
@@ -299,7 +290,7 @@ def test_the_hemisphere_is_blocked_where_a_mesh_stands() -> None:
     context = TraceContext(occluder, table(), None, place, normal)
     shading = CASES["monte_carlo, occluded"]
     free = np.array(shading.model.trace(points, context, shading).free)
-    directions = baselines.hemisphere(DIRECTIONS, np.array([0, 1.0, 0]))
+    directions = models.hemisphere(DIRECTIONS, np.array([0, 1.0, 0]))
     blocked = directions[:, 0] * 50 > 1  # the wall is as good as infinite
     assert 0 < blocked.sum() < DIRECTIONS
     for k in range(n):

@@ -10,7 +10,7 @@ import pytest
 from mi_refgs.fitting import refine
 from mi_refgs.methods.method import Relocation
 from mi_refgs.methods.window import Window
-from mi_refgs.reference import relocation as reference
+from mi_refgs.reference import losses as reference
 from mi_refgs.reference.camera import look_at
 from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels.attributes import logit, sigmoid
@@ -38,7 +38,7 @@ def table(count: int, idle: int, rng: np.random.Generator, scale: float = 0.05) 
 @pytest.mark.parametrize("number", [1, 2, 5, 20])
 def test_the_correction_is_that_of_the_paper(opacity: float, number: int) -> None:
     new, factor = refine.shared(np.array([0.5, opacity]), np.array([1, number]))
-    expected = reference.shared(opacity, number)
+    expected = reference.relocated(opacity, number)
     np.testing.assert_allclose([new[1], factor[1]], expected, rtol=1e-9)
     np.testing.assert_allclose([new[0], factor[0]], [0.5, 1], rtol=1e-12)
     alone, together = (
@@ -61,7 +61,7 @@ def test_idle_surfels_go_where_others_are_seen(rng: np.random.Generator) -> None
     number = np.bincount(edit.parent, minlength=24)[edit.parent]
     for row in range(30):
         opacity = float(sigmoid(before["opacity"][edit.parent[row], 0]))
-        new, factor = reference.shared(opacity, int(number[row]))
+        new, factor = reference.relocated(opacity, int(number[row]))
         assert sigmoid(after["opacity"][row, 0]) == pytest.approx(new, rel=1e-4)
         size = before["scale"][edit.parent[row]] + np.log(factor)
         np.testing.assert_allclose(after["scale"][row], size, atol=1e-5)

@@ -20,8 +20,8 @@ from mi_refgs.formats.gaussian_ply import read_splats
 from mi_refgs.io.exr import read_exr
 from mi_refgs.io.images import read_png
 from mi_refgs.reference import splat as oracle
-from mi_refgs.reference.lookup import harmonics
-from mi_refgs.reference.pinhole import PinholeCamera
+from mi_refgs.reference.camera import PinholeCamera
+from mi_refgs.reference.models import harmonics
 from mi_refgs.render.display import displayed
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.points import ShadingPoints

@@ -15,7 +15,7 @@ from benchmarks.stability.__main__ import main
 from benchmarks.stability.case import Case, plain
 from benchmarks.stability.cases import catalogue
 from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, Row, measure
-from mi_refgs.reference import picture as oracle
+from mi_refgs.reference import image as oracle
 from mi_refgs.surfels.primitives.surfel import FootprintAdjoint
 from tests.benchmarks.benchmark_runs import ROOT  # first: it lets `benchmarks` be found
 

@@ -12,14 +12,11 @@ import numpy as np
 
 from mi_refgs import constants as c
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
-from mi_refgs.reference import antialias, lookup, occlusion, picture, surroundings
-from mi_refgs.reference.baselines import hemisphere
-from mi_refgs.reference.camera import look_at
+from mi_refgs.reference import image, losses, occlusion
+from mi_refgs.reference.camera import PinholeCamera, look_at, rotation_axes
 from mi_refgs.reference.footprint import GEOMETRY
-from mi_refgs.reference.lookup import Light
-from mi_refgs.reference.models import Options
-from mi_refgs.reference.pinhole import PinholeCamera, rotation_axes
-from mi_refgs.reference.primitives import primitive_of
+from mi_refgs.reference.models import Light, Options, hemisphere, unit
+from mi_refgs.reference.splat import primitive_of
 from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.render.surroundings import Surroundings, nothing_around
@@ -124,7 +121,7 @@ class Oracle:
             if chosen.occlusion:
                 free = self._keep("free", lambda: _free(own["position"], normal, chosen.directions))
                 options = replace(options, free=free)
-        scene = picture.Scene(
+        scene = image.Scene(
             own, camera, self.pixels, order, chosen.at, chosen.reflectance, chosen.diffuse,
             light_of(case, values), options=options, terms=True,
         )  # fmt: skip
@@ -134,12 +131,12 @@ class Oracle:
             )
         background = values.get("background", np.full((8, 16, 3), -np.inf))
         if chosen.antialias and "variance" not in self._kept:
-            maps, _ = surroundings.render(surroundings.OpenScene(scene, around, background))
+            maps, _ = image.render_open(image.OpenScene(scene, around, background))
             shape = camera.height, camera.width
             normal, share = maps["object_normal"].reshape(*shape, 3), maps["object_alpha"].reshape(shape)
-            self._kept["variance"] = antialias.widened(np.zeros(shape), normal, share).ravel() ** 4
+            self._kept["variance"] = losses.widened_roughness(np.zeros(shape), normal, share).ravel() ** 4
         scene = replace(scene, variance=self._kept.get("variance"))
-        maps, band = surroundings.render(surroundings.OpenScene(scene, around, background))
+        maps, band = image.render_open(image.OpenScene(scene, around, background))
         if chosen.occlusion and chosen.model.visibility == "mirror":
             maps["visibility"] = self._kept["visible"][:, None]
         floor = np.abs(maps["object_alpha"] - c.COVERAGE_FLOOR)[:, 0] < 0.5 * c.COVERAGE_FLOOR
@@ -210,7 +207,7 @@ class Oracle:
         alpha, share = self._blocks(maps["alpha"]), self._blocks(maps["object_alpha"])
         if kind == "alpha":
             return alpha
-        if kind in picture.TERMS:
+        if kind in image.TERMS:
             return self._blocks(maps[kind])
         if kind == "normal":
             mean = self._blocks(maps["normal"])
@@ -296,7 +293,7 @@ def _facing(raw: dict[str, Array], camera: PinholeCamera) -> Array:
     """Normals (N, 3) of surfels towards the camera."""
     axes = np.stack(rotation_axes(raw["rotation"]))
     normal = axes[primitive_of(raw).normal(raw), np.arange(len(raw["rotation"]))]
-    direction = lookup.unit(raw["position"] - camera.to_world[:3, 3])
+    direction = unit(raw["position"] - camera.to_world[:3, 3])
     away = np.sum(normal * direction, 1, keepdims=True) > c.FACING_TOLERANCE
     return np.where(away, -normal, normal)
 

@@ -120,7 +120,6 @@ NOT_CLEAN_YET = {
     "mi_refgs/plugins",
     "mi_refgs/profiling",
     "mi_refgs/reconstruction",
-    "mi_refgs/reference",
     "mi_refgs/relighting",
     "mi_refgs/render",
     "mi_refgs/runs",

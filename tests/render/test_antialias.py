@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.kernels.device import upload
-from mi_refgs.reference import antialias as oracle
+from mi_refgs.reference import losses as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.antialias import widened
 from mi_refgs.render.pipeline import Frame
@@ -55,13 +55,13 @@ def found(roughness: mi.Float, normal: np.ndarray, alpha: np.ndarray) -> mi.Floa
 def test_maps_against_the_oracle(maps: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
     roughness, normal, alpha = maps
     roughness[2, 4] = 0  # a perfect mirror
-    expected = oracle.widened(roughness, normal, alpha)
+    expected = oracle.widened_roughness(roughness, normal, alpha)
     np.testing.assert_allclose(found(upload(roughness), normal, alpha), expected.ravel(), atol=2e-6)
     grown = expected**4 - roughness**4
     assert (grown[alpha < 1e-3] == 0).all() and grown.max() == pytest.approx(0.18)
     assert 1e-4 < np.median(grown[alpha > 1e-3]) < 1e-2
     rough = np.full_like(roughness, 0.99)
-    expected = oracle.widened(rough, normal, alpha)
+    expected = oracle.widened_roughness(rough, normal, alpha)
     np.testing.assert_allclose(found(upload(rough), normal, alpha), expected.ravel(), atol=2e-6)
     assert expected.max() == 1
     flat = np.tile([0.0, 0, 2], (*alpha.shape, 1))
@@ -77,7 +77,8 @@ def test_derivative_of_the_roughness(
     weight, tangent = rng.normal(size=(2, *roughness.shape))
     step = 1e-6
     slope = (
-        oracle.widened(roughness + step, normal, alpha) - oracle.widened(roughness - step, normal, alpha)
+        oracle.widened_roughness(roughness + step, normal, alpha)
+        - oracle.widened_roughness(roughness - step, normal, alpha)
     ) / (2 * step)
     given = upload(roughness)
     dr.enable_grad(given)

@@ -12,8 +12,7 @@ import pytest
 
 from mi_refgs.reference import shade as reference
 from mi_refgs.reference import splat as oracle
-from mi_refgs.reference.camera import look_at
-from mi_refgs.reference.pinhole import rotation_matrix
+from mi_refgs.reference.camera import look_at, rotation_matrix
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light import lobe_matrices

@@ -14,7 +14,7 @@ import pytest
 from benchmarks.stability import measure
 from benchmarks.stability.case import camera, plain
 from mi_refgs.kernels.device import upload, upload_tensor
-from mi_refgs.reference import surroundings as oracle
+from mi_refgs.reference import image as oracle
 from mi_refgs.render.display import displayed, srgb_from_linear
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.samples import box_mean, supersampled
@@ -78,7 +78,7 @@ class Pair:
         pixels = np.arange(case.camera.width * case.camera.height)
         scene = measure.scene_of(case, pixels, self.order, measure.light_of(values["light"]))
         others = {name: values[f"surroundings/{name}"] for name in scattered_discs()}
-        return oracle.render(oracle.OpenScene(scene, others, values["background"]))
+        return oracle.render_open(oracle.OpenScene(scene, others, values["background"]))
 
     def frame(self, params: dict[str, Any], eye: Camera | None = None) -> Frame:
         surfels = Surfels({name: params[name] for name in self.case.raw})

@@ -226,7 +226,7 @@ def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -
     cosines = [0.1, 0.3, 0.5, 0.7, 0.9]
     truth = [
         exact.reflected(
-            lambda d: reference.bilinear_many(map_, d),
+            lambda d: reference.bilinear(map_, d),
             np.array([1.0, 0, 0]),
             np.array([c, np.sqrt(1 - c * c), 0]),
             roughness,

@@ -15,7 +15,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
 from mi_refgs.reference import shade as reference
-from mi_refgs.reference.ambient import ambient as exact
+from mi_refgs.reference.occlusion import ambient as exact
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade import ambient, brdf
 from mi_refgs.shade.ggx_sampling import lobe_turn

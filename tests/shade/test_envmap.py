@@ -197,8 +197,7 @@ def test_irradiance_is_the_cosine_integral(rng: np.random.Generator) -> None:
     )
     d = np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], -1).reshape(-1, 3)
     sampled = (
-        reference.bilinear_many(radiance, d)
-        * (np.sin(θ).ravel() * (np.pi / 400) * (2 * np.pi / 800))[:, None]
+        reference.bilinear(radiance, d) * (np.sin(θ).ravel() * (np.pi / 400) * (2 * np.pi / 800))[:, None]
     )
     normals = np.concatenate([AXES, unit(rng.normal(size=(10, 3)))])
     expected = np.maximum(normals @ d.T, 0) @ sampled / np.pi

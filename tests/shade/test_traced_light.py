@@ -149,10 +149,10 @@ def true_reflection(
     map_, x, y = gradient_sky(), np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
 
     def sky(d: np.ndarray) -> np.ndarray:
-        return np.where(d[:, 1:2] < 0, 0, reference.bilinear_many(map_, d))  # the floor is long
+        return np.where(d[:, 1:2] < 0, 0, reference.bilinear(map_, d))  # the floor is long
 
     def incoming(d: np.ndarray) -> np.ndarray:
-        out = reference.bilinear_many(map_, d)
+        out = reference.bilinear(map_, d)
         for k in np.flatnonzero(wall_blocks(place, d)[0]):
             out[k] = exact.reflected(sky, x, -d[k], wall_roughness, np.array(WALL_COLOUR), 12)
         return out

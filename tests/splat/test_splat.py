@@ -14,9 +14,9 @@ from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.errors import InputError
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference import surfel as oracle_surfel
-from mi_refgs.reference.blend import differentiate
 from mi_refgs.reference.camera import look_at
 from mi_refgs.reference.footprint import Rules
+from mi_refgs.reference.splat import differentiate
 from mi_refgs.splat import Camera, list_by_tile, project, splat, tiles
 from mi_refgs.surfels.primitives.surfel import FootprintAdjoint
 from mi_refgs.surfels.table import Surfels

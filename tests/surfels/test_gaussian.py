@@ -16,10 +16,10 @@ from mi_refgs.fitting import refine
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods import Refine
 from mi_refgs.reference import gaussian as exact
-from mi_refgs.reference import picture
+from mi_refgs.reference import image
 from mi_refgs.reference import splat as oracle
-from mi_refgs.reference.blend import differentiate
 from mi_refgs.reference.footprint import Rules
+from mi_refgs.reference.splat import differentiate
 from mi_refgs.render.pipeline import Request, Shading, SurfelScene, render
 from mi_refgs.splat import blend, list_by_tile, project
 from mi_refgs.surfels.init import from_points
@@ -277,7 +277,7 @@ def test_a_3dgs_file_of_ours_is_rendered_as_the_oracle_has_it(tmp_path: Path) ->
     pixels = np.arange(camera.width * camera.height)
     key = exact.sort_key(double, camera, pixels, (0, 0))
     order = np.argsort(key, axis=0, kind="stable")
-    truth = picture.render(picture.Scene(double, camera, pixels, order, "surfel", "radiance"))
+    truth = image.render(image.Scene(double, camera, pixels, order, "surfel", "radiance"))
     assert truth.band.mean() < 0.05 and truth.maps["alpha"].max() > 0.9
     found = {"radiance": frame.radiance, "normal": frame.normal, "alpha": [frame.alpha]}
     for name, values in found.items():

@@ -1,8 +1,8 @@
-"""A whole picture and its gradients in float64: footprints, compositing, shading, for any pixels of a view.
+"""Render an image and its gradients in float64: footprints, compositing, shading, for any pixels of a view.
 
 Every stage treats its items (surfels, surfel-pixel pairs, pixels) one by one, so its derivative is one
-complex step a column, exact to the last digit: the imaginary part of f(x + ih) is h f'(x). Compositing has
-the derivative of its sums. The order of surfels is an input: the sort has no derivative.
+complex step per column, exact to the last digit: the imaginary part of f(x + ih) is h f'(x). The order of
+surfels is an input: the sort has no derivative.
 
 Letters: N surfels, P pixels, K features, D raw columns. Maps are (P, …).
 """
@@ -15,12 +15,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.blend import STEP, Blend
-from mi_refgs.reference.footprint import Rules
-from mi_refgs.reference.lookup import Light, harmonics, positive, unit
-from mi_refgs.reference.models import MATERIALS, MODELS, Options, Points
-from mi_refgs.reference.pinhole import QUATERNION_FLOOR, PinholeCamera, rotation_axes, sigmoid
-from mi_refgs.reference.primitives import primitive_of
+from mi_refgs.reference.camera import QUATERNION_FLOOR, PinholeCamera, rotation_axes, sigmoid
+from mi_refgs.reference.footprint import GEOMETRY, Rules
+from mi_refgs.reference.models import MATERIALS, MODELS, Light, Options, Points, harmonics, positive, unit
+from mi_refgs.reference.shade import bilinear
+from mi_refgs.reference.splat import STEP, Blend, primitive_of
 
 Array = np.ndarray
 TERMS = ("diffuse", "specular", "indirect")
@@ -28,7 +27,7 @@ TERMS = ("diffuse", "specular", "indirect")
 
 @dataclass(frozen=True)
 class Scene:
-    """What a picture is made from. `order` (N, P): surfels from front to back at each pixel."""
+    """Everything that an image is rendered from. `order` (N, P): surfels from front to back at each pixel."""
 
     raw: dict[str, Array]
     camera: PinholeCamera
@@ -46,7 +45,7 @@ class Scene:
 
 
 @dataclass
-class Picture:
+class Image:
     """Maps (P, …) by name; `taps` of lookups in the light: texels, weights, and what their sum is times."""
 
     maps: dict[str, Array]
@@ -56,8 +55,8 @@ class Picture:
     gradients: dict[str, Array] = field(default_factory=dict)  # of Σ weights · maps; "light": flat levels
 
 
-def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 1e-4) -> Picture:
-    """The picture, and with `weights` (P, …) of some maps the gradients of Σ weights · maps.
+def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 1e-4) -> Image:
+    """Render an image, and with `weights` (P, …) of some maps the gradients of Σ weights · maps.
 
     `band` is the relative width of the declared discontinuities.
     """
@@ -73,9 +72,9 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     pixel_taps: list[tuple[Array, Array, Array]] = []
     maps = resolve.named(resolve(sums, pixel_taps).real)
 
-    picture = Picture(maps, blend.band(band), blend.shown, taps + pixel_taps)
+    image = Image(maps, blend.band(band), blend.shown, taps + pixel_taps)
     if weights is None:
-        return picture
+        return image
 
     δout = np.concatenate(
         [np.asarray(weights.get(n, np.zeros_like(maps[n])), np.float64).reshape(len(x), -1) for n in maps], 1
@@ -95,8 +94,8 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
             for texel, share, factor in found:
                 np.add.at(δlight, texel, share.real[..., None] * (factor.real * δcolour)[:, None])
         gradients["light"] = δlight
-    picture.gradients = gradients
-    return picture
+    image.gradients = gradients
+    return image
 
 
 def itemwise_adjoint(function: Callable[[Array], Array], inputs: Array, δ: Array) -> Array:
@@ -217,3 +216,54 @@ class Resolve:
         """Columns by map."""
         widths = self.maps()
         return dict(zip(widths, np.split(values, np.cumsum([*widths.values()])[:-1], axis=1), strict=True))
+
+
+# ---------------- scenes with a background ----------------
+
+
+@dataclass(frozen=True)
+class OpenScene:
+    """`scene` is the object, its `order` (N + M, P) of all rows, those of the surroundings last."""
+
+    scene: Scene
+    around: dict[str, Array]  # raw channels of M rows: geometry and radiance_sh
+    background: Array  # (h, 2h, 3) raw, radiance is log(1 + exp raw)
+
+
+def render_open(open_scene: OpenScene) -> tuple[dict[str, Array], Array]:
+    """Maps (P, …) of the object and of both, and pixels (P,) near a declared discontinuity."""
+    scene, camera = open_scene.scene, open_scene.scene.camera
+    own = {name: np.asarray(values, np.float64) for name, values in scene.raw.items()}
+    other = {name: np.asarray(values, np.float64) for name, values in open_scene.around.items()}
+    count = len(own["position"])
+    x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
+    both = {name: np.concatenate([own[name], other[name]]) for name in GEOMETRY}
+    blend = Blend.of(both, camera, scene.order, x, y, scene.rules)
+
+    features = Features(scene, own)
+    values = features(features.columns, []).real
+    direction = unit(other["position"] - camera.to_world[:3, 3])
+    colour = positive(harmonics(other["radiance_sh"], direction) + 0.5)
+    alpha = blend.weight.sum(0)
+    depth = np.sum(blend.weight * blend.z, 0)
+    share = blend.weight[:count].sum(0)
+    sums = np.concatenate([blend.weight[:count].T @ values, depth[:, None], share[:, None]], axis=1)
+    resolve = Resolve(scene, features, x, y, sums)
+    maps = resolve.named(resolve(sums, []).real)
+    maps["object_alpha"], maps["object_normal"] = share[:, None], maps["normal"]
+    maps["alpha"] = alpha[:, None]
+    seen = alpha > c.COVERAGE_FLOOR
+    maps["depth"] = np.where(seen, depth / np.where(seen, alpha, 1), 0)[:, None]
+    maps["radiance"] = maps["radiance"] + blend.weight[count:].T @ colour
+    if scene.at == "surfel":  # one slot for the normals of both
+        maps["normal"] = maps["normal"] + blend.weight[count:].T @ _facing(other, direction)
+    texels = np.log1p(np.exp(np.asarray(open_scene.background, np.float64)))
+    maps["background"] = bilinear(texels, resolve.ray)
+    return maps, blend.band(1e-4)
+
+
+def _facing(raw: dict[str, Array], direction: Array) -> Array:
+    """Normals (M, 3), turned towards the camera."""
+    normal = np.choose(primitive_of(raw).normal(raw)[:, None], rotation_axes(raw["rotation"]))
+    away = np.sum(normal * direction, axis=1, keepdims=True) > c.FACING_TOLERANCE
+    return np.where(away, -normal, normal)
