@@ -41,6 +41,7 @@ from mi_refgs.shade.reflectance import Reflectance as Reflectance
 from mi_refgs.shade.reflectance.model import SurfelView as SurfelView
 from mi_refgs.shade.shading import Shading as Shading
 from mi_refgs.splat.camera import Camera as Camera
+from mi_refgs.surfels.attributes import Attribute as Attribute
 from mi_refgs.surfels.attributes import Channel as Channel
 from mi_refgs.surfels.init import from_points as from_points
 from mi_refgs.surfels.ply import read_ply as read_ply
@@ -51,6 +52,7 @@ from mi_refgs.synthesis.make_dataset import make_dataset as make_dataset
 
 FormatOption = mi_refgs.formats.format.Option
 load_method = mi_refgs.methods.read.load
+register_attribute = mi_refgs.surfels.attributes.register
 register_channel = mi_refgs.surfels.attributes.register
 register_format = mi_refgs.formats.format.register
 register_primitive = mi_refgs.surfels.primitives.register

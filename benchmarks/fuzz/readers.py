@@ -33,7 +33,7 @@ from mi_refgs.runs import checkpoint
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.synthesis.settings import Settings, prepare_folder
@@ -72,7 +72,7 @@ def _read_file(read: Callable[[Path], Any], name: str) -> Callable[[Path, bytes]
 
 def _table(rows: int = 7) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(SEED)
-    return {name: rng.normal(size=(rows, channel.width(1))) for name, channel in CHANNELS.items()}
+    return {name: rng.normal(size=(rows, channel.width(1))) for name, channel in ATTRIBUTES.items()}
 
 
 def _surfel_files(folder: Path) -> list[bytes]:

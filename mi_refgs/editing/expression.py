@@ -20,7 +20,7 @@ from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.evaluation.images import LUMINANCE
 from mi_refgs.runs.relightable import outward
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.surfels.attributes import CHANNELS, SH_DC, sigmoid
+from mi_refgs.surfels.attributes import ATTRIBUTES, SH_DC, sigmoid
 
 MAX_LENGTH = 2000
 """Characters of an expression: bounds the work of Python's parser."""
@@ -205,7 +205,7 @@ class SurfelValues(Mapping[str, np.ndarray]):
         self.raw = scene.surfels.to_numpy()
         self.columns: dict[str, tuple[str, list[int]]] = {}  # attribute, or COLOUR, and its columns by name
         for name, table in self.raw.items():
-            declared, width = CHANNELS[name], table.shape[1]
+            declared, width = ATTRIBUTES[name], table.shape[1]
             if not declared.harmonics and declared.activation not in ("quaternion", "exp"):
                 letters = declared.aov.lower() if len(declared.aov) == width else AXES
                 self._add(name, name, width, letters)
@@ -243,7 +243,7 @@ class SurfelValues(Mapping[str, np.ndarray]):
     def settable(self) -> list[str]:
         """The names that can be given other values, of all columns of an attribute or of one."""
         return [
-            n for n, (of, _) in self.columns.items() if of == COLOUR or CHANNELS[of].activation == "sigmoid"
+            n for n, (of, _) in self.columns.items() if of == COLOUR or ATTRIBUTES[of].activation == "sigmoid"
         ]
 
     def activated(self, name: str) -> np.ndarray:
@@ -251,7 +251,7 @@ class SurfelValues(Mapping[str, np.ndarray]):
         if name == COLOUR:
             return 0.5 + SH_DC * self.raw["radiance_sh"][:, :3].astype(np.float64)
         values = self.raw[name].astype(np.float64)
-        return sigmoid(values) if CHANNELS[name].activation == "sigmoid" else values
+        return sigmoid(values) if ATTRIBUTES[name].activation == "sigmoid" else values
 
     def require(self, names: frozenset[str], where: str) -> None:
         """Raise InputError, with `where` in the message, for names that the surfels have no values of."""

@@ -11,7 +11,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.options import TRACED
 from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
 
 
@@ -37,7 +37,7 @@ def join(first: TrainedScene, second: TrainedScene) -> tuple[TrainedScene, list[
             )
     tables = [scene.surfels.to_numpy() for scene in (first, second)]
     raw = {
-        name: np.concatenate(_columns(name, tables)) for name in CHANNELS if any(name in t for t in tables)
+        name: np.concatenate(_columns(name, tables)) for name in ATTRIBUTES if any(name in t for t in tables)
     }
     joined = replace(
         first,
@@ -72,7 +72,7 @@ def _columns(name: str, tables: list[dict[str, np.ndarray]]) -> list[np.ndarray]
     found = []
     for table in tables:
         values = table.get(name)
-        if values is None and not CHANNELS[name].harmonics:
+        if values is None and not ATTRIBUTES[name].harmonics:
             raise InputError(f"--join: {name}: one of the runs has no such attribute; fit both by one method")
         values = np.zeros((len(table["position"]), 0), np.float32) if values is None else values
         found.append(np.pad(values, ((0, 0), (0, width - values.shape[1]))))

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.sh import sh_rotation
-from mi_refgs.surfels.attributes import CHANNELS, sigmoid
-from mi_refgs.surfels.primitives import primitive_of, widths_of
+from mi_refgs.surfels.attributes import ATTRIBUTES, sigmoid
+from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import QUATERNION_FLOOR
 
 NEIGHBOURS = 8
@@ -57,11 +57,11 @@ class Placement:
             return
         raw["position"][:] = self.points(raw["position"])
         if self.factor != 1:
-            primitive_of(widths_of(raw)).resize(raw, np.ones(len(raw["position"]), bool), self.factor)
+            primitive_of(raw).resize(raw, np.ones(len(raw["position"]), bool), self.factor)
         if self.keeps_directions:
             return
         for name, table in raw.items():
-            declared = CHANNELS[name]
+            declared = ATTRIBUTES[name]
             if declared.activation == "quaternion":
                 values = table.astype(np.float64)  # (x, y, z, w) of any norm; zeros are the identity
                 values[np.abs(values).max(axis=1) < QUATERNION_FLOOR] = (0, 0, 0, 1)

@@ -18,7 +18,7 @@ from mi_refgs.evaluation.metrics import environment
 from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 
 LIGHT_KEY = 0.36
 """Average luminance of a shown light before the tone curve x / (1 + x), which displays it as 0.55."""
@@ -75,7 +75,7 @@ def panels(shot: RenderedView, view: View) -> dict[str, np.ndarray]:
         covered = np.linalg.norm(view.normal, axis=-1)
         shown["true normals"] = on_white(0.5 + 0.5 * view.normal, covered)
     shown["normals"] = on_white(0.5 + 0.5 * shot.normal, shot.alpha)
-    for name in (*(name for name, channel in CHANNELS.items() if channel.aov), "visibility"):
+    for name in (*(name for name, channel in ATTRIBUTES.items() if channel.aov), "visibility"):
         if name in shot.maps:
             values = shot.maps[name]
             grey = srgb_from_linear(values) if values.ndim == 3 else np.repeat(values[..., None], 3, axis=-1)

@@ -25,7 +25,7 @@ from mi_refgs.render.display import displayed
 from mi_refgs.runs.trained_scene import Pruned, TrainedScene
 from mi_refgs.shade.options import TRACED, ShadingOptions
 from mi_refgs.splat import Camera, splat
-from mi_refgs.surfels.attributes import channel, sh_columns
+from mi_refgs.surfels.attributes import attribute, sh_columns
 from mi_refgs.surfels.ply import encode_ply
 from mi_refgs.surfels.table import Surfels
 
@@ -124,7 +124,7 @@ def _drop_terms(search: _Search, limit: float) -> None:
     for name in [name for name in surfels.raw if name not in needed]:
         raw = {other: values for other, values in search.scene.surfels.raw.items() if other != name}
         search.attempt(name, search.with_surfels(Surfels(raw)), limit)
-    for name in [name for name in search.scene.surfels.raw if channel(name).harmonics]:
+    for name in [name for name in search.scene.surfels.raw if attribute(name).harmonics]:
         for degree in reversed(range(search.scene.surfels.sh_degree(name))):
             arrays = search.scene.surfels.to_numpy()
             arrays[name] = np.ascontiguousarray(arrays[name][:, : sh_columns(degree)])

@@ -18,7 +18,7 @@ from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.methods.surroundings import AROUND
 from mi_refgs.runs.checkpoint import channels_of
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.attributes import channel
+from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def _converted(rows: Raw, like: Raw, method: Method, rng: np.random.Generator) -
             kept = rows[name][:, :width]
             made[name] = np.pad(kept, ((0, 0), (0, width - kept.shape[1])))
         else:
-            made[name] = channel(name).start(count, width, rng, method.surfels.start(name))
+            made[name] = attribute(name).start(count, width, rng, method.surfels.start(name))
     return {name: values.astype(np.float32) for name, values in made.items()}
 
 

@@ -18,9 +18,9 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.method import Propagation, Refine, Relocation
-from mi_refgs.surfels.attributes import channel, logit, sigmoid
+from mi_refgs.surfels.attributes import attribute, logit, sigmoid
 from mi_refgs.surfels.order import morton_order
-from mi_refgs.surfels.primitives import Primitive, primitive_of, widths_of
+from mi_refgs.surfels.primitives import Primitive, primitive_of
 from mi_refgs.surfels.table import Surfels
 
 SPLIT_SHRINK = 1.6
@@ -79,7 +79,7 @@ def densify_and_prune(
     """
     raw = surfels.to_numpy()
     count = len(gradient)
-    primitive = primitive_of(widths_of(raw))
+    primitive = primitive_of(raw)
     size = primitive.extent(raw)[1].max(axis=1)
     dense = np.broadcast_to(np.asarray(options.dense_extent * extent, size.dtype), count)
     keep = size <= (options.prune_extent * extent if largest is None else largest)
@@ -146,7 +146,7 @@ def propagate_normals(surfels: Surfels, options: Propagation, rng: np.random.Gen
     reflective = metallic >= options.metallic
     if options.roughness is not None and "roughness" in raw:
         reflective &= sigmoid(raw["roughness"][:, 0]) <= options.roughness
-    primitive_of(widths_of(raw)).resize(raw, reflective, options.scale)
+    primitive_of(raw).resize(raw, reflective, options.scale)
     if options.noise and "radiance_sh" in raw:
         dull = np.flatnonzero(metallic <= options.noise_metallic)
         noise = rng.uniform(-options.noise, options.noise, (len(dull), 3))
@@ -160,7 +160,7 @@ def restart(surfels: Surfels, starts: Mapping[str, float], rng: np.random.Genera
     raw = surfels.to_numpy()
     for name, value in starts.items():
         count, width = raw[name].shape
-        raw[name] = channel(name).start(count, width, rng, value)
+        raw[name] = attribute(name).start(count, width, rng, value)
     return Surfels.from_numpy(raw)
 
 
@@ -213,7 +213,7 @@ def relocate(surfels: Surfels, options: Relocation, max_count: int, rng: np.rand
     table = {name: values[parent].copy() for name, values in raw.items()}
     changed = number[parent] > 1
     table["opacity"][changed, 0] = logit(np.clip(new[parent[changed]], *OPACITY_RANGE))
-    for name in primitive_of(widths_of(raw)).sizes:
+    for name in primitive_of(raw).sizes:
         table[name][changed] += np.log(factor[parent[changed], None]).astype(np.float32)
     return TableEdit(Surfels.from_numpy(table), parent.astype(np.uint32), changed)
 

@@ -16,7 +16,7 @@ from mi_refgs.methods.surroundings import AROUND, BACKGROUND
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.attributes import channel
+from mi_refgs.surfels.attributes import attribute
 
 POSITION_STEPS = 0.6
 """Share of the iterations after which positions learn at their final rate: 30,000 of 50,000 in the released
@@ -74,7 +74,7 @@ class Schedule:
         groups = {}
         for name in names:
             rate = rates.of(name)
-            head = 3 if channel(name).harmonics else 0
+            head = 3 if attribute(name).harmonics else 0
             groups[name] = Group(rate, rate * rates.decay, iterations, head, rates.rest_of(name))
         steps = int(POSITION_STEPS * iterations)
         start, final = rates.of("position") * extent, rates.position_final * extent

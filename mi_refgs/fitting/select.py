@@ -26,7 +26,7 @@ from mi_refgs.methods.surroundings import AROUND, BACKGROUND
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import resample
-from mi_refgs.surfels.attributes import channel
+from mi_refgs.surfels.attributes import attribute
 
 
 def branched(trainer: Trainer, method: Method) -> Trainer:
@@ -42,7 +42,7 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
     for name in method.surfels.names:
         width = method.surfels.columns(name)
         if name not in old:
-            wanted[name] = channel(name).start(count, width, rng, method.surfels.start(name))
+            wanted[name] = attribute(name).start(count, width, rng, method.surfels.start(name))
         else:
             wanted[name] = _columns(old[name], width)
     wanted |= {name: old[name] for name in old if name == BACKGROUND or name.startswith(AROUND)}

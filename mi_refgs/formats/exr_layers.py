@@ -12,7 +12,7 @@ from mi_refgs.formats.format import Shot
 from mi_refgs.io.exr import write_exr_layers
 from mi_refgs.plugins.aovs import aov_values, suffixes
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 
 LETTERS = {"normal": "XYZ", "depth": "Z"}
 """Letters of layers that are no colours."""
@@ -36,7 +36,7 @@ def write(
     frame = trained.renderer(samples=samples)(camera)
     layers = dict(zip("RGBA", [*frame.radiance, frame.alpha], strict=True))
     for name, letters in suffixes().items():
-        if name == "alpha" or (name in CHANNELS and name not in frame.maps):
+        if name == "alpha" or (name in ATTRIBUTES and name not in frame.maps):
             continue
         values = [frame.depth] if name == "depth" else aov_values(name, frame, camera)
         letters = LETTERS.get(name, "V" if len(letters) == 1 else letters)

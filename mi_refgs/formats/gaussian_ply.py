@@ -18,7 +18,7 @@ from mi_refgs.io.ply import read_header
 from mi_refgs.methods.method import DataOptions, Method, Stage, SurfelOptions
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
 
@@ -51,7 +51,7 @@ def read_splats(path: Path, linear: bool = False) -> TrainedScene:
     if not surfels.count:
         raise InputError(f"{path}: vertex: there are none; export the file again")
     needed = {*surfels.primitive.widths, "radiance_sh"}
-    if others := [CHANNELS[name].properties[0] for name in surfels.raw if name not in needed]:
+    if others := [ATTRIBUTES[name].properties[0] for name in surfels.raw if name not in needed]:
         raise InputError(
             f"{path}: {others[0]}: materials of a run, which require its light and shading; give the run "
             "folder to the command that needs it"

@@ -14,8 +14,8 @@ from mi_refgs.methods.surroundings import BACKGROUND, SurroundingsOptions
 from mi_refgs.methods.weights import LossWeights
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.shade.options import ShadingOptions
-from mi_refgs.surfels.attributes import MAX_SH_DEGREE, channel
-from mi_refgs.surfels.primitives import primitive_named
+from mi_refgs.surfels.attributes import MAX_SH_DEGREE, attribute
+from mi_refgs.surfels.primitives import PRIMITIVES
 
 LIGHT = "light"
 """Name of the environment among the parameters of a fit, beside the channels of the surfels."""
@@ -61,16 +61,16 @@ class SurfelOptions:
     @property
     def names(self) -> tuple[str, ...]:
         """All channels, those of the primitive first; raises InputError for an unknown primitive."""
-        return (*primitive_named(self.primitive).widths, *self.channels)
+        return (*PRIMITIVES.find(self.primitive, "primitive").widths, *self.channels)
 
     def columns(self, name: str) -> int:
         """Raw columns of a channel."""
-        widths = primitive_named(self.primitive).widths
-        return widths[name] if name in widths else channel(name).width(self.degree_of(name))
+        widths = PRIMITIVES.find(self.primitive, "primitive").widths
+        return widths[name] if name in widths else attribute(name).width(self.degree_of(name))
 
     def start(self, name: str) -> float:
         """Initial value of a channel, activated."""
-        return self.initial.get(name, channel(name).initial)
+        return self.initial.get(name, attribute(name).initial)
 
 
 @dataclass(frozen=True)
@@ -161,11 +161,11 @@ class Rates:
 
     def of(self, name: str) -> float:
         """Rate of a channel."""
-        return self.channel.get(name, channel(name).rate)
+        return self.channel.get(name, attribute(name).rate)
 
     def rest_of(self, name: str) -> float:
         """Factor of that for harmonics of degree 1 and above."""
-        return self.rest.get(name, channel(name).rest_rate)
+        return self.rest.get(name, attribute(name).rest_rate)
 
 
 @dataclass(frozen=True)

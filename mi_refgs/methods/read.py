@@ -23,7 +23,7 @@ from mi_refgs.methods.presets import PRESETS, scaled
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, is_height
 from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 
 MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
@@ -105,18 +105,18 @@ def _checked(method: Method, where: str) -> Method:
         channels = {*surfels.names}
     except InputError as error:
         raise InputError(f"{where}: surfels.{error}") from error
-    bounded = {name for name in channels & CHANNELS.keys() if CHANNELS[name].activation == "sigmoid"}
+    bounded = {name for name in channels & ATTRIBUTES.keys() if ATTRIBUTES[name].activation == "sigmoid"}
     for key, named, known in (
-        ("surfels.channels", surfels.channels, {name for name, x in CHANNELS.items() if not x.geometry}),
+        ("surfels.channels", surfels.channels, {name for name, x in ATTRIBUTES.items() if not x.geometry}),
         ("surfels.initial", surfels.initial, channels),
-        ("surfels.degree", surfels.degree, {name for name in CHANNELS if CHANNELS[name].harmonics}),
+        ("surfels.degree", surfels.degree, {name for name in ATTRIBUTES if ATTRIBUTES[name].harmonics}),
         ("surfels.from_pictures", surfels.from_pictures, {*surfels.channels}),
-        ("rates.channel", rates.channel, set(CHANNELS)),
-        ("rates.rest", rates.rest, {name for name in CHANNELS if CHANNELS[name].harmonics}),
+        ("rates.channel", rates.channel, set(ATTRIBUTES)),
+        ("rates.rest", rates.rest, {name for name in ATTRIBUTES if ATTRIBUTES[name].harmonics}),
         ("refine.reset_raise", method.refine.reset_raise, bounded),
     ):
         if unknown := [name for name in named if name not in known]:
-            allowed = ", ".join(name for name in CHANNELS if name in known)
+            allowed = ", ".join(name for name in ATTRIBUTES if name in known)
             raise InputError(f"{where}: {key}: '{unknown[0]}' is unknown; use some of {allowed}")
     if method.light is not None and not is_height(method.light.height):
         raise InputError(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, is_height
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE
-from mi_refgs.surfels.primitives import primitive_named
+from mi_refgs.surfels.primitives import PRIMITIVES
 
 BACKGROUND, AROUND = "background", "surroundings/"
 """Name of what lies behind everything among the parameters of a fit, and what the names of the surroundings'
@@ -32,7 +32,7 @@ class SurroundingsOptions:
 
     def names(self, primitive: str) -> tuple[str, ...]:
         """All channels of a table of a primitive."""
-        return (*primitive_named(primitive).widths, "radiance_sh")
+        return (*PRIMITIVES.find(primitive, "primitive").widths, "radiance_sh")
 
     def fault(self) -> str:
         """Which value cannot be used, and what to give; empty if all can."""

@@ -18,7 +18,7 @@ from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import ray_distance
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 
 # Suffixes as Mitsuba's own `aov` integrator gives them; `Bitmap.split` makes a greyscale layer of a lone Y.
 _SUFFIXES = {
@@ -32,7 +32,7 @@ _SUFFIXES = {
 
 def suffixes() -> dict[str, str]:
     """Suffixes of the channels of every type: of what surfels may have, of geometry, and of terms."""
-    return {name: channel.aov for name, channel in CHANNELS.items() if channel.aov} | _SUFFIXES
+    return {name: channel.aov for name, channel in ATTRIBUTES.items() if channel.aov} | _SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class AOV:
     type: str
 
     def channels(self) -> list[str]:
-        """Channel names, such as `n.X`, `n.Y`, `n.Z`."""
+        """Attribute names, such as `n.X`, `n.Y`, `n.Z`."""
         return [f"{self.name}.{suffix}" for suffix in suffixes()[self.type]]
 
 
@@ -102,9 +102,9 @@ PREMULTIPLIED = (*TERMS, "alpha", "normal")
 
 def _weighted(kind: str, frame: Frame, camera: Camera) -> tuple[list[Any], Any]:
     """The channels of one type as the frame has them, and the opacity of what they are of."""
-    if kind in CHANNELS:
+    if kind in ATTRIBUTES:
         value = frame.maps[kind]
-        return [*value] if len(CHANNELS[kind].aov) > 1 else [value], frame.object_alpha
+        return [*value] if len(ATTRIBUTES[kind].aov) > 1 else [value], frame.object_alpha
     if kind == "normal":
         return [*frame.normal], frame.normal_alpha
     if kind == "depth":

@@ -26,8 +26,8 @@ from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.attributes import CHANNELS
-from mi_refgs.surfels.primitives import primitive_of, widths_of
+from mi_refgs.surfels.attributes import ATTRIBUTES
+from mi_refgs.surfels.primitives import require_known_primitive
 from mi_refgs.surfels.table import Surfels
 
 
@@ -187,9 +187,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def check(self) -> None:
         """Raise InputError for shapes that do not fit and for channels that are needed but absent."""
         Surfels(self.surfels.raw)  # checks shapes; values are checked where a file is read
-        primitive_of(widths_of(self.surfels.raw))
+        require_known_primitive(self.surfels.raw)
         self.shading.require_inputs(self.surfels.raw)
-        for name in (aov.type for aov in self.aovs if aov.type in CHANNELS):
+        for name in (aov.type for aov in self.aovs if aov.type in ATTRIBUTES):
             if not self.surfels.has(name):
                 raise InputError(f"refgs: {name}: the surfels have no such channel; add it, or do without it")
         self.around.check(self.surfels, self.light)

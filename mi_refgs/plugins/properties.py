@@ -22,7 +22,7 @@ from mi_refgs.shade.options import DIFFUSE, QUALITY, ShadingOptions
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
 
@@ -125,7 +125,7 @@ def _channels(props: Any, file: str, prefix: str) -> dict[str, Any]:
     """Raw channels of the PLY file that a property names, and those given as tensors, `prefix` + name."""
     path = _path(props, file)
     raw = {} if path is None else dict(read_ply(path).raw)
-    for name in CHANNELS:
+    for name in ATTRIBUTES:
         value = _tensor(props, prefix + name)
         if value is not None:
             raw[name] = value

@@ -29,8 +29,8 @@ from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera, splat
 from mi_refgs.splat.lanes import Places
-from mi_refgs.surfels.attributes import channel
-from mi_refgs.surfels.primitives import primitive_of, widths_of
+from mi_refgs.surfels.attributes import attribute
+from mi_refgs.surfels.primitives import require_known_primitive
 from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
 from mi_refgs.types import Color3f, Float, Point2f, Vector3f
 
@@ -48,7 +48,7 @@ class SurfelScene:
     @property
     def all_aovs(self) -> frozenset[str]:
         """Names of all AOVs that a frame of this scene may have."""
-        materials = {name for name in self.surfels.raw if channel(name).aov}
+        materials = {name for name in self.surfels.raw if attribute(name).aov}
         return frozenset({*materials, *TERMS, "visibility", "normal", "depth"})
 
 
@@ -81,7 +81,7 @@ class Frame:
     radiance: Color3f  # over black
     terms: RadianceTerms | None = None  # diffuse, specular, indirect; they sum to the radiance of the object
     maps: dict[str, Any] = field(default_factory=dict)  # by name: materials such as albedo, visibility
-    background: Color3f = None  # linear, seen through 1 - alpha; only with surroundings
+    background: Color3f = None  # dot2, seen through 1 - alpha; only with surroundings
     object_alpha: Float = None  # opacity of the object, `alpha` itself without surroundings
     normal_alpha: Float = None  # opacity of the surfels that `normal` is of: `alpha`, `object_alpha`
     distance: Float = None  # mean along the ray from the near plane, of several samples per pixel
@@ -104,7 +104,7 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     `Shading.require_inputs` does.
     """
     require_supported_variant("mi_refgs.render_frame")
-    primitive_of(widths_of(scene.surfels.raw))
+    require_known_primitive(scene.surfels.raw)
     scene.shading.require_inputs(scene.surfels.raw, scene.light is not None, scene.occluder is not None)
     view = _View.of(*_without_empty_tables(scene, request), camera)
     frame, buffer = _shade_at_surfels(view) if scene.shading.order == "surfel" else _shade_at_pixels(view)

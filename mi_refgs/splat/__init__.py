@@ -31,20 +31,20 @@ __all__ = [
 
 
 @phase("project")
-def project(surfels: Surfels, camera: Camera, shift: Any = None) -> Footprints:
-    """Footprints of a table's own primitive in a camera; `shift` as `Primitive.project` has it."""
-    return surfels.primitive.project(surfels, camera, shift)
+def project(surfels: Surfels, camera: Camera, screen_offset: Any = None) -> Footprints:
+    """Footprints of a table's own primitive in a camera; `screen_offset` as `Primitive.project` has it."""
+    return surfels.primitive.project(surfels, camera, screen_offset)
 
 
-def splat(surfels: Surfels, features: list[Any], camera: Camera, shift: Any = None) -> Blended:
+def splat(surfels: Surfels, features: list[Any], camera: Camera, screen_offset: Any = None) -> Blended:
     """Splat per-surfel features (K × mi.Float (N,)) to maps of H·W pixels; derivatives as in `blend`.
 
-    `shift` is an optional zero mi.Point2f (N,) that receives the gradient of a screen translation, in pixels.
+    `screen_offset` (mi.Point2f (N,), zeros, pixels) receives the gradient of a screen translation.
     """
     if surfels.count == 0:
         blank = [dr.zeros(mi.Float, camera.width * camera.height) for _ in range(len(features) + 2)]
         return Blended(blank[2:], *blank[:2])
-    footprints = project(surfels, camera, shift)
+    footprints = project(surfels, camera, screen_offset)
     lists = list_by_tile(footprints, camera)
     footprints, features = boundary((footprints, features), "surfels backward")
     return boundary(blend(footprints, features, lists, camera), "splat backward")

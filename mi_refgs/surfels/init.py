@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.errors import InputError
-from mi_refgs.surfels.attributes import CHANNELS, MAX_SH_DEGREE, SH_DC, channel
-from mi_refgs.surfels.primitives import primitive_named
+from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE, SH_DC, attribute
+from mi_refgs.surfels.primitives import PRIMITIVES
 from mi_refgs.surfels.table import Surfels
 
 # Least distance to the neighbours, as part of the points' extent: keeps the log scale of doubled points
@@ -45,25 +45,25 @@ def from_points(
     points = _check("points", points, np.shape(points)[:1])
     count = len(points)
     for name in (*(channels or ()), *(degree or ()), *initial):
-        channel(name)
+        attribute(name)
     for name, wanted in (degree or {}).items():
         if not 0 <= wanted <= MAX_SH_DEGREE:
             raise InputError(f"surfels: degree of {name}: {wanted} is not in 0 … {MAX_SH_DEGREE}; choose one")
     if normals is not None:
         normals = _check("normals", normals, (count,))
-    kind = primitive_named(primitive)
+    kind = PRIMITIVES.find(primitive, "primitive")
     raw = {"position": points}
     spacing = neighbour_scale(points) * scale_factor
     spacing = spacing if largest is None else np.minimum(spacing, largest)
     raw |= kind.start(spacing, quaternions(normals, count, rng))
-    for name, declared in CHANNELS.items():
+    for name, declared in ATTRIBUTES.items():
         chosen = not declared.geometry if channels is None else name in channels
         if name not in raw and (name in kind.widths or chosen):
             width = declared.width((degree or {}).get(name, 0))
             raw[name] = declared.start(count, width, rng, initial.get(name))
     if colours is not None and "radiance_sh" in raw:
         raw["radiance_sh"][:, :3] = (_check("colours", colours, (count,)) - 0.5) / SH_DC
-    return Surfels.from_numpy({name: raw[name] for name in CHANNELS if name in raw})
+    return Surfels.from_numpy({name: raw[name] for name in ATTRIBUTES if name in raw})
 
 
 def neighbour_scale(points: np.ndarray) -> np.ndarray:

@@ -19,8 +19,8 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import write_bytes
 from mi_refgs.io.ply import read_vertices
-from mi_refgs.surfels.attributes import CHANNELS, MAX_SH_DEGREE, sh_columns
-from mi_refgs.surfels.primitives import nearest_primitive, widths_of
+from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE, sh_columns
+from mi_refgs.surfels.primitives import nearest_primitive
 from mi_refgs.surfels.table import Surfels
 
 # ---------------- reading ----------------
@@ -42,7 +42,7 @@ def read_ply(path: str | Path) -> Surfels:
 
     names = vertices.dtype.names or ()
     arrays = {}
-    for name, channel in CHANNELS.items():
+    for name, channel in ATTRIBUTES.items():
         if channel.harmonics:
             prefix = channel.properties[0]
             if any(found.startswith(f"{prefix}_") for found in names):
@@ -51,9 +51,11 @@ def read_ply(path: str | Path) -> Surfels:
         elif there := [i for i, found in enumerate(channel.properties) if found in names]:
             width = min(width for width in channel.widths if width > max(there))
             arrays[name] = _columns(path, vertices, channel.properties[:width])
-    primitive, missing = nearest_primitive(widths_of(arrays))
+    primitive, missing = nearest_primitive(arrays)
     for name in missing:
-        _columns(path, vertices, CHANNELS[name].properties[: primitive.widths[name]])  # says what is missing
+        _columns(
+            path, vertices, ATTRIBUTES[name].properties[: primitive.widths[name]]
+        )  # says what is missing
     return Surfels.from_numpy(arrays)
 
 
@@ -109,8 +111,8 @@ def encode_ply(surfels: Surfels) -> bytes:
     surfels.validate()
     values: dict[str, np.ndarray] = {}
     for channel, table in surfels.to_numpy().items():
-        properties = CHANNELS[channel].properties[: table.shape[1]]
-        if CHANNELS[channel].harmonics:
+        properties = ATTRIBUTES[channel].properties[: table.shape[1]]
+        if ATTRIBUTES[channel].harmonics:
             properties = _sh_properties(properties[0], surfels.sh_degree(channel))
         values |= {name: table[:, column] for column, name in enumerate(properties)}
     names = _file_order(values)
@@ -134,7 +136,7 @@ def _file_order(values: dict[str, np.ndarray]) -> list[str]:
 
     order = ["x", "y", "z", "nx", "ny", "nz", *numbered("f_dc_"), *numbered("f_rest_"), "opacity"]
     order += [*numbered("scale_"), *numbered("rot_")]
-    others = [channel for channel in CHANNELS.values() if channel.properties[0] not in (*order, "f")]
+    others = [channel for channel in ATTRIBUTES.values() if channel.properties[0] not in (*order, "f")]
     for channel in sorted(others, key=lambda channel: channel.harmonics):
         prefix = channel.properties[0]
         if channel.harmonics:

@@ -23,8 +23,8 @@ from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.kernels.rows import columns_of
-from mi_refgs.surfels.attributes import CHANNELS, channel
-from mi_refgs.surfels.primitives import Primitive, primitive_of, widths_of
+from mi_refgs.surfels.attributes import ATTRIBUTES, attribute
+from mi_refgs.surfels.primitives import Primitive, primitive_of, require_known_primitive
 
 # Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is worthless.
 QUATERNION_FLOOR = 1e-12
@@ -52,7 +52,7 @@ class Surfels:
     """N surfels as named raw channels, each an `mi.TensorXf` of shape (N, D), often a leaf of the AD graph.
 
     Its channels say whether the rows are surfels, 3D Gaussians or another `primitive`. `raw` maps channel
-    names to tensors in the order of CHANNELS; a channel that a scene does not use is absent and costs
+    names to tensors in the order of ATTRIBUTES; a channel that a scene does not use is absent and costs
     nothing. Accessors return activated values as Dr.Jit arrays of width N; gradients flow to the raw tensors
     in both modes.
     """
@@ -67,8 +67,8 @@ class Surfels:
         elsewhere need it.
         """
         for name in raw:
-            channel(name)
-        self.raw = {name: raw[name] for name in CHANNELS if name in raw}
+            attribute(name)
+        self.raw = {name: raw[name] for name in ATTRIBUTES if name in raw}
         self.screened = screened
         self._check_shapes()
 
@@ -107,8 +107,8 @@ class Surfels:
             shape = tuple(tensor.shape)
             if len(shape) != 2 or shape[0] != rows:
                 raise InputError(f"surfels: {name}: shape {shape}, expected ({rows}, D); one row per surfel")
-            if shape[1] not in channel(name).widths:
-                choices = " or ".join(str(columns) for columns in channel(name).widths)
+            if shape[1] not in attribute(name).widths:
+                choices = " or ".join(str(columns) for columns in attribute(name).widths)
                 raise InputError(
                     f"surfels: {name}: {shape[1]} columns, expected {choices}; fix the array's shape"
                 )
@@ -116,12 +116,12 @@ class Surfels:
     @property
     def primitive(self) -> Primitive:
         """What its rows are; raises InputError if channels are missing for that."""
-        return primitive_of(widths_of(self.raw))
+        return primitive_of(self.raw)
 
     def validate(self) -> None:
         """Raise InputError if a channel of its primitive is missing, a shape is wrong, a value not finite."""
         self._check_shapes()
-        primitive_of(widths_of(self.raw))
+        require_known_primitive(self.raw)
         for name, tensor in self.raw.items():
             bad = int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0
             if bad:
@@ -179,9 +179,9 @@ class Surfels:
         coefficient) and other widths. Geometry has accessors of its own types.
         """
         columns = self.columns(name)
-        activate = {"sigmoid": sigmoid, "exp": _exp}.get(channel(name).activation)
+        activate = {"sigmoid": sigmoid, "exp": _exp}.get(attribute(name).activation)
         columns = columns if activate is None else [activate(column) for column in columns]
-        if channel(name).harmonics:
+        if attribute(name).harmonics:
             return [mi.Color3f(*columns[start : start + 3]) for start in range(0, len(columns), 3)]
         if len(columns) == 3:
             return mi.Color3f(*columns)
@@ -276,7 +276,7 @@ class Surfels:
 
 
 def _limit(name: str) -> float:
-    return math.inf if channel(name).bounded else RAW_LIMIT
+    return math.inf if attribute(name).bounded else RAW_LIMIT
 
 
 def gather_rows(tensor: Any, parent: Any) -> Any:

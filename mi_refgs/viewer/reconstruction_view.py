@@ -21,7 +21,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, backdrops_of, planes_of
@@ -54,7 +54,7 @@ def around_box(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
 
 def variables_of(surfels: Surfels, shading: Shading) -> tuple[str, ...]:
     """The picture and the variables that such surfels have."""
-    maps = [name for name in surfels.raw if CHANNELS[name].aov]
+    maps = [name for name in surfels.raw if ATTRIBUTES[name].aov]
     traced = ["visibility"] if shading.occlusion else []
     terms = () if shading.model.light == "none" else TERMS if traced else TERMS[:2]
     return (IMAGE, *maps, "normal", "depth", "alpha", *traced, *terms)

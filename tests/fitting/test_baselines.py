@@ -23,7 +23,7 @@ from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import MODELS, TraceContext
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import check_slopes, level_maps, unit, vector
 
@@ -248,7 +248,7 @@ def test_a_model_of_mirrors_does_not_pay_for_the_filter() -> None:
 def table(*channels: str, count: int = 60) -> Surfels:
     """Surfels on the unit sphere, with random materials and nearly opaque."""
     rng = np.random.default_rng(2)
-    raw = {name: 0.4 * rng.normal(size=(count, CHANNELS[name].width(2))) for name in channels}
+    raw = {name: 0.4 * rng.normal(size=(count, ATTRIBUTES[name].width(2))) for name in channels}
     raw |= {"position": unit(rng.normal(size=(count, 3))), "rotation": rng.normal(size=(count, 4))}
     raw |= {"scale": np.full((count, 2), -1.2), "opacity": np.full((count, 1), 2.0)}
     return Surfels.from_numpy(raw)

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from mi_refgs.errors import InputError
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
 
@@ -17,7 +17,7 @@ GEOMETRY = ["x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "r
 
 
 def table(count: int, rng: np.random.Generator, degree: int = 3) -> Surfels:
-    shape = {name: (count, channel.width(degree)) for name, channel in CHANNELS.items()}
+    shape = {name: (count, channel.width(degree)) for name, channel in ATTRIBUTES.items()}
     return Surfels.from_numpy({name: rng.normal(size=size) for name, size in shape.items()})
 
 

@@ -25,7 +25,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import resample
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.laws.covering import Case
@@ -160,7 +160,7 @@ def sensor(case: Case) -> dict[str, Any]:
 
 def surfels_of(found: Values, prefix: str = "") -> Surfels:
     """The table of the values whose names begin with a prefix."""
-    return Surfels.from_numpy({name: found[prefix + name] for name in CHANNELS if prefix + name in found})
+    return Surfels.from_numpy({name: found[prefix + name] for name in ATTRIBUTES if prefix + name in found})
 
 
 def build(case: Case, found: Values, folder: Path) -> Built:

@@ -25,7 +25,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.attributes import channel
+from mi_refgs.surfels.attributes import attribute
 from tests.scenes.integrator import hollow_mesh, integrator, raw_channels, sensor, sky
 
 TOLERANCE = 1e-5
@@ -48,7 +48,7 @@ def every_channel(model: str, diffuse: Any, gaussians: bool) -> dict[str, np.nda
         raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1]], axis=1)
     wanted = MODELS[model].channels(ShadingOptions(diffuse=diffuse))
     for name in wanted:
-        raw.setdefault(name, rng.normal(size=(COUNT, channel(name).widths[0])).astype(np.float32))
+        raw.setdefault(name, rng.normal(size=(COUNT, attribute(name).widths[0])).astype(np.float32))
     kept = {"position", "rotation", "scale", "opacity", *wanted}
     return {name: values for name, values in raw.items() if name in kept}
 

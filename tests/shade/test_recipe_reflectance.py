@@ -19,14 +19,14 @@ from mi_refgs.shade import reflectance
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance import Reflectance, SurfelView
-from mi_refgs.surfels import attributes as channels
-from mi_refgs.surfels.attributes import Channel
+from mi_refgs.surfels import attributes
+from mi_refgs.surfels.attributes import Attribute
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.integrator import raw_channels, scene
 from tests.scenes.tiny import train_command, write_data
 
-SHININESS = Channel("shininess", (1,), "sigmoid", 0.02, ("shininess",), initial=0.5, aov="Y")
+SHININESS = Attribute("shininess", (1,), "sigmoid", 0.02, ("shininess",), initial=0.5, aov="Y")
 SHARE = 0.3  # of the light that the lobe reflects
 
 
@@ -61,11 +61,11 @@ reflectance = "phong"
 
 @pytest.fixture(autouse=True)
 def phong() -> Iterator[None]:
-    channels.register(SHININESS)
+    attributes.register(SHININESS)
     reflectance.register(Phong())
     yield
     reflectance.unregister("phong")
-    channels.unregister("shininess")
+    attributes.ATTRIBUTES.unregister("shininess")
 
 
 def raw() -> dict[str, np.ndarray]:

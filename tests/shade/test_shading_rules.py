@@ -19,7 +19,7 @@ from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import Reflectance, SurfelView, register, unregister
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.table import CHANNELS, Surfels
+from mi_refgs.surfels.table import ATTRIBUTES, Surfels
 from tests.scenes.integrator import image, raw_channels, scene
 
 LIGHT = "[light]\nheight = 16\n"
@@ -135,9 +135,9 @@ def test_every_mode_that_is_not_refused_renders() -> None:
 
 def needless(shading: Shading) -> set[str]:
     found = set()
-    for name in (name for name in CHANNELS if not CHANNELS[name].geometry):
+    for name in (name for name in ATTRIBUTES if not ATTRIBUTES[name].geometry):
         try:
-            shading.require_inputs([other for other in CHANNELS if other != name])
+            shading.require_inputs([other for other in ATTRIBUTES if other != name])
             found.add(name)
         except InputError:
             pass

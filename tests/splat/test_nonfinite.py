@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from tests.scenes.integrator import COUNT, integrator, plane_mesh, raw_channels, scene, sensor, sky
 
 BAD = (np.nan, np.inf, -np.inf, 1e38, -1e38)
@@ -85,7 +85,7 @@ def test_a_surfel_with_such_a_value_is_as_good_as_absent(kind: str, tmp_path: Pa
     for channel in raw:
         values = {name: value.copy() for name, value in raw.items()}
         # A large number saturates where the activation has a bound, and does so without a NaN.
-        values[channel][CULPRITS, -1] = (*BAD[:3], np.nan, np.inf) if CHANNELS[channel].bounded else BAD
+        values[channel][CULPRITS, -1] = (*BAD[:3], np.nan, np.inf) if ATTRIBUTES[channel].bounded else BAD
         image, found = rendered(made, values | {"light": light})
         np.testing.assert_allclose(image, wanted, rtol=1e-5, atol=1e-6, err_msg=channel)
         for name, gradient in found.items():

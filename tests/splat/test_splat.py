@@ -137,9 +137,9 @@ def test_shift_receives_the_screen_translation_gradient() -> None:
     """The optional shift gets d loss / d centre, as moving the principal point under one surfel shows."""
     scene = make_scene(0)
     weights = loss_weights(scene, 0)
-    shift = mi.Point2f(dr.zeros(mi.Float, 1), dr.zeros(mi.Float, 1))
-    dr.enable_grad(shift)
-    maps = splat(scene.surfels(), scene.columns(), scene.fast_camera(), shift)
+    screen_offset = mi.Point2f(dr.zeros(mi.Float, 1), dr.zeros(mi.Float, 1))
+    dr.enable_grad(screen_offset)
+    maps = splat(scene.surfels(), scene.columns(), scene.fast_camera(), screen_offset)
     image = mi.Float(np.ascontiguousarray(weights[..., 5].ravel().astype(np.float32)))
     dr.backward(dr.sum(maps.alpha * image))
     step, sides = 1e-5, []
@@ -147,7 +147,7 @@ def test_shift_receives_the_screen_translation_gradient() -> None:
         moved = oracle.PinholeCamera(**{**scene.camera.__dict__, "cx": scene.camera.cx + sign * step})
         sides.append(np.sum(weights[..., 5] * oracle.splat(scene.raw, scene.features, moved).alpha))
     # Moving the principal point leaves a, b, c of this surfel alone, as the shift does.
-    assert dr.grad(shift).x[0] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3)
+    assert dr.grad(screen_offset).x[0] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3)
 
 
 def _drop_behind(monkeypatch: pytest.MonkeyPatch) -> None:

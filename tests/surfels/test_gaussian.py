@@ -168,9 +168,9 @@ def test_shift_receives_the_screen_translation_gradient() -> None:
     """The shift moves the projected centre alone, as the principal point does where nothing is clamped."""
     scene = gaussians(0)
     weights = loss_weights(scene, 0)
-    shift = mi.Point2f(dr.zeros(mi.Float, 1), dr.zeros(mi.Float, 1))
-    dr.enable_grad(shift)
-    maps = project(scene.surfels(), scene.fast_camera(), shift)
+    screen_offset = mi.Point2f(dr.zeros(mi.Float, 1), dr.zeros(mi.Float, 1))
+    dr.enable_grad(screen_offset)
+    maps = project(scene.surfels(), scene.fast_camera(), screen_offset)
     lists = list_by_tile(maps, scene.fast_camera())
     alpha = blend(maps, [], lists, scene.fast_camera()).alpha
     dr.backward(dr.sum(alpha * upload(weights[..., 5])))
@@ -178,7 +178,7 @@ def test_shift_receives_the_screen_translation_gradient() -> None:
     for sign in (1, -1):
         moved = oracle.PinholeCamera(**{**scene.camera.__dict__, "cx": scene.camera.cx + sign * step})
         sides.append(np.sum(weights[..., 5] * oracle.splat(scene.raw, scene.features, moved).alpha))
-    assert dr.grad(shift).x[0] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3)
+    assert dr.grad(screen_offset).x[0] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3)
 
 
 @pytest.mark.parametrize("seed", range(0, 20, 3))

@@ -10,7 +10,7 @@ from scipy.stats import kstest
 
 from mi_refgs.errors import InputError
 from mi_refgs.surfels import init
-from mi_refgs.surfels.attributes import Channel, sigmoid
+from mi_refgs.surfels.attributes import Attribute, sigmoid
 
 
 def test_from_points(rng: np.random.Generator) -> None:
@@ -59,7 +59,7 @@ def test_few_or_doubled_points_have_finite_scales(count: int, rng: np.random.Gen
         ({"points": np.full((4, 3), np.nan)}, "points: 12 values are NaN"),
         ({"degree": {"radiance_sh": 4}}, "degree of radiance_sh: 4"),
         ({"opacity": 1.5}, r"opacity: 1\.5"),
-        ({"channels": ("albdeo",)}, "albdeo: unknown"),
+        ({"channels": ("albdeo",)}, "albdeo.* is unknown"),
     ],
 )
 def test_bad_points_are_refused(change: dict[str, object], message: str, rng: np.random.Generator) -> None:
@@ -77,9 +77,9 @@ def test_random_normals_are_uniform(rng: np.random.Generator) -> None:
 def test_a_channel_starts_at_its_activated_value(rng: np.random.Generator) -> None:
     """Whatever the activation; a size that is none is refused."""
     declared = {
-        "exp": Channel("width", (2,), "exp", 1e-3, ("w_0", "w_1"), initial=0.2),
-        "sigmoid": Channel("share", (2,), "sigmoid", 1e-3, ("s_0", "s_1"), initial=0.2),
-        "identity": Channel("offset", (2,), "identity", 1e-3, ("o_0", "o_1"), initial=0.2),
+        "exp": Attribute("width", (2,), "exp", 1e-3, ("w_0", "w_1"), initial=0.2),
+        "sigmoid": Attribute("share", (2,), "sigmoid", 1e-3, ("s_0", "s_1"), initial=0.2),
+        "identity": Attribute("offset", (2,), "identity", 1e-3, ("o_0", "o_1"), initial=0.2),
     }
     activate: dict[str, Callable[..., np.ndarray]] = {
         "exp": np.exp,
@@ -92,7 +92,7 @@ def test_a_channel_starts_at_its_activated_value(rng: np.random.Generator) -> No
             assert raw.shape == (5, 2)
             np.testing.assert_allclose(activate[kind](raw), 0.2 if value is None else value, rtol=1e-6)
     for value in (0.0, -1.0, np.inf):
-        with pytest.raises(InputError, match=r"width: .* is no size; start it above 0"):
+        with pytest.raises(InputError, match=r"width: .* is out of range; start it above 0"):
             declared["exp"].start(1, 1, rng, value)
 
 

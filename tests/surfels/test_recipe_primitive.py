@@ -23,17 +23,16 @@ from mi_refgs.fitting import refine
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods import Refine
 from mi_refgs.splat import Camera, splat
-from mi_refgs.surfels import attributes as channels
-from mi_refgs.surfels import primitives
-from mi_refgs.surfels.attributes import Channel
+from mi_refgs.surfels import attributes, primitives
+from mi_refgs.surfels.attributes import Attribute
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.primitives import Footprints, Primitive
-from mi_refgs.surfels.primitives.screen import reach, rectangle
+from mi_refgs.surfels.primitives.primitive import cutoff_radius_squared, rectangle
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.tiny import train_command, write_data
 
-RADIUS = Channel("radius", (1,), "exp", 5e-3, ("radius",), geometry=True)
+RADIUS = Attribute("radius", (1,), "exp", 5e-3, ("radius",), geometry=True)
 
 
 @dataclass(frozen=True)
@@ -69,17 +68,17 @@ class Ball(Primitive):
     columns = 5  # 1/σ², p.z, centre.x, centre.y, opacity
     sizes = ("radius",)
 
-    def project(self, surfels: Any, camera: Any, shift: Any = None) -> Footprints:
+    def project(self, surfels: Any, camera: Any, screen_offset: Any = None) -> Footprints:
         p, opacity = camera.to_camera(surfels.position()), surfels.opacity()
         visible = dr.detach((p.z > camera.near) & (p.z > 0) & (opacity >= ALPHA_MIN))
         z = dr.select(visible, p.z, 1)
         centre = mi.Vector2f(camera.fx * p.x / z + camera.cx, camera.fy * p.y / z + camera.cy)
-        if shift is not None:
-            centre += mi.Vector2f(shift)
+        if screen_offset is not None:
+            centre += mi.Vector2f(screen_offset)
         sigma = dr.maximum(dr.abs(camera.fx) * surfels.value("radius") / z, 0.5)
         columns = [dr.rcp(sigma * sigma), z, centre.x, centre.y, opacity]
         with dr.suspend_grad():
-            half = mi.Vector2f(sigma * dr.sqrt(reach(opacity)) + 1e-3)
+            half = mi.Vector2f(sigma * dr.sqrt(cutoff_radius_squared(opacity)) + 1e-3)
             covered = rectangle(centre, -half, half, visible, camera)
         return Footprints([dr.select(visible, x, 0) for x in columns], *covered, self)
 
@@ -103,7 +102,7 @@ class Ball(Primitive):
 
     def overlaps(self, row: list[Any], low: Any, high: Any) -> Any:
         x, y = dr.clip(0, low.x - row[2], high.x - row[2]), dr.clip(0, low.y - row[3], high.y - row[3])
-        return row[0] * (x * x + y * y) <= reach(row[4]) * 1.001
+        return row[0] * (x * x + y * y) <= cutoff_radius_squared(row[4]) * 1.001
 
     def depth_near(self, row: list[Any], pixel: Any) -> Any:
         return row[1]
@@ -118,11 +117,11 @@ class Ball(Primitive):
 
 @pytest.fixture(autouse=True)
 def registered() -> Iterator[None]:
-    channels.register(RADIUS)
+    attributes.register(RADIUS)
     primitives.register(Ball())
     yield
-    primitives.unregister("ball")
-    channels.unregister("radius")
+    primitives.PRIMITIVES.unregister("ball")
+    attributes.ATTRIBUTES.unregister("radius")
 
 
 # ---------------- what the generic code then does ----------------
@@ -157,7 +156,7 @@ def in_numpy(raw: dict[str, np.ndarray], feature: np.ndarray) -> np.ndarray:
 
 def test_a_table_says_that_it_holds_balls() -> None:
     assert balls().primitive.name == "ball" and set(balls().raw) == {"position", "radius", "opacity"}
-    with pytest.raises(InputError, match="'ball' has its name or its channels"):
+    with pytest.raises(InputError, match="primitive: 'ball': the name is empty or in use"):
         primitives.register(Ball())
 
 

@@ -9,14 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.errors import InputError
-from mi_refgs.surfels.attributes import CHANNELS
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
 
 
 def raw_table(count: int, rng: np.random.Generator, degree: int = 2) -> dict[str, np.ndarray]:
     return {
         name: rng.normal(size=(count, channel.width(degree))).astype(np.float32)
-        for name, channel in CHANNELS.items()
+        for name, channel in ATTRIBUTES.items()
     }
 
 
@@ -102,7 +102,7 @@ def test_gradients_of_every_channel(rng: np.random.Generator) -> None:
     surfels = Surfels.from_numpy(raw)
     surfels.enable_grad()
     dr.backward(dr.sum(everything(surfels)))
-    for name in CHANNELS:
+    for name in ATTRIBUTES:
         found = dr.grad(surfels.raw[name]).numpy()
         wanted = np.zeros(found.shape)
         for column in range(found.shape[1]):
@@ -168,7 +168,7 @@ def test_empty_table(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"glitter": np.zeros((3, 1))}, "glitter: unknown channel"),
+        ({"glitter": np.zeros((3, 1))}, "surfels: .*glitter.* is unknown; use"),
         ({"albedo": np.zeros((3, 2))}, "albedo: 2 columns, expected 3"),
         ({"radiance_sh": np.zeros((3, 6))}, "radiance_sh: 6 columns, expected 3 or 12 or 27 or 48"),
         ({"opacity": np.zeros((4, 1))}, r"opacity: shape \(4, 1\), expected \(3, D\)"),
@@ -185,5 +185,5 @@ def test_bad_tables_are_refused(
 def test_missing_geometry_is_refused(rng: np.random.Generator) -> None:
     raw = raw_table(3, rng)
     del raw["rotation"]
-    with pytest.raises(InputError, match="rotation: the channel is missing"):
+    with pytest.raises(InputError, match="rotation: the attribute is missing"):
         Surfels.from_numpy(raw).validate()

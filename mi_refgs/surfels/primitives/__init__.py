@@ -1,34 +1,16 @@
-"""What is splatted: surfels and 3D Gaussians. A new primitive is one more file, registered here."""
+"""Primitives that are splatted: surfels and 3D Gaussians. A new one is another file, registered here."""
 
 from mi_refgs.surfels.primitives.gaussian import Gaussian
-from mi_refgs.surfels.primitives.primitive import (
-    PRIMITIVES,
-    Adjoint,
-    Footprints,
-    Primitive,
-    Sample,
-    nearest_primitive,
-    primitive_named,
-    primitive_of,
-    register,
-    unregister,
-    widths_of,
-)
+from mi_refgs.surfels.primitives.primitive import PRIMITIVES as PRIMITIVES
+from mi_refgs.surfels.primitives.primitive import Adjoint as Adjoint
+from mi_refgs.surfels.primitives.primitive import Footprints as Footprints
+from mi_refgs.surfels.primitives.primitive import FootprintSample as FootprintSample
+from mi_refgs.surfels.primitives.primitive import Primitive as Primitive
+from mi_refgs.surfels.primitives.primitive import nearest_primitive as nearest_primitive
+from mi_refgs.surfels.primitives.primitive import primitive_of as primitive_of
+from mi_refgs.surfels.primitives.primitive import register as register
+from mi_refgs.surfels.primitives.primitive import require_known_primitive as require_known_primitive
 from mi_refgs.surfels.primitives.surfel import Surfel
-
-__all__ = [
-    "PRIMITIVES",
-    "Adjoint",
-    "Footprints",
-    "Primitive",
-    "Sample",
-    "nearest_primitive",
-    "primitive_named",
-    "primitive_of",
-    "register",
-    "unregister",
-    "widths_of",
-]
 
 register(Surfel())
 register(Gaussian())

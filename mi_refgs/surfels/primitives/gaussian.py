@@ -28,8 +28,14 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN, GAUSSIAN_LOW_PASS, GAUSSIAN_SLOPE_MARGIN, SIZE_RANGE
-from mi_refgs.surfels.primitives.primitive import Footprints, Primitive, rotation_axes
-from mi_refgs.surfels.primitives.screen import linear, reach, rectangle
+from mi_refgs.surfels.primitives.primitive import (
+    Footprints,
+    Primitive,
+    cutoff_radius_squared,
+    dot2,
+    rectangle,
+    rotation_axes,
+)
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ class Gaussian(Primitive):
     columns = 7  # a.x a.y b p.z centre.x centre.y opacity
     sizes = ("scale",)
 
-    def project(self, surfels: Any, camera: Any, shift: Any = None) -> Footprints:
+    def project(self, surfels: Any, camera: Any, screen_offset: Any = None) -> Footprints:
         """Rows, and rectangles that hold every pixel with α ≥ ALPHA_MIN.
 
         Culled: centre not beyond the near plane, opacity below ALPHA_MIN, non-finite.
@@ -86,8 +92,8 @@ class Gaussian(Primitive):
         determinant = crossed + low_pass.x * yy + low_pass.y * unfiltered.x
         a = dr.sqrt(yy * dr.rcp(determinant))
         centre = focal * slope + middle
-        if shift is not None:
-            centre += mi.Vector2f(shift)
+        if screen_offset is not None:
+            centre += mi.Vector2f(screen_offset)
         columns = [
             a / focal.x,
             -a * xy / (yy * focal.y),
@@ -100,13 +106,15 @@ class Gaussian(Primitive):
         columns = [dr.select(visible, column, 0) for column in columns]
         with dr.suspend_grad():
             # Rounding of the contour itself, in pixels.
-            half = dr.sqrt(reach(opacity) * mi.Vector2f(xx, yy)) * dr.abs(focal) * 1.0001 + 1e-3
+            half = (
+                dr.sqrt(cutoff_radius_squared(opacity) * mi.Vector2f(xx, yy)) * dr.abs(focal) * 1.0001 + 1e-3
+            )
             return Footprints(columns, *rectangle(centre, -half, half, visible, camera), self)
 
     def evaluate(self, row: Any, pixel: Any, near: Any) -> GaussianSample:
         """The two linear forms of the pixel's offset; the centre is beyond the near plane."""
         delta = mi.Vector2f(pixel.x - row[4], pixel.y - row[5])
-        u, v = linear(row[0], row[1], delta), row[2] * delta.y
+        u, v = dot2(row[0], row[1], delta), row[2] * delta.y
         gaussian = dr.exp(-0.5 * dr.fma(u, u, v * v))
         alpha = row[6] * gaussian
         clamped = alpha > ALPHA_MAX
@@ -120,7 +128,7 @@ class Gaussian(Primitive):
     def evaluate_forward(self, row: Any, sample: GaussianSample, drow: Any) -> tuple[Any, Any]:
         """Apply the chain rule, column by column."""
         delta, ddelta = sample.delta, mi.Vector2f(-drow[4], -drow[5])
-        du = linear(drow[0], drow[1], delta) + linear(row[0], row[1], ddelta)
+        du = dot2(drow[0], drow[1], delta) + dot2(row[0], row[1], ddelta)
         dv = drow[2] * delta.y + row[2] * ddelta.y
         dalpha = drow[6] * sample.gaussian - sample.alpha * dr.fma(sample.u, du, sample.v * dv)
         return dr.select(sample.clamped, 0, dalpha), drow[3]
@@ -135,7 +143,7 @@ class Gaussian(Primitive):
     def overlaps(self, row: list[Any], low: Any, high: Any) -> Any:
         """Whether the least ρ of the rectangle, on an edge that faces the centre, is within the contour."""
         a_x, a_y, b, _, x, y, opacity = row[: self.columns]
-        r2 = reach(opacity) * 1.0005 + 1e-4  # rounding of ρ
+        r2 = cutoff_radius_squared(opacity) * 1.0005 + 1e-4  # rounding of ρ
         low, high = mi.Vector2f(low.x - x, low.y - y), mi.Vector2f(high.x - x, high.y - y)
         near_x, near_y = dr.clip(0, low.x, high.x), dr.clip(0, low.y, high.y)
         # Along an edge, ρ is a parabola: least at y = -x a_x a_y / (a_y² + b²) for x, where a·δ = 0 for y.
@@ -143,7 +151,7 @@ class Gaussian(Primitive):
         on_y = dr.clip(-near_y * a_y / a_x, low.x, high.x)
 
         def inside(x: Any, y: Any) -> Any:
-            u = linear(a_x, a_y, mi.Vector2f(x, y))
+            u = dot2(a_x, a_y, mi.Vector2f(x, y))
             return dr.fma(u, u, dr.square(b * y)) <= r2
 
         return inside(near_x, on_x) | inside(on_y, near_y)

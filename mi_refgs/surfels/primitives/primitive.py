@@ -12,9 +12,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
+from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.errors import InputError
+from mi_refgs.registry import Registry
+from mi_refgs.types import Float, Vector2f
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class Footprints:
     primitive: Primitive
 
 
-class Sample(Protocol):
+class FootprintSample(Protocol):
     """One footprint at one pixel; a primitive adds the intermediate values that its derivatives reuse."""
 
     @property
@@ -73,16 +78,16 @@ class Primitive(ABC):
     # ---------------- footprints, under AD ----------------
 
     @abstractmethod
-    def project(self, surfels: Any, camera: Any, shift: Any = None) -> Footprints:
+    def project(self, surfels: Any, camera: Any, screen_offset: Any = None) -> Footprints:
         """Footprints of all rows of a table in a camera.
 
-        `shift` is an optional mi.Point2f (N,) in pixels added to the centres: zero-valued, it receives the
-        gradient with respect to a screen translation, which densification reads. The rectangles carry no
-        derivative. Culled rows cover no pixel, and get zero gradient.
+        `screen_offset` (mi.Point2f (N,), pixels) is added to the centres: of zeros, it receives the gradient
+        of a screen translation, which densification reads. The rectangles have no derivative. Culled rows
+        cover no pixel, and get zero gradient.
         """
 
     @abstractmethod
-    def evaluate(self, row: Any, pixel: Any, near: Any) -> Sample:
+    def evaluate(self, row: Any, pixel: Any, near: Any) -> FootprintSample:
         """Evaluate rows at pixel centres (mi.Point2f)."""
 
     @abstractmethod
@@ -130,64 +135,87 @@ class Primitive(ABC):
             raw[name][rows] += np.float32(np.log(factor))
 
 
-PRIMITIVES: dict[str, Primitive] = {}
+def _check(primitive: Primitive) -> None:
+    mine = {*primitive.widths.items()}
+    for other in PRIMITIVES.values():
+        others = {*other.widths.items()}
+        if mine <= others or others <= mine:
+            raise InputError(
+                f"primitive '{primitive.name}': '{other.name}' has its attributes; give it an "
+                "attribute, or a number of columns, of its own"
+            )
+
+
+PRIMITIVES: Registry[Primitive] = Registry("primitive", _check)
 """Every primitive by name."""
 
 
-def register(primitive: Primitive) -> None:
-    """Make a primitive known; raises InputError if its name or its channels are another's."""
-    for other in PRIMITIVES.values():
-        mine, others = {*primitive.widths.items()}, {*other.widths.items()}
-        if other.name == primitive.name or mine <= others or others <= mine:
-            raise InputError(
-                f"primitive '{primitive.name}': '{other.name}' has its name or its channels; "
-                "give it a name, and a channel or a width, of its own"
-            )
-    PRIMITIVES[primitive.name] = primitive
+def register(primitive: Primitive) -> Primitive:
+    """Add a primitive, which is returned; raises InputError if another one has its name or its attributes."""
+    return PRIMITIVES.register(primitive)
 
 
-def unregister(name: str) -> None:
-    """Forget a registered primitive."""
-    del PRIMITIVES[name]
-
-
-def primitive_named(name: str) -> Primitive:
-    """The primitive of this name; raises InputError if there is none."""
-    if name not in PRIMITIVES:
-        raise InputError(f"primitive: '{name}' is unknown; use one of {', '.join(PRIMITIVES)}")
-    return PRIMITIVES[name]
-
-
-def nearest_primitive(widths: Mapping[str, int]) -> tuple[Primitive, list[str]]:
-    """The primitive that lacks the fewest of its channels, and which; `widths` are numbers of raw columns."""
+def nearest_primitive(raw: Mapping[str, Any]) -> tuple[Primitive, list[str]]:
+    """The primitive of which raw attributes (N, D) lack the fewest, and the names of those."""
 
     def lacking(primitive: Primitive) -> list[str]:
-        return [name for name, width in primitive.widths.items() if widths.get(name) != width]
+        return [n for n, width in primitive.widths.items() if n not in raw or raw[n].shape[1] != width]
 
     found = min(PRIMITIVES.values(), key=lambda primitive: len(lacking(primitive)))
     return found, lacking(found)
 
 
-def primitive_of(widths: Mapping[str, int]) -> Primitive:
-    """The primitive whose channels are there, with their numbers of raw columns.
+def primitive_of(raw: Mapping[str, Any]) -> Primitive:
+    """The primitive whose attributes are among raw ones (N, D).
 
-    Raises InputError naming what is missing for the primitive that comes nearest.
+    Raises InputError that names what the nearest primitive lacks.
     """
-    nearest, missing = nearest_primitive(widths)
+    nearest, missing = nearest_primitive(raw)
     if not missing:
         return nearest
     name = missing[0]
-    if name in widths:
+    if name in raw:
         raise InputError(
-            f"surfels: {name}: {widths[name]} columns, a {nearest.name} has {nearest.widths[name]}; "
+            f"surfels: {name}: {raw[name].shape[1]} columns, a {nearest.name} has {nearest.widths[name]}; "
             "fix the array's shape"
         )
-    raise InputError(f"surfels: {name}: the channel is missing; add it, nothing can be splatted without it")
+    raise InputError(f"surfels: {name}: the attribute is missing; add it, every {nearest.name} needs it")
 
 
-def widths_of(raw: Mapping[str, Any]) -> dict[str, int]:
-    """Number of raw columns of each channel of arrays (N, D)."""
-    return {name: int(values.shape[1]) for name, values in raw.items()}
+def require_known_primitive(raw: Mapping[str, Any]) -> None:
+    """Raise InputError unless raw attributes (N, D) are those of a primitive."""
+    primitive_of(raw)
+
+
+# ---------------- what all primitives share ----------------
+
+
+def cutoff_radius_squared(opacity: Float) -> Float:
+    """r² = 2 ln(o/α_min): the ρ at which α falls to ALPHA_MIN."""
+    return 2 * dr.log(dr.maximum(opacity, ALPHA_MIN) / ALPHA_MIN)
+
+
+def dot2(x: Float, y: Float, delta: Vector2f) -> Float:
+    """(x, y) · δ."""
+    return dr.fma(x, delta.x, y * delta.y)
+
+
+def rectangle(
+    centre: Any, low: Any, high: Any, visible: Any, camera: Any
+) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    """First and last pixel column and row (mi.Int32) from `low` to `high` (mi.Vector2f, pixels) of a centre.
+
+    The last is below the first where nothing is covered, as where it is not `visible`. `camera` is a
+    `splat.camera.Camera`.
+    """
+    first, last = [], []
+    for axis, size in enumerate((camera.width, camera.height)):
+        # Clamped as floats first: a rectangle far outside must not overflow an integer.
+        begin = dr.ceil(dr.clip(centre[axis] + low[axis], -1, size + 1) - 0.5)
+        end = dr.floor(dr.clip(centre[axis] + high[axis], -1, size + 1) - 0.5)
+        first.append(dr.select(visible, mi.Int32(dr.maximum(begin, 0)), 1))
+        last.append(dr.select(visible, mi.Int32(dr.minimum(end, size - 1)), 0))
+    return (first[0], first[1]), (last[0], last[1])
 
 
 def rotation_axes(rotation: np.ndarray) -> np.ndarray:

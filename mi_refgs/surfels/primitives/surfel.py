@@ -39,8 +39,14 @@ from mi_refgs.constants import (
     SORT_DEPTH_RANGE,
     SORT_REACH,
 )
-from mi_refgs.surfels.primitives.primitive import Footprints, Primitive, rotation_axes
-from mi_refgs.surfels.primitives.screen import linear, reach, rectangle
+from mi_refgs.surfels.primitives.primitive import (
+    Footprints,
+    Primitive,
+    cutoff_radius_squared,
+    dot2,
+    rectangle,
+    rotation_axes,
+)
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,7 @@ class Surfel(Primitive):
     columns = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
     sizes = ("scale",)
 
-    def project(self, surfels: Any, camera: Any, shift: Any = None) -> Footprints:
+    def project(self, surfels: Any, camera: Any, screen_offset: Any = None) -> Footprints:
         """Rows, and rectangles that hold every pixel with α ≥ ALPHA_MIN.
 
         Culled: centre not beyond the near plane, edge-on by EDGE_ON_COSINE, opacity below ALPHA_MIN,
@@ -98,8 +104,8 @@ class Surfel(Primitive):
         )
         of_u, of_v = inverse / s.x, inverse / s.y
         centre = focal * slope + mi.Vector2f(camera.cx, camera.cy)
-        if shift is not None:
-            centre += mi.Vector2f(shift)
+        if screen_offset is not None:
+            centre += mi.Vector2f(screen_offset)
         columns = [of_u * along_v.y / focal.x, -of_u * along_v.x / focal.y]
         columns += [-of_v * along_u.y / focal.x, of_v * along_u.x / focal.y]
         columns += [inverse * n.x / focal.x, inverse * n.y / focal.y]
@@ -118,8 +124,8 @@ class Surfel(Primitive):
         w = dr.fma(row[4], delta.x, dr.fma(row[5], delta.y, 1))
         in_front = w > 0
         ratio = dr.rcp(dr.select(in_front, w, 1))
-        u = ratio * linear(row[0], row[1], delta)
-        v = ratio * linear(row[2], row[3], delta)
+        u = ratio * dot2(row[0], row[1], delta)
+        v = ratio * dot2(row[2], row[3], delta)
         rho_plane = dr.fma(u, u, v * v)
         rho_screen = LOW_PASS_INV_VARIANCE * dr.fma(delta.x, delta.x, delta.y * delta.y)
         low_pass = ~in_front | (rho_screen < rho_plane)
@@ -144,7 +150,7 @@ class Surfel(Primitive):
 
         def tangent(i: int) -> Any:
             """Tangent of the linear form in columns i and i + 1."""
-            return linear(drow[i], drow[i + 1], delta) + linear(row[i], row[i + 1], ddelta)
+            return dot2(drow[i], drow[i + 1], delta) + dot2(row[i], row[i + 1], ddelta)
 
         dw = dr.select(plane, tangent(4), 0)
         dz = ratio * (drow[6] - sample.z * dw)
@@ -164,7 +170,7 @@ class Surfel(Primitive):
         parabola. [cf. Speedy-Splat, Hanson et al. 2025, §4: tiles by the exact ellipse]
         """
         a_x, a_y, b_x, b_y, c_x, c_y, _, x, y, opacity = row[: self.columns]
-        r2 = reach(opacity) * 1.0005 + 1e-4  # rounding of q
+        r2 = cutoff_radius_squared(opacity) * 1.0005 + 1e-4  # rounding of q
         low, high = mi.Vector2f(low.x - x, low.y - y), mi.Vector2f(high.x - x, high.y - y)
         # The matrix of q of a thin ellipse keeps no digit of its determinant. That of a sum of squares of
         # linear forms is the sum of squares of their cross products, and q itself is best left in squares.
@@ -183,8 +189,8 @@ class Surfel(Primitive):
 
         def inside(x: Any, y: Any) -> Any:
             delta = mi.Vector2f(x, y)
-            u, v = linear(a_x, a_y, delta), linear(b_x, b_y, delta)
-            return dr.fma(u, u, v * v) <= r2 * dr.square(1 + linear(c_x, c_y, delta))
+            u, v = dot2(a_x, a_y, delta), dot2(b_x, b_y, delta)
+            return dr.fma(u, u, v * v) <= r2 * dr.square(1 + dot2(c_x, c_y, delta))
 
         by_plane = inside(near_x, on_x) | inside(on_y, near_y)
         beside_x, beside_y = dr.clip(0, low.x, high.x), dr.clip(0, low.y, high.y)
@@ -201,9 +207,9 @@ class Surfel(Primitive):
         """
         a_x, a_y, b_x, b_y, c_x, c_y, z, x, y = row[:9]
         delta = mi.Vector2f(pixel.x - x, pixel.y - y)
-        u, v = linear(a_x, a_y, delta), linear(b_x, b_y, delta)
+        u, v = dot2(a_x, a_y, delta), dot2(b_x, b_y, delta)
         inside = dr.minimum(1, SORT_REACH * dr.rsqrt(dr.maximum(dr.fma(u, u, v * v), NORM_FLOOR)))
-        return z / dr.maximum(dr.fma(inside, linear(c_x, c_y, delta), 1), 1 / SORT_DEPTH_RANGE)
+        return z / dr.maximum(dr.fma(inside, dot2(c_x, c_y, delta), 1), 1 / SORT_DEPTH_RANGE)
 
     def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
         """A disc as wide as the neighbours are far, in the tangent plane."""
@@ -269,7 +275,7 @@ def _extent(depth_u: Any, depth_v: Any, along_u: Any, along_v: Any, opacity: Any
     contour that reaches behind the camera has no bounds: such a surfel is listed everywhere. For σ along t_u
     and t_v: depth (mi.Float) in depths of the centre, and the way across the screen (mi.Vector2f) in pixels.
     """
-    r2 = reach(opacity)
+    r2 = cutoff_radius_squared(opacity)
     denominator = r2 * (dr.square(depth_u) + dr.square(depth_v)) - 1
     bounded = denominator < -1e-4  # float32 margin: the bounds diverge at 0
     f = r2 / dr.select(bounded, denominator, -1)
