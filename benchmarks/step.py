@@ -79,7 +79,7 @@ def step_times(surfels: int, size: int, steps: int, variant: str = METHOD) -> di
     """For every stage of the schedule: a step's time, launches, cache misses, and where its time goes."""
     from benchmarks.common.timing import milliseconds
     from benchmarks.splatting.ours import Ours
-    from mi_refgs.profiling.profile import held_in_stage, profile_stage
+    from mi_refgs.profiling.profile import profile_stage
 
     trainer, method = make_trainer(surfels, sphere_data(size, 8, np.random.default_rng(0)), variant)
     result = {}
@@ -87,7 +87,7 @@ def step_times(surfels: int, size: int, steps: int, variant: str = METHOD) -> di
         if stage.shading.at == "pixel" and method.mesh is not None:
             trainer.extract_mesh()
         found = profile_stage(trainer, name, steps)
-        with held_in_stage(trainer, name) as prepare:
+        with trainer.held_in_stage(name) as prepare:
             prepare()
             splat_ms = milliseconds({name: Ours.of_step(trainer).both}, SECONDS, steps)[name]
         result[name] = {

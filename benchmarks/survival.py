@@ -223,7 +223,7 @@ def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
                 "wall_ms": round(1e3 * float(np.median(np.diff(wall))), 3),
                 "cpu_ms": round(1e3 * float(np.median(np.diff(cpu))), 3),
                 "surfels": state.surfels.count,
-                "skipped": state.skipped,
+                "skipped": state.health.skipped,
                 "not_finite": bad,
                 "loss": round(float(state.loss[0]), 5),
             }
@@ -247,12 +247,14 @@ def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
         "rss_mb_per_10000_steps": round(slope("rss_mb"), 3),
         "cpu_ms_first_and_last_third": [round(early, 2), round(late, 2)],
         "step_time_drift": round(late / early - 1, 4),
-        "skipped_steps": trainer.skipped,
+        "skipped_steps": trainer.health.skipped,
         "not_finite": sum(r["not_finite"] for r in records),
         "notices": trainer.notices[:10],
     }
     result["ok"] = (
-        result["rss_mb_per_10000_steps"] <= GROWTH_LIMIT and not trainer.skipped and not result["not_finite"]
+        result["rss_mb_per_10000_steps"] <= GROWTH_LIMIT
+        and not trainer.health.skipped
+        and not result["not_finite"]
     )
     if output is not None:
         output.write_text(json.dumps({"result": result, "records": records}, indent=1) + "\n")

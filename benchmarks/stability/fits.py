@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.step import make_trainer, sphere_data
-from mi_refgs.fitting.targets import Targets
+from mi_refgs.fitting.state import FitSetup
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import LIGHT
 
@@ -46,12 +46,12 @@ def fit(name: str) -> dict[str, Any]:
     case = CASES[name]
     if "view" in case:
         views = tuple(replace(view, **case["view"](view)) for view in trainer.data.views)
-        trainer.data = replace(trainer.data, views=views, is_linear_radiance=views[0].is_linear_radiance)
-        trainer.targets = Targets(trainer.data, method.data)
+        data = replace(trainer.data, views=views, is_linear_radiance=views[0].is_linear_radiance)
+        trainer.adopt(FitSetup(method, data), trainer.state())
     if "light" in case:
         raw = trainer.params[LIGHT].numpy()
         trainer.params[LIGHT] = upload_tensor(case["light"](raw.ravel()).reshape(raw.shape))
-        trainer.optimiser.reset(LIGHT)
+        trainer.fit.optimiser.reset(LIGHT)
     losses = []
     for _, stage in method.stages():
         if stage.shading.at == "pixel":

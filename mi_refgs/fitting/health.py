@@ -1,4 +1,4 @@
-"""When the loss or a gradient is not finite: the surfels that cause it go, or one sentence ends the fit.
+"""Steps whose loss or gradient is not finite: the surfels that cause them are removed, or the fit ends.
 
 The optimiser does not apply such steps, so the state is always the last good one.
 """
@@ -6,20 +6,18 @@ The optimiser does not apply such steps, so the state is always the last good on
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.optim import Skipped
+from mi_refgs.fitting.state import FitSetup, FitState
 from mi_refgs.methods.method import LIGHT
 from mi_refgs.methods.surroundings import BACKGROUND
 from mi_refgs.runs.checkpoint import channels_of
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
-
-if TYPE_CHECKING:
-    from mi_refgs.fitting.train import Trainer
 
 CULL_SHARE = 0.1
 """Share of the surfels from which on a fault is not theirs: a pixel has tens of them, a table thousands."""
@@ -29,26 +27,46 @@ NAMED = 5
 """Surfels that a message names."""
 
 
-def check(fit: Trainer) -> None:
-    """Remove the surfels that made steps fail since the last check; see `Trainer.check`."""
-    skipped, steps = fit.optimiser.report(), fit.iteration - fit.checked
-    fit.checked, fit.skipped = fit.iteration, fit.skipped + skipped.count
-    fit.failed = fit.failed + steps if skipped.count >= steps else 0
-    check_light(fit.light)
-    if fit.surroundings is not None:
-        check_light(fit.surroundings.background, BACKGROUND)
-    found = {table: culprits(table.surfels, skipped, table.prefix) for table in fit.control.tables}
-    rows = {table.prefix + name: at for table, names in found.items() for name, at in names.items()}
-    if not rows and not skipped.count:
-        return
-    view = fit.data.views[fit.schedule.view(skipped.iteration + 1)].name if skipped.count else ""
-    said = sentence(rows, skipped, view)
-    fit.notices.append(said)
-    if fit.failed >= PATIENCE * fit.method.log_every:
-        raise gave_up(said, fit.failed)
-    for table, names in found.items():
-        if names:
-            fit.control.remove(together(names), table)
+@dataclass
+class Health:
+    """Counts the steps that changed nothing, and removes the surfels that caused them."""
+
+    skipped: int = 0  # steps that changed nothing, since their loss or gradient was not finite
+    checked: int = 0  # iteration of the last check
+    failed: int = 0  # steps that failed in a row
+
+    def check(self, setup: FitSetup, state: FitState) -> str | None:
+        """Remove the surfels that made steps fail since the last check; returns a sentence about it, if any.
+
+        Raises InputError if the light is not finite, if no surfel is left, or if nothing helps. Waits for the
+        device, and so is called on intervals only.
+        """
+        skipped, steps = state.optimiser.report(), state.iteration - self.checked
+        self.checked, self.skipped = state.iteration, self.skipped + skipped.count
+        self.failed = self.failed + steps if skipped.count >= steps else 0
+        require_finite_light(state.light)
+        if state.surroundings is not None:
+            require_finite_light(state.surroundings.background, BACKGROUND)
+        found = [culprits(table.surfels, skipped, table.prefix) for table in state.tables]
+        rows = {
+            t.prefix + name: at
+            for t, names in zip(state.tables, found, strict=True)
+            for name, at in names.items()
+        }
+        if not rows and not skipped.count:
+            return None
+        view = setup.data.views[setup.schedule.view(skipped.iteration + 1)].name if skipped.count else ""
+        said = sentence(rows, skipped, view)
+        if self.failed >= PATIENCE * setup.method.log_every:
+            raise InputError(
+                f"{said}; nothing was learnt in {self.failed} iterations: look at that image and its camera, "
+                "or lower the rates (--set rates.…)"
+            )
+        for table, names in zip(state.tables, found, strict=True):
+            if names:
+                table.remove(together(names))
+                state.occluder.vertex_surfels = None
+        return said
 
 
 def culprits(surfels: Surfels, skipped: Skipped, prefix: str = "") -> dict[str, np.ndarray]:
@@ -79,18 +97,10 @@ def sentence(rows: Mapping[str, np.ndarray], skipped: Skipped, view: str) -> str
     return f"{where}{channels} not finite at surfels {named}: {len(indices)} were removed"
 
 
-def check_light(light: EnvironmentLight | None, name: str = LIGHT) -> None:
+def require_finite_light(light: EnvironmentLight | None, name: str = LIGHT) -> None:
     """Raise InputError if the environment has a texel that renders black and learns no more."""
     if light is not None and light.unusable():
         rate = "rates.light" if name == LIGHT else "surroundings.rate"
         raise InputError(
             f"{name}: a texel is not finite or too large; go on from a checkpoint with a lower {rate}"
         )
-
-
-def gave_up(said: str, steps: int) -> InputError:
-    """What to raise after so many failed steps in a row."""
-    return InputError(
-        f"{said}; nothing was learnt in {steps} iterations: look at that picture and its camera, or lower "
-        "the rates (--set rates.…)"
-    )

@@ -62,41 +62,37 @@ def _measured(method: Method, has_alpha: bool, size: int) -> tuple[dict[str, flo
     """Seconds of a step by stage, and of a mesh without views and of each of its views."""
     data_options = replace(method.data, coarse=())
     still = replace(method, refine=Refine(), exposure=None, select=None, data=data_options)
-    trainer = Trainer(replace(still, mesh=None), stand_in(has_alpha, size))
+    trainer = Trainer(still, stand_in(has_alpha, size))
     every = 1 if method.light is None else method.light.every
     timed = max(TIMED // every, 1) * every
     steps, mesh, begin = {}, (0.0, 0.0), 0
     for name, stage in method.stages():
-        if method.mesh is not None and trainer.occluder.empty and trainer.shading(stage.until).traceable:
-            trainer.method = still
+        if method.mesh is not None and trainer.fit.occluder.empty and trainer.shading(stage.until).traceable:
             mesh = _mesh(trainer)
-            trainer.method = replace(still, mesh=None)
         first = min(begin + 1, stage.until - 1)
-        _run(trainer, first, max(WARM, every))
-        few = partial(_run, trainer, first, timed)
-        steps[name] = min(_seconds(few) / timed for _ in range(REPEATS))
+
+        def run(count: int, name: str = name, first: int = first) -> None:
+            with trainer.held_in_stage(name, first, share_light=True):
+                for _ in range(count):
+                    trainer.step()
+                dr.sync_thread()
+
+        run(max(WARM, every))
+        steps[name] = min(_seconds(partial(run, timed)) / timed for _ in range(REPEATS))
         begin = stage.until
     return steps, mesh
 
 
 def _mesh(trainer: Trainer) -> tuple[float, float]:
     """Seconds of a mesh without views, and of each view: from one of all views, and one of four times all."""
-    data = trainer.data
-    trainer.extract_mesh()
-    few = min(_seconds(trainer.extract_mesh) for _ in range(REPEATS))
-    trainer.data = replace(data, views=4 * data.views)
-    many = min(_seconds(trainer.extract_mesh) for _ in range(REPEATS))
-    trainer.data = data
+    cameras = [view.camera() for view in trainer.data.views]
+    trainer.extract_mesh(cameras)
+    few, many = (
+        min(_seconds(partial(trainer.extract_mesh, seen)) for _ in range(REPEATS))
+        for seen in (cameras, 4 * cameras)
+    )
     each = max(many - few, 0) / (3 * VIEWS)
     return max(few - VIEWS * each, 0), each
-
-
-def _run(trainer: Trainer, first: int, steps: int) -> None:
-    """Steps from iteration `first` on, so that short stages do not end meanwhile."""
-    trainer.iteration = first
-    for _ in range(steps):
-        trainer.step()
-    dr.sync_thread()
 
 
 def _seconds(call: Callable[[], Any]) -> float:

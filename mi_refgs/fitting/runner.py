@@ -14,10 +14,10 @@ from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.data.dataset import Dataset, PointCloud
 from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.exposure import EXPOSURE_FILE
+from mi_refgs.fitting import exposure
 from mi_refgs.fitting.plan import planned
 from mi_refgs.fitting.progress import Progress
-from mi_refgs.fitting.select import DECISIONS, select_terms, with_terms
+from mi_refgs.fitting.select import DECISIONS, select_components, with_components
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.targets import read_views
 from mi_refgs.fitting.train import Trainer
@@ -60,7 +60,7 @@ def begin(
             "would replace; choose another -o"
         )
     if state is not None:
-        method = with_terms(method, decisions_of(state))
+        method = with_components(method, decisions_of(state))
     else:
         require_several_sides(views)
         for note in views.notes:
@@ -68,12 +68,12 @@ def begin(
         if find_points is not None:
             views = replace(views, points=find_points(views, run.path, tell))
     trainer = Trainer(method, views, run, state)
-    trainer.exposure.tell = tell
+    trainer.tell = tell
     if resumed:
         run.rewind(trainer.iteration)
     else:
         run.create(method, str(views.path.resolve()), views.region)
-    select_terms(trainer, tell)
+    select_components(trainer, tell)
     return trainer
 
 
@@ -101,11 +101,11 @@ def finish(trainer: Trainer, run: Run) -> str | None:
     """
     if not any(int(path.stem) == trainer.iteration for path in run.checkpoints()):
         run.save_checkpoint(trainer.iteration, trainer.state())
-    if trainer.decisions:
+    if trainer.fit.decisions:
         run.write_method(trainer.method)
-        run.write_json(DECISIONS, trainer.decisions)
-    if (exposure := trainer.exposure.record()) is not None:
-        run.write_json(EXPOSURE_FILE, exposure)
+        run.write_json(DECISIONS, trainer.fit.decisions)
+    if (gains := exposure.record(trainer.setup, trainer.fit)) is not None:
+        run.write_json(exposure.EXPOSURE_FILE, gains)
     warning = None
     try:
         first = read_views(trainer.method, trainer.data.path, "test").views[0]

@@ -86,7 +86,7 @@ GATHERED = "light_gradient"
 """Name of the gradient of the levels in a checkpoint."""
 
 
-class LightWindow:
+class SharedPrefilter:
     """Steps that share the levels of one filtered light; `close` ends them, and passes on their gradient."""
 
     def __init__(self) -> None:

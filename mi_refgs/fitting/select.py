@@ -18,8 +18,9 @@ import numpy as np
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.exposure import displayed_of, picture, psnr
+from mi_refgs.fitting.exposure import displayed_of, image_of, psnr
 from mi_refgs.fitting.initial import first_light
+from mi_refgs.fitting.state import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import LIGHT, Method, Selection
 from mi_refgs.methods.surroundings import AROUND, BACKGROUND
@@ -37,7 +38,7 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
     """
     state = trainer.state()
     old, count = part(state, PARAMS), trainer.surfels.count
-    rng = trainer.schedule.rng(trainer.iteration, "branch")
+    rng = trainer.setup.schedule.rng(trainer.iteration, "branch")
     wanted: dict[str, np.ndarray] = {}
     for name in method.surfels.names:
         width = method.surfels.columns(name)
@@ -61,7 +62,7 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
         new[f"{PARAMS}{name}"] = np.asarray(values, np.float32)
         new |= {f"{OPTIMISER}{key}": value for key, value in _history(state, old, name, values).items()}
     made = Trainer(method, trainer.data, state=new)
-    if method.mesh is not None and made.occluder.empty and made.shading().traceable:
+    if method.mesh is not None and made.fit.occluder.empty and made.shading().traceable:
         made.extract_mesh()
     return made
 
@@ -101,7 +102,7 @@ DECISIONS = "decisions.json"
 
 
 @dataclass(frozen=True)
-class Trial:
+class ComponentTrial:
     """How a method did in a trial."""
 
     psnr: float  # dB, mean over the views held out
@@ -117,8 +118,8 @@ class Decision:
     iteration: int
     stays: bool
     reason: str
-    without: Trial | None = None
-    with_it: Trial | None = None
+    without: ComponentTrial | None = None
+    with_it: ComponentTrial | None = None
 
     @property
     def gain(self) -> float | None:
@@ -126,11 +127,11 @@ class Decision:
         return None if self.without is None or self.with_it is None else self.with_it.psnr - self.without.psnr
 
 
-def select_terms(trainer: Trainer, tell: Callable[[str], None] = lambda _: None) -> None:
-    """Let a trainer try the terms of its method as they fall due; none if its method selects nothing.
+def select_components(trainer: Trainer, tell: Callable[[str], None] = lambda _: None) -> None:
+    """Let a trainer try the components of its method as they are due; none if its method selects nothing.
 
-    Until the last decision it fits the views that are not held out. `tell` is called with a sentence for
-    every decision.
+    Until the last decision it is fitted to the views that are not validation views. `tell` is called with a
+    sentence for every decision.
     """
     select = trainer.method.select
     if select is None:
@@ -138,61 +139,56 @@ def select_terms(trainer: Trainer, tell: Callable[[str], None] = lambda _: None)
     whole = trainer.data
     kept = tuple(view for i, view in enumerate(whole.views) if i % select.holdout)
     judges = replace(whole, views=whole.views[:: select.holdout])
-    if _open(trainer, select):
-        trainer.adopt(trainer.method, replace(whole, views=kept), trainer.state())
+    if _undecided(trainer, select):
+        trainer.adopt(FitSetup(trainer.method, replace(whole, views=kept)), trainer.state())
 
-    def between(trainer: Trainer) -> None:
-        while (name := _due(trainer, select)) is not None:
-            seconds, begin = trainer.seconds, time.perf_counter()
-            decision = _try(trainer, name, select, judges)
-            trainer.decisions.append(asdict(decision))
+    def before_step(trainer: Trainer) -> None:
+        while (names := _undecided(trainer, select)) and trainer.iteration >= select.term[names[0]].after:
+            seconds, begin = trainer.fit.seconds, time.perf_counter()
+            decision = _try(trainer, names[0], select, judges)
+            trainer.fit.decisions.append(asdict(decision))
             tell(sentence(decision))
-            if not _open(trainer, select):
-                trainer.adopt(trainer.method, whole, trainer.state())
-            # All that a trial took counts: the loser's steps, the pictures of the judges.
-            trainer.seconds = seconds + time.perf_counter() - begin
+            if not _undecided(trainer, select):
+                trainer.adopt(FitSetup(trainer.method, whole), trainer.state())
+            # All that a trial took counts: the loser's steps and the validation images.
+            trainer.fit.seconds = seconds + time.perf_counter() - begin
             trainer.save()
             if trainer.run is not None:
                 trainer.run.write_method(trainer.method)
 
-    trainer.between = between
+    trainer.before_step = before_step
 
 
-def _open(trainer: Trainer, select: Selection) -> list[str]:
-    """Terms that are not decided yet, in the order in which they are tried."""
-    decided = {row["term"] for row in trainer.decisions}
+def _undecided(trainer: Trainer, select: Selection) -> list[str]:
+    """Components that are not decided yet, in the order in which they are tried."""
+    decided = {row["term"] for row in trainer.fit.decisions}
     return [name for name in select.order if name not in decided]
 
 
-def _due(trainer: Trainer, select: Selection) -> str | None:
-    names = _open(trainer, select)
-    return names[0] if names and trainer.iteration >= select.term[names[0]].after else None
-
-
 def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Decision:
-    term, method, iteration = select.term[name], trainer.method, trainer.iteration
-    if missing := [needed for needed in term.needs if needed not in method.terms]:
+    component, method, iteration = select.term[name], trainer.method, trainer.iteration
+    if missing := [needed for needed in component.needs if needed not in method.terms]:
         return Decision(name, iteration, False, f"needs {missing[0]}")
-    if present := [other for other in term.unless if other in method.terms]:
+    if present := [other for other in component.unless if other in method.terms]:
         return Decision(name, iteration, False, f"nothing to do beside {present[0]}")
     made = methods.load(method.file, method.preset, method.assignments, (*method.terms, name))
     candidate = replace(made, data=method.data)
-    if iteration + term.trial > method.iterations:
+    if iteration + component.trial > method.iterations:
         return Decision(name, iteration, False, "too late in the fit")
     try:
         rival = branched(trainer, candidate)
-        with_it = _run(rival, term.trial, judges, trainer.release)
+        with_it = _run(rival, component.trial, judges, trainer.release)
     except InputError as error:
         return Decision(name, iteration, False, f"its fit failed: {error}")
-    without = _run(trainer, term.trial, judges, trainer.release)
-    gain, wanted = with_it.psnr - without.psnr, asked(without, with_it, select)
+    without = _run(trainer, component.trial, judges, trainer.release)
+    gain, wanted = with_it.psnr - without.psnr, required_gain(without, with_it, select)
     stays = gain >= wanted
     if stays:
-        trainer.adopt(candidate, trainer.data, rival.state())
+        trainer.adopt(FitSetup(candidate, trainer.data), rival.state())
     return Decision(name, iteration, stays, f"{gain:+.2f} dB of {wanted:.2f} asked", without, with_it)
 
 
-def asked(without: Trial, with_it: Trial, select: Selection) -> float:
+def required_gain(without: ComponentTrial, with_it: ComponentTrial, select: Selection) -> float:
     """PSNR (dB) that a term has to bring for what it costs; what it may lose, where it saves."""
     time_price = select.gain_per_ms * (with_it.ms - without.ms)
     price = time_price + select.gain_per_mb * (with_it.mb - without.mb)
@@ -200,7 +196,7 @@ def asked(without: Trial, with_it: Trial, select: Selection) -> float:
     return price + (select.gain if costs else 0)
 
 
-def _run(trainer: Trainer, steps: int, judges: Dataset, release: Callable[[], None]) -> Trial:
+def _run(trainer: Trainer, steps: int, judges: Dataset, release: Callable[[], None]) -> ComponentTrial:
     """Go on for some steps, and what came of it; `release` lets an interrupt through between two of them."""
     seconds = []
     for _ in range(steps):
@@ -211,17 +207,17 @@ def _run(trainer: Trainer, steps: int, judges: Dataset, release: Callable[[], No
         release()
     entries = sum(int(np.prod(tensor.shape)) for tensor in trainer.params.values())
     # The first half may compile kernels.
-    return Trial(
-        held_out_psnr(trainer, judges),
+    return ComponentTrial(
+        validation_psnr(trainer, judges),
         1e3 * float(np.median(seconds[steps // 2 :])),
         MOMENTS * 4 * entries / 1e6,
     )
 
 
-def held_out_psnr(trainer: Trainer, judges: Dataset) -> float:
+def validation_psnr(trainer: Trainer, judges: Dataset) -> float:
     """Mean PSNR (dB) of the present state on views that it was not fitted to; waits for the device."""
     shown = [(trainer.view(view.camera(), aovs=False), view) for view in judges.views]
-    return float(np.mean([psnr(picture(displayed_of(frame, judges), view), view) for frame, view in shown]))
+    return float(np.mean([psnr(image_of(displayed_of(frame, judges), view), view) for frame, view in shown]))
 
 
 def sentence(decision: Decision) -> str:
@@ -254,7 +250,7 @@ def table(decisions: list[dict[str, Any]]) -> str:
     )
 
 
-def with_terms(method: Method, decisions: list[dict[str, Any]]) -> Method:
+def with_components(method: Method, decisions: list[dict[str, Any]]) -> Method:
     """The method with the terms that decisions have left in it."""
     names = tuple(row["term"] for row in decisions if row["stays"])
     if method.select is None or names == method.terms:

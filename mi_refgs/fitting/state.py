@@ -1,93 +1,297 @@
-"""What a checkpoint holds of a fit, as named arrays; `runs.checkpoint` reads and checks the files."""
+"""State of a fit: everything that its steps change, and its form in a checkpoint.
+
+A checkpoint contains named arrays (`runs.checkpoint` reads, checks and writes the files):
+
+    params/NAME  optimiser/NAME/PART       parameters, and Adam's moments and counters of each
+    gradient_sum  gradient_count           per surfel, with the prefix "surroundings/" for the background
+    mesh/PART                              the occluder, if there is one
+    iteration  seconds  held_until  decisions  exposure  light_gradient
+"""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
+from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.methods.method import GAIN, LIGHT, Method
+from mi_refgs.fitting.initial import initial_parameters, is_open
+from mi_refgs.fitting.optim import Adam, Group
+from mi_refgs.fitting.refine import TableEdit
+from mi_refgs.fitting.schedule import Schedule, SharedPrefilter
+from mi_refgs.kernels.device import upload
+from mi_refgs.methods.method import GAIN, LIGHT, ExposureOptions, Method
 from mi_refgs.methods.surroundings import AROUND, BACKGROUND
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import VertexSurfels
 from mi_refgs.occlusion.vertex_colours import VertexColours
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
-
-if TYPE_CHECKING:
-    from mi_refgs.fitting.train import Trainer
-
-
-def shapes(method: Method, open_scene: bool) -> dict[str, tuple[int, ...]]:
-    """The shape of every parameter of a method, without the first axis; of surroundings if `open_scene`."""
-    surfels, around = method.surfels, method.surroundings
-    found: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
-    if open_scene and around is not None:
-        harmonics = replace(surfels, degree={"radiance_sh": around.degree})
-        found |= {AROUND + name: (harmonics.columns(name),) for name in around.names(surfels.primitive)}
-        found[BACKGROUND] = (2 * around.height, 3)
-    return found if method.light is None else found | {LIGHT: (2 * method.light.height, 3)}
-
-
-def packed(trainer: Trainer) -> dict[str, np.ndarray]:
-    """Everything that a checkpoint holds."""
-    mesh = trainer.occluder.mesh()
-    state = {f"{PARAMS}{name}": tensor.numpy() for name, tensor in trainer.params.items()}
-    state |= {f"{OPTIMISER}{name}": value for name, value in trainer.optimiser.state_dict().items()}
-    for table in trainer.control.tables:
-        state |= table.state()
-    state |= {"iteration": np.array(trainer.iteration), "seconds": np.array(trainer.seconds)}
-    state["held_until"] = np.array(trainer.control.held_until)
-    state |= trainer.window.state() | trainer.exposure.state()
-    if trainer.decisions:
-        state["decisions"] = np.frombuffer(json.dumps(trainer.decisions).encode(), np.uint8)
-    if mesh is not None:
-        state |= {
-            "mesh/vertices": mesh.vertices,
-            "mesh/faces": mesh.faces,
-            "mesh/voxel": np.array(mesh.voxel),
-        }
-    if trainer.occluder.vertex_surfels is not None:
-        state |= {
-            f"{MESH}{name}": values for name, values in trainer.occluder.vertex_surfels.arrays().items()
-        }
-    if trainer.occluder.ambient is not None:
-        state["mesh/ambient"] = trainer.occluder.ambient.numpy()
-    return state
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.checkpoint import (
+    MESH,
+    OPTIMISER,
+    PARAMS,
+    channels_of,
+    light_of,
+    part,
+    surroundings_of,
+    tensors,
+)
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
+from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Float, TensorXf
 
 
-def decisions_of(state: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """What was decided about the terms of the method so far."""
+@dataclass(frozen=True, eq=False)
+class FitSetup:
+    """Method and data of a fit, and what follows from them alone."""
+
+    method: Method
+    data: Dataset
+
+    @cached_property
+    def open_scene(self) -> bool:
+        """Whether the images show a background that the method models apart from the object."""
+        return is_open(self.method, self.data)
+
+    @cached_property
+    def schedule(self) -> Schedule:
+        """Draws and learning rates by iteration."""
+        return Schedule(self.method, len(self.data.views))
+
+    @property
+    def exposure(self) -> ExposureOptions | None:
+        """Options of the per-image exposure compensation, unless the method switches it off."""
+        options = self.method.exposure
+        return None if options is None or options.gains == "off" else options
+
+    def groups(self, params: Mapping[str, TensorXf]) -> dict[str, Group]:
+        """Learning rates by the name of the parameter."""
+        groups = self.schedule.groups(self.data.scene_extent, self.open_scene)
+        if self.exposure is not None and GAIN in params:
+            rate = self.exposure.rate
+            groups[GAIN] = Group(rate, 0.1 * rate, self.method.iterations)
+        return groups
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of every parameter but the gains, without the first axis."""
+        surfels, around = self.method.surfels, self.method.surroundings
+        found: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
+        if self.open_scene and around is not None:
+            harmonics = replace(surfels, degree={"radiance_sh": around.degree})
+            found |= {AROUND + name: (harmonics.columns(name),) for name in around.names(surfels.primitive)}
+            found[BACKGROUND] = (2 * around.height, 3)
+        return found if self.method.light is None else found | {LIGHT: (2 * self.method.light.height, 3)}
+
+    def require_own(self, state: Mapping[str, np.ndarray]) -> None:
+        """Raise InputError if the method or the kind of images has changed since the state was written."""
+        expected, views = self.shapes(), len(self.data.views)
+        found = {name: value.shape[1:] for name, value in part(state, PARAMS).items() if name != GAIN}
+        for name in expected.keys() | found.keys():
+            if found.get(name) != expected.get(name):
+                raise InputError(
+                    f"config.toml: {name}: the checkpoint has {found.get(name, 'none')}, the method "
+                    f"{expected.get(name, 'none')}; undo the change, or start another run"
+                )
+        gains = state.get(f"{PARAMS}{GAIN}")
+        if gains is not None and len(gains) != views:
+            raise InputError(
+                f"{self.data.path}: frames: {views} training views, but the checkpoint has gains of "
+                f"{len(gains)}; resume with the data set that the run began with"
+            )
+
+
+@dataclass(eq=False)
+class ParameterTable:
+    """One set of surfels as parameters: edits of its rows, which moments and statistics follow."""
+
+    params: dict[str, TensorXf]  # of the fit, (N, D) each; this table's have the prefix
+    optimiser: Adam
+    prefix: str  # "" of the object, AROUND of the background
+    max_count: int  # most surfels that the method allows
+    gradient_sum: Float = None  # (N,) of screen-space gradients since the last densification, NDC
+    gradient_count: Float = None  # (N,) views with a gradient
+
+    @property
+    def surfels(self) -> Surfels:
+        """The surfels, attached to the leaves that the optimiser owns."""
+        return Surfels(channels_of(self.params, self.prefix))
+
+    @property
+    def gradient(self) -> np.ndarray:
+        """Mean length of the observed gradients (N,); waits for the device."""
+        mean: np.ndarray = self.gradient_sum.numpy() / np.maximum(self.gradient_count.numpy(), 1)
+        return mean
+
+    def clear(self) -> None:
+        """Set the statistics to zero."""
+        count = self.surfels.count
+        self.gradient_sum = dr.opaque(mi.Float, 0, count)
+        self.gradient_count = dr.opaque(mi.Float, 0, count)
+
+    def observe(
+        self,
+        length: Float,  # (N,) of a step's gradients with respect to screen positions, NDC
+    ) -> None:
+        """Add to the statistics."""
+        seen = (length > 0) & dr.isfinite(length)
+        self.gradient_sum += dr.select(seen, length, 0.0)
+        self.gradient_count += dr.select(seen, mi.Float(1), 0)
+        dr.schedule(self.gradient_sum, self.gradient_count)
+
+    def apply(self, edit: TableEdit) -> None:
+        """Replace the surfels by edited ones in Morton order; moments and statistics follow the rows."""
+        edit = edit.ordered()
+        parent, fresh = upload(edit.parent, mi.UInt32), upload(edit.fresh, mi.Bool)
+        self.replace(edit.surfels)
+        self.optimiser.gather(parent, self._names(edit.surfels), fresh)
+        self.gradient_sum = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_sum, parent))
+        self.gradient_count = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_count, parent))
+        dr.eval(self.gradient_sum, self.gradient_count)
+
+    def remove(self, rows: np.ndarray) -> None:
+        """Remove surfels; raises InputError if none would be left."""
+        surfels = self.surfels
+        parent = np.delete(np.arange(surfels.count), rows)
+        if not len(parent):
+            raise InputError("surfels: none of them is finite; lower the rates (--set rates.…)")
+        index = upload(parent, mi.UInt32)
+        self.replace(surfels.gather(index))
+        self.optimiser.gather(index, self._names(surfels))
+        self.gradient_sum = dr.gather(mi.Float, self.gradient_sum, index)
+        self.gradient_count = dr.gather(mi.Float, self.gradient_count, index)
+
+    def replace(self, surfels: Surfels, cleared: tuple[str, ...] = ()) -> None:
+        """Replace the surfels; the attributes in `cleared` lose their moments."""
+        self.params.update({self.prefix + name: tensor for name, tensor in surfels.raw.items()})
+        dr.enable_grad([self.params[name] for name in self._names(surfels)])
+        for name in cleared:
+            if self.prefix + name in self.params:
+                self.optimiser.reset(self.prefix + name)
+
+    def _names(self, surfels: Surfels) -> list[str]:
+        return [self.prefix + name for name in surfels.raw]
+
+
+@dataclass(eq=False)
+class FitState:
+    """What the steps of a fit change; exactly what a checkpoint contains."""
+
+    params: dict[str, TensorXf]  # raw, by name: surfels, AROUND + surfels, LIGHT, BACKGROUND, GAIN
+    optimiser: Adam
+    tables: list[ParameterTable]  # object, and background if there is one
+    occluder: Occluder = field(default_factory=Occluder)
+    prefilter: SharedPrefilter = field(default_factory=SharedPrefilter)
+    iteration: int = 0  # steps done
+    seconds: float = 0.0  # spent in steps
+    held_until: int = 0  # iteration before which opacities do not learn
+    decisions: list[dict[str, Any]] = field(default_factory=list)  # about components of the method
+    exposure: dict[str, Any] | None = None  # decision about the exposure compensation
+
+    @staticmethod
+    def start(setup: FitSetup, gains: Mapping[str, TensorXf]) -> FitState:
+        """The state before the first step; `gains`, if there are any, do not learn until they are decided."""
+        draws = setup.schedule.rng(0, "start")
+        params = initial_parameters(setup.method, setup.data, draws, setup.open_scene)
+        made = FitState._assembled(setup, params | dict(gains))
+        made.optimiser.set_factor(GAIN, 0.0)
+        for table in made.tables:
+            table.clear()
+        return made
+
+    @staticmethod
+    def _assembled(setup: FitSetup, params: dict[str, TensorXf]) -> FitState:
+        optimiser, method = Adam(params, setup.groups(params)), setup.method
+        tables = [ParameterTable(params, optimiser, "", method.surfels.max_count)]
+        if setup.open_scene and method.surroundings is not None:
+            tables.append(ParameterTable(params, optimiser, AROUND, method.surroundings.max_count))
+        return FitState(params, optimiser, tables)
+
+    @property
+    def surfels(self) -> Surfels:
+        """The object, attached to the leaves that the optimiser owns."""
+        return self.tables[0].surfels
+
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """The background in images without alpha, attached likewise."""
+        return surroundings_of(self.params)
+
+    @property
+    def light(self) -> EnvironmentLight | None:
+        """The environment map, attached likewise."""
+        return light_of(self.params)
+
+    def shading(self, method: Method, iteration: int | None = None) -> Shading:
+        """Shading options of the present (or another) iteration."""
+        _, stage = method.stage_at(iteration or max(self.iteration, 1))
+        return Shading.resolve(stage.shading, not self.occluder.empty)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The content of a checkpoint."""
+        state = {f"{PARAMS}{name}": tensor.numpy() for name, tensor in self.params.items()}
+        state |= {f"{OPTIMISER}{name}": value for name, value in self.optimiser.state_dict().items()}
+        for table in self.tables:
+            state[f"{table.prefix}gradient_sum"] = table.gradient_sum.numpy()
+            state[f"{table.prefix}gradient_count"] = table.gradient_count.numpy()
+        state |= {name: np.array(getattr(self, name)) for name in ("iteration", "seconds", "held_until")}
+        state |= self.prefilter.state()
+        for name, value in (("exposure", self.exposure), ("decisions", self.decisions)):
+            if value:
+                state[name] = np.frombuffer(json.dumps(value).encode(), np.uint8)
+        if (mesh := self.occluder.mesh()) is not None:
+            state |= {f"{MESH}vertices": mesh.vertices, f"{MESH}faces": mesh.faces}
+            state[f"{MESH}voxel"] = np.array(mesh.voxel)
+        if self.occluder.vertex_surfels is not None:
+            state |= {f"{MESH}{name}": x for name, x in self.occluder.vertex_surfels.arrays().items()}
+        if self.occluder.ambient is not None:
+            state[f"{MESH}ambient"] = self.occluder.ambient.numpy()
+        return state
+
+    @staticmethod
+    def from_arrays(setup: FitSetup, state: Mapping[str, np.ndarray]) -> FitState:
+        """Restore the content of a checkpoint, bit for bit; raises InputError if it is of another fit."""
+        setup.require_own(state)
+        made = FitState._assembled(setup, tensors(state, PARAMS))
+        made.optimiser.load_state_dict(part(state, OPTIMISER))
+        for table in made.tables:
+            table.gradient_sum = upload(state[f"{table.prefix}gradient_sum"])
+            table.gradient_count = upload(state[f"{table.prefix}gradient_count"])
+        made.iteration, made.seconds = int(state["iteration"]), float(state["seconds"])
+        made.held_until = int(state["held_until"])
+        made.decisions = decisions_of(state)
+        if "exposure" in state:
+            made.exposure = json.loads(state["exposure"].tobytes().decode())
+        made.occluder = _occluder_of(state)
+        made.prefilter.restore(made.light, made.shading(setup.method), state)
+        return made
+
+
+def decisions_of(state: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """The decisions about components of the method in a checkpoint."""
     if "decisions" not in state:
         return []
     found: list[dict[str, Any]] = json.loads(state["decisions"].tobytes().decode())
     return found
 
 
-def occluder_of(state: dict[str, np.ndarray]) -> Occluder:
-    """The occluder, with its materials' surfels and its ambient ratios if it has any."""
+def _occluder_of(state: Mapping[str, np.ndarray]) -> Occluder:
+    """The occluder of a checkpoint, with its caches if it has any."""
     occluder = Occluder()
-    if "mesh/faces" in state:
-        mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
+    if f"{MESH}faces" in state:
+        mesh = Mesh(state[f"{MESH}vertices"], state[f"{MESH}faces"], float(state[f"{MESH}voxel"]))
         occluder.update(mesh)
-        if "mesh/surfels" in state:
+        if f"{MESH}surfels" in state:
             count = len(state[f"{PARAMS}position"])
             occluder.vertex_surfels = VertexSurfels.restored(mesh, count, part(state, MESH))
-        if "mesh/ambient" in state:
-            occluder.ambient = VertexColours.of(mesh, state["mesh/ambient"])
+        if f"{MESH}ambient" in state:
+            occluder.ambient = VertexColours.of(mesh, state[f"{MESH}ambient"])
     return occluder
-
-
-def require_fit(method: Method, state: dict[str, np.ndarray], open_scene: bool = False) -> None:
-    """Raise InputError if the method, or what its pictures show, has changed since the state was written."""
-    expected = shapes(method, open_scene)
-    found = {name: value.shape[1:] for name, value in part(state, PARAMS).items() if name != GAIN}
-    for name in expected.keys() | found.keys():
-        if found.get(name) != expected.get(name):
-            raise InputError(
-                f"config.toml: {name}: the checkpoint has {found.get(name, 'none')}, the method "
-                f"{expected.get(name, 'none')}; undo the change, or start another run"
-            )

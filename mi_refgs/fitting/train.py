@@ -1,4 +1,4 @@
-"""The optimisation loop: stages from the method, one view a step, refinement and meshes on their windows.
+"""The optimisation loop: stages of the method, one view per step, refinement and meshes on their windows.
 
 A step is a pure function of the state and the iteration number (view order and random draws are derived from
 the seed and the iteration), so a resumed run repeats a straight one: bit for bit with one thread.
@@ -7,7 +7,9 @@ the seed and the iteration), so a resumed run repeats a straight one: bit for bi
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,35 +18,35 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.fitting import health
+from mi_refgs.data.view import View
+from mi_refgs.fitting import exposure
 from mi_refgs.fitting.control import AdaptiveControl
-from mi_refgs.fitting.exposure import Exposure
-from mi_refgs.fitting.initial import initial_parameters, is_open
+from mi_refgs.fitting.health import Health
 from mi_refgs.fitting.objective import objective
-from mi_refgs.fitting.optim import Adam, Group
-from mi_refgs.fitting.schedule import LightWindow, Schedule
-from mi_refgs.fitting.state import decisions_of, occluder_of, packed, require_fit
+from mi_refgs.fitting.state import FitSetup, FitState
 from mi_refgs.fitting.surface import surface_of, update_missing_caches
 from mi_refgs.fitting.targets import Targets, require_memory
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.timing import phase
-from mi_refgs.methods.method import GAIN, Method, Stage
+from mi_refgs.methods.method import GAIN, Method, Refine, Stage
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS, channels_of, light_of, part, surroundings_of, tensors
 from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Float, TensorXf
 
 
 class Trainer:
-    """The state of a fit and the step that advances it."""
+    """A fit and the loop that advances it.
+
+    `setup` contains the method and the data, `fit` all that the steps change.
+    """
 
     def __init__(
         self,
@@ -55,88 +57,123 @@ class Trainer:
     ) -> None:
         """Set up a fit of `data`: from a `state`, the newest checkpoint of `run`, or the start."""
         self.run = run
-        self.notices: list[str] = []  # messages for people; who shows one removes it
-        self.decisions: list[dict[str, Any]] = []  # about terms of the method
-        self.between: Callable[[Trainer], None] | None = None  # called ahead of each step of `train`
-        self.release: Callable[[], None] = lambda: None  # lets an interrupt through, while `train` runs
-        self.occluder = Occluder()
-        self.iteration, self.seconds = 0, 0.0
-        self.skipped = 0  # steps that changed nothing, since their loss or gradient was not finite
-        self.checked, self.failed = 0, 0  # iteration of the last check; failed steps in a row
-        self.params: dict[str, Any] = {}
-        self.control = AdaptiveControl(self)
-        self.window = LightWindow()
-        self.exposure = Exposure(self)
-        self.loss: Any = None
-        self.error: Any = None
+        self.notices: list[str] = []  # messages for users, removed by what displays them
+        self.tell: Callable[[str], None] = lambda message: None  # is called with decisions about the exposure
+        self.before_step: Callable[[Trainer], None] | None = None  # is called before each step of `train`
+        self.release: Callable[[], None] = lambda: None  # raises a pending interrupt, while `train` runs
+        self.health = Health()
+        self.loss: Float = None  # of the last step, width 1
+        self.error: Float = None  # mean squared error of the last step, width 1
         if state is None and run is not None:
             state = run.load_checkpoint()
-        self._set(method, data)
-        if state is not None:
+        self._set_up(FitSetup(method, data))
+        if state is None:
+            self.fit = FitState.start(self.setup, exposure.initial_gains(self.setup))
+        else:
             self.restore(state)
-            return
-        self.params |= initial_parameters(method, data, self.schedule.rng(0, "start"), self.open)
-        self.params |= self.exposure.start()
-        self.optimiser = Adam(self.params, self._groups())
-        self.optimiser.set_factor(GAIN, 0.0)  # until it is decided
-        self.control.clear()
 
-    def adopt(self, method: Method, data: Dataset, state: dict[str, np.ndarray]) -> None:
-        """Go on with another method, data and state, such as those of a `branched` fit.
+    def _set_up(self, setup: FitSetup) -> None:
+        require_memory(setup.method, setup.data)
+        self.setup, self.targets = setup, Targets(setup.data, setup.method.data)
+
+    def adopt(self, setup: FitSetup, state: dict[str, np.ndarray]) -> None:
+        """Continue with another method, data and state, such as those of a `branched` fit.
 
         Raises InputError if the state is not one of the method.
         """
-        self._set(method, data)
-        decisions = self.decisions
+        self._set_up(setup)
         self.restore(state)
-        self.decisions = decisions
 
-    def _set(self, method: Method, data: Dataset) -> None:
-        self.method, self.data = method, data
-        self.extent, self.open = data.scene_extent, is_open(method, data)
-        self.schedule = Schedule(method, len(data.views))
-        require_memory(method, data)
-        self.targets = Targets(data, method.data)
+    def state(self) -> dict[str, np.ndarray]:
+        """The content of a checkpoint."""
+        return self.fit.arrays()
 
-    def _groups(self) -> dict[str, Group]:
-        return self.schedule.groups(self.extent, self.open) | self.exposure.groups()
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Continue from the content of a checkpoint; raises InputError if it is not one of the method."""
+        self.fit = FitState.from_arrays(self.setup, state)
+        self.health.checked = self.fit.iteration
 
-    # ---------------- what others look at ----------------
+    # ---------------- the present state ----------------
+
+    @property
+    def method(self) -> Method:
+        """The method; it may gain components during a fit that selects them."""
+        return self.setup.method
+
+    @property
+    def data(self) -> Dataset:
+        """The training views in use."""
+        return self.setup.data
+
+    @property
+    def iteration(self) -> int:
+        """Steps done."""
+        return self.fit.iteration
+
+    @iteration.setter
+    def iteration(self, value: int) -> None:
+        self.fit.iteration = value
+
+    @property
+    def seconds(self) -> float:
+        """Time spent in steps and trials."""
+        return self.fit.seconds
+
+    @property
+    def decisions(self) -> list[dict[str, Any]]:
+        """Decisions about components of the method."""
+        return self.fit.decisions
+
+    @property
+    def params(self) -> dict[str, TensorXf]:
+        """The parameters by name, raw."""
+        return self.fit.params
 
     @property
     def surfels(self) -> Surfels:
-        """The object's table, attached to the leaves that the optimiser owns."""
-        return Surfels(channels_of(self.params))
+        """The object, attached to the leaves that the optimiser owns."""
+        return self.fit.surfels
 
     @property
     def surroundings(self) -> Surroundings | None:
-        """What is around the object in pictures without alpha, attached likewise."""
-        return surroundings_of(self.params)
+        """The background in images without alpha, attached likewise."""
+        return self.fit.surroundings
 
     @property
     def light(self) -> EnvironmentLight | None:
-        """The environment, attached likewise."""
-        return light_of(self.params)
+        """The environment map, attached likewise."""
+        return self.fit.light
 
     def shading(self, iteration: int | None = None) -> Shading:
-        """How the present (or another) iteration shades."""
-        _, stage = self.method.stage_at(iteration or max(self.iteration, 1))
-        return self._shading(stage)
+        """Shading options of the present (or another) iteration."""
+        return self.fit.shading(self.method, iteration)
 
-    def view(self, camera: Camera, aovs: bool = True, alone: bool = False) -> Frame:
-        """Render a view of the present state, without derivatives; `alone`: without the surroundings."""
+    def view(self, camera: Camera, aovs: bool = True, object_only: bool = False) -> Frame:
+        """Render the present state, without derivatives; `object_only`: without the background."""
         with dr.suspend_grad():
             shading = self.shading()
-            update_missing_caches(self.occluder, self.surfels, self.light, shading)
-            light, surroundings = shading.light_of(self.light), None if alone else self.surroundings
-            scene = SurfelScene(self.surfels, shading, light, self.occluder, surroundings)
-            asked = scene.all_aovs if aovs else ()
-            return render(scene, camera, Request(asked, sh_degree=self.schedule.sh_degree(self.iteration)))
+            update_missing_caches(self.fit.occluder, self.surfels, self.light, shading)
+            light, around = shading.light_of(self.light), None if object_only else self.surroundings
+            scene = SurfelScene(self.surfels, shading, light, self.fit.occluder, around)
+            degree = self.setup.schedule.sh_degree(self.iteration)
+            return render(scene, camera, Request(scene.all_aovs if aovs else (), sh_degree=degree))
+
+    def statistics(self) -> dict[str, Any]:
+        """One line of the log; waits for the device."""
+        return {
+            "iteration": self.iteration,
+            "seconds": round(self.fit.seconds, 3),
+            "stage": self.method.stage_at(self.iteration)[0],
+            "loss": float(self.loss[0]),
+            "psnr": round(psnr_of(float(self.error[0])), 3),
+            "surfels": sum(table.surfels.count for table in self.fit.tables),
+            "skipped_steps": self.health.skipped,
+        }
 
     # ---------------- the loop ----------------
 
     def train(self, progress: Callable[[Trainer], None] | None = None) -> None:
-        """Run to the last iteration; an interrupt ends it after the step in hand, saved, and is passed on.
+        """Run to the last iteration; an interrupt ends it after the current step, saved, and is passed on.
 
         Raises InputError when the run folder cannot be written: a checkpoint interval is lost at most.
         """
@@ -144,8 +181,8 @@ class Trainer:
             self.release = release
             while self.iteration < self.method.iterations:
                 try:
-                    if self.between is not None:
-                        self.between(self)
+                    if self.before_step is not None:
+                        self.before_step(self)
                 except KeyboardInterrupt:
                     self.save()
                     raise
@@ -155,7 +192,7 @@ class Trainer:
                 self.step()
                 if self.iteration % self.method.log_every == 0:
                     dr.sync_thread()
-                self.seconds += time.perf_counter() - begin
+                self.fit.seconds += time.perf_counter() - begin
                 self._record()
                 try:
                     if progress is not None:
@@ -181,106 +218,126 @@ class Trainer:
             self.run.save_checkpoint(self.iteration, self.state())
 
     def check(self) -> None:
-        """Remove the surfels that made steps fail since the last check, and leave a notice of it.
-
-        Raises InputError if the light is not finite, if no surfel is left, or if nothing helps. Waits for the
-        device, and so is called on intervals only.
-        """
-        health.check(self)
+        """Remove the surfels that made steps fail since the last check, with a notice; see `Health.check`."""
+        if (notice := self.health.check(self.setup, self.fit)) is not None:
+            self.notices.append(notice)
 
     def step(self) -> None:
-        """One iteration: enter a stage if it begins, one gradient step, then what falls due."""
-        iteration = self.iteration + 1
+        """One iteration: enter a stage if it begins, one gradient step, then the edits that are due."""
+        iteration, control = self.iteration + 1, AdaptiveControl(self.setup, self.fit)
         name, stage = self.method.stage_at(iteration)
         if iteration > 1 and stage.restart and self.method.stage_at(iteration - 1)[0] != name:
-            self.control.restart(stage.restart, iteration)
-        self._gradient_step(iteration, stage)
+            control.restart(stage.restart, iteration)
+        self._gradient_step(iteration, stage, control)
         self.iteration = iteration
-        self.control.refine(iteration)
-        self.exposure.decide(iteration)
+        if control.changes_rows(iteration):
+            self.check()
+        control.refine(iteration)
+        self._decide_exposure()
         mesh = self.method.mesh
         if mesh is not None and self._shading(stage).traceable and mesh.extract.due(iteration):
             self.extract_mesh()
 
-    def statistics(self) -> dict[str, Any]:
-        """One line of the log; waits for the device."""
-        return {
-            "iteration": self.iteration,
-            "seconds": round(self.seconds, 3),
-            "stage": self.method.stage_at(self.iteration)[0],
-            "loss": float(self.loss[0]),
-            "psnr": round(psnr_of(float(self.error[0])), 3),
-            "surfels": sum(table.surfels.count for table in self.control.tables),
-            "skipped_steps": self.skipped,
-        }
-
-    def extract_mesh(self) -> Mesh:
-        """Fuse the rendered depth of all training views into a mesh and make it the occluder."""
+    def extract_mesh(self, cameras: Sequence[Camera] | None = None) -> Mesh:
+        """Fuse the rendered depth of all training views, or of `cameras`, into a mesh: the new occluder."""
         self.check()
-        assert self.method.mesh is not None
-        cameras = [view.camera() for view in self.data.views]
         options, around = self.method.mesh, self.surroundings
+        assert options is not None
+        cameras = [view.camera() for view in self.data.views] if cameras is None else cameras
         far = around.surfels.detach() if around is not None and options.unbounded else None
         mesh = surface_of(self.surfels.detach(), cameras, options.resolution, far, self.data.region)
-        self.occluder.update(mesh)
+        self.fit.occluder.update(mesh)
         return mesh
+
+    @contextmanager
+    def held_in_stage(
+        self, name: str, first: int | None = None, share_light: bool = False
+    ) -> Iterator[Callable[[], None]]:
+        """Keep steps within a stage, for measurements: nothing is refined, extracted, decided or saved.
+
+        Yields a function to call before each step. Steps start at iteration `first`, by default near the end
+        of the stage, where every SH degree is in use. Every step filters its light, so that all steps are
+        alike, unless they `share_light` as in a fit. Afterwards the iteration is what it was before.
+        """
+        setup, before = self.setup, self.iteration
+        ends = {found: stage.until for found, stage in setup.method.stages()}
+        names = [*ends]
+        begin = ends[names[names.index(name) - 1]] if names.index(name) else 0
+        end = ends[name]
+        again = min(begin + 1, end - 1)  # the first iteration of a stage may reset materials
+        if first is not None:
+            self.iteration = first
+        elif not again <= before < end:
+            self.iteration = max(again, end - 100)
+        light = setup.method.light
+        if light is not None and not share_light:
+            light = replace(light, every=1)
+        still = replace(setup.method, refine=Refine(), mesh=None, exposure=None, light=light)
+        self.setup = FitSetup(still, setup.data)
+        self.fit.prefilter.close()
+
+        def prepare() -> None:
+            if self.iteration >= end:
+                self.iteration = again
+
+        try:
+            yield prepare
+        finally:
+            self.setup, self.iteration = setup, before
 
     # ---------------- one step ----------------
 
-    def _gradient_step(self, iteration: int, stage: Stage) -> None:
-        index = self.schedule.view(iteration)
+    def _gradient_step(self, iteration: int, stage: Stage, control: AdaptiveControl) -> None:
+        fit, schedule, weights = self.fit, self.setup.schedule, self.method.loss
+        index = schedule.view(iteration)
         target = self.targets.at(iteration, index)
-        camera, surfels, around = target.camera, self.surfels, self.surroundings
+        camera, surfels, around = target.camera, fit.surfels, fit.surroundings
+
+        # Offsets of the surfels on the screen: their gradient is what densification looks at.
         rows = surfels.count + (0 if around is None else around.surfels.count)
         offset = mi.Point2f(dr.opaque(mi.Float, 0, rows), dr.opaque(mi.Float, 0, rows))
         dr.enable_grad(offset)
+
+        # Render the view, and differentiate its loss.
         shading = self._shading(stage)
-        update_missing_caches(self.occluder, self.surfels, self.light, shading)
-        light = self.window.light(self.light, shading)
-        scene = SurfelScene(surfels, shading, light, self.occluder, around)
-        request = Request(
-            ("normal",) if self.method.loss.uses_normals else (),
-            sh_degree=self.schedule.sh_degree(iteration),
-            screen_offset=offset,
-        )
+        update_missing_caches(fit.occluder, surfels, fit.light, shading)
+        light = fit.prefilter.light(fit.light, shading)
+        scene = SurfelScene(surfels, shading, light, fit.occluder, around)
+        aovs = ("normal",) if weights.uses_normals else ()
+        request = Request(aovs, sh_degree=schedule.sh_degree(iteration), screen_offset=offset)
         view = partial(render, scene, request=request)
-        frame = supersampled(view, camera, stage.samples, details=self.method.loss.uses_maps)
-        gain = self.exposure.log_gain(index)
-        loss, self.error = objective(frame, target, self.data, self.method.loss, iteration, light, gain)
+        frame = supersampled(view, camera, stage.samples, details=weights.uses_maps)
+        gain = exposure.log_gain(fit.params, index)
+        loss, self.error = objective(frame, target, self.data, weights, iteration, light, gain)
         self.loss = dr.detach(loss)
         phase("loss backward")(dr.backward)(loss)
-        if self.schedule.light_learns(iteration):
-            self.window.close()
+        if schedule.light_learns(iteration):
+            fit.prefilter.close()
 
-        fine = camera.supersampled(samples_per_axis(stage.samples))  # whose pixels the offset is in
-        self.control.observe(dr.grad(offset), fine, iteration)
+        # Statistics, the optimiser's step, and the random step of positions.
+        fine = camera.supersampled(samples_per_axis(stage.samples))  # whose pixels the offsets are in
+        control.observe(dr.grad(offset), fine, iteration)
         if iteration % self.method.log_every == 0:
             dr.schedule(self.loss, self.error)
-        self.optimiser.stage = stage.rates
-        self.optimiser.step(iteration - 1, self.loss)
-        self.control.wander(iteration)
+        fit.optimiser.stage = stage.rates
+        fit.optimiser.step(iteration - 1, self.loss)
+        control.wander(iteration)
 
     def _shading(self, stage: Stage) -> Shading:
-        return Shading.resolve(stage.shading, not self.occluder.empty)
+        return Shading.resolve(stage.shading, not self.fit.occluder.empty)
 
-    # ---------------- state ----------------
+    def _decide_exposure(self) -> None:
+        """Decide about gains, if that is due, and continue with them or without."""
+        if not exposure.is_due(self.setup, self.fit):
+            return
 
-    def state(self) -> dict[str, np.ndarray]:
-        """Everything that a checkpoint holds."""
-        return packed(self)
+        def shown(view: View) -> Frame:
+            return self.view(view.camera(), aovs=False)
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go on from the state of a checkpoint; raises InputError if it is not one of the method."""
-        require_fit(self.method, state, self.open)
-        self.exposure.restore(state)
-        self.iteration, self.seconds = int(state["iteration"]), float(state["seconds"])
-        self.checked = self.iteration
-        self.params = tensors(state, PARAMS)
-        self.optimiser = Adam(self.params, self._groups())
-        self.optimiser.load_state_dict(part(state, OPTIMISER))
-        for table in self.control.tables:
-            table.restore(state)
-        self.control.held_until = int(state["held_until"])
-        self.decisions = decisions_of(state)
-        self.occluder = occluder_of(state)
-        self.window.restore(self.light, self.shading(), state)
+        decision = exposure.decide(self.setup, self.iteration, shown)
+        self.fit.exposure = decision
+        self.tell(exposure.sentence(decision))
+        if decision["gains"] or GAIN in self.params:
+            log = exposure.fitted_log_gains(self.data, shown) if decision["gains"] else None
+            self.check()
+            self.restore(exposure.with_gains(self.state(), log))

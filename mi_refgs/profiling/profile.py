@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -15,7 +14,6 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.method import Refine
 from mi_refgs.profiling.phases import phase_times
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.shading import Shading
@@ -217,7 +215,7 @@ def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
     for name in names:
         mesh = trainer.method.mesh
         traced = Shading.resolve(trainer.method.stage[name].shading, mesh=True).occlusion
-        if traced and mesh is not None and trainer.occluder.mesh() is None:
+        if traced and mesh is not None and trainer.fit.occluder.mesh() is None:
             trainer.extract_mesh()
         found.append(profile_stage(trainer, name, steps))
     allocated = int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
@@ -227,7 +225,7 @@ def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
 
 def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
     """Times, launches and cache misses of steps in one stage of the schedule."""
-    with held_in_stage(trainer, name) as prepare:
+    with trainer.held_in_stage(name) as prepare:
         for _ in range(WARM_UP):
             prepare()
             trainer.step()
@@ -260,35 +258,6 @@ def _launches(call: Callable[[], None]) -> int:
         call()
         dr.sync_thread()
     return len(dr.kernel_history([dr.KernelType.JIT]))
-
-
-@contextmanager
-def held_in_stage(trainer: Trainer, name: str) -> Iterator[Callable[[], None]]:
-    """Keep the iteration in a stage (by what is to be called before each step), and let nothing fall due.
-
-    Every step filters its light, which those of a fit may share (`light.every`), so that all steps are alike.
-    """
-    method, schedule, before = trainer.method, trainer.schedule, trainer.iteration
-    stages = method.stages()
-    place = [found for found, _ in stages].index(name)
-    first, last = stages[place - 1][1].until if place else 0, stages[place][1].until
-    # The first iteration of a stage may reset materials.
-    first = min(first + 1, last - 1)
-    if not first <= before < last:
-        trainer.iteration = max(first, last - 100)
-    light = None if method.light is None else replace(method.light, every=1)
-    trainer.method = replace(method, refine=Refine(), mesh=None, light=light, exposure=None)
-    trainer.schedule = replace(schedule, method=trainer.method)
-    trainer.window.close()
-
-    def prepare() -> None:
-        if trainer.iteration >= last:
-            trainer.iteration = first
-
-    try:
-        yield prepare
-    finally:
-        trainer.method, trainer.schedule, trainer.iteration = method, schedule, before
 
 
 def count_work(trainer: Trainer) -> Work:

@@ -17,7 +17,7 @@ from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, MAX_GAIN, fitted_gain, log_exposure
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import exposure
-from mi_refgs.fitting.exposure import Exposure, exif_gains
+from mi_refgs.fitting.exposure import exif_gains
 from mi_refgs.fitting.objective import GAIN_PRIOR, Target, objective
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import EXIF_IFD, srgb_from_linear
@@ -27,6 +27,7 @@ from mi_refgs.methods.weights import LossWeights
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.run import Run
+from mi_refgs.splat import Camera
 from tests.fitting.image_checks import HEIGHT, STEP, WIDTH, planes
 from tests.scenes.highlight import METHOD, ball, run_folder
 
@@ -167,11 +168,17 @@ def fit(method: Method, data: Dataset) -> Trainer:
     return trainer
 
 
-def perfect(data: Dataset) -> Any:
-    """In place of `Exposure._frame`: frames that show the pictures of a data set as they are."""
+def decide(trainer: Trainer, iteration: int) -> None:
+    """Decide about gains as a step does that ends with this iteration."""
+    trainer.iteration = iteration
+    trainer._decide_exposure()
 
-    def frame(_: Exposure, view: View) -> Frame:
-        own = next(other for other in data.views if other.name == view.name)
+
+def perfect(data: Dataset) -> Any:
+    """In place of `Trainer.view`: frames that show the pictures of a data set as they are."""
+
+    def frame(_: Trainer, camera: Camera, aovs: bool = True) -> Frame:
+        [own] = [view for view in data.views if np.array_equal(view.camera().origin, camera.origin)]
         assert own.alpha is not None
         radiance = own.alpha[..., None] * own.colour(data.background)
         opacity = upload(own.alpha)
@@ -186,23 +193,23 @@ def test_gains_are_switched_on_where_pictures_have_them(
     """They begin as those that bring the render to each picture, up to the mean of all views."""
     log, said = rng.uniform(-0.5, 0.3, (12, 3)), list[str]()
     trainer = Trainer(method, exposed(ball(views=12), log))
-    trainer.exposure.tell = said.append
-    monkeypatch.setattr(Exposure, "_frame", perfect(ball(views=12)))
-    trainer.exposure.decide(DECIDED - 1)
-    assert trainer.exposure.decision is None
-    trainer.exposure.decide(DECIDED)
-    decision, gains = trainer.exposure.decision, trainer.exposure.gains()
+    trainer.tell = said.append
+    monkeypatch.setattr(Trainer, "view", perfect(ball(views=12)))
+    decide(trainer, DECIDED - 1)
+    assert trainer.fit.exposure is None
+    decide(trainer, DECIDED)
+    decision, gains = trainer.fit.exposure, exposure.gains_of(trainer.params)
     assert decision is not None and decision["gains"] and decision["iteration"] == DECIDED
     assert decision["psnr_gain"] > decision["psnr"] + 10 and len(said) == 1 and "stays" in said[0]
     assert gains is not None
     np.testing.assert_allclose(np.log(gains), log - log.mean(axis=0), atol=5e-3)
-    record = trainer.exposure.record()
+    record = exposure.record(trainer.setup, trainer.fit)
     assert record is not None and record["gain"]["3"] == gains[3].round(5).tolist()
     trainer.params[GAIN] = trainer.params[GAIN] + 0.3  # what all have in common is the scene's
-    used = trainer.exposure.log_gain(3)
+    used = exposure.log_gain(trainer.params, 3)
     assert used is not None
     np.testing.assert_allclose([float(value[0]) for value in used], np.log(gains[3]), atol=1e-6)
-    trainer.exposure.decide(DECIDED + 1)
+    decide(trainer, DECIDED + 1)
     assert len(said) == 1
 
 
@@ -220,17 +227,17 @@ def test_gains_that_fit_half_of_the_pixels_only_do_not_pay(
         image = (alpha * colour + (1 - alpha) * data.background).astype(np.float32)
         squares.append(dataclasses.replace(view, image=image))
     trainer = Trainer(method, dataclasses.replace(data, views=tuple(squares)))
-    monkeypatch.setattr(Exposure, "_frame", perfect(data))
-    trainer.exposure.decide(DECIDED)
-    decision = trainer.exposure.decision
+    monkeypatch.setattr(Trainer, "view", perfect(data))
+    decide(trainer, DECIDED)
+    decision = trainer.fit.exposure
     assert decision is not None and not decision["gains"] and decision["psnr_gain"] < decision["psnr"] - 3
 
 
 def test_where_gains_do_not_pay_the_fit_stays_what_it_was(method: Method, one_thread: None) -> None:
     method = dataclasses.replace(method, iterations=DECIDED + 4)
     trainer, without = fit(method, ball()), fit(dataclasses.replace(method, exposure=None), ball())
-    assert trainer.exposure.decision is not None and not trainer.exposure.decision["gains"]
-    assert without.exposure.decision is None
+    assert trainer.fit.exposure is not None and not trainer.fit.exposure["gains"]
+    assert without.fit.exposure is None
     found, expected = trainer.state(), without.state()
     assert found.keys() - expected.keys() == {"exposure"} and GAIN not in trainer.params
     for name in expected.keys() - {"seconds"}:
@@ -238,8 +245,8 @@ def test_where_gains_do_not_pay_the_fit_stays_what_it_was(method: Method, one_th
     choices: list[tuple[Any, bool]] = [("off", False), ("on", True)]
     for gains, there in choices:
         chosen = Trainer(dataclasses.replace(method, exposure=ExposureOptions(gains, after=2)), ball())
-        chosen.exposure.decide(method.iterations)
-        assert (chosen.exposure.decision is not None) == (GAIN in chosen.params) == there
+        decide(chosen, method.iterations)
+        assert (chosen.fit.exposure is not None) == (GAIN in chosen.params) == there
 
 
 @pytest.mark.parametrize("stop", [DECIDED - 1, DECIDED + 3])
@@ -259,7 +266,7 @@ def test_a_fit_with_gains_resumes_bit_for_bit(
         first.step()
     first.save()
     second = Trainer(method, data, Run(tmp_path / "run"))
-    second.exposure.tell = said.append
+    second.tell = said.append
     while second.iteration < method.iterations:
         second.step()
     assert len(said) == (stop < DECIDED)
@@ -284,10 +291,10 @@ def test_a_warm_step_with_gains_compiles_nothing(method: Method) -> None:
     dr.sync_thread()
     assert dr.detail.launch_stats()[2] == misses
     for _ in range(2):
-        trainer.optimiser.reset(GAIN)
+        trainer.fit.optimiser.reset(GAIN)
         before = trainer.params[GAIN].numpy()
         trainer.step()
-        index = trainer.schedule.view(trainer.iteration)
+        index = trainer.setup.schedule.view(trainer.iteration)
         moved = np.flatnonzero(np.any(trainer.params[GAIN].numpy() != before, axis=1))
         assert moved.tolist() == [index]
 

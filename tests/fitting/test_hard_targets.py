@@ -59,7 +59,7 @@ def test_a_fit_stays_finite(name: str, tmp_path: Path) -> None:
     method = dataclasses.replace(methods.load_resolved(tmp_path / "small.toml"), iterations=STEPS)
     trainer = Trainer(method, CASES[name]())
     trainer.train()
-    assert trainer.iteration == STEPS and trainer.skipped == 0 and not trainer.notices
+    assert trainer.iteration == STEPS and trainer.health.skipped == 0 and not trainer.notices
     for key, values in trainer.state().items():
         assert np.all(np.isfinite(values)), key
     frame = trainer.view(trainer.targets[0].camera)

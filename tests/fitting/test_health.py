@@ -34,7 +34,7 @@ def spoil_gradient(monkeypatch: pytest.MonkeyPatch, name: str, rows: list[int], 
     original = Adam.step
 
     def step(self: Adam, iteration: int, loss: object = None) -> None:
-        if trainers[0].schedule.view(iteration + 1) in views:
+        if trainers[0].setup.schedule.view(iteration + 1) in views:
             gradient = np.array(dr.grad(self.params[name]).numpy())
             gradient[[row for row in rows if row < len(gradient)], 0] = np.nan
             dr.set_grad(self.params[name], mi.TensorXf(gradient))
@@ -60,7 +60,7 @@ def test_surfels_with_a_gradient_that_is_not_finite_are_removed_and_named(
     run = run_folder(tmp_path / "run", still)
     trainer = Trainer(still, ball(), run)
     before = trainer.surfels.to_numpy()["albedo"]
-    failed = [i for i in range(1, 10) if trainer.schedule.view(i) == 2]
+    failed = [i for i in range(1, 10) if trainer.setup.schedule.view(i) == 2]
 
     def look(state: Trainer) -> None:
         if state.iteration == failed[0]:
@@ -69,10 +69,10 @@ def test_surfels_with_a_gradient_that_is_not_finite_are_removed_and_named(
             monkeypatch.undo()
 
     trainer.train(look)
-    assert trainer.skipped == 1 and trainer.surfels.count == len(before) - 2
+    assert trainer.health.skipped == 1 and trainer.surfels.count == len(before) - 2
     [said] = trainer.notices
     assert said == f"iteration {failed[0]}, view 2: albedo not finite at surfels 17, 52: 2 were removed"
-    assert len(trainer.control.table.gradient_sum) == trainer.surfels.count
+    assert len(trainer.fit.tables[0].gradient_sum) == trainer.surfels.count
     lines = (run.path / "metrics.jsonl").read_text().splitlines()
     assert json.loads(lines[-1])["skipped_steps"] == 1
 
@@ -86,7 +86,7 @@ def test_surfels_that_are_not_finite_are_removed_and_the_fit_goes_on(
     trainer.step()
     raw = trainer.surfels.to_numpy()
     raw[name][[3, 9], 0] = value
-    trainer.control.table.replace(Surfels.from_numpy(raw))
+    trainer.fit.tables[0].replace(Surfels.from_numpy(raw))
     trainer.train()
     assert (
         "2 were removed" in trainer.notices[0] and f"{name} not finite at surfels 3, 9" in trainer.notices[0]
@@ -112,7 +112,7 @@ def test_a_fit_in_which_every_step_fails_ends_with_one_sentence(
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(dataclasses.replace(method, refine=methods.Refine()), ball(), run)
     before = trainer.surfels.to_numpy()
-    with pytest.raises(InputError, match=r"view \d: scale not finite; .*look at that picture"):
+    with pytest.raises(InputError, match=r"view \d: scale not finite; .*look at that image"):
         trainer.train()
     assert trainer.iteration == 3 * method.log_every
     after = trainer.surfels.to_numpy()

@@ -73,7 +73,7 @@ def test_what_an_open_fit_starts_from(data: Dataset, method: Method) -> None:
     assert np.mean(np.any(views, axis=0)) > 0.99
     # The sky is 0.5 + 0.3 d in the direction d, encoded; what no view sees is grey.
     trainer = Trainer(method, data)
-    assert [table.max_count for table in trainer.control.tables] == [100, 90]
+    assert [table.max_count for table in trainer.fit.tables] == [100, 90]
     scene = TrainedScene.from_state(method, trainer.state())
     assert scene.surroundings is not None and scene.surroundings.background is not None
     assert np.ptp(scene.surroundings.background.radiance().numpy(), axis=(0, 1)).max() < 1e-6
@@ -193,18 +193,18 @@ def test_a_fit_of_an_open_scene_improves(data: Dataset, method: Method) -> None:
     end = trainer.state()
     for name in ("params/background", "params/light"):
         assert np.abs(end[name] - start[name]).max() > 1e-3, name
-    assert trainer.skipped == 0 and all(np.isfinite(x).all() for n, x in end.items() if n in start)
+    assert trainer.health.skipped == 0 and all(np.isfinite(x).all() for n, x in end.items() if n in start)
 
 
 def test_a_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> None:
     trainer = Trainer(method, data)
-    raw = trainer.control.around.surfels.to_numpy()
+    raw = trainer.fit.tables[1].surfels.to_numpy()
     raw["opacity"][[3, 5]] = np.nan
-    trainer.control.around.replace(Surfels.from_numpy(raw))
+    trainer.fit.tables[1].replace(Surfels.from_numpy(raw))
     for _ in range(2):
         trainer.step()
     trainer.check()
-    assert trainer.control.around.surfels.count == 58 and trainer.surfels.count == 80
+    assert trainer.fit.tables[1].surfels.count == 58 and trainer.surfels.count == 80
     assert "surroundings/opacity" in trainer.notices[0]
 
 

@@ -18,6 +18,7 @@ from mi_refgs.kernels import memory
 from mi_refgs.methods.method import CoarsePictures, DataOptions, Method, Rates
 from mi_refgs.methods.presets import PRESETS
 from mi_refgs.methods.surroundings import SurroundingsOptions
+from mi_refgs.splat import Camera
 from tests.scenes.highlight import METHOD
 from tests.scenes.tiny import write_data
 
@@ -123,7 +124,7 @@ class Machine:
         monkeypatch.setattr(plan.time, "thread_time", lambda: self.cpu)
         monkeypatch.setattr(plan.time, "perf_counter", lambda: self.wall)
         monkeypatch.setattr(Trainer, "step", lambda trainer: self.step(trainer))
-        monkeypatch.setattr(Trainer, "extract_mesh", lambda trainer: self.extract(trainer))
+        monkeypatch.setattr(Trainer, "extract_mesh", lambda _, cameras: self.extract(cameras))
 
     def work(self, seconds: float) -> None:
         self.cpu, self.wall = self.cpu + seconds, self.wall + self.busy * seconds
@@ -136,10 +137,10 @@ class Machine:
         late = trainer.method.stage_at(trainer.iteration)[0] == "deferred"
         self.work(1 + late + view.width * view.height + 5 * (self.steps % 7 == 0))
 
-    def extract(self, trainer: Trainer) -> None:
-        """Of 3 seconds and 0.5 for each view."""
-        self.meshes.append(len(trainer.data.views))
-        self.work(3 + 0.5 * len(trainer.data.views))
+    def extract(self, cameras: list[Camera]) -> None:
+        """Take 3 seconds, and 0.5 per view."""
+        self.meshes.append(len(cameras))
+        self.work(3 + 0.5 * len(cameras))
 
 
 @pytest.fixture

@@ -97,7 +97,7 @@ def judged(monkeypatch: pytest.MonkeyPatch, scores: list[float]) -> list[int]:
         seen.append(len(trainer.data.views))
         return next(rest)
 
-    monkeypatch.setattr(select, "held_out_psnr", psnr)
+    monkeypatch.setattr(select, "validation_psnr", psnr)
     steps = itertools.count()  # all take the same time
     monkeypatch.setattr(select.time, "process_time", lambda: float(next(steps)))
     return seen
@@ -122,7 +122,7 @@ def test_terms_stay_if_they_earn_their_price(
     ]
     assert seen == [6] * 6 and len(trainer.data.views) == 9 and trainer.iteration == 12
     assert trainer.method.terms == ("specular", "interreflection")
-    assert {*trainer.params} >= {LIGHT, "indirect_sh"} and not trainer.occluder.empty
+    assert {*trainer.params} >= {LIGHT, "indirect_sh"} and not trainer.fit.occluder.empty
     assert trainer.surfels.sh_degree() == 0
 
 
@@ -139,13 +139,13 @@ def test_a_term_without_what_it_needs_is_not_tried(
 
 
 def test_the_price_is_of_time_and_memory() -> None:
-    cheap, dear = select.Trial(20.0, 5.0, 1.0), select.Trial(20.5, 25.0, 11.0)
+    cheap, dear = select.ComponentTrial(20.0, 5.0, 1.0), select.ComponentTrial(20.5, 25.0, 11.0)
     method = methods.load("auto", "quick")
     assert method.select is not None
-    asked = select.asked(cheap, dear, method.select)
+    asked = select.required_gain(cheap, dear, method.select)
     expected = method.select.gain + 20 * method.select.gain_per_ms + 10 * method.select.gain_per_mb
     assert asked == pytest.approx(expected)
-    assert select.asked(dear, cheap, method.select) == pytest.approx(method.select.gain - expected)
+    assert select.required_gain(dear, cheap, method.select) == pytest.approx(method.select.gain - expected)
 
 
 @pytest.fixture
@@ -349,10 +349,10 @@ def test_linear_pictures_are_judged_as_they_are_shown(
 ) -> None:
     """The score of a picture in linear radiance is that of the same picture as a PNG."""
     trainer = Trainer(other(variant), views)
-    encoded = select.held_out_psnr(trainer, views)
+    encoded = select.validation_psnr(trainer, views)
     linear = tuple(
         replace(v, image=linear_from_srgb(v.image), is_linear_radiance=True)
         for v in (view.load() for view in views.views)
     )
     judges = replace(views, views=linear, is_linear_radiance=False)
-    assert select.held_out_psnr(trainer, judges) == pytest.approx(encoded, abs=1e-4)
+    assert select.validation_psnr(trainer, judges) == pytest.approx(encoded, abs=1e-4)

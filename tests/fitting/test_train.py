@@ -18,6 +18,7 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import train
+from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import DataOptions, Method, Rates
 from mi_refgs.runs.interrupt import TerminatedError, held_interrupts
@@ -42,7 +43,7 @@ def test_the_loss_falls_and_everything_trains(method: Method) -> None:
         trainer.step()
         losses.append(float(trainer.loss[0]))
     assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:6])
-    assert trainer.optimiser.report().count == 0
+    assert trainer.fit.optimiser.report().count == 0
     for name, tensor in trainer.params.items():  # the indirect channel starts at exactly 0 and must leave it
         assert np.all(np.isfinite(tensor.numpy())), name
         assert not np.array_equal(before[name], tensor.numpy()), name
@@ -116,7 +117,7 @@ def test_an_edit_clears_the_moments_of_what_it_changed(method: Method) -> None:
         return {name for name, value in trainer.state().items() if name.endswith("first") and np.any(value)}
 
     before = moving()
-    trainer.control.refine(5)
+    AdaptiveControl(trainer.setup, trainer.fit).refine(5)
     assert before - moving() == {"optimiser/opacity/first", "optimiser/scale/first"}
 
 
@@ -139,7 +140,7 @@ def test_the_screen_gradient_is_in_half_pictures(
     trainer.step()
     expected = 0.5 * (SIZE // 3) * factor * np.linalg.norm(np.array(dr.grad(offsets[0])), axis=0)
     assert expected.max() > 0
-    np.testing.assert_allclose(trainer.control.table.gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(trainer.fit.tables[0].gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
 
 
 def test_a_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: Path) -> None:
@@ -172,14 +173,14 @@ def test_a_signal_waits_for_the_step_in_hand(
     """A signal inside iteration 7, before its refinement: the checkpoint holds the whole iteration."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
-    refine = trainer.control.refine
+    refine = AdaptiveControl.refine
 
-    def interrupted_refine(iteration: int) -> None:
+    def interrupted_refine(control: AdaptiveControl, iteration: int) -> None:
         if iteration == 7:
             os.kill(os.getpid(), signal.Signals[number])
-        refine(iteration)
+        refine(control, iteration)
 
-    monkeypatch.setattr(trainer.control, "refine", interrupted_refine)
+    monkeypatch.setattr(AdaptiveControl, "refine", interrupted_refine)
     before = signal.getsignal(signal.Signals[number])
     with pytest.raises(KeyboardInterrupt) as caught:
         trainer.train()
@@ -196,16 +197,16 @@ def test_a_second_signal_is_not_held(
     """Twice within iteration 7, which ends it there; what was saved before is whole."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
-    refine, after = trainer.control.refine, []
+    refine, after = AdaptiveControl.refine, []
 
-    def interrupted_refine(iteration: int) -> None:
+    def interrupted_refine(control: AdaptiveControl, iteration: int) -> None:
         if iteration == 7:
             os.kill(os.getpid(), signal.SIGTERM)
             os.kill(os.getpid(), signal.SIGINT)
             after.append(iteration)
-        refine(iteration)
+        refine(control, iteration)
 
-    monkeypatch.setattr(trainer.control, "refine", interrupted_refine)
+    monkeypatch.setattr(AdaptiveControl, "refine", interrupted_refine)
     with pytest.raises(TerminatedError):
         trainer.train()
     state = run.load_checkpoint()
@@ -346,13 +347,13 @@ def test_a_light_that_is_shared_learns_the_sum(method: Method, monkeypatch: pyte
         rates = dataclasses.replace(still.rates, light=0.0)
         trainer = Trainer(dataclasses.replace(still, light=light, rates=rates), ball())
         seen: list[np.ndarray] = []
-        real = trainer.optimiser.step
+        real = trainer.fit.optimiser.step
 
         def step(iteration: int, loss: Any, fit: Any = trainer, seen: Any = seen, real: Any = real) -> None:
             seen.append(np.array(dr.grad(fit.params["light"]).array))
             real(iteration, loss)
 
-        monkeypatch.setattr(trainer.optimiser, "step", step)
+        monkeypatch.setattr(trainer.fit.optimiser, "step", step)
         for _ in range(3):
             trainer.step()
         assert [bool(g.any()) for g in seen] == [every == 1, every == 1, True]

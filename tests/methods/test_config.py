@@ -174,16 +174,16 @@ def test_every_preset_has_the_same_events_in_the_same_order(
     for name in ("reset_opacity", "propagate_normals", "restart"):
         monkeypatch.setattr(refine, name, recorder(name, lambda surfels: surfels))
     monkeypatch.setattr(Trainer, "extract_mesh", lambda self: done.append("mesh"))
-    monkeypatch.setattr(Trainer, "_gradient_step", lambda self, iteration, stage: None)
+    monkeypatch.setattr(Trainer, "_gradient_step", lambda *_: None)
     sequences = {}
     for preset in methods.PRESETS:
         method = methods.load(path, preset, ["surfels.count=20", "surfels.max_count=20"])
         trainer = Trainer(method, ball())
         done.clear()
         while trainer.iteration < method.iterations:
-            degree = trainer.schedule.sh_degree(trainer.iteration)
+            degree = trainer.setup.schedule.sh_degree(trainer.iteration)
             trainer.step()
-            done += ["degree"] * (trainer.schedule.sh_degree(trainer.iteration) - degree)
+            done += ["degree"] * (trainer.setup.schedule.sh_degree(trainer.iteration) - degree)
         sequences[preset] = list(done)
     counts = {name: Counter(done) for name, done in sequences.items()}
     assert counts["quick"] == counts["standard"] == counts["paper"], counts
