@@ -51,7 +51,10 @@ def test_the_loss_falls_and_everything_trains(method: Method) -> None:
 
 def with_deferred(method: Method, options: dict[str, Any]) -> Method:
     """The method with these options of its second stage."""
-    deferred = dataclasses.replace(method.stage["deferred"], **options)
+    deferred = method.stage["deferred"]
+    own = {name: value for name, value in options.items() if name == "samples"}
+    shading = dataclasses.replace(deferred.shading, **{n: x for n, x in options.items() if n not in own})
+    deferred = dataclasses.replace(deferred, shading=shading, **own)
     return dataclasses.replace(method, stage=method.stage | {"deferred": deferred})
 
 
