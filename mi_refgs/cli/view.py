@@ -52,14 +52,14 @@ def run(args: argparse.Namespace) -> Result:
         pass
     finally:
         page.close()
-    return Result({"url": page.url, "pictures": page.loop.pictures}, f"{page.loop.pictures} pictures shown")
+    return Result({"url": page.url, "pictures": page.loop.delivered}, f"{page.loop.delivered} pictures shown")
 
 
 def _serve_run(args: argparse.Namespace) -> Page:
     from mi_refgs.runs.run import Run
     from mi_refgs.viewer.serve import serve_run
 
-    return serve_run(Run(args.scene), args.host, args.port, args.output, args.data, say)
+    return serve_run(Run(args.scene), (args.host, args.port), args.output, args.data, say)
 
 
 def _serve_scene(args: argparse.Namespace) -> Page:
@@ -69,4 +69,4 @@ def _serve_scene(args: argparse.Namespace) -> Page:
     if args.data is not None:
         raise InputError(f"--data: {args.data}: a scene has no data set; give the run, or drop --data")
     scene = load_scene(scene_file(args.scene), [])
-    return serve_scene(scene, args.scene, args.host, args.port, args.output, say)
+    return serve_scene(scene, args.scene, (args.host, args.port), args.output, say)

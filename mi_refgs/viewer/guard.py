@@ -1,8 +1,8 @@
 """Access control of a page: which requests viser's server answers, and which messages it reads.
 
-viser checks neither. Every request needs the page's host name and origin and a random token, the first part
-of the address's path: a path is sent to this server alone, a cookie to all ports of a host. Every message is
-of a kind that the page's own script sends, with numbers in range; others are dropped.
+viser checks neither. Every request requires the page's host name and origin and a random token, the first
+part of the address's path: a path is sent to this server only, a cookie to all ports of a host. Messages must
+be of a kind that the page's own script sends, with numbers in range; others are dropped.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ Count = Annotated[int, msgspec.Meta(ge=0)]
 
 
 class Camera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage"):
-    """Where a page looks from."""
+    """The camera of a page."""
 
     wxyz: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
     position: Point
@@ -76,14 +76,14 @@ class Value(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Update(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage"):
-    """A control is used."""
+    """A new value of a control."""
 
     uuid: str
     updates: Value
 
 
 class Start(msgspec.Struct, tag_field="type", tag="FileTransferStartUpload"):
-    """A file is going to be sent."""
+    """The announcement of a file."""
 
     source_component_uuid: str
     transfer_uuid: Text
@@ -94,7 +94,7 @@ class Start(msgspec.Struct, tag_field="type", tag="FileTransferStartUpload"):
 
 
 class Part(msgspec.Struct, tag_field="type", tag="FileTransferPart"):
-    """A part of it."""
+    """A part of a file."""
 
     source_component_uuid: str
     transfer_uuid: str
@@ -103,31 +103,15 @@ class Part(msgspec.Struct, tag_field="type", tag="FileTransferPart"):
 
 
 DECODER = msgspec.msgpack.Decoder(Camera | Update | Start | Part)
-
-
-def _is_option(control: Any, value: object) -> bool:
-    return value in control.options
-
-
-def _is_flag(control: Any, value: object) -> bool:
-    return isinstance(value, bool)
-
-
-def _in_range(control: Any, value: object) -> bool:
-    return isinstance(value, float) and control.min <= value <= control.max
-
-
-def _is_text(control: Any, value: object) -> bool:
-    return isinstance(value, str)
-
-
-VALUES: dict[str, Callable[[Any, object], bool]] = {
-    "GuiButtonHandle": _is_flag,
-    "GuiButtonGroupHandle": _is_option,
-    "GuiCheckboxHandle": _is_flag,
-    "GuiDropdownHandle": _is_option,
-    "GuiSliderHandle": _in_range,
-    "GuiTextHandle": _is_text,
+VALUES: dict[str, Callable[[Any, Any], bool]] = {
+    "GuiButtonHandle": lambda control, value: isinstance(value, bool),
+    "GuiButtonGroupHandle": lambda control, value: value in control.options,
+    "GuiCheckboxHandle": lambda control, value: isinstance(value, bool),
+    "GuiDropdownHandle": lambda control, value: value in control.options,
+    "GuiSliderHandle": lambda control, value: (
+        isinstance(value, float) and control.min <= value <= control.max
+    ),
+    "GuiTextHandle": lambda control, value: isinstance(value, str),
 }
 """Whether a page may set a control to a value, by viser's class of the control; no other class may be set."""
 UPLOAD = "GuiUploadButtonHandle"
@@ -145,67 +129,70 @@ class Upload:
 
 
 class Guard:
-    """What one page answers and reads."""
+    """The requests that a page answers, and the messages that it reads."""
 
     def __init__(self, host: str) -> None:
-        """For a server that listens at `host`; nothing is answered until it is `in_place`."""
+        """Guard a server that listens at `host`."""
         self.host = host.lower()
         self.token = secrets.token_hex(16)
-        self.in_place = False  # viser's server has been made with it
-        self.controls: Mapping[str, Any] = {}  # viser's handles, by their ids
-        self.refused: Callable[[str], None] = lambda reason: None  # told why a file is not taken
+        self.in_place = False  # whether viser's server uses it
+        self.controls: Mapping[str, Any] = {}  # viser's handles by id
+        self.refused: Callable[[str], None] = lambda reason: None  # called with why a file is refused
         self._upload: Upload | None = None
 
     def url(self, port: int) -> str:
-        """The address that opens the page."""
+        """Return the address that opens the page."""
         host = socket.gethostname() if self.host in WILDCARDS else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{port}/{self.token}/"
 
     # ---------------- requests ----------------
 
     def refusal(self, request: Request) -> str | None:
-        """Why a request is refused, one sentence; None for one that is answered."""
+        """Return why a request is refused, one sentence; None for one that is answered."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_own(hosts[0]):
             return "This server answers to its own host name only: open the address that the terminal shows."
         own = [f"{scheme}://{hosts[0]}".lower() for scheme in ("http", "https")]
         if any(origin.lower() not in own for origin in origins):
             return "Pages of other sites may not use this server."
-        if not hmac.compare_digest(_parts(request.path)[0].encode(errors="replace"), self.token.encode()):
+        if not hmac.compare_digest(split(request.path)[0].encode(errors="replace"), self.token.encode()):
             return "The token is missing: open the address that the terminal shows."
         return None
 
     def _is_own(self, host: str) -> bool:
-        """Whether a Host header names this server: a foreign name may be one that its owner points here."""
-        try:
+        """Whether a Host header names this server; the owner of a foreign name may resolve it to here."""
+        with contextlib.suppress(ValueError):
             name = urlsplit(f"//{host}").hostname or ""
-        except ValueError:
-            return False
-        if name in LOOPBACK or name == self.host:
-            return True
-        return self.host not in LOOPBACK and (name == socket.gethostname().lower() or _is_address(name))
+            if name in LOOPBACK or name == self.host:
+                return True
+            if self.host not in LOOPBACK:
+                return name == socket.gethostname().lower() or bool(ipaddress.ip_address(name))
+        return False
 
     # ---------------- messages ----------------
 
     def admits(self, connection: Any, raw: object) -> bool:
         """Whether viser may read a message of a connection."""
-        if not isinstance(raw, bytes):
-            return False
         try:
-            message = DECODER.decode(raw)
+            message = DECODER.decode(raw) if isinstance(raw, bytes) else None
         except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
             return False
-        if isinstance(message, Camera):
-            turned = 0.5 < math.hypot(*message.wxyz) < 2
-            return turned and message.image_width * message.image_height <= PIXELS
-        if isinstance(message, Update):
-            control, value = self.controls.get(message.uuid), message.updates.value
-            allowed = VALUES.get(type(control).__name__)
-            return allowed is not None and allowed(control, value)
-        return self._starts(connection, message) if isinstance(message, Start) else self._goes_on(message)
+        match message:
+            case Camera():
+                is_rotation = 0.5 < math.hypot(*message.wxyz) < 2
+                return is_rotation and message.image_width * message.image_height <= PIXELS
+            case Update():
+                control = self.controls.get(message.uuid)
+                allowed = VALUES.get(type(control).__name__)
+                return allowed is not None and allowed(control, message.updates.value)
+            case Start():
+                return self._may_start(connection, message)
+            case Part():
+                return self._may_continue(message)
+        return False
 
-    def _starts(self, connection: Any, start: Start) -> bool:
-        """Whether an upload may begin: one at a time on all pages, so that memory is bounded, too."""
+    def _may_start(self, connection: Any, start: Start) -> bool:
+        """Whether an upload may begin: one at a time on all pages, which bounds memory, too."""
         if type(self.controls.get(start.source_component_uuid)).__name__ != UPLOAD:
             return False
         if start.size_bytes > UPLOAD_BYTES:
@@ -220,7 +207,7 @@ class Guard:
             self._upload = Upload(connection, start.transfer_uuid, start.part_count, start.size_bytes)
         return True
 
-    def _goes_on(self, part: Part) -> bool:
+    def _may_continue(self, part: Part) -> bool:
         upload = self._upload
         if upload is None or (part.transfer_uuid, part.part_index) != (upload.transfer, upload.next_part):
             return False
@@ -233,26 +220,18 @@ class Guard:
         return True
 
 
-def _parts(path: str) -> tuple[str, str]:
-    """The first part of a path, and the path that follows."""
+def split(path: str) -> tuple[str, str]:
+    """Return the first part of a path, and the rest as a path."""
     first, _, rest = path.removeprefix("/").partition("/")
     first, mark, query = first.partition("?")
     return first, f"/{rest}{mark}{query}"
 
 
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
-
-
 @contextlib.contextmanager
 def guarded(guard: Guard) -> Iterator[None]:
-    """Let the WebSocket server that is made inside ask a guard first, and be the only one that does.
+    """Let the WebSocket server that is created inside pass requests and messages through a guard.
 
-    Raises InputError if the installed viser or websockets offer no such place: nothing is served unguarded.
+    Raises InputError if the installed websockets has no such interface: nothing is served unguarded.
     """
     original = websockets_server.serve
     offered = inspect.signature(original).parameters
@@ -269,7 +248,7 @@ def guarded(guard: Guard) -> Iterator[None]:
         def check(connection: Any, request: Request) -> Any:
             if (reason := guard.refusal(request)) is not None:
                 return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
-            inner = replace(request, path=_parts(request.path)[1])
+            inner = replace(request, path=split(request.path)[1])
             return None if process_request is None else process_request(connection, inner)
 
         options |= {"max_size": MESSAGE_BYTES, "create_connection": Connection, "process_request": check}
@@ -284,7 +263,7 @@ def guarded(guard: Guard) -> Iterator[None]:
 
 
 def guard_controls(guard: Guard, server: Any) -> None:
-    """Let pages use the controls of viser's server; an unguarded one is stopped, and InputError raised."""
+    """Let pages use the controls of viser's server; stop an unguarded one and raise InputError."""
     controls: dict[str, Any] | None = getattr(server.gui, "_gui_input_handle_from_uuid", None)
     if not guard.in_place or controls is None:
         server.stop()

@@ -1,7 +1,7 @@
-"""The one thread that renders: for whoever looks, small pictures while something moves, better ones after.
+"""The render thread: coarse frames during motion, refined at rest.
 
-A picture is drawn in steps of one sample a pixel; what has changed meanwhile is seen between two of them, and
-what was under way is then dropped. Callbacks of the page run on other threads: they only leave a note here.
+An image is drawn in steps of one sample per pixel. A change is noticed between two steps, and the image that
+it outdates is dropped. Callbacks of the page run on other threads: they only queue tasks here.
 """
 
 from __future__ import annotations
@@ -18,115 +18,99 @@ import drjit as dr
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.types import Float
 from mi_refgs.viewer import resolution
-from mi_refgs.viewer.compare import Compared
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.resolution import COARSE, DONE, LARGE, NOTHING, SHOWN_AT
-from mi_refgs.viewer.tonemap import DisplayOptions, shown_planes, to_bytes
-from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
+from mi_refgs.viewer.tonemap import DisplayOptions, displayed_planes, to_bytes
+from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
 
 FAR = 160.0
-"""Depth that pages can show at most, scene units: viser packs it into 24 bits of 1e-5."""
+"""Largest depth that pages can represent, scene units: viser packs it into 24 bits of 1e-5."""
+
+Comparison = Callable[[ViewerScene, DisplayOptions, tuple[int, int]], np.ndarray]
+"""Draws an image that a page displays instead, (H, W, 3) uint8, for a window's width and height."""
 
 
 @dataclass(frozen=True, eq=False)
 class DeliveredImage:
-    """A picture for a page."""
+    """An image for a page."""
 
     image: np.ndarray  # (H, W, 3) uint8
-    shown: int  # how good it is, from resolution.COARSE to resolution.DONE
-    seconds: float  # that its last sample took
-    depth: np.ndarray | None = None  # (H, W) float32, where the page asked for it
-    samples: int = 1  # of a pixel
+    progress: int  # from resolution.COARSE to resolution.DONE
+    seconds: float  # of its last sample
+    depth: np.ndarray | None = None  # (H, W) float32, if the page requires it
+    samples: int = 1  # per pixel
 
 
 @dataclass(eq=False)
 class Client:
-    """One page: what it looks at, and how far its picture is."""
+    """An open page: its view, and the progress of its image."""
 
     deliver: Callable[[DeliveredImage], None]
     pose: Pose | None = None
     window: tuple[int, int] = (0, 0)  # pixels
     look: DisplayOptions = field(default_factory=DisplayOptions)
-    largest: int = resolution.FINEST  # rung while nothing moves, at most
-    fixed: int | None = None  # rung while something moves; None: by the time that pictures take
-    depth: bool = False  # whether it wants depth
-    compared: Compared | None = None  # a test view that it shows beside its picture
-    side: int = resolution.COARSEST  # rung of the next small picture
-    changed: float = -math.inf  # when its view or the scene changed last
-    version: int = 0  # of both
-    shown: int = DONE
-    sums: list[Any] = field(default_factory=list)  # planes, over samples of a smooth picture
-
-    def size(self, side: int, square: bool) -> tuple[int, int]:
-        """Pixels of a rung in the shape of its window; if they are `square`, in exactly that shape."""
-        width, height = self.window
-        exact = max(width, 1) / max(height, 1)
-        return resolution.size_of(side, exact if square else resolution.shape_of(width, height))
+    largest: int = resolution.FINEST  # finest resolution level at rest
+    fixed: int | None = None  # resolution level during motion; None: by the time per image
+    depth: bool = False  # whether it requires depth
+    comparison: Comparison | None = None  # replaces its image
+    side: int = resolution.COARSEST  # resolution level of the next image during motion
+    changed: float = -math.inf  # time of the last change of its view or of the scene
+    version: int = 0  # counts these changes
+    progress: int = DONE
+    sums: list[Float] = field(default_factory=list)  # planes (H*W,), over samples of a supersampled image
 
 
 class RenderLoop:
-    """Draws a scene for visitors; `step` and `run` belong to the thread that renders, the rest to any."""
+    """Draws a scene for clients; `step` and `run` belong to the render thread, the rest to any thread."""
 
-    def __init__(self, drawable: ViewerScene, clock: Callable[[], float] = time.monotonic) -> None:
-        self.drawable, self.clock = drawable, clock
-        self.visitors: dict[int, Client] = {}
-        self.failed: Callable[[str], None] = lambda message: None  # told of what fails, in one sentence
-        self.pictures = 0  # that were sent
-        self.smooth = True  # whether pictures that stay are averaged over samples
-        self._notes: dict[Any, Callable[[], None]] = {}
+    def __init__(self, scene: ViewerScene, clock: Callable[[], float] = time.monotonic) -> None:
+        self.scene, self.clock = scene, clock
+        self.clients: dict[int, Client] = {}
+        self.report: Callable[[str], None] = lambda message: None  # called with a sentence about a failure
+        self.delivered = 0  # images
+        self.smooth = True  # whether images at rest are supersampled
+        self._tasks: dict[Any, Callable[[], None]] = {}
         self._wake = threading.Condition()
         self._stopped = False
 
     # ---------------- from any thread ----------------
 
-    def ask(self, key: Any, note: Callable[[], None], *, changes: bool = True) -> None:
-        """Let the renderer's thread call `note`; a later one with the same key takes its place.
+    def submit(self, key: Any, task: Callable[[], None], *, changes: bool = True) -> None:
+        """Queue a task for the render thread; it replaces a waiting task with the same key.
 
-        `changes`: whether pictures are to be drawn again.
+        `changes`: whether images have to be drawn again.
         """
 
-        def whole() -> None:
-            note()
+        def run() -> None:
+            task()
             if changes:
                 self.change()
 
         with self._wake:
-            self._notes[key] = whole
-            self._wake.notify()
-
-    def look(self, number: int, pose: Pose, window: tuple[int, int]) -> None:
-        """A visitor looks from there, with a window of so many pixels."""
-        with self._wake:
-            visitor = self.visitors.get(number)
-            if visitor is None:
-                return
-            visitor.pose, visitor.window = pose, window
-            self._restart(visitor)
+            self._tasks[key] = run
             self._wake.notify()
 
     def change(self, number: int | None = None, **fields: Any) -> None:
-        """The picture of a visitor, or of all, is old; sets these fields of it."""
+        """Outdate the image of a client, or of all, and set fields of it."""
         with self._wake:
-            for visitor in (v for n, v in self.visitors.items() if number in (None, n)):
+            for client in (c for n, c in self.clients.items() if number in (None, n)):
                 for name, value in fields.items():
-                    setattr(visitor, name, value)
-                self._restart(visitor)
+                    setattr(client, name, value)
+                client.changed, client.progress, client.sums = self.clock(), NOTHING, []
+                client.version += 1
             self._wake.notify()
 
-    def _restart(self, visitor: Client) -> None:
-        visitor.changed, visitor.shown, visitor.sums = self.clock(), NOTHING, []
-        visitor.version += 1
-
-    def enter(self, number: int, visitor: Client) -> None:
-        """A page is open."""
+    def enter(self, number: int, client: Client) -> None:
+        """Add the client of an opened page."""
         with self._wake:
-            self.visitors[number] = visitor
+            self.clients[number] = client
 
     def leave(self, number: int) -> None:
-        """A page is closed."""
+        """Remove the client of a closed page."""
         with self._wake:
-            self.visitors.pop(number, None)
+            self.clients.pop(number, None)
 
     def stop(self) -> None:
         """Let `run` return."""
@@ -134,117 +118,125 @@ class RenderLoop:
             self._stopped = True
             self._wake.notify()
 
-    # ---------------- on the renderer's thread ----------------
+    # ---------------- on the render thread ----------------
 
     def run(self) -> None:
         """Draw until `stop`."""
         while not self._stopped:
             wait = self.step()
             if wait == math.inf:
-                dr.flush_malloc_cache()  # what the sizes of pictures have left there
+                dr.flush_malloc_cache()  # buffers of other image sizes
             with self._wake:
-                if wait > 0 and not self._notes and not self._stopped:
+                if wait > 0 and not self._tasks and not self._stopped:
                     self._wake.wait(None if wait == math.inf else wait)
 
     def step(self) -> float:
-        """Read the notes, then draw the sample that is due; returns the seconds until the next one is.
+        """Run the tasks, then draw the sample that is due; returns the seconds until the next one is.
 
         0 after a sample was drawn; inf while there is nothing to do.
         """
         with self._wake:
-            notes, self._notes = self._notes, {}
-        for note in notes.values():
-            self._guarded(note)
-        now = self.clock()
-        waiting = [
-            (resolution.due(v.shown if self.smooth or v.shown < LARGE else DONE, now - v.changed), v.shown, v)
-            for v in tuple(self.visitors.values())
-            if v.pose is not None
-        ]
+            tasks, self._tasks = self._tasks, {}
+        for task in tasks.values():
+            self._succeeds(task)
+
+        # The client with the least progress goes first.
+        waiting = []
+        for client in tuple(self.clients.values()):
+            if client.pose is not None:
+                progress = client.progress if self.smooth or client.progress < LARGE else DONE
+                wait = resolution.due(progress, self.clock() - client.changed)
+                waiting.append((wait, client.progress, client))
         if not waiting:
             return math.inf
-        wait, _, visitor = min(waiting, key=lambda entry: entry[:2])  # who sees least goes first
+        wait, _, client = min(waiting, key=lambda entry: entry[:2])
         if wait > 0:
             return wait
-        version = visitor.version
-        if not self._guarded(lambda: self._advance(visitor)):
+        version = client.version
+        if not self._succeeds(lambda: self._advance(client)):
             with self._wake:
-                if visitor.version == version:  # else it would fail again at once, without an end
-                    visitor.shown, visitor.sums = DONE, []
+                if client.version == version:  # else it would fail again at once, without an end
+                    client.progress, client.sums = DONE, []
         return 0.0
 
-    def _guarded(self, task: Callable[[], None]) -> bool:
-        """Whether a task succeeds. The page is told of a failure in one sentence, and goes on."""
+    def _succeeds(self, task: Callable[[], None]) -> bool:
+        """Whether a task succeeds; a failure is reported in one sentence."""
         try:
             task()
         except InputError as error:
-            self.failed(str(error))
+            self.report(str(error))
         except Exception as error:
             traceback.print_exc()
             reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
-            self.failed(f"{reason}; what was shown stays, and the terminal shows where this failed")
+            self.report(f"{reason}; the image stays as it was, and the terminal shows where this failed")
         else:
             return True
         return False
 
-    def _advance(self, visitor: Client) -> None:
-        """Draw a visitor's next sample and send the picture, unless it is old by then."""
+    def _advance(self, client: Client) -> None:
+        """Draw a client's next sample and deliver the image, unless it is outdated by then."""
         with self._wake:
-            version, shown, pose, compared = visitor.version, visitor.shown, visitor.pose, visitor.compared
-            sums = visitor.sums
+            version, before, comparison = client.version, client.progress, client.comparison
+            sums, pose, window = client.sums, client.pose, client.window
         assert pose is not None
         begin = self.clock()
-        if compared is not None:
-            image, depth, reached = compared.picture(self.drawable, visitor.look, visitor.window), None, DONE
+        image, depth, progress, still, side = None, None, DONE, 0, 0
+        if comparison is not None:
+            image = comparison(self.scene, client.look, window)
         else:
-            still = resolution.still_side(*visitor.window, visitor.largest)
-            moving = visitor.fixed or min(visitor.side, still)
-            side = moving if shown == NOTHING else still
-            reached = shown + 1 if shown >= LARGE else (LARGE if side >= still else COARSE)
-            sample = self._sample(visitor, pose, side, reached)
-            sampled = self.drawable.draw(sample)
-            sums = added(sums, sampled.planes)
-            count = max(reached - LARGE, 1)
-            image = None
-            if reached <= LARGE or reached in SHOWN_AT:
-                share = dr.opaque(type(sums[0]), 1 / count)
-                mean = [plane * share for plane in sums] if count > 1 else sums
-                image = to_bytes(shown_planes(mean, visitor.look), sample.width, sample.height)
-            depth = self._depth(visitor, sampled, sample) if image is not None else None
+            # Resolution level, and progress after this sample.
+            still = resolution.still_side(*window, client.largest)
+            side = (client.fixed or min(client.side, still)) if before == NOTHING else still
+            progress = before + 1 if before >= LARGE else LARGE if side >= still else COARSE
+
+            # One sample per pixel, added to those before.
+            index = max(progress - LARGE - 1, 0)
+            aspect = window[0] / max(window[1], 1)
+            exact = max(window[0], 1) / max(window[1], 1)
+            shape = exact if self.scene.square_pixels else resolution.shape_of(*window)
+            request = SampleRequest(
+                replace(pose, aspect=aspect),
+                *resolution.size_of(side, shape),
+                client.look,
+                resolution.offsets()[index] if progress > LARGE else (0.0, 0.0),
+                index,
+                settled=progress >= LARGE,
+                depth=client.depth,
+            )
+            drawn = self.scene.draw(request)
+            sums = added(sums, drawn.planes)
+
+            # The mean as an image, if it is to be sent.
+            if progress <= LARGE or progress in SHOWN_AT:
+                share = dr.opaque(type(sums[0]), 1 / (index + 1))
+                mean = [plane * share for plane in sums] if index else sums
+                size = request.width, request.height
+                image = to_bytes(displayed_planes(mean, client.look), *size)
+                if client.depth and drawn.depth is not None:
+                    depth = depth_image(drawn.depth, *size)
             dr.sync_thread()
         taken = self.clock() - begin
         with self._wake:
-            if compared is None and shown == NOTHING and visitor.fixed is None:
-                visitor.side = resolution.moving_side(side, taken, still)
-            if visitor.version == version:
-                visitor.shown, visitor.sums = reached, sums if LARGE < reached < DONE else []
-            elif shown != NOTHING:  # a small picture is shown all the same: else nothing is while it moves
+            if comparison is None and before == NOTHING and client.fixed is None:
+                client.side = resolution.moving_side(side, taken, still)
+            if client.version == version:
+                client.progress, client.sums = progress, sums if LARGE < progress < DONE else []
+            elif before != NOTHING:  # a coarse image is delivered: else nothing would be during motion
                 return
         if image is not None:
-            self.pictures += 1
-            samples = 1 if compared is not None else max(reached - LARGE, 1)
-            visitor.deliver(DeliveredImage(image, reached, taken, depth, samples))
-
-    def _sample(self, visitor: Client, pose: Pose, side: int, reached: int) -> SampleRequest:
-        width, height = visitor.size(side, self.drawable.square_pixels)
-        aspect = visitor.window[0] / max(visitor.window[1], 1)
-        index = max(reached - LARGE - 1, 0)
-        offset = resolution.offsets()[index] if reached > LARGE else (0.0, 0.0)
-        pose = replace(pose, aspect=aspect)
-        settled = reached >= LARGE
-        return SampleRequest(pose, width, height, visitor.look, offset, index, settled, depth=visitor.depth)
-
-    def _depth(self, visitor: Client, sampled: SampleResult, sample: SampleRequest) -> np.ndarray | None:
-        if not visitor.depth or sampled.depth is None:
-            return None
-        depth = dr.select(sampled.depth > 0, sampled.depth, FAR) + dr.zeros(
-            type(sampled.depth), sample.width * sample.height
-        )
-        return np.array(depth.numpy(), dtype=np.float32).reshape(sample.height, sample.width)
+            self.delivered += 1
+            samples = 1 if comparison is not None else max(progress - LARGE, 1)
+            client.deliver(DeliveredImage(image, progress, taken, depth, samples))
 
 
-def added(sums: list[Any], planes: list[Any]) -> list[Any]:
-    """Sums of planes, evaluated."""
+def added(sums: list[Float], planes: list[Float]) -> list[Float]:
+    """Return sums of planes, evaluated."""
     total = [a + b for a, b in zip(sums, planes, strict=True)] if sums else list(planes)
     dr.eval(total)
     return total
+
+
+def depth_image(depth: Float, width: int, height: int) -> np.ndarray:
+    """Return depth (H, W) float32 of depth (H*W,) or (1,): FAR where nothing is seen."""
+    values = dr.select(depth > 0, depth, FAR) + dr.zeros(type(depth), width * height)
+    return np.array(values.numpy(), dtype=np.float32).reshape(height, width)

@@ -1,11 +1,10 @@
-"""A reconstruction as a page shows it: its surfels with changed materials, under a light that turns."""
+"""A reconstruction as a viewer scene: with changed materials, under a rotated or another light."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,179 +20,141 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, backdrops_of, planes_of
-from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, fine_planes
+from mi_refgs.viewer.tonemap import IMAGE, backdrops_of, planes_of
+from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
 
 OUTLIERS = 2.0
 """Percent of the surfels along each axis and side that do not count as the object."""
 
 Change = Callable[[TrainedScene], TrainedScene]
-"""An edit of a scene that keeps its rows."""
+"""An edit of a scene that keeps number and order of its surfels."""
 
 
 def bounds_of(surfels: Surfels, region: Region | None = None) -> tuple[np.ndarray, float]:
-    """Centre (3,) and radius of the object: its region, else where most of its surfels are."""
+    """Return centre (3,) and radius of the object: its region, else where most of its surfels are."""
     if region is not None:
         return np.array(region.centre), region.radius
     position = surfels.to_numpy()["position"].astype(np.float64)
-    return around_box(*box_of(position)) if len(position) else (np.zeros(3), 1.0)
+    return sphere_around(*box_of(position)) if len(position) else (np.zeros(3), 1.0)
 
 
 def box_of(position: np.ndarray) -> np.ndarray:
-    """Lower and upper corner (2, 3) of the box of most positions (N, 3), N > 0."""
+    """Return lower and upper corner (2, 3) of the box of most positions (N, 3), N > 0."""
     return np.percentile(position, (OUTLIERS, 100 - OUTLIERS), axis=0)
 
 
-def around_box(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (3,) and radius of the sphere around a box."""
+def sphere_around(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return centre (3,) and radius of the sphere around a box."""
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
 
 def variables_of(surfels: Surfels, shading: Shading) -> tuple[str, ...]:
-    """The picture and the variables that such surfels have."""
+    """Return the image and the AOVs that such surfels have."""
     maps = [name for name in surfels.raw if ATTRIBUTES[name].aov]
     traced = ["visibility"] if shading.occlusion else []
     terms = () if shading.model.light == "none" else TERMS if traced else TERMS[:2]
     return (IMAGE, *maps, "normal", "depth", "alpha", *traced, *terms)
 
 
-class ReconstructionView:
-    """A `TrainedScene` of which parts change. What costs time is made again only where it has to be."""
-
-    square_pixels = False
-    scene: TrainedScene
+class ReconstructionView(ViewerScene):
+    """A `TrainedScene` of which parts change; only what depends on a change is computed again."""
 
     def __init__(self, scene: TrainedScene, region: Region | None = None) -> None:
-        """Show the scene as it is; `region` is what its data set is about."""
-        self.original = scene
+        """Display a scene, whose data set may have a region of interest."""
+        self.original = self._base = self.scene = scene
         self.centre, self.radius = bounds_of(scene.surfels, region)
-        self.turn = 0.0  # degrees that the light is turned about z, counter-clockwise from above
+        self.can_turn = scene.light is not None and scene.shading.model.light != "none"  # its environment map
+        self.variables = variables_of(scene.surfels, scene.shading)
+        self.backdrops = backdrops_of(scene.surroundings is not None, self.can_turn)
+        self.materials = tuple(name for name in ("roughness", "metallic") if scene.surfels.has(name))
+        self.can_relight = not lacking(scene)
+        self.turn = 0.0  # rotation of the light about z, degrees, counter-clockwise seen from above
         self.environment = scene.light
         self.changes: list[Change] = []
-        self.relit = False
         self._relightable: TrainedScene | None = None
-        self._put(scene)
+        self.set_relit(False)
 
-    # ---------------- what there is ----------------
-
-    @property
-    def variables(self) -> tuple[str, ...]:
-        """See `ViewerScene`."""
-        return variables_of(self.scene.surfels, self.scene.shading)
-
-    @property
-    def backdrops(self) -> tuple[str, ...]:
-        """See `ViewerScene`."""
-        return backdrops_of(self.scene.surroundings is not None, self.lit)
-
-    @property
-    def lit(self) -> bool:
-        """Whether it has a light that may turn."""
-        return self.scene.light is not None and self.scene.shading.model.light != "none"
-
-    @property
-    def materials(self) -> tuple[str, ...]:
-        """Channels of one number a surfel that may be set."""
-        return tuple(name for name in ("roughness", "metallic") if self.scene.surfels.has(name))
-
-    @property
-    def can_relight(self) -> bool:
-        """Whether `runs.relightable` takes it."""
-        return not lacking(self.original)
-
-    # ---------------- what changes it ----------------
+    # ---------------- changes ----------------
 
     def set_light(self, light: EnvironmentLight | None) -> None:
-        """Put another light in place of the scene's own; None brings that back."""
+        """Replace the scene's light; None restores it."""
         self.environment = self.original.light if light is None else light
         self._filter()
 
     def set_turn(self, degrees: float) -> None:
-        """Turn the light to this angle about z, counter-clockwise seen from above."""
+        """Rotate the light to this angle about z, counter-clockwise seen from above."""
         self.turn = float(degrees)
         self._stale = True
 
     def set_relit(self, relit: bool) -> None:
-        """Show materials alone, as `refgs relight` does, or what was fitted; InputError as that raises."""
+        """Display materials only, as `refgs relight` does, or the scene as fitted.
+
+        Raises InputError as `runs.relightable` does.
+        """
         if relit and self._relightable is None:
             self._relightable = relightable(self.original)
-        self.relit = relit
-        self._rebuild()
-
-    def set_changes(self, changes: list[Change]) -> None:
-        """Show the scene after these edits, in order."""
-        self.changes = list(changes)
-        before = self.scene
-        scene = self._base()
-        for change in self.changes:
-            scene = change(scene)
-        self.scene = replace(before, surfels=scene.surfels)
-        self._stale = True
-
-    def _base(self) -> TrainedScene:
-        return self._relightable if self.relit and self._relightable is not None else self.original
-
-    def _rebuild(self) -> None:
-        self._put(self._base())
+        self._base = self._relightable if relit and self._relightable is not None else self.original
+        self.scene = self._base
+        self._occluder = Occluder(self.scene.mesh)
+        self._filter()
         self.set_changes(self.changes)
 
-    def _put(self, scene: TrainedScene) -> None:
-        """Show a scene with a mesh of its own."""
-        self.scene = scene
-        self._occluder = Occluder(scene.mesh)
-        self._filter()
+    def set_changes(self, changes: list[Change]) -> None:
+        """Display the scene after these edits, in order."""
+        self.changes = list(changes)
+        scene = self._base
+        for change in self.changes:
+            scene = change(scene)
+        self.scene = replace(self.scene, surfels=scene.surfels)
+        self._stale = True
 
     def _filter(self) -> None:
         with dr.suspend_grad():
             self._filtered = self.scene.shading.light_of(self.environment)
-        self._stale = True
+        self._stale = True  # caches of the occluder
 
     @property
     def light(self) -> Light | None:
-        """The light as it is turned. The angle is opaque, so that no kernel depends on it."""
+        """The rotated light. The angle is opaque, so that no kernel depends on it."""
         if self._filtered is None:
             return None
         angle = math.radians(self.turn)
         cos, sin = dr.opaque(mi.Float, math.cos(angle)), dr.opaque(mi.Float, math.sin(angle))
         return RotatedLight(self._filtered, mi.Matrix3f([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]))
 
-    # ---------------- pictures ----------------
+    # ---------------- images ----------------
 
     def frame(
-        self, camera: Any, aovs: Collection[str] = (), settled: bool = True, alone: bool = False
+        self, camera: Camera, aovs: Collection[str] = (), settled: bool = True, object_only: bool = False
     ) -> Frame:
-        """A view, without derivatives; until it is `settled`, ambient shadows may be those of before.
-
-        `aovs` as in `render`; `alone`: without the surroundings.
-        """
-        light = self.light
+        """Render a view forward only; ambient shadows may be outdated unless it is `settled`."""
+        light, scene = self.light, self.scene
         with dr.suspend_grad():
-            if self._stale and (settled or self._never):
-                update_occluder_caches(self._occluder, self.scene.surfels, light, self.scene.shading)
+            if self._stale and (settled or self._lacks_caches):
+                update_occluder_caches(self._occluder, scene.surfels, light, scene.shading)
                 self._stale = False
-            surroundings = None if alone else self.scene.surroundings
-            scene = SurfelScene(self.scene.surfels, self.scene.shading, light, self._occluder, surroundings)
-            return render(scene, camera, Request(aovs, forward_only=True))
+            background = None if object_only else scene.surroundings
+            rendered = SurfelScene(scene.surfels, scene.shading, light, self._occluder, background)
+            return render(rendered, camera, Request(aovs, forward_only=True))
 
     @property
-    def _never(self) -> bool:
-        """Whether the mesh lacks what the shading asks for altogether."""
-        shading = self.scene.shading
-        wanted = bool(shading.ambient_rays), bool(shading.traced_bounces)
-        there = self._occluder.ambient is not None, self._occluder.vertex_surfels is not None
-        return not self._occluder.empty and any(w and not t for w, t in zip(wanted, there, strict=True))
+    def _lacks_caches(self) -> bool:
+        """Whether the occluder has no ambient visibility, or no vertex materials, that the shading needs."""
+        shading, occluder = self.scene.shading, self._occluder
+        ambient = bool(shading.ambient_rays) and occluder.ambient is None
+        traced = bool(shading.traced_bounces) and occluder.vertex_surfels is None
+        return not occluder.empty and (ambient or traced)
 
     def draw(self, sample: SampleRequest) -> SampleResult:
         """See `ViewerScene`."""
         camera = sample.camera()
-        frame = self.frame(camera, sample.asked, sample.settled, sample.look.object_only)
+        frame = self.frame(camera, sample.aovs, sample.settled, sample.look.object_only)
         with dr.suspend_grad():
             return SampleResult(planes_of(frame, camera, sample.look, self.light), frame.depth)
 
-    def fine(self, pose: Pose, width: int, height: int, look: DisplayOptions) -> list[Any]:
+    def cost(self) -> tuple[Shading, int]:
         """See `ViewerScene`."""
-        scene = self.scene
-        return fine_planes(self.draw, pose, width, height, look, scene.shading, scene.count)
+        return self.scene.shading, self.scene.count

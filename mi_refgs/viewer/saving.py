@@ -1,4 +1,4 @@
-"""Save what is seen: as PNG, as EXR, as a camera."""
+"""Saving of the displayed view: as PNG, as EXR, as a camera."""
 
 from __future__ import annotations
 
@@ -14,76 +14,70 @@ from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import cannot_write, make_folder
 from mi_refgs.io.images import straight_srgb, write_png
 from mi_refgs.shade.points import TERMS
+from mi_refgs.types import Float
 from mi_refgs.viewer.page import Page
-from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, seen_of, shown_planes
-from mi_refgs.viewer.viewer_scene import ViewerScene
+from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, composited, displayed_planes
+from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
 
 NUMBERED = re.compile(r"view_\d{3,6}", re.ASCII)
-"""Names of views. The number after a longer one may be too long for the name of a file."""
+"""Names of saved views. The number after a longer one may be too long for the name of a file."""
 CAMERA = ".json"
 
 
-def add(page: Page) -> None:
+def add_saving(page: Page) -> None:
     """Add the controls."""
     gui = page.server.gui
     with gui.add_folder("Save"):
         buttons = {
             suffix: gui.add_button(label, hint=hint)
             for suffix, label, hint in (
-                (".png", "PNG", "The view as it is shown, 16 samples a pixel, with its camera beside it."),
-                (".exr", "EXR", "Linear radiance and alpha, or the variable, with its camera beside it."),
-                (CAMERA, "Camera", "A transforms file of this one view."),
+                (".png", "PNG", "The view as displayed, 16 samples per pixel, and its camera."),
+                (".exr", "EXR", "Linear radiance and alpha, or the AOV, and its camera."),
+                (CAMERA, "Camera", "A transforms file of this view."),
             )
         }
         saved = gui.add_markdown(f"into {page.views_folder}")
 
     def save(suffix: str, number: int) -> None:
-        visitor = page.loop.visitors.get(number)
-        if visitor is None or visitor.pose is None:
-            return
-        path = write_view(
-            page.drawable, visitor.pose, visitor.window, visitor.look, page.views_folder, suffix
-        )
-        saved.content = f"saved {path}"
+        client = page.loop.clients.get(number)
+        if client is not None and client.pose is not None:
+            request = SampleRequest(client.pose, *client.window, client.look)
+            saved.content = f"saved {write_view(page.scene, request, page.views_folder, suffix)}"
 
     for suffix, button in buttons.items():
 
         @button.on_click
         def _(event: Any, suffix: str = suffix) -> None:
             number = event.client.client_id
-            page.loop.ask(("save", suffix, number), lambda: save(suffix, number), changes=False)
+            page.loop.submit(("save", suffix, number), lambda: save(suffix, number), changes=False)
 
 
-def write_view(
-    drawable: ViewerScene,
-    pose: Pose,
-    window: tuple[int, int],
-    look: DisplayOptions,
-    folder: Path,
-    suffix: str,
-) -> Path:
-    """Write the next numbered view in a folder, and its camera; returns the path of the picture, or of that.
+def write_view(scene: ViewerScene, request: SampleRequest, folder: Path, suffix: str) -> Path:
+    """Write the next numbered view in a folder, and its camera.
 
-    Raises InputError if it cannot be written.
+    Returns the path of the image, or of the camera if `suffix` is CAMERA. Raises InputError if it cannot be
+    written.
     """
     make_folder(folder)
-    camera = write_camera(folder, lambda stem: json.dumps(pose.transforms(*window, stem), indent=1) + "\n")
-    picture = camera.with_suffix(suffix)
+    size = request.width, request.height
+    camera = write_camera(
+        folder, lambda stem: json.dumps(request.pose.transforms(*size, stem), indent=1) + "\n"
+    )
+    image = camera.with_suffix(suffix)
     if suffix != CAMERA:
         try:
-            write_picture(picture, drawable.fine(pose, *window, look), window, look)
+            write_image(image, scene.fine(request), size, request.look)
         except BaseException:
             camera.unlink(missing_ok=True)
             raise
-    return picture
+    return image
 
 
 def write_camera(folder: Path, content: Callable[[str], str]) -> Path:
-    """Write the file that takes the next number, and its text for that name; other files stay as they are.
+    """Write the file with the next number, its text depending on its name; other files stay as they are.
 
-    Whoever creates the file first has the number, so two viewers may save into one folder. Raises InputError
-    if it cannot be written.
+    The number belongs to whoever creates the file first, so two viewers may save into one folder. Raises
+    InputError if it cannot be written.
     """
     stems = {path.name.partition(".")[0] for path in folder.iterdir()}
     number = max((int(stem[5:]) for stem in stems if NUMBERED.fullmatch(stem)), default=-1)
@@ -102,29 +96,24 @@ def write_camera(folder: Path, content: Callable[[str], str]) -> Path:
         return path
 
 
-def write_picture(path: Path, planes: list[Any], window: tuple[int, int], look: DisplayOptions) -> None:
-    """Write planes of `develop.planes_of` as PNG, as they are shown, or as EXR, linear."""
-    straight = look.what == IMAGE and len(planes) == 4  # nothing of its own behind it
+def write_image(path: Path, planes: list[Float], size: tuple[int, int], look: DisplayOptions) -> None:
+    """Write planes of `tonemap.planes_of` as PNG, as displayed, or as EXR, linear."""
     if path.suffix == ".exr":
-        values, coverage = seen_of(planes, look), planes[-1]
-        if look.what == IMAGE:
-            planes = values
-        elif look.what in (*TERMS, "alpha"):
-            planes = [*values, coverage]
-        else:
-            planes = [*(value * coverage for value in values), coverage]
-        names = {2: "YA", 4: "RGBA"}[len(planes)]
-        write_exr(path, stacked(planes, window), names)
-    elif straight:
-        rgba = stacked(planes, window)
+        values, alpha = composited(planes, look), planes[-1]
+        if look.what != IMAGE:
+            premultiplied = look.what in (*TERMS, "alpha")
+            values = [*(value if premultiplied else value * alpha for value in values), alpha]
+        write_exr(path, stacked(values, size), {2: "YA", 4: "RGBA"}[len(values)])
+    elif look.what == IMAGE and len(planes) == 4:  # nothing behind the object
+        rgba = stacked(planes, size)
         rgba[..., :3] *= np.float32(2.0**look.exposure)
         write_png(path, straight_srgb(rgba))
     else:
-        write_png(path, stacked(shown_planes(planes, look), window))
+        write_png(path, stacked(displayed_planes(planes, look), size))
 
 
-def stacked(planes: list[Any], window: tuple[int, int]) -> np.ndarray:
-    """Planes as an array (H, W, C) float32."""
-    width, height = window
+def stacked(planes: list[Float], size: tuple[int, int]) -> np.ndarray:
+    """Return planes (H*W,) or (1,) as an array (H, W, C) float32."""
+    width, height = size
     full = [np.broadcast_to(np.array(plane, np.float32).ravel(), width * height) for plane in planes]
     return np.stack(full, axis=-1).reshape(height, width, len(planes))

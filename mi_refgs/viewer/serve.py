@@ -1,8 +1,7 @@
-"""`refgs view`: everything ready before the page is served, then pictures until it is stopped."""
+"""Pages of `refgs view`, ready to be opened."""
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import time
 from collections.abc import Callable
@@ -16,89 +15,98 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.runs.export import newest
 from mi_refgs.runs.run import DATASET, Run
-from mi_refgs.viewer import resolution, saving
-from mi_refgs.viewer.controls import light, look, materials, overlays, truth
+from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.viewer import resolution
+from mi_refgs.viewer.comparison import add_comparison
 from mi_refgs.viewer.loop import added
 from mi_refgs.viewer.mitsuba_scene import MitsubaScene
 from mi_refgs.viewer.page import Page, Views
-from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.panels import MaterialsPanel, add_display, add_light, add_overlays
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
-from mi_refgs.viewer.tonemap import DisplayOptions, shown_planes, to_bytes
-from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
+from mi_refgs.viewer.saving import add_saving
+from mi_refgs.viewer.tonemap import displayed_planes, to_bytes
+from mi_refgs.viewer.viewer_scene import SampleRequest
 
 USUAL_SHAPES = (1.0, 1.6)
-"""Shapes of the pictures that are compiled before a page asks: of small and of large desktop windows, less
-the panel at their side."""
+"""Aspect ratios of the images that are compiled beforehand: of small and of large desktop windows, less the
+panel at their side."""
 
 Tell = Callable[[str], None]
 
 
 def serve_run(
-    run: Run, host: str, port: int, output: Path | None = None, data: Path | None = None, tell: Tell = print
+    run: Run,
+    address: tuple[str, int],
+    output: Path | None = None,
+    data: Path | None = None,
+    tell: Tell = print,
 ) -> Page:
-    """A page of a run, ready to be opened, with the views of its data set as far as they are there.
+    """Return the page of a run, with the views of its data set, or of that in `data`.
 
-    Nothing is written into the run. Raises InputError for a folder that is no run or holds no fit, for a port
+    Nothing is written into the run. Raises InputError for a folder that is no run or has no fit, for a port
     that is taken, and without viser.
     """
     views = views_of(run, data, tell)
     some = views.test or views.train
-    scene = newest(run, run.method())
-    drawable = ReconstructionView(scene, None if some is None else some.region)
-    page = Page(drawable, views, run.path.resolve().name, host, port, output or run.path / "views")
-    page.side = warm_up(drawable, page.look, page.start(), tell)
-    look.add(page)
-    light.add(page, drawable)
-    materials.add(page, drawable)
-    overlays.add(page, scene)
-    truth.add(page)
-    saving.add(page)
-    page.listen()
+    trained = newest(run, run.method())
+    scene = ReconstructionView(trained, None if some is None else some.region)
+    page = Page(scene, views, run.path.resolve().name, address, output or run.path / "views")
+    warm_up(page, tell)
+    add_panels(page, scene, trained)
     return page
 
 
-def serve_scene(scene: Any, path: Path, host: str, port: int, output: Path | None, tell: Tell) -> Page:
-    """A page of a loaded Mitsuba scene, drawn by its own integrator; raises InputError as `serve_run`."""
-    drawable = MitsubaScene(scene, str(path))
-    page = Page(drawable, Views(), path.name, host, port, output or path.parent / "views", drawable.start())
-    page.side = warm_up(drawable, page.look, page.start(), tell)
-    look.add(page)
-    light.add(page, drawable)
-    saving.add(page)
-    page.listen()
+def serve_scene(scene: Any, path: Path, address: tuple[str, int], output: Path | None, tell: Tell) -> Page:
+    """Return the page of a loaded Mitsuba scene; raises InputError as `serve_run`."""
+    shown = MitsubaScene(scene, str(path))
+    page = Page(shown, Views(), path.name, address, output or path.parent / "views", shown.start())
+    warm_up(page, tell)
+    add_panels(page, shown)
     return page
+
+
+def add_panels(
+    page: Page, scene: ReconstructionView | MitsubaScene, trained: TrainedScene | None = None
+) -> None:
+    """Add all panels that a scene has something for, and accept pages."""
+    add_display(page)
+    add_light(page, scene)
+    if isinstance(scene, ReconstructionView):
+        MaterialsPanel(page, scene)
+    add_overlays(page, trained)
+    add_comparison(page)
+    add_saving(page)
+    page.listen()
 
 
 def views_of(run: Run, data: Path | None, tell: Tell) -> Views:
-    """The views of a run's data set, or of that in `data`; without what cannot be read, which is told."""
-    method, found = run.method(), Views()
-    if data is None and not (run.path / DATASET).is_file():
-        return found
-    for split in ("train", "test"):
-        try:
-            some: Dataset = load_split(run, method, split, data, decode=False)
-            found = dataclasses.replace(found, **{split: some})
-        except InputError as error:
-            if data is not None:
-                raise
-            tell(f"{error}; shown without {split} views")
-    return found
+    """Return the views of a run's data set, or of that in `data`; tells which cannot be read."""
+    method, found = run.method(), dict[str, Dataset]()
+    if data is not None or (run.path / DATASET).is_file():
+        for split in ("train", "test"):
+            try:
+                found[split] = load_split(run, method, split, data, decode=False)
+            except InputError as error:
+                if data is not None:
+                    raise
+                tell(f"{error}; shown without {split} views")
+    return Views(**found)
 
 
-def warm_up(drawable: ViewerScene, look: DisplayOptions, pose: Pose, tell: Tell) -> int:
-    """Compile the kernels of all sizes that a desktop window needs; returns the rung to begin moving at."""
-    tell("preparing: compiling for each size of picture")
-    chosen = resolution.COARSEST
+def warm_up(page: Page, tell: Tell) -> None:
+    """Compile the kernels of all sizes that a desktop window needs; choose the first level during motion."""
+    tell("preparing: compiling for each image size")
+    fastest, look = resolution.COARSEST, page.settings["look"]
     for shape, side in itertools.product(USUAL_SHAPES, resolution.SIDES):
         if side > resolution.FINEST:
             continue
-        sample = SampleRequest(pose, *resolution.size_of(side, shape), look, settled=True)
-        sums = added([], drawable.draw(sample).planes)
+        sample = SampleRequest(page.start(), *resolution.size_of(side, shape), look, settled=True)
+        sums = added([], page.scene.draw(sample).planes)
         begin = time.monotonic()
-        sums = added(sums, drawable.draw(sample).planes)
-        to_bytes(shown_planes(sums, look), sample.width, sample.height)
+        sums = added(sums, page.scene.draw(sample).planes)
+        to_bytes(displayed_planes(sums, look), sample.width, sample.height)
         if time.monotonic() - begin < resolution.SLOW:
-            chosen = max(side, chosen)
+            fastest = max(side, fastest)
     dr.sync_thread()
     dr.flush_malloc_cache()
-    return chosen
+    page.set(side=fastest)

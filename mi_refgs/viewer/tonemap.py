@@ -1,9 +1,8 @@
-"""Frames to what a page shows: the picture or one of its variables, as 8-bit RGB."""
+"""Conversion of frames to what a page displays: the image or one of its AOVs, as 8-bit RGB."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,53 +14,54 @@ from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
+from mi_refgs.types import Float
 
 IMAGE = "image"
-"""What is shown unless a variable is asked for."""
+"""What is displayed unless an AOV is chosen."""
 BACKDROPS = {"white": 1.0, "grey": 0.25, "black": 0.0}
 """Display-encoded brightness behind the object, by name."""
 ENVIRONMENT = "environment map"
-"""The backdrop that is the light."""
+"""The environment map as backdrop."""
 BACKGROUND = "background"
-"""The backdrop that is what the object was photographed in; all others show the object alone."""
+"""The photographed background as backdrop; with all others the object only is displayed."""
 
 
-def backdrops_of(surroundings: bool, light: bool) -> tuple[str, ...]:
-    """The backdrops of a scene that has these or not; a page begins with the first."""
-    return (*((BACKGROUND,) if surroundings else ()), *BACKDROPS, *((ENVIRONMENT,) if light else ()))
+def backdrops_of(background: bool, light: bool) -> tuple[str, ...]:
+    """Return the backdrops of a scene that has these or not, the initial one first."""
+    return (*((BACKGROUND,) if background else ()), *BACKDROPS, *((ENVIRONMENT,) if light else ()))
 
 
 @dataclass(frozen=True)
 class DisplayOptions:
-    """What of the scene is shown, and how."""
+    """What is displayed of a scene, and how."""
 
     what: str = IMAGE  # or a type of `plugins.aovs`
     exposure: float = 0.0  # stops
     backdrop: str = "white"  # one of `backdrops_of`
-    depths: tuple[float, float] = (0.0, 1.0)  # distances that are shown as white and as black
+    depths: tuple[float, float] = (0.0, 1.0)  # distances that are displayed as white and as black
 
     @property
     def object_only(self) -> bool:
-        """Whether the object is shown without its surroundings."""
+        """Whether the background is left out."""
         return self.backdrop != BACKGROUND
 
 
-def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light | None) -> list[Any]:
-    """What is averaged over samples: the planes of the picture or variable, premultiplied, and alpha.
+def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light | None) -> list[Float]:
+    """Return what is averaged over samples, (H*W,) each: the premultiplied image or AOV, and alpha.
 
-    For a picture with surroundings or the light behind it, three planes of that follow, times 1 - alpha.
+    For an image with background or environment map, three planes of that follow, times 1 - alpha.
     """
-    if look.what == IMAGE:
-        behind = frame.background
-        if behind is None and look.backdrop == ENVIRONMENT and light is not None:
-            behind = light.radiance(dr.normalize(camera.rays()))
-        through = () if behind is None else (1 - frame.alpha) * mi.Color3f(behind)
-        return [*frame.radiance, frame.alpha, *through]
-    return aov_planes(look.what, frame, camera)
+    if look.what != IMAGE:
+        return aov_planes(look.what, frame, camera)
+    behind = frame.background
+    if behind is None and look.backdrop == ENVIRONMENT and light is not None:
+        behind = light.radiance(dr.normalize(camera.rays()))
+    through = () if behind is None else (1 - frame.alpha) * mi.Color3f(behind)
+    return [*frame.radiance, frame.alpha, *through]
 
 
-def seen_of(planes: list[Any], look: DisplayOptions) -> list[Any]:
-    """Channels of an image from the mean of `planes_of`: linear RGBA, or those of the variable's AOV."""
+def composited(planes: list[Float], look: DisplayOptions) -> list[Float]:
+    """Return linear RGBA, or the channels of the AOV, of the mean of `planes_of`."""
     if look.what != IMAGE:
         return values_of_planes(look.what, planes)
     radiance, alpha, behind = planes[:3], planes[3], planes[4:]
@@ -70,38 +70,33 @@ def seen_of(planes: list[Any], look: DisplayOptions) -> list[Any]:
     return [*(plane + value for plane, value in zip(radiance, behind, strict=True)), mi.Float(1)]
 
 
-def shown_planes(planes: list[Any], look: DisplayOptions) -> list[Any]:
-    """Three display-encoded planes of the mean of `planes_of`, not clipped."""
+def displayed_planes(planes: list[Float], look: DisplayOptions) -> list[Float]:
+    """Return display-encoded RGB planes, not clipped, of the mean of `planes_of`."""
     backdrop = BACKDROPS.get(look.backdrop, 1.0)
-    if look.what == IMAGE:
+    values, alpha = composited(planes, look), planes[-1]
+    if look.what == IMAGE or look.what in TERMS:
         gain = dr.opaque(mi.Float, 2.0**look.exposure)
-        *seen, alpha = seen_of(planes, look)
-        radiance = [plane * gain for plane in seen]
-        if len(planes) == 4:
-            return display_image(radiance, alpha, [backdrop] * 3)
-        return [srgb_from_linear(plane) for plane in radiance]
-    values, alpha = seen_of(planes, look), planes[-1]
-    if look.what in TERMS:
-        gain = dr.opaque(mi.Float, 2.0**look.exposure)
-        return [srgb_from_linear(value * gain) for value in values]
+        radiance = [value * gain for value in values[:3]]
+        if look.what == IMAGE and len(planes) == 4:  # nothing behind the object
+            return display_image(radiance, values[3], [backdrop] * 3)
+        return [srgb_from_linear(value) for value in radiance]
     if look.what == "alpha":
         return values * 3
-    kind = suffixes()[look.what]
-    if kind == "XYZ":
-        values = [0.5 + 0.5 * value for value in values]
-    elif kind == "RGB":
-        values = [srgb_from_linear(value) for value in values]
-    elif kind == "T":
-        near, far = (dr.opaque(mi.Float, x) for x in look.depths)
-        values = [dr.clip((far - values[0]) / (far - near), 0, 1)]
-    shown = values * (3 // len(values))
-    return [alpha * value + (1 - alpha) * backdrop for value in shown]
+    match suffixes()[look.what]:
+        case "XYZ":
+            values = [0.5 + 0.5 * value for value in values]
+        case "RGB":
+            values = [srgb_from_linear(value) for value in values]
+        case "T":
+            near, far = (dr.opaque(mi.Float, x) for x in look.depths)
+            values = [dr.clip((far - values[0]) / (far - near), 0, 1)]
+    return [alpha * value + (1 - alpha) * backdrop for value in values * (3 // len(values))]
 
 
-def to_bytes(shown: list[Any], width: int, height: int) -> np.ndarray:
-    """8-bit RGB (height, width, 3) of three display-encoded planes, clipped; waits for the device."""
+def to_bytes(planes: list[Float], width: int, height: int) -> np.ndarray:
+    """Return 8-bit RGB (height, width, 3) of display-encoded planes, clipped; waits for the device."""
     packed = dr.zeros(mi.UInt32, width * height)
-    for index, plane in enumerate(shown):
+    for index, plane in enumerate(planes):
         packed |= mi.UInt32(dr.clip(plane, 0, 1) * 255 + 0.5) << (8 * index)
     pixels = np.array(packed.numpy(), dtype="<u4").view(np.uint8)
     return np.ascontiguousarray(pixels.reshape(height, width, 4)[..., :3])

@@ -1,10 +1,9 @@
-"""What a page can draw: one protocol of scenes, which the loop asks for pictures."""
+"""The interface of scenes that a page displays."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -14,6 +13,7 @@ from mi_refgs.render.passes import in_passes
 from mi_refgs.render.samples import box_mean
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
+from mi_refgs.types import Float
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.resolution import GRID
 from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions
@@ -21,81 +21,65 @@ from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions
 
 @dataclass(frozen=True, eq=False)
 class SampleRequest:
-    """One sample of every pixel of a picture."""
+    """One sample per pixel of an image."""
 
     pose: Pose
     width: int
     height: int
     look: DisplayOptions
-    offset: tuple[float, float] = (0.0, 0.0)  # of the sample from the pixel's centre, pixels
+    offset: tuple[float, float] = (0.0, 0.0)  # of the samples from the pixel centres, pixels
     index: int = 0  # of the sample
-    settled: bool = False  # whether nothing has moved for a while, so that it may cost more
-    exact: Camera | None = None  # in place of the pose, with its pixels
-    depth: bool = False  # whether depth is wanted, too
+    settled: bool = False  # whether nothing has moved for a while, so that it may take longer
+    exact: Camera | None = None  # replaces the pose, and has its own pixels
+    depth: bool = False  # whether depth is required, too
 
     @property
-    def asked(self) -> frozenset[str]:
-        """What `render` is to make beside the picture."""
-        shown = {self.look.what} - {IMAGE, "alpha"}
-        return frozenset(shown | ({"depth"} if self.depth else set()))
+    def aovs(self) -> frozenset[str]:
+        """The AOVs to render."""
+        return frozenset({self.look.what, *(["depth"] if self.depth else [])} - {IMAGE, "alpha"})
 
     def camera(self) -> Camera:
-        """The renderer's camera."""
+        """Return the renderer's camera."""
         return self.exact or self.pose.camera(self.width, self.height, self.offset)
 
 
-@dataclass(frozen=True, eq=False)
-class SampleResult:
-    """What a scene gives for a sample."""
+class SampleResult(NamedTuple):
+    """A rendered sample."""
 
-    planes: list[Any]  # see `develop.planes_of`
-    depth: Any = None  # mi.Float: along the camera's z axis, 0 where nothing is seen; None where unknown
+    planes: list[Float]  # (H*W,) each, see `tonemap.planes_of`
+    depth: Float | None = None  # (H*W,) along the camera's z axis, 0 where nothing is seen; None if unknown
 
 
-class ViewerScene(Protocol):
-    """A scene as a page shows it. All but the constants is called on one thread, that of the loop."""
+class ViewerScene:
+    """A scene that a page displays. The methods are called on the render thread."""
 
-    @property
-    def variables(self) -> tuple[str, ...]:
-        """`develop.IMAGE` and the types of `plugins.aovs` that it has."""
-
-    @property
-    def backdrops(self) -> tuple[str, ...]:
-        """See `develop.backdrops_of`."""
-
-    centre: np.ndarray
-    """World point (3,) that cameras turn around."""
-    radius: float
-    """Of the object around it, scene units."""
-    square_pixels: bool
-    """Whether its pixels must be square, whatever sizes that gives."""
+    variables: tuple[str, ...]  # `tonemap.IMAGE` and the types of `plugins.aovs` that the scene has
+    backdrops: tuple[str, ...]  # see `tonemap.backdrops_of`
+    centre: np.ndarray  # (3,) world, the point that cameras orbit
+    radius: float  # of the object around it, scene units
+    square_pixels = False  # whether its pixels must be square, whatever sizes that gives
 
     def draw(self, sample: SampleRequest) -> SampleResult:
-        """One sample of every pixel."""
+        """Render one sample per pixel."""
+        raise NotImplementedError
 
-    def fine(self, pose: Pose, width: int, height: int, look: DisplayOptions) -> list[Any]:
-        """The planes of a picture to keep, of square pixels."""
+    def cost(self) -> tuple[Shading, int]:
+        """Return the shading and the number of surfels, which decide about passes."""
+        raise NotImplementedError
 
+    def fine(self, request: SampleRequest) -> list[Float]:
+        """Render an image to save, of square pixels: planes, means over GRID × GRID samples per pixel.
 
-def fine_planes(
-    draw: Callable[[SampleRequest], SampleResult],
-    pose: Pose,
-    width: int,
-    height: int,
-    look: DisplayOptions,
-    shading: Shading,
-    surfels: int,
-) -> list[Any]:
-    """Means over the samples of all pixels, planes as `draw` gives them.
+        Displayed images average samples that are filtered for the displayed pixels. Here each sample is
+        filtered for its own footprint, as in `render.samples` and `refgs render`, in passes that fit into
+        memory.
+        """
 
-    The samples of a page are those of the large picture, moved: their surfels are low-pass filtered for its
-    pixels. Here they are for their own, as in `render.samples`.
-    """
+        def means(camera: Camera) -> list[Float]:
+            exact = camera.supersampled(GRID)
+            drawn = self.draw(replace(request, height=camera.height, settled=True, exact=exact))
+            pixels = dr.zeros(mi.Float, camera.width * camera.height)
+            return [box_mean(plane, camera, GRID) + pixels for plane in drawn.planes]
 
-    def means(camera: Camera) -> list[Any]:
-        exact = camera.supersampled(GRID)
-        drawn = draw(SampleRequest(pose, width, camera.height, look, settled=True, exact=exact))
-        pixels = dr.zeros(mi.Float, camera.width * camera.height)
-        return [box_mean(plane, camera, GRID) + pixels for plane in drawn.planes]
-
-    return in_passes(means, pose.camera(width, height), GRID, shading.neighbours, surfels)
+        shading, surfels = self.cost()
+        return in_passes(means, request.camera(), GRID, shading.neighbours, surfels)

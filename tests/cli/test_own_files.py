@@ -22,6 +22,7 @@ from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.relighting.relight import relight
 from mi_refgs.runs.run import RUN_FILES, Run
 from mi_refgs.viewer.saving import write_view
+from mi_refgs.viewer.viewer_scene import SampleRequest
 from tests.helpers import refused
 from tests.scenes.tiny import train_command
 
@@ -204,7 +205,7 @@ def run(case: Case, place: Place) -> int:
     pose: Any = SimpleNamespace(transforms=lambda *_: {})
     look: Any = SimpleNamespace(what="image", exposure=0.0)
     for suffix in (".json", ".exr"):
-        write_view(drawable, pose, (2, 2), look, place / "views", suffix)
+        write_view(drawable, SampleRequest(pose, 2, 2, look), place / "views", suffix)
     return 0
 
 

@@ -42,7 +42,7 @@ from mi_refgs.viewer import viewer_scene
 from mi_refgs.viewer.mitsuba_scene import MitsubaScene
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
-from mi_refgs.viewer.tonemap import BACKGROUND, IMAGE, DisplayOptions, seen_of
+from mi_refgs.viewer.tonemap import BACKGROUND, IMAGE, DisplayOptions, composited
 from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
 from tests.scenes.integrator import (
     OTHER_OPTIONS,
@@ -284,8 +284,8 @@ def of_viewer(case: Case, drawable: ViewerScene) -> Maps:
         else:
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(viewer_scene, "GRID", round(case.samples**0.5))
-                shown = drawable.fine(pose, WIDTH, HEIGHT, look)
-        found[what] = image_array(seen_of(shown, look), HEIGHT, WIDTH)
+                shown = drawable.fine(SampleRequest(pose, WIDTH, HEIGHT, look))
+        found[what] = image_array(composited(shown, look), HEIGHT, WIDTH)
     return case.of_whole(found)
 
 

@@ -16,6 +16,7 @@ import pytest
 
 from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
+from mi_refgs.editing import Change, Selection, apply, assignments, select
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.fitting.train import Trainer
@@ -31,20 +32,19 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer import resolution
-from mi_refgs.viewer.compare import AROUND, GAP, side_by_side
-from mi_refgs.viewer.controls.light import light_of
-from mi_refgs.viewer.edits import mean_of, selected, with_material
+from mi_refgs.viewer.comparison import BORDER, GAP, side_by_side
 from mi_refgs.viewer.loop import Client, DeliveredImage, RenderLoop
 from mi_refgs.viewer.mitsuba_scene import MitsubaScene
-from mi_refgs.viewer.pose import Pose, page_rotation
+from mi_refgs.viewer.panels import light_of
+from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import COARSE, DONE, LARGE, NOTHING
 from mi_refgs.viewer.saving import write_view
-from mi_refgs.viewer.tonemap import DisplayOptions, shown_planes, to_bytes
+from mi_refgs.viewer.tonemap import DisplayOptions, displayed_planes, to_bytes
 from mi_refgs.viewer.training import Training, TrainingPage, read_log
 from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
 from tests.helpers import ROOT
-from tests.scenes.known import CLAY, known_scene
+from tests.scenes.known import known_scene
 from tests.scenes.tiny import SETTINGS
 
 
@@ -120,7 +120,7 @@ def test_samples_are_a_raster_of_which_each_four_lie_in_all_quarters() -> None:
 def test_a_page_that_looks_as_a_test_view_does_sees_its_picture(scene: TrainedScene, data: Path) -> None:
     view = read_dataset(data, "test").views[0]
     pose = Pose.of_view(view)
-    back = Pose.of_page(page_rotation(pose), pose.position, pose.fov, pose.aspect, view.near)
+    back = Pose.of_page(pose.page_rotation, pose.position, pose.fov, pose.aspect, view.near)
     assert np.abs(back.to_world - view.to_world).max() < 1e-12
     draw = scene.renderer(aovs=False)
     wanted = image_array(draw(view.camera()).radiance, view.height, view.width)
@@ -135,7 +135,7 @@ def test_every_rotation_survives_the_page(axis: tuple[int, int, int], degrees: f
     matrix = np.array(mi.ScalarTransform4f().rotate(axis, degrees).matrix, np.float64)
     matrix[:3, :3] = np.linalg.qr(matrix[:3, :3])[0] * np.sign(np.diag(np.linalg.qr(matrix[:3, :3])[1]))
     pose = Pose(matrix, 0.7, 1.0)
-    again = Pose.of_page(page_rotation(pose), pose.position, 0.7, 1.0)
+    again = Pose.of_page(pose.page_rotation, pose.position, 0.7, 1.0)
     assert np.abs(again.to_world - pose.to_world).max() < 1e-9
 
 
@@ -159,20 +159,16 @@ def test_an_offset_moves_the_sample_that_way() -> None:
 # ---------------- the loop ----------------
 
 
-class Plain:
+class Plain(ViewerScene):
     """A scene of one grey, which says what it was asked for."""
 
-    variables: tuple[str, ...] = ("image",)
-    backdrops: tuple[str, ...] = ("white",)
-    centre, radius, square_pixels = np.zeros(3), 1.0, False
+    variables, backdrops = ("image",), ("white",)
+    centre, radius = np.zeros(3), 1.0
 
     def __init__(self) -> None:
         self.samples: list[SampleRequest] = []
         self.grey = 0.25
         self.during: Any = None
-
-    def fine(self, *_: Any) -> list[Any]:
-        raise NotImplementedError
 
     def draw(self, sample: SampleRequest) -> SampleResult:
         self.samples.append(sample)
@@ -206,7 +202,7 @@ POSE = Pose(np.eye(4), 0.7, 1.0)
 def test_the_loop_waits_draws_small_then_large_then_smooth(running: Any) -> None:
     loop, drawable, clock, seen = running
     assert loop.step() == math.inf
-    loop.look(7, POSE, (640, 400))
+    loop.change(7, pose=POSE, window=(640, 400))
     assert loop.step() == 0
     assert loop.step() == pytest.approx(resolution.STILL_AFTER)
     clock.now += resolution.STILL_AFTER + 1e-6
@@ -216,7 +212,7 @@ def test_the_loop_waits_draws_small_then_large_then_smooth(running: Any) -> None
     for _ in range(resolution.SAMPLES):
         assert loop.step() == 0
     assert loop.step() == math.inf
-    assert [s.shown for s in seen] == [COARSE, LARGE, LARGE + 4, DONE]
+    assert [s.progress for s in seen] == [COARSE, LARGE, LARGE + 4, DONE]
     small, large = (
         resolution.size_of(resolution.COARSEST, 1.6),
         resolution.size_of(resolution.still_side(640, 400), 1.6),
@@ -228,22 +224,24 @@ def test_the_loop_waits_draws_small_then_large_then_smooth(running: Any) -> None
 
 def test_what_moves_meanwhile_drops_what_was_under_way(running: Any) -> None:
     loop, drawable, clock, seen = running
-    loop.look(7, POSE, (640, 400))
+    loop.change(7, pose=POSE, window=(640, 400))
     loop.step()
     clock.now += 1
-    drawable.during = lambda: loop.look(7, replace(POSE, fov=0.8), (640, 400))
+    drawable.during = lambda: loop.change(7, pose=replace(POSE, fov=0.8), window=(640, 400))
     loop.step()  # a large picture, of the view before
     drawable.during = None
-    assert [s.shown for s in seen] == [COARSE]
+    assert [s.progress for s in seen] == [COARSE]
     loop.step()
-    assert [s.shown for s in seen] == [COARSE, COARSE]
+    assert [s.progress for s in seen] == [COARSE, COARSE]
     assert drawable.samples[-1].pose.fov == 0.8
 
 
 def test_small_pictures_are_shown_while_it_keeps_moving(running: Any) -> None:
     """Each is old by the time that it is drawn."""
     loop, drawable, _, seen = running
-    drawable.during = lambda: loop.look(7, replace(POSE, fov=0.7 + 0.01 * len(drawable.samples)), (640, 400))
+    drawable.during = lambda: loop.change(
+        7, pose=replace(POSE, fov=0.7 + 0.01 * len(drawable.samples)), window=(640, 400)
+    )
     drawable.during()
     for _ in range(5):
         assert loop.step() == 0
@@ -257,46 +255,46 @@ def test_a_smooth_picture_is_the_mean_of_its_samples_and_starts_anew_after_a_cha
     def encoded(grey: float) -> int:
         return round(255 * (1.055 * grey ** (1 / 2.4) - 0.055))
 
-    loop.look(7, POSE, (640, 400))
+    loop.change(7, pose=POSE, window=(640, 400))
     loop.step()
     clock.now += 1
     for grey in (9.0, *[0.1, 0.3] * 8):
         drawable.grey = grey
         loop.step()
-    assert (seen[-1].shown, seen[-1].image[0, 0, 0]) == (DONE, encoded(0.2))
+    assert (seen[-1].progress, seen[-1].image[0, 0, 0]) == (DONE, encoded(0.2))
     loop.change()
     for _ in range(8):  # stops amid the samples
         loop.step()
         clock.now += 1
-    assert LARGE < seen[-1].shown < DONE
+    assert LARGE < seen[-1].progress < DONE
     loop.change()
     drawable.grey = 0.5
     loop.step()
-    assert (seen[-1].shown, seen[-1].image[0, 0, 0]) == (COARSE, encoded(0.5))
+    assert (seen[-1].progress, seen[-1].image[0, 0, 0]) == (COARSE, encoded(0.5))
     clock.now += 1
     for _ in range(17):
         loop.step()
-    assert (seen[-1].shown, seen[-1].image[0, 0, 0]) == (DONE, encoded(0.5))
+    assert (seen[-1].progress, seen[-1].image[0, 0, 0]) == (DONE, encoded(0.5))
 
 
 def test_notes_run_once_the_last_of_a_key_wins_and_bad_input_is_told(running: Any) -> None:
     loop, _, _, seen = running
     told: list[str] = []
-    loop.failed = told.append
+    loop.report = told.append
 
     def bad() -> None:
         raise InputError("no such thing")
 
     done: list[int] = []
-    loop.look(7, POSE, (640, 400))
+    loop.change(7, pose=POSE, window=(640, 400))
     loop.step()
-    loop.ask("a", lambda: done.append(1))
-    loop.ask("a", lambda: done.append(2))
-    loop.ask("b", bad)
+    loop.submit("a", lambda: done.append(1))
+    loop.submit("a", lambda: done.append(2))
+    loop.submit("b", bad)
     loop.step()
     loop.step()
     assert (done, told) == ([2], ["no such thing"])
-    assert [s.shown for s in seen] == [COARSE, COARSE]  # the first note changed what is seen
+    assert [s.progress for s in seen] == [COARSE, COARSE]  # the first note changed what is seen
 
 
 def test_a_failure_is_told_and_the_others_go_on(running: Any, capsys: pytest.CaptureFixture[str]) -> None:
@@ -304,13 +302,13 @@ def test_a_failure_is_told_and_the_others_go_on(running: Any, capsys: pytest.Cap
     loop, drawable, _, seen = running
     told: list[str] = []
     other: list[DeliveredImage] = []
-    loop.failed = told.append
+    loop.report = told.append
 
     def broken() -> None:
         raise RuntimeError("out of memory\nand much more")
 
-    loop.ask("a", broken)
-    loop.ask("b", lambda: loop.look(7, POSE, (640, 400)))
+    loop.submit("a", broken)
+    loop.submit("b", lambda: loop.change(7, pose=POSE, window=(640, 400)))
     drawable.during = broken
     assert loop.step() == 0
     assert loop.step() == math.inf
@@ -319,12 +317,12 @@ def test_a_failure_is_told_and_the_others_go_on(running: Any, capsys: pytest.Cap
     assert capsys.readouterr().err.count("RuntimeError: out of memory\nand much more") == 2
     drawable.during = None
     loop.enter(8, Client(other.append))
-    loop.look(8, POSE, (640, 400))
+    loop.change(8, pose=POSE, window=(640, 400))
     loop.step()
-    assert (seen, [s.shown for s in other]) == ([], [COARSE])
-    loop.look(7, POSE, (640, 400))
+    assert (seen, [s.progress for s in other]) == ([], [COARSE])
+    loop.change(7, pose=POSE, window=(640, 400))
     loop.step()
-    assert [s.shown for s in seen] == [COARSE]
+    assert [s.progress for s in seen] == [COARSE]
 
 
 def test_a_picture_that_fails_after_a_change_is_drawn_anew(running: Any) -> None:
@@ -332,30 +330,30 @@ def test_a_picture_that_fails_after_a_change_is_drawn_anew(running: Any) -> None
 
     def moved_and_broken() -> None:
         drawable.during = None
-        loop.look(7, POSE, (640, 400))
+        loop.change(7, pose=POSE, window=(640, 400))
         raise RuntimeError("gone")
 
-    loop.look(7, POSE, (640, 400))
+    loop.change(7, pose=POSE, window=(640, 400))
     drawable.during = moved_and_broken
     assert loop.step() == loop.step() == 0
-    assert [s.shown for s in seen] == [COARSE]
+    assert [s.progress for s in seen] == [COARSE]
 
 
 def test_who_sees_least_goes_first_and_who_left_is_forgotten(running: Any) -> None:
     loop, _, clock, seen = running
     other: list[DeliveredImage] = []
-    loop.look(7, POSE, (640, 400))
+    loop.change(7, pose=POSE, window=(640, 400))
     loop.step()
     clock.now += 1
     loop.enter(8, Client(other.append))
-    loop.look(8, POSE, (640, 400))
+    loop.change(8, pose=POSE, window=(640, 400))
     loop.step()
     assert (len(seen), len(other)) == (1, 1)
     loop.leave(7)
     clock.now += 1
     for _ in range(30):
         loop.step()
-    assert (len(seen), other[-1].shown) == (1, DONE)
+    assert (len(seen), other[-1].progress) == (1, DONE)
 
 
 # ---------------- the scene that is shown ----------------
@@ -369,7 +367,7 @@ def shown(drawable: ViewerScene, look: DisplayOptions, size: int = 40) -> np.nda
     """A picture of the tiny scene from a side."""
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.0)
     sample = SampleRequest(pose, size, size, look, settled=True)
-    return to_bytes(shown_planes(drawable.draw(sample).planes, look), size, size).astype(int)
+    return to_bytes(displayed_planes(drawable.draw(sample).planes, look), size, size).astype(int)
 
 
 def test_every_variable_that_a_scene_has_is_drawn(scene: TrainedScene) -> None:
@@ -431,14 +429,11 @@ def test_materials_alone_are_those_of_relight_and_changes_stay_on_them(scene: Tr
 
 
 def test_a_slider_sets_a_material_of_what_is_selected(scene: TrainedScene) -> None:
-    mask = selected("metallic > 0.5", scene)
-    assert mask.sum() == scene.surfels.count // 2 and selected(" ", scene).all()
-    rough = with_material(scene, mask, {"roughness": 0.9, "metallic": 0.2})
-    assert mean_of(rough, mask, "roughness") == pytest.approx(0.9, abs=1e-5)
-    assert mean_of(rough, mask, "metallic") == pytest.approx(0.2, abs=1e-5)
-    assert mean_of(rough, ~mask, "roughness") == pytest.approx(CLAY["roughness"], abs=1e-5)
+    metal = select(scene, Selection(where="metallic > 0.5"))
+    change = Change(set=assignments({"roughness": 0.9, "metallic": 0.2}))
+    rough = apply(scene, metal, change)
     drawable = ReconstructionView(scene)
-    drawable.set_changes([lambda given: with_material(given, mask, {"roughness": 0.9, "metallic": 0.2})])
+    drawable.set_changes([lambda given: apply(given, metal, change)])
     assert np.array_equal(
         shown(drawable, DisplayOptions()), shown(ReconstructionView(rough), DisplayOptions())
     )
@@ -503,7 +498,9 @@ def test_what_is_saved_has_surroundings_or_is_transparent(surrounded: TrainedSce
     )
     found = {}
     for backdrop in ("background", "grey"):
-        path = write_view(drawable, pose, (32, 20), DisplayOptions(backdrop=backdrop), tmp_path, ".exr")
+        path = write_view(
+            drawable, SampleRequest(pose, 32, 20, DisplayOptions(backdrop=backdrop)), tmp_path, ".exr"
+        )
         found[backdrop] = read_exr_image(path)
     assert found["background"][..., 3].min() == 1
     assert np.allclose(found["background"][0, 0, :3], 0.2, rtol=1e-3)
@@ -535,6 +532,7 @@ def test_a_watched_fit_shows_its_object_alone_too(
     assert "background" not in drawable.backdrops
     before = shown(drawable, DisplayOptions())
     monkeypatch.setattr(Trainer, "surroundings", surrounded.surroundings)
+    drawable = Training(trainer)
     assert drawable.backdrops == ("background", "white", "grey", "black")
     assert np.array_equal(shown(drawable, DisplayOptions()), before)
     assert np.abs(shown(drawable, DisplayOptions(backdrop="background")) - before).max() > 50
@@ -549,7 +547,7 @@ def test_truth_and_picture_stand_side_by_side_in_the_shape_of_the_window() -> No
         row = canvas[height // 2, :, 0]
         assert (row == 10).sum() == (row == 20).sum() == 40
         assert np.flatnonzero(row == 20)[0] - np.flatnonzero(row == 10)[-1] == GAP + 1
-        assert canvas[0, 0, 0] == round(255 * AROUND)
+        assert canvas[0, 0, 0] == round(255 * BORDER)
     for window in ((16384, 1), (1, 16384)):  # its shape would take gigabytes
         assert side_by_side([left, right], window).nbytes < 1e6
 
@@ -558,13 +556,13 @@ def test_views_are_saved_under_the_next_number_with_their_camera(scene: TrainedS
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6)
     drawable, window = ReconstructionView(scene), (32, 20)
     paths = [
-        write_view(drawable, pose, window, DisplayOptions(), tmp_path, suffix)
+        write_view(drawable, SampleRequest(pose, *window, DisplayOptions()), tmp_path, suffix)
         for suffix in (".png", ".exr", ".json")
     ]
     assert [path.name for path in paths] == ["view_000.png", "view_001.exr", "view_002.json"]
     for split in ("train", "test"):
         (tmp_path / f"transforms_{split}.json").write_bytes((tmp_path / "view_000.json").read_bytes())
-    view = read_dataset(tmp_path, "train").views[0]
+    view = read_dataset(tmp_path, "train").views[0].load()
     assert np.abs(view.to_world - pose.to_world).max() < 1e-6
     wanted = image_array(scene.renderer(aovs=False, samples=16)(view.camera()).alpha, 20, 32)
     assert wanted.max() > 0.9
@@ -595,7 +593,7 @@ def test_a_saved_view_overwrites_no_file_and_takes_a_short_number(
         return iter(found)
 
     monkeypatch.setattr(Path, "iterdir", listed_before_another_came)
-    saved = write_view(drawable, pose, (32, 20), DisplayOptions(), tmp_path, ".png")
+    saved = write_view(drawable, SampleRequest(pose, 32, 20, DisplayOptions()), tmp_path, ".png")
     monkeypatch.undo()
     assert saved.name == "view_012.png" and saved.with_suffix(".json").is_file()
     for name in (*others, late.name):
@@ -605,7 +603,8 @@ def test_a_saved_view_overwrites_no_file_and_takes_a_short_number(
     for name in ("view_999999.png", "view_1000000.png"):
         (tmp_path / name).touch()
     assert (
-        write_view(drawable, pose, (32, 20), DisplayOptions(), tmp_path, ".json").name == "view_1000001.json"
+        write_view(drawable, SampleRequest(pose, 32, 20, DisplayOptions()), tmp_path, ".json").name
+        == "view_1000001.json"
     )
 
     def full(*_: Any) -> list[Any]:
@@ -614,7 +613,7 @@ def test_a_saved_view_overwrites_no_file_and_takes_a_short_number(
     before = sorted(tmp_path.iterdir())
     monkeypatch.setattr(drawable, "fine", full)
     with pytest.raises(MemoryError):
-        write_view(drawable, pose, (32, 20), DisplayOptions(), tmp_path, ".png")
+        write_view(drawable, SampleRequest(pose, 32, 20, DisplayOptions()), tmp_path, ".png")
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -625,7 +624,9 @@ def test_a_saved_picture_is_that_of_sixteen_samples(
     """Whole, and in passes of two rows."""
     monkeypatch.setattr(passes, "PASS_SAMPLES", samples)
     pose = Pose.of_page(FROM_THE_FRONT, np.array([0, -3.0, 0]), 0.8, 1.6)
-    path = write_view(ReconstructionView(scene), pose, (32, 20), DisplayOptions(), tmp_path, ".exr")
+    path = write_view(
+        ReconstructionView(scene), SampleRequest(pose, 32, 20, DisplayOptions()), tmp_path, ".exr"
+    )
     monkeypatch.setattr(passes, "PASS_SAMPLES", 1 << 20)
     frame = scene.renderer(aovs=False, samples=16)(pose.camera(32, 20))
     assert np.abs(read_exr_image(path) - image_array([*frame.radiance, frame.alpha], 20, 32)).max() < 1e-5
@@ -691,7 +692,7 @@ def test_a_mitsuba_scene_of_a_run_is_drawn_like_the_run(finished: Path) -> None:
     for name in ("image", "normal", "roughness", "depth", "specular"):
         found, wanted = (
             to_bytes(
-                shown_planes(
+                displayed_planes(
                     each.draw(SampleRequest(pose, 24, 24, DisplayOptions(name))).planes, DisplayOptions(name)
                 ),
                 24,
@@ -701,7 +702,7 @@ def test_a_mitsuba_scene_of_a_run_is_drawn_like_the_run(finished: Path) -> None:
         )
         assert np.abs(found.astype(int) - wanted).max() <= 2, name
         assert np.ptp(wanted) > 0, name
-    assert len(drawable.fine(pose, 12, 10, DisplayOptions())) == 4
+    assert len(drawable.fine(SampleRequest(pose, 12, 10, DisplayOptions()))) == 4
 
 
 def test_the_environment_of_a_path_traced_scene_turns() -> None:
@@ -724,12 +725,12 @@ def test_the_environment_of_a_path_traced_scene_turns() -> None:
         }
     )
     drawable = MitsubaScene(loaded, "ball.xml")
-    assert drawable.lit and drawable.variables == ("image",)
+    assert drawable.can_turn and drawable.variables == ("image",)
     assert drawable.radius == pytest.approx(3**0.5, rel=1e-3) and np.abs(drawable.centre).max() < 1e-3
     bright = []
     for degrees in (0.0, 90.0, 180.0, 360.0):
         drawable.set_turn(degrees)
-        planes_found = drawable.fine(drawable.start(), 16, 16, DisplayOptions())
+        planes_found = drawable.fine(SampleRequest(drawable.start(), 16, 16, DisplayOptions()))
         bright.append(np.array(planes_found[0]).reshape(16, 16)[:, :8].sum())
     assert bright[0] == pytest.approx(bright[3], rel=0.05)
     assert max(bright) > 1.5 * min(bright)
@@ -744,9 +745,9 @@ def test_a_fit_draws_only_for_those_who_look_and_a_share_of_its_time(
     views = read_dataset(data, "train")
     trainer = Trainer(load(str(method), "quick", SETTINGS), views)
     clock = Clock()
-    page = TrainingPage(trainer, Run(tmp_path), "127.0.0.1", 0, clock)
+    page = TrainingPage(trainer, Run(tmp_path), ("127.0.0.1", 0), clock)
     drawn: list[SampleRequest] = []
-    draw = page.page.drawable.draw
+    draw = page.page.scene.draw
 
     def slow(sample: SampleRequest) -> SampleResult:
         drawn.append(sample)
@@ -754,14 +755,14 @@ def test_a_fit_draws_only_for_those_who_look_and_a_share_of_its_time(
         return draw(sample)
 
     try:
-        page.page.drawable.draw = slow  # type: ignore[method-assign]
+        page.page.scene.draw = slow  # type: ignore[method-assign]
         for _ in range(20):
             clock.now += 0.1
             page.step()
         assert drawn == []
         seen: list[DeliveredImage] = []
         page.page.loop.enter(1, Client(seen.append))
-        page.page.loop.look(1, Pose.of_view(views.views[0]), (640, 400))
+        page.page.loop.change(1, pose=Pose.of_view(views.views[0]), window=(640, 400))
         for _ in range(100):
             clock.now += 0.1
             page.step()

@@ -27,11 +27,10 @@ from websockets.sync.client import ClientConnection, connect
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.viewer import guard as guard_module
-from mi_refgs.viewer import saving
-from mi_refgs.viewer.controls import light, look, materials, overlays, truth
 from mi_refgs.viewer.guard import SIDE, TEXT, UPLOAD, VALUES, Guard
 from mi_refgs.viewer.page import Page, Views
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
+from mi_refgs.viewer.serve import add_panels
 from tests.scenes.known import known_scene
 from tests.scenes.tiny import write_data
 
@@ -50,14 +49,8 @@ def fitted() -> ReconstructionView:
 def serving(fitted: ReconstructionView, host: str, folder: Path) -> Iterator[Page]:
     """A page with every panel, that nothing is drawn for."""
     views = Views(test=read_dataset(write_data(folder / "data"), "test"))
-    page = Page(fitted, views, "a page", host, 0, folder / "views")
-    look.add(page)
-    light.add(page, fitted)
-    materials.add(page, fitted)
-    overlays.add(page, fitted.scene)
-    truth.add(page)
-    saving.add(page)
-    page.listen()
+    page = Page(fitted, views, "a page", (host, 0), folder / "views")
+    add_panels(page, fitted, fitted.scene)
     yield page
     page.close()
 
@@ -197,7 +190,7 @@ class Client:
             subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
             max_queue=None,
         )
-        self.number = max(set(page.loop.visitors), default=-1)
+        self.number = max(set(page.loop.clients), default=-1)
 
     def send(self, **message: Any) -> None:
         """Send a message."""
@@ -232,14 +225,14 @@ def until(done: Callable[[], bool]) -> None:
 @pytest.fixture
 def client(page: Page) -> Iterator[Client]:
     """One that looks at the page."""
-    before = set(page.loop.visitors)
+    before = set(page.loop.clients)
     made = Client(page)
     made.send(**CAMERA)
-    until(lambda: bool(set(page.loop.visitors) - before))
-    (made.number,) = set(page.loop.visitors) - before
+    until(lambda: bool(set(page.loop.clients) - before))
+    (made.number,) = set(page.loop.clients) - before
     yield made
     made.connection.close()
-    until(lambda: made.number not in page.loop.visitors)
+    until(lambda: made.number not in page.loop.clients)
 
 
 def in_range(control: Any) -> bool:
@@ -282,7 +275,7 @@ def test_what_the_page_offers_is_taken(client: Client) -> None:
 
 
 def test_a_camera_without_sense_moves_nothing(client: Client) -> None:
-    visitor = client.page.loop.visitors[client.number]
+    visitor = client.page.loop.clients[client.number]
     before = visitor.pose, visitor.window
     for field, value in itertools.product(set(CAMERA) - {"type"}, HOSTILE):
         client.send(**CAMERA | {field: value})
@@ -434,7 +427,7 @@ def test_a_viser_that_goes_past_the_guard_is_stopped(
 
     monkeypatch.setattr(viser, "ViserServer", Other)
     with pytest.raises(InputError, match="does not let the page be protected; pip install viser=="):
-        Page(fitted, Views(), "a page", "127.0.0.1", 0, tmp_path)
+        Page(fitted, Views(), "a page", ("127.0.0.1", 0), tmp_path)
     assert len(stopped) == 1
 
 

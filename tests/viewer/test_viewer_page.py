@@ -137,7 +137,7 @@ class Tab:
 
     def still(self) -> np.ndarray:
         """The canvas once the picture is smooth and stays."""
-        self.page.get_by_text(re.compile(r"× \d+, 16 a pixel")).wait_for(timeout=1000 * PATIENCE)
+        self.page.get_by_text(re.compile(r"× \d+, 16 per pixel")).wait_for(timeout=1000 * PATIENCE)
         before, same = self.canvas(), 0
         for _ in range(200):
             self.page.wait_for_timeout(100)
@@ -285,7 +285,7 @@ def test_the_page_shows_the_object_and_the_light_turns_on_it(tab: Tab) -> None:
     assert len(np.unique(before.reshape(-1, 3), axis=0)) > 500
     tab.type("Turn", "120")
     tab.until(lambda picture: bool(np.abs(picture - before).mean() > 5), "another light")
-    tab.press("The fitted light")
+    tab.press("Estimated environment map")
     tab.until(lambda picture: bool(np.abs(picture - before).mean() < 0.5), "the light as it was")
 
 
@@ -352,7 +352,7 @@ def test_a_light_is_uploaded(
     dusk = replace(scene, light=EnvironmentLight.from_radiance(other_sky()))
     found, wanted = read_exr_image(path), rendered(dusk, camera_of(path))
     assert np.abs(found - wanted).max() < 0.02 * wanted.max()
-    tab.press("The fitted light")
+    tab.press("Estimated environment map")
 
 
 @pytest.mark.slow
@@ -370,7 +370,7 @@ def test_a_file_that_is_dropped_onto_the_page_becomes_the_light(tab: Tab, tmp_pa
         content,
     )
     tab.until(lambda picture: bool(np.abs(picture - before).mean() > 1), "another light")
-    tab.press("The fitted light")
+    tab.press("Estimated environment map")
 
 
 @pytest.mark.slow
