@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_refgs.capture.photographs import Photograph
 from mi_refgs.errors import InputError
-from mi_refgs.io.images import ENDINGS, open_picture, read_mask, to_8_bits
+from mi_refgs.io.images import ENDINGS, open_image, read_mask, to_8_bits
 
 
 def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:
@@ -34,7 +34,7 @@ def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[s
                 f"{folder}: --masks: none for {photograph.name}; add {photograph.path.stem}.png, white where "
                 "the object is"
             )
-        with open_picture(path) as picture:
+        with open_image(path) as picture:
             size = picture.size
         if size not in (photograph.size, photograph.stored_size):
             raise InputError(

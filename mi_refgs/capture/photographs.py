@@ -15,7 +15,7 @@ import numpy as np
 from mi_refgs.data.dataset import MAX_SIZES
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import replace_file
-from mi_refgs.io.images import ENDINGS, exif_tags, open_picture
+from mi_refgs.io.images import ENDINGS, exif_tags, open_image
 
 OTHER_ENDINGS = (
     ".heic",
@@ -107,7 +107,7 @@ class Photograph:
         """
         from PIL import Image
 
-        with open_picture(self.path) as picture:
+        with open_image(self.path) as picture:
             if picture.mode.startswith(("I", "F")):
                 raise InputError(
                     f"{self.path}: pixels: more than 8 bits per channel; save it as JPEG or 8-bit PNG"
@@ -133,7 +133,7 @@ class Photograph:
 
     def exif(self) -> bytes:
         """The EXIF data of a picture that lies as displayed; empty where the file's are broken."""
-        with open_picture(self.path) as picture:
+        with open_image(self.path) as picture:
             try:
                 data = picture.getexif()
                 data[ORIENTATION] = 1
@@ -179,7 +179,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
 
 
 def _photograph(path: Path) -> Photograph:
-    with open_picture(path) as picture:
+    with open_image(path) as picture:
         exif, detail = exif_tags(picture)
         size, plain = picture.size, picture.mode in ("RGB", "L")
     said = exif.get(ORIENTATION, 1)

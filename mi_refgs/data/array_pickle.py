@@ -57,7 +57,7 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         kind = NAMES.get((module, name))
         if kind is None:
-            raise pickle.UnpicklingError(f"it asks for {module[:40]}.{name[:40]}, which is no array")
+            raise pickle.UnpicklingError(f"it contains {module[:40]}.{name[:40]}, which is no array")
         return Record(kind)
 
     def persistent_load(self, _: Any) -> Any:

@@ -103,7 +103,7 @@ class Cursor:
         """The next number, of records of at least `row` bytes that follow."""
         (number,) = self.take("Q")
         if number * row > len(self.data) - self.at:
-            raise ValueError(f"{number} records are more than the file holds")
+            raise ValueError(f"{number} records are more than the file contains")
         return int(number)
 
     def skip(self, row: int) -> int:

@@ -198,12 +198,12 @@ def read_dataset(
 ) -> Dataset:
     """Read one split ("train" or "test") of the data set in folder `path`.
 
-    downscale: Side of the blocks of pixels that are averaged, colour premultiplied by alpha; by default 1.
+    `downscale`: side of the blocks of pixels that are averaged, colour premultiplied by alpha; by default 1.
         Pixels at the right and the bottom that fill no block are left out.
-    background: "white" or "black", behind images with alpha.
-    images: "png" (sRGB-encoded 8-bit files) or "exr" (linear radiance).
-    truth: Read ground-truth normals, depth and materials where there are any.
-    decode: Decode images now while the cache has room, so that a broken file is refused now; else
+    `background`: "white" or "black", behind images with alpha.
+    `images`: "png" (sRGB-encoded 8-bit files) or "exr" (linear radiance).
+    `truth`: read ground-truth normals, depth and materials where there are any.
+    `decode`: decode images now while the cache has room, so that a broken file is refused now; else
         `View.load` decodes them.
 
     Without a list of test views, every eighth image in the order of paths is one. The region of interest is

@@ -1,4 +1,4 @@
-"""Exposure and white balance of pictures: what EXIF says, and gains that fit a render to a picture."""
+"""Exposure and white balance: EXIF data, and the gains that fit a render to an image."""
 
 from __future__ import annotations
 
@@ -8,26 +8,25 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.data.view import View
-from mi_refgs.io.images import SRGB_LINEAR_LIMIT, exif_tags, linear_from_srgb, open_picture
+from mi_refgs.io.images import SRGB_LINEAR_LIMIT, exif_tags, linear_from_srgb, open_image
 
 EXPOSURE_TIME, F_NUMBER, ISO = 33434, 33437, 34855
-"""Tags of EXIF 2.3 in the table of the camera's settings: seconds, the f-number, and the sensitivity."""
+"""EXIF 2.3 tags of the camera settings: seconds, f-number, sensitivity."""
 CLIPPED = float(linear_from_srgb(np.array(254.5 / 255)))
-"""Linear value from which an 8-bit picture says only "at least this bright"."""
+"""Linear value from which an 8-bit image is clipped."""
 MAX_GAIN = 16.0
-"""Gains lie between this and its inverse, 4 stops either way: more is no exposure but a failed render."""
+"""Gains are limited to this and its inverse, ± 4 stops: larger ones mean a failed render."""
 
 
 def log_exposure(path: Path) -> float | None:
-    """log(time · ISO / f-number²) from the EXIF data of a picture; None where it does not say all three.
+    """log(time · ISO / f-number²) from the EXIF data of an image; None unless it contains all three.
 
-    The values of a sensor are proportional to its exponential. Raises InputError for a file that is no
-    picture.
+    Sensor values are proportional to its exponential. Raises InputError for a file that is no image.
     """
     if path.suffix.lower() == ".exr":
         return None
-    with open_picture(path) as picture:
-        _, settings = exif_tags(picture)
+    with open_image(path) as image:
+        _, settings = exif_tags(image)
     try:
         sensitivity = settings[ISO]
         iso = sensitivity[0] if isinstance(sensitivity, tuple) else sensitivity
@@ -38,18 +37,17 @@ def log_exposure(path: Path) -> float | None:
 
 
 def fitted_gain(
-    radiance: np.ndarray,
-    alpha: np.ndarray,
+    radiance: np.ndarray,  # (H, W, 3) linear, premultiplied by `alpha`
+    alpha: np.ndarray,  # (H, W)
     view: View,
-    background: np.ndarray,
-    where: np.ndarray | None = None,
+    background: np.ndarray,  # (3,) of the view
+    where: np.ndarray | None = None,  # (H, W) bool; pixels that count, by default all
 ) -> np.ndarray:
-    """Gains (3,) of linear `radiance` (H, W, 3), premultiplied by `alpha` (H, W), that bring it to a picture.
+    """Gains (3,) that fit a render to the image of a view.
 
     Per channel the least squares of g L - T over pixels, L and T the linear colours of the object in render
-    and picture, each pixel weighted by its coverage in both and by the slope of the sRGB curve: so errors
-    count as they are seen. Pixels where an 8-bit picture is clipped do not count, nor those not in `where`
-    (H, W, bool). A channel without light has gain 1.
+    and image; pixels are weighted by their coverage in both and by the slope of the sRGB curve, so that
+    errors count as displayed. Clipped pixels of 8-bit images are left out. The gain of a black channel is 1.
     """
     view = view.load()
     covered = alpha if view.alpha is None else np.minimum(alpha, view.alpha)

@@ -1,4 +1,4 @@
-"""Points to start from: on and in the visual hull of alpha masks, or in a box, and the colours there.
+"""Initial points: on and in the visual hull of alpha masks, or in a box, and their colours.
 
 World positions in scene units. `bounds` is a (2, 3) array: the lowest and highest corner of a box.
 """
@@ -14,25 +14,26 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
-# Voxels per edge of the visual hull's grid: at 200² a voxel of the cube the views span is two pixels wide.
 HULL_RESOLUTION = 96
-# Of smaller images: as many as their longer edge has pixels, but not fewer than this.
+"""Voxels per edge of the visual hull's grid: at 200², a voxel is two pixels wide."""
 HULL_LEAST = 32
-# Mask level that bounds the hull, and the level below which a voxel of the blurred masks is given up.
+"""The same for small images at least; in between, the number of pixels of their longer edge."""
 HULL_LEVEL = 0.5
+"""Mask level that bounds the hull."""
 HULL_CARVED = 0.05
-# Share of the views that must see a point of the hull: what hardly any camera sees was never carved.
+"""Level of the blurred masks below which a voxel is carved and not looked at again."""
 HULL_SEEN = 0.25
-# Rounds of rejection for points inside the hull; a round of a voxel-thin sheet keeps about a quarter.
+"""Fraction of the views that must see a point of the hull: what hardly any camera sees was never carved."""
 HULL_DRAWS = 64
-# Views that vote for a point's colour: a median needs no more, and memory grows with points times views.
+"""Rounds of rejection sampling inside the hull; one round keeps about a quarter for a voxel-thin sheet."""
 COLOUR_VIEWS = 32
-# Singular value of the mean of (I - d dᵀ), 0 for parallel view axes, below which they do not meet.
+"""Views from which a point's median colour is computed; memory grows with points times views."""
 FOCUS_CONDITION = 1e-3
+"""Smallest singular value of the mean of (I - d dᵀ) over view axes that meet; 0 for parallel ones."""
 
 
 def view_focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """The point nearest to the axes of all cameras (3,), and each camera's distance from it (V,).
+    """The point nearest to the axes of all cameras (3,), and the distance of each camera from it (V,).
 
     Raises InputError if the view axes have no common point (one view, or parallel ones).
     """
@@ -50,7 +51,7 @@ def view_focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def camera_bounds(views: Sequence[View]) -> np.ndarray:
-    """A cube around the point all cameras look at, as wide as the widest view there: (2, 3).
+    """A cube around the point that all cameras look at, as wide as the widest view there: (2, 3).
 
     Raises InputError if the view axes have no common point (one view, or parallel ones).
     """
@@ -61,21 +62,21 @@ def camera_bounds(views: Sequence[View]) -> np.ndarray:
 
 
 def random_points(count: int, bounds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Points (count, 3) uniform in the box, for data without alpha."""
+    """Uniform random points (count, 3) in a box, for data without alpha."""
     low, high = np.asarray(bounds, dtype=np.float64)
     return rng.uniform(low, high, (count, 3))
 
 
 @dataclass(frozen=True)
 class Hull:
-    """The visual hull of masks, as a field on a grid that is at most 0.5 on its border."""
+    """The visual hull of masks: a field on a grid, at most 0.5 on its border."""
 
     field: np.ndarray  # (X, Y, Z) float32, smallest mask value over the views; inside is above 0.5
     origin: np.ndarray  # (3,) world position of field[0, 0, 0]
     voxel: np.ndarray  # (3,) world distance of two samples along each axis
 
     def surface_points(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Points (count, 3) uniform on the surface (marching cubes), and outward unit normals (count, 3)."""
+        """Uniform points (count, 3) on the surface (marching cubes), and outward unit normals (count, 3)."""
         from skimage.measure import marching_cubes
 
         vertices, faces, _, _ = marching_cubes(self.field, HULL_LEVEL)
@@ -97,9 +98,9 @@ class Hull:
         return self.origin + grid * self.voxel, normals
 
     def inner_points(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Points (≤ count, 3) uniform in the volume where the field, trilinear between samples, is above 0.5.
+        """Uniform points (≤ count, 3) in the volume where the trilinear field is above 0.5.
 
-        Fewer than `count` where the hull fills hardly any of the cells that it touches.
+        Fewer than `count` if the hull fills only a small part of the cells that it touches.
         """
         steps = np.stack(np.meshgrid(*[(0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         shape = np.array(self.field.shape) - 1
@@ -120,9 +121,9 @@ class Hull:
 def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | None = None) -> Hull:
     """The set of points inside every mask (alpha > 0.5, blurred by half a voxel).
 
-    `resolution` is the number of voxels per edge; by default HULL_RESOLUTION, fewer for small images.
-    Where a view does not see a point it says nothing, but a quarter of the views must see it. Raises
-    InputError if nothing is inside every mask.
+    `resolution` is the number of voxels per edge; by default HULL_RESOLUTION, fewer for small images. Only
+    views that see a point carve it, and a quarter of the views must see it. Raises InputError if nothing is
+    inside every mask.
     """
     low, high = np.asarray(bounds, dtype=np.float64)
     if resolution is None:
@@ -137,7 +138,7 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | Non
     for view in views:
         points = low + (centres[alive] + 0.5) * voxel
         row, column, seen = view.project(points)
-        # No view is blurred as if it were nearer to the middle than a voxel.
+        # The blur is limited to that of a camera one voxel from the centre.
         distance = max(float(np.linalg.norm(middle - view.to_world[:3, 3])), float(voxel.max()))
         blur = 0.5 * float(voxel.max()) * view.fx / distance
         mask = gaussian_filter(np.asarray(view.load().alpha, dtype=np.float32), blur, mode="nearest")
@@ -148,8 +149,8 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | Non
         inside[alive[dead]] = 0
         alive = alive[~dead]
     inside[witnesses < HULL_SEEN * len(views)] = 0
-    # Padded by one voxel, so that a hull that touches the bounds is closed; sample 0 of the unpadded field
-    # lies half a voxel inside the box.
+    # Padding by one voxel closes a hull that touches the bounds; sample 0 of the unpadded field is half a
+    # voxel inside the box.
     field = np.pad(inside.reshape((resolution,) * 3), 1)
     if not np.any(field > HULL_LEVEL):
         raise InputError(
@@ -164,8 +165,8 @@ def median_colours(
     """Median linear colour (N, 3) of the points over the views that show them with alpha > 0.5.
 
     `background` (3,) is that of the views. Points that no view shows are 0.5 grey. With `normals`, only views
-    in front of a point vote. There is no occlusion test: the median of many views forgives it. At most 32
-    views, evenly chosen, are read.
+    in front of a point count. There is no occlusion test: the median of many views is robust to it. At most
+    32 evenly spaced views are read.
     """
     if not views or not len(points):
         return np.full((len(points), 3), 0.5)

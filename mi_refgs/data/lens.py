@@ -1,6 +1,6 @@
-"""Lens distortion: the models of OpenCV's documentation, and pictures resampled to those of a pinhole.
+"""Lens distortion: OpenCV's models, and resampling of images to those of a pinhole camera.
 
-With (x, y) = direction / depth and r² = x² + y², a lens moves the image of a point to
+With (x, y) = direction / depth and r² = x² + y², a lens distorts the image of a point to
 
     perspective   x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)
                   y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p2 x y + p1 (r² + 2 y²)
@@ -23,19 +23,19 @@ from mi_refgs.errors import InputError
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 MAX_ZOOM = 2.0
-"""Factor of the focal length beyond which less than a quarter of the picture would be left."""
+"""Factor of the focal length beyond which less than a quarter of the image would be left."""
 ZOOM_STEPS = 30
 """Bisections: 1e-9 of the focal length, 1e-6 pixels."""
 GRID = 65
-"""Points along each side at which a zoom is tried; between them an edge's image bends by < 0.01 pixels."""
+"""Points along each side at which a zoom is checked; between them edges bend by less than 0.01 pixels."""
 ROWS = 64
-"""Rows of a picture whose places in the distorted one are computed together."""
+"""Rows of an image whose source pixels are computed together."""
 _lock = Lock()
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Coefficients of one lens."""
+    """Distortion coefficients."""
 
     fisheye: bool
     radial: tuple[float, ...]  # k1, k2, k3, k4; a perspective lens has no k4
@@ -43,14 +43,14 @@ class Lens:
 
     @staticmethod
     def of(fisheye: bool, given: Mapping[str, float]) -> Lens | None:
-        """The lens of coefficients by their names, which are 0 where absent; None for a pinhole."""
+        """The lens with the given coefficients, 0 where absent; None for a pinhole."""
         k1, k2, k3, k4, p1, p2 = (given.get(name, 0.0) for name in COEFFICIENTS)
         if not (fisheye or any((k1, k2, k3, p1, p2))):
             return None
         return Lens(fisheye, (k1, k2, k3, k4) if fisheye else (k1, k2, k3), (p1, p2))
 
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where a pinhole's image points x, y (one unit before the eye) land, in the same unit."""
+        """Distort image points (x, y) at unit distance."""
         square = x * x + y * y
         if self.fisheye:
             r = np.sqrt(square)
@@ -72,28 +72,28 @@ class Lens:
 
 @dataclass(frozen=True)
 class Undistortion:
-    """How to resample pictures of one lens: the same size and principal point, the focal length × zoom.
+    """Resampling of images of one lens: same size and principal point, focal length × zoom.
 
-    The zoom is the smallest from 1 on with which every pixel of the result has data. What the lens shows
+    The zoom is the smallest one from 1 on for which every pixel of the result has data. What the lens shows
     beyond the result's edges (barrel distortion, fisheye) is left out.
     """
 
     lens: Lens
-    camera: tuple[int, int, float, float, float, float]  # of the distorted picture: as in `undistortion`
+    camera: tuple[int, int, float, float, float, float]  # of the distorted image: as in `undistortion`
     zoom: float
 
     def resample(self, image: np.ndarray, order: int = 3) -> np.ndarray:
-        """An (H, W, C) image seen without the lens; splines of `order`, within the channel's own range."""
+        """Undistort an (H, W, C) image by splines of `order`, clipped to the range of each channel."""
         planes = []
-        with _lock:  # several threads that need the same places would each make them
-            places = _places(self)
+        with _lock:  # else several threads would compute the same coordinates
+            coordinates = _source_coordinates(self)
         for plane in np.moveaxis(image, -1, 0):
-            moved = ndimage.map_coordinates(plane, places, order=order, mode="nearest")
+            moved = ndimage.map_coordinates(plane, coordinates, order=order, mode="nearest")
             planes.append(np.clip(moved, plane.min(), plane.max()))
         return np.stack(planes, axis=-1)
 
     def source(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and rows in the distorted picture of those in the result; 0 is the first pixel's centre."""
+        """Columns and rows in the distorted image of those in the result; 0 is the first pixel's centre."""
         _, _, fx, fy, cx, cy = self.camera
         x, y = (columns + 0.5 - cx) / (self.zoom * fx), (rows + 0.5 - cy) / (self.zoom * fy)
         x, y = self.lens.distort(x, y)
@@ -101,22 +101,22 @@ class Undistortion:
 
 
 @lru_cache(maxsize=2)
-def _places(straight: Undistortion) -> np.ndarray:
-    """Row and column in the distorted picture, (2, H, W) float32, of every pixel of the result."""
+def _source_coordinates(straight: Undistortion) -> np.ndarray:
+    """Row and column in the distorted image, (2, H, W) float32, of every pixel of the result."""
     width, height = straight.camera[:2]
-    places = np.empty((2, height, width), dtype=np.float32)
+    coordinates = np.empty((2, height, width), dtype=np.float32)
     for start in range(0, height, ROWS):  # all at once would take ten times the memory
         rows = np.arange(start, min(start + ROWS, height), dtype=float)
         columns, lines = straight.source(*np.meshgrid(np.arange(width, dtype=float), rows))
-        places[:, start : start + ROWS] = lines, columns
-    return places
+        coordinates[:, start : start + ROWS] = lines, columns
+    return coordinates
 
 
 @lru_cache(maxsize=4)
 def undistortion(
     lens: Lens, width: int, height: int, fx: float, fy: float, cx: float, cy: float
 ) -> Undistortion:
-    """The resampling of pictures of width × height pixels; fx, fy, cx, cy as in `View`.
+    """The resampling of images of width × height pixels; fx, fy, cx, cy as in `View`.
 
     Raises InputError, without a file's name, where no zoom up to MAX_ZOOM gives every pixel data.
     """
@@ -126,7 +126,7 @@ def undistortion(
     step = 1e-3  # pixels, for the derivatives
 
     def valid(zoom: float) -> bool:
-        """Whether the image lies inside the picture and the lens does not fold it."""
+        """Whether the source pixels are inside the distorted image and the lens does not fold it."""
         source = Undistortion(lens, camera, zoom).source
         u, v = source(across, down)
         right, below = source(across + step, down), source(across, down + step)
@@ -140,7 +140,7 @@ def undistortion(
         low, high = 1.0, MAX_ZOOM
         if not valid(high):
             raise InputError(
-                "the distortion moves the picture's edges more than half-way in, or folds it; "
+                "the distortion moves the image's edges more than half-way in, or folds it; "
                 "correct the coefficients"
             )
         if valid(low):

@@ -1,4 +1,4 @@
-"""Cameras of other programs in Mitsuba's frame: +z forward, +x left, +y up."""
+"""Conversion of other programs' cameras to Mitsuba's camera frame: +z forward, +x left, +y up."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from mi_refgs.constants import MAX_NUMBER, RIGID_TOLERANCE
 from mi_refgs.errors import InputError
 
 MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
-"""OpenGL's camera looks along −z with +x right and +y up; its own inverse."""
+"""OpenGL's camera: −z forward, +x right, +y up; the matrix is its own inverse."""
 MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""OpenCV's and COLMAP's looks along +z with +x right and +y down; its own inverse."""
+"""OpenCV's and COLMAP's camera: +z forward, +x right, +y down; the matrix is its own inverse."""
 
 
 def pinhole(width: int, height: int, focal: float) -> dict[str, Any]:
-    """The lens in a transforms file: square pixels, the principal point in the middle; lengths in pixels."""
+    """Intrinsics for a transforms file: square pixels, principal point at the centre; lengths in pixels."""
     return {
         "camera_angle_x": 2 * math.atan(0.5 * width / focal),
         "w": width,
@@ -30,7 +30,7 @@ def pinhole(width: int, height: int, focal: float) -> dict[str, Any]:
 
 
 def rigid(matrix: np.ndarray, field: str) -> np.ndarray:
-    """The (4, 4) matrix, if it is a rotation and a translation; else InputError that begins with `field`."""
+    """Return a (4, 4) matrix; raises InputError, starting with `field`, unless it is rigid."""
     rotation = matrix[:3, :3]
     with np.errstate(all="ignore"):  # any numbers
         fine = (
@@ -45,9 +45,9 @@ def rigid(matrix: np.ndarray, field: str) -> np.ndarray:
 
 
 def from_world_to_camera(rotation: np.ndarray, translation: np.ndarray, field: str) -> np.ndarray:
-    """`View.to_world` of a camera with OpenCV's axes that sees a world point x at R x + t.
+    """`View.to_world` of a camera with OpenCV's axes in which a world point x is at R x + t.
 
-    Raises InputError that begins with `field` unless it is rigid.
+    Raises InputError, starting with `field`, unless it is rigid.
     """
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation

@@ -1,8 +1,8 @@
-"""The region of interest: a sphere, the contraction of all of space around it, and how cameras suggest it.
+"""The region of interest: a sphere, the contraction of space around it, and its estimate from cameras.
 
-The contraction maps all of space into a ball of twice the sphere's radius: a grid or a random draw in
-contracted space covers near and far at once. World positions in scene units. [Mip-NeRF 360, Barron et al.
-2022, eq. 10]
+The contraction maps all of space into a ball of twice the sphere's radius, so that a grid or random samples
+in contracted space cover near and far. World positions in scene units. [Mip-NeRF 360, Barron et al. 2022,
+eq. 10]
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import read_json, write_json
 
 REGION_FILE = "region.json"
-"""Beside the pictures of a data set: {"centre": [x, y, z], "radius": r} in scene units."""
+"""File in the folder of a data set: {"centre": [x, y, z], "radius": r} in scene units."""
 REGION_SHARE = 0.8
-"""Radius of the region that cameras suggest, as part of the sphere that the median view shows whole."""
+"""Radius of the region estimated from cameras over that of the sphere that the median view shows entirely."""
 CAMERA_SHARE = 0.8
-"""Its largest radius as part of the nearest camera's distance: a camera stands outside of the region."""
+"""Its largest radius over the nearest camera's distance: cameras are outside of the region."""
 SMALLEST = 1e-6
-"""Its smallest radius as part of the largest coordinate of a camera: float32 resolves no smaller lengths."""
+"""Its smallest radius over the largest coordinate of a camera: float32 resolves no smaller lengths."""
 
 
 @dataclass(frozen=True)
@@ -59,18 +59,18 @@ class Region:
         return Region((x, y, z), self.radius)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Which of the points (N, 3) lie inside: (N,) bool."""
+        """Whether points (N, 3) are inside: (N,) bool."""
         return np.linalg.norm(points - np.array(self.centre), axis=-1) <= self.radius
 
     def contract(self, points: np.ndarray) -> np.ndarray:
-        """World points (N, 3) in the ball of radius 2: offset / radius inside, (2 − 1/|o|) o/|o| beyond."""
+        """Contract world points (N, 3): o = offset / radius inside the sphere, (2 − 1/|o|) o/|o| outside."""
         offset = (np.asarray(points, dtype=np.float64) - np.array(self.centre)) / self.radius
         length = np.linalg.norm(offset, axis=-1, keepdims=True)
         safe = np.maximum(length, 1.0)
         return np.where(length > 1, (2 - 1 / safe) * offset / safe, offset)
 
     def expand(self, contracted: np.ndarray) -> np.ndarray:
-        """The inverse of `contract` for points (N, 3) of length below 2."""
+        """Inverse of `contract` for points (N, 3) of length below 2."""
         contracted = np.asarray(contracted, dtype=np.float64)
         length = np.linalg.norm(contracted, axis=-1, keepdims=True)
         safe = np.maximum(length, 1.0)
@@ -79,10 +79,10 @@ class Region:
 
 
 def region_of(views: Sequence[View]) -> Region:
-    """The sphere around what all cameras look at, as large as the median view shows whole.
+    """The sphere around the point that all cameras look at, as large as the median view shows entirely.
 
-    Raises InputError if the view axes have no common point (one view, or parallel ones), if that point lies
-    behind half of the cameras (they look outward), and if a camera stands at that point.
+    Raises InputError if the view axes have no common point (one view, or parallel ones), if that point is
+    behind half of the cameras (they look outward), and if a camera is at that point.
     """
     focus, distance = view_focus(views)
     origins = np.array([view.to_world[:3, 3] for view in views])
@@ -96,13 +96,13 @@ def region_of(views: Sequence[View]) -> Region:
 
 
 def region_radius(distance: np.ndarray, half_angle: np.ndarray) -> float:
-    """The radius that cameras suggest at distances (V,) from its centre, half angles (V,) in radians."""
-    whole = float(np.median(distance * np.sin(half_angle)))
-    return min(REGION_SHARE * whole, CAMERA_SHARE * float(distance.min()))
+    """The radius for cameras at distances (V,) from the centre; half angles of view (V,) in radians."""
+    entire = float(np.median(distance * np.sin(half_angle)))
+    return min(REGION_SHARE * entire, CAMERA_SHARE * float(distance.min()))
 
 
 def region_pixels(view: View, region: Region) -> np.ndarray:
-    """Pixels (H, W) whose ray, through their centre, meets the region's sphere in front of the camera."""
+    """Mask (H, W) of pixels whose ray through the centre hits the region's sphere in front of the camera."""
     across = (view.cx - 0.5 - np.arange(view.width)) / view.fx
     up = (view.cy - 0.5 - np.arange(view.height)) / view.fy
     local = np.stack([*np.meshgrid(across, up), np.ones((view.height, view.width))], axis=-1)
@@ -115,7 +115,7 @@ def region_pixels(view: View, region: Region) -> np.ndarray:
 
 
 def read_region(folder: Path) -> Region | None:
-    """The region that a data set's folder records; None without the file.
+    """Read region.json of a data set's folder; None without the file.
 
     Raises InputError for a file that cannot be used.
     """

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, names that may be none, and JSON that may hold anything."""
+"""Atomic writes, locks, names from untrusted files, JSON, and size checks before decoding."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from typing import IO, Any
 from mi_refgs.errors import InputError
 
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp(\.[^.]*)?")
-"""Names that `replace_file` gives to files that are not whole yet."""
+"""Names of the temporary files of `replace_file`."""
 ANY_FILE = 2**24
-"""Bytes of pixels that any file may promise."""
+"""Bytes of pixels that a header of any file may promise."""
 MAX_EXPANSION = 1100
-"""Bytes of pixels that a byte of a larger file may promise: DEFLATE cannot expand by more than 1,032."""
+"""Bytes of pixels per byte of a larger file that its header may promise: DEFLATE expands by at most 1,032."""
 MAX_PIXELS = 2**28
-"""Pixels of an image file at most: twice those of a 16K panorama, and more than any camera has."""
+"""Largest number of pixels of an image file: twice those of a 16K panorama."""
 STRIP_PIXELS = 2**22
-"""Pixels of a large image that are floating-point numbers at a time: 50 MB of three channels."""
+"""Pixels of a large image that are converted to floating point at a time: 50 MB of three channels."""
 STRIP_ROWS = 256
-"""Rows of such a strip at most: those of the largest block in which EXR files are compressed (DWAB)."""
+"""Largest number of rows of such a strip: that of the largest compression block of EXR files (DWAB)."""
 POLL = 0.1
 """Seconds between two tries to take a lock."""
 _OWN = threading.local()
-"""`held`: the locks of this thread."""
+"""`held`: paths of the locks of this thread."""
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def cannot_write(path: Path, error: Exception) -> InputError:
-    """What to raise when `path` cannot be written, with the remedy that fits the error."""
+    """The InputError for a `path` that cannot be written, with a remedy that fits the error."""
     reason = getattr(error, "strerror", None) or error
     full = getattr(error, "errno", None) in NO_ROOM
     remedy = "free some space there, or choose another folder" if full else "choose a writable folder"
@@ -45,7 +45,7 @@ def cannot_write(path: Path, error: Exception) -> InputError:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, and those above it; raises InputError if that fails."""
+    """Make a folder and its parents; raises InputError if that fails."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -55,11 +55,11 @@ def make_folder(path: Path) -> None:
 
 
 def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
-    """Let `write(temporary)` make a file beside `path`, then move it there: readers see the old or the new.
+    """Write a file atomically: `write(temporary)` makes a file beside `path`, which is then moved there.
 
-    The data is on the disk before the move, so that a power cut leaves the old file or the new one, too. The
-    temporary name has the suffix of `path`. A killed process may leave one behind, hidden by its dot; see
-    `remove_temporaries`. Raises InputError if the folder is missing or the file cannot be written.
+    The data is flushed to disk before the move, so that also a power cut leaves the old file or the new one.
+    The temporary name has the suffix of `path`; a killed process may leave it behind (`remove_temporaries`).
+    Raises InputError if the folder is missing or the file cannot be written.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.tmp{path.suffix}")
@@ -76,28 +76,28 @@ def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write a file, whole or not at all; raises InputError as `replace_file` does."""
+    """Write a file atomically; raises InputError as `replace_file` does."""
     replace_file(path, lambda temporary: temporary.write_bytes(data))
 
 
 def write_json(path: str | Path, content: Any, indent: int = 1) -> None:
-    """Write a JSON file, whole or not at all; raises InputError as `replace_file` does."""
+    """Write a JSON file atomically; raises InputError as `replace_file` does."""
     write_bytes(path, f"{json.dumps(content, indent=indent)}\n".encode())
 
 
 class BusyError(InputError):
-    """Another process, or another thread of this one, holds a lock."""
+    """Another process or thread has locked the file."""
 
 
 @contextlib.contextmanager
 def locked(path: Path, busy: str, wait: float = 0.0) -> Iterator[None]:
-    """Hold the lock of the file at `path`, which the system releases however this process ends.
+    """Lock the file at `path`; the operating system releases the lock however this process ends.
 
-    A thread that holds it may take it again. The file is removed afterwards; one that a killed process leaves
-    locks nothing. Where the file system has no locks, nothing is held.
+    The lock is re-entrant per thread. The file is removed afterwards; one that a killed process leaves is not
+    locked. Nothing is locked where the file system has no locks.
 
-    Raises BusyError with the sentence `busy` if it is held elsewhere for `wait` seconds, and InputError as
-    `make_folder` does.
+    Raises BusyError with the message `busy` if it stays locked elsewhere for `wait` seconds, and InputError
+    as `make_folder` does.
     """
     key = path.parent.resolve() / path.name
     held: set[Path] = _OWN.__dict__.setdefault("held", set())
@@ -116,7 +116,7 @@ def locked(path: Path, busy: str, wait: float = 0.0) -> Iterator[None]:
         yield
     finally:
         held.remove(key)
-        with contextlib.suppress(OSError):  # while it is still held: nobody else can have this file's lock
+        with contextlib.suppress(OSError):  # still locked: nobody else can lock this file
             if not path.stat().st_size:  # a file with content is not ours
                 path.unlink()
             if new:
@@ -125,7 +125,7 @@ def locked(path: Path, busy: str, wait: float = 0.0) -> Iterator[None]:
 
 
 def _lock_of(path: Path) -> IO[str] | None:
-    """The file with its lock taken; None if it is held elsewhere."""
+    """The locked file; None if it is locked elsewhere."""
     while True:
         try:
             file = path.open("a")
@@ -138,7 +138,7 @@ def _lock_of(path: Path) -> IO[str] | None:
         except BlockingIOError:
             file.close()
             return None
-        except FileNotFoundError:  # removed by its holder since it was opened
+        except FileNotFoundError:  # removed by the other process since it was opened
             pass
         except OSError:  # no locks on this file system
             return file
@@ -146,14 +146,14 @@ def _lock_of(path: Path) -> IO[str] | None:
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Remove what processes that were killed while writing a file have left in a folder."""
+    """Remove temporary files that killed processes have left in a folder."""
     for path in folder.iterdir():
         if TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file exists; no for a name that no file can have."""
+    """Whether a file exists; False for an impossible name."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -161,9 +161,9 @@ def is_file(path: Path) -> bool:
 
 
 def inside(folder: Path, name: object) -> Path | None:
-    """The file of a relative name in a folder; None for one that leads out of it, or is no name.
+    """The path of a relative name in a folder; None if it leads out of the folder or is no name.
 
-    Symbolic links are followed: they belong to whoever made the folder, not to the file that has the name.
+    Symbolic links are followed: the user made them, not the untrusted file that contains the name.
     """
     parts = os.path.normpath(name) if isinstance(name, str) else os.pardir
     if os.path.isabs(parts) or parts.split(os.sep)[0] in (os.pardir, os.curdir):
@@ -174,13 +174,13 @@ def inside(folder: Path, name: object) -> Path | None:
 def read_json(path: str | Path) -> dict[str, Any]:
     """The object in a JSON file.
 
-    Raises InputError for a file that is missing, no JSON, nested too deeply, or holds anything but an object.
+    Raises InputError for a file that is missing, no JSON, nested too deeply, or not an object.
     """
     path = Path(path)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: JSON: cannot be read ({error}); mend it or export it again") from error
+        raise InputError(f"{path}: JSON: cannot be read ({error}); correct it or export it again") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: JSON: the outermost value is not an object; export the file again")
     return content
@@ -193,9 +193,9 @@ def require_file(path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:
-    """Raise InputError for a size beyond MAX_PIXELS, and for one that no file of this length can hold.
+    """Raise InputError for a size beyond MAX_PIXELS, and for one that no file of this length can contain.
 
-    Readers call it with what the header says, before they ask for memory.
+    Readers call it with the size in the header before they allocate memory.
     """
     if width * height > MAX_PIXELS:
         raise InputError(
@@ -205,7 +205,7 @@ def check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> Non
     promised = width * height * bytes_per_pixel
     if promised > max(ANY_FILE, MAX_EXPANSION * path.stat().st_size):
         raise InputError(
-            f"{path}: size: {width} × {height} pixels are more than the file can hold; export it again"
+            f"{path}: size: {width} × {height} pixels are more than the file can contain; export it again"
         )
 
 

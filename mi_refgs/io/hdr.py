@@ -1,4 +1,4 @@
-"""Radiance pictures (.hdr) as NumPy arrays."""
+"""Radiance images (.hdr) as NumPy arrays."""
 
 from __future__ import annotations
 
@@ -12,33 +12,31 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import check_size, require_file, strip_rows
 
 MAX_HDR_HEADER = 2**16
-"""Bytes in which the size of a Radiance picture must stand."""
-
-
+"""Bytes within which the size of a Radiance image must be given."""
 SCALES = np.append(0, np.ldexp(1.0, np.arange(1, 256) - 136)).astype(np.float32)
-"""What a number of red, green or blue stands for, by the byte of its exponent."""
+"""Factor of red, green and blue by the byte of their exponent."""
 
 
 def hdr_strips(path: Path) -> tuple[tuple[int, int], Iterator[np.ndarray]]:
-    """Height and width of a Radiance picture (.hdr), and its rows from the top in linear float32 (n, W, 3).
+    """Height and width of a Radiance image (.hdr), and strips of its rows: linear float32 (n, W, 3).
 
-    Written here because Mitsuba's reader writes beyond its memory where a run is longer than its row. Layout:
-    Ward, "Real Pixels", 1991. Raises InputError if the file is missing or no such picture; the strips raise
-    it where they are broken.
+    Mitsuba's reader is not used: it writes out of bounds where a run is longer than its row. Layout: Ward,
+    "Real Pixels", 1991. Raises InputError if the file is missing or no such image; the iterator raises it for
+    broken strips.
     """
     require_file(path)
     with path.open("rb") as file:
         header = file.read(MAX_HDR_HEADER)
     size = re.search(rb"\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", header)
     if not header.startswith(b"#?") or b"32-bit_rle_xyze" in header or size is None:
-        raise InputError(f"{path}: header: no Radiance picture of rows from the top; save it as EXR")
+        raise InputError(f"{path}: header: no Radiance image of rows from the top; save it as EXR")
     height, width = int(size.group(1)), int(size.group(2))
     check_size(path, width, height, 4)
     return (height, width), _strips(path, height, width, size.end())
 
 
 def _strips(path: Path, height: int, width: int, position: int) -> Iterator[np.ndarray]:
-    """The rows from a place in the file on, run lengths or none."""
+    """The rows from a position in the file on, run-length encoded or not."""
     marker, data = bytes((2, 2, width >> 8 & 255, width & 255)), path.read_bytes()
     step = strip_rows(max(width, 1))
     for top in range(0, height, step):
@@ -59,7 +57,7 @@ def _strips(path: Path, height: int, width: int, position: int) -> Iterator[np.n
 
 
 def _runs(data: bytes, position: int, width: int) -> tuple[bytes, int]:
-    """One channel of a row of a Radiance picture, and where the next begins; ValueError if it is too long."""
+    """One channel of a row, and the position of the next; raises ValueError if it is too long."""
     values = bytearray()
     while len(values) < width:
         count = data[position]

@@ -1,4 +1,4 @@
-"""8-bit image files, sRGB's transfer function and PSNR in NumPy; `exr` and `hdr` hold the linear formats."""
+"""8-bit image files, the sRGB transfer function and PSNR in NumPy; linear formats are in `exr` and `hdr`."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ SRGB_LINEAR_LIMIT = 0.0031308
 SRGB_ENCODED_LIMIT = 0.04045
 """The same point after encoding."""
 ALPHA_FLOOR = 1e-8
-"""Alpha that radiance is divided by at least: what covers so little has no colour."""
+"""Alpha by which radiance is divided at least."""
 
 ENDINGS = (".png", ".jpg", ".jpeg")
-"""Endings of the names of 8-bit image files, in small letters, in the order in which they are tried."""
+"""File name endings of 8-bit images, in lower case, in the order in which they are tried."""
 EXIF_IFD = 0x8769
-"""Tag of EXIF 2.3: the table of the camera's settings."""
+"""Tag of the table of camera settings (EXIF 2.3)."""
 PSNR_MAX = 100.0
-"""What identical images read, dB: JSON has no infinity, and float32 images cannot differ by less."""
+"""PSNR of identical images, dB: JSON has no infinity, and float32 images cannot differ by less."""
 JPEG_SHRINK = 8
-"""A JPEG file's blocks have 8 × 8 pixels: its decoder can give 8, 4, 2 or 1 pixels a side for each."""
+"""JPEG blocks have 8 × 8 pixels; the decoder can return 8 × 8, 4 × 4, 2 × 2 or 1 for each."""
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -47,7 +47,7 @@ def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
 
 
 def straight_srgb(rgba: np.ndarray) -> np.ndarray:
-    """What an RGBA PNG holds of premultiplied linear RGBA (H, W, 4): sRGB(radiance / alpha), and alpha."""
+    """Convert premultiplied linear RGBA (H, W, 4) to that of PNG: sRGB(radiance / alpha), and alpha."""
     alpha = rgba[..., 3:]
     colour = srgb_from_linear(rgba[..., :3] / np.maximum(alpha, ALPHA_FLOOR))
     return np.concatenate([colour, alpha], axis=-1)
@@ -56,7 +56,7 @@ def straight_srgb(rgba: np.ndarray) -> np.ndarray:
 def box_downscale(image: np.ndarray, factor: int) -> np.ndarray:
     """Mean over factor × factor blocks of an (H, W, C) image.
 
-    Rows below and columns right of the last whole block are left out: coordinates only divide by `factor`.
+    Rows below and columns right of the last whole block are left out, so that coordinates divide by `factor`.
     """
     if factor == 1:
         return image
@@ -67,14 +67,14 @@ def box_downscale(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def psnr_of(error: float) -> float:
-    """PSNR in dB of a mean squared error of values up to 1; at most PSNR_MAX, NaN of NaN."""
+    """PSNR in dB of the mean squared error of values up to 1; at most PSNR_MAX, NaN for NaN."""
     return PSNR_MAX if error <= 0 else min(-10 * float(np.log10(error)), PSNR_MAX)
 
 
 def with_ending(stem: Path, endings: tuple[str, ...] = ENDINGS) -> Path | None:
-    """The file whose name is that of `stem` and an ending, in letters of any case; None without one.
+    """The file whose name is `stem` and an ending, in upper or lower case; None without one.
 
-    Of several the first in the order of `endings`.
+    If there are several, the first in the order of `endings`.
     """
     for ending in endings:
         for suffix in (ending, ending.upper()):
@@ -96,8 +96,8 @@ def image_size(path: str | Path) -> tuple[int, int]:
     path = Path(path)
     if path.suffix.lower() == ".exr":
         return exr_size(path)
-    with open_picture(path) as picture:
-        width, height = picture.size
+    with open_image(path) as image:
+        width, height = image.size
         return int(width), int(height)
 
 
@@ -112,99 +112,98 @@ def read_png(path: str | Path) -> np.ndarray:
 def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
     """8-bit image file (PNG, JPEG) as uint8 (H, W, 3 or 4), and the factor by which both sides are smaller.
 
-    The factor is the largest divisor of `shrink` by which the decoder shrinks for less than a whole decoding
-    costs: of a JPEG file 2, 4 or 8, of others 1. A last block of fewer pixels counts as one, too. Raises
+    The factor is the largest divisor of `shrink` by which the decoder shrinks at lower cost than decoding the
+    whole file: 2, 4 or 8 for JPEG files, else 1. An incomplete last block counts as a pixel. Raises
     InputError as `read_png` does.
     """
     path = Path(path)
-    with open_picture(path) as picture:
-        if picture.mode.startswith(("I", "F")):
+    with open_image(path) as image:
+        if image.mode.startswith(("I", "F")):
             raise InputError(f"{path}: pixels: more than 8 bits per channel; save it as 8-bit PNG or EXR")
-        factor = math.gcd(shrink, JPEG_SHRINK) if picture.format == "JPEG" else 1
+        factor = math.gcd(shrink, JPEG_SHRINK) if image.format == "JPEG" else 1
         if factor > 1:
-            picture.draft(None, tuple(max(side // factor, 1) for side in picture.size))
-        return np.asarray(picture.convert("RGBA" if _transparent(picture) else "RGB")), factor
+            image.draft(None, tuple(max(side // factor, 1) for side in image.size))
+        return np.asarray(image.convert("RGBA" if _transparent(image) else "RGB")), factor
 
 
 def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
-    """Brightness (H, W) of a PNG or JPEG of 8 or 16 bits, and the number that means white.
+    """Brightness (H, W) of a PNG or JPEG of 8 or 16 bits, or alpha if it has transparent pixels; and white.
 
-    Of a picture with transparent pixels, which is cut out, it is alpha. White is the smallest of 1, 255 and
-    65535 that no number of the file exceeds: files of 8 and 16 bits may hold labels, and files of 16 bits the
-    numbers of 8. Raises InputError if the file is missing or unreadable.
+    White is the smallest of 1, 255 and 65535 that no number of the file exceeds: files of 8 and 16 bits may
+    contain labels, and files of 16 bits numbers of 8. Raises InputError if the file is missing or unreadable.
     """
     path = Path(path)
-    with open_picture(path) as picture:
-        if picture.mode.startswith("I"):
-            grey = np.asarray(picture)
+    with open_image(path) as image:
+        if image.mode.startswith("I"):
+            grey = np.asarray(image)
         else:
-            grey, alpha = np.moveaxis(np.asarray(picture.convert("LA")), -1, 0)
+            grey, alpha = np.moveaxis(np.asarray(image.convert("LA")), -1, 0)
             if not (alpha == 255).all():
                 grey = alpha
     return grey, next((white for white in (1, 255) if grey.max() <= white), 65535)
 
 
 def read_mask(path: str | Path) -> np.ndarray:
-    """Alpha (H, W) float32, 0 … 1, from a picture as `read_grey` takes it; raises InputError as it does."""
+    """Alpha (H, W) float32, 0 … 1, from an image as `read_grey` reads it; raises InputError as it does."""
     grey, white = read_grey(path)
     return grey.astype(np.float32) / np.float32(white)
 
 
 def read_tiff(path: str | Path) -> np.ndarray:
-    """The numbers (H, W) float32 of a TIFF file with one channel, floating-point or of 16 bits as 0 … 1.
+    """Numbers (H, W) float32 of a TIFF file with one channel: floats, or 16 bits as 0 … 1.
 
-    Raises InputError if the file is missing, unreadable or holds something else.
+    Raises InputError if the file is missing, unreadable, or contains something else.
     """
     path = Path(path)
-    with open_picture(path, "TIFF") as picture:
-        if picture.mode != "F" and not picture.mode.startswith("I;16"):
+    with open_image(path, "TIFF") as image:
+        if image.mode != "F" and not image.mode.startswith("I;16"):
             raise InputError(f"{path}: pixels: not one channel of floats or 16 bits; export it again")
-        scale = 1 if picture.mode == "F" else 65535
-        return np.nan_to_num(np.asarray(picture, dtype=np.float32) / np.float32(scale))
+        scale = 1 if image.mode == "F" else 65535
+        return np.nan_to_num(np.asarray(image, dtype=np.float32) / np.float32(scale))
 
 
 def has_alpha(path: str | Path) -> bool:
     """Whether a PNG or JPEG file has alpha, from its header; raises InputError as `read_png` does."""
-    with open_picture(Path(path)) as picture:
-        return _transparent(picture)
+    with open_image(Path(path)) as image:
+        return _transparent(image)
 
 
 def is_opaque(path: Path) -> bool:
     """Whether no pixel of a PNG or JPEG file is transparent; raises InputError as `read_png` does."""
-    with open_picture(path) as picture:
-        whole = picture if picture.mode in ("RGBA", "LA") else picture.convert("RGBA")
+    with open_image(path) as image:
+        whole = image if image.mode in ("RGBA", "LA") else image.convert("RGBA")
         return bool(whole.getchannel("A").getextrema()[0] == 255)
 
 
-def _transparent(picture: Any) -> bool:
-    return picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
+def _transparent(image: Any) -> bool:
+    return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
 
 
 @contextlib.contextmanager
-def open_picture(path: Path, *formats: str) -> Iterator[Any]:
-    """A PNG or JPEG file, or one of `formats`, whose header is read and whose size is believable."""
+def open_image(path: Path, *formats: str) -> Iterator[Any]:
+    """Open a PNG or JPEG file, or one of `formats`: the header is read and its size checked."""
     from PIL import Image
 
     require_file(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `check_size` is stricter
-            picture = Image.open(path, formats=formats or ("PNG", "JPEG"))
-        with picture:
-            check_size(path, *picture.size, len(picture.getbands()))
-            yield picture
+            image = Image.open(path, formats=formats or ("PNG", "JPEG"))
+        with image:
+            check_size(path, *image.size, len(image.getbands()))
+            yield image
     except InputError:
         raise
     except Exception as error:  # Pillow raises half a dozen types for broken files
         raise InputError(f"{path}: pixels: not a readable image ({error}); export it again") from error
 
 
-def exif_tags(picture: Any) -> tuple[dict[int, Any], dict[int, Any]]:
-    """EXIF data of a PIL image: the tags of the picture and of the camera's settings, less what is broken."""
+def exif_tags(image: Any) -> tuple[dict[int, Any], dict[int, Any]]:
+    """EXIF data of a PIL image: tags of the image and of the camera settings, without broken ones."""
     tags: dict[int, Any] = {}
     settings: dict[int, Any] = {}
-    with contextlib.suppress(Exception):  # Pillow raises many types for broken data, which no picture needs
-        exif = picture.getexif()
+    with contextlib.suppress(Exception):  # Pillow raises many types for broken data
+        exif = image.getexif()
         for tag in exif:
             with contextlib.suppress(Exception):
                 tags[tag] = exif[tag]
@@ -213,7 +212,7 @@ def exif_tags(picture: Any) -> tuple[dict[int, Any], dict[int, Any]]:
 
 
 def to_8_bits(image: np.ndarray) -> np.ndarray:
-    """Values in [0, 1] (clipped; NaN is 0) as uint8 of the same shape."""
+    """Quantise values in [0, 1] (clipped; NaN is 0) to uint8."""
     return np.asarray(np.round(np.clip(np.nan_to_num(image), 0, 1) * 255), dtype=np.uint8)
 
 

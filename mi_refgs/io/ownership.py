@@ -1,9 +1,8 @@
-"""Which files of an output folder belong to the command that fills it.
+"""Ownership of files in output folders: which command wrote each file.
 
 One rule for all commands: a file that the user names (`-o view.exr`) is replaced, unless it belongs to a run.
-In a folder that a command fills, the command replaces and removes only files that it wrote there itself for
-the same run or input; RECORD lists them. Where any other file is in the way, the command refuses before it
-changes anything.
+In an output folder, a command replaces and removes only files that it wrote itself for the same run or
+input; RECORD lists them. If any other file is in the way, the command refuses before it changes anything.
 """
 
 from __future__ import annotations
@@ -19,28 +18,28 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import cannot_write, make_folder
 
 RECORD = ".refgs"
-"""File of an output folder: lines of JSON, each with an owner and the files that it wrote. Lines are only
-appended, so that two processes lose none of each other's."""
+"""File of an output folder: lines of JSON, each with an owner and its files. Lines are only appended, so that
+two processes lose none of each other's."""
 RUN = "run"
 """Owner of the files of a run folder, whichever command wrote them."""
 
 
 @dataclass
 class OutputFolder:
-    """A folder that a command fills, and the owner for which it does so."""
+    """A folder that a command fills, and the owner of the files that it writes."""
 
     path: Path
-    owner: str  # the command, and what it is about; files of another owner are foreign
-    files: tuple[str, ...] = ()  # patterns of all files that the command may write
-    marker: str = ""  # file by which a folder without RECORD shows that this command filled it
+    owner: str  # command and run or input; files of other owners are not replaced
+    files: tuple[str, ...] = ()  # glob patterns of all files that the command may write
+    marker: str = ""  # file by which a folder without RECORD is recognised as filled by this command
     remedy: str = "move it away, or choose another output folder"
-    overwrite: bool = False  # the user permits replacing files of other owners, except those of a run
+    overwrite: bool = False  # replace files of other owners, except those of a run
     _claimed: set[str] = field(default_factory=set, init=False, repr=False)
 
     def owners(self) -> dict[str, str]:
         """Owner of each recorded file, by its path relative to the folder.
 
-        A folder with `marker` but without RECORD was filled by an earlier version: its `files` are the
+        All `files` of a folder with `marker` but without RECORD, which an earlier version filled, are the
         owner's.
         """
         try:
@@ -74,9 +73,9 @@ class OutputFolder:
                 )
 
     def claim(self, *names: str) -> None:
-        """Record files as the owner's, which are written next; makes their folders.
+        """Record files as the owner's before they are written, and make their folders.
 
-        Raises InputError as `require_free` does, with nothing changed, and for a folder that cannot be
+        Raises InputError as `require_free` does, before anything is changed, and for a folder that cannot be
         written.
         """
         new = [name for name in names if name not in self._claimed]
@@ -101,18 +100,18 @@ class OutputFolder:
         self._claimed.update(new)
 
     def own(self, name: str) -> Path:
-        """The path of a file that is written next; raises InputError as `claim` does."""
+        """Claim a file that is written next, and return its path; raises InputError as `claim` does."""
         self.claim(name)
         return self.path / name
 
     def owned(self, pattern: str) -> list[Path]:
-        """Files of the owner that match a pattern and are there."""
+        """Existing files of the owner that match a pattern."""
         owners = self.owners()
         found = sorted(self.path.glob(pattern))
         return [path for path in found if owners.get(path.relative_to(self.path).as_posix()) == self.owner]
 
     def remove(self, names: Iterable[str]) -> None:
-        """Remove files; raises InputError as `require_free` does, with nothing changed."""
+        """Remove files; raises InputError as `require_free` does, before anything is removed."""
         names = [*names]
         self.require_free(names)
         try:
@@ -127,5 +126,5 @@ class OutputFolder:
 
 
 def require_no_run(path: Path) -> None:
-    """Raise InputError for a file of a run: a file that the user names is replaced unless it is one."""
+    """Raise InputError if a file that the user names as output belongs to a run."""
     OutputFolder(path.parent, "", overwrite=True).require_free([path.name])

@@ -1,4 +1,4 @@
-"""The header and the vertices of a PLY file, checked against its length before memory is asked for."""
+"""Header and vertices of a PLY file, compared with its length before memory is allocated."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.memory import PER_PLY_BYTE, require
 
 MAX_HEADER_LINES = 1000
-"""A header of surfels has 124 lines at most; more than this without its end is no PLY header."""
+"""A header of surfels has 124 lines at most."""
 MAX_LINE = 4096
-"""Bytes of a line of the header."""
+"""Bytes per line of the header."""
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
@@ -32,10 +32,10 @@ class Element:
     name: str
     count: int  # rows
     fields: tuple[tuple[str, str], ...]  # name and TYPES code of the properties that are numbers
-    lists: tuple[tuple[str, str], ...]  # name and code of the length of those that are lists
+    lists: tuple[tuple[str, str], ...]  # name and code of the length of the properties that are lists
 
     def row_bytes(self, text: bool) -> int:
-        """Bytes that a row takes at least: every list empty; as text, a digit and a space a property."""
+        """Smallest size of a row: every list empty; as text, a digit and a space per property."""
         if text:
             return 2 * (len(self.fields) + len(self.lists))
         return sum(int(code[1]) for _, code in (*self.fields, *self.lists))
@@ -51,10 +51,10 @@ class Header:
 
 
 def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or mesh.ply of a run") -> Header:
-    """Read the header; the file then stands at the data.
+    """Read the header; the file position is then that of the data.
 
-    Raises InputError, naming `path`, for what is no PLY header and for one that promises more rows than the
-    file is long. `wanted` is what the message of the former says to give.
+    Raises InputError, naming `path`, for a file without PLY header (the message says to give `wanted`) and
+    for a header that promises more rows than the file contains.
     """
     if file.readline(MAX_LINE).strip() != b"ply":
         raise InputError(f"{path}: header: not a PLY file; give {wanted}")
@@ -89,15 +89,14 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
     left = os.fstat(file.fileno()).st_size - file.tell()
     for element in elements:
         names = [name for name, _ in (*element.fields, *element.lists)]
-        if not names or len({*names}) < len(names):
-            what = (
-                f"a property of {element.name} occurs twice" if names else f"{element.name} has no property"
-            )
-            raise InputError(f"{path}: header: {what}; export it again")
+        if not names:
+            raise InputError(f"{path}: header: {element.name} has no property; export it again")
+        if len({*names}) < len(names):
+            raise InputError(f"{path}: header: a property of {element.name} occurs twice; export it again")
         left -= element.count * element.row_bytes(order == "a")
         if left < (-1 if order == "a" else 0):  # text may end without a line break
             raise InputError(
-                f"{path}: {element.name}: {element.count} rows are more than the file holds; the file is "
+                f"{path}: {element.name}: {element.count} rows are more than the file contains; the file is "
                 "truncated, copy or export it again"
             )
     return Header(order, elements, (*comments,))
@@ -106,34 +105,28 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
 def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
     """The `vertex` element as a structured array.
 
-    Raises InputError as `read_header` does, and for vertices that do not come first or have lists.
+    Raises InputError as `read_header` does, and for vertices that are not the first element or have lists.
     """
     header = read_header(path, file)
-    vertex = header.elements[0]
+    vertex, text = header.elements[0], header.order == "a"
     if vertex.name != "vertex":
         raise InputError(f"{path}: {vertex.name}: the vertices must come first; export it as a surfel PLY")
     if vertex.lists:
         raise InputError(
             f"{path}: {vertex.lists[0][0]}: not a number property; export the vertices without lists"
         )
-    size = vertex.count * (8 if header.order == "a" else 1) * max(vertex.row_bytes(False), 1)
+    size = vertex.count * (8 if text else 1) * max(vertex.row_bytes(False), 1)
     require(PER_PLY_BYTE * size, f"{path}: vertex: {vertex.count:,} rows", "keep fewer of them")
-    if header.order == "a":
-        values = _read_ascii(path, file, vertex.count, len(vertex.fields))
-        dtype = np.dtype([(name, "f8") for name, _ in vertex.fields])
-        return np.ascontiguousarray(values).view(dtype).reshape(vertex.count)
-    dtype = np.dtype([(name, header.order + code) for name, code in vertex.fields])
-    return np.frombuffer(file.read(vertex.count * dtype.itemsize), dtype=dtype)
-
-
-def _read_ascii(path: Path, file: BinaryIO, count: int, width: int) -> np.ndarray:
-    values = np.empty((count, width))
-    for row in range(count):
-        words = file.readline().split()
+    if not text:
+        dtype = np.dtype([(name, header.order + code) for name, code in vertex.fields])
+        return np.frombuffer(file.read(vertex.count * dtype.itemsize), dtype=dtype)
+    values = np.empty((vertex.count, len(vertex.fields)))
+    for row in range(vertex.count):
         try:
-            values[row] = [float(word) for word in words]
+            values[row] = [float(word) for word in file.readline().split()]
         except ValueError as error:
             raise InputError(
                 f"{path}: vertex: row {row} is broken or missing; copy or export the file again"
             ) from error
-    return values
+    dtype = np.dtype([(name, "f8") for name, _ in vertex.fields])
+    return np.ascontiguousarray(values).view(dtype).reshape(vertex.count)

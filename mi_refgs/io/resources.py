@@ -1,4 +1,4 @@
-"""Where the files that come with the package lie: `variants/*.toml` and `scenes/*.xml`."""
+"""Folders of the files that come with the package: `variants/*.toml` and `scenes/*.xml`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 def resource_dir(name: str) -> Path:
     """Folder of the resource `name` ("variants" or "scenes"), in an installed wheel as in a checkout.
 
-    A wheel carries these folders inside the package; in a checkout they stand at the top level, beside it.
-
-    Raises:
-        InputError: when neither place has the folder.
+    A wheel has these folders inside the package; a checkout has them beside it. Raises InputError if neither
+    has the folder.
     """
     for folder, is_ours in (
         (_PACKAGE / name, True),

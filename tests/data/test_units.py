@@ -244,7 +244,7 @@ def test_cameras_in_one_place_are_refused_in_any_unit(
             frame["transform_matrix"] = content["frames"][0]["transform_matrix"]
         path.write_text(json.dumps(content))
     put(data, scale, offset)
-    with pytest.raises(InputError, match="stand in one place"):
+    with pytest.raises(InputError, match="in one place show no shape"):
         require_several_sides(read_dataset(data, "train"))
 
 

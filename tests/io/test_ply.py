@@ -169,7 +169,7 @@ def test_broken_files_are_refused(tmp_path: Path, rng: np.random.Generator) -> N
     text = write_file(tmp_path / "t.ply", geometry(rng), "ascii").read_bytes()
     face_first = whole.replace(b"element vertex", b"element face 2\nproperty float q\nelement vertex")
     for data, message in [
-        (whole[:-1], "vertex: 4 rows are more than the file holds; the file is truncated"),
+        (whole[:-1], "vertex: 4 rows are more than the file contains; the file is truncated"),
         (whole[:60], "no end_header; the file is truncated"),
         (b"", "not a PLY file"),
         (b"\x89PNG\r\n", "not a PLY file"),
