@@ -205,7 +205,7 @@ def check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> Non
     promised = width * height * bytes_per_pixel
     if promised > max(ANY_FILE, MAX_EXPANSION * path.stat().st_size):
         raise InputError(
-            f"{path}: size: {width} × {height} pixels are more than the file can contain; export it again"
+            f"{path}: size: {width} × {height} pixels are more than the file can hold; export it again"
         )
 
 
