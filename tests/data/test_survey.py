@@ -57,7 +57,7 @@ def test_folders_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize(
-    ("count", "words"), [(1, "a single training view shows no shape"), (3, "views in one place show no shape")]
+    ("count", "words"), [(1, "a single training view shows no shape"), (3, "in one place show no shape")]
 )
 def test_cameras_in_one_place(
     count: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
