@@ -18,8 +18,7 @@ from statistics import fmean
 from typing import Any
 
 from mi_refgs.compare.results import table as table_of
-from mi_refgs.compare.table import Row, Scene, Table
-from mi_refgs.compare.text import NOTHING, aligned
+from mi_refgs.compare.table import NOTHING, Row, Scene, Table, aligned
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import read_json
 

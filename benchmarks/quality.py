@@ -1,6 +1,6 @@
 """Time to quality: PSNR on test views against seconds of training, and the seconds to a given PSNR.
 
-    refgs compare DATA … --variants ref_gaussian,base_2dgs --preset quick -o after
+    refgs compare DATA … --methods ref_gaussian base_2dgs --preset quick -o after
     python -m benchmarks.quality after before --at 28 33 -o quality.png
 
 Reads folders that `refgs compare` made, one by each version of the code that is compared. Curves hold the
@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.common import figures
 from mi_refgs.compare.jobs import RUNS
-from mi_refgs.compare.plots import read_curve
+from mi_refgs.compare.page import read_curve
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.runs.run import Run
 

@@ -9,15 +9,15 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.cli import main
+from mi_refgs.cli import COMMANDS, command_class, main
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.errors import InputError
 
@@ -52,6 +52,25 @@ def refused(
     for word in words:
         assert str(word) in message, message
     return message
+
+
+def command_names() -> list[str]:
+    """Return the commands of `refgs`."""
+    return [name for group in COMMANDS.values() for name in group]
+
+
+def command_options(command: str | type) -> list[str]:
+    """Return the arguments and options of a command, as `data` and `--output`."""
+    kind = command_class(command)[0] if isinstance(command, str) else command
+    hints, found = get_type_hints(kind, include_extras=True), []
+    for field in fields(kind):
+        if is_dataclass(field.default):
+            found += command_options(type(field.default))  # a group of options
+        else:
+            marks = hints[field.name].__metadata__ if hasattr(hints[field.name], "__metadata__") else ()
+            [name] = [mark.name for mark in marks if getattr(mark, "name", None)] or [field.name]
+            found.append(name if "Positional" in str(marks) else f"--{name.replace('_', '-')}")
+    return found
 
 
 def unit(d: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ def page() -> str:
     text = [
         "# Methods and their deviations",
         "A method is a TOML file: where it shades, with which reflectance, light and visibility, over which "
-        "primitive, fitted on which schedule. `refgs train --variant NAME` takes one of these or a file of "
+        "primitive, fitted on which schedule. `refgs train --method NAME` takes one of these or a file of "
         "your own; [settings](settings.md) lists the keys, and `--set key=value` changes one for a run. "
         "Each file says how it deviates from the original.",
         "## Presets",
@@ -98,7 +98,7 @@ def section(path: Path, method: dict[str, Any]) -> str:
 
 
 def paper_settings() -> list[str]:
-    """Names of the methods of scenes/paper, as `--variant` takes them."""
+    """Names of the methods of scenes/paper, as `--method` takes them."""
     return [
         str(path.relative_to(ROOT / "scenes").with_suffix(""))
         for path in sorted((ROOT / "scenes" / "paper").glob("*/*.toml"))

@@ -1,88 +1,186 @@
-"""`refgs …`: one module a command; here the parser, and what turns errors into sentences and exit codes.
+"""`refgs …`: the table of commands, the parser, and errors as sentences with exit codes.
 
-Exit codes: 0 done, 1 the installation is unusable, 2 bad input, 3 jobs of a comparison failed, 130
-interrupted, 143 terminated (SIGTERM).
+A new command is a module with a dataclass (see command.py) and a line of COMMANDS.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
+import inspect
+import io
 import json
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 from mi_refgs import __version__
-from mi_refgs.cli import (
-    capture,
-    compare,
-    completion,
-    dataset,
-    demo,
-    doctor,
-    edit,
-    evaluate,
-    export,
-    import_splats,
-    profile,
-    relight,
-    render,
-    train,
-    view,
-)
-from mi_refgs.cli.command import Parser, Result, UnusableError, finite, prepare
 from mi_refgs.errors import InputError
-from mi_refgs.runs.interrupt import TerminatedError
 
-EXIT_UNUSABLE, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 2, 130, 143
-"""The last two are what shells report for a program that a signal ended: 128 + SIGINT, 128 + SIGTERM."""
+COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
+    "Make data": {
+        "dataset": ("dataset:Dataset", "path-trace a multi-view data set of a Mitsuba scene"),
+        "capture": ("capture:Capture", "find the cameras of photographs, and make a data set of them"),
+    },
+    "Fit": {
+        "train": ("train:Train", "fit surfels with materials and an environment map to images"),
+        "demo": ("demo:Demo", "path-trace a small glossy scene, fit it, and write a contact sheet"),
+    },
+    "Compare and look": {
+        "view": ("view:View", "open a run in the browser: orbit, relight, change materials, save views"),
+        "render": ("render:Render", "render a run or a Mitsuba scene to an EXR (linear) or PNG (sRGB) image"),
+        "eval": ("evaluate:Eval", "measure a run on its test views: metrics, renders, contact sheets"),
+        "compare": ("compare:Compare", "fit data sets with several methods, and tabulate the results"),
+    },
+    "Use": {
+        "relight": ("relight:Relight", "render a run under another environment map, with scores if possible"),
+        "edit": ("edit:Edit", "write a new run with surfels changed, cut, moved, duplicated or joined"),
+        "export": ("export:command", "write the files of a run anew, or files of other programs"),
+        "import": ("import_splats:Import", "convert a 3DGS or 2DGS PLY to a run folder"),
+    },
+    "Measure and set up": {
+        "profile": (
+            "profile:ProfileCommand",
+            "measure where the time of a step and of a frame goes, with advice",
+        ),
+        "doctor": ("doctor:Doctor", "examine the installation or a data set: problems and remedies"),
+        "completion": ("completion:Completion", "print the script for completion in a shell"),
+    },
+}
+"""Group → command → its class (or a function that returns it) and summary."""
+
+EXIT_CODES = {
+    0: "done",
+    1: "the installation is unusable",
+    2: "bad input",
+    3: "jobs of a comparison failed",
+    130: "interrupted",
+    143: "terminated (SIGTERM)",
+}
+"""130 and 143 are the codes of shells for a program that a signal ended: 128 + SIGINT, 128 + SIGTERM."""
+
+RENAMED: dict[str, dict[str, str]] = {
+    "capture": {"--camera": "--camera-model"},
+    "compare": {"--variants": "--methods"},
+    "dataset": {"--object": "--shapes", "--spp": "--samples"},
+    "import": {"--transforms": "--camera"},
+    "profile": {"--variant": "--method"},
+    "relight": {"--rotate": "--azimuth"},
+    "render": {"--spp": "--samples"},
+    "train": {"--variant": "--method", "--view": "--watch"},
+}
+"""Command → old option → new option: old names work for one release."""
 
 
-def build_parser() -> Parser:
-    """The parser of `refgs` with all its commands."""
-    parser = Parser(
-        prog="refgs", description="Pictures of a shiny object in, a relightable Mitsuba scene of surfels out."
-    )
-    parser.add_argument("--version", action="version", version=f"mi_refgs {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=Parser)
-    for module in (
-        doctor,
-        demo,
-        capture,
-        dataset,
-        train,
-        evaluate,
-        compare,
-        render,
-        relight,
-        edit,
-        export,
-        import_splats,
-        profile,
-        view,
-        completion,
-    ):
-        module.add(commands)
-    return parser
+def overview() -> str:
+    """Return what `refgs --help` prints."""
+    lines = [
+        "usage: refgs COMMAND …",
+        "",
+        "Reconstruct shiny objects from images as relightable Mitsuba scenes.",
+        "",
+    ]
+    for group, commands in COMMANDS.items():
+        lines += [f"{group}:", *(f"  {name:<12}{summary}" for name, (_, summary) in commands.items()), ""]
+    lines += ["refgs COMMAND --help: options, defaults and an example; refgs --version: the version.", ""]
+    return "\n".join([*lines, "exit codes:", *(f"  {code:<12}{what}" for code, what in EXIT_CODES.items())])
+
+
+def command_class(name: str) -> tuple[type[Any], str]:
+    """Import a command; returns its class and summary. Raises InputError for an unknown name."""
+    known = {name: entry for group in COMMANDS.values() for name, entry in group.items()}
+    if name not in known:
+        raise InputError(f"{name}: no such command; give one of {', '.join(known)}")
+    module, _, attribute = known[name][0].partition(":")
+    found = getattr(importlib.import_module(f"mi_refgs.cli.{module}"), attribute)
+    return found if isinstance(found, type) else found(), known[name][1]
+
+
+def parse(argv: Sequence[str]) -> Any:
+    """Parse a command line without `refgs`; returns a `Command`.
+
+    Raises InputError for bad input, SystemExit after `COMMAND --help`.
+    """
+    name, *options = argv
+    kind, summary = command_class(name)
+    return run_tyro(kind, [*_current(name, options)], name, f"{summary[0].upper()}{summary[1:]}.")
+
+
+def run_tyro(kind: Any, options: list[str], name: str, summary: str) -> Any:
+    """Call `tyro.cli`, whose boxed errors become an InputError of one sentence."""
+    import tyro
+    from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes
+
+    description = f"{summary}\n\n{inspect.cleandoc(kind.__doc__)}"
+    errors = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(errors):
+            return tyro.cli(
+                kind,
+                args=options,
+                prog=f"refgs {name}".strip(),
+                description=description,
+                config=(FlagCreatePairsOff, OmitArgPrefixes),
+            )
+    except SystemExit as error:
+        if error.code in (None, 0):
+            raise
+        raise InputError(f"{name}: {_sentence(errors.getvalue())}; see `refgs {name} --help`") from None
+
+
+def _sentence(box: str) -> str:
+    """Return the message in an error box of tyro, in one line.
+
+    Rules separate sections of a box: the first one is the message, or the title of a box without borders
+    (where the output is not UTF-8).
+    """
+    rows = [line.strip("│ ") for line in box.splitlines() if line[:1] not in ("╭", "╰")]
+    sections = re.split(r"\n[─-]{4,}\n", "\n".join(rows))
+    text = " ".join(sections[0 if "│" in box or len(sections) == 1 else 1].split())
+    if match := re.match(r"Error parsing (.+?): .*?\[(.*?)\]", text):
+        return f"{match[1].split('/')[-1]}: {match[2]}: no such value"
+    return text.removesuffix(".").replace("(required)", "").strip()
+
+
+def _current(name: str, options: Sequence[str]) -> Iterator[str]:
+    """Replace old names of options, with a warning."""
+    for text in options:
+        option, equals, value = text.partition("=")
+        new = RENAMED.get(name, {}).get(option)
+        if new is not None:
+            print(f"refgs: warning: {option} is now {new}; the old name will be removed", file=sys.stderr)
+        yield text if new is None else f"{new}{equals}{value}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code; `--help` and `--version` raise SystemExit."""
+    """Run one command and return its exit code."""
+    from mi_refgs.cli.command import UnusableError, finite
+    from mi_refgs.runs.interrupt import TerminatedError
+
+    argv = sys.argv[1:] if argv is None else list(argv)
+    if not argv or argv[0] in ("-h", "--help", "--version"):
+        print(f"mi_refgs {__version__}" if "--version" in argv else overview())
+        return 0
     try:
-        args = build_parser().parse_args(argv)
+        command = parse(argv)
         with _standard_output_to_error():
-            prepare(args)
-            result: Result = args.run(args)
+            command.common.prepare()
+            result = command.run()
+    except SystemExit:  # after --help
+        return 0
     except InputError as error:
-        return _failed(str(error), EXIT_BAD_INPUT)
+        return _failed(str(error), 2)
     except UnusableError as error:
-        return _failed(str(error), EXIT_UNUSABLE)
+        return _failed(str(error), 1)
     except TerminatedError as error:
-        return _failed(str(error) or "terminated", EXIT_TERMINATED)
+        return _failed(str(error) or "terminated", 143)
     except KeyboardInterrupt as error:
-        return _failed(str(error) or "interrupted", EXIT_INTERRUPTED)
-    print(json.dumps(finite(result.data), allow_nan=False) if args.json else result.text)
-    return result.code
+        return _failed(str(error) or "interrupted", 130)
+    text = json.dumps(finite(result.data), allow_nan=False) if command.common.json else result.text
+    print(text)
+    return int(result.code)
 
 
 def _failed(message: str, code: int) -> int:
@@ -92,7 +190,7 @@ def _failed(message: str, code: int) -> int:
 
 @contextlib.contextmanager
 def _standard_output_to_error() -> Iterator[None]:
-    """Send what libraries print to standard output to standard error, Mitsuba's C++ logger included.
+    """Redirect what libraries print on standard output, Mitsuba's C++ logger included, to standard error.
 
     Only the result of a command goes to standard output, so that `--json` can be piped.
     """

@@ -2,53 +2,47 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-from mi_refgs.cli.command import Result, add_command, add_output, say
+from tyro.conf import Positional, arg
 
-EXAMPLE = "refgs capture holiday/vase -o data/vase"
-
-
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    summary = "find the cameras of a folder of photographs, and make a data set of them"
-    parser = add_command(commands, "capture", summary, EXAMPLE, run, kernels=False)
-    parser.add_argument(
-        "photographs", type=Path, metavar="PHOTOS", help="folder with JPEG or PNG files of one scene"
-    )
-    add_output(parser, "folder of the data set; what an interrupted run left is continued", "DATA")
-    parser.add_argument(
-        "--masks",
-        type=Path,
-        metavar="FOLDER",
-        help="a mask for each photograph, NAME.png, white where the object is",
-    )
-    parser.add_argument(
-        "--camera",
-        metavar="MODEL",
-        help="COLMAP's model of the lens, such as OPENCV or OPENCV_FISHEYE (default: the simplest that fits)",
-    )
-    parser.add_argument(
-        "--region",
-        type=float,
-        nargs=4,
-        metavar=("X", "Y", "Z", "R"),
-        help="centre and radius of what matters, read off capture.png (default: what the cameras look at)",
-    )
+from mi_refgs.cli.command import Common, Output, Result
+from mi_refgs.progress import say
 
 
-def run(args: argparse.Namespace) -> Result:
-    """Place the photographs."""
-    from mi_refgs.capture.pipeline import capture
-    from mi_refgs.data.region import Region
+@dataclass(frozen=True, kw_only=True)
+class Capture:
+    """Requires COLMAP: pip install "mi_refgs[capture]".
 
-    region = None
-    if args.region is not None:
-        *centre, radius = args.region
-        region = Region.of({"centre": centre, "radius": radius}, "--region")
-    report = capture(
-        args.photographs, args.output, masks=args.masks, camera=args.camera, region=region, tell=say
-    )
-    return Result({"dataset": str(args.output), **report.content}, report.text(args.output))
+    example:
+      refgs capture holiday/vase -o data/vase
+    """
+
+    photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")]
+    """folder with JPEG or PNG files of one scene"""
+    output: Output
+    """folder of the data set; an interrupted run is continued"""
+    masks: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """masks NAME.png, one per photograph, white where the object is"""
+    camera_model: Annotated[str | None, arg(metavar="MODEL", help_behavior_hint="")] = None
+    """COLMAP camera model, such as OPENCV or OPENCV_FISHEYE (default: the simplest that fits)"""
+    region: Annotated[
+        tuple[float, float, float, float] | None, arg(metavar="X Y Z R", help_behavior_hint="")
+    ] = None
+    """centre and radius of the region of interest, see capture.png (default: what the cameras look at)"""
+    common: Common = Common()
+
+    def run(self) -> Result:
+        """Estimate the cameras."""
+        from mi_refgs.capture.pipeline import capture
+        from mi_refgs.data.region import Region
+
+        region = None
+        if self.region is not None:
+            region = Region.of({"centre": [*self.region[:3]], "radius": self.region[3]}, "--region")
+        report = capture(
+            self.photographs, self.output, masks=self.masks, camera=self.camera_model, region=region, tell=say
+        )
+        return Result({"dataset": str(self.output), **report.content}, report.text(self.output))

@@ -1,48 +1,50 @@
-"""`refgs completion`: what a shell sources to complete commands, options and files."""
+"""`refgs completion`: scripts that shells source."""
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-from typing import Any
+import contextlib
+import io
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
-from mi_refgs.cli.command import Result, add_command
-from mi_refgs.errors import InputError
+from tyro.conf import Positional, arg
 
-SHELLS = ("bash", "zsh", "tcsh")
-"""For which shtab writes a script."""
-EXAMPLE = "refgs completion bash > ~/.local/share/bash-completion/completions/refgs"
+from mi_refgs.cli.command import Common, Result
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    summary = "print the script by which a shell completes commands, options and files"
-    parser = add_command(commands, "completion", summary, EXAMPLE, run, kernels=False)
-    parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help=f"one of {', '.join(SHELLS)}")
+@dataclass(frozen=True, kw_only=True)
+class Completion:
+    """Completes commands, options and files.
 
+    example:
+      refgs completion bash > ~/.local/share/bash-completion/completions/refgs
+    """
 
-def run(args: argparse.Namespace) -> Result:
-    """Write the script from the parser as it is; raises InputError without the package shtab."""
-    try:
-        import shtab
-    except ImportError as error:
-        raise InputError(
-            'completion: shtab: not installed; type `pip install "mi_refgs[completion]"`'
-        ) from error
-    from mi_refgs.cli import build_parser
+    shell: Annotated[Positional[Literal["bash", "zsh", "tcsh", "fish"]], arg(metavar="{bash,zsh,tcsh,fish}")]
+    """the shell"""
+    common: Common = Common()
 
-    parser = build_parser()
-    for action in _actions(parser):
-        if action.type is Path:
-            action.complete = shtab.FILE  # type: ignore[attr-defined]
-    script = shtab.complete(parser, shell=args.shell)
-    return Result({"shell": args.shell, "script": script}, script)
+    def run(self) -> Result:
+        """Write the script for all commands."""
+        import tyro
+        from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes
 
+        from mi_refgs.cli import COMMANDS, command_class
 
-def _actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
-    """Options and arguments of a parser and of its commands."""
-    found = list(parser._actions)
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            found += [inner for command in action.choices.values() for inner in _actions(command)]
-    return found
+        commands: dict[str, Any] = {
+            name: command_class(name)[0] for group in COMMANDS.values() for name in group
+        }
+        script = io.StringIO()
+        with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
+            tyro.extras.subcommand_cli_from_dict(
+                commands,
+                prog="refgs",
+                args=["--tyro-print-completion", self.shell],
+                config=(FlagCreatePairsOff, OmitArgPrefixes),
+            )
+        # In bash, tyro joins preceding words to values with colons, which refgs does not have, and completes
+        # files after options only, not as arguments.
+        files = '"__TYRO_COMPLETE_FILES__"'
+        text = script.getvalue().replace("local i=$COMP_CWORD\n", "local i=0\n")
+        text = text.replace(f"== {files} ]]", f'== {files} || (-z "$completions" && "$cur" != -*) ]]')
+        return Result({"shell": self.shell, "script": text}, text)

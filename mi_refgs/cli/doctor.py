@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib.metadata
 import os
 import platform
@@ -11,10 +10,12 @@ import subprocess
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from tyro.conf import Positional, arg
 
 from mi_refgs import __version__, llvm
-from mi_refgs.cli.command import Result, add_command
+from mi_refgs.cli.command import Common, Result
 
 PROBE_TIMEOUT = 60.0
 """Time limit of the trial kernel in seconds; it usually takes half a second."""
@@ -25,7 +26,6 @@ EXTRAS = {
     "capture": "pycolmap",
     "view": "viser",
     "export": "xatlas",
-    "completion": "shtab",
 }
 """Extra of pyproject.toml that a command requires → a distribution that it installs."""
 
@@ -158,21 +158,24 @@ def _probe() -> tuple[int | None, str | None]:
     return None, f"exit status {done.returncode}, {last}"
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    summary = "say what is installed, or what is in a data set, what is wrong, and how to mend it"
-    parser = add_command(commands, "doctor", summary, "refgs doctor data/glossy", run, kernels=False)
-    parser.add_argument(
-        "data", type=Path, nargs="?", metavar="DATA", help="data set to look at, instead of the installation"
-    )
+@dataclass(frozen=True, kw_only=True)
+class Doctor:
+    """Exit code 1 means that the installation is unusable.
 
+    example:
+      refgs doctor data/glossy
+    """
 
-def run(args: argparse.Namespace) -> Result:
-    """Examine a data set, or the installation: exit code 1 if it is unusable."""
-    if args.data is not None:
-        from mi_refgs.data.survey import survey
+    data: Annotated[Positional[Path | None], arg(metavar="DATA", help_behavior_hint="")] = None
+    """data set to examine instead of the installation"""
+    common: Common = Common()
 
-        found = survey(args.data)
-        return Result(found.to_dict(), found.to_text())
-    report = examine()
-    return Result(report.to_dict(), report.to_text(), 0 if report.usable else 1)
+    def run(self) -> Result:
+        """Examine the data set or the installation."""
+        if self.data is not None:
+            from mi_refgs.data.survey import survey
+
+            found = survey(self.data)
+            return Result(found.to_dict(), found.to_text())
+        report = examine()
+        return Result(report.to_dict(), report.to_text(), 0 if report.usable else 1)

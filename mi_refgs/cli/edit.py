@@ -1,152 +1,141 @@
-"""`refgs edit`: other materials, colours and places of things; cut, duplicated, joined with another run."""
+"""`refgs edit`: a new run with other materials and arrangement."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from mi_refgs.cli.command import Result, add_command, add_output, add_run, say
+from tyro.conf import arg
+
+from mi_refgs.cli.command import Flag, OtherData, Output, Rendering, Result, RunFolder, Settings, joined
 from mi_refgs.errors import InputError
+from mi_refgs.progress import say
 
-EXAMPLE = 'refgs edit runs/glossy -o runs/matte --set roughness=0.6 --where "metallic > 0.5" --preview'
-
-OPTIONS = (
-    *("where", "box", "nearest", "mask", "view", "split", "invert", "materials"),
-    *("set", "scale", "rotate", "move", "duplicate", "cut", "keep"),
-)
-"""Options that are keywords of `Reconstruction.edit`."""
 PREVIEW = "preview.png"
+Vector = Annotated[tuple[float, float, float] | None, arg(metavar="X Y Z", help_behavior_hint="")]
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    summary = "write a new run with some surfels changed, cut, moved, duplicated, or with another run added"
-    parser = add_command(commands, "edit", summary, EXAMPLE, run)
-    # As newer versions of argparse have it: -1e-3 and -1,0,0 are no options either.
-    parser._negative_number_matcher = re.compile(r"-\.?\d")
-    add_run(parser)
-    add_output(parser, "new run folder", "NEW")
-    chosen = parser.add_argument_group("which surfels (those that meet all of it; default: all)")
-    chosen.add_argument(
-        "--where",
-        metavar="EXPRESSION",
-        help='such as "metallic > 0.5 and z < 0"; a wrong name lists what there is',
-    )
-    chosen.add_argument(
-        "--box", nargs=6, type=float, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"), help="inside of it"
-    )
-    chosen.add_argument(
-        "--nearest",
-        nargs=4,
-        type=float,
-        metavar=("X", "Y", "Z", "R"),
-        help="within R of the surfel that is nearest to the point",
-    )
-    chosen.add_argument(
-        "--mask", type=Path, metavar="PNG", help="what a picture of a view shows where it is painted white"
-    )
-    chosen.add_argument(
-        "--view",
-        type=view,
-        default=0,
-        metavar="I|CAMERA.json",
-        help="the view of --mask: a number, or what the page of `refgs view` saved (default %(default)s)",
-    )
-    chosen.add_argument(
-        "--split", choices=("test", "train"), default="test", help="whose views these are (default test)"
-    )
-    chosen.add_argument("--invert", action="store_true", help="all others instead")
-    done = parser.add_argument_group("what is done (in this order)")
-    done.add_argument(
-        "--materials",
-        action="store_true",
-        help="first make materials alone of the run, so that nothing stays as fitted to its light",
-    )
-    done.add_argument(
-        "--set",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="NAME=VALUE",
-        help='such as roughness=0.3 albedo=0.9,0.6,0.2 opacity*=0.5 "metallic=max(metallic, 0.5)"; '
-        "colour=R,G,B is that of methods with fitted colours",
-    )
-    done.add_argument("--scale", type=float, default=1.0, metavar="F", help="larger, about its middle")
-    done.add_argument(
-        "--rotate",
-        nargs=2,
-        metavar=("AXIS", "DEG"),
-        help="turned about its middle and the axis x, y, z or X,Y,Z, counter-clockwise",
-    )
-    done.add_argument("--move", nargs=3, type=float, metavar=("X", "Y", "Z"), help="moved, scene units")
-    done.add_argument(
-        "--duplicate",
-        nargs=3,
-        type=float,
-        metavar=("X", "Y", "Z"),
-        help="do it to a copy that is moved so far; what was there stays",
-    )
-    cuts = done.add_mutually_exclusive_group()
-    cuts.add_argument("--cut", action="store_true", help="remove it")
-    cuts.add_argument("--keep", action="store_true", help="remove everything else")
-    done.add_argument(
-        "--join",
-        type=Path,
-        metavar="OTHER",
-        help="add run OTHER, under the light of RUN; what is selected and done is then of OTHER",
-    )
-    parser.add_argument(
-        "--data", type=Path, metavar="DATA", help="data set of the views, if not that of the fit"
-    )
-    parser.add_argument("--preview", action="store_true", help="preview.png: views before and after")
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Surfels that meet all of these (default: all surfels)."""
+
+    where: Annotated[str | None, arg(metavar="EXPRESSION", help_behavior_hint="")] = None
+    """such as "metallic > 0.5 and z < 0"; an unknown name lists the known ones"""
+    box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint=""),
+    ] = None
+    """inside an axis-aligned box"""
+    nearest: Annotated[
+        tuple[float, float, float, float] | None, arg(metavar="X Y Z R", help_behavior_hint="")
+    ] = None
+    """within R of the surfel that is nearest to the point"""
+    mask: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="")] = None
+    """visible where an image of a view is white"""
+    view: Annotated[str, arg(metavar="I|CAMERA.json")] = "0"
+    """view of --mask: its number, or a camera that the page of `refgs view` saved"""
+    split: Literal["test", "train"] = "test"
+    """split of --view"""
+    invert: Flag = False
+    """all other surfels instead"""
 
 
-def view(text: str) -> int | Path:
-    """The number of a view, or the file of a camera."""
-    return int(text) if re.fullmatch(r"-?\d{1,9}", text, re.ASCII) else Path(text)
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """What is done to the selected surfels, in this order."""
+
+    materials: Flag = False
+    """first replace colours that were fitted to the environment map by materials"""
+    set: Annotated[
+        Settings,
+        arg(
+            metavar="NAME=VALUE …",
+            help='such as roughness=0.3 albedo=0.9,0.6,0.2 opacity*=0.5 "metallic=max(metallic, 0.5)"; '
+            "colour=R,G,B for methods with fitted colours",
+            help_behavior_hint="",
+        ),
+    ] = ()
+    scale: Annotated[float, arg(metavar="F")] = 1.0
+    """scale about the middle of the selection"""
+    rotate: Annotated[tuple[str, str] | None, arg(metavar="AXIS DEG", help_behavior_hint="")] = None
+    """rotate about the middle of the selection and the axis x, y, z or X,Y,Z, counter-clockwise"""
+    move: Vector = None
+    """translate, scene units"""
+    duplicate: Vector = None
+    """change a copy that is translated by this; the original stays"""
+    cut: Flag = False
+    """remove the selection"""
+    keep: Flag = False
+    """remove everything else"""
 
 
-def run(args: argparse.Namespace) -> Result:
-    """Edit."""
-    from mi_refgs.editing import assignments
-    from mi_refgs.editing.expression import parse_condition
-    from mi_refgs.formats.cameras import read_cameras
-    from mi_refgs.io.images import write_png
-    from mi_refgs.reconstruction.reconstruction import load
-    from mi_refgs.runs.run import Run
+@dataclass(frozen=True, kw_only=True)
+class Edit:
+    """The run stays as it is.
 
-    _require_free(args.output)
-    assignments(args.set)  # what is no formula is said before the run is read, which takes seconds
-    if args.where is not None:
-        parse_condition(args.where)
-    whole = load(args.run_folder, write=False)
-    whole = replace(whole, provenance=whole.provenance.with_data(args.data))
-    join = None if args.join is None else load(args.join, write=False)
-    options = {name: getattr(args, name) for name in OPTIONS}
-    if isinstance(args.view, Path):
-        options["view"] = read_cameras(args.view)[0]
-    try:
-        edited = whole.edit(**options, join=join)
-    except InputError as error:
-        runs = " + ".join(str(path) for path in (args.run_folder, args.join) if path is not None)
-        raise InputError(f"{runs}: {error}") from error
-    entry = edited.provenance.edits[-1]
-    for note in entry["notes"]:
-        say(f"note: {note}")
-    sheet = _preview(whole, edited) if args.preview else None
-    edited.save(args.output)
-    if sheet is not None:
-        write_png(Run(args.output).output.own(PREVIEW), sheet)
-    text = f"{args.output}: {entry['selected']} of {entry['of']} surfels; it has {entry['surfels']}"
-    return Result({"output": str(args.output), **entry}, text)
+    example:
+      refgs edit runs/glossy -o runs/matte --set roughness=0.6 --where "metallic > 0.5" --preview
+    """
+
+    run_folder: RunFolder
+    output: Output
+    """new run folder"""
+    join: Annotated[Path | None, arg(metavar="OTHER", help_behavior_hint="")] = None
+    """add run OTHER, lit by the environment map of RUN; selection and change then apply to OTHER"""
+    data: OtherData = None
+    preview: Flag = False
+    """also write preview.png: views before and after"""
+    selection: Selection = Selection()
+    change: Change = Change()
+    common: Rendering = Rendering()
+
+    def run(self) -> Result:
+        """Edit the run."""
+        from mi_refgs.editing import assignments
+        from mi_refgs.editing.expression import parse_condition
+        from mi_refgs.formats.cameras import read_cameras
+        from mi_refgs.io.images import write_png
+        from mi_refgs.reconstruction.reconstruction import load
+        from mi_refgs.runs.run import Run
+
+        _require_free(self.output)
+        options = vars(self.selection) | vars(self.change) | {"set": joined(self.change.set)}
+        # Formulas are checked before the run is read, which takes seconds.
+        assignments(options["set"])
+        if self.selection.where is not None:
+            parse_condition(self.selection.where)
+
+        # A number of a view or a file of a camera.
+        view = self.selection.view
+        if re.fullmatch(r"-?\d{1,9}", view, re.ASCII):
+            options["view"] = int(view)
+        else:
+            options["view"] = read_cameras(Path(view))[0]
+
+        whole = load(self.run_folder, write=False)
+        whole = replace(whole, provenance=whole.provenance.with_data(self.data))
+        join = None if self.join is None else load(self.join, write=False)
+        try:
+            edited = whole.edit(**options, join=join)
+        except InputError as error:
+            runs = " + ".join(str(path) for path in (self.run_folder, self.join) if path is not None)
+            raise InputError(f"{runs}: {error}") from error
+        entry = edited.provenance.edits[-1]
+        for note in entry["notes"]:
+            say(f"note: {note}")
+        sheet = _preview(whole, edited) if self.preview else None
+        edited.save(self.output)
+        if sheet is not None:
+            write_png(Run(self.output).output.own(PREVIEW), sheet)
+        text = f"{self.output}: {entry['selected']} of {entry['of']} surfels; it has {entry['surfels']}"
+        return Result({"output": str(self.output), **entry}, text)
 
 
 def _preview(before: Any, after: Any) -> Any:
-    """Test views before and after; of cameras around the object where the data set is not there."""
+    """Render test views before and after, or cameras around the object without the data set."""
     from mi_refgs.editing import before_and_after
 
     cameras = before.cameras()
@@ -159,7 +148,7 @@ def _preview(before: Any, after: Any) -> Any:
 
 
 def _require_free(out: Path) -> None:
-    """Raise InputError unless a folder can be made there: nothing stands there, or an empty one."""
+    """Raise InputError unless the path does not exist or is an empty folder."""
     from mi_refgs.io.files import cannot_write
 
     try:
@@ -167,4 +156,4 @@ def _require_free(out: Path) -> None:
     except (OSError, ValueError) as error:
         raise cannot_write(out, error) from error
     if taken:
-        raise InputError(f"{out}: output: stands there already; choose another -o")
+        raise InputError(f"{out}: output: exists already; choose another -o")

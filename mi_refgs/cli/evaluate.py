@@ -1,11 +1,11 @@
-"""`refgs eval`: the quality of a run on its test views."""
+"""`refgs eval`: metrics of a run on its test views."""
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from typing import Any
 
-from mi_refgs.cli.command import Result, add_command, add_run, add_test_views
+from mi_refgs.cli.command import Flag, OtherData, Rendering, Result, RunFolder, Samples
 
 ROWS = (
     ("image_size", "image size", "{0[0]} × {0[1]} pixels"),
@@ -22,20 +22,20 @@ ROWS = (
     ("albedo_psnr", "albedo, PSNR after scale", "{:.2f} dB"),
     ("roughness_mae", "roughness, mean error", "{:.3f}"),
     ("metallic_mae", "metallic, mean error", "{:.3f}"),
-    ("env_psnr", "light, PSNR after scale", "{:.2f} dB"),
-    ("env_correlation", "light, correlation", "{:.3f}"),
+    ("env_psnr", "environment map, PSNR", "{:.2f} dB"),
+    ("env_correlation", "environment map, corr.", "{:.3f}"),
     ("surface_distance", "surface distance", "{:.2f} % of the size"),
     ("concave_share", "concave pixels", "{:.1%} of the foreground"),
     ("surfels", "surfels", "{}"),
     ("pruned", "pruned", "from {0[surfels]} surfels, training views within {0[psnr]:.1f} dB"),
     ("iterations", "iterations", "{}"),
     ("train_seconds", "training", "{:.0f} s"),
-    ("samples", "samples of a pixel", "{}"),
+    ("samples", "samples per pixel", "{}"),
     ("ms_per_frame", "frame", "{:.1f} ms"),
 )
-"""Key of metrics.json, name and format of what people read."""
+"""Key of metrics.json, its title and format."""
 CONCAVE_ROWS = ("psnr", "normal_mae_deg", "albedo_psnr", "roughness_mae", "metallic_mae", "surface_distance")
-"""Rows whose number on concave pixels stands behind them."""
+"""Rows that also state the number on concave pixels."""
 REASONS = {
     "flip": "flip",
     "lpips": "lpips",
@@ -47,41 +47,42 @@ REASONS = {
     "surface_distance": "surface",
     "concave_share": "concave",
 }
-"""Which `…_reason` explains a missing number."""
+"""Key → name of the `…_reason` that explains a missing number."""
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    summary = "measure a run on the test views: metrics.json, renders, sheets of ours beside the truth"
-    parser = add_command(commands, "eval", summary, "refgs eval runs/glossy --json", run)
-    add_run(parser)
-    add_test_views(parser)
-    parser.add_argument(
-        "--antialias",
-        action="store_true",
-        help="widen roughness by how much normals turn within a pixel, also where the fit did not",
-    )
+@dataclass(frozen=True, kw_only=True)
+class Eval:
+    """Writes metrics.json, renders, and contact sheets compared with ground truth to the run folder.
 
+    example:
+      refgs eval runs/glossy --json
+    """
 
-def run(args: argparse.Namespace) -> Result:
-    """Evaluate."""
-    from mi_refgs.evaluation.evaluate import DECOMPOSITION, SHEET, evaluate
-    from mi_refgs.runs.run import Run
+    run_folder: RunFolder
+    data: OtherData = None
+    samples: Samples = 1
+    antialias: Flag = False
+    """widen roughness by the variation of normals within a pixel, also where the fit did not"""
+    common: Rendering = Rendering()
 
-    result = evaluate(
-        Run(args.run_folder), args.data, progress=True, samples=args.samples, antialias=args.antialias
-    )
-    return Result(result, f"{table(result)}\nsheets: {args.run_folder / SHEET}, {DECOMPOSITION}")
+    def run(self) -> Result:
+        """Evaluate the run."""
+        from mi_refgs.evaluation.evaluate import DECOMPOSITION, SHEET, evaluate
+        from mi_refgs.runs.run import Run
+
+        folder = Run(self.run_folder)
+        result = evaluate(folder, self.data, progress=True, samples=self.samples, antialias=self.antialias)
+        return Result(result, f"{table(result)}\nsheets: {self.run_folder / SHEET}, {DECOMPOSITION}")
 
 
 def table(result: dict[str, Any]) -> str:
-    """The numbers of metrics.json for people."""
+    """Return the numbers of metrics.json as text."""
     lines = []
     for key, name, form in ROWS:
         if result[key] is not None:
             concave = result.get(f"{key}_concave") if key in CONCAVE_ROWS else None
-            apart = "" if concave is None else f"  (concave: {form.format(concave)})"
-            lines.append(f"{name:<27}{form.format(result[key])}{apart}")
+            suffix = "" if concave is None else f"  (concave: {form.format(concave)})"
+            lines.append(f"{name:<27}{form.format(result[key])}{suffix}")
         elif key in REASONS:
             lines.append(f"{name:<27}none: {result[f'{REASONS[key]}_reason']}")
     return "\n".join(lines)

@@ -2,125 +2,148 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from mi_refgs.cli.command import Result, add_command, add_run, say
+from tyro.conf import arg
+
+from mi_refgs.cli.command import (
+    Flag,
+    OptionalOutput,
+    OtherData,
+    Rendering,
+    Result,
+    RunFolder,
+    Words,
+    separated,
+)
 from mi_refgs.constants import PRUNE_LIMIT
 from mi_refgs.errors import InputError, SceneError
+from mi_refgs.progress import say
 
 if TYPE_CHECKING:
     from mi_refgs.io.ownership import OutputFolder
     from mi_refgs.runs.run import Run
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Without --to: surfels.ply, envmap.exr, mesh.ply and scene.xml of the newest checkpoint."""
+
+    run_folder: RunFolder
+    output: OptionalOutput = None
+    """folder (default: RUN itself); with --to the file, or the folder of several"""
+    to: Words = ()
+    data: OtherData = None
+    overwrite: Flag = False
+    """replace files in the output folder that are not this export of RUN, but never those of a run"""
+    prune: Flag = False
+    """leave out surfels that the training views do not need; export again without it to restore them"""
+    limit: Annotated[float | None, arg(metavar="DB", help_behavior_hint=f"(default: {PRUNE_LIMIT:g})")] = None
+    """with --prune: least PSNR of each image of the pruned compared with the whole scene"""
+    format: Any = None
+    common: Rendering = Rendering()
+
+    def run(self) -> Result:
+        """Export the run."""
+        from mi_refgs.evaluation.evaluate import load_split
+        from mi_refgs.formats import write
+        from mi_refgs.reconstruction.provenance import Provenance
+        from mi_refgs.runs.export import export, newest
+        from mi_refgs.runs.run import Run
+        from mi_refgs.runs.trained_scene import ARTEFACTS, TrainedScene
+
+        # Refuse options that do not belong together.
+        names = separated(self.to)
+        options = {name: value for name, value in vars(self.format).items() if value not in (None, False)}
+        if self.limit is not None and not self.prune:
+            raise InputError("--limit: limits what --prune drops; add --prune, or leave it out")
+        if options and not names:
+            raise InputError(
+                f"--{next(iter(options)).replace('_', '-')}: belongs to a format; name it with --to"
+            )
+        if names and self.output is None:
+            raise InputError("--to: names no file; say with -o which file or folder to write")
+
+        # Load the newest state and the cameras.
+        folder = Run(self.run_folder)
+        method = folder.method()
+        state = folder.load_checkpoint()
+        fitted = newest(folder, method) if state is None else TrainedScene.from_state(method, state)
+        source = Provenance.of(folder).with_data(self.data)
+        if source.data is not None and not source.has_data:
+            say(f"note: {source.data} is gone; cameras are around the object, or give --data")
+        shots = source.shots(fitted, "test", "train")
+        target = self.output or folder.path
+        output = _output(folder, target, self.overwrite)
+        if not names:
+            output.require_free(ARTEFACTS)
+
+        report: dict[str, Any] = {}
+        if self.prune:
+            from mi_refgs.evaluation.prune import prune
+
+            if state is None and target.resolve() == folder.path.resolve():
+                raise InputError(
+                    f"{folder.path}: checkpoints: none, from which the whole scene could be restored; write "
+                    "the pruned one to another folder with -o"
+                )
+            training, views = (load_split(folder, method, split, self.data) for split in ("train", "test"))
+            limit = PRUNE_LIMIT if self.limit is None else self.limit
+            fitted, report = prune(fitted, training, views, limit, say)
+
+        if names:
+            try:
+                written = write(fitted, names, target, shots, options, folder.path, self.overwrite)
+            except SceneError as error:
+                raise InputError(f"{folder.path}: {error}") from error
+            files = [str(path) for paths in written.values() for path in paths]
+        else:
+            files = [str(path) for path in export(fitted, target, shots[0].camera, output=output)]
+        data = {"files": files, "iteration": fitted.iteration, "surfels": fitted.surfels.count}
+        if not self.prune:
+            return Result(data, "\n".join(files))
+        return Result(data | {"pruned": report}, "\n".join([*files, table(report)]))
+
+
+def command() -> type[Export]:
+    """Return the class of the command, with the options of all registered formats."""
     from mi_refgs.formats import FORMATS, options_of
 
-    summary = "write a run's surfels.ply, envmap.exr, mesh.ply and scene.xml anew, or files of other programs"
-    example = "refgs export runs/glossy --to 3dgs-ply,cameras -o taken_along"
-    parser = add_command(commands, "export", summary, example, run)
-    add_run(parser)
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="PATH",
-        help="folder to write to (default: RUN itself); with --to the file, or the folder of several",
-    )
-    formats = parser.add_argument_group(
-        "formats of other programs", "\n".join(f"{made.name:<14}{made.summary}" for made in FORMATS.values())
-    )
-    formats.add_argument("--to", metavar="NAME[,NAME…]", help="the formats to write")
+    fields: list[Any] = []
     for option in options_of(FORMATS).values():
-        flag = f"--{option.name.replace('_', '-')}"
+        users = ", ".join(name for name, made in FORMATS.items() if option in made.options)
         if option.default is False:
-            formats.add_argument(flag, action="store_true", default=None, help=option.help)
+            kind: Any = Annotated[bool, arg(help=f"{option.help} ({users})", help_behavior_hint="")]
+            fields.append((option.name, kind, False))
         else:
-            text = f"{option.help} (default {option.default})"
-            formats.add_argument(flag, type=type(option.default), metavar=option.name[0].upper(), help=text)
-    parser.add_argument(
-        "--data", type=Path, metavar="DATA", help="data set of the cameras, if not that of the fit"
-    )
-    parser.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="replace files in the folder -o that are not this export of RUN, but never those of a run",
-    )
-    parser.add_argument(
-        "--prune",
-        action="store_true",
-        help="leave out what the training views do not need; exporting again without it writes everything",
-    )
-    parser.add_argument(
-        "--limit",
-        type=float,
-        metavar="DB",
-        help="with --prune: PSNR of every pruned picture against the whole one, at least "
-        f"(default {PRUNE_LIMIT:g})",
-    )
-
-
-def run(args: argparse.Namespace) -> Result:
-    """Export."""
-    from mi_refgs.evaluation.evaluate import load_split
-    from mi_refgs.formats import FORMATS, options_of, write
-    from mi_refgs.reconstruction.provenance import Provenance
-    from mi_refgs.runs.export import export, newest
-    from mi_refgs.runs.run import Run
-    from mi_refgs.runs.trained_scene import ARTEFACTS, TrainedScene
-
-    if args.limit is not None and not args.prune:
-        raise InputError("--limit: limits what --prune drops; add --prune, or leave it out")
-    options = {name: getattr(args, name) for name in options_of(FORMATS) if getattr(args, name) is not None}
-    if args.to is None and options:
-        raise InputError(f"--{next(iter(options)).replace('_', '-')}: belongs to a format; name it with --to")
-    if args.to is not None and args.output is None:
-        raise InputError("--to: names no place; say with -o which file or folder to write")
-    folder = Run(args.run_folder)
-    method = folder.method()
-    state = folder.load_checkpoint()
-    fitted = newest(folder, method) if state is None else TrainedScene.from_state(method, state)
-    source = Provenance.of(folder).with_data(args.data)
-    if source.data is not None and not source.has_data:
-        say(f"note: {source.data} is gone; cameras are around the object, or give its folder with --data")
-    shots = source.shots(fitted, "test", "train")
-    target = args.output or folder.path
-    output = _output(folder, target, args.overwrite)
-    if args.to is None:
-        output.require_free(ARTEFACTS)
-    report: dict[str, Any] = {}
-    if args.prune:
-        from mi_refgs.evaluation.prune import prune
-
-        if state is None and target.resolve() == folder.path.resolve():
-            raise InputError(
-                f"{folder.path}: checkpoints: none is left to bring the whole scene back from; write the "
-                "pruned one to another folder with -o"
+            kind = type(option.default) | None
+            text = f"{option.help} ({users}; default: {option.default})"
+            metavar = option.name[0].upper()
+            fields.append(
+                (option.name, Annotated[kind, arg(help=text, metavar=metavar, help_behavior_hint="")], None)
             )
-        training, views = (load_split(folder, method, split, args.data) for split in ("train", "test"))
-        fitted, report = prune(
-            fitted, training, views, PRUNE_LIMIT if args.limit is None else args.limit, say
-        )
-    if args.to is not None:
-        try:
-            names = [name.strip() for name in args.to.split(",") if name.strip()]
-            written = write(fitted, names, target, shots, options, folder.path, args.overwrite)
-        except SceneError as error:
-            raise InputError(f"{folder.path}: {error}") from error
-        files = [str(path) for paths in written.values() for path in paths]
-    else:
-        files = [str(path) for path in export(fitted, target, shots[0].camera, output=output)]
-    data = {"files": files, "iteration": fitted.iteration, "surfels": fitted.surfels.count}
-    if not args.prune:
-        return Result(data, "\n".join(files))
-    return Result(data | {"pruned": report}, "\n".join([*files, table(report)]))
+    options = make_dataclass("FormatOptions", fields, frozen=True, kw_only=True)
+    formats = Annotated[
+        tuple[str, ...],
+        arg(metavar="NAME …", help=f"formats of other programs: {', '.join(FORMATS)}", help_behavior_hint=""),
+    ]
+    lines = [f"  {made.name:<14}{made.summary}" for made in FORMATS.values()]
+    export = make_dataclass(
+        "Export",
+        [("to", formats, ()), ("format", options, field(default=options()))],
+        bases=(Export,),
+        frozen=True,
+        kw_only=True,
+    )
+    example = ["example:", "  refgs export runs/glossy --to 3dgs-ply cameras -o out"]
+    export.__doc__ = "\n".join([Export.__doc__ or "", "", "formats:", *lines, "", *example])
+    return export
 
 
 def _output(run: Run, target: Path, overwrite: bool) -> OutputFolder:
-    """The folder of the artefacts of a run; raises InputError for the folder of another run."""
+    """Return the folder for the artefacts; raises InputError for the folder of another run."""
     from mi_refgs.io.ownership import OutputFolder
     from mi_refgs.runs.run import Run
 
@@ -133,7 +156,7 @@ def _output(run: Run, target: Path, overwrite: bool) -> OutputFolder:
 
 
 def table(report: dict[str, Any]) -> str:
-    """The report of `evaluation.prune` for people."""
+    """Return the report of `evaluation.prune` as text."""
     before, after = report["before"], report["after"]
     lines = [
         f"{'surfels':<22}{before['surfels']} -> {after['surfels']}",
@@ -149,7 +172,7 @@ def table(report: dict[str, Any]) -> str:
             scores = report[split]
             lines.append(
                 f"{f'{split} views':<22}worst {scores['worst']:.1f} dB, mean {scores['mean']:.1f} dB "
-                f"({scores['views']}), against the whole scene"
+                f"({scores['views']}), compared with the whole scene"
             )
     lines.append(f"{'frame':<22}{before['ms_per_frame']:.1f} -> {after['ms_per_frame']:.1f} ms")
     return "\n".join(lines)

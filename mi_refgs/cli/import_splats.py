@@ -1,51 +1,53 @@
-"""`refgs import`: a run folder of a PLY file that another program has written."""
+"""`refgs import`: a run folder from a PLY of another program."""
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-from mi_refgs.cli.command import Result, add_command, add_output
+from tyro.conf import Positional, arg
+
+from mi_refgs.cli.command import Cameras, Flag, Output, Rendering, Result
 from mi_refgs.errors import counted
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    summary = "make a run folder of a PLY file of 3DGS or 2DGS, which render, view, edit and export read"
-    parser = add_command(commands, "import", summary, "refgs import point_cloud.ply -o runs/theirs", run)
-    parser.add_argument("file", type=Path, metavar="FILE.ply", help="3D Gaussians or surfels of any degree")
-    add_output(parser, "run folder to write; one that holds a run is refused", "RUN")
-    parser.add_argument(
-        "--transforms",
-        type=Path,
-        metavar="FILE.json",
-        help="cameras for scene.xml (default: cameras around the object, z up)",
-    )
-    parser.add_argument(
-        "--linear",
-        action="store_true",
-        help="colours are linear radiance, as this program fits them (default: display-encoded)",
-    )
+@dataclass(frozen=True, kw_only=True)
+class Import:
+    """`refgs render`, `view`, `edit` and `export` read the run folder.
 
+    example:
+      refgs import point_cloud.ply -o runs/theirs
+    """
 
-def run(args: argparse.Namespace) -> Result:
-    """Import."""
-    from mi_refgs.formats.cameras import read_cameras
-    from mi_refgs.reconstruction.reconstruction import import_splats
-    from mi_refgs.runs.export import save
-    from mi_refgs.runs.run import Run
+    file: Annotated[Positional[Path], arg(metavar="FILE.ply")]
+    """3D Gaussians or surfels of any SH degree"""
+    output: Output
+    """new run folder"""
+    camera: Cameras = None
+    """cameras of scene.xml, in the form of transforms.json (default: around the object, z up)"""
+    linear: Flag = False
+    """colours are linear radiance, as fitted by this program (default: display-encoded)"""
+    common: Rendering = Rendering()
 
-    Run(args.output).require_none()
-    made = import_splats(args.file, linear=args.linear)
-    cameras = made.cameras() if args.transforms is None else read_cameras(args.transforms)
-    written = save(made.trained, args.output, made.method, cameras[0], more=cameras[1:])
-    files = [str(path) for path in written]
-    surfels = made.trained.surfels
-    kind, degree = surfels.primitive.name, surfels.sh_degree()
-    data = {"files": files, "surfels": surfels.count, "primitive": kind, "degree": degree}
-    data["cameras"] = len(cameras)
-    what = (
-        f"{counted(surfels.count, kind)} of degree {degree}, {counted(len(cameras), 'camera')} in scene.xml"
-    )
-    return Result(data, f"{args.output}: {what}")
+    def run(self) -> Result:
+        """Import the file."""
+        from mi_refgs.formats.cameras import read_cameras
+        from mi_refgs.reconstruction.reconstruction import import_splats
+        from mi_refgs.runs.export import save
+        from mi_refgs.runs.run import Run
+
+        Run(self.output).require_none()
+        made = import_splats(self.file, linear=self.linear)
+        cameras = made.cameras() if self.camera is None else read_cameras(self.camera)
+        files = save(made.trained, self.output, made.method, cameras[0], more=cameras[1:])
+        surfels = made.trained.surfels
+        data = {
+            "files": [str(path) for path in files],
+            "surfels": surfels.count,
+            "primitive": surfels.primitive.name,
+            "degree": surfels.sh_degree(),
+            "cameras": len(cameras),
+        }
+        what = f"{counted(surfels.count, surfels.primitive.name)} of SH degree {surfels.sh_degree()}"
+        return Result(data, f"{self.output}: {what}, {counted(len(cameras), 'camera')} in scene.xml")

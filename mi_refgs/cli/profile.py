@@ -1,141 +1,125 @@
-"""`refgs profile`: where the time of a training step and of a picture goes, and what would help."""
+"""`refgs profile`: times of a training step and of a frame, and advice."""
 
 from __future__ import annotations
 
-import argparse
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from mi_refgs.cli.command import Result, add_command, add_settings, say
-from mi_refgs.constants import DEFAULT_PRESET
+from tyro.conf import Positional, arg
+
+from mi_refgs.cli.command import MethodName, OtherData, Preset, Rendering, Result, Settings, joined
 from mi_refgs.errors import InputError
+from mi_refgs.progress import say
 
 if TYPE_CHECKING:
     from mi_refgs.fitting.train import Trainer
     from mi_refgs.profiling.profile import FrameProfile, Profile
+    from mi_refgs.runs.run import Run
 
-DEFAULT_STEPS = 15
 MOST_STEPS = 1000
 MOST_PIXELS = 4096
 MEBIBYTE = 2**20
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    summary = "say where the time of a training step and of a picture goes, and what would help"
-    parser = add_command(commands, "profile", summary, "refgs profile runs/glossy", run)
-    parser.add_argument(
-        "path",
-        type=Path,
-        metavar="RUN|DATA",
-        help="run folder (its newest checkpoint, in its stage; and its pictures) or data set (a fresh fit, "
-        "every stage)",
-    )
-    parser.add_argument("--data", type=Path, metavar="DATA", help="with RUN: its data set, if it has moved")
-    parser.add_argument("--variant", metavar="V", help="with DATA: method (default: the full one)")
-    parser.add_argument("--preset", metavar="P", help=f"with DATA: preset (default {DEFAULT_PRESET})")
-    parser.add_argument(
-        "--steps",
-        type=int,
-        default=DEFAULT_STEPS,
-        metavar="N",
-        help=f"steps to measure (default {DEFAULT_STEPS})",
-    )
-    parser.add_argument(
-        "--size",
-        type=int,
-        nargs="+",
-        metavar="N",
-        help="with RUN: pixels along the longer side of its pictures (default 200 400 800)",
-    )
-    add_settings(parser)
+@dataclass(frozen=True, kw_only=True)
+class ProfileCommand:
+    """Of a run: its newest checkpoint in its stage, and its frames. Of a data set: every stage of a new fit.
+
+    Nothing is written.
+
+    example:
+      refgs profile runs/glossy
+    """
+
+    path: Annotated[Positional[Path], arg(metavar="RUN|DATA")]
+    """run folder or data set"""
+    steps: Annotated[int, arg(metavar="N")] = 15
+    """steps to measure"""
+    size: Annotated[tuple[int, ...], arg(metavar="N …", help_behavior_hint="")] = ()
+    """with RUN: pixels along the longer side of its frames (default: 200 400 800)"""
+    data: OtherData = None
+    method: MethodName = None
+    preset: Preset = None
+    set: Settings = ()
+    common: Rendering = Rendering()
+
+    def run(self) -> Result:
+        """Measure, and advise."""
+        import drjit as dr
+
+        from mi_refgs.profiling.advice import advice
+        from mi_refgs.profiling.profile import profile
+        from mi_refgs.runs.run import Run
+        from mi_refgs.runs.trained_scene import MODEL
+
+        if not 1 <= self.steps <= MOST_STEPS:
+            raise InputError(f"--steps: {self.steps} is out of range; give 1 to {MOST_STEPS}")
+        for size in self.size:
+            if not 1 <= size <= MOST_PIXELS:
+                raise InputError(f"--size: {size} is out of range; give 1 to {MOST_PIXELS}")
+        folder = Run(self.path)
+        has_scene = folder.exists() and (bool(folder.checkpoints()) or (self.path / MODEL).is_file())
+        # Bad input of a fit is refused before the frames, which take longest.
+        fit = None if has_scene and not folder.checkpoints() else self._trainer(folder)
+        frames = self._frames(folder, has_scene)
+        data: dict[str, Any] = {
+            "frames": [asdict(frame) for frame in frames],
+            "threads": int(dr.thread_count()),
+        }
+        if fit is None:
+            return Result(data, frames_text(frames))
+        trainer, stages = fit
+        found = profile(trainer, stages, self.steps)
+        advised = advice(found, trainer.method)
+        data |= asdict(found) | {"advice": advised}
+        data["work"]["share"] = found.work.share
+        return Result(data, "\n\n".join([text(found, advised), *([frames_text(frames)] if frames else [])]))
+
+    def _frames(self, folder: Run, has_scene: bool) -> list[FrameProfile]:
+        """Measure frames of a run at each size; none for a data set, or a run without a checkpoint."""
+        from mi_refgs.profiling.profile import SIZES, aovs_of, profile_frame
+        from mi_refgs.reconstruction.reconstruction import load
+
+        if self.size and not folder.exists():
+            raise InputError(f"--size: {self.path} is no run; drop --size")
+        if not has_scene:
+            return []
+        found = load(self.path, write=False)
+        draw, camera = found.trained.drawn(), found.camera(0)
+        names = aovs_of(draw(camera, True))
+        return [profile_frame(draw, names, camera.resized(size)) for size in self.size or SIZES]
+
+    def _trainer(self, folder: Run) -> tuple[Trainer, list[str]]:
+        """Return the trainer of a run or of a new fit, and the stages of the schedule to measure."""
+        from mi_refgs.evaluation.evaluate import load_split
+        from mi_refgs.fitting.plan import sized
+        from mi_refgs.fitting.runner import load_method
+        from mi_refgs.fitting.targets import read_views
+        from mi_refgs.fitting.train import Trainer
+
+        if not self.path.is_dir():
+            raise InputError(f"{self.path}: RUN|DATA: no such folder; give a run folder or a data set")
+        if folder.exists():
+            for option in ("method", "preset", "set"):
+                if getattr(self, option):
+                    raise InputError(
+                        f"--{option}: {self.path} is a run and keeps its method; drop --{option}"
+                    )
+            method = folder.method()
+            if not folder.checkpoints():
+                raise InputError(f"{self.path}: checkpoints: none yet; train on, or profile its data set")
+            trainer = Trainer(method, load_split(folder, method, "train", self.data), folder)
+            return trainer, [method.stage_at(max(trainer.iteration, 1))[0]]
+        if self.data is not None:
+            raise InputError(f"--data: {self.path} is no run; drop --data")
+        method = sized(load_method(self.method, self.preset, joined(self.set)), self.path, say)
+        views = read_views(method, self.path, "train", truth=False)
+        return Trainer(method, views), [name for name, _ in method.stages()]
 
 
-def run(args: argparse.Namespace) -> Result:
-    """Measure, and advise. Nothing is written."""
-    from mi_refgs.profiling.advice import advice
-    from mi_refgs.profiling.profile import profile
-    from mi_refgs.runs.run import Run
-    from mi_refgs.runs.trained_scene import MODEL
-
-    if not 1 <= args.steps <= MOST_STEPS:
-        raise InputError(f"--steps: {args.steps} is out of range; give 1 to {MOST_STEPS}")
-    for size in args.size or ():
-        if not 1 <= size <= MOST_PIXELS:
-            raise InputError(f"--size: {size} is out of range; give 1 to {MOST_PIXELS}")
-    folder = Run(args.path)
-    trained = folder.exists() and not folder.checkpoints() and (args.path / MODEL).is_file()
-    # What is refused is refused before the images, which take longest.
-    made = None if trained else _trainer(args)
-    frames = _frames(args)
-    data: dict[str, Any] = {"frames": [asdict(frame) for frame in frames], "threads": _threads()}
-    if made is None:
-        return Result(data, frames_text(frames))
-    trainer, stages = made
-    found = profile(trainer, stages, args.steps)
-    said = advice(found, trainer.method)
-    data |= asdict(found) | {"advice": said}
-    data["work"]["share"] = found.work.share
-    return Result(data, "\n\n".join([text(found, said), *([frames_text(frames)] if frames else [])]))
-
-
-def _frames(args: argparse.Namespace) -> list[FrameProfile]:
-    """Pictures of a run at each size; none of a data set, or of a run that has found nothing yet."""
-    from mi_refgs.profiling.profile import SIZES, aovs_of, profile_frame
-    from mi_refgs.reconstruction.reconstruction import load
-    from mi_refgs.runs.run import Run
-    from mi_refgs.runs.trained_scene import MODEL
-
-    folder = Run(args.path)
-    if not folder.exists():
-        if args.size:
-            raise InputError(f"--size: {args.path} is no run; drop --size")
-        return []
-    if not folder.checkpoints() and not (args.path / MODEL).is_file():
-        return []
-    found = load(args.path, write=False)
-    draw, camera = found.trained.drawn(), found.camera(0)
-    names = aovs_of(draw(camera, True))
-    return [profile_frame(draw, names, camera.resized(size)) for size in args.size or SIZES]
-
-
-def _trainer(args: argparse.Namespace) -> tuple[Trainer, list[str]]:
-    """The trainer of a run or of a fresh fit, and the stages of the schedule to look at."""
-    from mi_refgs.evaluation.evaluate import load_split
-    from mi_refgs.fitting.plan import sized
-    from mi_refgs.fitting.runner import load_method
-    from mi_refgs.fitting.targets import read_views
-    from mi_refgs.fitting.train import Trainer
-    from mi_refgs.runs.run import Run
-
-    if not args.path.is_dir():
-        raise InputError(f"{args.path}: RUN|DATA: no such folder; give a run folder or a data set")
-    folder = Run(args.path)
-    if folder.exists():
-        for option, value in (("--variant", args.variant), ("--preset", args.preset), ("--set", args.set)):
-            if value:
-                raise InputError(f"{option}: {args.path} is a run and keeps its method; drop {option}")
-        method = folder.method()
-        if not folder.checkpoints():
-            raise InputError(f"{args.path}: checkpoints: none yet; train on, or profile its data set")
-        trainer = Trainer(method, load_split(folder, method, "train", args.data), folder)
-        return trainer, [method.stage_at(max(trainer.iteration, 1))[0]]
-    if args.data is not None:
-        raise InputError(f"--data: {args.path} is no run; drop --data")
-    method = sized(load_method(args.variant, args.preset, args.set), args.path, say)
-    views = read_views(method, args.path, "train", truth=False)
-    return Trainer(method, views), [name for name, _ in method.stages()]
-
-
-def _threads() -> int:
-    import drjit as dr
-
-    return int(dr.thread_count())
-
-
-def text(found: Profile, said: list[str]) -> str:
-    """The profile as lines of text: a table of milliseconds, counts, and what would help."""
+def text(found: Profile, advised: list[str]) -> str:
+    """Return the profile as text: a table of milliseconds, counts, and advice."""
     names = list(dict.fromkeys(name for stage in found.stages for name in stage.phases_ms))
     lines = [_row("a training step, ms", [stage.name for stage in found.stages])]
     for name in names:
@@ -152,20 +136,20 @@ def text(found: Profile, said: list[str]) -> str:
         ("surfel-tile pairs", f"{work.pairs:.0f}"),
         ("surfel-pixel evaluations", f"{work.evaluated:.0f}"),
         ("  that contribute", f"{work.contributing:.0f} ({work.share:.0%})"),
-        ("layers of a covered pixel", f"{work.contributing / max(work.covered, 1):.1f}"),
+        ("layers per covered pixel", f"{work.contributing / max(work.covered, 1):.1f}"),
         ("surfels in no view", f"{work.unseen_share:.0%}"),
         ("memory of the kernels", f"{found.allocated / MEBIBYTE:.0f} MiB at most"),
     ]
-    lines += ["", f"a view, mean of {work.views}", *(f"{name:<28}{value}" for name, value in counts), ""]
-    return "\n".join([*lines, *(said or ["Nothing stands out."])])
+    lines += ["", f"per view, mean of {work.views}", *(f"{name:<28}{value}" for name, value in counts), ""]
+    return "\n".join([*lines, *(advised or ["Nothing stands out."])])
 
 
 def frames_text(frames: list[FrameProfile]) -> str:
-    """A table of milliseconds: the picture alone, and what each AOV adds to it."""
-    lines = [_row("a picture, ms", [f"{frame.width}x{frame.height}" for frame in frames])]
+    """Return a table of milliseconds per frame and AOV."""
+    lines = [_row("a frame, ms", [f"{frame.width}x{frame.height}" for frame in frames])]
     lines.append(_row("  radiance and alpha", [f"{frame.frame_ms:.1f}" for frame in frames]))
     for name in frames[0].aovs_ms:
-        lines.append(_row(f"  {name} adds", [f"{frame.aovs_ms[name]:.1f}" for frame in frames]))
+        lines.append(_row(f"  + {name}", [f"{frame.aovs_ms[name]:.1f}" for frame in frames]))
     return "\n".join(lines)
 
 

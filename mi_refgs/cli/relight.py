@@ -1,76 +1,65 @@
-"""`refgs relight`: a trained scene under another light."""
+"""`refgs relight`: a run under another environment map."""
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-from mi_refgs.cli.command import Result, add_command, add_run, add_test_views, warn
+from tyro.conf import arg
 
-EXAMPLE = "refgs relight runs/glossy --envmap studio.hdr --rotate 90 -o relit/studio"
-
-
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    summary = "show a run under another light: pictures, scene.xml, and the score where the truth is known"
-    parser = add_command(commands, "relight", summary, EXAMPLE, run)
-    add_run(parser)
-    parser.add_argument(
-        "--envmap",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="lat-long map (EXR, HDR), its first row straight up, along +z",
-    )
-    parser.add_argument(
-        "--world",
-        action="store_true",
-        help="the map is in world directions already, as an environment.exr or envmap.exr is",
-    )
-    parser.add_argument(
-        "--rotate",
-        type=float,
-        default=0.0,
-        metavar="DEG",
-        help="turn the light about +z, which is up, counter-clockwise seen from above",
-    )
-    parser.add_argument(
-        "--exposure", type=float, default=0.0, metavar="EV", help="stops by which the light is brighter"
-    )
-    parser.add_argument(
-        "--turntable", type=int, default=0, metavar="N", help="N views around the object, not the test views"
-    )
-    add_test_views(parser)
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="folder for it all (default: RUN/relight/NAME)"
-    )
+from mi_refgs.cli.command import Flag, OptionalOutput, OtherData, Rendering, Result, RunFolder, Samples
+from mi_refgs.progress import warn
 
 
-def run(args: argparse.Namespace) -> Result:
-    """Relight."""
-    from mi_refgs.reconstruction.new_light import NewLight
-    from mi_refgs.relighting.relight import SHEET, relight
-    from mi_refgs.runs.run import Run
+@dataclass(frozen=True, kw_only=True)
+class Relight:
+    """Writes images, a contact sheet, scene.xml, and the score where ground truth is known.
 
-    light = NewLight(args.envmap, args.world, args.rotate, args.exposure)
-    relit = relight(
-        Run(args.run_folder),
-        light,
-        args.output,
-        turntable=args.turntable,
-        data=args.data,
-        samples=args.samples,
-        progress=True,
-    )
-    if relit.warning:
-        warn(relit.warning)
-    result = relit.result
-    lines = [f"{len(result['pictures'])} pictures, scene.xml and {SHEET} in {result['output']}"]
-    if result["psnr"] is None:
-        lines.append(f"score: none: {result['score_reason']}")
-    else:
-        factors = ", ".join(f"{x:.3f}" for x in result["scale"])
-        lines.append(f"PSNR                       {result['psnr']:.2f} dB")
-        lines.append(f"PSNR, one scale a channel  {result['psnr_scaled']:.2f} dB  (scale {factors})")
-    return Result(result, "\n".join(lines))
+    example:
+      refgs relight runs/glossy --envmap studio.hdr --azimuth 90 -o relit/studio
+    """
+
+    run_folder: RunFolder
+    envmap: Annotated[Path, arg(metavar="FILE")]
+    """lat-long map (EXR, HDR), first row towards +z"""
+    output: OptionalOutput = None
+    """folder of the result (default: RUN/relight/NAME)"""
+    world: Flag = False
+    """the map has world directions already, such as an environment.exr or envmap.exr"""
+    azimuth: Annotated[float, arg(metavar="DEG")] = 0.0
+    """rotation of the map about +z, counter-clockwise seen from above"""
+    exposure: Annotated[float, arg(metavar="EV")] = 0.0
+    """exposure compensation of the map in stops"""
+    turntable: Annotated[int, arg(metavar="N")] = 0
+    """render N views around the object instead of the test views"""
+    data: OtherData = None
+    samples: Samples = 1
+    common: Rendering = Rendering()
+
+    def run(self) -> Result:
+        """Relight the run."""
+        from mi_refgs.reconstruction.new_light import NewLight
+        from mi_refgs.relighting.relight import SHEET, relight
+        from mi_refgs.runs.run import Run
+
+        relit = relight(
+            Run(self.run_folder),
+            NewLight(self.envmap, self.world, self.azimuth, self.exposure),
+            self.output,
+            turntable=self.turntable,
+            data=self.data,
+            samples=self.samples,
+            progress=True,
+        )
+        if relit.warning:
+            warn(relit.warning)
+        result = relit.result
+        lines = [f"{len(result['pictures'])} images, scene.xml and {SHEET} in {result['output']}"]
+        if result["psnr"] is None:
+            lines.append(f"score: none: {result['score_reason']}")
+        else:
+            factors = ", ".join(f"{x:.3f}" for x in result["scale"])
+            lines.append(f"PSNR                            {result['psnr']:.2f} dB")
+            lines.append(f"PSNR after per-channel scaling  {result['psnr_scaled']:.2f} dB  (scale {factors})")
+        return Result(result, "\n".join(lines))

@@ -1,88 +1,88 @@
-"""`refgs render`: what Mitsuba's own command line cannot render, since it has no Python."""
+"""`refgs render`: scenes that Mitsuba's own command line, which has no Python, cannot render."""
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from mi_refgs.cli.command import Result, add_command, add_output
+from tyro.conf import Positional, arg
+
+from mi_refgs.cli.command import Cameras, Flag, Output, Rendering, Result, Words, separated
 from mi_refgs.errors import InputError, counted
 
-SUFFIXES = (".exr", ".png")
 
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """A run is rendered from the camera of its scene.xml.
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    summary = "render a Mitsuba scene, or a run's scene.xml, to an EXR (linear) or PNG (sRGB) picture"
-    parser = add_command(
-        commands, "render", summary, "refgs render runs/glossy -o glossy.exr --aov albedo normal", run
-    )
-    parser.add_argument("scene", type=Path, metavar="SCENE.xml|RUN", help="a Mitsuba scene, or a run folder")
-    add_output(parser, "picture: .exr (linear, premultiplied alpha) or .png (sRGB, straight alpha)", "OUT")
-    parser.add_argument(
-        "--sensor", type=int, default=0, metavar="I", help="which sensor of the scene (default %(default)s)"
-    )
-    parser.add_argument(
-        "--camera",
-        type=Path,
-        metavar="FILE.json",
-        help="cameras of a transforms.json, such as the page of `refgs view` saves; --sensor counts these",
-    )
-    parser.add_argument(
-        "--object", action="store_true", help="the object alone, on transparency, without its surroundings"
-    )
-    parser.add_argument(
-        "--spp", type=int, default=0, metavar="N", help="samples per pixel (default: the scene's)"
-    )
-    parser.add_argument(
-        "--aov",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="more channels of the EXR: albedo, metallic, roughness, normal, depth, alpha, visibility, "
-        "diffuse, specular, indirect",
-    )
+    example:
+      refgs render runs/glossy -o glossy.exr --aov albedo normal
+    """
 
+    scene: Annotated[Positional[Path], arg(metavar="RUN|SCENE.xml")]
+    """run folder, or Mitsuba scene"""
+    output: Output
+    """image: .exr (linear, premultiplied alpha) or .png (sRGB, straight alpha)"""
+    sensor: Annotated[int, arg(metavar="I")] = 0
+    """number of the sensor of the scene, or of the camera in --camera"""
+    camera: Cameras = None
+    """cameras in the form of transforms.json, such as the page of `refgs view` saves"""
+    object: Flag = False
+    """render the object without its background, on transparency"""
+    samples: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """samples per pixel (default: those of the scene's sampler)"""
+    aov: Words = ()
+    """additional channels of the EXR: albedo, metallic, roughness, normal, depth, alpha, visibility, diffuse,
+    specular, indirect"""
+    common: Rendering = Rendering()
 
-def run(args: argparse.Namespace) -> Result:
-    """Render."""
-    from mi_refgs.formats.cameras import read_cameras
-    from mi_refgs.io.ownership import require_no_run
-    from mi_refgs.render.load_scene import load_scene
-    from mi_refgs.render.scene_xml import sensors_of
+    def run(self) -> Result:
+        """Render the image."""
+        from mi_refgs.formats.cameras import read_cameras
+        from mi_refgs.io.ownership import require_no_run
+        from mi_refgs.render.load_scene import load_scene
+        from mi_refgs.render.scene_xml import sensors_of
 
-    if args.output.suffix.lower() not in SUFFIXES:
-        raise InputError(
-            f"{args.output}: suffix: '{args.output.suffix}' is no picture format here; use .exr or .png"
-        )
-    if not args.output.parent.is_dir():
-        raise InputError(
-            f"{args.output}: output: its folder does not exist; create it or choose a writable folder"
-        )
-    require_no_run(args.output)
-    if args.spp < 0:
-        raise InputError(f"--spp: {args.spp} is out of range; give a number from 1")
-    cameras = None if args.camera is None else read_cameras(args.camera)
-    scene = load_scene(scene_file(args.scene), args.aov, args.object)
-    own = sensors = scene.sensors()
-    whose = f"{args.scene}: --sensor: {args.sensor}: the scene has {counted(len(own), 'sensor')}"
-    if cameras is not None:
-        sensors = sensors_of(cameras)
-        whose = f"{args.camera}: --sensor: {args.sensor}: the file has {counted(len(sensors), 'frame')}"
-    if not sensors:
-        raise InputError(f"{args.scene}: sensor: the scene has none; add one, or give a file with --camera")
-    if not 0 <= args.sensor < len(sensors):
-        raise InputError(f"{whose}; give 0 to {len(sensors) - 1}")
-    spp = args.spp or (own[0].sampler().sample_count() if cameras is not None and own else 0)
-    names = write(scene, sensors[args.sensor], spp, args.output)
-    width, height = (int(x) for x in sensors[args.sensor].film().crop_size())
-    data = {"output": str(args.output), "width": width, "height": height, "channels": names}
-    return Result(data, f"{args.output}: {width} × {height}, {', '.join(names)}")
+        # Refuse the output before the scene is read.
+        out = self.output
+        if out.suffix.lower() not in (".exr", ".png"):
+            raise InputError(f"{out}: suffix: '{out.suffix}': no known image format; use .exr or .png")
+        if not out.parent.is_dir():
+            raise InputError(
+                f"{out}: output: its folder does not exist; create it or choose a writable folder"
+            )
+        require_no_run(out)
+        if self.samples is not None and self.samples < 1:
+            raise InputError(f"--samples: {self.samples} is out of range; give a number from 1")
+
+        # Choose the sensor.
+        cameras = None if self.camera is None else read_cameras(self.camera)
+        scene = load_scene(scene_file(self.scene), separated(self.aov), self.object)
+        own = scene.sensors()
+        sensors = own if cameras is None else sensors_of(cameras)
+        if not sensors:
+            raise InputError(
+                f"{self.scene}: sensor: the scene has none; add one, or give a file with --camera"
+            )
+        if not 0 <= self.sensor < len(sensors):
+            where, noun = (self.scene, "sensor") if cameras is None else (self.camera, "frame")
+            raise InputError(
+                f"{where}: --sensor: {self.sensor}: there {'is' if len(sensors) == 1 else 'are'} "
+                f"{counted(len(sensors), noun)}; give 0 to {len(sensors) - 1}"
+            )
+
+        sensor, samples = sensors[self.sensor], self.samples or 0
+        if not samples and cameras is not None and own:
+            samples = own[0].sampler().sample_count()
+        names = write(scene, sensor, samples, out)
+        width, height = (int(x) for x in sensor.film().crop_size())
+        data = {"output": str(out), "width": width, "height": height, "channels": names}
+        return Result(data, f"{out}: {width} × {height}, {', '.join(names)}")
 
 
 def scene_file(path: Path) -> Path:
-    """The XML of a scene, or of a run folder, whose artefacts are written first if a checkpoint is newer."""
+    """Return the XML of a scene or of a run, whose artefacts are written first if a checkpoint is newer."""
     if not path.is_dir():
         if not path.is_file():
             raise InputError(f"{path}: scene: no such file; give a Mitsuba XML or a run folder")
@@ -99,7 +99,7 @@ def scene_file(path: Path) -> Path:
 
 
 def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
-    """Render into a file, whole or not at all; returns the names of its channels."""
+    """Render into a file, atomically; returns the names of its channels. `spp` 0: the sampler's."""
     import mitsuba as mi
     import numpy as np
 

@@ -1,72 +1,63 @@
-"""`refgs view`: a reconstruction in the browser, drawn by the renderer itself."""
+"""`refgs view`: a page that renders a run in the browser."""
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated
 
-from mi_refgs.cli.command import Result, add_command, say
+from tyro.conf import Positional, arg
+
+from mi_refgs.cli.command import OptionalOutput, OtherData, Rendering, Result
 from mi_refgs.cli.render import scene_file
 from mi_refgs.errors import InputError
+from mi_refgs.progress import say
 
-if TYPE_CHECKING:
-    from mi_refgs.viewer.page import Page
-
-EXAMPLE = "refgs view runs/glossy --port 8080"
-HOST, PORT = "127.0.0.1", 8080
-
-
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    summary = "open a run in the browser: orbit it, turn its light, change its materials, save views"
-    parser = add_command(commands, "view", summary, EXAMPLE, run)
-    parser.add_argument("scene", type=Path, metavar="RUN|SCENE.xml", help="run folder, or a Mitsuba scene")
-    parser.add_argument("--port", type=int, default=PORT, metavar="P", help="port (default %(default)s)")
-    parser.add_argument(
-        "--host",
-        default=HOST,
-        metavar="H",
-        help="address to listen at; with 0.0.0.0 other machines can open the printed address, too "
-        "(default %(default)s: this machine only)",
-    )
-    parser.add_argument(
-        "--data", type=Path, metavar="DATA", help="another data set than the one it was fitted to"
-    )
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="folder for saved views (default: RUN/views)"
-    )
+HOST = "127.0.0.1"
+Port = Annotated[int, arg(metavar="P", help="port of the page")]
+PORT = 8080
 
 
-def run(args: argparse.Namespace) -> Result:
-    """Serve the page until it is interrupted."""
-    from mi_refgs.viewer.page import require_free, require_viser
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Requires the viewer: pip install "mi_refgs[view]".
 
-    require_viser()
-    require_free(args.host, args.port)
-    page = _serve_run(args) if args.scene.is_dir() else _serve_scene(args)
-    say(f"open {page.url} in a browser; Ctrl-C ends it")
-    try:
-        page.loop.run()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        page.close()
-    return Result({"url": page.url, "pictures": page.loop.delivered}, f"{page.loop.delivered} pictures shown")
+    example:
+      refgs view runs/glossy --port 8080
+    """
 
+    scene: Annotated[Positional[Path], arg(metavar="RUN|SCENE.xml")]
+    """run folder, or Mitsuba scene"""
+    output: OptionalOutput = None
+    """folder of saved views (default: RUN/views)"""
+    port: Port = PORT
+    host: Annotated[str, arg(metavar="ADDRESS")] = HOST
+    """address to listen at; 0.0.0.0 makes the page available to other machines, too"""
+    data: OtherData = None
+    common: Rendering = Rendering()
 
-def _serve_run(args: argparse.Namespace) -> Page:
-    from mi_refgs.runs.run import Run
-    from mi_refgs.viewer.serve import serve_run
+    def run(self) -> Result:
+        """Serve the page until it is interrupted."""
+        from mi_refgs.render.load_scene import load_scene
+        from mi_refgs.runs.run import Run
+        from mi_refgs.viewer.page import require_free, require_viser
+        from mi_refgs.viewer.serve import serve_run, serve_scene
 
-    return serve_run(Run(args.scene), (args.host, args.port), args.output, args.data, say)
-
-
-def _serve_scene(args: argparse.Namespace) -> Page:
-    from mi_refgs.render.load_scene import load_scene
-    from mi_refgs.viewer.serve import serve_scene
-
-    if args.data is not None:
-        raise InputError(f"--data: {args.data}: a scene has no data set; give the run, or drop --data")
-    scene = load_scene(scene_file(args.scene), [])
-    return serve_scene(scene, args.scene, (args.host, args.port), args.output, say)
+        require_viser()
+        require_free(self.host, self.port)
+        if self.scene.is_dir():
+            page = serve_run(Run(self.scene), (self.host, self.port), self.output, self.data, say)
+        elif self.data is not None:
+            raise InputError(f"--data: {self.data}: a scene has no data set; give the run, or drop --data")
+        else:
+            loaded = load_scene(scene_file(self.scene), [])
+            page = serve_scene(loaded, self.scene, (self.host, self.port), self.output, say)
+        say(f"open {page.url} in a browser; Ctrl-C ends it")
+        try:
+            page.loop.run()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            page.close()
+        shown = page.loop.delivered
+        return Result({"url": page.url, "pictures": shown}, f"{shown} images displayed")

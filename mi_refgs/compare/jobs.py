@@ -70,15 +70,18 @@ class Job:
             raise InputError(f"{folder / JOB}: not a job ({error}); remove the file") from error
 
 
+@dataclass(frozen=True)
+class Shared:
+    """What all jobs of a comparison have in common."""
+
+    preset: str
+    settings: tuple[str, ...] = ()  # KEY=VALUE
+    mitsuba_variant: str = "llvm_ad_rgb"
+    threads: int | None = None  # None: every core
+
+
 def plan(
-    folder: Path,
-    data: Sequence[Path],
-    variants: Sequence[str],
-    seeds: Sequence[int],
-    preset: str,
-    settings: Sequence[str],
-    mitsuba_variant: str,
-    threads: int | None,
+    folder: Path, data: Sequence[Path], methods: Sequence[str], seeds: Sequence[int], shared: Shared
 ) -> list[Job]:
     """The jobs of a comparison in `folder`, checked: every data set has test views, every method loads.
 
@@ -86,12 +89,12 @@ def plan(
     data set or a method that cannot be used, two of one name, and runs that were made with other settings.
     """
     _unique((absolute(path).name for path in data), "DATA", "give the folders different names")
-    _unique((Path(variant).stem for variant in variants), "--variants", "name each once")
+    _unique((Path(method).stem for method in methods), "--methods", "name each once")
     _unique((str(seed) for seed in seeds), "--seeds", "give each once")
     for seed in seeds:
         if not 0 <= seed <= MAX_SEED:
             raise InputError(f"--seeds: {seed} is out of range; give whole numbers from 0 to {MAX_SEED}")
-    if any(setting.partition("=")[0].strip() == "seed" for setting in settings):
+    if any(setting.partition("=")[0].strip() == "seed" for setting in shared.settings):
         raise InputError("--set: seed: a comparison takes its seeds from --seeds; drop it here")
     jobs = [
         Job(
@@ -99,16 +102,13 @@ def plan(
             data=str(absolute(path)),
             variant=str(Path(variant).resolve()) if variant.endswith(".toml") else variant,
             seed=seed,
-            preset=preset,
-            settings=tuple(settings),
-            mitsuba_variant=mitsuba_variant,
-            threads=threads,
+            **vars(shared),
         )
         for seed in seeds
         for path in data
-        for variant in variants
+        for variant in methods
     ]
-    require_settings(folder, preset, settings)
+    require_settings(folder, shared)
     _require_test_views(folder, jobs)
     for job in jobs:
         require_same(job)
@@ -147,12 +147,12 @@ def require_one_size(where: str, sizes: Mapping[str, list[int]], remedy: str) ->
         raise InputError(f"{where}: image sizes: {each}: scores of different sizes do not compare; {remedy}")
 
 
-def require_settings(folder: Path, preset: str, settings: Sequence[str]) -> None:
+def require_settings(folder: Path, shared: Shared) -> None:
     """Raise InputError if `folder` holds a comparison with another preset or other settings."""
     if not (folder / SETTINGS).is_file():
         return
     before = read_json(folder / SETTINGS)
-    for option, now in (("preset", preset), ("set", list(settings))):
+    for option, now in (("preset", shared.preset), ("set", list(shared.settings))):
         if (then := before.get(option)) != now:
             raise InputError(
                 f"{folder / SETTINGS}: --{option}: the comparison was begun with {_words(then)}, "
@@ -170,7 +170,7 @@ def require_same(job: Job) -> None:
     # The terms are what the run has chosen.
     for key, (before, now) in differences(made, job.method(made.terms)).items():
         raise InputError(
-            f"{job.folder}/config.toml: {key}: the run was made with {before}, and now --variants, "
+            f"{job.folder}/config.toml: {key}: the run was made with {before}, and now --methods, "
             f"--preset or --set would make it {now}; choose another -o, or remove that run"
         )
     if (job_file := Path(job.folder) / JOB).is_file() and (

@@ -12,8 +12,8 @@ from mi_refgs import __version__
 from mi_refgs.compare import jobs
 from mi_refgs.compare.jobs import SETTINGS, Job
 from mi_refgs.compare.page import PAGE, PICTURES, write_page
-from mi_refgs.compare.table import Table, rows_or_error, table_of
-from mi_refgs.compare.text import markdown
+from mi_refgs.compare.table import Table, markdown, table_of
+from mi_refgs.errors import InputError
 from mi_refgs.io.files import read_json, write_bytes, write_json
 from mi_refgs.io.ownership import OutputFolder
 
@@ -66,7 +66,9 @@ def write(folder: Path) -> Table:
 
     Raises InputError if there are none, and if a file cannot be written.
     """
-    found, files = rows_or_error(table(folder)), output(folder)
+    found, files = table(folder), output(folder)
+    if not found.scenes:
+        raise InputError("DATA: none given, and the folder has no comparison; name data sets to fit")
     files.require_free()
     content = json.dumps(dataclasses.asdict(found), indent=1, ensure_ascii=False)
     write_bytes(files.own(TABLE), f"{content}\n".encode())

@@ -232,7 +232,7 @@ def default_method(
         return None
     method = methods.for_purpose(OPEN_PURPOSE)
     (progress or Progress()).say(
-        f"{data}: pictures without alpha: --variant {method} fits their surroundings too"
+        f"{data}: pictures without alpha: --method {method} fits their surroundings too"
     )
     return method
 
@@ -255,7 +255,7 @@ def _require_same(
     elif wanted is not None:
         file = wanted
         now = methods.load(file, made.preset or DEFAULT_PRESET, made.assignments, made.terms)
-        _require(folder, "--variant (--for)", made, now)
+        _require(folder, "--method (--for)", made, now)
     if preset is not None and preset != made.preset:
         raise InputError(
             f"{folder.path / 'config.toml'}: --preset: the run was started with '{made.preset}', not "

@@ -41,7 +41,7 @@ def load(
     """
     if preset not in PRESETS:
         raise InputError(f"--preset: {preset}: unknown; use one of {', '.join(PRESETS)}")
-    path = _find(variant, "--variant", Path())
+    path = _find(variant, "--method", Path())
     table = _extended(path, [])
     for name in terms:
         table = _with_term(table, name, path)
@@ -189,9 +189,7 @@ def for_purpose(purpose: str) -> str:
     found = {_read(path).get("about", {}).get("purpose"): path.stem for path in _shipped()}
     if not purpose or purpose not in found:
         known = ", ".join(sorted(filter(None, found)))
-        raise InputError(
-            f"--for: {purpose}: no method is for that; use one of {known}, or choose a --variant"
-        )
+        raise InputError(f"--for: {purpose}: no method is for that; use one of {known}, or choose a --method")
     return found[purpose]
 
 

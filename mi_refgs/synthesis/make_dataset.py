@@ -117,7 +117,7 @@ def make_dataset(
     )
     settings.check()
     if objects and others:
-        raise InputError(f"{scene}: --relight: an open scene keeps its lamps; leave it out, or --object")
+        raise InputError(f"{scene}: --relight: an open scene keeps its lamps; leave it out, or --shapes")
     loaded = load_scene(scene, whole=bool(objects))
     about = named_shapes(loaded, objects, scene) if objects else []
     shapes = about or loaded.shapes()

@@ -22,7 +22,7 @@ def named_shapes(scene: Any, ids: Sequence[str], file: Path) -> list[Any]:
     if missing:
         known = ", ".join(sorted(name for name in found if name)) or "none"
         raise InputError(
-            f"{file}: --object: no shape has the id '{missing[0]}'; give one of those there: {known}"
+            f"{file}: --shapes: no shape has the id '{missing[0]}'; give one of those there: {known}"
         )
     return [found[name] for name in dict.fromkeys(ids)]
 

@@ -126,8 +126,15 @@ def prepare_folder(
 
 def _option(field: str) -> str:
     """The argument of `refgs dataset` that a field of the settings comes from."""
-    names = {"scene": "SCENE", "scene_sha256": "SCENE", "height": "--size", "light_sha256": "--light"}
-    return names.get(field) or f"--{'object' if field == 'objects' else field.replace('_', '-')}"
+    names = {
+        "scene": "SCENE",
+        "scene_sha256": "SCENE",
+        "height": "--size",
+        "light_sha256": "--light",
+        "objects": "--shapes",
+        "spp": "--samples",
+    }
+    return names.get(field) or f"--{field.replace('_', '-')}"
 
 
 def _as_json(values: dict[str, Any]) -> dict[str, Any]:

@@ -379,7 +379,7 @@ def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         (photographs / name).write_bytes(b"0")
     refused(["capture", photographs, "-o", tmp_path / "data"], "a.jpg: pixels: not a readable image")
-    refused(["capture", photographs, "-o", tmp_path / "data", "--camera", "PIG"], "unknown lens model")
+    refused(["capture", photographs, "-o", tmp_path / "data", "--camera-model", "PIG"], "unknown lens model")
     for numbers in ((0, 0, 0, -1), (0, 0, float("nan"), 1), (0, 1e30, 0, 1), (0, 0, 0, 0)):
         said = refused(["capture", photographs, "-o", tmp_path, "--region", *numbers])
         assert "--region: centre, radius: not three numbers and a positive one" in said

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.cli import demo, main
+from mi_refgs.cli import RENAMED, demo, main
 from mi_refgs.fitting import cost_model, plan
 from mi_refgs.fitting.plan import sized
 from mi_refgs.fitting.runner import load_method
@@ -23,24 +23,10 @@ from mi_refgs.io.exr import read_exr
 from mi_refgs.io.images import read_png, srgb_from_linear, write_png
 from mi_refgs.io.ownership import RECORD
 from mi_refgs.methods.presets import PRESETS
-from mi_refgs.methods.read import load_resolved
-from tests.helpers import ROOT, refused
+from mi_refgs.methods.read import load_resolved, names
+from tests.helpers import ROOT, command_names, command_options, refused
 from tests.scenes.tiny import SIZE, train_command
 
-COMMANDS = (
-    "doctor",
-    "demo",
-    "capture",
-    "dataset",
-    "train",
-    "eval",
-    "compare",
-    "render",
-    "relight",
-    "export",
-    "profile",
-    "view",
-)
 ARTEFACTS = ("surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "config.toml", "metrics.jsonl")
 
 
@@ -53,13 +39,37 @@ def run(finished: Path, tmp_path: Path) -> Path:
 # ---------- Help and output ----------
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", command_names())
 def test_every_command_has_help_with_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as leave:
-        main([command, "--help"])
-    assert leave.value.code == 0
+    assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
-    assert f"example:\n  refgs {command}" in text and "--json" in text
+    assert f"example:\n  refgs {command}" in text
+    assert all(option in text for option in command_options(command) if option.startswith("-"))
+
+
+@pytest.mark.parametrize("argv", [[], ["--help"], ["-h"]])
+def test_overview_lists_commands_and_exit_codes(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(argv) == 0
+    text = capsys.readouterr().out
+    assert all(f"\n  {name} " in text for name in command_names())
+    assert "exit codes:" in text and "bad input" in text
+
+
+def test_old_names_of_options_work_with_a_warning(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """For one release."""
+    assert main(["profile", str(data), "--variant=none"]) == 2
+    said = capsys.readouterr().err
+    assert "--variant is now --method" in said and "--method: none: no such method" in said
+    for command, renamed in RENAMED.items():
+        options = {*command_options(command)}
+        assert {*renamed.values()} <= options and not {*renamed} & options
+
+
+def test_purposes_and_presets_of_the_help_are_all(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "--help"]) == 0
+    text = capsys.readouterr().out
+    purposes = {load_method(name, None, []).about.purpose for name in names()} - {""}
+    assert "{" + ",".join(sorted(purposes)) + "}" in text and "{" + ",".join(PRESETS) + "}" in text
 
 
 def test_json_is_all_that_is_printed(
@@ -180,7 +190,7 @@ def test_an_interrupt_says_how_to_resume_and_resuming_changes_nothing(
 
 
 def test_resume_refuses_another_method(run: Path, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for option, value in (("--preset", "paper"), ("--variant", "other.toml"), ("--set", "loss.ssim=0")):
+    for option, value in (("--preset", "paper"), ("--method", "other.toml"), ("--set", "loss.ssim=0")):
         assert main(["train", str(data), "-o", str(run), "--resume", option, value]) == 2
         assert option in capsys.readouterr().err
 
@@ -251,7 +261,7 @@ def test_dataset_traces_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         '<scene version="3.0.0"><emitter type="constant"/><shape type="sphere">'
         '<bsdf type="diffuse"/></shape></scene>'
     )
-    options = ["--views", "2", "--test-views", "1", "--size", "16", "--spp", "1", "--json"]
+    options = ["--views", "2", "--test-views", "1", "--size", "16", "--samples", "1", "--json"]
     assert main(["dataset", str(scene), "-o", str(tmp_path / "out"), *options]) == 0
     assert json.loads(capsys.readouterr().out)["train_views"] == 2
     assert (tmp_path / "out" / "transforms_test.json").is_file()
@@ -388,7 +398,7 @@ def test_unwritable_output(finished: Path, data: Path, method: Path, tmp_path: P
     below = tmp_path / "file" / "out"
     scene = tmp_path / "scene.xml"
     scene.write_text('<scene version="3.0.0"><emitter type="constant"/><shape type="sphere"/></scene>')
-    tiny = ["--views", "1", "--size", "16", "--spp", "1"]
+    tiny = ["--views", "1", "--size", "16", "--samples", "1"]
     for argv in (
         train_command(data, below, method),
         ["dataset", str(scene), "-o", str(below), *tiny],
@@ -402,14 +412,14 @@ def test_unwritable_output(finished: Path, data: Path, method: Path, tmp_path: P
 @pytest.mark.parametrize(
     ("argv", "parts"),
     [
-        ([], ["COMMAND"]),
+        (["trian"], ["trian", "train, demo"]),
         (["train"], ["DATA"]),
         (["train", "here", "-o", "there", "--preset", "fast"], ["--preset", "quick, standard, paper"]),
-        (["train", "here", "-o", "there", "--variant", "nothing"], ["--variant", "nothing"]),
+        (["train", "here", "-o", "there", "--method", "nothing"], ["--method", "nothing"]),
         (["train", "here", "-o", "there", "--for", "nothing"], ["--for", "nothing", "relighting"]),
         (
-            ["train", "here", "-o", "there", "--for", "relighting", "--variant", "no_pbr"],
-            ["--for", "--variant no_pbr", "one of the two"],
+            ["train", "here", "-o", "there", "--for", "relighting", "--method", "no_pbr"],
+            ["--for", "--method no_pbr", "one of the two"],
         ),
         (["train", "here", "-o", "there", "--threads", "0"], ["--threads"]),
         (
@@ -418,7 +428,10 @@ def test_unwritable_output(finished: Path, data: Path, method: Path, tmp_path: P
         ),
         (["dataset", "no.xml", "-o", "there"], ["no.xml", "missing"]),
         (["render", "no.xml", "-o", "x.bmp"], ["x.bmp", ".exr or .png"]),
-        (["render", "no.xml", "-o", "x.png", "--spp", "-1"], ["--spp"]),
+        (["render", "no.xml", "-o", "x.png", "--samples", "-1"], ["--samples"]),
+        (["render", "no.xml", "-o", "x.png", "--samples", "x"], ["--samples: 'x'"]),
+        (["render", "no.xml", "-o", "x.png", "--smaples", "4"], ["--smaples"]),
+        (["edit", "run", "-o", "x", "--split", "all"], ["--split", "test"]),
         (["export", "run", "--limit", "40"], ["--limit", "--prune"]),
     ],
 )

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mi_refgs
-from mi_refgs.cli import build_parser, demo, main
+from mi_refgs.cli import demo, main
 from mi_refgs.errors import InputError
 from mi_refgs.formats import FORMATS, options_of
 from mi_refgs.io.exr import write_exr
@@ -23,7 +23,7 @@ from mi_refgs.relighting.relight import relight
 from mi_refgs.runs.run import RUN_FILES, Run
 from mi_refgs.viewer.saving import write_view
 from mi_refgs.viewer.viewer_scene import SampleRequest
-from tests.helpers import refused
+from tests.helpers import command_names, refused
 from tests.scenes.tiny import train_command
 
 FOREIGN = b'{"of": "another program"}\n'  # JSON, so that model.json and its like can be read
@@ -60,7 +60,7 @@ def _train(place: Place) -> list[str]:
 
 
 def _dataset(place: Place, *more: str) -> list[str]:
-    size = ["--views", "1", "--test-views", "1", "--size", "4", "--spp", "1"]
+    size = ["--views", "1", "--test-views", "1", "--size", "4", "--samples", "1"]
     return ["dataset", str(place / "ball.xml"), "-o", str(place / "out"), *size, *more]
 
 
@@ -74,7 +74,7 @@ def _on(command: str, *more: str) -> Callable[[Place], list[str]]:
 
 
 def _compare(place: Place) -> list[str]:
-    method = ["--variants", str(place / "tiny.toml"), "--preset", "quick"]
+    method = ["--methods", str(place / "tiny.toml"), "--preset", "quick"]
     return ["compare", str(place / "data"), "-o", str(place / "out"), *method]
 
 
@@ -210,9 +210,7 @@ def run(case: Case, place: Place) -> int:
 
 
 def test_every_command_has_a_case() -> None:
-    parser = build_parser()
-    [commands] = [action.choices for action in parser._actions if isinstance(action.choices, dict)]
-    assert {case.command for case in CASES} == set(commands)
+    assert {case.command for case in CASES} == {*command_names()}
 
 
 @pytest.mark.usefixtures("small_demo")

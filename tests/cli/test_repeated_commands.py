@@ -6,7 +6,6 @@ that has run is given again with this option changed.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import shutil
@@ -21,7 +20,7 @@ from pathlib import Path
 import pytest
 
 from mi_refgs import methods
-from mi_refgs.cli import build_parser, main
+from mi_refgs.cli import main
 from mi_refgs.compare import execute, jobs
 from mi_refgs.compare.jobs import Job
 from mi_refgs.errors import InputError
@@ -33,6 +32,7 @@ from mi_refgs.io.resources import resource_dir
 from mi_refgs.reconstruction import fit as reconstruct
 from mi_refgs.runs.run import LOCK, Run
 from mi_refgs.synthesis import make_dataset
+from tests.helpers import command_names, command_options
 from tests.scenes.sphere import SCENE
 from tests.scenes.tiny import METHOD, SETTINGS, train_command
 
@@ -75,13 +75,14 @@ KEPT: dict[str, dict[str, Row]] = {
     "train": {
         "data": Shows(("{moved}",), "trains_on_moved"),
         "--output": WHERE,
-        "--variant": refused("--variant", "{other}"),
+        "--method": refused("--method", "{other}"),
         "--for": Refused(("--for", "relighting"), ("--for",)),
         "--preset": refused("--preset", "standard"),
         "--minutes": refused("--minutes", "0.001"),
         "--set": refused("--set", "loss.ssim=0.4"),
         "--resume": Free("absent, the run is refused: see test_a_run_is_not_begun_twice"),
-        "--view": Free("shows the fit"),
+        "--watch": Free("shows the fit"),
+        "--port": Free("shows the fit"),
     },
     "demo": {
         "--output": WHERE,
@@ -94,10 +95,10 @@ KEPT: dict[str, dict[str, Row]] = {
         "--views": refused("--views", "3"),
         "--test-views": refused("--test-views", "2"),
         "--size": refused("--size", "6"),
-        "--object": refused("--object", "a"),
+        "--shapes": refused("--shapes", "a"),
         "--distance": refused("--distance", "3", "4"),
         "--colmap": Shows(("--colmap", "{out}/colmap"), "writes_colmap"),
-        "--spp": refused("--spp", "2"),
+        "--samples": refused("--samples", "2"),
         "--seed": refused("--seed", "1"),
         "--max-depth": refused("--max-depth", "3"),
         "--elevation": refused("--elevation", "-10", "20"),
@@ -109,7 +110,7 @@ KEPT: dict[str, dict[str, Row]] = {
     "compare": {
         "data": refused("{elsewhere}", word="DATA"),
         "--output": WHERE,
-        "--variants": refused("--variants", "{other}"),
+        "--methods": refused("--methods", "{other}"),
         "--seeds": Shows(("--seeds", "0,1"), "has_two_seeds"),
         "--preset": refused("--preset", "standard"),
         "--set": refused("--set", "loss.ssim=0.4"),
@@ -118,7 +119,7 @@ KEPT: dict[str, dict[str, Row]] = {
         "--mitsuba-variant": Free("kept: see test_a_comparison_keeps_its_mitsuba_variant"),
     },
     "capture": {
-        **dict.fromkeys(("photographs", "--masks", "--camera"), HASHED),
+        **dict.fromkeys(("photographs", "--masks", "--camera-model"), HASHED),
         "--output": WHERE,
         "--region": Free("is written each time"),
     },
@@ -132,7 +133,7 @@ ANEW: dict[str, dict[str, Row]] = {
         "--antialias": Shows(("--antialias",), "anew"),
     },
     "render": dict.fromkeys(
-        ("scene", "--output", "--sensor", "--camera", "--object", "--spp", "--aov"), WHOLE
+        ("scene", "--output", "--sensor", "--camera", "--object", "--samples", "--aov"), WHOLE
     ),
 }
 """Commands that do everything again."""
@@ -148,20 +149,11 @@ OTHERS = {
 }
 
 
-def commands() -> dict[str, list[str]]:
-    """Names of the commands, each with its options and arguments."""
-    [found] = [a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction)]
-    return {
-        name: [(a.option_strings or [a.dest])[-1] for a in parser._actions if a.dest != "help"]
-        for name, parser in found.choices.items()
-    }
-
-
 def test_every_option_of_every_command_has_a_row() -> None:
-    found = commands()
-    assert found.keys() == {*KEPT, *ANEW, *OTHERS}
+    assert {*command_names()} == {*KEPT, *ANEW, *OTHERS}
     for name, rows in (KEPT | ANEW).items():
-        assert {*found[name]} == {*rows} | {*COMMON} & {*found[name]}, name
+        found = {*command_options(name)}
+        assert found == {*rows} | {*COMMON} & found, name
 
 
 @pytest.fixture(scope="module")
@@ -231,7 +223,7 @@ def began(
                     job.run.create(job.method(), job.data)
 
         monkeypatch.setattr(execute, "execute_all", begin)
-        options = ["--preset", "quick", "--variants", places["method"], "--set", *SETTINGS]
+        options = ["--preset", "quick", "--methods", places["method"], "--set", *SETTINGS]
         argv = ["compare", places["data"], "-o", str(out), *options]
         assert main(argv) == 3  # nothing is fitted
         return argv
@@ -240,7 +232,7 @@ def began(
     return lambda command: (made[command](), out)
 
 
-TRACE = ["dataset", "--views", "2", "--test-views", "1", "--size", "4", "--spp", "1"]
+TRACE = ["dataset", "--views", "2", "--test-views", "1", "--size", "4", "--samples", "1"]
 
 
 @pytest.fixture(scope="module")
@@ -319,7 +311,7 @@ def test_the_same_command_goes_on(began: Began, capsys: pytest.CaptureFixture[st
     argv, out = began("train")
     state = tree(out / "checkpoints")
     config = Run(out).method()
-    for more in ([], ["--minutes", "1e6"], ["--variant", config.file], ["--preset", "quick"]):
+    for more in ([], ["--minutes", "1e6"], ["--method", config.file], ["--preset", "quick"]):
         assert main([*argv, *more]) == 0
     assert main([*argv[:4], "--resume"]) == 0 and tree(out / "checkpoints") == state
     assert main([*argv[:4], "--resume", "--for", "relighting"]) == 2
@@ -354,9 +346,7 @@ def test_a_comparison_keeps_its_mitsuba_variant(began: Began) -> None:
         jobs.require_same(dataclasses.replace(job, mitsuba_variant="cuda_ad_rgb"))
 
 
-@pytest.mark.parametrize(
-    "option", ["--variants=a", "--seeds=1", "--preset=quick", "--set=a=1", "--workers=1"]
-)
+@pytest.mark.parametrize("option", ["--methods=a", "--seeds=1", "--preset=quick", "--set=a=1", "--workers=1"])
 def test_a_table_that_is_made_again_takes_no_option_of_a_fit(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -391,7 +381,9 @@ def test_a_picture_is_rendered_anew(finished: Path, tmp_path: Path) -> None:
     assert main(["render", str(run), "-o", str(tmp_path / "used.exr")]) == 0
     first = (tmp_path / "used.exr").read_bytes()
     for name in ("used.exr", "fresh.exr"):
-        assert main(["render", str(run), "-o", str(tmp_path / name), "--spp", "4", "--aov", "albedo"]) == 0
+        assert (
+            main(["render", str(run), "-o", str(tmp_path / name), "--samples", "4", "--aov", "albedo"]) == 0
+        )
     assert (tmp_path / "used.exr").read_bytes() == (tmp_path / "fresh.exr").read_bytes() != first
 
 

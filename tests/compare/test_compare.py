@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 
 from mi_refgs.cli import main
-from mi_refgs.compare import execute, jobs, plots, results
-from mi_refgs.compare.jobs import Job
-from mi_refgs.compare.table import Statistic
-from mi_refgs.compare.text import heading
+from mi_refgs.compare import execute, jobs, page, results
+from mi_refgs.compare.jobs import Job, Shared
+from mi_refgs.compare.table import Statistic, heading
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import read_png
@@ -32,7 +31,7 @@ SIX = [setting for setting in SETTINGS if "preview" not in setting]
 
 def command(data: Path, folder: Path, *variants: Path, more: tuple[str, ...] = ()) -> list[str]:
     """Arguments of `refgs compare` for tiny methods."""
-    options = ["--preset", "quick", "--threads", "1", "--variants", *map(str, variants)]
+    options = ["--preset", "quick", "--threads", "1", "--methods", *map(str, variants)]
     return ["compare", str(data), "-o", str(folder), *options, *more, "--set", *SIX]
 
 
@@ -199,10 +198,10 @@ def test_a_worker_of_the_cluster_is_killed_midway(
 ) -> None:
     """Another worker goes on from the checkpoint; the log has each iteration once."""
     distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
-    from mi_refgs.compare.cluster import run_on_cluster
+    from mi_refgs.compare.execute import run_on_cluster
 
     settings = ("iterations=150", "checkpoint_every=10", "log_every=10", *SIX[1:3])
-    [job] = jobs.plan(tmp_path, [ball], [str(variants[1])], [0], "quick", settings, "llvm_ad_rgb", 1)
+    [job] = jobs.plan(tmp_path, [ball], [str(variants[1])], [0], Shared("quick", settings, threads=1))
     reports: list[tuple[Job, str | None]] = []
     killed: list[int] = []
 
@@ -238,18 +237,18 @@ def test_a_worker_of_the_cluster_is_killed_midway(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["{data}", "--variants", "nothing_like_it", "-o", "{out}"], ["no such method"]),
-        (["{data}/none", "--variants", "{tiny}", "-o", "{out}"], ["no such folder"]),
-        (["{data}", "{twin}", "--variants", "{tiny}", "-o", "{out}"], ["'ball' stands there twice"]),
-        (["{data}", "--variants", "{tiny},{tiny}", "-o", "{out}"], ["'tiny' stands there twice"]),
-        (["{data}", "--variants", "{tiny}", "--seeds", "0,x", "-o", "{out}"], ["--seeds", "0,x"]),
-        (["{data}", "--variants", "{tiny}", "--seeds=-1", "-o", "{out}"], ["--seeds", "-1"]),
-        (["{data}", "--variants", "{tiny}", "--seeds", "1,1", "-o", "{out}"], ["'1' stands there twice"]),
-        (["{data}", "--variants", "{tiny}", "--set", "seed=2", "-o", "{out}"], ["--seeds"]),
-        (["{data}", "--variants", "{tiny}", "--workers", "0", "-o", "{out}"], ["--workers"]),
-        (["{data}", "-o", "{out}"], ["--variants", "ref_gaussian"]),
-        (["{data}", "--variants", "{tiny}"], ["-o"]),
-        (["-o", "{out}"], ["holds no comparison"]),
+        (["{data}", "--methods", "nothing_like_it", "-o", "{out}"], ["no such method"]),
+        (["{data}/none", "--methods", "{tiny}", "-o", "{out}"], ["no such folder"]),
+        (["{data}", "{twin}", "--methods", "{tiny}", "-o", "{out}"], ["'ball' stands there twice"]),
+        (["{data}", "--methods", "{tiny},{tiny}", "-o", "{out}"], ["'tiny' stands there twice"]),
+        (["{data}", "--methods", "{tiny}", "--seeds", "0,x", "-o", "{out}"], ["--seeds", "0,x"]),
+        (["{data}", "--methods", "{tiny}", "--seeds=-1", "-o", "{out}"], ["--seeds", "-1"]),
+        (["{data}", "--methods", "{tiny}", "--seeds", "1,1", "-o", "{out}"], ["'1' stands there twice"]),
+        (["{data}", "--methods", "{tiny}", "--set", "seed=2", "-o", "{out}"], ["--seeds"]),
+        (["{data}", "--methods", "{tiny}", "--workers", "0", "-o", "{out}"], ["--workers"]),
+        (["{data}", "-o", "{out}"], ["--methods", "ref_gaussian"]),
+        (["{data}", "--methods", "{tiny}"], ["-o PATH, --output"]),
+        (["-o", "{out}"], ["has no comparison"]),
         (["-o", "{out}", "--preset", "quick"], ["DATA"]),
     ],
 )
@@ -289,8 +288,8 @@ def test_pictures_are_looked_for_as_the_methods_read_them(
         picture.unlink()
 
     def plan(*settings: str) -> list[Job]:
-        folder, options = tmp_path / "out", [*SIX, *settings]
-        return jobs.plan(folder, [data], [str(variants[0])], [0], "quick", options, "llvm_ad_rgb", 1)
+        options = Shared("quick", (*SIX, *settings), threads=1)
+        return jobs.plan(tmp_path / "out", [data], [str(variants[0])], [0], options)
 
     assert len(plan("data.images='exr'")) == 1
     with pytest.raises(InputError, match="png"):
@@ -416,7 +415,7 @@ def test_statistics() -> None:
 def test_the_crop_is_where_pictures_differ_most(rng: np.random.Generator) -> None:
     """Against every square, tried one by one."""
     truth, first, second = rng.random((3, 12, 9, 3))
-    score, row, column = plots.most_different(truth, [first, second], 4)
+    score, row, column = page.most_different(truth, [first, second], 4)
 
     def error(picture: np.ndarray, y: int, x: int) -> float:
         return float(np.mean((picture[y : y + 4, x : x + 4] - truth[y : y + 4, x : x + 4]) ** 2))
@@ -424,7 +423,7 @@ def test_the_crop_is_where_pictures_differ_most(rng: np.random.Generator) -> Non
     spread = {(y, x): abs(error(first, y, x) - error(second, y, x)) for y in range(9) for x in range(6)}
     assert (row, column) == max(spread, key=lambda key: spread[key])
     assert score == pytest.approx(spread[row, column])
-    lone, *place = plots.most_different(truth, [first], 4)
+    lone, *place = page.most_different(truth, [first], 4)
     assert lone == pytest.approx(max(error(first, y, x) for y in range(9) for x in range(6)))
     assert lone == pytest.approx(error(first, *place))
 
@@ -454,7 +453,7 @@ def test_a_run_that_chose_its_terms_is_still_the_same(ball: Path, tmp_path: Path
         'extends = "base_2dgs"\n[select.term.colour]\nafter = 1\ntrial = 1\n'
         "change = { surfels = { degree = { radiance_sh = 0 } } }\n"
     )
-    job = jobs.plan(tmp_path / "out", [ball], [str(variant)], [0], "quick", [], "llvm_ad_rgb", 1)[0]
+    job = jobs.plan(tmp_path / "out", [ball], [str(variant)], [0], Shared("quick", threads=1))[0]
     chosen = job.method(["colour"])
     job.run.create(chosen, str(ball))
     assert chosen.terms == ("colour",) and chosen.surfels.degree_of("radiance_sh") == 0

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from mi_refgs import methods
-from mi_refgs.compare import plots
+from mi_refgs.compare import page
 from mi_refgs.data import dataset
 from mi_refgs.evaluation import images, metrics
 from mi_refgs.evaluation.evaluate import evaluate, render_names
@@ -232,7 +232,7 @@ def test_comparisons_read_the_image_of_each_view(
         read.append(path)
         return read_png(path)
 
-    monkeypatch.setattr(plots, "read_png", noted)
+    monkeypatch.setattr(page, "read_png", noted)
     scene: Any = SimpleNamespace(rows=[SimpleNamespace(runs=["run"], variant="tiny")], path=str(data))
-    assert plots.write_crops(tmp_path, scene, tmp_path / "crops.png") is not None
+    assert page.write_crops(tmp_path, scene, tmp_path / "crops.png") is not None
     assert {*read} == images

@@ -301,7 +301,7 @@ def transforms() -> dict[str, object]:
 def test_cameras_of_a_transforms_file_are_those_of_the_run(theirs: Path, tmp_path: Path) -> None:
     file, run = tmp_path / "transforms.json", tmp_path / "run"
     file.write_text(json.dumps(transforms()))
-    assert main(["import", str(theirs), "-o", str(run), "--transforms", str(file)]) == 0
+    assert main(["import", str(theirs), "-o", str(run), "--camera", str(file)]) == 0
     first, second = (Camera.from_sensor(sensor) for sensor in mi.load_file(str(run / "scene.xml")).sensors())
     assert (first.width, first.height, second.width) == (64, 48, 32)
     np.testing.assert_allclose(first.pose(), pinhole().to_world, atol=1e-6)

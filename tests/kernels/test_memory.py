@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import pytest
 
-from mi_refgs.cli import build_parser, main
+from mi_refgs.cli import main
 from mi_refgs.errors import InputError
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.kernels import memory
-from tests.helpers import refused
+from tests.helpers import command_names, refused
 from tests.scenes.integrator import scene, sensor
 from tests.scenes.tiny import train_command
 
@@ -40,15 +39,8 @@ UNBOUNDED = {
 """Commands that need none beyond that of others, or none that grows, and why."""
 
 
-def commands() -> set[str]:
-    for action in build_parser()._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            return {*action.choices}
-    raise AssertionError("no commands")
-
-
 def test_every_command_is_listed_with_its_bound() -> None:
-    assert commands() == BOUNDED.keys() | UNBOUNDED.keys() and not BOUNDED.keys() & UNBOUNDED.keys()
+    assert {*command_names()} == BOUNDED.keys() | UNBOUNDED.keys() and not BOUNDED.keys() & UNBOUNDED.keys()
 
 
 @pytest.mark.parametrize("name", BOUNDED)

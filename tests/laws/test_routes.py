@@ -253,7 +253,7 @@ def of_mitsuba(scene: Any, view: Any, case: Case) -> Maps:
 def of_command(case: Case, scene: Path, *more: object) -> Maps:
     """What `refgs render` writes."""
     path = case.scratch / "out.exr"
-    command = ["render", scene, "-o", path, "--spp", case.samples, "--aov", *case.names, *more]
+    command = ["render", scene, "-o", path, "--samples", case.samples, "--aov", *case.names, *more]
     assert main([str(word) for word in [*command, *(["--object"] if case.alone else [])]]) == 0
     layers = read_exr(path)
     return {IMAGE: np.stack([layers[letter] for letter in "RGBA"], axis=-1)} | of_layers(layers, case.names)
@@ -324,7 +324,7 @@ def edited(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
         str(out),
         "--where",
         "x > 0.2",
-        "--rotate",
+        "--azimuth",
         "z",
         "20",
         "--scale",

@@ -53,5 +53,5 @@ def test_every_scene_of_the_tables_has_settings() -> None:
 
 
 def test_an_unknown_name_is_one_sentence() -> None:
-    with pytest.raises(InputError, match="--variant: paper/ref_real/no: no such method"):
+    with pytest.raises(InputError, match="--method: paper/ref_real/no: no such method"):
         methods.load("paper/ref_real/no")

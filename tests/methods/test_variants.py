@@ -201,6 +201,6 @@ def test_every_method_fits_and_evaluates(variant: str, data: Path, tmp_path: Pat
     if method.mesh is not None:
         small += ["mesh.resolution=12", "mesh.extract={start = 0, until = 6, every = 1}"]
     settings = [*SETTINGS, *stages, *small]
-    assert main(["train", str(data), "-o", str(run), "--variant", variant, "--set", *settings]) == 0
+    assert main(["train", str(data), "-o", str(run), "--method", variant, "--set", *settings]) == 0
     assert main(["eval", str(run)]) == 0
     assert main(["render", str(run), "-o", str(tmp_path / "view.exr")]) == 0

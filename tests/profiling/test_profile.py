@@ -268,7 +268,7 @@ def test_aovs_of_a_frame_are_those_that_it_has(finished: Path) -> None:
 
 
 def test_of_a_data_set(data: Path, method: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--variant", str(method), "--preset", "quick", "--steps", "1", "--set", *SETTINGS]
+    options = ["--method", str(method), "--preset", "quick", "--steps", "1", "--set", *SETTINGS]
     assert main(["profile", str(data), *options]) == 0
     said = capsys.readouterr().out
     head = said.splitlines()[0].split()

@@ -297,9 +297,9 @@ def test_the_command(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture)
     ]
     assert main([*command, "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["psnr_scaled"] > 20
-    assert main([*command, "--rotate", "30"]) == 2
+    assert main([*command, "--azimuth", "30"]) == 2
     assert "r_000.png: output: exists, and was not written" in capfd.readouterr().err
-    assert main([*command[:-1], str(tmp_path / "turned"), "--rotate", "30"]) == 0
+    assert main([*command[:-1], str(tmp_path / "turned"), "--azimuth", "30"]) == 0
     shown = capfd.readouterr()
     assert "score: none" in shown.out and "warning" not in shown.err
 

@@ -52,7 +52,7 @@ def write_method(folder: Path) -> Path:
 
 def train_command(data: Path, run: Path, method: Path, *more: str) -> list[str]:
     """Arguments of `refgs train` for the two."""
-    options = ["--variant", str(method), "--preset", "quick", *more]
+    options = ["--method", str(method), "--preset", "quick", *more]
     return ["train", str(data), "-o", str(run), *options, "--set", *SETTINGS]
 
 

@@ -189,7 +189,7 @@ def test_every_eighth_picture_is_a_test_view(made: Path, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"objects": ["vase"]}, "--object: no shape has the id 'vase'.*ball, lamp, table, wall"),
+        ({"objects": ["vase"]}, "--shapes: no shape has the id 'vase'.*ball, lamp, table, wall"),
         ({"distance": (0.55, 2.0)}, "--distance: 0.5.*inside of the region"),
         ({"distance": (6.0, 6.0)}, "--distance: something stands between"),
         ({"distance": (3.0, 2.0)}, "distance: .*out of range"),
@@ -216,10 +216,10 @@ def test_sizes_on_the_command_line(made: Path, tmp_path: Path, capsys: pytest.Ca
         "1",
         "--test-views",
         "1",
-        "--spp",
+        "--samples",
         "1",
     ]
-    command += ["--object", "ball", "--distance", "2", "2.5", "--elevation", "30", "50"]
+    command += ["--shapes", "ball", "--distance", "2", "2.5", "--elevation", "30", "50"]
     assert main([*command, "--size", "10x6", "--colmap", str(tmp_path / "colmap")]) == 0
     capsys.readouterr()
     view = read_loaded(tmp_path / "out", "train").views[0]

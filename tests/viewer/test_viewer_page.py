@@ -428,7 +428,7 @@ def test_a_photographed_object_is_shown_in_its_surroundings_first_then_alone(
 @pytest.mark.slow
 def test_a_fit_is_watched_while_it_runs(chromium: Any, tmp_path: Path) -> None:
     data, method = write_data(tmp_path / "data"), write_method(tmp_path)
-    command = train_command(data, tmp_path / "run", method, "--view", "0")
+    command = train_command(data, tmp_path / "run", method, "--watch", "--port", "0")
     running = Server(*command, "iterations=1000000", "checkpoint_every=100000")
     page = chromium.new_page(viewport=WINDOW)
     try:
