@@ -1,4 +1,4 @@
-"""The quality of a run on the test views of its data set: metrics.json and pictures."""
+"""Evaluate a run on the test views of its data set: metrics.json, renders, contact sheets."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import region_pixels
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation import decomposition, images, metrics
-from mi_refgs.evaluation.speed import milliseconds
+from mi_refgs.evaluation import decomposition, metrics
+from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
 from mi_refgs.fitting.runner import of_run
@@ -43,33 +43,35 @@ LONGEST_STEM, HASH_DIGITS = 60, 12
 the hash that separates equal ones."""
 SHEET_VIEWS = 4
 """Rows of either sheet, spread evenly over the test views."""
-REGION_KEYS = ("psnr_region", "ssim_region", "region_share")
-NORMAL_KEYS = ("normal_mae_deg", "normal_mae_deg_full")
+MEANS = (
+    *("psnr", "psnr_gain", "ssim", "flip", "lpips"),
+    *("psnr_region", "ssim_region", "region_share", "normal_mae_deg", "normal_mae_deg_full"),
+)
+"""Scores of views whose means are reported."""
 LIGHT_KEYS = ("env_scale", "env_mae", "env_psnr", "env_correlation")
 
 
 def load_split(
     run: Run, method: Method, split: str, path: Path | None = None, decode: bool = True
 ) -> Dataset:
-    """A split of the data set that a run was fitted to, or of the one at `path`, read as the method says.
+    """Read a split of the data set of a run, or of the one at `path`, with the options of the method.
 
     Its region of interest is the run's. Raises InputError as `read_dataset` and `Run.region` do, and if the
-    run does not say where its data is or it is gone.
+    run records no data set or the data set is gone.
     """
     if path is None:
-        if not (run.path / DATASET).is_file():
+        record = run.path / DATASET
+        if not record.is_file():
             raise InputError(f"{run.path}: data set: the run records none; name one with --data")
         try:
             path = run.dataset()
             found = path.is_dir()
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(
-                f"{run.path / 'dataset.json'}: path: cannot be read ({error}); name the data with --data"
+                f"{record}: path: cannot be read ({error}); name the data with --data"
             ) from error
         if not found:
-            raise InputError(
-                f"{run.path / 'dataset.json'}: path: {path} is gone; name the data set's folder with --data"
-            )
+            raise InputError(f"{record}: path: {path} is gone; name the data set's folder with --data")
     return of_run(run, read_views(method, path, split, decode=decode))
 
 
@@ -80,98 +82,84 @@ def evaluate(
     samples: int = 1,
     antialias: bool = False,
 ) -> dict[str, Any]:
-    """Render the test views, measure them, and write metrics.json, renders and two sheets into the run.
+    """Render the test views, measure them, and write metrics.json, renders and two contact sheets.
 
-    Evaluates the artefacts as they lie in the folder, after writing what a newer checkpoint makes stale.
-    Every key is always there: null, with a `…_reason`, where it does not apply. `psnr_region` and
-    `ssim_region` are of pixels whose ray meets the data's region of interest (`data.region.region_pixels`),
-    `region_share` is their part of all. Normals count where the true alpha is above ½ and there is a true
-    normal (without alpha, where there is one), materials (`evaluation.decomposition`) where the data defines
-    them; keys that end in `_concave` count pixels where the true surface is (`evaluation.surface`).
-    `psnr_gain` is that after `data.exposure.fitted_gain`, a gain a channel of every view: what pictures of
-    different exposure are judged by, for every method alike. `exposure` is what the fit decided about its own
-    gains. `image_size` is that of the test views as they are read, each pixel the mean of `downscale`² pixels
-    of the file; scores of different sizes do not compare. `ms_per_frame` is the median over single
-    synchronised frames of the displayed image alone, light filtered beforehand. `pruned` is null for a whole
-    scene. All that is rendered has `samples` a pixel, box filtered (`render.samples`); `antialias` asks for
-    widened roughness (`render.antialias`) where the run was fitted without.
+    Evaluates the scene files in the run folder, after updating those that are older than a checkpoint.
+    Every key is always present: null, with a `…_reason`, where it does not apply.
 
-    Raises InputError for a folder that is no run or holds neither artefacts nor a checkpoint, for data
+    `psnr_region`, `ssim_region`   pixels whose ray meets the data's region of interest; `region_share` of all
+    `normal_…`                     pixels with true alpha above ½ (where there is alpha) and a true normal
+    `…_concave`                    pixels where the true surface is concave (`evaluation.surface`)
+    `psnr_gain`                    after one gain per channel and view (`data.exposure.fitted_gain`), which
+                                   compares methods on images of different exposure
+    `exposure`                     what the fit decided about its own exposure compensation
+    `image_size`                   of the test views as they are read, each pixel the mean of `downscale`²
+                                   pixels of the file; scores of different sizes are not comparable
+    `ms_per_frame`                 median over single synchronised frames of the displayed image without AOVs,
+                                   with the environment map prefiltered beforehand
+    `pruned`                       null for a scene that was not pruned
+
+    Renders have `samples` per pixel, box filtered (`render.samples`); `antialias` widens roughness
+    (`render.antialias`) where the run was fitted without.
+
+    Raises InputError for a folder that is no run or contains neither a scene nor a checkpoint, for data
     that is gone, and for a foreign file in the run that has the name of a result.
     """
+    # The scene, its test views, and the files to write.
     method = run.method()
     views = load_split(run, method, "test", data)
     renders = render_names(views.views)
-    run.output.require_free([*renders, SHEET, DECOMPOSITION, METRICS])
+    outputs = [*renders, SHEET, DECOMPOSITION, METRICS]
+    run.output.require_free(outputs)
     fitted = up_to_date(run, method, views.views[0].camera())
     if antialias:
         shading = dataclasses.replace(fitted.shading, antialias=True)
         fitted = dataclasses.replace(fitted, shading=shading)
-    view = fitted.renderer(samples=samples)
-    alone = None if fitted.surroundings is None else dataclasses.replace(fitted, surroundings=None)
-    object_view = None if alone is None else alone.renderer(samples=samples)
-    run.output.claim(*renders, SHEET, DECOMPOSITION, METRICS)
+    render = fitted.renderer(samples=samples)
+    object_only = None
+    if fitted.surroundings is not None:
+        object_only = dataclasses.replace(fitted, surroundings=None).renderer(samples=samples)
+    run.output.claim(*outputs)
 
-    shown = set(np.linspace(0, len(views.views) - 1, SHEET_VIEWS).round().astype(int).tolist())
+    # Render and measure view by view.
+    in_sheets = set(np.linspace(0, len(views.views) - 1, SHEET_VIEWS).round().astype(int).tolist())
     rows: list[dict[str, np.ndarray]] = []
-    kept: list[Any] = []
+    kept: list[Any] = []  # arguments of `decomposition.panels`, which need the final albedo scale
     per_view: list[dict[str, Any]] = []
     surface, errors = TrueSurface.read(views.path, views.offset), decomposition.Decomposition()
-    materials = decomposition.material_maps(fitted, samples)
-    for index, truth in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
-        truth = truth.load()
-        frame = view(truth.camera())
-        shot = images.RenderedView.of(frame, views, truth)
-        gain, gained = with_gain(frame, truth, views)
-        goal = truth.displayed
-        scores: dict[str, Any] = {
-            "name": truth.name,
-            "psnr": metrics.psnr(shot.image, goal),
-            "psnr_gain": metrics.psnr(gained, goal),
-            "gain": gain.round(4).tolist(),
-            "ssim": metrics.ssim(shot.image, goal),
-        }
-        for name, measure in (("flip", metrics.flip), ("lpips", metrics.lpips)):
-            previous = per_view[0] if per_view else {}
-            if previous.get(f"{name}_reason"):  # what is not installed for one picture is not for the next
-                scores[name], scores[f"{name}_reason"] = None, previous[f"{name}_reason"]
-            else:
-                scores[name], scores[f"{name}_reason"] = measure(shot.image, goal)
-        if views.region is not None and (where := region_pixels(truth, views.region)).any():
-            scores["psnr_region"] = metrics.psnr(shot.image, goal, where)
-            scores["ssim_region"] = metrics.ssim(shot.image, goal, where)
-            scores["region_share"] = float(where.mean())
-        if truth.normal is not None:
-            scores |= metrics.normal_mae_deg(shot.normal, truth.normal, truth.covered())
+    material_maps = decomposition.material_maps(fitted, samples)
+    for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
+        view = view.load()
+        frame = render(view.camera())
+        rendered = RenderedView.of(frame, views, view)
+        scores = _scores(rendered, view, views, per_view[0] if per_view else {})
+        gain, gained = with_gain(frame, view, views)
+        scores |= {"psnr_gain": metrics.psnr(gained, view.displayed), "gain": gain.round(4).tolist()}
         per_view.append(scores)
-        maps = materials(truth.camera(), shot)
-        concave = None if surface is None else surface.concave(truth)
-        errors.add(shot, maps, truth, concave)
-        write_png(run.path / renders[index], shot.image)
-        if index in shown:
-            found = images.panels(shot, truth)
-            if object_view is not None:
-                found["object alone"] = images.RenderedView.of(
-                    object_view(truth.camera()), views, truth
-                ).image
-            rows.append(found)
-            kept.append((shot, maps, truth, concave))
+        maps = material_maps(view.camera(), rendered)
+        concave = None if surface is None else surface.concave(view)
+        errors.add(rendered, maps, view, concave)
+        write_png(run.path / renders[index], rendered.image)
+        if index in in_sheets:
+            rows.append(panels(rendered, view))
+            if object_only is not None:
+                rows[-1]["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
+            kept.append((rendered, maps, view, concave))
 
-    result: dict[str, Any] = {
-        name: _mean(per_view, name)
-        for name in ("psnr", "psnr_gain", "ssim", "flip", "lpips", *REGION_KEYS, *NORMAL_KEYS)
-    }
+    # Numbers.
+    result: dict[str, Any] = {name: _mean(per_view, name) for name in MEANS}
     for name in ("flip", "lpips"):
         result[f"{name}_reason"] = per_view[0][f"{name}_reason"] or None
-    result["region_reason"] = (
-        None if result["psnr_region"] is not None else "the data set has no region of interest"
-    )
-    result["normal_reason"] = (
-        None if result["normal_mae_deg"] is not None else "the data set has no true normals"
-    )
-    light, light_panels = _light(fitted, views)
-    result |= light | errors.result()
+    for name, key, reason in (
+        ("region", "psnr_region", "the data set has no region of interest"),
+        ("normal", "normal_mae_deg", "the data set has no true normals"),
+    ):
+        result[f"{name}_reason"] = reason if result[key] is None else None
+    light_scores, footer = _light(fitted, views)
+    result |= light_scores | errors.result()
     result |= surface_scores(fitted.mesh, surface, views.views)
+    cameras = [view.camera() for view in views.views]
+    frames = [fitted.renderer(aovs=False, samples=samples)]
     result |= {
         "exposure": _exposure(run),
         "train_seconds": fitted.seconds,
@@ -180,9 +168,7 @@ def evaluate(
         "pruned": None if fitted.pruned is None else dataclasses.asdict(fitted.pruned),
         "samples": samples_per_axis(samples) ** 2,
         "antialias": fitted.shading.antialias,
-        "ms_per_frame": milliseconds(
-            [fitted.renderer(aovs=False, samples=samples)], [v.camera() for v in views.views], views
-        )[0],
+        "ms_per_frame": metrics.frame_milliseconds(frames, cameras, views)[0],
         "variant": method.variant,
         "preset": method.preset,
         "dataset": str(views.path),
@@ -190,27 +176,46 @@ def evaluate(
         "image_size": [views.views[0].width, views.views[0].height],
         "downscale": method.data.downscale or 1,
         "machine": machine(),
-        "views": [
-            {key: value for key, value in scores.items() if not key.endswith("_reason")}
-            for scores in per_view
-        ],
+        "views": [{k: v for k, v in scores.items() if not k.endswith("_reason")} for scores in per_view],
     }
-    write_png(run.path / SHEET, images.contact_sheet(rows, light_panels))
-    rows = [decomposition.panels(s, m, v, errors.scale(), c) for s, m, v, c in kept]
-    write_png(run.path / DECOMPOSITION, images.contact_sheet(rows, light_panels))
+
+    # Sheets.
+    write_png(run.path / SHEET, contact_sheet(rows, footer))
+    rows = [decomposition.panels(*arguments, scale=errors.scale()) for arguments in kept]
+    write_png(run.path / DECOMPOSITION, contact_sheet(rows, footer))
     run.write_json(METRICS, result)
     return result
 
 
+def _scores(rendered: RenderedView, view: View, data: Dataset, first: dict[str, Any]) -> dict[str, Any]:
+    """Return the scores of one view, which has ground truth loaded; `first` are those of the first view."""
+    image, truth = rendered.image, view.displayed
+    scores: dict[str, Any] = {
+        "name": view.name,
+        "psnr": metrics.psnr(image, truth),
+        "ssim": metrics.ssim(image, truth),
+    }
+    for name, measure in (("flip", metrics.flip), ("lpips", metrics.lpips)):
+        reason = first.get(f"{name}_reason")  # a metric that is not installed stays so
+        scores[name], scores[f"{name}_reason"] = (None, reason) if reason else measure(image, truth)
+    if data.region is not None and (where := region_pixels(view, data.region)).any():
+        scores["psnr_region"] = metrics.psnr(image, truth, where)
+        scores["ssim_region"] = metrics.ssim(image, truth, where)
+        scores["region_share"] = float(where.mean())
+    if view.normal is not None:
+        scores |= metrics.normal_mae_deg(rendered.normal, view.normal, view.covered())
+    return scores
+
+
 def _exposure(run: Run) -> dict[str, Any] | None:
-    """What the fit decided about gains; None if it decided nothing."""
+    """Return what the fit decided about exposure compensation; None if it decided nothing."""
     if not (run.path / EXPOSURE_FILE).is_file():
         return None
     return {name: value for name, value in read_json(run.path / EXPOSURE_FILE).items() if name != "gain"}
 
 
 def render_names(views: Sequence[View]) -> list[str]:
-    """Path, below the run folder, of the image that `evaluate` writes of each test view; no two are the same.
+    """Return unique paths, below the run folder, of the image that `evaluate` writes of each test view.
 
     Views whose names differ only in what file names lose, such as case or punctuation, get a hash of the
     name.
@@ -231,16 +236,15 @@ def render_names(views: Sequence[View]) -> list[str]:
 
 
 def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
-    """The env_ keys, and the pictures of the light."""
+    """Return the env_ keys, and the panels of the environment map."""
     nothing: dict[str, Any] = dict.fromkeys(LIGHT_KEYS)
     if fitted.light is None:
         return nothing | {"env_reason": "the method has no light"}, None
-    tensor = fitted.light.radiance()
-    light = np.array(tensor, dtype=np.float32).reshape(tensor.shape)
+    light = fitted.light.radiance().numpy()
     if data.environment is None:
-        return nothing | {"env_reason": "the data set has no environment.exr"}, images.light_panels(light)
+        return nothing | {"env_reason": "the data set has no environment.exr"}, light_panels(light)
     truth = read_radiance(data.environment, len(light))
-    return metrics.environment(light, truth) | {"env_reason": None}, images.light_panels(light, truth)
+    return metrics.environment(light, truth) | {"env_reason": None}, light_panels(light, truth)
 
 
 def _mean(per_view: list[dict[str, Any]], name: str) -> float | None:
@@ -249,7 +253,7 @@ def _mean(per_view: list[dict[str, Any]], name: str) -> float | None:
 
 
 def read_metrics(run: Run) -> dict[str, Any] | None:
-    """The metrics.json of a run, or None if it has none that can be read."""
+    """Read the metrics.json of a run; None if it has none that can be read."""
     try:
         return read_json(run.path / METRICS)
     except InputError:

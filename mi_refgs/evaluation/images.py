@@ -1,13 +1,12 @@
-"""Pictures to look at: maps as colours, previews, contact sheets, and a light beside the true one. All NumPy.
+"""Images for display: rendered views, maps as colours, contact sheets, environment maps. All NumPy.
 
-A picture is (H, W, 3), display-encoded, in [0, 1].
+An image is (H, W, 3), display-encoded, in [0, 1].
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -19,17 +18,26 @@ from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.surfels.attributes import ATTRIBUTES
+from mi_refgs.types import Array
 
 LIGHT_KEY = 0.36
-"""Average luminance of a shown light before the tone curve x / (1 + x), which displays it as 0.55."""
+"""Average luminance of a displayed environment before the tone curve x / (1 + x), which maps it to 0.55."""
 CELL_MIN = 128
-"""Pixels: smaller pictures are enlarged by a whole factor, so that a sheet of thumbnails can be read."""
+"""Pixels: smaller images are enlarged by a whole factor, so that a sheet of thumbnails can be read."""
 MARGIN = 4
-"""Pixels between pictures."""
+"""Pixels between images."""
 TITLE_HEIGHT = 16
-"""Pixels above each picture, enough for Pillow's built-in font."""
+"""Pixels above each image, enough for Pillow's built-in font."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Luminance of the linear sRGB primaries (ITU-R BT.709)."""
+
+
+def image_array(array: Array, height: int, width: int) -> np.ndarray:
+    """Convert an array of H*W pixels to (H, W), one of colours or vectors to (H, W, 3), float32."""
+    if isinstance(array, list) or dr.depth_v(array) > 1:
+        return np.stack([image_array(part, height, width) for part in array], axis=-1)
+    values = np.array(array, dtype=np.float32).ravel()
+    return np.broadcast_to(values, height * width).reshape(height, width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +46,7 @@ class RenderedView:
 
     image: np.ndarray  # (H, W, 3) display-encoded, over the data's background
     alpha: np.ndarray  # (H, W)
-    normal: np.ndarray  # (H, W, 3) unit, or 0 where nothing is seen
+    normal: np.ndarray  # (H, W, 3) unit, or 0 where there is no surface
     maps: dict[str, np.ndarray]  # (H, W) or (H, W, 3), linear
 
     @staticmethod
@@ -56,37 +64,54 @@ class RenderedView:
 
     @staticmethod
     def maps_of(frame: Frame, height: int, width: int) -> dict[str, np.ndarray]:
-        """The maps of a frame alone."""
+        """Copy only the maps of a frame."""
         return {name: image_array(m, height, width) for name, m in frame.maps.items()}
 
 
-def image_array(array: Any, height: int, width: int) -> np.ndarray:
-    """An array over pixels as (H, W), one of colours or vectors as (H, W, 3), float32."""
-    if isinstance(array, list) or dr.depth_v(array) > 1:
-        return np.stack([image_array(part, height, width) for part in array], axis=-1)
-    values = np.array(array, dtype=np.float32).ravel()
-    return np.broadcast_to(values, height * width).reshape(height, width)
+# ---------------- panels ----------------
 
 
-def panels(shot: RenderedView, view: View) -> dict[str, np.ndarray]:
-    """Everything there is to see of a view, by title."""
-    shown = {"ground truth": view.load().displayed, "render": shot.image}
+def panels(rendered: RenderedView, view: View) -> dict[str, np.ndarray]:
+    """Return all images of a view by title."""
+    found = {"ground truth": view.displayed, "render": rendered.image}
     if view.normal is not None:
-        covered = np.linalg.norm(view.normal, axis=-1)
-        shown["true normals"] = on_white(0.5 + 0.5 * view.normal, covered)
-    shown["normals"] = on_white(0.5 + 0.5 * shot.normal, shot.alpha)
-    for name in (*(name for name, channel in ATTRIBUTES.items() if channel.aov), "visibility"):
-        if name in shot.maps:
-            values = shot.maps[name]
-            grey = srgb_from_linear(values) if values.ndim == 3 else np.repeat(values[..., None], 3, axis=-1)
-            shown[name] = on_white(grey, shot.alpha)
-    return {title: np.clip(picture, 0, 1) for title, picture in shown.items()}
+        found["true normals"] = normal_colours(view.normal, np.linalg.norm(view.normal, axis=-1))
+    found["normals"] = normal_colours(rendered.normal, rendered.alpha)
+    for name in (*(name for name, attribute in ATTRIBUTES.items() if attribute.aov), "visibility"):
+        if name in rendered.maps:
+            values = rendered.maps[name]
+            colours = (
+                srgb_from_linear(values) if values.ndim == 3 else np.repeat(values[..., None], 3, axis=-1)
+            )
+            found[name] = on_white(colours, rendered.alpha)
+    return {title: np.clip(image, 0, 1) for title, image in found.items()}
+
+
+def normal_colours(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Convert unit normals (H, W, 3) to colours over white."""
+    return on_white(0.5 + 0.5 * normal, alpha)
+
+
+def on_white(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Composite an image (H, W, 3) over white by alpha (H, W)."""
+    alpha = np.clip(alpha, 0, 1)[..., None]
+    return alpha * image + (1 - alpha)
+
+
+def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Place images of one height side by side."""
+    gap = np.ones((images[0].shape[0], MARGIN // 2, 3))
+    parts = [part for image in images for part in (gap, image)]
+    return np.concatenate(parts[1:], axis=1)
+
+
+# ---------------- environment maps ----------------
 
 
 def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """A recovered lat-long light (h, w, 3), linear, and the true one at one exposure, by title.
+    """Tone-map a recovered environment (h, w, 3), linear, and the ground truth at one exposure, by title.
 
-    The recovered one is first brought to the true one by a least-squares scale per channel.
+    The recovered one is first scaled per channel to the ground truth by least squares.
     """
     if truth is None:
         return {"recovered light": tonemap(light, _exposure(light))}
@@ -96,81 +121,62 @@ def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str
 
 
 def tonemap(radiance: np.ndarray, exposure: float) -> np.ndarray:
-    """Radiance of any range as a picture: x / (1 + x) [Reinhard et al. 2002, eq. 3], sRGB-encoded."""
+    """Map radiance of any range to an image: x / (1 + x) [Reinhard et al. 2002, eq. 3], sRGB-encoded."""
     scaled = np.maximum(radiance, 0) * exposure
     return np.clip(srgb_from_linear(scaled / (1 + scaled)), 0, 1)
+
+
+def _exposure(radiance: np.ndarray) -> float:
+    """Return the scale that maps the average luminance over the sphere to LIGHT_KEY."""
+    rows = np.sin((np.arange(radiance.shape[0]) + 0.5) / radiance.shape[0] * np.pi)
+    mean = float(np.average((radiance @ LUMINANCE).mean(axis=1), weights=rows))
+    return LIGHT_KEY / max(mean, 1e-8)
+
+
+# ---------------- contact sheets ----------------
 
 
 def contact_sheet(
     rows: Sequence[dict[str, np.ndarray]], footer: dict[str, np.ndarray] | None = None
 ) -> np.ndarray:
-    """A contact sheet: a row of titled pictures a view, and `footer` (lights) across the foot."""
+    """Arrange titled images in a sheet: one row per view, and `footer` (environment maps) below."""
     titles = list(dict.fromkeys(title for row in rows for title in row))
     factor = -(-CELL_MIN // min(next(iter(rows[0].values())).shape[:2]))
-    body = [[(title, _enlarge(row[title], factor)) for title in titles if title in row] for row in rows]
-    lines = [_line(cells) for cells in body]
-    width = max(line.shape[1] for line in lines)
-    if footer:
-        share = (width - MARGIN * (len(footer) - 1)) // max(len(footer), 2)
-        lines.append(_line([(title, _fit_width(picture, share)) for title, picture in footer.items()]))
-    width = max(line.shape[1] for line in lines)
-    padded = [
-        np.pad(line, ((0, MARGIN), (0, width - line.shape[1]), (0, 0)), constant_values=1) for line in lines
+    lines = [
+        _line([(t, row[t].repeat(factor, axis=0).repeat(factor, axis=1)) for t in titles if t in row])
+        for row in rows
     ]
-    return np.concatenate(padded)
+    if footer:
+        width = max(line.shape[1] for line in lines)
+        part = (width - MARGIN * (len(footer) - 1)) // max(len(footer), 2)
+        lines.append(_line([(title, _resized(image, part)) for title, image in footer.items()]))
+    width = max(line.shape[1] for line in lines)
+    return np.concatenate([_padded(line, MARGIN, width - line.shape[1]) for line in lines])
 
 
 def _line(cells: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
-    height = max(picture.shape[0] for _, picture in cells)
+    """Place titled images side by side."""
+    from PIL import Image, ImageDraw
+
+    height = max(image.shape[0] for _, image in cells)
     columns = []
-    for title, picture in cells:
-        below = height - picture.shape[0]
-        column = np.concatenate(
-            [
-                _title(title, picture.shape[1]),
-                np.pad(picture, ((0, below), (0, 0), (0, 0)), constant_values=1),
-            ]
-        )
-        columns.append(np.pad(column, ((0, 0), (0, MARGIN), (0, 0)), constant_values=1))
+    for text, image in cells:
+        label = Image.new("RGB", (image.shape[1], TITLE_HEIGHT), "white")
+        ImageDraw.Draw(label).text((2, 2), text, fill="black")
+        title = np.asarray(label, dtype=np.float32) / 255
+        columns.append(_padded(np.concatenate([title, image]), height - image.shape[0], MARGIN))
     return np.concatenate(columns, axis=1)[:, :-MARGIN]
 
 
-def _title(text: str, width: int) -> np.ndarray:
-    from PIL import Image, ImageDraw
-
-    label = Image.new("RGB", (width, TITLE_HEIGHT), "white")
-    ImageDraw.Draw(label).text((2, 2), text, fill="black")
-    return np.asarray(label, dtype=np.float32) / 255
+def _padded(image: np.ndarray, below: int, right: int) -> np.ndarray:
+    """Pad an image with white."""
+    return np.pad(image, ((0, below), (0, right), (0, 0)), constant_values=1)
 
 
-def _enlarge(picture: np.ndarray, factor: int) -> np.ndarray:
-    return picture.repeat(factor, axis=0).repeat(factor, axis=1)
-
-
-def _fit_width(picture: np.ndarray, width: int) -> np.ndarray:
-    """A picture at another width, aspect kept, each channel resampled by Pillow's box filter."""
+def _resized(image: np.ndarray, width: int) -> np.ndarray:
+    """Resize an image to another width, keeping its aspect; each channel by Pillow's box filter."""
     from PIL import Image
 
-    size = (width, max(1, round(picture.shape[0] * width / picture.shape[1])))
-    planes = [Image.fromarray(np.ascontiguousarray(picture[..., i], dtype=np.float32)) for i in range(3)]
-    return np.stack([np.asarray(plane.resize(size, Image.Resampling.BOX)) for plane in planes], axis=-1)
-
-
-def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Pictures of one height side by side."""
-    gap = np.ones((pictures[0].shape[0], MARGIN // 2, 3))
-    parts = [part for picture in pictures for part in (gap, picture)]
-    return np.concatenate(parts[1:], axis=1)
-
-
-def on_white(picture: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """A picture (H, W, 3) over white."""
-    alpha = np.clip(alpha, 0, 1)[..., None]
-    return alpha * picture + (1 - alpha)
-
-
-def _exposure(radiance: np.ndarray) -> float:
-    """Scale that brings the average luminance over the sphere to LIGHT_KEY."""
-    rows = np.sin((np.arange(radiance.shape[0]) + 0.5) / radiance.shape[0] * np.pi)
-    mean = float(np.average((radiance @ LUMINANCE).mean(axis=1), weights=rows))
-    return LIGHT_KEY / max(mean, 1e-8)
+    size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
+    channels = [Image.fromarray(np.ascontiguousarray(image[..., i], dtype=np.float32)) for i in range(3)]
+    return np.stack([np.asarray(c.resize(size, Image.Resampling.BOX)) for c in channels], axis=-1)

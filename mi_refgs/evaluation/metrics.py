@@ -1,44 +1,55 @@
-"""Measures of quality, in NumPy: images, normals, recovered light.
+"""Metrics of images, normals and recovered environment maps, in NumPy; and the time of a frame.
 
 Images are (H, W, 3) display-encoded floats, clamped to [0, 1] and never quantised; a data set's value is the
-mean over its images. Normals are (H, W, 3) world vectors. Lights are (h, w, 3) linear lat-long radiance in
-Mitsuba's orientation.
+mean over its images. Normals are (H, W, 3) world vectors. Environment maps are (h, w, 3) linear lat-long
+radiance in Mitsuba's orientation.
 """
 
 from __future__ import annotations
 
 import functools
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
+from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.ssim import WINDOW_RADIUS, WINDOW_SIGMA
 from mi_refgs.io.images import psnr_of, srgb_from_linear
+from mi_refgs.render.display import displayed
+from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.splat import Camera
 
-# A pixel is foreground where the true alpha is above this.
 FOREGROUND_ALPHA = 0.5
-# Variance of display-encoded values below which a map is constant but for rounding: it correlates with none.
+"""True alpha above which a pixel is foreground."""
 FLAT = 1e-12
-# The network of LPIPS: the one its authors recommend for comparing images ("forward" scores).
+"""Variance of encoded values below which a map is constant but for rounding and has no correlation."""
 LPIPS_NETWORK = "alex"
+"""The network of LPIPS that its authors recommend for comparing images ("forward" scores)."""
+WARM_UP_FRAMES = 2
+"""Frames before the timing: the first compiles or loads the kernels, the second fills the memory pools."""
+TIMED_FRAMES = 20
+"""Frames whose median is reported; the views repeat if there are fewer."""
 
 
 # ---------------- images ----------------
 
 
 def psnr(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
-    """Peak signal-to-noise ratio in dB over all pixels and channels, background included; at most 100.
+    """Compute the peak signal-to-noise ratio in dB over all pixels and channels, at most 100.
 
-    `where` (H, W) chooses pixels, at least one.
+    `where` (H, W) selects pixels, at least one; by default the background counts too.
     """
     image, truth = _pair(image, truth)
     return psnr_of(float(np.mean((image - truth)[where] ** 2)))
 
 
 def ssim(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
-    """Structural similarity as `fitting.ssim` trains with it, by scikit-image; `where` as in `psnr`.
+    """Compute the structural similarity that the loss uses (`fitting.ssim`); `where` as in `psnr`.
 
     scikit-image reflects at the border and leaves it out of the mean; padding by the window's radius with
     zeros turns that into the zero padding and the mean over every pixel that 3DGS and Ref-Gaussian report.
@@ -63,17 +74,14 @@ def ssim(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
 
 
 def lpips(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
-    """(LPIPS with AlexNet, ""), or (None, why): without the extra `lpips` or its network's weights."""
+    """Return (LPIPS with AlexNet, ""), or (None, reason) without the extra `lpips` or its weights."""
     try:
         import torch
 
         network = _lpips_network()
         with torch.no_grad():
-            tensors = [
-                torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)[None], dtype=np.float32)) * 2
-                - 1
-                for array in _pair(image, truth)
-            ]
+            planes = [array.transpose(2, 0, 1)[None] for array in _pair(image, truth)]
+            tensors = [torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)) * 2 - 1 for p in planes]
             return float(network(*tensors)), ""
     except ImportError:
         return None, "not installed: pip install 'mi_refgs[lpips]'"
@@ -89,7 +97,7 @@ def _lpips_network() -> Any:
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
-    """(mean LDR FLIP, ""), or (None, why) without the extra `flip`. 67 pixels per degree."""
+    """Return (mean LDR FLIP at 67 pixels per degree, ""), or (None, reason) without the extra `flip`."""
     try:
         import flip_evaluator
     except ImportError:
@@ -109,13 +117,12 @@ def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> dict[str, float]:
-    """Mean angle in degrees between two normal maps, over the foreground and over the whole image.
+    """Compute the mean angle in degrees between normal maps, over the foreground and over the whole image.
 
-    normal: recovered, any length; truth: (H, W, 3), zero where nothing is hit; alpha: true alpha (H, W).
+    normal: recovered, of any length; truth: (H, W, 3), zero where nothing is hit; alpha: true alpha (H, W).
     Foreground is alpha > 0.5 with a true normal; a missing recovered normal counts 90° there.
     `normal_mae_deg` is the mean over the foreground; `normal_mae_deg_full` divides the same sum by all
-    pixels, so the background counts as 0° (the number that most papers print). Both are 0 for an image
-    without foreground.
+    pixels, so the background counts as 0°, as in most papers. Both are 0 for an image without foreground.
     """
     normal, truth = np.asarray(normal, np.float64), np.asarray(truth, np.float64)
     if normal.shape != truth.shape or normal.shape[:2] != np.shape(alpha):
@@ -130,7 +137,7 @@ def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> 
 
 
 def angle_deg(normal: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Angle (H, W) in degrees between normals of any length; 90° where one is 0."""
+    """Compute angles (H, W) in degrees between normals of any length; 90° where one is 0."""
     normal, truth = np.asarray(normal, np.float64), np.asarray(truth, np.float64)
     # atan2 keeps small angles exact, where acos of a float32 dot product cannot go below 0.03°.
     cosine = np.sum(normal * truth, axis=-1)
@@ -142,12 +149,12 @@ def angle_deg(normal: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """Recovered against true environment after one least-squares scale per channel, weighted by solid angle.
+    """Compare a recovered environment with the true one after a least-squares scale per channel.
 
-    Photographs fix the light only up to such a scale, which the albedo takes up. The true map is resampled to
-    the recovered one's grid (`shade.lobe_matrices`: first and last row on the poles) by averaging. Keys:
-    `env_scale` (three numbers), `env_mae` (linear, after the scale), `env_psnr` (dB, after sRGB encoding and
-    clamping to [0, 1]) and `env_correlation` (Pearson, of the same encoded values).
+    Pixels are weighted by solid angle. Light and albedo share an unknown per-channel scale. The true map is
+    resampled to the recovered one's grid (`shade.lobe_matrices`: first and last row on the poles) by
+    averaging. Keys: `env_scale` (three numbers), `env_mae` (linear, after the scale), `env_psnr` (dB, after
+    sRGB encoding and clamping to [0, 1]) and `env_correlation` (Pearson, of the same encoded values).
     """
     light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
     for name, array in (("light", light), ("truth", truth)):
@@ -159,19 +166,35 @@ def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     columns = lobe_matrices.column_resampling(truth.shape[1], light.shape[1])
     truth = np.einsum("ih,jw,hwc->ijc", rows, columns, truth, optimize=True)
     weight = np.broadcast_to(lobe_matrices.row_areas(len(light))[:, None, None], light.shape)
-    scale = np.sum(weight * light * truth, axis=(0, 1)) / np.maximum(
-        np.sum(weight * light**2, axis=(0, 1)), 1e-30
-    )
+    power = np.sum(weight * light**2, axis=(0, 1))
+    scale = np.sum(weight * light * truth, axis=(0, 1)) / np.maximum(power, 1e-30)
     fitted = light * scale
     shown, goal = (np.clip(srgb_from_linear(array), 0, 1) for array in (fitted, truth))
     error = float(np.average((shown - goal) ** 2, weights=weight))
     shown, goal = (array - np.average(array, weights=weight) for array in (shown, goal))
     spread = float(np.sqrt(np.sum(weight * shown**2) * np.sum(weight * goal**2)))
+    correlation = float(np.sum(weight * shown * goal)) / spread if spread > FLAT * weight.sum() else 0.0
     return {
         "env_scale": [float(value) for value in scale],
         "env_mae": float(np.average(np.abs(fitted - truth), weights=weight)),
         "env_psnr": psnr_of(error),
-        "env_correlation": float(np.sum(weight * shown * goal)) / spread
-        if spread > FLAT * weight.sum()
-        else 0.0,
+        "env_correlation": correlation,
     }
+
+
+# ---------------- time ----------------
+
+
+def frame_milliseconds(
+    renderers: Sequence[Callable[[Camera], Frame]], cameras: Sequence[Camera], data: Dataset
+) -> list[float]:
+    """Return the median time per synchronised frame up to the displayed image; renderers take turns."""
+    seconds: list[list[float]] = [[] for _ in renderers]
+    for i in range(WARM_UP_FRAMES + TIMED_FRAMES):
+        for render, times in zip(renderers, seconds, strict=True):
+            dr.sync_thread()
+            begin = time.perf_counter()
+            dr.eval(displayed(render(cameras[i % len(cameras)]), data.background, data.is_linear_radiance))
+            dr.sync_thread()
+            times.append(time.perf_counter() - begin)
+    return [1000 * float(np.median(times[WARM_UP_FRAMES:])) for times in seconds]

@@ -1,13 +1,13 @@
-"""A finished fit without what its pictures do not need: rows, channels, harmonics, light, mesh.
+"""Prune a finished fit: remove surfels, attributes, SH degrees, light and mesh that its images do not need.
 
-Each candidate is dropped on trial and kept out if the pictures of all training views stay within a limit.
+Each candidate is removed on trial and stays removed if the images of all training views stay within a limit.
 Nothing is fitted again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -17,8 +17,7 @@ import numpy as np
 from mi_refgs.constants import PRUNE_LIMIT
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.metrics import psnr
-from mi_refgs.evaluation.speed import milliseconds
+from mi_refgs.evaluation.metrics import frame_milliseconds, psnr
 from mi_refgs.io.images import PSNR_MAX
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import displayed
@@ -29,15 +28,13 @@ from mi_refgs.surfels.attributes import attribute, sh_columns
 from mi_refgs.surfels.ply import encode_ply
 from mi_refgs.surfels.table import Surfels
 
-ROWS_STEP = 1 / 1000
-"""Share of the rows to which the number of those that go is searched."""
-
-Tell = Callable[[str], None]
+COUNT_STEP = 1 / 1000
+"""Fraction of the surfels to which the number of those that are removed is bisected."""
 
 
 @dataclass(frozen=True)
-class Trial:
-    """Something that was left out on trial."""
+class PruneTrial:
+    """Something that was removed on trial."""
 
     what: str
     psnr: float  # dB, of the worst view, or of the first below the limit
@@ -45,7 +42,7 @@ class Trial:
 
 
 def contributions(surfels: Surfels, cameras: Sequence[Camera]) -> np.ndarray:
-    """Blended weight Σ w of each row over all pixels of the views (N,) float64, in pixels; 0 where unseen.
+    """Return the blended weight Σ w of each surfel over all pixels of the views (N,) float64, in pixels.
 
     The gradient of a blended feature Σ w f with respect to f.
     """
@@ -63,163 +60,47 @@ def prune(
     train: Dataset,
     test: Dataset | None = None,
     limit: float = PRUNE_LIMIT,
-    tell: Tell = lambda _: None,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[TrainedScene, dict[str, Any]]:
-    """The scene without what its pictures do not need, and a report that JSON can hold.
+    """Remove what the images of a scene do not need; return the pruned scene and a report for JSON.
 
-    First what the shading never reads goes. Then, on trial and in this order: the traced mesh, channels that
-    the model can do without, degrees of harmonics, which every row pays for, and as many rows of the least
-    blended weight as the training views allow.
-    The worst training view stays at `limit` dB (above 0, at most 100: the same to rounding) or above, both
-    its displayed picture and its alpha. `tell` is called with every trial.
+    First what the shading never reads is removed. Then, on trial and in this order: the traced mesh, optional
+    attributes, SH degrees, and as many surfels of the least blended weight as the training views allow. In
+    the worst training view, the displayed image and alpha keep a PSNR of `limit` dB or more (above 0, at most
+    100: the same to rounding). `tell` is called with every trial.
 
-    The report has rows, channels and bytes of the PLY file `before` and `after`, the PSNR against the whole
-    scene over the training and the test views, the median time of a frame, and the trials. Raises InputError
-    for a limit out of range.
+    The report has surfels, attributes and bytes of the PLY file `before` and `after`, the PSNR against the
+    whole scene over the training and the test views, the median time per frame, and the trials. Raises
+    InputError for a limit out of range.
     """
     if not 0 < limit <= PSNR_MAX:
-        raise InputError(
-            f"--limit: {limit:g} dB is out of range; give a number above 0, at most {PSNR_MAX:g}"
-        )
-    search = _Search(_unread(whole), _Pictures(whole, train), tell)
-    if search.scene.surfels.count:
-        weight = contributions(whole.surfels, search.pictures.cameras)
-        _drop_terms(search, limit)
-        _drop_rows(search, weight, limit)
+        allowed = f"give a number above 0, at most {PSNR_MAX:g}"
+        raise InputError(f"--limit: {limit:g} dB is out of range; {allowed}")
+
+    # What shading never reads, then trials.
+    images = _WholeImages(whole, train)
+    light = None if whole.shading.model.light == "none" else whole.light
+    unread = replace(whole, light=light, mesh=whole.mesh if whole.shading.occlusion else None)
+    search = _Search(unread, images, limit, tell)
+    if unread.surfels.count:
+        weight = contributions(whole.surfels, images.cameras)
+        search.drop_optional()
+        search.drop_surfels(weight)
     pruned = search.scene
-    compared = {"train": search.pictures.all(pruned)}
-    if test is not None:
-        compared["test"] = _Pictures(whole, test).all(pruned)
+
+    # The report.
     report: dict[str, Any] = {"limit": limit, "before": _size(whole), "after": _size(pruned)}
+    compared = {"train": images.all(pruned)}
+    if test is not None:
+        compared["test"] = _WholeImages(whole, test).all(pruned)
     for split, values in compared.items():
         report[split] = {"views": len(values), "worst": min(values), "mean": float(np.mean(values))}
-    views = [scene.renderer(aovs=False) for scene in (whole, pruned)]
-    for name, time in zip(
-        ("before", "after"), milliseconds(views, search.pictures.cameras, train), strict=True
-    ):
-        report[name]["ms_per_frame"] = time
+    renderers = [scene.renderer(aovs=False) for scene in (whole, pruned)]
+    times = frame_milliseconds(renderers, images.cameras, train)
+    report["before"]["ms_per_frame"], report["after"]["ms_per_frame"] = times
     report["trials"] = [asdict(trial) for trial in search.trials]
     note = Pruned(whole.surfels.count, limit, report["train"]["worst"])
     return replace(pruned, pruned=note), report
-
-
-# ---------------- what may go ----------------
-
-
-def _unread(scene: TrainedScene) -> TrainedScene:
-    """The scene without the light and the mesh that its shading does not ask for."""
-    light = None if scene.shading.model.light == "none" else scene.light
-    return replace(scene, light=light, mesh=scene.mesh if scene.shading.occlusion else None)
-
-
-def _drop_terms(search: _Search, limit: float) -> None:
-    """Try the scene without tracing, without each channel that it can do without, with fewer harmonics."""
-    shading = search.scene.shading
-    if shading.occlusion:
-        defaults = {name: getattr(ShadingOptions, name) for name in TRACED}
-        untraced = replace(shading, occlusion=False, **defaults)
-        search.attempt("mesh", replace(search.scene, mesh=None, shading=untraced), limit)
-    surfels = search.scene.surfels
-    needed = {*surfels.primitive.widths, *shading.channels}
-    for name in [name for name in surfels.raw if name not in needed]:
-        raw = {other: values for other, values in search.scene.surfels.raw.items() if other != name}
-        search.attempt(name, search.with_surfels(Surfels(raw)), limit)
-    for name in [name for name in search.scene.surfels.raw if attribute(name).harmonics]:
-        for degree in reversed(range(search.scene.surfels.sh_degree(name))):
-            arrays = search.scene.surfels.to_numpy()
-            arrays[name] = np.ascontiguousarray(arrays[name][:, : sh_columns(degree)])
-            lower = search.with_surfels(Surfels.from_numpy(arrays))
-            if not search.attempt(f"{name} above degree {degree}", lower, limit):
-                break
-
-
-def _drop_rows(search: _Search, weight: np.ndarray, limit: float) -> None:
-    """Drop as many rows of the least weight as the limit allows, by bisection; one stays at least."""
-    table, order = search.scene.surfels, np.argsort(weight, kind="stable")
-
-    def without(count: int) -> bool:
-        kept = upload(np.sort(order[count:]), mi.UInt32)
-        return search.attempt(f"{count} surfels", search.with_surfels(table.gather(kept)), limit)
-
-    unseen = min(int(np.count_nonzero(weight == 0)), table.count - 1)
-    if unseen and not without(unseen):
-        return
-    most, too_many = unseen, table.count
-    while too_many - most > max(1, round(ROWS_STEP * table.count)):
-        middle = (most + too_many) // 2
-        most, too_many = (middle, too_many) if without(middle) else (most, middle)
-
-
-@dataclass
-class _Search:
-    """The scene so far, and what was tried."""
-
-    scene: TrainedScene
-    pictures: _Pictures
-    tell: Tell
-
-    def __post_init__(self) -> None:
-        self.trials: list[Trial] = []
-
-    def with_surfels(self, surfels: Surfels) -> TrainedScene:
-        """The scene so far with another table."""
-        return replace(self.scene, surfels=surfels)
-
-    def attempt(self, what: str, candidate: TrainedScene, limit: float) -> bool:
-        """Take the candidate if no picture falls below the limit."""
-        worst = self.pictures.worst(candidate, limit)
-        trial = Trial(what, worst, worst >= limit)
-        self.trials.append(trial)
-        self.tell(f"without {what}: {worst:.1f} dB, {'dropped' if trial.dropped else 'stays'}")
-        if trial.dropped:
-            self.scene = candidate
-        return trial.dropped
-
-
-# ---------------- the measure ----------------
-
-
-class _Pictures:
-    """What the views of a split show of the whole scene: four float32 planes a view are kept."""
-
-    def __init__(self, whole: TrainedScene, data: Dataset) -> None:
-        self.data = data
-        self.cameras = [view.camera() for view in data.views]
-        self.order = list(range(len(self.cameras)))
-        self.whole = [planes for _, planes in self._shown(whole)]
-
-    def worst(self, scene: TrainedScene, limit: float) -> float:
-        """The lowest PSNR; of the first view below the limit, if there is one.
-
-        That view is the first to be looked at the next time.
-        """
-        lowest = PSNR_MAX
-        for place, planes in self._shown(scene):
-            lowest = min(lowest, self._psnr(place, planes))
-            if lowest < limit:
-                self.order.remove(place)
-                self.order.insert(0, place)
-                break
-        return lowest
-
-    def all(self, scene: TrainedScene) -> list[float]:
-        """The PSNR of every view."""
-        return [self._psnr(place, planes) for place, planes in self._shown(scene)]
-
-    def _shown(self, scene: TrainedScene) -> Iterator[tuple[int, np.ndarray]]:
-        """Place of a view in the split, and its planes (4, H·W): displayed colour, and alpha."""
-        view = scene.renderer(aovs=False)
-        for place in list(self.order):
-            frame, camera = view(self.cameras[place]), self.cameras[place]
-            shown = [*displayed(frame, self.data.background, self.data.is_linear_radiance), frame.alpha]
-            dr.eval(shown)
-            pixels = camera.width * camera.height
-            yield place, np.stack([np.broadcast_to(np.array(x, np.float32), pixels) for x in shown])
-
-    def _psnr(self, place: int, planes: np.ndarray) -> float:
-        """PSNR in dB of the picture, or of alpha, which other backgrounds show, where that is lower."""
-        whole = self.whole[place]
-        return min(psnr(planes[:3], whole[:3]), psnr(planes[3], whole[3]))
 
 
 def _size(scene: TrainedScene) -> dict[str, Any]:
@@ -231,3 +112,102 @@ def _size(scene: TrainedScene) -> dict[str, Any]:
         "mesh": scene.mesh is not None,
         "ply_bytes": len(encode_ply(surfels)),
     }
+
+
+@dataclass
+class _Search:
+    """The pruned scene so far, and the trials."""
+
+    scene: TrainedScene
+    images: _WholeImages
+    limit: float  # dB
+    tell: Callable[[str], None]
+    trials: list[PruneTrial] = field(default_factory=list)
+
+    def attempt(self, what: str, **changes: Any) -> bool:
+        """Change fields of the scene if no image falls below the limit; return whether that is so."""
+        candidate = replace(self.scene, **changes)
+        worst = self.images.worst(candidate, self.limit)
+        trial = PruneTrial(what, worst, worst >= self.limit)
+        self.trials.append(trial)
+        self.tell(f"without {what}: {worst:.1f} dB, {'dropped' if trial.dropped else 'stays'}")
+        if trial.dropped:
+            self.scene = candidate
+        return trial.dropped
+
+    def drop_optional(self) -> None:
+        """Try the scene without tracing, without each optional attribute, with lower SH degrees."""
+        shading = self.scene.shading
+        if shading.occlusion:
+            defaults = {name: getattr(ShadingOptions, name) for name in TRACED}
+            self.attempt("mesh", mesh=None, shading=replace(shading, occlusion=False, **defaults))
+        needed = {*self.scene.surfels.primitive.widths, *shading.channels}
+        for name in [name for name in self.scene.surfels.raw if name not in needed]:
+            raw = {other: values for other, values in self.scene.surfels.raw.items() if other != name}
+            self.attempt(name, surfels=Surfels(raw))
+        for name in [name for name in self.scene.surfels.raw if attribute(name).harmonics]:
+            for degree in reversed(range(self.scene.surfels.sh_degree(name))):
+                arrays = self.scene.surfels.to_numpy()
+                arrays[name] = np.ascontiguousarray(arrays[name][:, : sh_columns(degree)])
+                if not self.attempt(f"{name} above degree {degree}", surfels=Surfels.from_numpy(arrays)):
+                    break
+
+    def drop_surfels(self, weight: np.ndarray) -> None:
+        """Drop as many surfels of the least weight (N,) as the limit allows, by bisection; one stays."""
+        table, order = self.scene.surfels, np.argsort(weight, kind="stable")
+
+        def without(count: int) -> bool:
+            kept = upload(np.sort(order[count:]), mi.UInt32)
+            return self.attempt(f"{count} surfels", surfels=table.gather(kept))
+
+        unseen = min(int(np.count_nonzero(weight == 0)), table.count - 1)
+        if unseen and not without(unseen):
+            return
+        most, too_many = unseen, table.count
+        while too_many - most > max(1, round(COUNT_STEP * table.count)):
+            middle = (most + too_many) // 2
+            most, too_many = (middle, too_many) if without(middle) else (most, middle)
+
+
+class _WholeImages:
+    """Images of the whole scene in the views of a split: four float32 planes per view are kept."""
+
+    def __init__(self, whole: TrainedScene, data: Dataset) -> None:
+        self.data = data
+        self.cameras = [view.camera() for view in data.views]
+        self.order = list(range(len(self.cameras)))
+        self.whole = [planes for _, planes in self._render(whole)]
+
+    def worst(self, scene: TrainedScene, limit: float) -> float:
+        """Return the lowest PSNR in dB, or that of the first view below the limit.
+
+        That view is the first to be rendered the next time.
+        """
+        lowest = PSNR_MAX
+        for index, planes in self._render(scene):
+            lowest = min(lowest, self._psnr(index, planes))
+            if lowest < limit:
+                self.order.remove(index)
+                self.order.insert(0, index)
+                break
+        return lowest
+
+    def all(self, scene: TrainedScene) -> list[float]:
+        """Return the PSNR of every view in dB."""
+        return [self._psnr(index, planes) for index, planes in self._render(scene)]
+
+    def _render(self, scene: TrainedScene) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield the index of a view and its planes (4, H*W): displayed colour, and alpha."""
+        render = scene.renderer(aovs=False)
+        for index in list(self.order):
+            camera = self.cameras[index]
+            frame = render(camera)
+            planes = [*displayed(frame, self.data.background, self.data.is_linear_radiance), frame.alpha]
+            dr.eval(planes)
+            pixels = camera.width * camera.height
+            yield index, np.stack([np.broadcast_to(np.array(x, np.float32), pixels) for x in planes])
+
+    def _psnr(self, index: int, planes: np.ndarray) -> float:
+        """Return the PSNR in dB of the image or of alpha, which other backgrounds show; the lower one."""
+        whole = self.whole[index]
+        return min(psnr(planes[:3], whole[:3]), psnr(planes[3], whole[3]))

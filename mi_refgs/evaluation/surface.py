@@ -1,4 +1,4 @@
-"""How near a mesh is to the true surface, and where that surface is concave."""
+"""Distance between a mesh and the true surface, and the concave regions of that surface."""
 
 from __future__ import annotations
 
@@ -20,23 +20,24 @@ from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
 from mi_refgs.shade.ambient import ambient_direction
 from mi_refgs.shade.ggx_sampling import lobe_turn
 from mi_refgs.synthesis.settings import SURFACE
+from mi_refgs.types import Bool, Float, Point3f, UInt32, Vector3f
 
 OPEN_RAYS = 64
-"""Rays of the hemisphere of each point: the share of free ones is known to 1/64 and better."""
+"""Rays over the hemisphere of each point: the fraction of unoccluded ones is accurate to 1/64 or better."""
 CONCAVE_BELOW = 0.9
-"""Ambient visibility below which a point counts as occluded or concave. On a convex object it is 1, in the
-corner of two walls ½, everywhere inside a cap of a sphere that is h high and its radius R 1 - h / 2R. At 0.9
-a tenth of the diffuse light is not that of the environment; the error of OPEN_RAYS stays below that."""
+"""Ambient visibility below which a point is concave. It is 1 on a convex object, ½ in a corner of two walls,
+1 - h / 2R everywhere inside a spherical cap of height h and radius R. At 0.9 a tenth of the diffuse
+light is not that of the environment; the error of OPEN_RAYS is below that."""
 QUERIES = 20_000
-"""Points whose distances are averaged, on either surface."""
+"""Points per surface whose distances are averaged."""
 TARGETS = 200_000
-"""Points on the surface whose triangles are tried: an object of size 2 has one each 0.01."""
+"""Points on a surface among which the nearest are searched: 0.01 apart on an object of size 2."""
 CANDIDATES = 8
-"""Nearest of these points, whose triangles are tried exactly."""
+"""Nearest of these points, to whose triangles the distance is computed."""
 GRAZING = 0.1
 """Cosine to the viewing ray below which a view does not see a point: its pixel may see the back."""
 NEAR_TRUTH = 1.2
-"""Radius around the truth, in its own, of what is compared with it where a mesh has surroundings."""
+"""Radius, relative to the true surface's, beyond which an open scene's mesh is not compared with it."""
 SEED = 0
 SURFACE_KEYS = ("surface_distance", "surface_accuracy", "surface_completeness")
 NO_SURFACE = f"the data set has no {SURFACE}; make it again with this version of `refgs dataset`"
@@ -44,14 +45,14 @@ NO_SURFACE = f"the data set has no {SURFACE}; make it again with this version of
 
 @dataclass(frozen=True, eq=False)
 class TrueSurface:
-    """The surface of the scene, and rays against it."""
+    """The true surface of a scene, and rays against it."""
 
     mesh: Mesh
     occluder: Occluder
 
     @staticmethod
     def read(folder: Path, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> TrueSurface | None:
-        """That of a data set, relative to `Dataset.offset`; None where there is none.
+        """Read the surface of a data set, relative to `Dataset.offset`; None where there is none.
 
         Raises InputError for a file that cannot be read.
         """
@@ -63,36 +64,44 @@ class TrueSurface:
         return TrueSurface(mesh, Occluder(mesh)) if len(mesh.faces) else None
 
     def concave(self, view: View) -> np.ndarray | None:
-        """Pixels (H, W) whose point on the true surface has an ambient visibility below CONCAVE_BELOW.
+        """Find pixels (H, W) whose point on the true surface has an ambient visibility below CONCAVE_BELOW.
 
-        None where the view has no true depth and normals; false off the object.
+        Pixels beside the object are False. None where the view has no true depth and normals.
         """
         if view.depth is None or view.normal is None:
             return None
         camera = view.camera()
         depth = upload(view.depth)
         point = mi.Point3f(camera.origin + camera.rays() * depth)
-        open_ = openness(self.occluder, point, mi.Vector3f(view.normal.reshape(-1, 3).T), depth > 0)
-        return (open_.numpy().reshape(view.depth.shape) < CONCAVE_BELOW) & (view.depth > 0)
+        normal = mi.Vector3f(view.normal.reshape(-1, 3).T)
+        visibility = ambient_visibility(self.occluder, point, normal, depth > 0).numpy()
+        return (visibility.reshape(view.depth.shape) < CONCAVE_BELOW) & (view.depth > 0)
 
 
-def openness(occluder: Occluder, point: Any, normal: Any, active: Any = True) -> Any:
-    """Ambient visibility (mi.Float): share of cosine-weighted rays that leave the mesh; 1 if not `active`."""
+def ambient_visibility(
+    occluder: Occluder,
+    point: Point3f,  # (P,)
+    normal: Vector3f,  # (P,) unit
+    active: Bool = True,  # (P,)
+) -> Float:
+    """Return the fraction (P,) of cosine-weighted rays that the mesh does not block; 1 if not `active`."""
     frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
     count = dr.opaque(mi.UInt32, OPEN_RAYS)
     active = mi.Bool(active) & (dr.squared_norm(normal) > 0)
 
-    def body(index: Any, free: Any) -> tuple[Any, Any]:
+    def body(index: UInt32, free: Float) -> tuple[UInt32, Float]:
         direction = ambient_direction(frame, turn, index, count)
         return index + 1, free + occluder.visible(point, direction, normal, active)
 
     start = (mi.UInt32(0), dr.zeros(mi.Float, dr.width(normal)))
-    _, free = dr.while_loop(start, lambda index, _: active & (index < count), body, label="openness")
+    _, free = dr.while_loop(
+        start, lambda index, _: active & (index < count), body, label="ambient_visibility"
+    )
     return dr.select(active, free / OPEN_RAYS, 1)
 
 
 def surface_scores(mesh: Mesh | None, truth: TrueSurface | None, views: Sequence[View]) -> dict[str, Any]:
-    """`surface_distance`, or None by its keys, and `surface_reason`, which says why."""
+    """Return the keys of `surface_distance`, None where unknown, and `surface_reason`, which says why."""
     found: dict[str, Any] = dict.fromkeys((*SURFACE_KEYS, *(f"{key}_concave" for key in SURFACE_KEYS)))
     if mesh is None or not len(mesh.faces):
         return found | {"surface_reason": "the run has no mesh"}
@@ -104,14 +113,14 @@ def surface_scores(mesh: Mesh | None, truth: TrueSurface | None, views: Sequence
 
 
 def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> dict[str, float]:
-    """Distance between a mesh and the true surface in percent of the size, where some view sees either.
+    """Compute the distance between a mesh and the true surface in percent of the true size.
 
-    Size is the diameter of the sphere around the truth's bounding box's centre that holds it. Keys:
+    The size is the diameter of the true surface's bounding sphere, centred on its bounding box. Keys:
     `surface_accuracy`, mean distance from points of the mesh to the true surface; `surface_completeness`,
     from points of the true surface to the mesh; `surface_distance`, the mean of both (Chamfer distance); and
     each with `_concave`, of points whose (nearest) point on the true surface is concave, if there are any.
-    Points are spread evenly over the area that the views see, each surface in front of itself. Of a mesh with
-    surroundings (views without alpha) what is near the truth counts, in pixels that show the object.
+    Points are spread evenly over the area of each surface that some view sees. In an open scene (views
+    without alpha) the mesh near the true surface counts, in pixels that show the object.
     """
     corners = np.asarray(truth.mesh.vertices, np.float64)
     centre = (corners.min(0) + corners.max(0)) / 2
@@ -125,10 +134,10 @@ def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> d
     result: dict[str, float] = {}
     if not len(ours) or not len(true):
         return result
-    open_ = openness(truth.occluder, mi.Point3f(true.T), mi.Vector3f(facing.T)).numpy()
+    visibility = ambient_visibility(truth.occluder, mi.Point3f(true.T), mi.Vector3f(facing.T)).numpy()
     _, nearest = cKDTree(true).query(ours)
     accuracy, completeness = percent * distance_to(truth.mesh, ours), percent * distance_to(mesh, true)
-    for suffix, counted in (("", np.ones(len(true), bool)), ("_concave", open_ < CONCAVE_BELOW)):
+    for suffix, counted in (("", np.ones(len(true), bool)), ("_concave", visibility < CONCAVE_BELOW)):
         if counted[nearest].any():
             means = float(accuracy[counted[nearest]].mean()), float(completeness[counted].mean())
             result[f"surface_accuracy{suffix}"], result[f"surface_completeness{suffix}"] = means
@@ -137,7 +146,7 @@ def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> d
 
 
 def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """Even points (P, 3) of a mesh that some view sees past the mesh itself, and normals towards it."""
+    """Sample points (P, 3) of a mesh that some view sees, and their normals (P, 3) towards that view."""
     position, triangle = sample(mesh, QUERIES)
     corners = np.asarray(mesh.vertices, np.float64)[mesh.faces[triangle]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -156,7 +165,7 @@ def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.nda
             better &= view.covered()[*at] > 0
         start = mi.Point3f(np.tile(origin, (len(ray), 1)).T)
         hit, stopped = occluder.first_hit(start, mi.Vector3f(ray.T), upload(better, mi.Bool))
-        # In lengths of the ray: what stands in the way does so by more than rays are moved off a surface.
+        # In lengths of the ray: an occluder is nearer by more than the offset of rays from a surface.
         margin = 1 - OFFSET_VOXELS * mesh.voxel / reach
         better &= ~stopped.numpy() | (hit.numpy() > margin)
         facing[better] = (-np.sign(cosine)[:, None] * normal)[better]
@@ -166,7 +175,7 @@ def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.nda
 
 
 def sample(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (count, 3) spread evenly over the area of a mesh, and the triangle (count,) of each."""
+    """Sample points (count, 3) evenly over the area of a mesh, and return the triangle (count,) of each."""
     rng = np.random.default_rng(SEED)
     corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
     edges = corners[:, 1:] - corners[:, :1]
@@ -179,7 +188,7 @@ def sample(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def distance_to(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """Distance (P,) from points (P, 3) to a mesh: to the nearest of the triangles around each."""
+    """Compute distances (P,) from points (P, 3) to a mesh: to the nearest of the triangles around each."""
     targets, triangle = sample(mesh, TARGETS)
     near = triangle[cKDTree(targets).query(points, k=CANDIDATES)[1]]
     corners = np.asarray(mesh.vertices, np.float64)[mesh.faces[near.ravel()]]

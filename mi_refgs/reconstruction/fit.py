@@ -97,7 +97,7 @@ class Previews(Progress):
         """Write the first training view and the environment map, where a preview is due."""
         if trainer.run is None or trainer.iteration % trainer.method.preview_every:
             return
-        view = trainer.data.views[0]
+        view = trainer.data.views[0].load()
         rendered = RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data, view)
         light = None if trainer.light is None else light_panels(trainer.light.radiance().numpy())
         image = contact_sheet([panels(rendered, view)], light)

@@ -234,7 +234,7 @@ def pitted_box() -> Any:
     return trimesh.util.concatenate([box, pit])
 
 
-def test_openness_of_a_cap() -> None:
+def test_ambient_visibility_inside_a_cap() -> None:
     """Everywhere inside a cap of a sphere it is 1 - h / 2R; on the outside 1."""
     sphere = trimesh.creation.icosphere(subdivisions=5)
     for height in (0.5, 1.0):
@@ -243,9 +243,9 @@ def test_openness_of_a_cap() -> None:
         occluder = Occluder(mesh_of(cap))
         down = np.array([[0, 0, -1], [0.3, 0, -0.95], [0.2, 0.2, -0.96]])
         point = down / np.linalg.norm(down, axis=1, keepdims=True)
-        inside = surface.openness(occluder, mi.Point3f(point.T * 0.999), mi.Vector3f(-point.T))
+        inside = surface.ambient_visibility(occluder, mi.Point3f(point.T * 0.999), mi.Vector3f(-point.T))
         np.testing.assert_allclose(inside.numpy(), 1 - height / 2, atol=0.04)
-        outside = surface.openness(occluder, mi.Point3f(point.T * 1.001), mi.Vector3f(point.T))
+        outside = surface.ambient_visibility(occluder, mi.Point3f(point.T * 1.001), mi.Vector3f(point.T))
         np.testing.assert_array_equal(outside.numpy(), 1)
 
 

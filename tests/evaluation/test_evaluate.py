@@ -20,7 +20,6 @@ from mi_refgs.compare import page
 from mi_refgs.data import dataset
 from mi_refgs.evaluation import images, metrics
 from mi_refgs.evaluation.evaluate import evaluate, render_names
-from mi_refgs.evaluation.speed import TIMED_FRAMES, WARM_UP_FRAMES
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import read_png
 from mi_refgs.render.display import displayed
@@ -136,7 +135,7 @@ def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: 
 
     monkeypatch.setattr("mi_refgs.runs.trained_scene.render", rendered)
     evaluate(run)
-    assert asked == [True] * 4 + [False] * (WARM_UP_FRAMES + TIMED_FRAMES)
+    assert asked == [True] * 4 + [False] * (metrics.WARM_UP_FRAMES + metrics.TIMED_FRAMES)
 
 
 def test_an_export_without_light_or_mesh_leaves_no_stale_one(run: Run, folder: Path) -> None:
@@ -160,7 +159,7 @@ def test_pictures_of_the_run(run: Run) -> None:
 def test_panels_show_what_there_is(run: Run, folder: Path) -> None:
     trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
     views = dataset.read_dataset(folder / "ball", "test")
-    view = views.views[0]
+    view = views.views[0].load()
     shot = images.RenderedView.of(trainer.view(view.camera()), views, view)
     panels = images.panels(shot, view)
     assert list(panels) == [
