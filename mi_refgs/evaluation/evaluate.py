@@ -181,7 +181,7 @@ def evaluate(
 
     # Sheets.
     write_png(run.path / SHEET, contact_sheet(rows, footer))
-    rows = [decomposition.panels(*arguments, scale=errors.scale()) for arguments in kept]
+    rows = [decomposition.panels(r, m, v, c, errors.scale()) for r, m, v, c in kept]
     write_png(run.path / DECOMPOSITION, contact_sheet(rows, footer))
     run.write_json(METRICS, result)
     return result
