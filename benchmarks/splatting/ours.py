@@ -14,7 +14,7 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.timing import listening, phase
 from mi_refgs.profiling.phases import phase_times
 from mi_refgs.profiling.profile import Counts, count
-from mi_refgs.splat import Blended, Camera, list_by_tile, project, splat
+from mi_refgs.splat import Camera, Composited, list_by_tile, project, splat
 from mi_refgs.surfels.table import Surfels
 
 
@@ -98,6 +98,6 @@ class _Arguments:
         return value
 
 
-def _maps(blended: Blended) -> list[Any]:
+def _maps(blended: Composited) -> list[Any]:
     """Those that have derivatives."""
     return [*blended.features, blended.depth, blended.alpha]

@@ -141,7 +141,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     count n (of ``mi.render``, else of the sensor's sampler, whose default is 4) gives k × k regular samples
     a pixel, k = ⌈√n⌉, box filtered; n = 1 takes pixel centres. `mi.render` differentiates it in both modes
     with respect to the parameters above and to ``data``, ``scale`` or ``radiance.value`` of the scene's
-    environment, but not to sensors, background or mesh; `mi_refgs.splat.blend` lists the derivatives that
+    environment, but not to sensors, background or mesh; `mi_refgs.splat.composite` lists the derivatives that
     are absent.
 
     A surfel with a value that is NaN or infinite in any channel, or beyond 1e18 in position or harmonics,

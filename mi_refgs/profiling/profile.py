@@ -47,7 +47,7 @@ class Counts:
 
 
 def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
-    """Walk the lists as `splat.blend` does, and count; waits for the device."""
+    """Walk the lists as `splat.composite` does, and count; waits for the device."""
     columns = [dr.detach(column) for column in footprints.columns]
     surfels = dr.width(columns[0])
     pixels_of_surfel = dr.zeros(mi.UInt32, surfels)

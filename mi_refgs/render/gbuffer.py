@@ -1,4 +1,4 @@
-"""The G-buffer: named values of the surfels, blended together and divided by alpha once."""
+"""The G-buffer: named values of the surfels, composited together and divided by alpha once."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Any
 import drjit as dr
 
 from mi_refgs.constants import COVERAGE_FLOOR
-from mi_refgs.splat import Blended, Camera, Shown, splat, splat_shown
-from mi_refgs.splat.lanes import Places
+from mi_refgs.splat import Camera, splat
+from mi_refgs.splat.lanes import CompactedPixels
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Float, Point2f
 
 OBJECT = "object"
 """Slot of the object's opacity; where it is blended, slots are divided by it."""
@@ -19,37 +20,29 @@ OBJECT = "object"
 
 @dataclass(frozen=True)
 class GBuffer:
-    """Blended slots of a view: arrays of H·W values in raster order. A slot that nobody needs is absent.
+    """Blended slots of a view, in raster order or in that of `pixels`. A slot that nobody needs is absent."""
 
-    Those of a picture alone are in the order of `places`.
-    """
-
-    alpha: Any  # accumulated opacity
-    depth: Any  # expected camera-z depth, 0 where nothing is seen; None where it was not asked for
+    alpha: Float  # accumulated opacity
+    depth: Float  # expected camera-z depth, 0 where nothing is seen; None if not asked for
     slots: dict[str, Any]  # premultiplied by alpha, each of the type that was blended
-    inverse: Any  # 1/alpha, or 1/object alpha, where that is seen, else 0
-    places: Places | None = None
+    inverse: Float  # 1/alpha or 1/opacity of the object where that is seen, else 0
+    pixels: CompactedPixels | None
 
     @staticmethod
     def blend(
         surfels: Surfels,
-        slots: Mapping[str, Any],
+        slots: Mapping[str, Any],  # (N,) each: mi.Float, or an array of several such as mi.Color3f
         camera: Camera,
-        screen_offset: Any = None,
-        forward_only: bool = False,
-        depth: bool = True,
+        screen_offset: Point2f | None,
+        forward_only: bool,
+        depth: bool,
     ) -> GBuffer:
-        """Blend values of width N by name: mi.Float, or an array of several such as mi.Color3f.
+        """Blend values of surfels by name; arguments as in `splat`.
 
-        Every component is a feature, which costs time in every surfel-tile pair. `screen_offset`: see
-        `splat.project`. `forward_only`: no derivatives, and no depth unless `depth`.
+        Every component is a feature, which costs time in every surfel-tile pair.
         """
         features = [part for value in slots.values() for part in parts(value)]
-        blended: Blended | Shown
-        if forward_only:
-            blended = splat_shown(surfels, features, camera, depth)
-        else:
-            blended = splat(surfels, features, camera, screen_offset)
+        blended = splat(surfels, features, camera, screen_offset, forward_only, depth)
         rest, maps = list(blended.features), {}
         for name, value in slots.items():
             width = len(parts(value))
@@ -57,7 +50,7 @@ class GBuffer:
         inverse = inverse_alpha(blended.alpha)
         own = inverse_alpha(maps[OBJECT]) if OBJECT in maps else inverse
         mean_depth = None if blended.depth is None else blended.depth * inverse
-        return GBuffer(blended.alpha, mean_depth, maps, own, getattr(blended, "places", None))
+        return GBuffer(blended.alpha, mean_depth, maps, own, blended.pixels)
 
     def divided(self, name: str) -> Any:
         """A slot divided by alpha or the object's opacity: the mean of what is seen, 0 where nothing is."""
@@ -65,17 +58,17 @@ class GBuffer:
         return of_parts(value, [part * self.inverse for part in parts(value)])
 
 
-def inverse_alpha(alpha: Any) -> Any:
+def inverse_alpha(alpha: Float) -> Float:
     """1/A where anything is seen (COVERAGE_FLOOR), else 0, with a finite gradient everywhere."""
     seen = alpha > COVERAGE_FLOOR
     return dr.select(seen, dr.rcp(dr.select(seen, alpha, 1)), 0)
 
 
-def parts(value: Any) -> list[Any]:
-    """The components of a value, mi.Float each."""
+def parts(value: Any) -> list[Float]:
+    """The components of a value."""
     return [*value] if dr.depth_v(value) > 1 else [value]
 
 
-def of_parts(like: Any, parts: list[Any]) -> Any:
+def of_parts(like: Any, parts: list[Float]) -> Any:
     """The parts as an array of the type of `like`."""
     return type(like)(*parts)

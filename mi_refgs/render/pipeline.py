@@ -4,7 +4,7 @@
     deferred shading:  attributes ─ blend ─► G-buffer ─ shade ─► image      (`Shading.at` is "pixel")
 
 The same splatter and the same `shade` serve both. Everything is traced by Dr.Jit. No derivative: visibility,
-the side to which a normal is turned, the camera, and those that `mi_refgs.splat.blend` lists.
+the side to which a normal is turned, the camera, and those that `mi_refgs.splat.composite` lists.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mi_refgs.shade.points import TERMS, RadianceTerms, ShadingPoints, safe_norm
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera, splat
-from mi_refgs.splat.lanes import Places
+from mi_refgs.splat.lanes import CompactedPixels
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives import require_known_primitive
 from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
@@ -109,7 +109,7 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     view = _View.of(*_without_empty_tables(scene, request), camera)
     frame, buffer = _shade_at_surfels(view) if scene.shading.order == "surfel" else _shade_at_pixels(view)
     if request.forward_only:
-        frame = _in_raster_order(frame.only(request.aovs), buffer.places)
+        frame = _in_raster_order(frame.only(request.aovs), buffer.pixels)
     return boundary(frame, "shade backward")
 
 
@@ -123,12 +123,12 @@ def render_depth(
     return blended.depth * inverse_alpha(blended.alpha), blended.alpha
 
 
-def _in_raster_order(frame: Frame, places: Places | None) -> Frame:
-    if places is None:
+def _in_raster_order(frame: Frame, pixels: CompactedPixels | None) -> Frame:
+    if pixels is None:
         return frame
     alphas = frame.alpha, frame.object_alpha, frame.normal_alpha
     dr.eval(frame.depth, frame.normal, frame.radiance, frame.terms, frame.maps, *alphas)
-    raster = places.to_raster
+    raster = pixels.to_raster
     terms = frame.terms and RadianceTerms(
         **{name: raster(term) for name, term in frame.terms.known().items()}
     )
@@ -281,7 +281,7 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
     normal, alpha = buffer.slots["normal"], buffer.slots.get(OBJECT, buffer.alpha)
 
     # Points to shade.
-    pixel = None if buffer.places is None else buffer.places.raster
+    pixel = None if buffer.pixels is None else buffer.pixels.raster
     ray, index = camera.rays(pixel), camera.image_index(pixel)
     attributes = {name: values[name] for name in view.points.attributes}
     if shading.antialias:

@@ -1,8 +1,18 @@
-"""How SIMD lanes cover a picture, and their common walk along the lists of tiles.
+"""SIMD lanes over an image, and their common walk along the lists of tiles.
 
-A packet works on a few tiles, and the lanes of a tile on one surfel at a time; each has one pixel in every
-block of its tile and keeps their states side by side. Reading a row and adding to its gradient, most of the
-work with one pixel a lane, are then shared.
+A tile is the smallest area that has a list of surfels. It is divided into LANE_PIXELS_PER_AXIS² blocks, and a
+lane has the pixel at one place of every block. Here a tile of 8 × 4 pixels, its 2 × 2 blocks of 4 × 2 pixels,
+and its 8 lanes a … h:
+
+    a b c d | a b c d        A lane keeps the states of its pixels side by side: it reads the row of a surfel,
+    e f g h | e f g h        and adds to its gradient, once for all of them. With one pixel per lane, that is
+    --------+--------        most of the work.
+    a b c d | a b c d
+    e f g h | e f g h
+
+A packet of PACKET_EDGE² pixels, one tile or several, fills a SIMD vector with its lanes (here 2 tiles, one
+above the other: 16 lanes). It ends with the last pixel of its tiles. Lanes are in the order of packets, then
+tiles of the packet, then places in the block, each row by row.
 """
 
 from __future__ import annotations
@@ -18,6 +28,7 @@ import mitsuba as mi
 from mi_refgs.constants import LANE_PIXELS_PER_AXIS, PACKET_EDGE, TRANSMITTANCE_MIN
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.tiles import TileLists
+from mi_refgs.types import Bool, Float, Point2f, UInt32
 
 BLOCKS = LANE_PIXELS_PER_AXIS**2
 """Pixels of a lane."""
@@ -29,7 +40,7 @@ NOWHERE = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class Grid:
-    """Packets of tiles over a picture, row by row."""
+    """Packets of tiles over an image, row by row."""
 
     lists: TileLists
     camera: Camera
@@ -40,72 +51,71 @@ class Grid:
         return self.camera.tile[0] // LANE_PIXELS_PER_AXIS, self.camera.tile[1] // LANE_PIXELS_PER_AXIS
 
     @property
-    def side(self) -> tuple[int, int]:
+    def tiles(self) -> tuple[int, int]:
         """Tiles of a packet along each axis."""
         return PACKET_EDGE // self.camera.tile[0], PACKET_EDGE // self.camera.tile[1]
 
     @property
-    def across(self) -> int:
-        """Packets in a row."""
-        return -(-self.lists.tiles_x // self.side[0])
+    def columns(self) -> int:
+        """Packets per row of packets."""
+        return -(-self.lists.tiles_x // self.tiles[0])
 
     @property
     def packets(self) -> int:
         """Number of packets."""
-        return self.across * -(-self.lists.tiles_y // self.side[1])
+        return self.columns * -(-self.lists.tiles_y // self.tiles[1])
 
-    def filled(self) -> Any:
-        """The packets (mi.UInt32) with a tile that has a list; waits for the device."""
+    def filled(self) -> UInt32:
+        """The packets with a tile that lists a surfel; waits for the device."""
         lanes = Lanes.of(self)
-        listed = dr.block_reduce(
-            dr.ReduceOp.Or, dr.select(lanes.begin < lanes.end, mi.UInt32(1), 0), PACKET_LANES
-        )
-        return dr.compress(listed > 0)
+        listed = dr.select(lanes.begin < lanes.end, mi.UInt32(1), 0)
+        return dr.compress(dr.block_reduce(dr.ReduceOp.Or, listed, PACKET_LANES) > 0)
 
 
 @dataclass(frozen=True)
 class Lanes:
-    """Lanes, packet by packet of tiles, and their pixel in each block of the tile."""
+    """L lanes, and their pixel in each block of their tile."""
 
-    pixel: list[Any]  # mi.Point2f: centre
-    raster: list[Any]  # mi.UInt32: index in the image
-    inside: list[Any]  # mi.Bool: is it inside the image?
-    begin: Any  # first pair of the tile
-    end: Any  # one past its last pair
+    pixel: list[Point2f]  # BLOCKS × (L,): centre
+    raster: list[UInt32]  # BLOCKS × (L,): index in the image
+    inside: list[Bool]  # BLOCKS × (L,): whether it is in the image
+    begin: UInt32  # (L,): first pair of the tile
+    end: UInt32  # (L,): one past its last pair
 
     @staticmethod
-    def of(grid: Grid, chosen: Any = None) -> Lanes:
-        """The lanes of all packets, or of those `chosen` (mi.UInt32)."""
-        camera, lists, (lanes_x, lanes_y), (side_x, side_y) = grid.camera, grid.lists, grid.lanes, grid.side
+    def of(grid: Grid, chosen: UInt32 | None = None) -> Lanes:
+        """The lanes of all packets, or of those `chosen`."""
+        camera, lists, (lanes_x, lanes_y), (side_x, side_y) = grid.camera, grid.lists, grid.lanes, grid.tiles
+        # Packet, tile in the packet, place in the block.
         count = grid.packets if chosen is None else dr.width(chosen)
         lane = dr.arange(mi.UInt32, count * PACKET_LANES)
         packet, lane = lane // PACKET_LANES, lane % PACKET_LANES
         if chosen is not None:
             packet = dr.gather(mi.UInt32, chosen, packet)
         tile, lane = lane // (lanes_x * lanes_y), lane % (lanes_x * lanes_y)
-        tile_x = packet % grid.across * side_x + tile % side_x
-        tile_y = packet // grid.across * side_y + tile // side_x
+        tile_x = packet % grid.columns * side_x + tile % side_x
+        tile_y = packet // grid.columns * side_y + tile // side_x
         there = (tile_x < lists.tiles_x) & (tile_y < lists.tiles_y)
         tile = tile_y * lists.tiles_x + tile_x
-        # Pixels before the image wrap round to huge numbers, and are not inside either.
+        # Pixels. Those before the image wrap round to huge numbers, and are not inside either.
         corner_x = tile_x * camera.tile[0] + lane % lanes_x - camera.tile_offset[0]
         corner_y = tile_y * camera.tile[1] + lane // lanes_x - camera.tile_offset[1]
         blocks = range(LANE_PIXELS_PER_AXIS)
-        places = [(corner_x + x * lanes_x, corner_y + y * lanes_y) for y in blocks for x in blocks]
+        pixels = [(corner_x + x * lanes_x, corner_y + y * lanes_y) for y in blocks for x in blocks]
         return Lanes(
-            [mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5) for x, y in places],
-            [y * camera.width + x for x, y in places],
-            [there & (x < camera.width) & (y < camera.height) for x, y in places],
+            [mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5) for x, y in pixels],
+            [y * camera.width + x for x, y in pixels],
+            [there & (x < camera.width) & (y < camera.height) for x, y in pixels],
             dr.gather(mi.UInt32, lists.pair_begin, tile, there),
             dr.gather(mi.UInt32, lists.pair_end, tile, there),
         )
 
     def each(self, *values: list[Any]) -> Any:
-        """Pixel, raster index and inside, with anything else that there is one of for each block."""
+        """Iterate over the blocks: pixel, raster index, inside, and further lists of one value per block."""
         return zip(self.pixel, self.raster, self.inside, *values, strict=True)
 
-    def to_raster(self, camera: Camera, values: list[list[Any]]) -> list[Any]:
-        """Values of each block to raster images, in the kernel of the loop that made them."""
+    def to_raster(self, camera: Camera, values: list[list[Float]]) -> list[Float]:
+        """Images of values per block, written in the kernel of the loop that made them."""
         images = [dr.empty(mi.Float, camera.width * camera.height) for _ in values[0]]
         for _, raster, inside, of_block in self.each(values):
             for image, value in zip(images, of_block, strict=True):
@@ -113,65 +123,75 @@ class Lanes:
         dr.eval(images)
         return images
 
-    def from_raster(self, images: list[Any]) -> list[list[Any]]:
+    def from_raster(self, images: list[Float]) -> list[list[Float]]:
         """Inverse of `to_raster`; 0 outside the image."""
         return [[dr.gather(mi.Float, x, raster, inside) for x in images] for _, raster, inside in self.each()]
 
 
 @dataclass(frozen=True)
-class Places:
-    """The P pixels of the packets in which there is something, in an order of their own.
+class CompactedPixels:
+    """The P pixels of the packets that list a surfel, packet by packet and block by block.
 
-    Packet by packet and block by block: what a SIMD packet reads is a square of the picture, not a line, and
-    pixels of which nothing is known but that they are empty have no place.
+    What a SIMD vector reads is then a square of the image, not a line: neighbours' rays are traced together.
     """
 
-    raster: Any  # mi.UInt32 (P,): index in the image
-    place: Any  # mi.UInt32 (H·W,): where each pixel is
-    there: Any  # mi.Bool (H·W,): whether it is anywhere
+    raster: UInt32  # (P,): index in the image
+    index: UInt32  # (H·W,): which of the P each pixel of the image is
+    there: Bool  # (H·W,): whether it is one of them
 
     @staticmethod
-    def of(grid: Grid, chosen: Any, lanes: Lanes) -> Places:
-        """Those of the `chosen` packets, whose lanes these are."""
-        camera, (lanes_x, lanes_y) = grid.camera, grid.lanes
-        raster = dr.empty(mi.UInt32, BLOCKS * dr.width(chosen) * PACKET_LANES)
-        for place, index in zip(Places.of_blocks(dr.width(chosen)), lanes.raster, strict=True):
-            dr.scatter(raster, index, place, mode=dr.ReduceMode.NoConflicts)
+    def of(grid: Grid, chosen: UInt32, lanes: Lanes) -> CompactedPixels:
+        """The pixels of the `chosen` packets, to which these lanes belong."""
+        camera, (lanes_x, lanes_y), packets = grid.camera, grid.lanes, dr.width(chosen)
+        raster = dr.empty(mi.UInt32, BLOCKS * packets * PACKET_LANES)
+        for index, of_block in zip(CompactedPixels._indices(packets), lanes.raster, strict=True):
+            dr.scatter(raster, of_block, index, mode=dr.ReduceMode.NoConflicts)
         slot = dr.full(mi.UInt32, NOWHERE, grid.packets)
-        dr.scatter(slot, dr.arange(mi.UInt32, dr.width(chosen)), chosen, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(slot, dr.arange(mi.UInt32, packets), chosen, mode=dr.ReduceMode.NoConflicts)
         dr.eval(raster, slot)
 
+        # From a pixel of the image to its packet, tile, block and lane.
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
         x, y = pixel % camera.width + camera.tile_offset[0], pixel // camera.width + camera.tile_offset[1]
-        slot = dr.gather(mi.UInt32, slot, y // PACKET_EDGE * grid.across + x // PACKET_EDGE)
+        slot = dr.gather(mi.UInt32, slot, y // PACKET_EDGE * grid.columns + x // PACKET_EDGE)
         x, y = x % PACKET_EDGE, y % PACKET_EDGE
-        tile = y // camera.tile[1] * grid.side[0] + x // camera.tile[0]
+        tile = y // camera.tile[1] * grid.tiles[0] + x // camera.tile[0]
         x, y = x % camera.tile[0], y % camera.tile[1]
         block = y // lanes_y * LANE_PIXELS_PER_AXIS + x // lanes_x
         lane = tile * (lanes_x * lanes_y) + y % lanes_y * lanes_x + x % lanes_x
-        return Places(raster, (slot * BLOCKS + block) * PACKET_LANES + lane, slot != NOWHERE)
+        return CompactedPixels(raster, (slot * BLOCKS + block) * PACKET_LANES + lane, slot != NOWHERE)
 
     @staticmethod
-    def of_blocks(packets: int) -> list[Any]:
-        """The place (mi.UInt32) that each block of the lanes of so many packets has."""
+    def _indices(packets: int) -> list[UInt32]:
+        """Index among the P pixels of each lane's pixel in each block."""
         lane = dr.arange(mi.UInt32, packets * PACKET_LANES)
         first = lane // PACKET_LANES * (BLOCKS * PACKET_LANES) + lane % PACKET_LANES
         return [first + block * PACKET_LANES for block in range(BLOCKS)]
 
+    @staticmethod
+    def scattered(values: list[list[Float]], packets: int) -> list[Float]:
+        """Maps (P,) of values per block, written in the kernel of the loop that made them."""
+        maps = [dr.empty(mi.Float, BLOCKS * packets * PACKET_LANES) for _ in values[0]]
+        for index, of_block in zip(CompactedPixels._indices(packets), values, strict=True):
+            for image, value in zip(maps, of_block, strict=True):
+                dr.scatter(image, value, index, mode=dr.ReduceMode.NoConflicts)
+        dr.eval(maps)
+        return maps
+
     def to_raster(self, value: Any) -> Any:
-        """Evaluated values of P places as ones of H·W pixels, 0 where there is nothing; constants stay."""
+        """Evaluated values (P,) as ones (H·W,), 0 where there is nothing; None and constants stay."""
         if value is None or dr.width(value) == 1:
             return value
-        return dr.gather(type(value), value, self.place, self.there)
+        return dr.gather(type(value), value, self.index, self.there)
 
 
-def any_of(flags: list[Any]) -> Any:
+def any_of(flags: list[Bool]) -> Bool:
     """Whether one of several masks is set."""
     return reduce(operator.or_, flags)
 
 
-def advance(sample: Any, active: Any, transmittance: Any) -> tuple[Any, Any, Any]:
-    """Does this surfel contribute, with which weight, and does the pixel go on?"""
+def advance(sample: Any, active: Bool, transmittance: Float) -> tuple[Float, Float, Bool]:
+    """Weight of a footprint's sample, the transmittance behind it, and whether the pixel goes on."""
     hit = active & sample.valid
     after = transmittance * (1 - sample.alpha)
     ends = hit & (after < TRANSMITTANCE_MIN)
@@ -181,11 +201,11 @@ def advance(sample: Any, active: Any, transmittance: Any) -> tuple[Any, Any, Any
 
 
 def walk(lists: TileLists, lanes: Lanes, step: Any, start: list[tuple[Any, ...]], label: str) -> list[Any]:
-    """Take every surfel of its tile's list to each lane, until the lane's last pixel has ended.
+    """Visit the surfels of each lane's tile in order, until the lane's last pixel has ended.
 
-    `start` is the state of each block, first whether its pixel goes on; `step` maps a surfel, whether the
-    lane goes on, and the blocks' states (a list a quantity) to states in the form of `start`. Returns the
-    last states, a list a quantity.
+    `start` has the state of each block; its first entry says whether the pixel goes on. `step` maps a surfel,
+    whether the lane goes on, and the states (one list per quantity) to states in the form of `start`. Returns
+    the last states, one list per quantity.
     """
 
     def surfel_at(pair: Any, some: Any) -> Any:
@@ -206,5 +226,5 @@ def walk(lists: TileLists, lanes: Lanes, step: Any, start: list[tuple[Any, ...]]
 
 
 def _transposed(rows: list[tuple[Any, ...]]) -> tuple[list[Any], ...]:
-    """One tuple a block to one list a quantity."""
+    """One tuple per block to one list per quantity."""
     return tuple(list(column) for column in zip(*rows, strict=True))

@@ -162,17 +162,17 @@ def test_a_term_that_is_off_is_absent(
     """Channels, parameters, features of the blend, launches and rays of a step, and the PLY's properties."""
     features: list[int] = []
     rays: list[int] = []
-    blend, visible = splat.blend, Occluder.visible
+    composite, visible = splat.composite, Occluder.visible
 
-    def counted_blend(footprints: Any, columns: list[Any], *rest: Any) -> Any:
+    def counted_composite(footprints: Any, columns: list[Any], *rest: Any) -> Any:
         features.append(len(columns))
-        return blend(footprints, columns, *rest)
+        return composite(footprints, columns, *rest)
 
     def counted_visible(self: Occluder, point: Any, *rest: Any) -> Any:
         rays.append(dr.width(point))
         return visible(self, point, *rest)
 
-    monkeypatch.setattr(splat, "blend", counted_blend)
+    monkeypatch.setattr(splat, "composite", counted_composite)
     monkeypatch.setattr(Occluder, "visible", counted_visible)
     counted = {}
     for name, scores in (("off", [0.0, 9.0] * 2), ("on", [0.0, 9.0] + [9.0, 0.0] * 2)):

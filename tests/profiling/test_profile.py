@@ -38,7 +38,7 @@ from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.shade.shading import Shading
-from mi_refgs.splat import Blended, Camera, Footprints
+from mi_refgs.splat import Camera, Composited, Footprints
 from tests.helpers import ROOT
 from tests.scenes.tiny import SETTINGS, SIZE
 
@@ -169,7 +169,7 @@ def test_hooks_stand_where_their_names_say(trainer: Trainer) -> None:
     assert notes.calls.index("splat forward") < notes.calls.index("shade forward")  # at pixels
     footprints, features = notes.boundaries.pop("surfels backward")
     assert isinstance(footprints, Footprints) and dr.width(features[0]) == trainer.surfels.count
-    kinds = {"splat backward": Blended, "shade backward": Frame, "prefilter backward": PrefilteredLight}
+    kinds = {"splat backward": Composited, "shade backward": Frame, "prefilter backward": PrefilteredLight}
     assert {name: type(value) for name, value in notes.boundaries.items()} == kinds
 
 

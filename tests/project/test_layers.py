@@ -341,7 +341,7 @@ def test_a_planted_cycle_is_found(modules: dict[str, str]) -> None:
         ("shade.brdf", "from mi_refgs.splat.camera import Camera"),
         ("shade.brdf", "from ..splat.camera import Camera"),
         ("shade.brdf", "from .sh import sh_basis\nfrom mi_refgs.errors import InputError"),
-        ("splat", "from .blend import blend"),
+        ("splat", "from .composite import composite"),
         ("cli", "from mi_refgs import __version__, llvm"),
         ("render.pipeline", "from mi_refgs import splat\nimport numpy as np"),
     ],

@@ -192,13 +192,13 @@ def test_normals_are_blended_only_where_something_needs_them(monkeypatch: pytest
     """At surfels a picture needs none: three features fewer, and the same radiance."""
     from mi_refgs import splat
 
-    blend, features = splat.blend, []
+    composite, features = splat.composite, []
 
     def counted(footprints: Any, columns: list[Any], *rest: Any) -> Any:
         features.append(len(columns))
-        return blend(footprints, columns, *rest)
+        return composite(footprints, columns, *rest)
 
-    monkeypatch.setattr(splat, "blend", counted)
+    monkeypatch.setattr(splat, "composite", counted)
     surfels = discs(radiance_sh=np.full((3, 3), 0.2))
     camera = seen_from(0, 0, 4.0, size=12)
     frames = [render(SurfelScene(surfels, COLOUR), camera, Request(aovs)) for aovs in (("normal",), ())]

@@ -13,7 +13,7 @@ import pytest
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
-from mi_refgs.splat import Blended, Camera, splat
+from mi_refgs.splat import Camera, Composited, splat
 from mi_refgs.surfels.table import Surfels
 
 MAX_LEFT_OUT = 0.05
@@ -82,7 +82,7 @@ def quaternion_to(normal: np.ndarray) -> np.ndarray:
     return np.array([*axis, 1 + normal[2]]) + 1e-9
 
 
-def fast_maps(scene: Scene) -> Blended:
+def fast_maps(scene: Scene) -> Composited:
     return splat(scene.surfels(), scene.columns(), scene.fast_camera())
 
 

@@ -19,7 +19,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
-from mi_refgs.splat.lanes import Grid, Lanes, Places
+from mi_refgs.splat.lanes import CompactedPixels, Grid, Lanes
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.integrator import camera_at, image, raw_channels, scattered_discs, scene, sky, two_balls
 
@@ -132,13 +132,13 @@ def test_nothing_in_view_is_looked_for_once(name: str, monkeypatch: pytest.Monke
 @pytest.mark.parametrize("name", ["", *sorted(ALL)])
 def test_a_frame_has_what_is_asked_for(at: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """And blends no more channels than that takes."""
-    blend, blended = splat.blend_shown, []
+    composite, blended = splat.composite, []
 
-    def counted(footprints: Any, features: list[Any], lists: Any, view: Camera, depth: bool) -> Any:
-        blended.append(len(features) + depth)
-        return blend(footprints, features, lists, view, depth)
+    def counted(footprints: Any, features: list[Any], *rest: Any) -> Any:
+        blended.append(len(features) + rest[-1])
+        return composite(footprints, features, *rest)
 
-    monkeypatch.setattr(splat, "blend_shown", counted)
+    monkeypatch.setattr(splat, "composite", counted)
     light = EnvironmentLight.from_radiance(sky())
     shading = Shading(at, "split_sum", "sh", occlusion=at == "pixel")
     scene = SurfelScene(things(), shading, shading.light_of(light), Occluder(two_balls()))
@@ -159,9 +159,9 @@ def test_every_pixel_of_a_chosen_packet_has_one_place() -> None:
     grid = Grid(lists, view)
     chosen = grid.filled()
     assert 0 < dr.width(chosen) < grid.packets
-    places = Places.of(grid, chosen, Lanes.of(grid, chosen))
-    there, raster = np.array(places.there), np.array(places.raster)
-    back = raster[np.array(places.place)[there]]
+    pixels = CompactedPixels.of(grid, chosen, Lanes.of(grid, chosen))
+    there, raster = np.array(pixels.there), np.array(pixels.raster)
+    back = raster[np.array(pixels.index)[there]]
     np.testing.assert_array_equal(back, np.flatnonzero(there))
     alpha = np.array(splat.splat(things(), [], view).alpha)
     assert not alpha[~there].any() and alpha[there].any()

@@ -21,7 +21,7 @@ from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.footprint import Rules
 from mi_refgs.reference.splat import differentiate
 from mi_refgs.render.pipeline import Request, Shading, SurfelScene, render
-from mi_refgs.splat import blend, list_by_tile, project
+from mi_refgs.splat import composite, list_by_tile, project
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.primitives.gaussian import GaussianAdjoint
@@ -172,7 +172,7 @@ def test_shift_receives_the_screen_translation_gradient() -> None:
     dr.enable_grad(screen_offset)
     maps = project(scene.surfels(), scene.fast_camera(), screen_offset)
     lists = list_by_tile(maps, scene.fast_camera())
-    alpha = blend(maps, [], lists, scene.fast_camera()).alpha
+    alpha = composite(maps, [], lists, scene.fast_camera()).alpha
     dr.backward(dr.sum(alpha * upload(weights[..., 5])))
     step, sides = 1e-5, []
     for sign in (1, -1):

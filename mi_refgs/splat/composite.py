@@ -1,0 +1,226 @@
+"""Front-to-back compositing of K features, its adjoint and its tangent: three traced loops over tile lists.
+
+    out_k = Σᵢ wᵢ f_ik,    wᵢ = αᵢ Tᵢ,    Tᵢ = Π_{j<i} (1 - αⱼ)                             [2DGS, eq. 12]
+
+Depth and accumulated alpha are two more features (f = z and f = 1). The adjoint replays the same order; with
+gᵢ = Σ_k δ_k f_ik, and S = Σ_k δ_k out_k, from which wᵢ gᵢ is subtracted at each step so that S is what lies
+behind,
+
+    δf_ik = wᵢ δ_k,        δαᵢ = Tᵢ gᵢ - S_{j>i} / (1 - αᵢ)
+
+needs neither a reversed list nor storage per pair.
+
+No derivative, on purpose: the sort order, the tile lists, the α < 1/255 cut and the end at T < 1e-4, the near
+plane, the clamp at α_max (zero). The bias of the cut is known: the border of a footprint does
+not move. With ε = 1/255, mean gradients of size and position fall short by the part ε ln(o/ε) / (o - ε),
+those of opacity by ε/o:
+
+    opacity o             0.9     0.5     0.3     0.1    0.05
+    size, position      -2.4 %  -3.8 %  -5.7 %  -13 %  -22 %
+    opacity             -0.4 %  -0.8 %  -1.3 %  -3.9 %  -7.8 %
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.kernels.rows import PackedRows
+from mi_refgs.kernels.timing import phase
+from mi_refgs.splat.camera import Camera
+from mi_refgs.splat.lanes import CompactedPixels, Grid, Lanes, advance, any_of, walk
+from mi_refgs.splat.tiles import TileLists
+from mi_refgs.surfels.primitives import Footprints, Primitive
+from mi_refgs.types import Float
+
+
+@dataclass(frozen=True)
+class Composited:
+    """Maps of H·W pixels in raster order, or of P pixels in that of `pixels`; not divided by alpha."""
+
+    features: list[Float]  # K maps Σ w f
+    depth: Float  # Σ w z; None if not asked for
+    alpha: Float  # Σ w
+    pixels: CompactedPixels | None = None
+
+    @staticmethod
+    def nothing(features: int, camera: Camera, depth: bool = True) -> Composited:
+        """Maps of a view without surfels."""
+        blank = [dr.zeros(mi.Float, camera.width * camera.height) for _ in range(features + 2)]
+        return Composited(blank[2:], blank[0] if depth else None, blank[1])
+
+
+@phase("splat forward")
+def composite(
+    footprints: Footprints,
+    features: list[Float],  # K × (N,)
+    lists: TileLists,
+    camera: Camera,
+    forward_only: bool = False,
+    depth: bool = True,
+) -> Composited:
+    """Composite features of surfels; differentiable in these and in the columns of the footprints.
+
+    `forward_only`: no derivatives, `depth` on demand, and pixels of empty packets left out, so that what
+    shades the others is faster. Alpha is then 1 - T instead of one more sum, and equal to rounding.
+    """
+    if not forward_only:
+        out = dr.custom(_Composite, footprints.columns + features, footprints.primitive, lists, camera)
+        return Composited(out[: len(features)], *out[-2:])
+    if not lists.pairs:
+        return Composited.nothing(len(features), camera, depth)
+    rows = PackedRows.pack(footprints.columns + features)
+    dr.eval(rows.data)
+    grid = Grid(lists, camera)
+    chosen = grid.filled()
+    lanes, loop = Lanes.of(grid, chosen), _Loop(rows, footprints.primitive, lists, camera)
+    transmittance, sums = loop.forward(lanes, len(features) + depth)
+    values = [[*of_block, 1 - T] for of_block, T in zip(sums, transmittance, strict=True)]
+    maps = CompactedPixels.scattered(values, dr.width(chosen))
+    pixels = CompactedPixels.of(grid, chosen, lanes)
+    return Composited(maps[: len(features)], maps[-2] if depth else None, maps[-1], pixels)
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """What the three loops over the tile lists read."""
+
+    rows: PackedRows  # columns of the footprints, then features
+    primitive: Primitive
+    lists: TileLists
+    camera: Camera
+
+    @property
+    def features(self) -> int:
+        """Number of features K."""
+        return self.rows.width - self.primitive.columns
+
+    def values(self, row: list[Float], z: Float) -> list[Float]:
+        """What a surfel adds to each map, times its weight: features, depth, and 1 for alpha."""
+        return [*row[self.primitive.columns :][: self.features], z, mi.Float(1)]
+
+    def forward(self, lanes: Lanes, maps: int) -> tuple[list[Float], list[list[Float]]]:
+        """Transmittance and the first `maps` maps, per block of the lanes."""
+
+        def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
+            row = self.rows.fetch(surfel, some)
+            after = []
+            for pixel, _, _, active_here, transmittance, out in lanes.each(active, *state):
+                sample = self.primitive.evaluate(row, pixel, self.camera.near)
+                weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
+                values = self.values(row, sample.z)[:maps]
+                out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
+                after.append((goes_on, transmittance_after, out))
+            return after
+
+        start = [(mi.Bool(inside), mi.Float(1), [mi.Float(0)] * maps) for inside in lanes.inside]
+        _, transmittance, out = walk(self.lists, lanes, step, start, "composite")
+        return transmittance, out
+
+    def backward(self, lanes: Lanes, δ: list[list[Float]], out: list[list[Float]]) -> PackedRows:
+        """Adjoint of the rows, for adjoints δ of the maps and the maps themselves, per block of the lanes."""
+        behind = [
+            sum((a * b for a, b in zip(of_block, total, strict=True)), start=mi.Float(0))
+            for of_block, total in zip(δ, out, strict=True)
+        ]
+        δrows = PackedRows.zeros(self.rows.count, self.rows.width)
+
+        def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
+            row = self.rows.fetch(surfel, some)
+            after, weights = [], []
+            geometry = self.primitive.adjoint()
+            # Adjoints of α and z per pixel, summed over the pixels of the lane.
+            for pixel, _, _, active_here, transmittance, behind_here, δhere in lanes.each(active, *state, δ):
+                sample = self.primitive.evaluate(row, pixel, self.camera.near)
+                weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
+                g = mi.Float(0)
+                for adjoint, value in zip(δhere, self.values(row, sample.z), strict=True):
+                    g = dr.fma(adjoint, value, g)
+                rest = dr.fma(-weight, g, behind_here)
+                δalpha = dr.select(weight > 0, dr.fma(transmittance, g, -rest / (1 - sample.alpha)), 0)
+                geometry.add(sample, δalpha, weight * δhere[-2])
+                after.append((goes_on, transmittance_after, rest))
+                weights.append(weight)
+            # One addition per lane to the adjoint of the row.
+            δrow = geometry.columns(row)
+            for k in range(self.features):
+                δfeature = mi.Float(0)
+                for weight, δhere in zip(weights, δ, strict=True):
+                    δfeature = dr.fma(weight, δhere[k], δfeature)
+                δrow.append(δfeature)
+            δrows.add(surfel, δrow, any_of([weight > 0 for weight in weights]))
+            return after
+
+        inside = zip(lanes.inside, behind, strict=True)
+        start = [(mi.Bool(inside_here), mi.Float(1), total) for inside_here, total in inside]
+        walk(self.lists, lanes, step, start, "composite_backward")
+        dr.eval(δrows.data)
+        return δrows
+
+    def tangent(self, lanes: Lanes, drows: PackedRows) -> list[list[Float]]:
+        """Tangents of the maps, per block of the lanes, for tangents of the rows."""
+
+        def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
+            row, drow = self.rows.fetch(surfel, some), drows.fetch(surfel, some)
+            after = []
+            for pixel, _, _, active_here, transmittance, dtransmittance, dout in lanes.each(active, *state):
+                sample = self.primitive.evaluate(row, pixel, self.camera.near)
+                weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
+                hit = weight > 0
+                dalpha, dz = self.primitive.evaluate_forward(row, sample, drow)
+                dweight = dr.select(hit, dtransmittance * sample.alpha + transmittance * dalpha, 0)
+                dvalues = [*drow[self.primitive.columns :][: self.features], dz, mi.Float(0)]
+                dout = [
+                    total + dweight * value + dr.select(hit, weight * dvalue, 0)
+                    for total, value, dvalue in zip(dout, self.values(row, sample.z), dvalues, strict=True)
+                ]
+                dafter = dtransmittance * (1 - sample.alpha) - transmittance * dalpha
+                after.append((goes_on, transmittance_after, dr.select(hit, dafter, dtransmittance), dout))
+            return after
+
+        zeros = [mi.Float(0)] * (self.features + 2)
+        start = [(mi.Bool(inside), mi.Float(1), mi.Float(0), zeros) for inside in lanes.inside]
+        *_, dout = walk(self.lists, lanes, step, start, "composite_forward")
+        return dout
+
+
+class _Composite(dr.CustomOp):
+    """Columns (N,) → [features…, depth, alpha] (H·W,)."""
+
+    def eval(self, columns: list[Any], primitive: Primitive, lists: TileLists, camera: Camera) -> list[Any]:
+        self.loop = _Loop(PackedRows.pack(columns), primitive, lists, camera)
+        dr.eval(self.loop.rows.data)
+        if lists.pairs:
+            lanes = self._lanes()
+            self.out = lanes.to_raster(camera, self.loop.forward(lanes, self.loop.features + 2)[1])
+        else:  # Dr.Jit refuses to gather from an empty list, even fully masked
+            self.out = self._blank()
+        return self.out
+
+    def forward(self) -> None:
+        if not self.loop.lists.pairs:
+            self.set_grad_out(self._blank())
+            return
+        lanes, drows = self._lanes(), PackedRows.pack(self.grad_in("columns"))
+        self.set_grad_out(lanes.to_raster(self.loop.camera, self.loop.tangent(lanes, drows)))
+
+    def backward(self) -> None:
+        if not self.loop.lists.pairs:
+            return
+        δout, lanes = self.grad_out(), self._lanes()
+        dr.eval(δout)  # together: to gather from them would evaluate one by one what they have in common
+        δrows = self.loop.backward(lanes, lanes.from_raster(δout), lanes.from_raster(self.out))
+        self.set_grad_in("columns", δrows.columns())
+
+    def name(self) -> str:
+        return "composite"
+
+    def _lanes(self) -> Lanes:
+        return Lanes.of(Grid(self.loop.lists, self.loop.camera))
+
+    def _blank(self) -> list[Any]:
+        pixels = self.loop.camera.width * self.loop.camera.height
+        return [dr.zeros(mi.Float, pixels) for _ in range(self.loop.features + 2)]
