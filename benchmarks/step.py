@@ -78,7 +78,7 @@ def make_trainer(surfels: int, data: Any, variant: str = METHOD) -> tuple[Any, A
 def step_times(surfels: int, size: int, steps: int, variant: str = METHOD) -> dict[str, Any]:
     """For every stage of the schedule: a step's time, launches, cache misses, and where its time goes."""
     from benchmarks.common.timing import milliseconds
-    from benchmarks.splatting.ours import Ours
+    from benchmarks.splatting.renderers import Ours
     from mi_refgs.profiling.profile import profile_stage
 
     trainer, method = make_trainer(surfels, sphere_data(size, 8, np.random.default_rng(0)), variant)

@@ -29,7 +29,7 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
-from benchmarks.common.command import plain_parser
+from benchmarks.common.report import plain_parser
 
 ROOT = Path(__file__).parents[1]
 SIZE, VIEWS = 32, 5

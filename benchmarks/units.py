@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
-from benchmarks.common.command import plain_parser
-from benchmarks.common.report import write_json
+from benchmarks.common.report import plain_parser, write_json
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip

@@ -1,7 +1,8 @@
-"""Results on disk: CSV, JSON, Markdown tables, numbers that know their floor."""
+"""Options of the command line, results on disk (CSV, JSON), Markdown tables and pages."""
 
 from __future__ import annotations
 
+import argparse
 import csv
 import io
 import json
@@ -9,14 +10,30 @@ import math
 import os
 import platform
 import re
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
+import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
+
+from benchmarks.common.view import ROOT
+from mi_refgs.errors import InputError
 from mi_refgs.io.files import replace_file
+
+Row = dict[str, Any]
+
+
+def where(rows: Iterable[Row], **values: Any) -> list[Row]:
+    """Rows that have all these values; a tuple or list means any of them."""
+
+    def fits(row: Row) -> bool:
+        return all(row[k] in v if isinstance(v, tuple | list) else row[k] == v for k, v in values.items())
+
+    return [row for row in rows if fits(row)]
 
 
 def machine() -> dict[str, Any]:
@@ -104,3 +121,62 @@ def floored(relmse: float, floor: float, clear: float) -> str:
     if relmse < clear * floor:
         return f"< {percent((clear * floor) ** 0.5)}"
     return percent(relmse**0.5)
+
+
+def plain_parser(name: str, description: str | None) -> argparse.ArgumentParser:
+    """Parser of `python -m benchmarks.NAME`."""
+    return argparse.ArgumentParser(
+        prog=f"python -m benchmarks.{name}",
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def make_parser(
+    name: str, description: str | None, page: Any = None, **sizes: tuple[Any, str]
+) -> argparse.ArgumentParser:
+    """With the options that all pages have, and a flag for each other size than that of the page.
+
+    `sizes`: settings and help. `options.settings` are the chosen ones. Sets Mitsuba's variant.
+    """
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    parser = plain_parser(name, description)
+    parser.set_defaults(settings=page)
+    parser.add_argument("-o", "--output", type=Path, help="folder; without it docs/ and runs/")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write page and pictures of this earlier run"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    group = parser.add_mutually_exclusive_group()
+    for flag, (settings, text) in sizes.items():
+        group.add_argument(f"--{flag}", action="store_const", dest="settings", const=settings, help=text)
+    return parser
+
+
+def write_reports(
+    name: str,
+    options: argparse.Namespace,
+    measure: Callable[[], dict[str, Any]],
+    plot: Callable[[dict[str, Any], Path], Any],
+    page: Callable[[dict[str, Any]], dict[str, Any]],
+) -> int:
+    """Measure, or read `options.json`; write JSON, CSV (of "rows") and page. The exit code: 2 for bad input.
+
+    `plot` writes its pictures of the result to a folder; `page` returns what the template page.md of the
+    benchmark leaves open: tables and numbers by name. The machine and the run's minutes are added.
+    """
+    folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", ROOT / "runs")
+    try:
+        result = json.loads(options.json.read_text(encoding="utf-8")) if options.json else measure()
+        write_json(data / f"{name}.json", result)
+        write_csv(data / f"{name}.csv", result["rows"])
+        plot(result, folder / "images")
+        values = result["machine"] | {"minutes": f"{result['seconds'] / 60:.1f}"} | page(result)
+        template = (ROOT / "benchmarks" / name / "page.md").read_text(encoding="utf-8")
+        write_text(folder / f"{name}.md", fill(template, values))
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    print(folder / f"{name}.md")
+    return 0

@@ -10,8 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.common import montecarlo as mc
-from benchmarks.common.lights import Light
-from benchmarks.common.view import Look, Points, first_hits, make_sensor, surface
+from benchmarks.common.view import Light, Look, Points, first_hits, make_sensor, surface
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.init import from_points

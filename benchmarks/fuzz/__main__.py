@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.command import plain_parser
+from benchmarks.common.report import plain_parser
 from benchmarks.fuzz import SECONDS
 from benchmarks.fuzz.readers import READERS
 from benchmarks.fuzz.worker import mutated

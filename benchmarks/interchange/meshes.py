@@ -21,7 +21,7 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.common.command import plain_parser
+from benchmarks.common.report import plain_parser
 from benchmarks.interchange.programs import validated
 from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.evaluation.images import image_array

@@ -16,8 +16,7 @@ import sys
 import time
 from typing import Any
 
-from benchmarks.common.command import make_parser, write_reports
-from benchmarks.common.report import machine, table
+from benchmarks.common.report import machine, make_parser, table, write_reports
 from benchmarks.memory import cell
 from mi_refgs.kernels import memory
 

@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
 
-from benchmarks.common.command import plain_parser
+from benchmarks.common.report import plain_parser
 from benchmarks.mutation.planting import Mistake, catalogue, copy_repository, planted
 
 WORKERS = 2

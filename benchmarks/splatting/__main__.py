@@ -14,11 +14,10 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 
-from benchmarks.common.command import make_parser, write_reports
+from benchmarks.common.report import make_parser, write_reports
+from benchmarks.splatting.cases import FULL, PAGE, SMALL
 from benchmarks.splatting.measure import measure
-from benchmarks.splatting.page import page
-from benchmarks.splatting.plots import plot
-from benchmarks.splatting.settings import FULL, PAGE, SMALL
+from benchmarks.splatting.page import page, plot
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,24 +1,128 @@
-"""The experiment: every case by every renderer in turns, what it asks of the machine, how wrong it is."""
+"""Measure every case by every renderer in turns: times, work, memory, errors, and lower bounds.
+
+FLOPs of a contributing pair, counted by hand from the formulas, an exponential as 12: forward about 36 for
+the footprint and 24 for compositing; forward and backward 260, where the footprint is evaluated twice.
+Evaluations that do not contribute, sorting and memory are not in it, so `contributing · flops / peak` is a
+lower bound of the time of any renderer of these surfels.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy.optimize import nnls
 from tqdm import tqdm
 
 from benchmarks.common import report, timing
-from benchmarks.splatting import errors, process, roofline
-from benchmarks.splatting.ours import Ours
-from benchmarks.splatting.settings import Settings
-from benchmarks.splatting.volprim import Volprim
-from benchmarks.splatting.workload import COLOUR, FEATURES, Workload, fitted, sphere
+from benchmarks.common.timing import once
+from benchmarks.splatting import process
+from benchmarks.splatting.cases import COLOUR, FEATURES, Settings, Workload, fitted, sphere
+from benchmarks.splatting.renderers import Ours, Volprim
+from benchmarks.stability.cases import Case, sky
+from benchmarks.stability.measure import measure as measure_case
 from benchmarks.step import step_times
+from mi_refgs.constants import tile_size
+from mi_refgs.profiling.profile import Counts
+from mi_refgs.splat import list_by_tile, project
+from mi_refgs.surfels.primitives.surfel import Surfel
+
+FLOPS = {"forward": 60, "both": 260}
+CHAINS = 16
+"""Independent sums a lane: more than latency times ports of any CPU's multiply-add unit."""
+STEPS = 4096
+PACKETS = 256
+"""Packets of 16 lanes: enough blocks for every thread."""
+TRIES = 12
+FLOAT = 4  # bytes
+LISTED_BYTES = 24
+"""A listed pair's surfel, tile and depth, written once and read once; a sort's passes are not in it."""
+
+
+def measure_peaks(triad: int) -> dict[str, float]:
+    """Multiply-add rate in GFLOP/s, and triad bandwidth in GB/s (two reads and a write) on all threads.
+
+    The best of some tries: a limit is what nothing exceeds.
+    """
+    factors = [dr.opaque(mi.Float, 0.5 + 0.01 * i) for i in range(CHAINS)]
+    steps = dr.opaque(mi.UInt32, STEPS)
+    a, b = (dr.opaque(mi.Float, x, triad) for x in (1.0, 2.0))
+    lanes = PACKETS * 16 * dr.thread_count()
+
+    def multiply_add() -> Any:
+        def body(i: Any, sums: list[Any]) -> Any:
+            return i + 1, [dr.fma(s, factor, factor) for s, factor in zip(sums, factors, strict=True)]
+
+        lane = dr.arange(mi.Float, lanes)
+        state = (dr.zeros(mi.UInt32, lanes), [lane + k for k in range(CHAINS)])
+        _, sums = dr.while_loop(state, lambda i, sums: i < steps, body, label="peak")
+        return sum(sums, mi.Float(0))
+
+    def add() -> Any:
+        return dr.fma(b, factors[0], a)
+
+    fma, moved = (min(once(call) for _ in range(TRIES)) for call in (multiply_add, add))
+    return {"gflops": 2e-9 * lanes * STEPS * CHAINS / fma, "gbytes": 1e-9 * 3 * FLOAT * triad / moved}
+
+
+def bytes_moved(counts: Counts, features: int) -> dict[str, int]:
+    """Bytes that a view must load and store at least, most of them from caches.
+
+    Forward: what is listed; an index and a row of geometry and features for each visited pair; the maps.
+    Backward again the rows and the maps with their adjoints, and a read and a write of a row of adjoints for
+    each visited pair (a bound from above: not every visited pair contributes).
+    """
+    row = FLOAT * (Surfel.columns + features)
+    maps = FLOAT * (features + 2) * counts.pixels
+    forward = LISTED_BYTES * counts.pairs + (FLOAT + row) * counts.visited + maps
+    return {"forward": forward, "both": forward + (FLOAT + 3 * row) * counts.visited + 2 * maps}
+
+
+def lower_bound(counts: Counts, gflops: float) -> dict[str, float]:
+    """Milliseconds below which no renderer gets at this rate."""
+    return {kind: 1e-6 * counts.contributing * flops / gflops for kind, flops in FLOPS.items()}
+
+
+MARGIN = 16
+"""Pixels around the part whose surfels the oracle looks at too: those that wrongly miss a tile are seen."""
+CLASSES = ("position", "rotation", "scale", "opacity", "radiance_sh")
+
+
+def crop(workload: Workload, size: int, margin: int = 0) -> Workload:
+    """The same surfels in a part of the view, a third from its left and upper edge; tiles stay in place."""
+    p = workload.pinhole
+    size = min(size, p.width, p.height)
+    tile = tile_size(abs(p.fx))
+    left, top = (
+        step * (edge // 3 // step) - margin for step, edge in zip(tile, (p.width, p.height), strict=True)
+    )
+    size += 2 * margin
+    return replace(workload, pinhole=replace(p, width=size, height=size, cx=p.cx - left, cy=p.cy - top))
+
+
+def compare(workload: Workload, size: int) -> dict[str, float]:
+    """Errors of the part, as `stability.measure` defines them; the oracle blends in the product's order.
+
+    order: largest relative depth difference of two surfels in the wrong order where they show; left_out:
+    share of the pixels in the oracle's declared band; image: largest error of radiance and alpha;
+    gradient_…: of each class of parameters.
+    """
+    around = crop(workload, size, MARGIN)
+    lists = list_by_tile(project(around.surfels(), around.camera()), around.camera())
+    near = np.unique(np.array(lists.surfel_from_pair))
+    raw = {name: values[near] for name, values in workload.raw.items()}
+    raw["radiance_sh"] = workload.features[near, :3] - 0.5
+    part = crop(workload, size)
+    case = Case("part", raw, part.pinhole, sky(), at="surfel", reflectance="radiance")
+    row = measure_case(case, floors=False, book=False)
+    found = {"order": row.order, "left_out": 1 - row.kept, "image": row.image, "maps": row.maps}
+    return found | {f"gradient_{name}": row.gradients[name] for name in CLASSES}
+
 
 PHASES = ("project", "tile lists", "sort", "splat forward", "splat backward", "surfels backward")
 PHASE_REPEATS = 5
@@ -42,12 +146,12 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
         for count in settings.surfels
         for size in settings.sizes
     ] + [fitted(folder) for folder in settings.scenes]
-    peaks = roofline.measure_peaks(settings.triad)
+    peaks = measure_peaks(settings.triad)
     rows = [case(workload, settings, peaks) for workload in shown(workloads, "cases")]
     spheres = [row for row in rows if row["spread"] is not None]
     wrong = [
         {"surfels": count, "size": size, "spread": spread}
-        | errors.compare(sphere(count, size, spread), settings.crop)
+        | compare(sphere(count, size, spread), settings.crop)
         for spread in settings.spreads
         for count, size in shown(settings.errors, f"errors at {spread:g}")
     ]
@@ -87,8 +191,8 @@ def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row
         slow["volprim_both"] = (volprim.both, settings.volprim_repeats)
     times = timing.milliseconds(calls, settings.seconds / len(calls), settings.repeats, slow)
     launches = {kind: full.launches(getattr(full, kind)) for kind in ("forward", "both")}
-    bound = roofline.lower_bound(counts, peaks["gflops"])
-    moved = roofline.bytes_moved(counts, FEATURES)
+    bound = lower_bound(counts, peaks["gflops"])
+    moved = bytes_moved(counts, FEATURES)
     phases = full.phases(min(PHASE_REPEATS, settings.repeats))
     row: Row = {"case": workload.name, "spread": workload.spread, "surfels": count, "size": size}
     names = ("pixels", "covered", "pairs", "evaluated", "contributing", "share")

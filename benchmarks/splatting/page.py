@@ -1,15 +1,16 @@
-"""What a run fills into the page: its tables and a few numbers."""
+"""Tables, numbers and plots of the page."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.common import figures
 from benchmarks.common.report import number, percent, table
-from benchmarks.splatting.errors import CLASSES
-from benchmarks.splatting.measure import COST, MEMORY, PHASES
+from benchmarks.splatting.measure import CLASSES, COST, FLOPS, MEMORY, PHASES
 
 CASE = "surfels, image"
 MIB = 2**20
@@ -144,3 +145,62 @@ def _sum(
     terms = [f"{number(scale * fit['constant'])} {unit}"]
     terms += [f"{number(small_scale * fit[name])} {small} a {WORDS[name]}" for name in names]
     return f"{' + '.join(terms)} (R² = {fit['r2']:.3f}, worst residual {100 * fit['worst']:.0f} %)"
+
+
+SHADES = ("#9ecae1", "#4292c6", "#2171b5", "#08306b")
+MARKERS = ("o", "s", "^", "D")
+PANELS = {"forward": "forward", "both": "forward + backward"}
+BARS = dict(zip(PHASES, ("#bbbbbb", "#f2c14e", "#c77b30", "#4292c6", "#08306b", "#777777"), strict=True))
+MOST_BARS = 12
+
+
+def plot(result: dict[str, Any], folder: Path) -> None:
+    """Write splatting_time.png and splatting_phases.png."""
+    _plot_times(result, folder)
+    _plot_phases(result, folder)
+
+
+def _plot_times(result: dict[str, Any], folder: Path) -> None:
+    from matplotlib import ticker
+
+    figure, axes = figures.new(1, 2, 4.6, 4.2)
+    rows = result["rows"]
+    counts = sorted({row["surfels"] for row in rows if row["spread"] is not None})
+    for ax, (kind, title) in zip(axes[0], PANELS.items(), strict=True):
+
+        def marks(chosen: list[Any], key: str, style: str, colour: str, text: str, ax: Any = ax) -> None:
+            points = [(row["contributing"], row[key]) for row in chosen if row[key]]
+            if points:
+                ax.plot(*zip(*points, strict=True), style, color=colour, ms=4, label=text)
+
+        for i, count in enumerate(counts):
+            found = [row for row in rows if row["surfels"] == count and row["spread"] is not None]
+            style, colour = MARKERS[i % len(MARKERS)], SHADES[i % len(SHADES)]
+            marks(found, f"{kind}_ms", style, colour, f"ours, {count:,} surfels")
+        marks(rows, f"volprim_{kind}_ms", "x", "#c0392b", "volprim_rf_basic")
+        pairs = [float(row["contributing"]) for row in rows]
+        x = np.geomspace(min(pairs), max(pairs), 50)
+        ax.plot(x, 1e-6 * x * FLOPS[kind] / result["peaks"]["gflops"], "k-", lw=1, label="limit: peak FMA")
+        bytes_ms = [1e-6 * row[f"bytes_{kind}"] / result["peaks"]["gbytes"] for row in rows]
+        ax.plot(pairs, bytes_ms, "k_", ms=5, label="bytes at peak bandwidth")
+        ax.set(xscale="log", yscale="log", xlabel="contributing surfel-pixel pairs", title=title)
+        ax.xaxis.set_minor_formatter(ticker.NullFormatter())
+    axes[0, 0].set_ylabel("milliseconds")
+    axes[0, 1].legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+    figures.save(figure, folder / "splatting_time.png")
+
+
+def _plot_phases(result: dict[str, Any], folder: Path) -> None:
+    rows = [row for row in result["rows"] if row["size"] in (256, 512)] or result["rows"]
+    rows = rows[-MOST_BARS:]
+    figure, axes = figures.new(1, 1, 9.2, 0.6 + 0.3 * len(rows))
+    ax, left = axes[0, 0], np.zeros(len(rows))
+    for phase in PHASES:
+        widths = np.array([row[f"{phase.replace(' ', '_')}_ms"] for row in rows])
+        ax.barh(range(len(rows)), widths, left=left, color=BARS[phase], label=phase)
+        left += widths
+    ax.set_yticks(range(len(rows)), [label(row) for row in rows], fontsize=7)
+    ax.invert_yaxis()
+    ax.set_xlabel("milliseconds between barriers, forward and backward")
+    ax.legend(fontsize=7, facecolor="#dddddd", edgecolor="none", loc="center left", bbox_to_anchor=(1, 0.5))
+    figures.save(figure, folder / "splatting_phases.png")

@@ -20,7 +20,7 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
-from benchmarks.common.lights import ROOT
+from benchmarks.common.view import ROOT
 
 SPREAD = 1.5
 STEPS = 3
@@ -64,8 +64,8 @@ def _run(task: str, case: tuple[int, int], **environment: str) -> dict[str, Any]
 
 
 def _memory(count: int, size: int) -> dict[str, Any]:
-    from benchmarks.splatting.ours import Ours
-    from benchmarks.splatting.workload import FEATURES, sphere
+    from benchmarks.splatting.cases import FEATURES, sphere
+    from benchmarks.splatting.renderers import Ours
 
     dr.eval(Ours.of(sphere(*TINY, SPREAD), FEATURES).both())
     workload = sphere(count, size, SPREAD)
@@ -101,8 +101,8 @@ def _step(count: int, size: int) -> dict[str, Any]:
 
 
 def _compile(count: int, size: int) -> dict[str, Any]:
-    from benchmarks.splatting.ours import Ours
-    from benchmarks.splatting.workload import FEATURES, sphere
+    from benchmarks.splatting.cases import FEATURES, sphere
+    from benchmarks.splatting.renderers import Ours
 
     ours = Ours.of(sphere(count, size, SPREAD), FEATURES)
     found: dict[str, Any] = {}

@@ -14,12 +14,11 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 
-from benchmarks.common.command import make_parser, write_reports
-from benchmarks.common.lights import BUILT_IN
+from benchmarks.common.report import make_parser, write_reports
+from benchmarks.common.view import BUILT_IN
 from benchmarks.splitsum.measure import measure
-from benchmarks.splitsum.page import page
-from benchmarks.splitsum.plots import plot
-from benchmarks.splitsum.settings import CONVEX, FULL, PAGE, SMALL
+from benchmarks.splitsum.page import page, plot
+from benchmarks.splitsum.setup import CONVEX, FULL, PAGE, SMALL
 
 
 def main(arguments: list[str] | None = None) -> int:

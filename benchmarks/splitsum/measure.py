@@ -1,4 +1,4 @@
-"""The experiment: errors and times of every method, from one run and on the same pixels."""
+"""Measure errors and times of every method in one run, on the same pixels, and speed-ups at equal error."""
 
 from __future__ import annotations
 
@@ -15,14 +15,82 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.common import errors, report, timing
-from benchmarks.common.lights import Light, make_light
+from benchmarks.common.errors import CLEAR
+from benchmarks.common.report import Row, where
 from benchmarks.common.setup import path_tracer
+from benchmarks.common.view import Light, make_light, view_bins
 from benchmarks.common.view import rows as picture_values
-from benchmarks.common.view import view_bins
-from benchmarks.splitsum import decompose, surfels
-from benchmarks.splitsum.exact import LEVEL_SETS, OPTIONS, SHIPPED, Exact, split_sum
-from benchmarks.splitsum.settings import Settings
-from benchmarks.splitsum.speedup import Times, speed_ups, time_of
+from benchmarks.splitsum import budget
+from benchmarks.splitsum.setup import CONVEX, LEVEL_SETS, OPTIONS, SHIPPED, Exact, Settings, split_sum
+
+METHOD = "split_sum"
+CASE = ("shape", "light", "roughness", "metallic")
+Times = dict[tuple[str, str, str], dict[int, float]]
+"""Milliseconds per megapixel by shape, light and method, then by setting."""
+
+
+def line(times: dict[int, float]) -> Callable[[float], float]:
+    """Time as a function of the samples: the line that fits best in relative terms, positive at 0."""
+    n, t = (np.array(list(x), np.float64) for x in (times.keys(), times.values()))
+    design = np.stack([1 / t, n / t], axis=1)
+    (offset, slope), *_ = np.linalg.lstsq(design, np.ones(len(n)), rcond=None)
+    if offset < 0 or slope < 0:
+        offset, slope = 0.0, float(np.median(t / n))
+    return lambda samples: float(offset + slope * samples)
+
+
+def time_of(times: Times, row: Row) -> float | None:
+    """Of a row: measured, or on the straight line through the measured ones."""
+    known = times.get((row["shape"], row["light"], row["method"]), {})
+    if row["setting"] in known:
+        return known[row["setting"]]
+    return line(known)(row["setting"]) if len(known) > 1 else None
+
+
+def error_times_samples(points: list[tuple[int, float, float]]) -> float:
+    """c of relMSE = c / samples through (samples, relMSE, floor), floors taken off; a mean of logarithms."""
+    clear = [(n, e - floor) for n, e, floor in points if e > CLEAR * floor]
+    chosen = clear or [(n, e) for n, e, _ in points]
+    return float(np.exp(np.mean([np.log(n * e) for n, e in chosen])))
+
+
+def exponent(points: list[tuple[int, float, float]]) -> float | None:
+    """Slope of log relMSE over log samples, floors taken off: -1 for independent samples."""
+    clear = [(n, e - floor) for n, e, floor in points if e > CLEAR * floor]
+    if len(clear) < 2:
+        return None
+    x, y = np.log(np.array(clear)).T
+    return float(np.polyfit(x, y, 1)[0])
+
+
+def speed_ups(rows: list[Row], times: Times) -> list[dict[str, Any]]:
+    """One record for each convex shape, light, material and height: samples, and the ratio of times.
+
+    Where the split sum's error is below the noise floor the ratio is a lower bound, taken at the floor. The
+    path tracer cannot take less than one sample.
+    """
+    found = []
+    for row in where(rows, method=METHOD, n_dot_v="all", shape=CONVEX):
+        case = {key: row[key] for key in CASE}
+        paths = [
+            (path["setting"], path["relmse"], path["relmse_floor"])
+            for path in where(rows, method="path", **case)
+        ]
+        spp = error_times_samples(paths) / max(row["relmse"], CLEAR * row["relmse_floor"])
+        path_ms = line(times[row["shape"], row["light"], "path"])(max(spp, 1))
+        split_ms = times[row["shape"], row["light"], METHOD][row["setting"]]
+        found.append(
+            case
+            | {
+                "height": row["setting"],
+                "lower_bound": row["below_floor"],
+                "path_spp": spp,
+                "speed_up": path_ms / split_ms,
+                "path_exponent": exponent(paths),
+            }
+        )
+    return found
+
 
 LEVELS_HEIGHT = 128
 """Rows of the light for other sets of levels: enough that its resolution does not hide them."""
@@ -88,9 +156,9 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     for name in tqdm(settings.budget_shapes, desc="error budget", disable=quiet):
         for light in lights:
             setup = shared.get((name, light.name)) or Exact(name, light, settings)
-            budgets += decompose.budgets(setup)
-            if name == surfels.SHAPE:
-                surfel_budgets.append(surfels.budget(setup))
+            budgets += budget.budgets(setup)
+            if name == budget.SHAPE:
+                surfel_budgets.append(budget.surfel_budget(setup))
     return {
         "machine": report.machine(),
         "settings": vars(settings),

@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks.common.command import make_parser, write_reports
-from benchmarks.stability.page import page
-from benchmarks.stability.run import failures, measure
+from benchmarks.common.report import make_parser, write_reports
+from benchmarks.stability.run import failures, measure, page
 
 
 def main(arguments: list[str] | None = None) -> int:

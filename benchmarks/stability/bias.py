@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.stability.case import Array, Case, Raw, camera, facing, filled, plain, sky, sphere
-from benchmarks.stability.measure import light_of
+from benchmarks.stability.cases import Array, Case, Raw, camera, facing, filled, plain, sky, sphere
+from benchmarks.stability.exact import light_of
 from mi_refgs.reference import image as oracle
 from mi_refgs.reference import surfel
 from mi_refgs.reference.camera import camera_frame

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.stability.case import Array
+from benchmarks.stability.cases import Array
 from mi_refgs.fitting import losses
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference import losses as oracle

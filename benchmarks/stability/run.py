@@ -1,19 +1,92 @@
-"""The whole run: every case of the catalogue, the response, the fits, the method's own error."""
+"""Measure every case, the camera response, extreme fits and the method's own error; fill the page."""
 
 from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
+import numpy as np
 from tqdm import tqdm
 
 from benchmarks.common import report
-from benchmarks.stability import bias, fits, response
+from benchmarks.common.report import table
+from benchmarks.stability import bias, response
 from benchmarks.stability.cases import catalogue
-from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, Row
+from benchmarks.stability.measure import (
+    GRADIENT_LIMIT,
+    GRADIENTS,
+    ILL,
+    IMAGE_LIMIT,
+    KEPT,
+    NEGLIGIBLE,
+    ORDER_LIMIT,
+    Row,
+)
 from benchmarks.stability.measure import measure as measure_case
+from benchmarks.step import make_trainer, sphere_data
+from mi_refgs.fitting.state import FitSetup
+from mi_refgs.kernels.device import upload_tensor
+from mi_refgs.methods.method import LIGHT
+
+SURFELS, SIZE, VIEWS, STEPS = 300, 32, 3, 24
+
+
+def measure_fits() -> list[dict[str, Any]]:
+    """One row a case: loss of the first and the last step, values that are not finite."""
+    return [fit(name) for name in FITS]
+
+
+def _with_peak(view: Any) -> dict[str, Any]:
+    image = view.image.copy()
+    image[SIZE // 2, SIZE // 2] = 1e6
+    return {"image": image, "is_linear_radiance": True}
+
+
+FITS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "a texel of the light starts at 1e6": {"light": lambda raw: np.where(np.arange(raw.size) < 3, 1e6, raw)},
+    "the whole light starts at 1e6": {"light": lambda raw: np.full_like(raw, 1e6)},
+    "the light starts black (raw -80)": {"light": lambda raw: np.full_like(raw, -80.0)},
+    "a pixel of 1e6 in linear pictures": {"view": _with_peak},
+    "over-exposed pictures": {"view": lambda v: {"image": np.ones_like(v.image)}},
+    "under-exposed pictures": {"view": lambda v: {"image": 1 - v.alpha[..., None] + 0 * v.image}},
+    "all-transparent pictures": {
+        "view": lambda v: {"image": np.ones_like(v.image), "alpha": np.zeros_like(v.alpha)}
+    },
+}
+
+
+def fit(name: str) -> dict[str, Any]:
+    """STEPS steps in each stage of the full method; pictures change after the start, which needs masks."""
+    trainer, method = make_trainer(SURFELS, sphere_data(SIZE, VIEWS, np.random.default_rng(0)))
+    case = FITS[name]
+    if "view" in case:
+        views = tuple(replace(view, **case["view"](view)) for view in trainer.data.views)
+        data = replace(trainer.data, views=views, is_linear_radiance=views[0].is_linear_radiance)
+        trainer.adopt(FitSetup(method, data), trainer.state())
+    if "light" in case:
+        raw = trainer.params[LIGHT].numpy()
+        trainer.params[LIGHT] = upload_tensor(case["light"](raw.ravel()).reshape(raw.shape))
+        trainer.fit.optimiser.reset(LIGHT)
+    losses = []
+    for _, stage in method.stages():
+        if stage.shading.at == "pixel":
+            trainer.extract_mesh()
+        for _ in range(STEPS):
+            trainer.step()
+            losses.append(float(trainer.loss[0]))
+        trainer.iteration = stage.until  # the next stage
+    values = [*(x.numpy() for x in trainer.params.values()), np.array(losses)]
+    return {
+        "name": name,
+        "steps": len(losses),
+        "first": losses[0],
+        "last": losses[-1],
+        "non_finite": sum(int(np.sum(~np.isfinite(x))) for x in values),
+    }
 
 
 def measure(quick: bool = False, only: list[str] | None = None, quiet: bool = False) -> dict[str, Any]:
@@ -32,7 +105,7 @@ def measure(quick: bool = False, only: list[str] | None = None, quiet: bool = Fa
     else:
         result |= {"curve": [], "losses": []}
     more = not (only or quick)
-    result["fits"] = fits.measure() if more else []
+    result["fits"] = measure() if more else []
     result |= bias.measure() if more else {"rules": [], "gradient": []}
     return result | {"seconds": time.perf_counter() - begin}
 
@@ -76,3 +149,79 @@ def failures(result: dict[str, Any]) -> list[str]:
 
 def _misses(row: dict[str, Any]) -> bool:
     return not all(row[key] is not None and row[key] <= IMAGE_LIMIT for key in ("value", "slope"))
+
+
+SHORT = {"radiance_sh": "SH", "roughness": "rough.", "indirect_sh": "indirect"}
+
+
+def page(result: dict[str, Any]) -> dict[str, Any]:
+    """By name in page.md."""
+    rows, limits = result["rows"], (IMAGE_LIMIT, GRADIENT_LIMIT, ORDER_LIMIT, NEGLIGIBLE)
+    names = ("image_limit", "gradient_limit", "order_limit", "negligible")
+    keys = ("value", "slope", "textbook_value", "textbook_slope")
+    return dict(zip(names, map(_e, limits), strict=True)) | {
+        "count": len(rows),
+        "hold": sum(row["verdict"] == "holds" for row in rows),
+        "ill": sum(row["verdict"].startswith("ill") for row in rows),
+        "failed": len(failures(result)),
+        "non_finite": sum(row["non_finite"] for row in [*rows, *result["losses"], *result["fits"]]),
+        "textbook_misses": sum(row["textbook"] is None or row["textbook"] > IMAGE_LIMIT for row in rows),
+        "kept": f"{KEPT:.0%}",
+        "ill_factor": f"{ILL:g}",
+        "cases": table(["case", *COLUMNS], [[row["case"], *_case(row)] for row in rows]),
+        "gradients": table(
+            ["case", *(SHORT.get(n, n) for n in GRADIENTS)],
+            [[row["case"], *(_class(row, name) for name in GRADIENTS)] for row in rows],
+        ),
+        "curve": table(
+            ["sRGB at", "value", "slope", "textbook value", "textbook slope"],
+            [[row["at"], *(_e(row[key]) for key in keys)] for row in result["curve"]],
+        ),
+        "losses": table(
+            ["picture", "loss", "gradient", "not finite"],
+            [[r["name"], _e(r["value"]), _e(r["slope"]), r["non_finite"]] for r in result["losses"]],
+        ),
+        "fits": table(
+            ["fit", "steps", "first loss", "last loss", "not finite"],
+            [[r["name"], r["steps"], _e(r["first"]), _e(r["last"]), r["non_finite"]] for r in result["fits"]],
+        ),
+        "rules": table(
+            ["scene", "rule", "bias", "mean", "largest", "alpha"],
+            [
+                [r["scene"], r["rule"], _p(r["bias"]), _p(r["mean"], ""), _p(r["max"], ""), _p(r["alpha"])]
+                for r in result["rules"]
+            ],
+        ),
+        "cut": table(
+            ["opacity", "log scale", "logit of opacity"],
+            [[f"{r['opacity']:g}", _p(r["scale_bias"]), _p(r["opacity_bias"])] for r in result["gradient"]],
+        ),
+    }
+
+
+COLUMNS = (
+    "image", "maps", "gradient, largest", "not finite", "textbook image", "image, 1 ulp", "gradient, 1 ulp",
+    "verdict",
+)  # fmt: skip
+
+
+def _case(row: dict[str, Any]) -> list[Any]:
+    worst = max((row[f"gradient_{n}"] or 0.0 for n in GRADIENTS), default=0.0)
+    ulps = [_e(x) if (x := row[key]) else "" for key in ("ulp_image", "ulp_gradient")]  # cheap cases
+    errors = [*map(_e, (row["image"], row["maps"], worst)), row["non_finite"], _e(row["textbook"])]
+    return [*errors, *ulps, row["verdict"]]
+
+
+def _class(row: dict[str, Any], name: str) -> str:
+    error = row[f"gradient_{name}"]
+    return "" if error is None else _e(error) + " †" * (name in row["negligible"].split())
+
+
+def _e(value: float | None) -> str:
+    if value is None or value == float("inf"):
+        return "not finite"
+    return "0" if value == 0 else f"{value:.1e}"
+
+
+def _p(value: float, sign: str = "+") -> str:
+    return "0" if abs(value) < 1e-9 else f"{100 * value:{sign}.2g} %"

@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.stability.case import Array, Case
+from benchmarks.stability.cases import Array, Case
+from benchmarks.stability.exact import light_of
 from mi_refgs import constants as c
 from mi_refgs.reference import image as oracle
 from mi_refgs.reference import models
@@ -139,8 +140,6 @@ def _shade(
     indirect: Array | None,
 ) -> Array:
     """The split sum with the light's exact levels; what is looked up is float32."""
-    from benchmarks.stability.measure import light_of
-
     f = np.float32
     radiance = np.log(1 + np.exp(case.light))  # softplus as written
     if not np.isfinite(radiance).all():

@@ -13,11 +13,10 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 
-from benchmarks.common.command import make_parser, write_reports
+from benchmarks.common.report import make_parser, write_reports
+from benchmarks.visibility.cases import PAGE, SMALL
 from benchmarks.visibility.measure import measure
-from benchmarks.visibility.page import page
-from benchmarks.visibility.plots import plot
-from benchmarks.visibility.settings import PAGE, SMALL
+from benchmarks.visibility.page import page, plot
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""The experiment: the specular picture by each rule of visibility, against the path tracer at two depths."""
+"""Measure the specular image by each rule of visibility against the path tracer at two depths."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from tqdm import tqdm
 from benchmarks.common import errors, report, timing
 from benchmarks.common import montecarlo as mc
 from benchmarks.visibility.budget import budgets
-from benchmarks.visibility.scenes import make_scene
-from benchmarks.visibility.settings import Rule, Settings, rules
+from benchmarks.visibility.cases import Rule, Settings, make_scene, rules
+from benchmarks.visibility.page import tradeoffs
 from benchmarks.visibility.setup import TIMED_ROUGHNESS, Setup
-from benchmarks.visibility.tradeoff import tradeoffs
 
 DEPTHS = {"direct": 2, "bounce": 3, "full": 12}
 """Mitsuba's `max_depth`: light after one reflection, after up to two, and after up to eleven."""

@@ -1,4 +1,4 @@
-"""What a run fills into the page: its tables and a few numbers."""
+"""Tables, numbers and plots of the page, and the settings that are worth their time."""
 
 from __future__ import annotations
 
@@ -7,10 +7,60 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.budget import above_noise, budget_table, interactions
-from benchmarks.common.report import number, signed, table
-from benchmarks.common.select import Row, where
-from benchmarks.visibility.tradeoff import MIRROR, TIMES
+from benchmarks.common import figures
+from benchmarks.common.errors import above_noise, budget_table, interactions
+from benchmarks.common.report import Row, number, signed, table, where
+
+MIRROR = "mirror ray"
+"""One mirror ray for the whole lobe and no indirect light: what the price is a multiple of."""
+PAPER = "harmonics"
+"""Budget of the paper's rule: one mirror ray, indirect light by the best-fit spherical harmonics."""
+BUDGET = 3.0
+"""Times of the mirror ray alone that a setting may take."""
+TIMES = ("ms", "frame_ms")
+"""Of visibility and shading on a mesh; of the product's frame of surfels."""
+
+
+def tradeoffs(rows: list[Row], budgets: list[Row]) -> list[Row]:
+    """For each scene, roughness and kind of time: a setting within the budget, and what it gains.
+
+    The setting is chosen on the other scenes: of those within the budget here, the one of the least mean
+    logarithm of relMSE there, over all roughness. With one scene only, it is chosen on that scene. Errors are
+    those against the path tracer at full depth; `gain` is the ratio of relMSE of the paper's rule and of the
+    setting, `best_gain` that of the best setting in hindsight, `price` the ratio of times.
+    """
+    found = []
+    names = list(dict.fromkeys(row["scene"] for row in rows))
+    for case in dict.fromkeys((row["scene"], row["roughness"]) for row in rows):
+        full = where(rows, scene=case[0], roughness=case[1], depth="full")
+        mirror = where(full, method=MIRROR)[0]
+        (paper,) = where(budgets, scene=case[0], roughness=case[1], indirect=PAPER)
+        others = [name for name in names if name != case[0]] or names
+        elsewhere = where(rows, scene=others, depth="full")
+        for key in TIMES:
+            affordable = [row for row in full if row[key] is not None and row[key] <= BUDGET * mirror[key]]
+            chosen = min(affordable, key=lambda row: _mean_log(where(elsewhere, method=row["method"])))
+            found.append(
+                {
+                    "scene": case[0],
+                    "roughness": case[1],
+                    "time": key,
+                    "method": chosen["method"],
+                    "gain": paper["total"] / chosen["relmse"],
+                    "best_gain": paper["total"] / min(row["relmse"] for row in affordable),
+                    "price": chosen[key] / mirror[key],
+                    "mirror_relmse": mirror["relmse"],
+                    "paper_relmse": paper["total"],
+                    "relmse": chosen["relmse"],
+                }
+            )
+    return found
+
+
+def _mean_log(rows: list[Row]) -> float:
+    # The floor keeps an exact setting finite.
+    return float(np.mean([np.log(max(row["relmse"], 1e-12)) for row in rows]))
+
 
 WHAT = dict(zip(TIMES, ("shading the mesh", "the product's frame"), strict=True))
 DEPTHS = {"direct": "depth 2", "full": "full depth"}
@@ -126,3 +176,65 @@ def _budgets(budgets: list[Row]) -> str:
         cases = [(f"{row['scene']}, r = {row['roughness']:g}", row) for row in where(budgets, indirect=name)]
         tables.append(f"**{name[0].upper()}{name[1:]}**\n\n{budget_table('case', cases)}")
     return "\n\n".join(tables)
+
+
+RAYS_ONLY = "#c77b30"
+BOUNCES = ("#9ecae1", "#4292c6", "#08306b", "#6a51a3")
+"""Colours of rising numbers of bounces."""
+MARKERS = {False: "o", True: "^"}
+"""By `dominant`."""
+SHADES = ("#9ecae1", "#4292c6", "#08306b")
+
+
+def middle(values: list[float]) -> float:
+    """The roughness that the plot of error over time shows."""
+    return values[len(values) // 2]
+
+
+def plot(result: dict[str, Any], folder: Path) -> Path:
+    """Write visibility_convergence.png."""
+    scenes = list(result["scenes"])
+    figure, axes = figures.new(2, len(scenes), 3.9, 3.2)
+    roughness = middle(list(result["settings"]["roughness"]))
+    for column, scene in enumerate(scenes):
+        _speed(axes[0, column], result, scene, roughness)
+        _convergence(axes[1, column], result, scene)
+    for row in axes:
+        row[0].legend(fontsize=6, framealpha=0.9, edgecolor="none", handlelength=3)
+    return figures.save(figure, folder / "visibility_convergence.png")
+
+
+def _speed(ax: Any, result: dict[str, Any], scene: str, roughness: float) -> None:
+    from matplotlib import ticker
+
+    rows = where(result["rows"], scene=scene, roughness=roughness, depth="full")
+    timed = [row for row in rows if row["ms"] is not None]
+    for bounces, dominant in dict.fromkeys((row["bounces"], row["dominant"]) for row in timed):
+        found = [row for row in where(timed, bounces=bounces, dominant=dominant) if row["rays"]]
+        points = [(row["ms"], row["relmse"], None if dominant else row["rays"]) for row in found]
+        rank = list(result["settings"]["bounces"]).index(bounces) if bounces else 0
+        colour = BOUNCES[rank % len(BOUNCES)] if bounces else RAYS_ONLY
+        label = f"{bounces} bounce{'s' * (bounces > 1)}" if bounces else "rays only"
+        figures.series(ax, points, MARKERS[dominant], colour, label + ", dominant" * dominant)
+    none, mirror = where(timed, rays=0)[0], where(timed, method=MIRROR)[0]
+    ax.plot(none["ms"], none["relmse"], "x", color="#444444", label="no occlusion")
+    ax.axhline(mirror["relmse"], color="#bbbbbb", lw=0.8, zorder=0)
+    ax.set(xlabel="ms per frame", title=f"{scene}, roughness {roughness:g}")
+    ax.set_ylabel("relMSE at full depth")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_minor_formatter(ticker.LogFormatterSciNotation(minor_thresholds=(1.2, 0.3)))
+        axis.set_tick_params(which="minor", labelsize=6)
+
+
+def _convergence(ax: Any, result: dict[str, Any], scene: str) -> None:
+    values = list(result["settings"]["roughness"])
+    for k, roughness in enumerate(values):
+        rows = where(result["curve"], scene=scene, roughness=roughness)
+        colour = SHADES[k % len(SHADES)]
+        near = [(row["rays"], row["visibility_rms"], None) for row in rows]
+        picture = [(row["rays"], row["to_limit"] ** 0.5, None) for row in rows[:-1]]
+        figures.series(ax, near, "o-", colour, f"visibility, r = {roughness:g}", markersize=3)
+        figures.series(ax, picture, "s--", colour, f"traced picture, r = {roughness:g}", markersize=3)
+        ax.axhline(rows[0]["visibility_floor"], color=colour, lw=0.8, ls=":", zorder=0)
+    ax.set(xlabel="rays of the lobe", ylabel="distance to the traced answer")
+    ax.set_title(scene)

@@ -1,4 +1,4 @@
-"""Set-ups: one concave scene under the light, its pictures by each rule and by the path tracer."""
+"""One concave scene under the light, its images by each rule of visibility and by the path tracer."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ import numpy as np
 
 from benchmarks.common import montecarlo as mc
 from benchmarks.common import setup
-from benchmarks.common.lights import make_light
-from benchmarks.common.view import Points, rows
-from benchmarks.visibility.scenes import Concave
-from benchmarks.visibility.settings import METALLIC, VOXEL, Rule, Settings
+from benchmarks.common.view import Points, make_light, rows
+from benchmarks.visibility.cases import METALLIC, VOXEL, Concave, Rule, Settings
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import SurfelScene, render

@@ -11,17 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.common.select import where
+from benchmarks.common.report import where
 from benchmarks.common.timing import milliseconds
-from benchmarks.splatting import errors, page, roofline
-from benchmarks.splatting import measure as measure_module
+from benchmarks.splatting import measure, page
 from benchmarks.splatting.__main__ import main
-from benchmarks.splatting.ours import Ours
-from benchmarks.splatting.volprim import Volprim
-from benchmarks.splatting.workload import Workload, sphere
-from benchmarks.stability import measure
-from benchmarks.stability.case import Case, sky
-from benchmarks.stability.measure import product_order, scene_of
+from benchmarks.splatting.cases import Workload, sphere
+from benchmarks.splatting.renderers import Ours, Volprim
+from benchmarks.stability import measure as stability
+from benchmarks.stability.cases import Case, sky
+from benchmarks.stability.exact import product_order, scene_of
 from mi_refgs.profiling.profile import Counts
 from mi_refgs.reference import image as oracle
 from mi_refgs.reference.camera import rotation_matrix
@@ -88,13 +86,13 @@ def test_every_renderer_and_phase_is_timed(result: dict[str, Any]) -> None:
         assert min(page._phases(row)) > 0
         assert row["bound_forward_ms"] < row["forward_ms"] and row["bound_both_ms"] < row["both_ms"]
     for stage in result["step"].values():
-        assert stage["splat_ms"] > 0 and set(measure_module.PHASES) <= set(stage["phases_ms"])
+        assert stage["splat_ms"] > 0 and set(measure.PHASES) <= set(stage["phases_ms"])
 
 
 def test_errors_are_small(result: dict[str, Any]) -> None:
     for row in result["errors"]:
         assert row["image"] <= 1e-4 and row["left_out"] < 0.2 and row["order"] < 1e-5
-        assert all(0 < row[f"gradient_{name}"] <= 1e-3 for name in errors.CLASSES)
+        assert all(0 < row[f"gradient_{name}"] <= 1e-3 for name in measure.CLASSES)
 
 
 def test_bad_input_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -131,9 +129,9 @@ def test_counts_are_the_oracle_s(make: Any) -> None:
 
 def test_bytes_and_bound_grow_with_what_they_stand_for() -> None:
     counts = Counts(10, 16, 16, 100, 50, 400, 16, None)
-    forward = roofline.bytes_moved(counts, 14)["forward"]
+    forward = measure.bytes_moved(counts, 14)["forward"]
     assert forward == 24 * 100 + (4 + 4 * 24) * 50 + 4 * 16 * 16
-    assert roofline.lower_bound(counts, 1.0) == pytest.approx({"forward": 0.024, "both": 0.104})
+    assert measure.lower_bound(counts, 1.0) == pytest.approx({"forward": 0.024, "both": 0.104})
 
 
 # ---------- Renderers ----------
@@ -165,32 +163,32 @@ def test_volprim_shows_the_same_object() -> None:
 # ---------- Errors ----------
 
 
-@pytest.mark.parametrize("name", errors.CLASSES)
+@pytest.mark.parametrize("name", measure.CLASSES)
 def test_a_planted_gradient_error_is_seen(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    original = measure.product
+    original = stability.product
 
-    def spoilt(*arguments: Any) -> measure.Found:
+    def spoilt(*arguments: Any) -> stability.Found:
         found = original(*arguments)
         return replace(found, gradients=found.gradients | {name: 1.1 * found.gradients[name]})
 
     workload = sphere(300, 48, 1.5)
-    sound = errors.compare(workload, 16)
-    assert max(sound[f"gradient_{other}"] for other in errors.CLASSES) < 1e-3
-    monkeypatch.setattr(measure, "product", spoilt)
-    assert errors.compare(workload, 16)[f"gradient_{name}"] > 1e-2
+    sound = measure.compare(workload, 16)
+    assert max(sound[f"gradient_{other}"] for other in measure.CLASSES) < 1e-3
+    monkeypatch.setattr(stability, "product", spoilt)
+    assert measure.compare(workload, 16)[f"gradient_{name}"] > 1e-2
 
 
 def test_a_wrong_order_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = measure.product_order
-    monkeypatch.setattr(measure, "product_order", lambda *arguments: original(*arguments)[::-1])
-    assert errors.compare(sphere(300, 48, 1.5), 16)["order"] > 1e-3
+    original = stability.product_order
+    monkeypatch.setattr(stability, "product_order", lambda *arguments: original(*arguments)[::-1])
+    assert measure.compare(sphere(300, 48, 1.5), 16)["order"] > 1e-3
 
 
 def test_the_oracle_looks_at_surfels_around_the_part() -> None:
     """Else it would not miss one that no tile lists."""
     workload, listed = sphere(300, 48, 1.5), []
-    for margin in (0, errors.MARGIN):
-        part = errors.crop(workload, 16, margin)
+    for margin in (0, measure.MARGIN):
+        part = measure.crop(workload, 16, margin)
         lists = list_by_tile(project(part.surfels(), part.camera()), part.camera())
         listed.append(set(np.array(lists.surfel_from_pair).tolist()))
     assert listed[0] < listed[1]
@@ -204,7 +202,7 @@ def test_fits_find_what_was_put_in() -> None:
     rows = [dict(zip("abc", rng.uniform(1, 1e6, size=3), strict=True)) for _ in range(12)]
     for row in rows:
         row["y"] = 5e6 + 3 * row["a"] + 40 * row["b"]
-    found = measure_module.plane(rows, "y", "abc")
+    found = measure.plane(rows, "y", "abc")
     expected = {"constant": 5e6, "a": 3, "b": 40}
     assert all(found[key] == pytest.approx(value, rel=1e-3) for key, value in expected.items())
     assert found["c"] < 1e-2 and found["r2"] > 0.9999

@@ -14,10 +14,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from benchmarks.common import budget, errors, lights, view
+from benchmarks.common import errors
 from benchmarks.common import montecarlo as mc
-from benchmarks.common.select import where
-from benchmarks.splitsum import decompose, exact, speedup, surfels
+from benchmarks.common import view as common
+from benchmarks.common.report import where
+from benchmarks.splitsum import budget, measure, setup
 from mi_refgs.errors import InputError
 from mi_refgs.reference.shade import lobe_average, split_sum
 from mi_refgs.shade.light import lobe_matrices
@@ -173,14 +174,14 @@ def test_budgets_add_up(result: dict[str, Any]) -> None:
             assert sum(part["share"] for part in parts.values()) == pytest.approx(1)
         alone = sum(part["relmse"] for part in parts.values())
         assert row["total"] == pytest.approx(alone + row["interaction"])
-        assert (decompose.SHADOW in parts) == (row["shape"] == "torus")
-        assert parts[decompose.TABLE]["relmse"] < 1e-6
+        assert (budget.SHADOW in parts) == (row["shape"] == "torus")
+        assert parts[budget.TABLE]["relmse"] < 1e-6
     sphere = where(result["budgets"], shape="sphere", light="checker", roughness=0.1, height=32)
     for row in sphere:
-        assert max(row["parts"], key=lambda part: float(part["relmse"]))["name"] == decompose.RESOLUTION
+        assert max(row["parts"], key=lambda part: float(part["relmse"]))["name"] == budget.RESOLUTION
     rough = where(result["budgets"], shape="sphere", light="gradient", roughness=0.8)
     for row in rough:
-        assert max(row["parts"], key=lambda part: float(part["relmse"]))["name"] == decompose.LOBE
+        assert max(row["parts"], key=lambda part: float(part["relmse"]))["name"] == budget.LOBE
 
 
 def test_surfels_cost_something_and_add_up(result: dict[str, Any]) -> None:
@@ -191,25 +192,25 @@ def test_surfels_cost_something_and_add_up(result: dict[str, Any]) -> None:
         assert row["covered"] > 0.9
         assert sum(part["share"] for part in row["parts"]) == pytest.approx(1)
     parts = {part["name"]: part["relmse"] for part in found["constant"]["parts"]}
-    assert parts[surfels.SPLIT_SUM] < 1e-5 < parts[surfels.BLENDING] < 1e-2
+    assert parts[budget.SPLIT_SUM] < 1e-5 < parts[budget.BLENDING] < 1e-2
 
 
 # ---------- Its parts, against what they stand for ----------
 
 
-def sphere(size: int = 16) -> tuple[Any, view.Points]:
+def sphere(size: int = 16) -> tuple[Any, common.Points]:
     """A sphere under a gradient, and its points."""
-    light = lights.make_light("gradient", 32)
+    light = common.make_light("gradient", 32)
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "light": light.emitter()})
-    look = view.Look((0, 0.6, 4), (0, 0, 0), 30)
-    return scene, view.surface(scene, view.make_sensor(look, size), size)
+    look = common.Look((0, 0.6, 4), (0, 0, 0), 30)
+    return scene, common.surface(scene, common.make_sensor(look, size), size)
 
 
 def test_samples_go_through_pixel_centres() -> None:
     """However many samples, Mitsuba's depth of a sphere is that of the central rays, to float32."""
     size = 16
     scene, points = sphere(size)
-    sensor = view.make_sensor(view.Look((0, 0.6, 4), (0, 0, 0), 30), size)
+    sensor = common.make_sensor(common.Look((0, 0.6, 4), (0, 0, 0), 30), size)
     depth = mi.load_dict({"type": "aov", "aovs": "p:position", "path": {"type": "direct"}})
     image = np.array(mi.render(scene, sensor=sensor, integrator=depth, spp=16))[..., -3:]
     position = np.array(points.position).T
@@ -220,10 +221,10 @@ def test_samples_go_through_pixel_centres() -> None:
 @pytest.mark.parametrize("roughness", [0.1, 0.5, 1.0])
 def test_integrals_of_a_constant_light_are_the_table(roughness: float) -> None:
     """∫ (1 - Fc) f cosθ and ∫ Fc f cosθ against float64 quadrature, and their noise says how far."""
-    light = lights.make_light("constant", 16)
+    light = common.make_light("constant", 16)
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "light": light.emitter()})
-    look = view.Look((0, 0.6, 4), (0, 0, 0), 30)
-    points = view.surface(scene, view.make_sensor(look, 8), 8)
+    look = common.Look((0, 0.6, 4), (0, 0, 0), 30)
+    points = common.surface(scene, common.make_sensor(look, 8), 8)
     α = dr.opaque(mi.Float, roughness**2)
     found = mc.integrate(lambda p: mc.brdf_lobe(p, α), points, scene.environment(), samples=1597)
     wanted = np.array([split_sum(float(c), roughness, 800) for c in points.n_dot_v()])
@@ -246,7 +247,7 @@ def test_lobe_average_is_the_reference_one(roughness: float) -> None:
     )
     normal, towards = (np.array(v, np.float64).T for v in (points.normal, points.view))
     mirror = 2 * np.sum(normal * towards, -1, keepdims=True) * normal - towards
-    radiance = lights.make_light("gradient", 32).radiance.astype(np.float64)
+    radiance = common.make_light("gradient", 32).radiance.astype(np.float64)
     for k in range(0, points.count, 5):
         wanted = lobe_average(radiance, mirror[k], roughness, rings=200, spokes=200)
         assert (np.abs(estimate.mean[k] - wanted) < 6 * estimate.error[k] + 2e-3 * wanted).all()
@@ -269,7 +270,7 @@ def test_the_standard_error_is_honest() -> None:
 
 
 def test_lights_have_a_mean_of_one_and_rise_in_frequency() -> None:
-    made = [lights.make_light(name, 64) for name in lights.BUILT_IN]
+    made = [common.make_light(name, 64) for name in common.BUILT_IN]
     for light in made:
         assert light.radiance.shape == (64, 128, 3)
         mean = np.average(light.radiance.mean((1, 2)), weights=lobe_matrices.row_areas(64))
@@ -278,11 +279,11 @@ def test_lights_have_a_mean_of_one_and_rise_in_frequency() -> None:
     row, column = np.unravel_index(sky.argmax(), sky.shape)
     elevation = 90 - np.degrees(lobe_matrices.row_angles(64)[row])
     azimuth = np.degrees(lobe_matrices.column_angles(128)[column])
-    assert elevation == pytest.approx(lights.SUN_ELEVATION, abs=3)
-    assert azimuth == pytest.approx(lights.SUN_AZIMUTH % 360, abs=3)
+    assert elevation == pytest.approx(common.SUN_ELEVATION, abs=3)
+    assert azimuth == pytest.approx(common.SUN_AZIMUTH % 360, abs=3)
     assert made[0].frequency() == 0 < made[1].frequency() < made[-1].frequency()
     with pytest.raises(InputError, match=r"nowhere\.exr"):
-        lights.make_light("nowhere.exr", 64)
+        common.make_light("nowhere.exr", 64)
 
 
 def test_errors_know_their_floor() -> None:
@@ -301,14 +302,14 @@ def test_a_budget_of_known_parts() -> None:
     """Two orthogonal errors and two that cancel."""
     exact = np.ones((2, 3))
     a, b = np.array([[0.1], [0.0]]), np.array([[0.0], [0.2]])
-    steps = [budget.Step("", exact + a + b), budget.Step("a", exact + b), budget.Step("b", exact)]
-    found = budget.decompose(steps)
+    steps = [errors.Step("", exact + a + b), errors.Step("a", exact + b), errors.Step("b", exact)]
+    found = errors.decompose(steps)
     assert found.record()["adds_up"] and found.interaction == pytest.approx(0, abs=1e-12)
     assert [part.share for part in found.parts] == pytest.approx([0.2, 0.8])
     assert [part.bias for part in found.parts] == pytest.approx([0.05, 0.1])
-    opposed = [budget.Step("", exact), budget.Step("a", exact - a), budget.Step("b", exact)]
+    opposed = [errors.Step("", exact), errors.Step("a", exact - a), errors.Step("b", exact)]
     with np.errstate(all="raise"):
-        found = budget.decompose(opposed)
+        found = errors.decompose(opposed)
     assert found.total == pytest.approx(0) and not found.record()["adds_up"]
     assert found.correlation == pytest.approx(-1)
 
@@ -318,19 +319,19 @@ def test_a_budget_knows_its_pair() -> None:
     exact = np.ones((2, 3))
     a, b = np.array([[0.3], [0.0]]), np.array([[0.0], [0.2]])
     steps = [
-        budget.Step("", exact + a),
-        budget.Step("a", exact),
-        budget.Step("b", exact - b),
-        budget.Step("c", exact),
+        errors.Step("", exact + a),
+        errors.Step("a", exact),
+        errors.Step("b", exact - b),
+        errors.Step("c", exact),
     ]
-    found = budget.decompose(steps)
+    found = errors.decompose(steps)
     record = found.record()
     assert record["pair"] == ["b", "c"] and found.correlation == pytest.approx(-1)
     assert not record["adds_up"]
     row = {"floor": 0.0, **record}
-    text = budget.interactions([row, {**row, "total": 0.0, "floor": 1.0}])
+    text = errors.interactions([row, {**row, "total": 0.0, "floor": 1.0}])
     assert text.splitlines()[2:] == ["| b and c | 1 | 1 | -1.00 |"]
-    cells = budget.budget_table("case", [("known", row), ("noise", {**row, "floor": 1.0})]).splitlines()[2:]
+    cells = errors.budget_table("case", [("known", row), ("noise", {**row, "floor": 1.0})]).splitlines()[2:]
     assert cells[0].startswith("| known | 100 % (") and "b and c, ρ = -1.00" in cells[0]
     assert cells[1] == "| noise | – | – | – | < 1.0 | – | noise |"
 
@@ -338,17 +339,17 @@ def test_a_budget_knows_its_pair() -> None:
 def test_equal_error_is_interpolated() -> None:
     """relMSE = 0.8 / spp and 3 + 2 spp milliseconds: a split sum of 0.01 is worth 80 spp, 163 ms."""
     points = [(n, 0.8 / n, 0.0) for n in (1, 4, 16)]
-    assert speedup.error_times_samples(points) / 0.01 == pytest.approx(80)
-    assert speedup.exponent(points) == pytest.approx(-1)
-    assert speedup.line({n: 3 + 2.0 * n for n in (1, 4, 16)})(80) == pytest.approx(163)
+    assert measure.error_times_samples(points) / 0.01 == pytest.approx(80)
+    assert measure.exponent(points) == pytest.approx(-1)
+    assert measure.line({n: 3 + 2.0 * n for n in (1, 4, 16)})(80) == pytest.approx(163)
     noisy = [(n, 0.8 / n + 0.1, 0.1) for n in (1, 4)]
-    assert speedup.error_times_samples(noisy) == pytest.approx(0.8)
+    assert measure.error_times_samples(noisy) == pytest.approx(0.8)
 
 
 def test_other_levels_are_filtered_beside_the_shipped_ones() -> None:
     """A light with other levels has their texels and mixes by their roughness."""
-    light = lights.make_light("gradient", 16).environment(16)
-    shipped, few = light.prefilter(), light.prefilter(exact.LEVEL_SETS["few"])
+    light = common.make_light("gradient", 16).environment(16)
+    shipped, few = light.prefilter(), light.prefilter(setup.LEVEL_SETS["few"])
     assert len(few.operator.shapes) == 4
     assert len(np.array(few.levels)) < len(np.array(shipped.levels))
     direction = mi.Vector3f(0.6, 0.0, 0.8)

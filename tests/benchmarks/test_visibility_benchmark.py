@@ -15,10 +15,10 @@ from scipy.spatial import cKDTree
 
 from benchmarks.common.errors import compare
 from benchmarks.common.montecarlo import estimate
-from benchmarks.common.select import where
-from benchmarks.visibility import scenes, tradeoff
+from benchmarks.common.report import where
+from benchmarks.visibility import cases, page
 from benchmarks.visibility.__main__ import main
-from benchmarks.visibility.settings import SMALL, Rule
+from benchmarks.visibility.cases import SMALL, Rule
 from benchmarks.visibility.setup import Setup
 from tests.benchmarks.benchmark_runs import read_result, small_instance
 from tests.helpers import ROOT
@@ -128,7 +128,7 @@ def test_the_budget_takes_the_error_of_the_rule_apart(result: dict[str, Any], sc
 def test_bounces_approach_the_path_tracer_at_full_depth() -> None:
     """In a bowl, most of whose light comes by several reflections: the bias falls to less than 4 %."""
     settings = replace(SMALL, spp=64)
-    setup = Setup(scenes.make_scene("bowl", settings.detail), settings)
+    setup = Setup(cases.make_scene("bowl", settings.detail), settings)
     setup.material(0.3)
     reference = estimate(setup.reference(12))
     found = [compare(setup.picture(Rule(64, bounces)), reference) for bounces in (0, 1, 2, 4, 8)]
@@ -157,7 +157,7 @@ def test_payoff_is_chosen_elsewhere_within_the_budget() -> None:
         {"scene": name, "roughness": 0.3, "indirect": "harmonics", "total": 0.4} for name in ("here", "there")
     ]
     budgets += [row | {"indirect": "1 bounce", "total": 9.0} for row in budgets]
-    shading = tradeoff.tradeoffs(rows, budgets)[0]
+    shading = page.tradeoffs(rows, budgets)[0]
     assert (shading["scene"], shading["time"], shading["method"]) == ("here", "ms", "steady")
     assert shading["gain"] == pytest.approx(2) and shading["price"] == pytest.approx(2)
     assert shading["best_gain"] == pytest.approx(4) and shading["mirror_relmse"] == 1
@@ -165,7 +165,7 @@ def test_payoff_is_chosen_elsewhere_within_the_budget() -> None:
 
 @pytest.mark.parametrize("name", ["bowl", "deep_bowl", "plates"])
 def test_scenes_are_closed_and_face_outwards(name: str) -> None:
-    mesh = scenes.make_scene(name, 0).mesh
+    mesh = cases.make_scene(name, 0).mesh
     whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
     assert whole.is_watertight
     parts = whole.split()
@@ -175,7 +175,7 @@ def test_scenes_are_closed_and_face_outwards(name: str) -> None:
 
 
 def test_a_mesh_of_a_file_is_scaled() -> None:
-    concave = scenes.make_scene(str(ROOT / "scenes" / "meshes" / "trefoil.ply"), 0)
+    concave = cases.make_scene(str(ROOT / "scenes" / "meshes" / "trefoil.ply"), 0)
     assert concave.name == "trefoil" and concave.mesh.volume > 0
     assert np.linalg.norm(concave.mesh.vertices, axis=1).max() == pytest.approx(1)
 

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.common.budget import Step, decompose
+from benchmarks.common.errors import Step, decompose
 from benchmarks.common.view import Look
-from benchmarks.visibility import budget, harmonics
+from benchmarks.visibility import budget
+from benchmarks.visibility.cases import PAPER, SMALL, Concave, Rule, make_scene
 from benchmarks.visibility.measure import DEPTHS
-from benchmarks.visibility.scenes import Concave, make_scene
-from benchmarks.visibility.settings import PAPER, SMALL, Rule
 from benchmarks.visibility.setup import Setup
 from mi_refgs.shade.points import reflect
 from mi_refgs.shade.sh import sh_basis
@@ -175,7 +174,7 @@ def directions(rng: np.random.Generator, points: int, count: int) -> tuple[np.nd
     d = rng.normal(size=(points, count, 3))
     d /= np.linalg.norm(d, axis=-1, keepdims=True)
     d[..., 2] = np.abs(d[..., 2])
-    basis = sh_basis(mi.Vector3f(np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)), harmonics.DEGREE)
+    basis = sh_basis(mi.Vector3f(np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)), budget.DEGREE)
     columns = [np.broadcast_to(np.array(y, np.float64), points * count) for y in basis]
     return d, np.stack(columns, -1).reshape(points, count, -1)
 
@@ -187,10 +186,10 @@ def test_harmonics_that_harmonics_can_say_are_found(rng: np.random.Generator) ->
     wanted[:, 0] = 5
     blocked = d[..., 0] < 0.6
     radiance = np.where(blocked[..., None], basis @ wanted, 1e3)
-    found = basis @ harmonics.sums(basis, radiance, blocked).solve()
+    found = basis @ budget.sums(basis, radiance, blocked).solve()
     truth = basis @ wanted
     assert np.sqrt(np.mean((found - truth)[blocked] ** 2)) < 0.01 * truth.mean()
-    np.testing.assert_array_equal(harmonics.sums(basis, radiance, np.zeros_like(blocked)).solve(), 0)
+    np.testing.assert_array_equal(budget.sums(basis, radiance, np.zeros_like(blocked)).solve(), 0)
 
 
 def test_harmonics_over_the_lobe_are_their_radiance(plates: Setup) -> None:
@@ -200,15 +199,15 @@ def test_harmonics_over_the_lobe_are_their_radiance(plates: Setup) -> None:
     coefficients[:, 0] = np.linspace(1, 2, count)[:, None] * np.array([1, 2, 3])
     constant = np.sqrt(1 / (4 * np.pi)) * coefficients[:, 0]
     lobe = plates.reflected(plates.constant, None).mean(0)
-    found = plates.reflected(harmonics.Surroundings(coefficients), None).mean(0)
+    found = plates.reflected(budget.Surroundings(coefficients), None).mean(0)
     np.testing.assert_allclose(found, constant * lobe, rtol=5e-3)
     coefficients[:, 2] = 0.5
     mirror = reflect(plates.points.view, plates.points.normal)
-    along = np.array(harmonics.along(coefficients, mirror)).T
+    along = np.array(budget.along(coefficients, mirror)).T
     tilt = 0.5 * np.sqrt(3 / (4 * np.pi)) * np.array(mirror.z)[:, None]
     np.testing.assert_allclose(along, np.maximum(constant + tilt, 0), atol=1e-5)
     plates.roughness = dr.opaque(mi.Float, 0.05)
-    narrow = plates.reflected(harmonics.Surroundings(coefficients), None).mean(0)
+    narrow = plates.reflected(budget.Surroundings(coefficients), None).mean(0)
     lobe = plates.reflected(plates.constant, None).mean(0)
     assert np.median(np.abs(narrow / lobe - along)) < 0.01
     plates.material(0.3)

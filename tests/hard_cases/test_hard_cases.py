@@ -12,8 +12,7 @@ import pytest
 from benchmarks.stability import measure as module
 from benchmarks.stability import response
 from benchmarks.stability.__main__ import main
-from benchmarks.stability.case import Case, plain
-from benchmarks.stability.cases import catalogue
+from benchmarks.stability.cases import Case, catalogue, plain
 from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, Row, measure
 from mi_refgs.reference import image as oracle
 from mi_refgs.surfels.primitives.surfel import FootprintAdjoint

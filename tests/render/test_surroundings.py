@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from benchmarks.stability import measure
-from benchmarks.stability.case import camera, plain
+from benchmarks.stability import exact
+from benchmarks.stability.cases import camera, plain
 from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.reference import image as oracle
 from mi_refgs.render.display import displayed, srgb_from_linear
@@ -71,12 +71,12 @@ class Pair:
         }
         pixels = np.arange(self.case.camera.width * self.case.camera.height)
         colour = np.zeros((len(raw["scale"]), 3))
-        return measure.product_order(replace(self.case, raw=raw | {"radiance_sh": colour}), pixels)
+        return exact.product_order(replace(self.case, raw=raw | {"radiance_sh": colour}), pixels)
 
     def truth(self, values: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
         case = replace(self.case, raw={n: values[n] for n in self.case.raw})
         pixels = np.arange(case.camera.width * case.camera.height)
-        scene = measure.scene_of(case, pixels, self.order, measure.light_of(values["light"]))
+        scene = exact.scene_of(case, pixels, self.order, exact.light_of(values["light"]))
         others = {name: values[f"surroundings/{name}"] for name in scattered_discs()}
         return oracle.render_open(oracle.OpenScene(scene, others, values["background"]))
 
@@ -86,7 +86,7 @@ class Pair:
         behind = Surroundings(others, EnvironmentLight(params["background"]))
         light = EnvironmentLight(params["light"]).prefilter()
         shading = Shading(self.at, "split_sum", self.diffuse)  # type: ignore[arg-type]
-        eye = eye or measure.fast_camera(self.case)
+        eye = eye or exact.fast_camera(self.case)
         scene = SurfelScene(surfels, shading, light, surroundings=behind)
         return render(scene, eye, Request(scene.all_aovs))
 
@@ -183,7 +183,7 @@ def test_a_pixel_is_the_mean_of_its_samples() -> None:
     it is seen through, so that compositing the mean is the mean of composites."""
     pair = Pair("pixel", "sh")
     params = {name: upload_tensor(x) for name, x in pair.values.items()}
-    eye = measure.fast_camera(pair.case)
+    eye = exact.fast_camera(pair.case)
     fine = pair.frame(params, eye.supersampled(2))
     frame = supersampled(lambda camera: pair.frame(params, camera), eye, 4)
 
@@ -205,7 +205,7 @@ def test_an_empty_table_shows_nothing_and_a_screened_one_leaves_rows_out() -> No
     own = {name: params[name] for name in pair.case.raw}
     others = {name: np.array(x) for name, x in scattered_discs().items()}
     light = EnvironmentLight(params["light"]).prefilter()
-    eye, shading = measure.fast_camera(pair.case), Shading("pixel", "split_sum", "sh")
+    eye, shading = exact.fast_camera(pair.case), Shading("pixel", "split_sum", "sh")
 
     def radiance(surroundings: Surroundings | None) -> np.ndarray:
         frame = render(SurfelScene(Surfels(own), shading, light, surroundings=surroundings), eye)
