@@ -1,6 +1,7 @@
 # The public names, each stated once: `mi_refgs.NAME` is imported from where this file says on first use.
 
 import mi_refgs.data.dataset
+import mi_refgs.fitting.objective
 import mi_refgs.formats.format
 import mi_refgs.methods.read
 import mi_refgs.render.pipeline
@@ -13,6 +14,8 @@ from mi_refgs.data.view import View as View
 from mi_refgs.editing.edit import EditOptions as EditOptions
 from mi_refgs.errors import InputError as InputError
 from mi_refgs.evaluation.evaluate import evaluate as evaluate
+from mi_refgs.fitting.objective import Loss as Loss
+from mi_refgs.fitting.objective import LossInputs as LossInputs
 from mi_refgs.fitting.progress import Progress as Progress
 from mi_refgs.fitting.train import Trainer as Trainer
 from mi_refgs.formats.format import Format as Format
@@ -55,6 +58,7 @@ load_method = mi_refgs.methods.read.load
 register_attribute = mi_refgs.surfels.attributes.register
 register_channel = mi_refgs.surfels.attributes.register
 register_format = mi_refgs.formats.format.register
+register_loss = mi_refgs.fitting.objective.register
 register_primitive = mi_refgs.surfels.primitives.register
 register_reader = mi_refgs.data.dataset.register_reader
 register_reflectance = mi_refgs.shade.reflectance.register

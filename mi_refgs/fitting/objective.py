@@ -1,54 +1,109 @@
-"""What a step lowers: the loss of one rendered view against its picture."""
+"""The loss of one rendered view: image losses, and registered losses with the weights of the method.
+
+A registered loss has a name; its weight is the field of that name in `[loss]` of a method file, or the table
+`[loss.registered.NAME]` with `weight`, `start`, `rise` and `until`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from mi_refgs.data.dataset import Dataset, View
+from mi_refgs.data.dataset import Dataset
 from mi_refgs.fitting import losses
-from mi_refgs.kernels.device import upload
+from mi_refgs.fitting.targets import Target
 from mi_refgs.methods.weights import LossWeights
+from mi_refgs.registry import Registry
 from mi_refgs.render.depth_normals import normals_from_depth
-from mi_refgs.render.display import displayed, srgb_from_linear
+from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.splat import Camera
+from mi_refgs.shade.light.light import Light
+from mi_refgs.types import Float
 
 MATERIALS = ("roughness", "metallic")
-"""Maps that neighbours of like colour share."""
+"""Maps that neighbouring pixels of similar colour share."""
 MATERIAL_EDGE = 10.0
-"""Steepness of edges that are kept: a step of 0.1 in the picture from a pixel to the next counts a third."""
-
+"""Steepness of edges that are kept: a step of 0.1 in the image from a pixel to the next counts a third."""
 GAIN_PRIOR = 1e-3
-"""Weight of the squared log gains: two stops cost as much as 0.6 % of brightness, so it decides only where a
-picture tells nothing, such as a channel without light."""
+"""Weight of the squared log gains: two stops cost as much as 0.6 % of brightness, so it decides only where an
+image does not, such as a channel without light."""
 
 
 @dataclass(frozen=True)
-class Target:
-    """A view on the device: camera and planes of H·W values."""
+class LossInputs:
+    """What a loss may read of a step."""
 
-    camera: Camera
-    image: list[Any]  # display-encoded
-    clipped: list[Any] | None  # where an 8-bit target says only "at least this bright"
-    alpha: Any | None
+    frame: Frame  # with derivatives
+    image: list[Float]  # three planes (H*W,), display-encoded as the target
+    target: Target
+    light: Light | None  # with derivatives
 
-    @staticmethod
-    def of(view: View, background: np.ndarray) -> Target:
-        """Upload a view; `background` (3,) in the space of its picture."""
-        loaded = view.load()
-        colour, opacity = loaded.image, loaded.alpha
-        planes = [upload(colour[..., i]) for i in range(3)]
-        image = [srgb_from_linear(plane) for plane in planes] if view.is_linear_radiance else planes
-        alpha = None if opacity is None else upload(opacity)
-        clipped = None if view.is_linear_radiance else losses.saturated(image, alpha, map(float, background))
-        target = Target(view.camera(), image, clipped, alpha)
-        dr.eval(target.image, target.clipped, target.alpha)
-        return target
+
+@dataclass(frozen=True)
+class Loss:
+    """A loss beside the image losses."""
+
+    name: str  # of its weight in `[loss]` of a method file
+    value: Callable[[LossInputs], Float | None]  # width 1; None: not defined for these inputs
+    normals: bool = False  # reads blended normals
+    maps: bool = False  # reads blended materials, which deferred stages have
+
+
+LOSSES = Registry[Loss]("loss")
+"""The registered losses, in the order in which they are summed."""
+register = LOSSES.register
+"""Add a loss, which method files can weigh from then on."""
+
+
+def _normal(inputs: LossInputs) -> Float:
+    frame = inputs.frame
+    depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, inputs.target.camera)
+    return losses.normal_consistency(frame.normal, depth_normal, valid, frame.normal_alpha)
+
+
+def _smooth(inputs: LossInputs) -> Float:
+    camera = inputs.target.camera
+    return losses.smoothness(list(inputs.frame.normal), inputs.target.image, camera.width, camera.height)
+
+
+def _half_metal(inputs: LossInputs) -> Float | None:
+    metallic = inputs.frame.maps.get("metallic")
+    return None if metallic is None else losses.half_metal(metallic, inputs.frame.object_alpha)
+
+
+def _materials(inputs: LossInputs) -> Float | None:
+    frame, camera = inputs.frame, inputs.target.camera
+    if not {*MATERIALS} <= {*frame.maps}:
+        return None
+    maps = [dr.detach(frame.object_alpha) * frame.maps[name] for name in MATERIALS]
+    return losses.smoothness(maps, inputs.target.image, camera.width, camera.height, MATERIAL_EDGE)
+
+
+def _light_colour(inputs: LossInputs) -> Float | None:
+    return None if inputs.light is None else losses.light_colour(inputs.light)
+
+
+def _alpha(inputs: LossInputs) -> Float | None:
+    mask = inputs.target.alpha
+    return None if mask is None else losses.alpha_loss(inputs.frame.alpha, mask)
+
+
+register(Loss("normal", _normal, normals=True))
+register(Loss("smooth", _smooth, normals=True))
+register(Loss("half_metal", _half_metal, maps=True))
+register(Loss("materials", _materials, maps=True))
+register(Loss("light_colour", _light_colour))
+register(Loss("alpha", _alpha))
+
+
+def losses_in_use(weights: LossWeights) -> list[Loss]:
+    """The registered losses that a method weighs; raises InputError for a name that is not registered."""
+    for name in weights.registered:
+        LOSSES.find(name, f"loss.registered.{name}")
+    return [loss for loss in LOSSES.values() if weights.of(loss.name).weight]
 
 
 def objective(
@@ -57,16 +112,15 @@ def objective(
     data: Dataset,
     weights: LossWeights,
     iteration: int,
-    light: Any = None,
-    log_gain: list[Any] | None = None,
-) -> tuple[Any, Any]:
-    """Weighted sum of the losses of a frame (mi.Float of width 1), and its mean squared error, detached.
+    light: Light | None = None,
+    log_gain: list[Float] | None = None,  # three of width 1
+) -> tuple[Float, Float]:
+    """Weighted sum of the losses of a frame (width 1), and its mean squared error, detached.
 
-    The terms are those of `LossWeights`, weighted as it says for this iteration; see `render.display`.
-    `light` is the light of the step, under AD; without it there is no prior on its colour.
-    `log_gain`, three mi.Float of width 1, is the exposure of the picture; without it, that is 0.
+    `light` is the light of the step, under AD; losses on it are left out without it. `log_gain` is the log
+    exposure of the image, by default 0.
     """
-    width, height = target.camera.width, target.camera.height
+    # The image as it is displayed, compared with the target.
     gain = None if log_gain is None else [dr.exp(value) for value in log_gain]
     image = displayed(frame, data.background, data.is_linear_radiance, gain)
     if target.clipped is not None:
@@ -75,31 +129,16 @@ def objective(
     if log_gain is not None:
         loss += GAIN_PRIOR * sum((dr.square(value) for value in log_gain), mi.Float(0))
     if weights.ssim:
+        width, height = target.camera.width, target.camera.height
         loss += weights.ssim * losses.d_ssim(image, target.image, width, height)
-    if weights.normal and iteration > weights.normal_start:
-        weight = _risen(weights.normal, iteration - weights.normal_start, weights.normal_rise)
-        depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, target.camera)
-        loss += weight * losses.normal_consistency(frame.normal, depth_normal, valid, frame.normal_alpha)
-    if weights.smooth and iteration <= weights.smooth_until:
-        loss += weights.smooth * losses.smoothness(list(frame.normal), target.image, width, height)
-    if weights.half_metal and "metallic" in frame.maps and iteration > weights.half_metal_start:
-        since = iteration - weights.half_metal_start
-        weight = _risen(weights.half_metal, since, weights.half_metal_rise)
-        loss += weight * losses.half_metal(frame.maps["metallic"], frame.object_alpha)
-    if weights.materials and {*MATERIALS} <= {*frame.maps}:
-        maps = [dr.detach(frame.object_alpha) * frame.maps[name] for name in MATERIALS]
-        loss += weights.materials * losses.smoothness(maps, target.image, width, height, MATERIAL_EDGE)
-    if weights.light_colour and light is not None:
-        loss += weights.light_colour * losses.light_colour(light)
-    if weights.alpha and target.alpha is not None:
-        loss += weights.alpha * losses.alpha_loss(frame.alpha, target.alpha)
+
+    # Registered losses. A weight that changes from step to step is opaque: a literal would be compiled into
+    # each step's kernels.
+    inputs = LossInputs(frame, image, target, light)
+    for term in losses_in_use(weights):
+        window = weights.of(term.name)
+        weight = window.at(iteration)
+        if weight and (value := term.value(inputs)) is not None:
+            loss += (dr.opaque(mi.Float, weight) if window.rise else weight) * value
     squares = (dr.square(dr.detach(a) - b) for a, b in zip(image, target.image, strict=True))
     return loss, dr.mean(sum(squares, mi.Float(0))) / 3
-
-
-def _risen(weight: float, since: int, rise: int) -> Any:
-    """A weight that rises linearly from 0 in `rise` iterations.
-
-    Opaque: it changes from step to step, and a literal would be compiled into each one's kernels.
-    """
-    return dr.opaque(mi.Float, weight * (min(since / rise, 1) if rise else 1))

@@ -1,15 +1,24 @@
-"""The pictures of a fit on the device: uploaded at once where memory allows, else when a step needs them."""
+"""The images of a fit: read as the method says, and kept on the device as far as memory allows."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import dataclass
 from pathlib import Path
+
+import drjit as dr
+import numpy as np
 
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.images import CACHE_BYTES
-from mi_refgs.fitting.objective import Target
+from mi_refgs.data.view import View
+from mi_refgs.fitting import losses
+from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.memory import of_fit, require
 from mi_refgs.methods.method import DataOptions, Method
+from mi_refgs.render.display import srgb_from_linear
+from mi_refgs.splat import Camera
+from mi_refgs.types import Bool, Float
 
 BUDGET = 2**30
 """Bytes of targets that stay on the device: a thousand pictures of 200², or ten of 2000²."""
@@ -48,6 +57,29 @@ def read_views(method: Method, path: Path, split: str, truth: bool = True, decod
         truth=truth,
         decode=decode,
     )
+
+
+@dataclass(frozen=True)
+class Target:
+    """A training image on the device."""
+
+    camera: Camera
+    image: list[Float]  # three planes (H*W,), display-encoded
+    clipped: list[Bool] | None  # where an 8-bit value only means "at least this bright"
+    alpha: Float | None  # (H*W,)
+
+    @staticmethod
+    def of(view: View, background: np.ndarray) -> Target:
+        """Upload a view; `background` (3,) is in the colour space of its image."""
+        loaded = view.load()
+        colour, opacity = loaded.image, loaded.alpha
+        planes = [upload(colour[..., i]) for i in range(3)]
+        image = [srgb_from_linear(plane) for plane in planes] if view.is_linear_radiance else planes
+        alpha = None if opacity is None else upload(opacity)
+        clipped = None if view.is_linear_radiance else losses.saturated(image, alpha, map(float, background))
+        target = Target(view.camera(), image, clipped, alpha)
+        dr.eval(target.image, target.clipped, target.alpha)
+        return target
 
 
 class Targets:

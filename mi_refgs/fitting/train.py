@@ -22,7 +22,7 @@ from mi_refgs.data.view import View
 from mi_refgs.fitting import exposure
 from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.health import Health
-from mi_refgs.fitting.objective import objective
+from mi_refgs.fitting.objective import losses_in_use, objective
 from mi_refgs.fitting.state import FitSetup, FitState
 from mi_refgs.fitting.surface import surface_of, update_missing_caches
 from mi_refgs.fitting.targets import Targets, require_memory
@@ -73,6 +73,7 @@ class Trainer:
             self.restore(state)
 
     def _set_up(self, setup: FitSetup) -> None:
+        losses_in_use(setup.method.loss)  # refuses unknown names
         require_memory(setup.method, setup.data)
         self.setup, self.targets = setup, Targets(setup.data, setup.method.data)
 
@@ -303,10 +304,11 @@ class Trainer:
         update_missing_caches(fit.occluder, surfels, fit.light, shading)
         light = fit.prefilter.light(fit.light, shading)
         scene = SurfelScene(surfels, shading, light, fit.occluder, around)
-        aovs = ("normal",) if weights.uses_normals else ()
+        asked = losses_in_use(weights)
+        aovs = ("normal",) if any(loss.normals for loss in asked) else ()
         request = Request(aovs, sh_degree=schedule.sh_degree(iteration), screen_offset=offset)
         view = partial(render, scene, request=request)
-        frame = supersampled(view, camera, stage.samples, details=weights.uses_maps)
+        frame = supersampled(view, camera, stage.samples, details=any(loss.maps for loss in asked))
         gain = exposure.log_gain(fit.params, index)
         loss, self.error = objective(frame, target, self.data, weights, iteration, light, gain)
         self.loss = dr.detach(loss)

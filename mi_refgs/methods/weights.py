@@ -8,6 +8,22 @@ from mi_refgs.methods.window import ITERATIONS
 
 
 @dataclass(frozen=True)
+class LossWeight:
+    """Weight of one loss over the iterations."""
+
+    weight: float
+    start: int = field(default=0, metadata=ITERATIONS)  # iterations without the loss
+    rise: int = field(default=0, metadata=ITERATIONS)  # then its weight rises linearly from 0
+    until: int = field(default=2**31, metadata=ITERATIONS)  # last iteration with the loss
+
+    def at(self, iteration: int) -> float:
+        """The weight in this (1-based) iteration."""
+        if not self.start < iteration <= self.until:
+            return 0.0
+        return self.weight * (min((iteration - self.start) / self.rise, 1) if self.rise else 1)
+
+
+@dataclass(frozen=True)
 class LossWeights:
     """L = (1 - ssim) L1 + ssim (1 - SSIM) + normal L_n + smooth L_s + alpha L_α, and priors.
 
@@ -27,13 +43,11 @@ class LossWeights:
     half_metal_rise: int = field(default=0, metadata=ITERATIONS)  # then this weight rises linearly
     materials: float = 0.0  # neighbours of like colour share roughness and metallic
     light_colour: float = 0.0  # colour belongs to the albedo rather than to the light
+    registered: dict[str, LossWeight] = field(default_factory=dict)  # losses of `register_loss`, by name
 
-    @property
-    def uses_maps(self) -> bool:
-        """Whether a loss looks at the blended materials."""
-        return self.half_metal > 0 or self.materials > 0
-
-    @property
-    def uses_normals(self) -> bool:
-        """Whether a loss looks at the blended normals."""
-        return self.normal > 0 or self.smooth > 0
+    def of(self, name: str) -> LossWeight:
+        """Weight and window of a loss by its name."""
+        if name in self.registered:
+            return self.registered[name]
+        window = {end: getattr(self, f"{name}_{end}", None) for end in ("start", "rise", "until")}
+        return LossWeight(getattr(self, name, 0.0), **{end: x for end, x in window.items() if x is not None})

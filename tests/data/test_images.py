@@ -16,8 +16,7 @@ from mi_refgs.data.dataset import View, read_dataset
 from mi_refgs.data.images import BAND, ImageCache, ImageFile, ImageSource, Mask, compose
 from mi_refgs.data.survey import survey
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.objective import Target
-from mi_refgs.fitting.targets import PIXEL_BYTES, Targets
+from mi_refgs.fitting.targets import PIXEL_BYTES, Target, Targets
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.images import box_downscale, read_bytes, read_grey, read_png, write_png
 from mi_refgs.methods.method import CoarsePictures, DataOptions

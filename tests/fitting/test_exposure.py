@@ -18,7 +18,8 @@ from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, MAX_GAIN, fitte
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import exposure
 from mi_refgs.fitting.exposure import exif_gains
-from mi_refgs.fitting.objective import GAIN_PRIOR, Target, objective
+from mi_refgs.fitting.objective import GAIN_PRIOR, objective
+from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import EXIF_IFD, srgb_from_linear
 from mi_refgs.kernels.device import upload

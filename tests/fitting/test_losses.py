@@ -11,8 +11,8 @@ import pytest
 
 from mi_refgs.data.dataset import View
 from mi_refgs.fitting import losses
-from mi_refgs.fitting.objective import Target
 from mi_refgs.fitting.ssim import ssim
+from mi_refgs.fitting.targets import Target
 from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.reference import losses as reference
 from mi_refgs.render import display

@@ -13,7 +13,8 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View, read_dataset
 from mi_refgs.fitting import losses
-from mi_refgs.fitting.objective import Target, objective
+from mi_refgs.fitting.objective import objective
+from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.kernels.device import upload
@@ -44,7 +45,8 @@ def frame_of(radiance: np.ndarray, alpha: np.ndarray) -> Frame:
     normal = mi.Vector3f(0, 0, upload(-alpha.astype(np.float32)))
     planes = [upload(radiance[..., c].astype(np.float32)) for c in range(3)]
     opacity = upload(alpha.astype(np.float32))
-    return Frame(alpha=opacity, depth=upload(flat), normal=normal, radiance=mi.Color3f(*planes))
+    frame = Frame(alpha=opacity, depth=upload(flat), normal=normal, radiance=mi.Color3f(*planes))
+    return dataclasses.replace(frame, object_alpha=opacity, normal_alpha=opacity)
 
 
 @pytest.fixture

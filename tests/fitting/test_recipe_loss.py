@@ -1,0 +1,58 @@
+"""The recipe of a loss in CONTRIBUTING.md, followed line by line: it can be copied."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import mi_refgs
+from mi_refgs import methods
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.fitting.objective import LOSSES
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.types import Float
+
+SETTINGS = ["iterations=30", "surfels.count=80", "surfels.max_count=100", "stage.initial.until=1"]
+
+
+def rough(inputs: mi_refgs.LossInputs) -> Float | None:
+    """Mean over all pixels of A (1 - r): 0 where every surface is rough."""
+    roughness = inputs.frame.maps.get("roughness")
+    if roughness is None:  # forward stages blend no materials
+        return None
+    return dr.mean(dr.detach(inputs.frame.object_alpha) * (1 - roughness))
+
+
+@pytest.fixture
+def registered() -> Iterator[None]:
+    mi_refgs.register_loss(mi_refgs.Loss("rough", rough, maps=True))
+    yield
+    LOSSES.unregister("rough")
+
+
+def roughness_after(data: Path, method: Path, *settings: str) -> float:
+    """Mean raw roughness after some steps of the deferred stage."""
+    chosen = methods.load(str(method), "quick", [*SETTINGS, *settings])
+    trainer = Trainer(replace(chosen, refine=methods.Refine()), read_dataset(data, "train", truth=False))
+    for _ in range(12):
+        trainer.step()
+    return float(np.mean(trainer.surfels.to_numpy()["roughness"]))
+
+
+def test_registered_loss_is_weighed_by_method_file(data: Path, method: Path, registered: None) -> None:
+    without = roughness_after(data, method)
+    weighed = roughness_after(data, method, "loss.registered.rough={weight=1.0}")
+    late = roughness_after(data, method, "loss.registered.rough={weight=1.0, start=12}")
+    early = roughness_after(data, method, "loss.registered.rough={weight=1.0, until=6}")
+    assert weighed > without + 0.02 and late == pytest.approx(without, abs=1e-4)
+    assert without < early < weighed
+
+
+def test_loss_that_is_not_registered_is_refused(data: Path, method: Path) -> None:
+    with pytest.raises(mi_refgs.InputError, match=r"registered\.rough: 'rough' is unknown; use normal or"):
+        roughness_after(data, method, "loss.registered.rough={weight=1.0}")
