@@ -16,6 +16,19 @@ MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 """OpenCV's and COLMAP's camera: +z forward, +x right, +y down; the matrix is its own inverse."""
 
 
+def poses_around(outward: np.ndarray, centre: np.ndarray, distance: float | np.ndarray) -> np.ndarray:
+    """World-from-camera matrices (N, 4, 4) in Mitsuba's frame, z up, of cameras that look at `centre`.
+
+    `outward` (N, 3) are unit directions from there, none of them ±z; `distance` is a number or (N, 1).
+    """
+    left = np.cross([0.0, 0.0, 1.0], -outward)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    up = np.cross(-outward, left)
+    poses = np.tile(np.eye(4), (len(outward), 1, 1))
+    poses[:, :3, :] = np.stack([left, up, -outward, centre + distance * outward], axis=2)
+    return poses
+
+
 def pinhole(width: int, height: int, focal: float) -> dict[str, Any]:
     """Intrinsics for a transforms file: square pixels, principal point at the centre; lengths in pixels."""
     return {

@@ -16,6 +16,7 @@ import numpy as np
 
 from mi_refgs import __version__
 from mi_refgs.data.dataset import Dataset, fitting_downscale
+from mi_refgs.data.poses import poses_around
 from mi_refgs.data.region import Region
 from mi_refgs.data.view import View
 from mi_refgs.fitting import cost_model
@@ -26,7 +27,6 @@ from mi_refgs.kernels.device import machine, simd_width
 from mi_refgs.methods.build import plain
 from mi_refgs.methods.method import Method, Refine
 from mi_refgs.methods.presets import PRESETS
-from mi_refgs.synthesis.pathtrace import poses_around
 
 VIEWS = 6
 COVERED = 0.35

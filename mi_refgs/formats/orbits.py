@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from mi_refgs.constants import GOLDEN_ANGLE
+from mi_refgs.data.poses import poses_around
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.synthesis.pathtrace import poses_around
 
 AROUND = {"test": 4, "train": 60}
 """Cameras around an object without a data set."""

@@ -18,8 +18,7 @@ from mi_refgs.io.files import require_file
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.synthesis.pathtrace import ENVIRONMENT_OVERSAMPLING, environment_image
-from mi_refgs.synthesis.scene_file import Z_UP
-from mi_refgs.synthesis.settings import RELIGHT, recorded_lights
+from mi_refgs.synthesis.settings import RELIGHT, Z_UP, recorded_lights
 
 HEIGHT = 256
 """Rows of a light, at most: a texel is 0.7°, an eighth of the lobe of roughness 0.1."""

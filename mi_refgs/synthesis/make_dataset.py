@@ -1,52 +1,67 @@
-"""Path-traces a multi-view data set of a Mitsuba scene: pictures, maps, light, surface and cameras.
+"""Path tracing of a multi-view data set of a Mitsuba scene: images, maps, environment, surface and cameras.
 
-A data set folder holds
+A data set folder contains
 
-    transforms_train.json, transforms_test.json   cameras in the Blender / NeRF convention, written after the
-                                                  views
+    transforms_train.json, transforms_test.json   cameras in the Blender / NeRF convention, written after
+                                                  the views
     train/r_000.png    RGBA, 8 bit: straight alpha, colour = sRGB(radiance / alpha), clipped
     train/r_000.exr    RGBA, float32, linear: premultiplied radiance and alpha
     train/r_000_normal.exr     X, Y, Z: unit shading normal at the pixel centre, world space, towards the
                                camera
     train/r_000_depth.exr      Y: distance at the pixel centre, along the viewing axis (not along the ray)
     train/r_000_albedo.exr     R, G, B: diffuse reflectance, or F0 of a metal, at the pixel centre
-                               (see `data.materials`)
+                               (see `synthesis.ground_truth`)
     train/r_000_roughness.exr  Y: √α of GGX; like albedo and metallic with A = 1 where the BSDF defines it,
                                else 0
     train/r_000_metallic.exr   Y: 0 … 1
-    environment.exr    lat-long radiance of the environment, as a Mitsuba `envmap` without `to_world` shows it
+    environment.exr    lat-long radiance of the environment for a Mitsuba `envmap` without `to_world`
     surface.ply        triangles of all shapes, world space
-    region.json        of an open scene: a sphere around the object
-    relight/NAME/      the test views under another light, a data set with a test split: test/r_000.png and
-                       .exr, environment.exr, transforms_test.json
-    dataset.json       the settings, which decide whether a folder may be resumed; and further lights
+    region.json        only for an open scene: a sphere around the object
+    relight/NAME/      the test views under another environment map, a data set with a test split:
+                       test/r_000.png and .exr, environment.exr, transforms_test.json
+    dataset.json       the settings, which decide whether a folder may be resumed; and other environment maps
 
-Maps are 0 off the object. Of an open scene, an object in its surroundings, pictures are RGB without alpha,
-and maps, materials and surface are those of the object alone; there is no environment.exr, because a room is
-not lit by what is far away alone.
+Maps are 0 off the object. An open scene is an object in its surroundings: images are RGB without alpha, maps,
+materials and surface are those of the object only, and there is no environment.exr, because not only distant
+light arrives at the object.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.region import REGION_FILE, write_region
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, pinhole
+from mi_refgs.data.region import REGION_FILE, Region, write_region
 from mi_refgs.errors import InputError
+from mi_refgs.io.exr import read_exr, read_exr_image, write_exr
+from mi_refgs.io.files import write_json
+from mi_refgs.io.images import read_png, srgb_from_linear, straight_srgb, write_png
+from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
-from mi_refgs.synthesis.open_scene import check_cameras, named_shapes, region_around
-from mi_refgs.synthesis.pathtrace import bounding_sphere, reach
-from mi_refgs.synthesis.scene_file import LightFile, load_scene, scene_hash, under_light
-from mi_refgs.synthesis.settings import RELIGHT, SURFACE, Settings, prepare_folder
-from mi_refgs.synthesis.surface import surface_mesh
+from mi_refgs.progress import with_bar
+from mi_refgs.synthesis.ground_truth import surface_mesh
+from mi_refgs.synthesis.pathtrace import MAPS, Cameras, Tracer, bounding_sphere, environment_image, reach
+from mi_refgs.synthesis.settings import (
+    RELIGHT,
+    SURFACE,
+    LightFile,
+    Settings,
+    load_scene,
+    prepare_folder,
+    scene_hash,
+    under_light,
+)
 from mi_refgs.synthesis.write_colmap import colmap_output, write_colmap
-from mi_refgs.synthesis.write_views import Cameras, write_views
 
 SURFACE_VOXELS = 2048
 """Voxels along the diameter of `surface.ply`, which decide how far from it rays start: 2 voxels are 0.1 % of
-the size, ten times what the tessellation of a sphere is off."""
+the size, ten times the error of a tessellated sphere."""
+REGION_MARGIN = 1.2
+"""Radius of the region over that of the object's bounding sphere, which includes adjacent surfaces."""
 
 
 def make_dataset(
@@ -73,24 +88,26 @@ def make_dataset(
 ) -> Path:
     """Path-trace a data set of a Mitsuba scene into the folder `out`, which is returned.
 
-    Cameras sit on a sphere around the scene's bounding sphere and look at its centre, z up; training and test
-    views are two lattices, evenly spread over the band of elevations, turned and jittered by the seed.
-    `test_views` is a quarter of `views` by default; `size` is width and height, or both as one, in pixels;
-    `fov` is that of the shorter side, degrees. Cameras stand so far away that the sphere fills the part
-    `fill` of the shorter side, or at random distances between the two of `distance`, scene units. The pixel
-    filter is a box, the light is hidden from the camera (alpha 0). With `objects`, ids of shapes, the scene
-    is an open one: the cameras look at those shapes from among the others. `colmap` is a folder for the same
-    as COLMAP's text files (`data.write_colmap`). `light` is a lat-long map (EXR, HDR) that takes the place of
-    the scene's environment, turned as that is. The test views are traced once more under each map of
-    `relight`, in a folder of its file's name without suffix. Needs a Dr.Jit variant to be set.
+    Cameras are on a sphere around the scene's bounding sphere and look at its centre, z up; training and test
+    views are two lattices, evenly spread over the band of `elevation`, rotated and jittered by the seed. The
+    pixel filter is a box, and emitters are hidden from the camera (alpha 0).
 
-    A folder that the same settings left unfinished is continued: what is there is kept, what is missing is
-    made, lights of `relight` among it. Every file appears whole or not at all. `overwrite` removes the views
-    that a folder holds.
+    `test_views`: by default a quarter of `views`.
+    `size`: width and height in pixels, or one number for both; `fov`: degrees, of the shorter side.
+    `fill`: fraction of the shorter side that the bounding sphere fills, which sets the cameras' distance.
+    `distance`: instead of `fill`, two distances between which those of cameras are random, scene units.
+    `light`: lat-long map (EXR, HDR) that replaces the scene's environment, rotated as that is.
+    `relight`: maps under which the test views are traced again, each in a folder of its name without suffix.
+    `objects`: ids of shapes that cameras look at among all others: an open scene.
+    `colmap`: folder for the same data set as COLMAP's text files (`write_colmap`).
+    `overwrite`: remove the views in the folder.
 
-    Raises InputError if the scene or a light cannot be loaded, a shape has no triangles (`data.surface`), a
-    setting makes no sense, a camera does not see the object, the folder cannot be written, or it holds a data
-    set of other settings or from elsewhere and `overwrite` is false.
+    A folder that the same settings left unfinished is continued. Files are written atomically. A Dr.Jit
+    variant must be set.
+
+    Raises InputError if the scene or a light cannot be loaded, a shape cannot be tessellated, a setting is
+    out of range, a camera does not see the object, the folder cannot be written, or it contains a data set of
+    other settings or foreign files and `overwrite` is false.
     """
     scene, out = Path(scene), Path(out)
     width, height = (size, 0) if isinstance(size, int) else size
@@ -115,9 +132,9 @@ def make_dataset(
         objects=tuple(objects),
         distance=(0.0, 0.0) if distance is None else (float(distance[0]), float(distance[1])),
     )
-    settings.check()
+    settings.require_valid()
     if objects and others:
-        raise InputError(f"{scene}: --relight: an open scene keeps its lamps; leave it out, or --shapes")
+        raise InputError(f"{scene}: --relight: an open scene keeps its emitters; leave it out, or --shapes")
     loaded = load_scene(scene, whole=bool(objects))
     about = named_shapes(loaded, objects, scene) if objects else []
     shapes = about or loaded.shapes()
@@ -129,10 +146,11 @@ def make_dataset(
     relit = [under_light(loaded, other.path) for other in others]  # read before anything is written
     centre, radius = bounding_sphere(shapes)
     cameras = Cameras(settings, centre, radius, reach(loaded.shapes(), centre) if about else radius, about)
-    region = region_around(centre, radius)
+    x, y, z = (float(c) for c in centre)
+    region = Region((x, y, z), REGION_MARGIN * radius)
     if about:
         poses = np.stack([pose for split in ("train", "test") for pose, _ in cameras.of(split)])
-        check_cameras(loaded, about, region, poses, scene)
+        require_clear_view(loaded, about, region, poses, scene)
     points = None if colmap is None else colmap_output(Path(colmap), out, cameras)
     output = prepare_folder(out, settings, overwrite, others)
     if about:
@@ -150,3 +168,119 @@ def make_dataset(
         part = f"{RELIGHT}/{other.name}/"
         write_views(output, part, ("test",), cameras, cameras.tracer(scene_there), False, progress)
     return out
+
+
+def named_shapes(scene: Any, ids: Sequence[str], file: Path) -> list[Any]:
+    """The shapes of a scene with these ids; raises InputError for an id that none has."""
+    found = {shape.id(): shape for shape in scene.shapes()}
+    missing = [name for name in ids if not name or name not in found]
+    if missing:
+        known = ", ".join(sorted(name for name in found if name)) or "none"
+        raise InputError(
+            f"{file}: --shapes: no shape has the id '{missing[0]}'; give one of those there: {known}"
+        )
+    return [found[name] for name in dict.fromkeys(ids)]
+
+
+def require_clear_view(
+    scene: Any, objects: Sequence[Any], region: Region, poses: np.ndarray, file: Path
+) -> None:
+    """Raise InputError if a camera (poses (N, 4, 4)) is in the region, or something hides its centre."""
+    import drjit as dr
+    import mitsuba as mi
+
+    origin = np.asarray(poses)[:, :3, 3]
+    toward = np.array(region.centre) - origin
+    distance = np.linalg.norm(toward, axis=1)
+    if distance.min() <= region.radius:
+        raise InputError(
+            f"{file}: --distance: {distance.min():.4g} is inside of the region around the object, whose "
+            f"radius is {region.radius:.4g}; give more"
+        )
+    with dr.suspend_grad():
+        ray = mi.Ray3f(
+            mi.Point3f(np.ascontiguousarray(origin.T, np.float32)),
+            mi.Vector3f(np.ascontiguousarray((toward / distance[:, None]).T, np.float32)),
+        )
+        hit = scene.ray_intersect_preliminary(ray)
+        own = mi.Bool(False)
+        for shape in objects:
+            own |= hit.shape == mi.ShapePtr(shape)
+        hidden = np.array(hit.is_valid() & ~own) & (np.array(hit.t) < distance - region.radius)
+    if hidden.any():
+        raise InputError(
+            f"{file}: --distance: something is between {int(hidden.sum())} of {len(poses)} cameras and "
+            f"the object, at {distance[hidden].min():.4g} … {distance[hidden].max():.4g}; give a shorter "
+            "distance, or another --elevation"
+        )
+
+
+def write_views(
+    output: OutputFolder,
+    part: str,
+    splits: Sequence[str],
+    cameras: Cameras,
+    tracer: Tracer,
+    maps: bool,
+    progress: bool,
+) -> None:
+    """Write the environment map, the views, and then the transforms of some splits; `maps`: also the maps.
+
+    `part` is the folder of the files, "" or "relight/NAME/".
+    """
+    out = output.path / part
+    endings = (".png", ".exr", *(f"_{name}.exr" for name in MAPS if maps))
+    views = [f"{split}/r_{i:03d}" for split in splits for i, _ in enumerate(cameras.of(split))]
+    files = ["environment.exr", *(f"transforms_{split}.json" for split in splits)]
+    output.claim(*(f"{part}{file}" for file in (*files, *(view + end for view in views for end in endings))))
+    light, height = out / "environment.exr", cameras.settings.environment_height
+    known = tracer.scene.environment() is not None and not cameras.objects  # see the head of this file
+    if height and known and not light.exists():
+        write_exr(light, environment_image(tracer.scene, height))
+    jobs = [(f"{split}/r_{i:03d}", *job) for split in splits for i, job in enumerate(cameras.of(split))]
+    for name, pose, seed in with_bar(jobs, f"dataset {out.name}", unit="view", disable=not progress):
+        _trace_view(tracer, out / name, pose, seed, maps)
+    for split in splits:
+        frames = [_frame(split, i, pose, maps) for i, (pose, _) in enumerate(cameras.of(split))]
+        write_json(out / f"transforms_{split}.json", _transforms(cameras.settings, frames))
+
+
+def _trace_view(tracer: Tracer, stem: Path, pose: np.ndarray, seed: int, maps: bool) -> None:
+    """Trace the missing and broken files of a view."""
+    if _whole(read_png, f"{stem}.png") and _whole(read_exr, f"{stem}.exr"):
+        rgba = None
+    else:
+        rgba = tracer.image(pose, seed)
+        write_exr(f"{stem}.exr", rgba)
+        write_png(f"{stem}.png", straight_srgb(rgba) if rgba.shape[-1] == 4 else srgb_from_linear(rgba))
+    files = {name: f"{stem}_{name}.exr" for name in MAPS} if maps else {}
+    missing = [name for name, file in files.items() if not _whole(read_exr, file)]
+    if missing:
+        image = read_exr_image(f"{stem}.exr") if rgba is None else rgba
+        found = tracer.maps(pose, image[..., -1] > 0 if image.shape[-1] == 4 else np.array(True))
+        for name in missing:
+            write_exr(files[name], found[name], names=MAPS[name])
+
+
+def _whole(read: Callable[[str], object], file: str) -> bool:
+    """Whether a file exists and can be read."""
+    try:
+        read(file)
+    except InputError:
+        return False
+    return True
+
+
+def _frame(split: str, index: int, pose: np.ndarray, maps: bool) -> dict[str, Any]:
+    stem = f"./{split}/r_{index:03d}"
+    return {
+        "file_path": stem,
+        "exr_path": f"{stem}.exr",
+        **({f"{name}_path": f"{stem}_{name}.exr" for name in MAPS} if maps else {}),
+        "transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist(),
+    }
+
+
+def _transforms(settings: Settings, frames: list[dict[str, Any]]) -> dict[str, Any]:
+    width, height = settings.resolution
+    return {**pinhole(width, height, settings.focal), "frames": frames}

@@ -1,30 +1,33 @@
-"""Path tracing around a Mitsuba scene: its size, camera poses, one view, the environment."""
+"""Path tracing of views of a Mitsuba scene: its size, cameras, images and maps, the environment map."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mi_refgs.constants import GOLDEN_ANGLE
+from mi_refgs.data.poses import poses_around
 from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
 from mi_refgs.shade.light import lobe_matrices
-from mi_refgs.synthesis.materials import materials_at
+from mi_refgs.synthesis.ground_truth import materials_at
+from mi_refgs.synthesis.settings import Settings
 
 SAMPLES_PER_LAUNCH = 1 << 24
-"""Largest number of paths traced at once; the path tracer keeps about 100 bytes for each."""
+"""Largest number of paths per launch; the path tracer keeps about 100 bytes for each."""
 SURFACE_SAMPLES = 4096
-"""Points on each shape that measure the scene's size; the farthest is found to about 1 %."""
+"""Points per shape that measure the scene's size; the farthest is found to about 1 %."""
 ENVIRONMENT_OVERSAMPLING = 4
-"""Directions per texel and axis of an environment that is turned, so that a small sun keeps its energy."""
+"""Directions per texel and axis of a rotated environment map, so that a small sun keeps its energy."""
 MAPS = {"normal": "XYZ", "depth": "Y", "albedo": "RGBA", "roughness": "YA", "metallic": "YA"}
 """Channels of the maps of a view; A is 1 where the BSDF defines the material, 0 where it does not."""
 
 
 def bounding_sphere(shapes: Sequence[Any]) -> tuple[np.ndarray, float]:
-    """Centre (3,) of the shapes' bounding box, and the radius around it that holds every surface."""
+    """Centre (3,) of the shapes' bounding box, and the radius around it that contains every surface."""
     boxes = [shape.bbox() for shape in shapes]
     low = np.min([np.array(box.min, dtype=np.float64) for box in boxes], axis=0)
     high = np.max([np.array(box.max, dtype=np.float64) for box in boxes], axis=0)
@@ -33,7 +36,7 @@ def bounding_sphere(shapes: Sequence[Any]) -> tuple[np.ndarray, float]:
 
 
 def reach(shapes: Sequence[Any], centre: np.ndarray) -> float:
-    """The radius around a centre (3,) that holds every surface of the shapes."""
+    """The radius around a centre (3,) that contains every surface of the shapes."""
     import drjit as dr
     import mitsuba as mi
 
@@ -58,9 +61,8 @@ def camera_poses(
 ) -> np.ndarray:
     """World-from-camera matrices (count, 4, 4) in Mitsuba's frame that look at `centre`, z up.
 
-    A spherical Fibonacci lattice over the band of elevations (degrees): equal areas, turned by a random
-    azimuth and jittered by a third of its spacing. Each camera's distance from the centre is uniform between
-    the two given.
+    A spherical Fibonacci lattice over the band of elevations (degrees): equal areas, rotated by a random
+    azimuth and jittered by a third of its spacing. Distances from the centre are uniform between the two.
     """
     low, high = (math.sin(math.radians(e)) for e in elevation)
     jitter = rng.uniform(-1 / 3, 1 / 3, (count, 2))
@@ -72,23 +74,12 @@ def camera_poses(
     return poses_around(outward, centre, rng.uniform(*distance, (count, 1)))
 
 
-def poses_around(outward: np.ndarray, centre: np.ndarray, distance: float | np.ndarray) -> np.ndarray:
-    """World-from-camera matrices (N, 4, 4) in Mitsuba's frame, z up, that look at `centre` from unit
-    `outward` (N, 3) directions, none of them ±z; `distance` is one, or (N, 1)."""
-    left = np.cross([0.0, 0.0, 1.0], -outward)
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
-    up = np.cross(-outward, left)
-    poses = np.tile(np.eye(4), (len(outward), 1, 1))
-    poses[:, :3, :] = np.stack([left, up, -outward, centre + distance * outward], axis=2)
-    return poses
-
-
 def environment_image(scene: Any, height: int) -> np.ndarray:
     """Radiance (height, 2·height, 3) of the scene's environment, on the grid of Mitsuba's `envmap`.
 
-    Shown by an `envmap` with an identity `to_world` it is the same light: first row at +y, last at -y;
-    column 0 beside −z, turning to +x. An `envmap` of this size that is not turned comes back unchanged; what
-    is finer is averaged (`shade.lobe_matrices.resample`).
+    An `envmap` with an identity `to_world` shows the same radiance: first row at +y, last at -y; column 0
+    beside −z, turning to +x. An `envmap` of this size that is not rotated is returned unchanged; finer ones
+    are averaged (`shade.lobe_matrices.resample`).
     """
     import drjit as dr
     import mitsuba as mi
@@ -106,7 +97,7 @@ def environment_image(scene: Any, height: int) -> np.ndarray:
     theta = (index // columns) * (dr.pi / (rows - 1))
     si = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
     si.wi = -mi.Vector3f(dr.sin(theta) * dr.sin(phi), dr.cos(theta), -dr.sin(theta) * dr.cos(phi))
-    # A constant emitter answers with one value for all directions.
+    # A constant emitter returns one value for all directions.
     radiance = np.array(emitter.eval(si) + dr.zeros(mi.Float, rows * columns))
     image = lobe_matrices.resample(radiance.T.reshape(rows, columns, 3), height)
     image[[0, -1]] = image[[0, -1]].mean(axis=1, keepdims=True)  # a pole is one point
@@ -116,9 +107,9 @@ def environment_image(scene: Any, height: int) -> np.ndarray:
 class Tracer:
     """One sensor that moves from view to view, so that each kernel is compiled once.
 
-    `size` is width and height, `fov` that of the shorter side in degrees. Pictures have alpha, and emitters
-    are hidden, unless `objects` name shapes of an open scene: then pictures show all, and maps are of those
-    shapes.
+    `size` is width and height, `fov` that of the shorter side in degrees. Images have alpha, and emitters are
+    hidden, unless `objects` are shapes of an open scene: then images show everything, and maps are of those
+    shapes only.
     """
 
     def __init__(
@@ -166,8 +157,8 @@ class Tracer:
         )
         self.params = mi.traverse(self.sensor)
 
-    def picture(self, pose: np.ndarray, seed: int) -> np.ndarray:
-        """Premultiplied linear RGBA (H, W, 4) of one view; of an open scene RGB (H, W, 3)."""
+    def image(self, pose: np.ndarray, seed: int) -> np.ndarray:
+        """Premultiplied linear RGBA (H, W, 4) of one view; RGB (H, W, 3) of an open scene."""
         import drjit as dr
         import mitsuba as mi
 
@@ -183,10 +174,10 @@ class Tracer:
         return image
 
     def maps(self, pose: np.ndarray, covered: np.ndarray) -> dict[str, np.ndarray]:
-        """The maps of MAPS at the pixels' centres, where `covered` (H, W): hidden lamps have none.
+        """The maps of MAPS at pixel centres, where `covered` (H, W), which excludes hidden emitters.
 
-        Of an open scene only where one of its objects is seen. A mean over a pixel at an edge would belong to
-        no surface.
+        Maps of an open scene are those of its objects. They are not averaged per pixel: a mean across an edge
+        would belong to no surface.
         """
         import drjit as dr
         import mitsuba as mi
@@ -217,8 +208,10 @@ class Tracer:
         return {name: np.where(hit[..., None], array, 0) for name, array in found.items()}
 
     def points(self, pose: np.ndarray, film: np.ndarray) -> np.ndarray:
-        """What a view shows at positions (N, 2) on its film, 0 … 1 from the upper left: world points (N, 3),
-        NaN where it shows nothing."""
+        """World points (N, 3) that a view shows at film positions (N, 2), 0 … 1 from the upper left.
+
+        NaN where it shows none.
+        """
         import drjit as dr
         import mitsuba as mi
 
@@ -239,3 +232,48 @@ class Tracer:
 
         self.params["to_world"] = mi.ScalarTransform4f(pose)
         self.params.update()
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """The cameras of a data set around the bounding sphere of its object."""
+
+    settings: Settings
+    centre: np.ndarray
+    radius: float
+    reach: float  # radius around the centre that contains all shapes
+    objects: Sequence[Any] = ()  # the object's shapes in an open scene
+
+    @property
+    def distance(self) -> tuple[float, float]:
+        """Distance from the centre to the nearest and the farthest camera."""
+        filling = self.radius / (self.settings.fill * math.sin(math.radians(self.settings.fov) / 2))
+        near, far = self.settings.distance
+        return near or filling, far or filling
+
+    def tracer(self, scene: Any) -> Tracer:
+        """The path tracer of the scene's views."""
+        s, (low, high) = self.settings, self.distance
+        near, far = 0.1 * (low - self.radius), 10 * (high + self.reach)
+        return Tracer(
+            scene,
+            size=s.resolution,
+            fov=s.fov,
+            spp=s.spp,
+            max_depth=s.max_depth,
+            near=near,
+            far=far,
+            objects=self.objects,
+        )
+
+    def of(self, split: str) -> list[tuple[np.ndarray, int]]:
+        """Pose and seed of each view of a split.
+
+        Random streams are independent: one per split for the cameras, one per view for its paths.
+        """
+        s, index = self.settings, ("train", "test").index(split)
+        rng = np.random.default_rng([s.seed, index])
+        count = s.test_views if index else s.views
+        poses = camera_poses(count, self.centre, self.distance, s.elevation, rng)
+        streams = (np.random.SeedSequence([s.seed, index, i]) for i in range(count))
+        return [(p, int(stream.generate_state(1)[0])) for p, stream in zip(poses, streams, strict=True)]

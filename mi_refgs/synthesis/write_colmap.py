@@ -1,8 +1,8 @@
-"""A path-traced data set as COLMAP's text files: `images/`, and `sparse/0/` with true cameras and points.
+"""A path-traced data set as COLMAP's text files: `images/`, and `sparse/0/` with exact cameras and points.
 
-Pictures are named by number so that every eighth is a test view, the share that readers of COLMAP hold out,
-for as long as there are test views; `sparse/0/test.txt` lists all of them. Points are places on surfaces
-whose colour is the same in the views that see them, as structure from motion finds them: mirrors have few.
+Images are numbered so that every eighth is a test view, as readers of COLMAP split them, while there are test
+views; `sparse/0/test.txt` lists all of them. Points are surface points of equal colour in the views that see
+them, as structure from motion finds them: mirrors have few.
 """
 
 from __future__ import annotations
@@ -19,25 +19,24 @@ from mi_refgs.data.region import REGION_FILE
 from mi_refgs.io.files import replace_file
 from mi_refgs.io.images import read_png
 from mi_refgs.io.ownership import OutputFolder
-from mi_refgs.synthesis.pathtrace import Tracer
-from mi_refgs.synthesis.write_views import Cameras
+from mi_refgs.synthesis.pathtrace import Cameras, Tracer
 
 CANDIDATES = 40_000
-"""Places on surfaces that are drawn; those of one colour become points."""
+"""Surface points that are sampled; those of equal colour are kept."""
 POINT_VIEWS = 4
-"""Views of a point's track at most."""
+"""Largest track length of a point."""
 SAME_COLOUR = 0.04
-"""Largest standard deviation of a point's encoded colour over the views of its track: three times what the
-noise of 64 samples a pixel is."""
+"""Largest standard deviation of a point's encoded colour over the views of its track: three times the noise
+of 64 samples per pixel."""
 SAME_PLACE = 1e-3
-"""Difference of depths, as part of them, within which a view sees a place and nothing before it."""
+"""Largest relative difference of depths for which a view sees a point and nothing in front of it."""
 
 
 def colmap_output(folder: Path, data: Path, cameras: Cameras) -> OutputFolder:
-    """Claim the COLMAP files of the data set in `data`; raises InputError where a foreign one is there."""
+    """Claim the COLMAP files of the data set in `data`; raises InputError if a foreign file is in the way."""
     output = OutputFolder(folder, f"colmap of {data.resolve()}")
     sparse = (f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D", "test"))
-    output.claim(*sparse, REGION_FILE, *(f"images/{file}" for file in _pictures(_order(cameras)[0])))
+    output.claim(*sparse, REGION_FILE, *(f"images/{file}" for file in _files(_order(cameras)[0])))
     return output
 
 
@@ -46,16 +45,16 @@ def write_colmap(output: OutputFolder, data: Path, cameras: Cameras, tracer: Tra
     folder = output.path
     names, poses, tests = _order(cameras)
     sparse, images = folder / "sparse" / "0", folder / "images"
-    pictures = _pictures(names)
-    for name, picture in zip(names, pictures, strict=True):
-        _copy(data / f"{name}.png", images / picture)
+    files = _files(names)
+    for name, file in zip(names, files, strict=True):
+        _copy(data / f"{name}.png", images / file)
     settings = cameras.settings
     (width, height), focal = settings.resolution, settings.focal
-    shown = np.stack([read_png(images / picture)[..., :3] for picture in pictures])
+    shown = np.stack([read_png(images / file)[..., :3] for file in files])
     points, colours, tracks, places = _points(shown, poses, tracer, focal, settings.seed)
 
     write_cameras(sparse, [((width, height, focal, focal, width / 2, height / 2), None)])
-    seen: list[list[str]] = [[] for _ in pictures]
+    seen: list[list[str]] = [[] for _ in files]
     rows = []
     for i, (point, colour) in enumerate(zip(points, colours, strict=True)):
         track = []
@@ -65,18 +64,18 @@ def write_colmap(output: OutputFolder, data: Path, cameras: Cameras, tracer: Tra
         r, g, b = np.round(255 * colour).astype(int)
         rows.append(f"{i + 1} {' '.join(f'{c:.6f}' for c in point)} {r} {g} {b} 0 {' '.join(track)}")
     write_points(sparse, rows)
-    write_images(sparse, pictures, poses, [1] * len(pictures), [" ".join(places) for places in seen])
-    write_test_list(sparse, [pictures[i] for i in tests])
+    write_images(sparse, files, poses, [1] * len(files), [" ".join(places) for places in seen])
+    write_test_list(sparse, [files[i] for i in tests])
     if (data / REGION_FILE).is_file():
         _copy(data / REGION_FILE, folder / REGION_FILE)
 
 
-def _pictures(names: Sequence[str]) -> list[str]:
+def _files(names: Sequence[str]) -> list[str]:
     return [f"{i:04d}.png" for i in range(len(names))]
 
 
 def _order(cameras: Cameras) -> tuple[list[str], np.ndarray, list[int]]:
-    """Names without ending and poses (N, 4, 4) of all views, and the places of the test views among them."""
+    """Names without ending and poses (N, 4, 4) of all views, and the indices of the test views among them."""
     views = {s: [(f"{s}/r_{i:03d}", p) for i, (p, _) in enumerate(cameras.of(s))] for s in ("train", "test")}
     total = sum(map(len, views.values()))
     left, ordered, tests = {s: iter(v) for s, v in views.items()}, [], []
@@ -94,7 +93,7 @@ def _order(cameras: Cameras) -> tuple[list[str], np.ndarray, list[int]]:
 def _points(
     shown: np.ndarray, poses: np.ndarray, tracer: Tracer, focal: float, seed: int
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]:
-    """Points (P, 3), encoded colours (P, 3), and of each point the views that see it and where, in pixels."""
+    """Points (P, 3), encoded colours (P, 3), and per point the views of its track and its pixels there."""
     count, height, width = shown.shape[:3]
     rng = np.random.default_rng(seed)
     share = -(-CANDIDATES // count)

@@ -87,7 +87,7 @@ from pathlib import Path
 import mi_refgs, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 dr.set_thread_count(1)
-from mi_refgs.synthesis.scene_file import load_scene
+from mi_refgs.synthesis.settings import load_scene
 from mi_refgs.io.exr import mitsuba_exr
 from mi_refgs.shade.light.envmap import EnvironmentLight
 folder = Path(sys.argv[1])

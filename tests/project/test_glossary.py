@@ -124,7 +124,6 @@ NOT_CLEAN_YET = {
     "mi_refgs/shade",
     "mi_refgs/splat",
     "mi_refgs/surfels",
-    "mi_refgs/synthesis",
     "mi_refgs/viewer",
     "scenes/make_lights.py",
     "scenes/make_meshes.py",

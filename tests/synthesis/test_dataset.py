@@ -23,7 +23,7 @@ from mi_refgs.io.ownership import RECORD
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis import pathtrace
 from mi_refgs.synthesis.make_dataset import make_dataset
-from mi_refgs.synthesis.scene_file import load_scene, under_light
+from mi_refgs.synthesis.settings import load_scene, under_light
 from tests.helpers import read_loaded
 from tests.scenes.integrator import sky
 from tests.scenes.sphere import CENTRE, RADIUS, SCENE
@@ -180,13 +180,13 @@ def test_cameras_are_seeded_and_spread() -> None:
 def traced(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Seeds of the pictures that are path-traced from now on."""
     seeds: list[int] = []
-    picture = pathtrace.Tracer.picture
+    image = pathtrace.Tracer.image
 
     def counted(self: pathtrace.Tracer, pose: np.ndarray, seed: int) -> np.ndarray:
         seeds.append(seed)
-        return picture(self, pose, seed)
+        return image(self, pose, seed)
 
-    monkeypatch.setattr(pathtrace.Tracer, "picture", counted)
+    monkeypatch.setattr(pathtrace.Tracer, "image", counted)
     return seeds
 
 
@@ -241,11 +241,11 @@ def test_passes_average(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = mi.load_string(SCENE)
     pose = pathtrace.camera_poses(1, CENTRE, (3.0, 3.0), (0, 30), np.random.default_rng(0))[0]
     options: dict[str, Any] = {"size": (8, 8), "fov": 30, "spp": 64, "max_depth": 3, "near": 0.1, "far": 50}
-    whole = pathtrace.Tracer(scene, **options).picture(pose, 5)
+    whole = pathtrace.Tracer(scene, **options).image(pose, 5)
     monkeypatch.setattr(pathtrace, "SAMPLES_PER_LAUNCH", 8 * 8 * 16)
     split = pathtrace.Tracer(scene, **options)
     assert (split.passes, split.spp) == (4, 16)
-    np.testing.assert_allclose(split.picture(pose, 5).mean(), whole.mean(), rtol=0.02)
+    np.testing.assert_allclose(split.image(pose, 5).mean(), whole.mean(), rtol=0.02)
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.occlusion.mesh import read_mesh
+from mi_refgs.synthesis.ground_truth import materials_at
 from mi_refgs.synthesis.make_dataset import make_dataset
-from mi_refgs.synthesis.materials import materials_at
 from tests.helpers import read_loaded
 
 BASE = (0.2, 0.5, 0.8)

@@ -16,8 +16,7 @@ from mi_refgs.cli import main
 from mi_refgs.data.region import read_region
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import read_png
-from mi_refgs.synthesis.make_dataset import make_dataset
-from mi_refgs.synthesis.open_scene import REGION_MARGIN
+from mi_refgs.synthesis.make_dataset import REGION_MARGIN, make_dataset
 from tests.helpers import read_loaded
 
 CENTRE, RADIUS = np.array([0.3, -0.2, 0.5]), 0.5
@@ -191,7 +190,7 @@ def test_every_eighth_picture_is_a_test_view(made: Path, tmp_path: Path) -> None
     [
         ({"objects": ["vase"]}, "--shapes: no shape has the id 'vase'.*ball, lamp, table, wall"),
         ({"distance": (0.55, 2.0)}, "--distance: 0.5.*inside of the region"),
-        ({"distance": (6.0, 6.0)}, "--distance: something stands between"),
+        ({"distance": (6.0, 6.0)}, "--distance: something is between"),
         ({"distance": (3.0, 2.0)}, "distance: .*out of range"),
         ({"relight": ["sun.exr"]}, "--relight"),
     ],

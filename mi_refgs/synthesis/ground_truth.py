@@ -1,4 +1,4 @@
-"""The materials that Mitsuba's BSDFs declare, at surface points: albedo, roughness, metallic.
+"""Ground truth from a Mitsuba scene: materials of its BSDFs at surface points, and its surface as a mesh.
 
 Which of them a BSDF defines follows from the names of its parameters (T: textures count):
 
@@ -9,47 +9,56 @@ Which of them a BSDF defines follows from the names of its parameters (T: textur
     eta, k                          F0 specular_reflectance         √α          1          (rough)conductor
     diffuse_reflectance             what the base reflects          √α          0          (rough)plastic
 
-Albedo is that of the shading here: what the diffuse base reflects of the light that reaches it, or a metal's
-F0. A plastic whose base is nonlinear multiplies the light inside by ρ (1 - Fᵢ) / (1 - ρ Fᵢ). α of an
-anisotropic metal is the geometric mean of both; a smooth interface has roughness 0. `diffuse` has no
-roughness: nothing shows it. `twosided`, `mask`, `bumpmap` and `normalmap` are what they hold, and a
-`blendbsdf` is the one that it shows alone. Anything else (glass, hair, measured, a `principled` that
-transmits) is unknown, and its maps have A = 0 there.
+Albedo is that of this project's shading: the reflectance of the diffuse base, or F0 of a metal. The base of a
+nonlinear plastic multiplies the light inside by ρ (1 - Fᵢ) / (1 - ρ Fᵢ). α of an anisotropic metal is the
+geometric mean of both; a smooth interface has roughness 0. The roughness of `diffuse` is undefined.
+`twosided`, `mask`, `bumpmap` and `normalmap` have the materials of their nested BSDF, a `blendbsdf` those of
+the one with all the weight. Everything else (glass, hair, measured, a `principled` that transmits) is
+unknown: A = 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
+import numpy as np
+import trimesh
+
 from mi_refgs.constants import MAX_NUMBER
+from mi_refgs.errors import InputError
+from mi_refgs.types import Bool, Color3f, Float
 
 OPAQUE = 1e-3
-"""Share of transmitted light, or of the other BSDF of a blend, below which a material counts as pure."""
+"""Fraction of transmitted light, or weight of the other BSDF of a blend, that is neglected."""
+SPHERE_SUBDIVISIONS = 5
+"""Subdivisions of an icosahedron: 20,480 triangles, whose centres are 1.5e-4 radii inside the sphere."""
+ROUND_SIDES = 256
+"""Sides of a circle: the centre of a side is 8e-5 radii inside it."""
 
 
 @dataclass(frozen=True)
 class Materials:
-    """Materials at points: (mi.Color3f or mi.Float, mi.Bool: defined there) each; values are 0 elsewhere."""
+    """Materials at points: each a value, 0 where undefined, and whether it is defined."""
 
-    albedo: tuple[Any, Any]
-    roughness: tuple[Any, Any]
-    metallic: tuple[Any, Any]
+    albedo: tuple[Color3f, Bool]
+    roughness: tuple[Float, Bool]
+    metallic: tuple[Float, Bool]
 
-    def where(self, mask: Any, other: Materials) -> Materials:
-        """These under the mask, the others elsewhere."""
+    def where(self, mask: Bool, other: Materials) -> Materials:
+        """These materials under the mask, the others elsewhere."""
         import drjit as dr
 
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return Materials(*((dr.select(mask, a[0], b[0]), dr.select(mask, a[1], b[1])) for a, b in pairs))
 
-    def only(self, mask: Any) -> Materials:
-        """These where they are under the mask, unknown elsewhere."""
+    def only(self, mask: Bool) -> Materials:
+        """These materials under the mask, unknown elsewhere."""
         return self.where(mask, unknown())
 
     def cleaned(self) -> Materials:
-        """Unknown where a value is not finite; the others in 0 … 1."""
+        """Unknown where a value is not finite; clipped to 0 … 1 elsewhere."""
         import drjit as dr
         import mitsuba as mi
 
@@ -63,7 +72,7 @@ class Materials:
 
 
 def unknown() -> Materials:
-    """Nothing is defined."""
+    """Materials that are undefined everywhere."""
     import mitsuba as mi
 
     nothing = (mi.Float(0), mi.Bool(False))
@@ -73,7 +82,7 @@ def unknown() -> Materials:
 def materials_at(scene: Any, si: Any) -> Materials:
     """Materials of the scene's shapes at their surface interactions `si`.
 
-    Instances of groups of shapes are unknown: their BSDFs are not the scene's.
+    Instances of shape groups are unknown: their BSDFs are not listed in the scene.
     """
     import mitsuba as mi
 
@@ -136,7 +145,7 @@ class _Parameters:
         return mi.Color3f(self.children[name].eval(self.si, self.active))
 
     def nested(self, name: str, si: Any = None) -> Materials:
-        """The materials of a BSDF that this one holds."""
+        """The materials of a nested BSDF."""
         return _of(self.children[name], self.si if si is None else si, self.active)
 
 
@@ -219,4 +228,66 @@ RULES: tuple[tuple[tuple[str, ...], Callable[[_Parameters], Materials]], ...] = 
     (("transmittance",), lambda p: unknown()),
     (("reflectance",), _diffuse),
 )
-"""What parameters a BSDF has, and what they mean; the first that fits."""
+"""Parameters of a BSDF → its materials; the first entry that fits."""
+
+
+def surface_mesh(shapes: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64 and faces (F, 3) of shapes of a scene, concatenated.
+
+    Spheres, disks and cylinders are tessellated with vertices on the surface. Raises InputError that names a
+    shape of any other kind but meshes.
+    """
+    vertices, faces, count = [], [], 0
+    for shape in shapes:
+        points, triangles = _triangles(shape)
+        vertices.append(points)
+        faces.append(triangles + count)
+        count += len(points)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _triangles(shape: Any) -> tuple[np.ndarray, np.ndarray]:
+    import mitsuba as mi
+
+    if shape.is_mesh():
+        points = np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+        return points, np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+    name = shape.class_name()
+    params = mi.traverse(shape)
+    if name not in UNIT_SHAPES or "to_world" not in params:
+        raise InputError(
+            f"shape '{shape.id()}': a {name} cannot be tessellated; use a mesh, sphere, disk or cylinder"
+        )
+    points, triangles = UNIT_SHAPES[name]()
+    matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    return points @ matrix[:3, :3].T + matrix[:3, 3], triangles
+
+
+def _sphere() -> tuple[np.ndarray, np.ndarray]:
+    ball = trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS)
+    return np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int64)
+
+
+def _circle() -> np.ndarray:
+    angle = 2 * np.pi * np.arange(ROUND_SIDES) / ROUND_SIDES
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros(ROUND_SIDES)], axis=1)
+
+
+def _disk() -> tuple[np.ndarray, np.ndarray]:
+    """The unit disk around the origin, across z."""
+    rim = np.arange(ROUND_SIDES)
+    fan = np.stack([np.full(ROUND_SIDES, ROUND_SIDES), rim, (rim + 1) % ROUND_SIDES], axis=1)
+    return np.concatenate([_circle(), np.zeros((1, 3))]), fan
+
+
+def _cylinder() -> tuple[np.ndarray, np.ndarray]:
+    """The open cylinder of radius 1 from z = 0 to z = 1."""
+    low, after = np.arange(ROUND_SIDES), (np.arange(ROUND_SIDES) + 1) % ROUND_SIDES
+    first = np.stack([low, after, after + ROUND_SIDES], axis=1)
+    second = np.stack([low, after + ROUND_SIDES, low + ROUND_SIDES], axis=1)
+    upper = _circle() + np.array([0, 0, 1])
+    return np.concatenate([_circle(), upper]), np.concatenate([first, second])
+
+
+UNIT_SHAPES = {"Sphere": _sphere, "Disk": _disk, "Cylinder": _cylinder}
+"""Tessellations of the unit shapes that Mitsuba transforms by `to_world`."""
