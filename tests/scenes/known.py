@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from mi_refgs.data.dataset import read_dataset
 from mi_refgs.io.exr import write_exr
 from mi_refgs.methods.read import load
 from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -102,6 +104,17 @@ def known_scene() -> TrainedScene:
     shading = Shading(diffuse="irradiance", occlusion=True)
     light = EnvironmentLight.from_radiance(sky(32))
     return TrainedScene(known_surfels(), light, known_mesh(), shading, 1, 0.0)
+
+
+def with_background(scene: TrainedScene, radiance: float | None = None) -> TrainedScene:
+    """The ball of metal as the object, the other as its background, before a map of constant radiance."""
+    raw = scene.surfels.to_numpy()
+    own = raw["position"][:, 0] < 0
+    geometry = ("position", "rotation", "scale", "opacity", "radiance_sh")
+    others = Surfels.from_numpy({name: raw[name][~own] for name in geometry})
+    behind = None if radiance is None else EnvironmentLight.constant(radiance, 8)
+    surfels = Surfels.from_numpy({name: table[own] for name, table in raw.items()})
+    return replace(scene, surfels=surfels, surroundings=Surroundings(others, behind))
 
 
 def write_known_run(data: Path, folder: Path, **shading: Any) -> Run:

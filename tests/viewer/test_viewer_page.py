@@ -30,22 +30,20 @@ from mi_refgs.editing import Change, Selection, apply, assignments, select
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.methods.read import load
-from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.pose import Pose
 from tests.helpers import ROOT
-from tests.scenes.known import known_scene, other_sky
+from tests.scenes.known import known_scene, other_sky, with_background
 from tests.scenes.tiny import train_command, write_data, write_method
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 WINDOW = {"width": 760, "height": 420}
-"""Small: browser and viewer draw on the same processor. The picture is as wide as it is high."""
+"""Small: browser and viewer draw on the same processor. The image is as wide as it is high."""
 SMALL = "200²"
 """Pixels at rest."""
 PATIENCE = 45.0
@@ -112,11 +110,11 @@ class Tab:
         page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda error: self.errors.append(str(error)))
         page.goto(url)
-        # Messages may lie over the picture, such as that on WebGL in software.
+        # Messages may cover the image, such as that on WebGL in software.
         page.add_style_tag(content=".mantine-Notifications-root { visibility: hidden }")
 
     def canvas(self) -> np.ndarray:
-        """What the canvas shows, (H, W, 3), without the edges, which other things may cover."""
+        """The canvas (H, W, 3) without its edges, which other things may cover."""
         box = self.page.locator("canvas").first.bounding_box()
         clip = {
             "x": box["x"] + 0.3 * box["width"],
@@ -131,18 +129,26 @@ class Tab:
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             self.page.wait_for_timeout(50)
-            if done(picture := self.canvas()):
-                return picture
+            if done(image := self.canvas()):
+                return image
         raise AssertionError(f"not within {PATIENCE} s: {what}")
 
+    def differs(self, before: np.ndarray, mean: float, what: str) -> np.ndarray:
+        """Wait until the canvas differs by more than `mean` on average."""
+        return self.until(lambda image: bool(np.abs(image - before).mean() > mean), what)
+
+    def returns(self, before: np.ndarray, what: str) -> np.ndarray:
+        """Wait until the canvas is as before."""
+        return self.until(lambda image: bool(np.abs(image - before).mean() < 0.5), what)
+
     def still(self) -> np.ndarray:
-        """The canvas once the picture is smooth and stays."""
+        """The canvas once the image is supersampled and stays."""
         self.page.get_by_text(re.compile(r"× \d+, 16 per pixel")).wait_for(timeout=1000 * PATIENCE)
         before, same = self.canvas(), 0
         for _ in range(200):
             self.page.wait_for_timeout(100)
             same = same + 1 if np.array_equal(now := self.canvas(), before) else 0
-            if same == 3:  # a busy browser takes its time to decode a picture
+            if same == 3:  # a busy browser takes its time to decode an image
                 return now
             before = now
         raise AssertionError("the canvas does not come to rest")
@@ -206,12 +212,12 @@ def server(known_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     saved = tmp_path_factory.mktemp("saved")
     running = Server("view", known_run, "--port", "0", "-o", saved)
     yield running, saved
-    assert "pictures shown" in running.stop()
+    assert "images displayed" in running.stop()
 
 
 @pytest.fixture(scope="module")
 def opened(server: tuple[Server, Path], chromium: Any) -> Iterator[Tab]:
-    """A page of it with small pictures, which 16 samples of take less time."""
+    """A page of it with small images, of which 16 samples take less time."""
     page = chromium.new_page(viewport=WINDOW)
     tab = Tab(page, server[0].url)
     tab.choose("Still", SMALL)
@@ -230,16 +236,10 @@ def tab(opened: Tab) -> Iterator[Tab]:
 def photographed(
     scene: TrainedScene, known_run: Path, chromium: Any, tmp_path: Path
 ) -> Iterator[tuple[Tab, Path]]:
-    """A page of a run whose second ball is what surrounds the first, and the folder that it saves into."""
-    raw = scene.surfels.to_numpy()
-    own = raw["position"][:, 0] < 0
-    geometry = ("position", "rotation", "scale", "opacity", "radiance_sh")
-    around = Surfels.from_numpy({name: raw[name][~own] for name in geometry})
-    surfels = Surfels.from_numpy({name: table[own] for name, table in raw.items()})
-    behind = Surroundings(around, EnvironmentLight.constant(0.2, 8))
+    """A page of a run whose second ball is the first one's background, and the folder of its saved views."""
     run = shutil.copytree(known_run, tmp_path / "run")
     camera = Pose(np.eye(4), 0.7, 1.0).camera(8, 8)
-    export(replace(scene, surfels=surfels, surroundings=behind), run, camera)
+    export(with_background(scene, 0.2), run, camera)
     (tmp_path / "saved").mkdir()
     running = Server("view", run, "--port", "0", "-o", tmp_path / "saved")
     page = chromium.new_page(viewport=WINDOW)
@@ -253,7 +253,7 @@ def photographed(
 
 
 def saved_view(folder: Path, suffix: str, before: set[Path]) -> Path:
-    """The picture that appears beside those of before, with its camera."""
+    """The image that appears beside those of before, with its camera."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         new = set(folder.iterdir()) - before
@@ -265,7 +265,7 @@ def saved_view(folder: Path, suffix: str, before: set[Path]) -> Path:
 
 
 def camera_of(path: Path) -> Camera:
-    """The camera that lies beside a saved picture."""
+    """The camera beside a saved image."""
     content = json.loads(path.with_suffix(".json").read_text())
     to_world = np.array(content["frames"][0]["transform_matrix"]) @ np.diag([-1.0, 1, -1, 1])
     near = 0.0
@@ -279,17 +279,17 @@ def rendered(scene: TrainedScene, camera: Camera) -> np.ndarray:
     return image_array([*frame.radiance, frame.alpha], camera.height, camera.width)
 
 
-def test_the_page_shows_the_object_and_the_light_turns_on_it(tab: Tab) -> None:
-    tab.until(lambda picture: float(picture.std()) > 10, "a picture")
+def test_the_page_displays_the_object_and_rotates_its_light(tab: Tab) -> None:
+    tab.until(lambda image: float(image.std()) > 10, "an image")
     before = tab.still()
     assert len(np.unique(before.reshape(-1, 3), axis=0)) > 500
     tab.type("Turn", "120")
-    tab.until(lambda picture: bool(np.abs(picture - before).mean() > 5), "another light")
+    tab.differs(before, 5, "another light")
     tab.press("Estimated environment map")
-    tab.until(lambda picture: bool(np.abs(picture - before).mean() < 0.5), "the light as it was")
+    tab.returns(before, "the light as it was")
 
 
-def test_the_roughness_slider_shows_and_saves_the_edited_scene(
+def test_the_roughness_slider_displays_and_saves_the_edited_scene(
     tab: Tab, scene: TrainedScene, server: tuple[Server, Path]
 ) -> None:
     folder = server[1]
@@ -297,7 +297,7 @@ def test_the_roughness_slider_shows_and_saves_the_edited_scene(
     tab.type("Where", "metallic > 0.5")
     tab.page.get_by_text("3,000 of 6,000 surfels").wait_for(timeout=1000 * PATIENCE)
     tab.type("Roughness", "0.9")
-    tab.until(lambda picture: bool(np.abs(picture - before).mean() > 0.5), "rough metal")
+    tab.differs(before, 0.5, "rough metal")
     known = set(folder.iterdir())
     tab.press("EXR")
     path = saved_view(folder, ".exr", known)
@@ -308,13 +308,13 @@ def test_the_roughness_slider_shows_and_saves_the_edited_scene(
     assert unlike.max() > 0.1
     assert like.max() < 0.02 and like.mean() < 1e-5  # files keep fewer digits of camera, light and channels
     tab.press("As fitted")
-    tab.until(lambda picture: bool(np.abs(picture - before).mean() < 0.5), "the scene as it was")
+    tab.returns(before, "the scene as it was")
     tab.type("Where", "")
     tab.page.get_by_text("6,000 of 6,000 surfels").wait_for(timeout=1000 * PATIENCE)
 
 
-def test_a_selection_that_is_none_is_one_sentence_on_the_page(tab: Tab) -> None:
-    """Below the field, where it may come and go while one types; no message covers the picture."""
+def test_a_bad_selection_is_one_sentence_on_the_page(tab: Tab) -> None:
+    """Below the field, where it may come and go while one types; no message covers the image."""
     for text, said in (("metallic > ", "a name or a number is missing"), ("x < {", "'{' is not allowed")):
         tab.type("Where", text)
         tab.page.get_by_text(said).wait_for(timeout=1000 * PATIENCE)
@@ -324,17 +324,17 @@ def test_a_selection_that_is_none_is_one_sentence_on_the_page(tab: Tab) -> None:
     tab.page.get_by_text("6,000 of 6,000 surfels", exact=True).wait_for(timeout=1000 * PATIENCE)
 
 
-def test_another_variable_is_shown_and_saved(tab: Tab, server: tuple[Server, Path]) -> None:
+def test_an_aov_is_displayed_and_saved(tab: Tab, server: tuple[Server, Path]) -> None:
     before = tab.still()
     tab.choose("Show", "normal")
-    picture = tab.until(lambda picture: bool(np.abs(picture - before).mean() > 5), "normals")
+    image = tab.differs(before, 5, "normals")
     known = set(server[1].iterdir())
     tab.press("PNG")
     path = saved_view(server[1], ".png", known)
     png = np.asarray(Image.open(path).convert("RGB"), np.int16)
-    assert png.std() > 10 and picture.std() > 10
+    assert png.std() > 10 and image.std() > 10
     tab.choose("Show", "image")
-    tab.until(lambda picture: bool(np.abs(picture - before).mean() < 0.5), "the picture")
+    tab.returns(before, "the image")
 
 
 @pytest.mark.slow
@@ -345,7 +345,7 @@ def test_a_light_is_uploaded(
     write_exr(tmp_path / "dusk.exr", other_sky())
     tab.row("Map has world directions").check(force=True)
     tab.page.locator("input[type=file]").set_input_files(tmp_path / "dusk.exr")
-    tab.until(lambda picture: bool(np.abs(picture - before).mean() > 1), "another light")
+    tab.differs(before, 1, "another light")
     known = set(server[1].iterdir())
     tab.press("EXR")
     path = saved_view(server[1], ".exr", known)
@@ -356,7 +356,7 @@ def test_a_light_is_uploaded(
 
 
 @pytest.mark.slow
-def test_a_file_that_is_dropped_onto_the_page_becomes_the_light(tab: Tab, tmp_path: Path) -> None:
+def test_a_file_dropped_onto_the_page_becomes_the_light(tab: Tab, tmp_path: Path) -> None:
     before = tab.still()
     write_exr(tmp_path / "dusk.exr", other_sky())
     content = list((tmp_path / "dusk.exr").read_bytes())
@@ -369,12 +369,12 @@ def test_a_file_that_is_dropped_onto_the_page_becomes_the_light(tab: Tab, tmp_pa
         }""",
         content,
     )
-    tab.until(lambda picture: bool(np.abs(picture - before).mean() > 1), "another light")
+    tab.differs(before, 1, "another light")
     tab.press("Estimated environment map")
 
 
 @pytest.mark.slow
-def test_orbiting_moves_the_object_and_test_views_stand_beside_it(tab: Tab) -> None:
+def test_orbiting_moves_the_object_and_test_views_are_beside_it(tab: Tab) -> None:
     before = tab.still()
     box = tab.page.locator("canvas").first.bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -383,60 +383,60 @@ def test_orbiting_moves_the_object_and_test_views_stand_beside_it(tab: Tab) -> N
     for step in range(12):
         tab.page.mouse.move(x + 12 * step, y + 3 * step)
     tab.page.mouse.up()
-    tab.until(lambda picture: bool(np.abs(picture - before).mean() > 3), "another side")
+    tab.differs(before, 3, "another side")
     tab.page.get_by_text("Test views", exact=True).click()
     tab.press("next")
     tab.page.get_by_text(re.compile(r"PSNR [\d.]+ dB")).wait_for(timeout=1000 * PATIENCE)
-    tab.until(lambda picture: bool((picture == round(255 * 0.12)).mean() > 0.02), "two pictures")
+    tab.until(lambda image: bool((image == round(255 * 0.12)).mean() > 0.02), "two images")
     tab.press("leave")
-    tab.until(lambda picture: not (picture == round(255 * 0.12)).mean() > 0.02, "one picture")
+    tab.until(lambda image: not (image == round(255 * 0.12)).mean() > 0.02, "one image")
 
 
 @pytest.mark.slow
 def test_overlays_are_drawn(tab: Tab) -> None:
     before = tab.still()
     tab.row("Cameras").first.check(force=True)
-    tab.until(lambda picture: bool(np.abs(picture - before).max() > 50), "cameras")
+    tab.until(lambda image: bool(np.abs(image - before).max() > 50), "cameras")
     tab.row("Cameras").first.uncheck(force=True)
     tab.row("Mesh").first.check(force=True)
-    tab.until(lambda picture: bool(np.abs(picture - before).mean() > 1), "the mesh")
+    tab.differs(before, 1, "the mesh")
     tab.row("Mesh").first.uncheck(force=True)
 
 
 @pytest.mark.slow
-def test_a_photographed_object_is_shown_in_its_surroundings_first_then_alone(
+def test_a_photographed_object_is_displayed_with_background_then_without(
     photographed: tuple[Tab, Path],
 ) -> None:
     tab, folder = photographed
-    left = np.s_[:, :40]  # where nothing but the surroundings is seen
+    left = np.s_[:, :40]  # where only the background is visible
     before = tab.still()
     assert (before[left] == 124).all(axis=2).any()  # 0.2 as sRGB
     assert (np.abs(before[left] - 124).max(axis=2) > 20).any()
     tab.row("Mesh").first.check(force=True)
-    tab.until(lambda picture: bool(np.abs(picture - before)[left].max() > 20), "the whole mesh")
+    tab.until(lambda image: bool(np.abs(image - before)[left].max() > 20), "the whole mesh")
     tab.choose("Backdrop", "black")
-    alone = tab.until(lambda picture: bool(picture[left].max() == 0), "the object and its part of the mesh")
+    alone = tab.until(lambda image: bool(image[left].max() == 0), "the object and its part of the mesh")
     assert alone.max() > 100
     known = set(folder.iterdir())
     tab.press("EXR")
     assert read_exr_image(saved_view(folder, ".exr", known))[..., 3].min() == 0
     tab.row("Mesh").first.uncheck(force=True)
     tab.choose("Backdrop", "background")
-    tab.until(lambda picture: bool(np.abs(picture - before).mean() < 0.5), "the surroundings")
+    tab.returns(before, "the background")
 
 
 @pytest.mark.slow
-def test_a_fit_is_watched_while_it_runs(chromium: Any, tmp_path: Path) -> None:
+def test_a_running_fit_is_displayed(chromium: Any, tmp_path: Path) -> None:
     data, method = write_data(tmp_path / "data"), write_method(tmp_path)
     command = train_command(data, tmp_path / "run", method, "--watch", "--port", "0")
     running = Server(*command, "iterations=1000000", "checkpoint_every=100000")
     page = chromium.new_page(viewport=WINDOW)
     try:
         tab = Tab(page, running.url)
-        tab.until(lambda picture: float(picture.std()) > 5, "a picture")
+        tab.until(lambda image: float(image.std()) > 5, "an image")
         page.wait_for_function("document.querySelectorAll('.uplot').length >= 2", timeout=1000 * PATIENCE)
         before = tab.canvas()
-        tab.until(lambda picture: bool(np.abs(picture - before).mean() > 0.1), "a later picture")
+        tab.differs(before, 0.1, "a later image")
         assert tab.errors == []
     finally:
         page.close()
