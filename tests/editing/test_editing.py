@@ -657,7 +657,7 @@ def test_an_existing_output_is_refused(finished: Path, tmp_path: Path) -> None:
     (tmp_path / "something").touch()
     for taken in (finished, tmp_path):
         command = ["edit", finished, "-o", taken, "--set", "roughness=1"]
-        refused(command, "stands there already; choose another -o")
+        refused(command, "exists already; choose another -o")
 
 
 def test_assignments_are_parsed_from_texts_and_values() -> None:
