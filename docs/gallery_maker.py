@@ -32,7 +32,7 @@ from mi_refgs.reconstruction.fit import fit
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.reconstruction.reconstruction import Reconstruction
 from mi_refgs.relighting import relight as relighting
-from mi_refgs.relighting.score import shown
+from mi_refgs.relighting.score import displayed_over
 from mi_refgs.runs.run import Run
 from mi_refgs.synthesis.make_dataset import make_dataset
 
@@ -224,7 +224,7 @@ def _write_images(exhibit: Exhibit, run: Reconstruction, out: Path, size: int) -
 
 def _shown(run: Reconstruction, camera: Any, size: int) -> np.ndarray:
     """Render a camera (size, size, 3) on a white background, display-encoded."""
-    return shown(run.render(camera, size=size, samples=SAMPLES), np.ones(3))
+    return displayed_over(run.render(camera, size=size, samples=SAMPLES), np.ones(3))
 
 
 # ---------- Image files ----------

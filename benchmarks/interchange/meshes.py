@@ -29,7 +29,7 @@ from mi_refgs.evaluation.metrics import psnr
 from mi_refgs.formats import write
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.reconstruction.provenance import Provenance
-from mi_refgs.relighting.score import shown
+from mi_refgs.relighting.score import displayed_over
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -75,7 +75,7 @@ def measured(folder: Path, out: Path, args: Any) -> dict[str, Any]:
         subprocess.run([command, *options, files["mitsuba"][0]], check=True, capture_output=True)
 
         def displayed(rgba: np.ndarray) -> np.ndarray:
-            return shown(rgba, views.background)
+            return displayed_over(rgba, views.background)
 
         def ours(frame: Any, height: int = view.height, width: int = view.width) -> np.ndarray:
             return displayed(image_array([*frame.radiance, frame.alpha], height, width))

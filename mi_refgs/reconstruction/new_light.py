@@ -1,7 +1,7 @@
-"""The light that a scene is relit by, and where a data set has the truth under it.
+"""New lights for relighting, and the test views of a data set under them.
 
-A panorama is stored with its zenith in the first row, Mitsuba's y axis; in the world of a scene z is up. Maps
-that this package writes (environment.exr, envmap.exr) are in world directions already.
+The first row of a panorama is its zenith, Mitsuba's y axis; in the world of a scene z is up. Maps that this
+package writes (environment.exr, envmap.exr) are in world directions already.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
@@ -21,61 +22,57 @@ from mi_refgs.synthesis.pathtrace import ENVIRONMENT_OVERSAMPLING, environment_i
 from mi_refgs.synthesis.settings import RELIGHT, Z_UP, recorded_lights
 
 HEIGHT = 256
-"""Rows of a light, at most: a texel is 0.7°, an eighth of the lobe of roughness 0.1."""
+"""Maximum number of rows of a light: a texel is 0.7°, an eighth of the lobe of roughness 0.1."""
 READ_ROWS = ENVIRONMENT_OVERSAMPLING * HEIGHT
-"""Rows to which a larger map is averaged first: turned, it is sampled at as many."""
+"""Rows to which a larger map is averaged first: a rotated map is sampled at as many."""
 EXPOSURE_MAX = 10.0
-"""Stops; a light keeps no radiance below 1e-4, so that a much darker one would be grey."""
+"""Stops; a light stores no radiance below 1e-4, so that a much darker one would be grey."""
 
 
 @dataclass(frozen=True)
 class NewLight:
-    """A lat-long map as a light of the world."""
+    """A lat-long map file as the light of a scene."""
 
     path: Path
-    world: bool = False  # whether the map is in world directions already, else its first row is +z
+    world: bool = False  # whether the map is in world directions; otherwise its first row is +z
     rotate: float = 0.0  # degrees about +z, counter-clockwise seen from above
     exposure: float = 0.0  # stops: radiance times 2^exposure
 
     def __post_init__(self) -> None:
-        """Raise InputError if there is no such file, or a number makes no sense."""
+        """Raise InputError for a missing file, or a number out of range."""
         require_file(self.path)
         _require_range(f"{self.path}: --rotate, --exposure", self.rotate, self.exposure)
 
     @property
     def suffix(self) -> str:
-        """What tells pictures under this light from those under the map as it is: "_r90_e-1", or nothing."""
+        """Return the part of a folder's name for rotation and exposure, such as "_r90_e-1", or nothing."""
         turned = f"_r{self.rotate:g}" if self.rotate % 360 else ""
         return turned + (f"_e{self.exposure:+g}" if self.exposure else "")
 
     @property
     def identity(self) -> str:
-        """What the radiance depends on: a hash of the file, its orientation and its exposure."""
+        """Return all that the radiance depends on: a hash of the file, its orientation and its exposure."""
         digest = hashlib.sha256(self.path.read_bytes()).hexdigest()
         return f"{digest} world={self.world} rotate={self.rotate % 360!r} exposure={self.exposure!r}"
 
     def read(self) -> EnvironmentLight:
-        """The light, of at most HEIGHT rows; raises InputError for a file that is no lat-long image."""
+        """Read the light, of at most HEIGHT rows; raises InputError for a file that is no lat-long image."""
         return world_light(read_radiance(self.path, READ_ROWS), self.world, self.rotate, self.exposure)
 
 
-def _require_range(field: str, rotate: float, exposure: float) -> None:
+def _require_range(name: str, rotate: float, exposure: float) -> None:
     if not (np.isfinite(rotate) and abs(exposure) <= EXPOSURE_MAX):
-        raise InputError(
-            f"{field}: {rotate}, {exposure} are out of range; give degrees, and stops from "
-            f"{-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
-        )
+        allowed = f"give degrees, and stops from {-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
+        raise InputError(f"{name}: {rotate}, {exposure} are out of range; {allowed}")
 
 
 def world_light(
     radiance: np.ndarray, world: bool = False, rotate: float = 0.0, exposure: float = 0.0
 ) -> EnvironmentLight:
-    """Lat-long radiance (h, w, 3) as a light of at most HEIGHT rows; the rest as in `NewLight`.
+    """Convert lat-long radiance (h, w, 3) to a light of at most HEIGHT rows; options as in `NewLight`.
 
-    Raises InputError for an array that is no such map, and for a number that makes no sense.
+    Raises InputError for an array that is no such map, and for a number out of range.
     """
-    import mitsuba as mi
-
     _require_range("light: rotate, exposure", rotate, exposure)
     radiance = np.ascontiguousarray(radiance, dtype=np.float32)
     if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape) < 2:
@@ -92,13 +89,13 @@ def world_light(
 
 
 AnyLight: TypeAlias = NewLight | EnvironmentLight | str | Path | np.ndarray
-"""A light, its file, or its radiance (h, w, 3)."""
+"""A light, its file, or its linear radiance (h, w, 3)."""
 
 
 def any_light(light: AnyLight, world: bool, rotate: float, exposure: float) -> EnvironmentLight:
-    """A light of whatever stands for one: its file, its radiance (h, w, 3); the rest as in `NewLight`.
+    """Convert a light, its file or its radiance (h, w, 3) to a light; options as in `NewLight`.
 
-    An `EnvironmentLight` is in world directions already. Raises InputError for what is no light.
+    An `EnvironmentLight` is in world directions already. Raises InputError for any other object.
     """
     if isinstance(light, NewLight):
         if world or rotate or exposure:
@@ -112,11 +109,11 @@ def any_light(light: AnyLight, world: bool, rotate: float, exposure: float) -> E
 
 
 def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:
-    """The data set with test views under this light, and the light as they were traced; None without one.
+    """Find the data set with test views under this light; return it and the light of its renders, or None.
 
-    It is the map that `refgs dataset --relight` was given, by the content of the file, or an environment.exr
-    of the data set itself. A light that is turned has no truth. Raises InputError for such an environment.exr
-    that is not said to be in world directions.
+    The light must be the map that `refgs dataset --relight` was given, by the content of the file, or an
+    environment.exr of the data set itself; a rotated light has no ground truth. Raises InputError for such an
+    environment.exr without `world`.
     """
     content = light.path.read_bytes()
     digest = hashlib.sha256(content).hexdigest()

@@ -1,4 +1,4 @@
-"""What a reconstruction was made from, and the cameras that follow from it."""
+"""The method and data set that a reconstruction was fitted with, and their cameras."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
+from mi_refgs.data.view import FileCamera
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.targets import read_views
 from mi_refgs.formats import Shot
@@ -29,12 +30,12 @@ class Provenance:
 
     method: Method
     data: Path | None = None
-    region: Region | None = None  # in pictures without alpha
-    edits: tuple[dict[str, Any], ...] = ()  # what was done since, in order: `editing.Edited.record`
+    region: Region | None = None  # in images without alpha
+    edits: tuple[dict[str, Any], ...] = ()  # made since, in order: `editing.Edited.record`
 
     @staticmethod
     def of(run: Run) -> Provenance:
-        """That of a run folder; raises InputError if it is none, or records a region that cannot be used."""
+        """Read a run folder; raises InputError if it is none, or records a region that cannot be used."""
         method = run.method()
         try:
             data: Path | None = run.dataset()
@@ -45,58 +46,57 @@ class Provenance:
         return Provenance(method, data, run.region(), tuple(edits))
 
     def save(self, trained: TrainedScene, folder: Path, camera: Camera) -> None:
-        """Write a run folder of a scene (`runs.export.save`); raises InputError as that does."""
+        """Write a scene as a run folder (`runs.export.save`); raises InputError as that does."""
         records = {EDITS: {"edits": self.edits}} if self.edits else None
         save(trained, folder, self.method, camera, data=self.data, region=self.region, records=records)
 
     def with_data(self, folder: Path | None) -> Provenance:
-        """The same with another data set, or this for None; raises InputError for what is no folder."""
+        """Replace the data set, unless `folder` is None; raises InputError for a path that is no folder."""
         if folder is None:
             return self
         if not folder.is_dir():
-            raise InputError(f"{folder}: --data: no such folder; give that of a data set")
+            raise InputError(f"{folder}: --data: no such folder; give the folder of a data set")
         return replace(self, data=folder)
 
     @property
     def has_data(self) -> bool:
-        """Whether the folder of the data set is."""
+        """Whether the data set is known and exists."""
         return self.data is not None and self.data.is_dir()
 
     def views(self, split: str, decode: bool = True) -> Dataset:
-        """A split of the data set; raises InputError where that is unknown, gone or unreadable."""
+        """Read a split of the data set; raises InputError for one that is unknown, missing or unreadable."""
         if self.data is None or not self.has_data:
             gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
-            raise InputError(f"views: {split}: {gone}; use cameras(), or bring the data set back")
+            raise InputError(f"views: {split}: {gone}; use cameras(), or restore the data set")
         found = read_views(self.method, self.data, split, decode=decode)
         return found if self.region is None else replace(found, region=self.region)
 
     def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
-        """The cameras of some splits by name; without a data set those around the surfels.
+        """Return the named cameras of some splits; without a data set, cameras around the surfels.
 
-        Decodes no picture. Raises InputError for a data set that is there and cannot be read.
+        Decodes no image. Raises InputError for a data set that exists and cannot be read.
         """
-        if not self.has_data:
+        if self.data is None or not self.has_data:
             return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
-        return [shot for split in splits for shot in self._shots_of(split)]
-
-    def _shots_of(self, split: str) -> list[Shot]:
-        """Those of one split, with the files of the pictures as they are on disk."""
-        assert self.data is not None
-        views = originals = read_views(self.method, self.data, split, truth=False, decode=False).views
-        if (self.method.data.downscale or 1) > 1:
-            whole = replace(self.method, data=replace(self.method.data, downscale=1))
-            originals = read_views(whole, self.data, split, truth=False, decode=False).views
         shots = []
-        for view, original in zip(views, originals, strict=True):
-            file = original.file
-            if file is not None:
-                mask = file.mask and replace(file.mask, path=Path(os.path.relpath(file.mask.path, self.data)))
-                file = replace(file, path=Path(os.path.relpath(file.path, self.data)), mask=mask)
-            shots.append(Shot(view.name, split, view.camera(), file))
+        for split in splits:
+            views = originals = read_views(self.method, self.data, split, truth=False, decode=False).views
+            if (self.method.data.downscale or 1) > 1:  # image files are those on disk
+                whole = replace(self.method, data=replace(self.method.data, downscale=1))
+                originals = read_views(whole, self.data, split, truth=False, decode=False).views
+            for view, original in zip(views, originals, strict=True):
+                shots.append(Shot(view.name, split, view.camera(), self._relative(original.file)))
         return shots
 
+    def _relative(self, file: FileCamera | None) -> FileCamera | None:
+        """Make the paths of an image file and its mask relative to the data set."""
+        if file is None:
+            return None
+        mask = file.mask and replace(file.mask, path=Path(os.path.relpath(file.mask.path, self.data)))
+        return replace(file, path=Path(os.path.relpath(file.path, self.data)), mask=mask)
+
     def turntable(self, trained: TrainedScene, count: int) -> list[Camera]:
-        """Cameras on a circle around the object, z up, like the test views in lens, distance and height.
+        """Return cameras on a circle around the object, z up, at the distance and height of the test views.
 
         Raises InputError as `shots` does, and for a number below 1.
         """

@@ -1,7 +1,7 @@
-"""How near relit pictures are to the truth: as they are, and after one scale a channel.
+"""Score relit images against ground truth: as they are, and after one scale per channel.
 
-The light and the albedo of a fit share a factor a channel that no picture of it can tell; under another
-light it shows as a wrong brightness or tint of everything. So both numbers are given.
+The light and the albedo of a fit share an unknown per-channel scale; under another light it appears as a
+wrong brightness or tint of everything. So both numbers are given.
 """
 
 from __future__ import annotations
@@ -16,30 +16,28 @@ from mi_refgs.evaluation import metrics
 from mi_refgs.io.images import srgb_from_linear
 
 SCALE_REACH = 2.0
-"""Stops around the ratio of the means in which the scale is looked for."""
+"""Stops around the ratio of the means within which the scale is searched."""
 INSIDE = 0.99
-"""Alpha from which a pixel is no edge: how much an edge covers is no matter of light."""
+"""Alpha from which a pixel is inside the object: the coverage of edges does not depend on light."""
 SCALE_PIXELS = 200_000
-"""Pixels that decide it."""
+"""Maximum number of pixels that the scale is fitted to."""
 
 
-def shown(rgba: np.ndarray, background: np.ndarray, scale: np.ndarray | float = 1.0) -> np.ndarray:
-    """What a camera shows of premultiplied linear RGBA (H, W, 4) before a background, display-encoded."""
+def displayed_over(rgba: np.ndarray, background: np.ndarray, scale: np.ndarray | float = 1.0) -> np.ndarray:
+    """Display-encode premultiplied linear RGBA (H, W, 4), scaled, over an encoded background: (H, W, 3)."""
     alpha = np.clip(rgba[..., 3:], 0, 1)
     return _encoded(rgba[..., :3] * scale, alpha) + (1 - alpha) * background
 
 
 def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.ndarray:
-    """The factor of radiance, a channel (3,), with which pictures are shown nearest to the truth.
+    """Fit the scale of radiance per channel (3,) that brings displayed images nearest to the ground truth.
 
-    One for all pictures: where the sum of squared differences of what is shown inside the object is least.
-    (Least squares of radiance would look at lamps alone.) 1 for a channel that is black in either.
+    One for all images: it minimises the sum of squared differences of displayed colours inside the object.
+    (Least squares of radiance would fit lamps alone.) 1 for a channel that is black in either.
     """
-    a, b = (
-        np.concatenate([p.reshape(-1, 4) for p in pictures]).astype(np.float64) for pictures in (ours, truth)
-    )
-    seen = np.flatnonzero(np.minimum(a[:, 3], b[:, 3]) > INSIDE)
-    chosen = seen[:: max(1, len(seen) // SCALE_PIXELS)]
+    a, b = (np.concatenate([p.reshape(-1, 4) for p in images]).astype(np.float64) for images in (ours, truth))
+    inside = np.flatnonzero(np.minimum(a[:, 3], b[:, 3]) > INSIDE)
+    chosen = inside[:: max(1, len(inside) // SCALE_PIXELS)]
     a, b = a[chosen], b[chosen]
     scale = np.ones(3)
     for c in range(3):
@@ -57,22 +55,22 @@ def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.
 
 
 def _encoded(radiance: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """What is shown of premultiplied radiance, over black."""
+    """Display-encode premultiplied radiance over black."""
     return alpha * np.clip(srgb_from_linear(np.maximum(radiance, 0) / np.maximum(alpha, 1e-6)), 0, 1)
 
 
 def score(
     names: Sequence[str], ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], background: np.ndarray
 ) -> dict[str, Any]:
-    """`psnr`, `ssim`, both after `scale` (`psnr_scaled`, `ssim_scaled`), means over pictures; and `views`.
+    """Return `psnr`, `ssim` and both after `scale` (`…_scaled`): means over images; and `views`.
 
-    Pictures are premultiplied linear RGBA (H, W, 4), compared as they are shown before the background.
+    Images are premultiplied linear RGBA (H, W, 4), compared display-encoded over the background.
     """
     scale = common_scale(ours, truth)
     views = []
     for name, own, true in zip(names, ours, truth, strict=True):
-        goal = shown(true, background)
-        plain, scaled = shown(own, background), shown(own, background, scale)
+        goal = displayed_over(true, background)
+        plain, scaled = displayed_over(own, background), displayed_over(own, background, scale)
         views.append(
             {
                 "name": name,

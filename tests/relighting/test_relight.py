@@ -24,7 +24,7 @@ from mi_refgs.io.images import read_png
 from mi_refgs.reconstruction.new_light import NewLight, any_light, truth_under
 from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.relighting.relight import relight
-from mi_refgs.relighting.score import common_scale, score, shown
+from mi_refgs.relighting.score import common_scale, displayed_over, score
 from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -127,7 +127,7 @@ def test_files_are_as_a_data_sets(folder: Path, dusk: dict[str, Any]) -> None:
         linear, displayed = read_exr_image((out / name).with_suffix(".exr")), read_png(out / name)
         assert linear.shape == displayed.shape == (SIZE, SIZE, 4)
         straight = np.dstack([displayed[..., :3] * displayed[..., 3:] + 1 - displayed[..., 3:]])
-        np.testing.assert_allclose(shown(linear, np.ones(3)), straight, atol=1.5 / 255)
+        np.testing.assert_allclose(displayed_over(linear, np.ones(3)), straight, atol=1.5 / 255)
     assert read_png(out / "sheet.png").std() > 0.05
     assert not (folder / "run" / "relight").exists()
 
@@ -319,7 +319,7 @@ def test_a_fitted_colour_is_warned_of(folder: Path, tmp_path: Path) -> None:
 def test_what_cannot_be_relit(folder: Path, tmp_path: Path) -> None:
     run, light = Run(folder / "run"), NewLight(folder / "dusk.exr")
     (tmp_path / "bad.exr").write_text("no picture")
-    with pytest.raises(InputError, match="holds a run"):
+    with pytest.raises(InputError, match="contains a run"):
         relight(run, light, folder / "run")
     with pytest.raises(InputError, match="a data set"):
         relight(run, light, folder / "data")
