@@ -1,9 +1,9 @@
-"""How true the cameras of `refgs capture` are: its data set beside one of the same pictures with true
+"""How true the cameras of `refgs capture` are: its data set beside one of the same images with true
 cameras.
 
     python -m benchmarks.capture CAPTURED TRUE
 
-Both are folders that `refgs train` reads; views are paired by the names of their pictures. Positions are in
+Both are folders that `refgs train` reads; views are paired by the names of their images. Positions are in
 per cent of the extent (the largest distance of a true camera from their mean), after the similarity that fits
 them best.
 """
@@ -32,7 +32,7 @@ def table(errors: PoseErrors, placed: int, wanted: int) -> str:
     """The errors as a table in Markdown."""
     rows = [("rotation, degrees", errors.rotation), ("position, % of the extent", 100 * errors.position)]
     rows.append(("focal length, %", 100 * abs(errors.focal)))
-    lines = [f"{placed} of {wanted} pictures placed", "", "| error | median | largest |", "|---|---|---|"]
+    lines = [f"{placed} of {wanted} images placed", "", "| error | median | largest |", "|---|---|---|"]
     lines += [f"| {name} | {np.median(values):.3f} | {values.max():.3f} |" for name, values in rows]
     return "\n".join(lines)
 

@@ -1,9 +1,9 @@
-"""Puts exposures and white balances on a data set: a copy whose pictures each have a gain a channel.
+"""Puts exposures and white balances on a data set: a copy whose images each have a gain per channel.
 
     python -m benchmarks.exposed DATA COPY --low 0.6 --high 1.3 --seed 0
 
 For 8-bit data sets with transforms_*.json. A gain multiplies the linear radiance of the object ahead of
-the sRGB curve and 8 bits; alpha stays. gains.json holds what was drawn, uniform in the logarithm.
+the sRGB curve and 8 bits; alpha stays. gains.json contains the gains, uniform in the logarithm.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--high", type=float, default=1.3)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    print(f"{args.copy}: {len(put_on(args.data, args.copy, args.low, args.high, args.seed))} pictures")
+    print(f"{args.copy}: {len(put_on(args.data, args.copy, args.low, args.high, args.seed))} images")
 
 
 if __name__ == "__main__":

@@ -104,7 +104,7 @@ def place_of(folder: Path, figures: Figures) -> Place | None:
 
     The folder's name is the scene's, with nothing but numbers and the data set's words beside it: `ball`,
     `chair_400`, `teapot_glossy`. Where two data sets have a scene of that name, a word of one of them must
-    stand in the folder's name or in its parent's.
+    are in the folder's name or in its parent's.
     """
     tokens = {token for token in re.split(r"[^a-z0-9]+", folder.name.lower()) if token}
     found = []

@@ -5,7 +5,7 @@
 
 Reads folders that `refgs compare` made, one by each version of the code that is compared. Curves hold the
 PSNR of some test views in the course of a fit, measured off the clock; the last column is the mean of all
-test views after the fit. The clock leaves out reading pictures and the start's surfels.
+test views after the fit. The clock leaves out reading images and the start's surfels.
 """
 
 from __future__ import annotations

@@ -30,14 +30,14 @@ SECONDS = 1.0
 
 
 def sphere_data(size: int, views: int, rng: np.random.Generator) -> Any:
-    """Views of a unit sphere with a smooth random picture on it."""
+    """Views of a unit sphere with a smooth random image on it."""
     from mi_refgs.data.dataset import Dataset, View
     from mi_refgs.reference.camera import look_at
 
     focal = 0.5 * size / np.tan(np.radians(20))
     y, x = np.mgrid[0:size, 0:size] + 0.5 - size / 2
     inside = (np.hypot(x, y) / focal < np.tan(np.arcsin(0.25))).astype(np.float32)
-    pictures = []
+    images = []
     for i in range(views):
         outward = rng.normal(size=3)
         to_world = look_at(4 * outward / np.linalg.norm(outward), np.zeros(3))
@@ -45,7 +45,7 @@ def sphere_data(size: int, views: int, rng: np.random.Generator) -> Any:
         colour = 0.5 + 0.4 * np.stack(waves, axis=-1)
         image = (inside[..., None] * colour + 1 - inside[..., None]).astype(np.float32)
         c = size / 2
-        pictures.append(
+        images.append(
             View(
                 f"{i}",
                 size,
@@ -62,7 +62,7 @@ def sphere_data(size: int, views: int, rng: np.random.Generator) -> Any:
                 is_linear_radiance=False,
             )
         )
-    return Dataset(Path("sphere"), "train", tuple(pictures), np.ones(3, np.float32), False, None)
+    return Dataset(Path("sphere"), "train", tuple(images), np.ones(3, np.float32), False, None)
 
 
 def make_trainer(surfels: int, data: Any, variant: str = METHOD) -> tuple[Any, Any]:

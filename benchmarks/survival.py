@@ -3,7 +3,7 @@
     python -m benchmarks.survival kill --times 50       kills a fit again and again, and resumes it
     python -m benchmarks.survival soak --steps 100000   one long fit: memory, step time, values not finite
 
-Both fit the full method to a few pictures of 32² pixels with a few hundred surfels, on one thread, so that
+Both fit the full method to a few images of 32² pixels with a few hundred surfels, on one thread, so that
 checkpoints, logs, densifying, resets of opacity and mesh extraction recur within seconds. The exit code is 1
 if a fit could not be resumed, lost more than an interval or left a half-written file, or if the long one grew
 by more than 1 MB in 10,000 steps or met a value that is not finite.
@@ -67,7 +67,7 @@ def settings(**windows: int) -> list[str]:
 
 
 def write_data(folder: Path) -> Path:
-    """The pictures as a data set on disk."""
+    """The images as a data set on disk."""
     from benchmarks.step import sphere_data
     from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
     from mi_refgs.io.images import write_png

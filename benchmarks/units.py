@@ -1,4 +1,4 @@
-"""Fits do not depend on the unit of length: the same pictures, with positions in several units.
+"""Fits do not depend on the unit of length: the same images, with positions in several units.
 
     python -m benchmarks.units [--size 64] [--views 32] [--seeds 4] [--json FILE]
 
@@ -27,7 +27,7 @@ import mitsuba as mi  # isort: skip
 UNITS = {"metre": 1.0, "millimetre": 1e3, "1e4 metres": 1e-4}
 """How many of the unit a metre is; the first is what the others are compared with."""
 SETTINGS = ["surfels.count=3000", "surfels.max_count=4000"]
-"""As many as pictures of 64² need."""
+"""As many as images of 64² need."""
 TEST_VIEWS = 16
 PSNR_BOUND = 0.1
 """Decibels."""

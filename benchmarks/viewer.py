@@ -5,7 +5,7 @@
 Measures, with the viewer in a process of its own:
 
     first_picture_s   from the page's opening until the canvas shows the object
-    orbit             while the camera is dragged round: pictures a second that the page received, and CPU
+    orbit             while the camera is dragged round: images a second that the page received, and CPU
                       milliseconds of the viewer for each (user and system, of all its threads)
     clicks            random controls, drags and wheel turns for some minutes: errors in the console, and the
                       viewer's resident memory at the start, after a tenth of the time, and at the end
@@ -39,7 +39,7 @@ URL.createObjectURL = (blob) => {
   return made.call(URL, blob);
 };
 """
-"""Counts the pictures that the page decodes: each becomes an object URL."""
+"""Counts the images that the page decodes: each becomes an object URL."""
 
 
 def cpu_seconds(pid: int) -> float:
@@ -134,12 +134,12 @@ def orbit(page: Any, viewer: Viewer, seconds: float) -> dict[str, float]:
         page.mouse.move(x + 0.3 * box["width"] * ((step % 120) / 60 - 1), y + (step % 40))
         page.wait_for_timeout(8)
     taken = time.monotonic() - begin
-    pictures = page.evaluate("window.refgsPictures") - before
+    images = page.evaluate("window.refgsPictures") - before
     result = {
         "seconds": round(taken, 2),
-        "pictures": pictures,
-        "pictures_per_s": round(pictures / taken, 2),
-        "cpu_ms_per_picture": round(1000 * (cpu_seconds(pid) - cpu) / max(pictures, 1), 1),
+        "images": images,
+        "pictures_per_s": round(images / taken, 2),
+        "cpu_ms_per_picture": round(1000 * (cpu_seconds(pid) - cpu) / max(images, 1), 1),
         "browser_cpu_s": round(children_cpu() - browser, 2),
     }
     page.mouse.up()

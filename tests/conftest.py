@@ -72,7 +72,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Modules and tests stay till the end: the collection after each test need not look at them again."""
+    """Modules and tests stay until the end: the collection after each test need not look at them again."""
     gc.collect()
     gc.freeze()
 

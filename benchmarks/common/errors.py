@@ -22,7 +22,7 @@ CLEAR = 2.0
 
 @dataclass(frozen=True)
 class Errors:
-    """Of one picture; each with the floor that the reference's noise sets.
+    """Errors of one image, each with the floor that the reference's noise sets.
 
     bias: mean signed error over mean radiance; relmse: mean of (x - ref)² / (ref² + ε), ε = (0.01 mean)²;
     mape: mean of |x - ref| / (ref + 0.01 mean).
@@ -65,11 +65,11 @@ def compare(values: np.ndarray, reference: Estimate, where: np.ndarray | None = 
     )
 
 
-def flip(picture: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
-    """(Mean LDR FLIP, "") of linear pictures, exposed so that the true mean is ½; or (None, why)."""
+def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
+    """(Mean LDR FLIP, "") of linear images, exposed so that the true mean is ½; or (None, why)."""
     lit = truth[truth > 0]
     exposure = 0.5 / float(lit.mean())
-    return metrics.flip(srgb_from_linear(picture * exposure), srgb_from_linear(truth * exposure))
+    return metrics.flip(srgb_from_linear(image * exposure), srgb_from_linear(truth * exposure))
 
 
 def mean_score(values: np.ndarray, reference: Estimate) -> float:
@@ -88,7 +88,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Step:
-    """A picture (P, 3), and the approximation that it no longer makes ("" for the first)."""
+    """An image (P, 3), and the approximation that it no longer makes ("" for the first)."""
 
     replaced: str
     values: np.ndarray

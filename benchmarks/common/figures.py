@@ -42,7 +42,7 @@ def new(rows: int, columns: int, width: float, height: float, **options: Any) ->
 
 
 def grid(titles: Sequence[str], columns: int, width: float, height: float, x: str, y: str) -> tuple[Any, Any]:
-    """Figure and an axis for each title, in rows of so many; axes are shared, labels stand at the rim."""
+    """Figure and an axis for each title, in rows of so many; axes are shared, labels are at the rim."""
     columns = min(columns, len(titles))
     figure, axes = new(-(-len(titles) // columns), columns, width, height, sharex=True, sharey=True)
     for ax, title in zip(axes.flat, titles, strict=False):

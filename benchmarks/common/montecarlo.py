@@ -51,7 +51,7 @@ class Estimate:
 
 
 def estimate(batches: np.ndarray) -> Estimate:
-    """Of independent batches (B, P, 3)."""
+    """Mean of independent batches (B, P, 3), and its standard error."""
     return Estimate(batches.mean(0), batches.std(0, ddof=1) / np.sqrt(len(batches)))
 
 

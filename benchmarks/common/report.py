@@ -144,9 +144,7 @@ def make_parser(
     parser = plain_parser(name, description)
     parser.set_defaults(settings=page)
     parser.add_argument("-o", "--output", type=Path, help="folder; without it docs/ and runs/")
-    parser.add_argument(
-        "--json", type=Path, metavar="FILE", help="write page and pictures of this earlier run"
-    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write page and images of this earlier run")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
     group = parser.add_mutually_exclusive_group()
     for flag, (settings, text) in sizes.items():
@@ -163,7 +161,7 @@ def write_reports(
 ) -> int:
     """Measure, or read `options.json`; write JSON, CSV (of "rows") and page. The exit code: 2 for bad input.
 
-    `plot` writes its pictures of the result to a folder; `page` returns what the template page.md of the
+    `plot` writes its images of the result to a folder; `page` returns what the template page.md of the
     benchmark leaves open: tables and numbers by name. The machine and the run's minutes are added.
     """
     folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", ROOT / "runs")

@@ -18,12 +18,12 @@ from mi_refgs.surfels.table import Surfels
 
 ALBEDO = (0.9, 0.6, 0.3)
 OPACITY = 0.99
-"""Of surfels that stand for a solid surface."""
+"""Opacity of surfels that cover a solid surface."""
 Colour = tuple[float, float, float]
 
 
 def path_tracer(depth: int) -> Any:
-    """Mitsuba's, without Russian roulette: pictures of two depths differ by their reflections alone."""
+    """Mitsuba's, without Russian roulette: images of two depths differ by their reflections alone."""
     return mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
 
 
@@ -51,7 +51,7 @@ class Setup:
         self.points = surface(self.scene, self.sensor, settings.size)
 
     def set_material(self, metallic: float, roughness: float) -> dict[str, Any]:
-        """Of the scene's surface; the same on the device, opaque: another one compiles no new kernel."""
+        """Set the surface's material; return it on the device, opaque: another one compiles no new kernel."""
         self.params["shape.bsdf.metallic.value"] = metallic
         self.params["shape.bsdf.roughness.value"] = roughness
         self.params.update()
@@ -62,9 +62,9 @@ class Setup:
         }
 
     def render(self, integrator: Any, spp: int, seed: int) -> np.ndarray:
-        """Mitsuba's picture (P, 3)."""
-        picture = mi.render(self.scene, sensor=self.sensor, integrator=integrator, spp=spp, seed=seed)
-        return self.points.of_image(picture)
+        """Mitsuba's image (P, 3)."""
+        image = mi.render(self.scene, sensor=self.sensor, integrator=integrator, spp=spp, seed=seed)
+        return self.points.of_image(image)
 
     def integrate(self, lobe: Any, emitter: Any, occluder: Any = None, seed: int = 0) -> list[np.ndarray]:
         """`montecarlo.integrate` at the points: batches (B, P, 3) of each weight of the lobe."""
@@ -79,7 +79,7 @@ class Setup:
         )
 
     def with_primary_rays(self, shader: Callable[[Points], Any]) -> Callable[[], Any]:
-        """A call that meets the surface at the centre of every pixel of the timed picture and shades it."""
+        """A call that meets the surface at the centre of every pixel of the timed image and shades it."""
         size = self.settings.timing_size
 
         def run() -> Any:

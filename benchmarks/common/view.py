@@ -26,7 +26,7 @@ STUDIO = ROOT / "scenes" / "lights" / "studio.exr"
 SUN_ELEVATION, SUN_AZIMUTH = 12.0, -90.0
 """Degrees above the horizon, and from -z towards +x: so low that a floor glints at a grazing angle."""
 SUBSAMPLES = 8
-"""Samples a texel side when Mitsuba's sky is baked; the sun's disc is about a texel wide."""
+"""Samples per side of a texel when Mitsuba's sky is baked; the sun's disc is about a texel wide."""
 CHECKS = 12
 """Checks from pole to pole: 15 degrees each."""
 BUILT_IN = ("constant", "gradient", "studio", "checker", "sunsky")
@@ -45,7 +45,7 @@ class Light:
         return {"type": "envmap", "bitmap": mi.Bitmap(self.radiance)}
 
     def environment(self, height: int) -> EnvironmentLight:
-        """The light as the product holds it, averaged down to `height` rows."""
+        """The product's light, averaged down to `height` rows."""
         rows = (
             self.radiance if height == len(self.radiance) else lobe_matrices.resample(self.radiance, height)
         )
@@ -164,7 +164,7 @@ def _register(variant: str) -> None:
 
 @dataclass(frozen=True)
 class Look:
-    """A perspective camera: where it stands, where it looks, and its field of view in degrees."""
+    """A perspective camera: position, target, and field of view in degrees."""
 
     origin: tuple[float, float, float]
     target: tuple[float, float, float]
@@ -185,7 +185,7 @@ def make_sensor(look: Look, size: int) -> Any:
 class Points:
     """The P pixels of a view that show the object from its front, and what is seen there."""
 
-    size: int  # edge of the picture
+    size: int  # edge of the image
     pixel: Any  # mi.UInt32 (P), raster order
     position: Any  # mi.Point3f
     normal: Any  # mi.Vector3f, unit shading normals
@@ -198,14 +198,14 @@ class Points:
         return int(dr.width(self.pixel))
 
     def image(self, values: np.ndarray) -> np.ndarray:
-        """(P, C) values as a picture (size, size, C), 0 elsewhere."""
-        picture = np.zeros((self.size * self.size, values.shape[-1]), np.float32)
-        picture[self.pixel.numpy()] = values
-        return picture.reshape(self.size, self.size, -1)
+        """(P, C) values as an image (size, size, C), 0 elsewhere."""
+        image = np.zeros((self.size * self.size, values.shape[-1]), np.float32)
+        image[self.pixel.numpy()] = values
+        return image.reshape(self.size, self.size, -1)
 
-    def of_image(self, picture: Any) -> np.ndarray:
-        """The P values (P, 3) of a picture, float64."""
-        return np.asarray(picture, np.float64).reshape(-1, 3)[self.pixel.numpy()]
+    def of_image(self, image: Any) -> np.ndarray:
+        """The P values (P, 3) of an image, float64."""
+        return np.asarray(image, np.float64).reshape(-1, 3)[self.pixel.numpy()]
 
     def n_dot_v(self) -> np.ndarray:
         """cos of the view angle (P,)."""

@@ -54,7 +54,7 @@ def _text() -> dict[str, bytes]:
 
 
 def colmap_files(folder: Path) -> list[bytes]:
-    """All files of a model as text and binary, with their kind before them, and pictures in the folder."""
+    """All files of a model as text and binary, with their kind before them, and images in the folder."""
     (folder / "images").mkdir(exist_ok=True)
     for i in range(VIEWS):
         write_png(folder / f"images/{i}.png", np.random.default_rng(i).random((SIZE[1], SIZE[0], 3)))

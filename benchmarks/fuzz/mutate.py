@@ -94,7 +94,7 @@ def _number(data: bytes, rng: random.Random) -> bytes:
 
 
 def _line(data: bytes, rng: random.Random) -> bytes:
-    """A line of text that is gone, doubled, or stands elsewhere."""
+    """Remove, repeat or move a line of text."""
     lines = data.split(b"\n")
     line = lines.pop(rng.randrange(min(len(lines), 40)))
     for _ in range(rng.choice((0, 1, 1, 2))):
@@ -129,7 +129,7 @@ def _json(data: bytes, rng: random.Random) -> bytes:
     content = json.loads(data.split(b"\n{")[0])
     for _ in range(rng.choice((1, 1, 1, 2, 5))):
         value, place = content, None
-        # A walk from the top: what stands there is as likely as a leaf.
+        # A walk from the top: an inner value is as likely as a leaf.
         while isinstance(value, dict | list) and value and (place is None or rng.random() < 0.6):
             key = rng.choice(list(value)) if isinstance(value, dict) else rng.randrange(len(value))
             place, value = (value, key), value[key]

@@ -137,7 +137,7 @@ def _read_foreign_mesh(folder: Path, data: bytes) -> None:
     _read_file(_read_mesh, f"a.{ending}")(folder, data[3:])
 
 
-# ---------------- pictures ----------------
+# ---------------- images ----------------
 
 
 def _exr_files(folder: Path) -> list[bytes]:
@@ -155,25 +155,25 @@ def _exr_files(folder: Path) -> list[bytes]:
     return [*files, (folder / "a.exr").read_bytes(), (folder / "b.exr").read_bytes()]
 
 
-def _picture_files(folder: Path) -> list[bytes]:
+def _image_files(folder: Path) -> list[bytes]:
     rgba = np.random.default_rng(SEED).integers(0, 256, (9, 11, 4), dtype=np.uint8)
-    picture, files = Image.fromarray(rgba), []
+    image, files = Image.fromarray(rgba), []
     for mode in ("RGBA", "RGB", "L", "LA", "P", "1", "I;16"):
         deep = Image.fromarray(rgba[..., 0].astype(np.uint16))
-        files.append(_saved(deep if mode == "I;16" else picture.convert(mode), "PNG"))
-    files.append(_saved(picture.convert("P"), "PNG", transparency=3, interlace=1))
+        files.append(_saved(deep if mode == "I;16" else image.convert(mode), "PNG"))
+    files.append(_saved(image.convert("P"), "PNG", transparency=3, interlace=1))
     for mode, progressive in (("RGB", False), ("RGB", True), ("L", False), ("CMYK", False)):
-        files.append(_saved(picture.convert(mode), "JPEG", progressive=progressive))
-    return [*files, _saved(picture, "GIF"), _saved(picture, "TIFF")]
+        files.append(_saved(image.convert(mode), "JPEG", progressive=progressive))
+    return [*files, _saved(image, "GIF"), _saved(image, "TIFF")]
 
 
-def _saved(picture: Any, kind: str, **options: Any) -> bytes:
+def _saved(image: Any, kind: str, **options: Any) -> bytes:
     buffer = io.BytesIO()
-    picture.save(buffer, format=kind, **options)
+    image.save(buffer, format=kind, **options)
     return buffer.getvalue()
 
 
-def _read_picture(path: Path) -> list[Any]:
+def _read_image(path: Path) -> list[Any]:
     pixels = read_png(path)
     assert not (pixels < 0).any() and not (pixels > 1).any()
     return [pixels]
@@ -185,7 +185,7 @@ def _light_files(folder: Path) -> list[bytes]:
     for ending in ("hdr", "exr", "pfm"):
         bitmap.write(str(folder / f"a.{ending}"))
         files.append((folder / f"a.{ending}").read_bytes())
-    return files + _picture_files(folder)[:2]
+    return files + _image_files(folder)[:2]
 
 
 def _read_light(path: Path) -> list[Any]:
@@ -237,7 +237,7 @@ def _read_method(path: Path) -> None:
 
 
 def _state() -> dict[str, np.ndarray]:
-    """What a checkpoint holds, with numbers of no meaning."""
+    """The arrays of a checkpoint, with arbitrary numbers."""
     state: dict[str, Any] = {f"params/{name}": np.float32(values) for name, values in _table().items()}
     state["params/light"] = np.float32(np.random.default_rng(SEED).random((8, 16, 3)))
     for name, values in list(state.items()):
@@ -371,7 +371,7 @@ READERS = {
         # A method may extend one elsewhere: it is the user's own file.
         _file("method", "toml", _methods, _read_method, "x.toml", inside=False),
         _file("exr", "", _exr_files, lambda path: [read_exr_image(path)], "x.exr"),
-        _file("picture", "", _picture_files, _read_picture, "x.png"),
+        _file("image", "", _image_files, _read_image, "x.png"),
         _file("light", "", _light_files, _read_light, "x.hdr"),
         _file("checkpoint", "", _checkpoints, _read_checkpoint, "x.npz", finish=_sign),
         _file("model", "json", _models, _read_model, "model.json"),

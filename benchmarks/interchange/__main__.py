@@ -1,7 +1,7 @@
-"""Files of a run in other people's programs: `python -m benchmarks.interchange RUN --node FOLDER`.
+"""Files of a run in other programs: `python -m benchmarks.interchange RUN --node FOLDER`.
 
 FOLDER is where `npm install @playcanvas/splat-transform gltf-validator @sparkjsdev/spark three` was run. For
-each view, PSNR in dB of what each program shows against our picture, both display-encoded on black.
+each view, PSNR in dB of what each program shows against our image, both display-encoded on black.
 """
 
 from __future__ import annotations
@@ -58,20 +58,20 @@ def measured(run: Path, node: Path, views: list[int], names: list[str]) -> dict[
         for index in views:
             camera = shots[index].camera
             frame = view(camera)
-            ours = _picture(display_image(list(frame.radiance), frame.alpha, [0.0] * 3), camera)
-            pictures = {"ours, same file": _blended(table, camera)}
+            ours = _image(display_image(list(frame.radiance), frame.alpha, [0.0] * 3), camera)
+            images = {"ours, same file": _blended(table, camera)}
             if "browser" in names:
-                pictures["Spark in Chromium"] = programs.in_browser(ply, camera, node)
+                images["Spark in Chromium"] = programs.in_browser(ply, camera, node)
             if "mitsuba" in names:
-                pictures["volprim_rf_basic"] = programs.in_mitsuba(ply, camera)
+                images["volprim_rf_basic"] = programs.in_mitsuba(ply, camera)
             found[shots[index].name] = {
                 title: round(float(-10 * np.log10(np.mean((np.clip(x, 0, 1) - ours) ** 2))), 2)
-                for title, x in pictures.items()
+                for title, x in images.items()
             }
     return found
 
 
-def _picture(planes: Any, camera: Any) -> np.ndarray:
+def _image(planes: Any, camera: Any) -> np.ndarray:
     flat = np.stack([np.array(plane, dtype=np.float64) for plane in planes], axis=-1)
     return np.clip(flat, 0, 1).reshape(camera.height, camera.width, 3)
 
@@ -81,7 +81,7 @@ def _blended(table: Any, camera: Any) -> np.ndarray:
     from mi_refgs.render.pipeline import SurfelScene, render
     from mi_refgs.shade.shading import Shading
 
-    return _picture(render(SurfelScene(table, Shading("surfel", "radiance")), camera).radiance, camera)
+    return _image(render(SurfelScene(table, Shading("surfel", "radiance")), camera).radiance, camera)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 The `mitsuba` command of a plain Mitsuba renders the exported scene; Khronos' validator (FOLDER is where
 `npm install gltf-validator` was run) reads the glTF file, and USD's validators the .usdz. PSNR in dB of test
-views, as they are displayed, against the truth of the data set: of our picture, of ours with the materials
+views, as they are displayed, against ground truth: of our image, of ours with the materials
 alone that are exported, and of Mitsuba's; and of Mitsuba's against ours.
 """
 
@@ -70,8 +70,8 @@ def measured(folder: Path, out: Path, args: Any) -> dict[str, Any]:
     )
     rows = []
     for index in args.views:
-        view, picture = views.views[index].load(), out / f"{index}.exr"
-        options = ["-m", args.mitsuba, "-s", str(index), "-D", f"spp={args.spp}", "-o", str(picture)]
+        view, image = views.views[index].load(), out / f"{index}.exr"
+        options = ["-m", args.mitsuba, "-s", str(index), "-D", f"spp={args.spp}", "-o", str(image)]
         subprocess.run([command, *options, files["mitsuba"][0]], check=True, capture_output=True)
 
         def displayed(rgba: np.ndarray) -> np.ndarray:
@@ -80,7 +80,7 @@ def measured(folder: Path, out: Path, args: Any) -> dict[str, Any]:
         def ours(frame: Any, height: int = view.height, width: int = view.width) -> np.ndarray:
             return displayed(image_array([*frame.radiance, frame.alpha], height, width))
 
-        stock, first = displayed(read_exr_image(picture)), ours(whole(view.camera()))
+        stock, first = displayed(read_exr_image(image)), ours(whole(view.camera()))
         second, truth = ours(alone(view.camera())), view.displayed
         rows.append([psnr(first, truth), psnr(second, truth), psnr(stock, truth), psnr(stock, first)])
     names = "ours", "ours, materials alone", "mitsuba", "mitsuba against ours"

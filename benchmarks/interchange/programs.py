@@ -1,4 +1,4 @@
-"""Other people's programs, each given a file that `refgs export --to` has written."""
+"""Other programs, each given a file that `refgs export --to` has written."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ def in_browser(ply: Path, camera: Camera, node: Path) -> np.ndarray:
                 shot = page.evaluate("(a) => window.shoot(...a)", arguments)
                 browser.close()
             server.shutdown()
-    picture = Image.open(io.BytesIO(base64.b64decode(shot["picture"].partition(",")[2])))
-    return np.asarray(picture.convert("RGB"), dtype=np.float64) / 255
+    image = Image.open(io.BytesIO(base64.b64decode(shot["image"].partition(",")[2])))
+    return np.asarray(image.convert("RGB"), dtype=np.float64) / 255
 
 
 def _opengl(camera: Camera) -> tuple[list[list[float]], list[list[float]]]:

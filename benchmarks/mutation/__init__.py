@@ -1,1 +1,1 @@
-"""Planted mistakes, each with the test that must catch it."""
+"""Mutation testing: mutants, each with the test that must catch it."""

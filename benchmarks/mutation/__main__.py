@@ -1,10 +1,10 @@
-"""Plant one mistake after another in a copy of the repository, and run the test that must catch it.
+"""Mutation testing: apply each mutant to a copy of the repository, and run the test that must fail.
 
-    python -m benchmarks.mutation                    all, two at a time; exit code 1 if one goes unnoticed
-    python -m benchmarks.mutation --only splat       those whose name holds the word
+    python -m benchmarks.mutation                    all, two at a time; exit code 1 if one survives
+    python -m benchmarks.mutation --only splat       mutants whose name contains the word
     python -m benchmarks.mutation --list             names, files and tests
 
-First all named tests run without a mistake: they must pass, or failing would prove nothing.
+First all named tests run without a mutant: they must pass, or a failure would prove nothing.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from benchmarks.common.report import plain_parser
-from benchmarks.mutation.planting import Mistake, catalogue, copy_repository, planted
+from benchmarks.mutation.planting import Mutant, catalogue, copy_repository, planted
 
 WORKERS = 2
 TIME_LIMIT = 300
-"""Seconds for a test, compiling its kernels included. A mistake that makes it hang is caught."""
+"""Seconds for a test, compiling its kernels included. A mutant that makes it hang is caught."""
 PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run, and print a line a mistake and the counts."""
+    """Run the mutants; print one line per mutant, and the counts."""
     parser = plain_parser("mutation", __doc__)
-    parser.add_argument("--only", default="", metavar="WORD", help="mistakes whose name holds the word")
+    parser.add_argument("--only", default="", metavar="WORD", help="mutants whose name contains the word")
     parser.add_argument("--list", action="store_true", help="print the catalogue and stop")
     parser.add_argument("--workers", type=int, default=WORKERS, metavar="N", help="copies tested at once")
     options = parser.parse_args(arguments)
-    chosen = [mistake for mistake in catalogue() if options.only in mistake.name]
+    chosen = [mutant for mutant in catalogue() if options.only in mutant.name]
     if options.list or not chosen:
-        for mistake in chosen:
-            print(f"{mistake.name:52} {mistake.file:36} {mistake.test}")
+        for mutant in chosen:
+            print(f"{mutant.name:52} {mutant.file:36} {mutant.test}")
         return 0 if chosen else 2
     start = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="mutation_") as folder:
@@ -46,33 +46,33 @@ def main(arguments: list[str] | None = None) -> int:
         for k in range(options.workers):
             copies.put(copy_repository(Path(folder) / str(k)))
 
-        def run(mistake: Mistake) -> tuple[str, float]:
+        def run(mutant: Mutant) -> tuple[str, float]:
             copy = copies.get()
             begin = time.perf_counter()
             try:
-                with planted(mistake, copy):
-                    return outcome([mistake.test], copy), time.perf_counter() - begin
+                with planted(mutant, copy):
+                    return outcome([mutant.test], copy), time.perf_counter() - begin
             finally:
                 copies.put(copy)
 
-        tests = sorted({mistake.test for mistake in chosen})
+        tests = sorted({mutant.test for mutant in chosen})
         copy = copies.get()
-        if (found := outcome(tests, copy, show=True)) != "unnoticed":
-            print(f"the tests without a mistake: {found}; mend them first")
+        if (found := outcome(tests, copy, show=True)) != "survived":
+            print(f"the tests without a mutant: {found}; fix them first")
             return 1
         copies.put(copy)
         with ThreadPoolExecutor(options.workers) as pool:
             outcomes: Counter[str] = Counter()
-            for mistake, (found, seconds) in zip(chosen, pool.map(run, chosen), strict=True):
+            for mutant, (found, seconds) in zip(chosen, pool.map(run, chosen), strict=True):
                 outcomes[found] += 1
-                print(f"{found:10} {seconds:4.0f} s  {mistake.name:52} {mistake.test}", flush=True)
+                print(f"{found:10} {seconds:4.0f} s  {mutant.name:52} {mutant.test}", flush=True)
     counts = ", ".join(f"{number} {found}" for found, number in sorted(outcomes.items()))
-    print(f"{len(chosen)} mistakes: {counts}; {(time.perf_counter() - start) / 60:.1f} minutes")
-    return 1 if outcomes["unnoticed"] + outcomes["broken"] else 0
+    print(f"{len(chosen)} mutants: {counts}; {(time.perf_counter() - start) / 60:.1f} minutes")
+    return 1 if outcomes["survived"] + outcomes["broken"] else 0
 
 
 def outcome(tests: list[str], copy: Path, show: bool = False) -> str:
-    """What the tests make of the copy: failed, crashed, hung, broken or unnoticed; `show` prints it, too."""
+    """Run the tests in the copy: failed, crashed, hung, broken or survived; `show` prints their output."""
     try:
         done = subprocess.run(
             [sys.executable, "-m", "pytest", *PYTEST, *tests],
@@ -87,7 +87,7 @@ def outcome(tests: list[str], copy: Path, show: bool = False) -> str:
     if show and done.returncode:
         print(done.stdout.decode())
     # Other codes of pytest say that no test ran, which proves nothing.
-    return "crashed" if done.returncode < 0 else {0: "unnoticed", 1: "failed"}.get(done.returncode, "broken")
+    return "crashed" if done.returncode < 0 else {0: "survived", 1: "failed"}.get(done.returncode, "broken")
 
 
 if __name__ == "__main__":

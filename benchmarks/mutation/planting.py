@@ -1,4 +1,4 @@
-"""How a mistake gets into a copy of the repository."""
+"""Mutants: changes of the package's source, each with the test that must fail."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 PARTS = ("mi_refgs", "variants", "scenes", "tests", "benchmarks", "pyproject.toml", "README.md", "setup.sh")
-"""What the tests read."""
+"""Files and folders that the tests read."""
 
 
 @dataclass(frozen=True)
-class Mistake:
-    """`before`, which stands once in `file`, becomes `after`; `test` (a pytest node) must then fail."""
+class Mutant:
+    """`before`, which occurs once in `file`, becomes `after`; `test` (a pytest node) must then fail."""
 
     name: str
     file: str  # below the root of the repository
@@ -25,16 +25,16 @@ class Mistake:
     test: str
 
 
-def catalogue() -> list[Mistake]:
-    """The mutants of mutants/*.toml: a file per folder of the package.
+def catalogue() -> list[Mutant]:
+    """Mutants of mutants/*.toml, one file per folder of the package.
 
-    Under the name of each source file: name = [text that occurs there once, replacement, the failing test].
+    Under the name of each source file: name = [text that occurs there once, replacement, failing test].
     """
     return [
-        Mistake(name, f"mi_refgs/{file}", before, after, f"tests/{test}")
+        Mutant(name, f"mi_refgs/{file}", before, after, f"tests/{test}")
         for room in sorted(Path(__file__).with_name("mutants").glob("*.toml"))
-        for file, mistakes in tomllib.loads(room.read_text(encoding="utf-8")).items()
-        for name, (before, after, test) in mistakes.items()
+        for file, mutants in tomllib.loads(room.read_text(encoding="utf-8")).items()
+        for name, (before, after, test) in mutants.items()
     ]
 
 
@@ -50,20 +50,20 @@ def copy_repository(folder: Path) -> Path:
     return folder
 
 
-def mutated(mistake: Mistake, root: Path = ROOT) -> str:
-    """Source with the mistake; raises ValueError unless what it replaces stands in its file exactly once."""
-    source = (root / mistake.file).read_text(encoding="utf-8")
-    if (found := source.count(mistake.before)) != 1:
-        raise ValueError(f"{mistake.name}: {mistake.file}: found {found} times: {mistake.before!r}")
-    return source.replace(mistake.before, mistake.after)
+def mutated(mutant: Mutant, root: Path = ROOT) -> str:
+    """Mutated source. Raises ValueError unless the replaced text occurs exactly once in its file."""
+    source = (root / mutant.file).read_text(encoding="utf-8")
+    if (found := source.count(mutant.before)) != 1:
+        raise ValueError(f"{mutant.name}: {mutant.file}: found {found} times: {mutant.before!r}")
+    return source.replace(mutant.before, mutant.after)
 
 
 @contextmanager
-def planted(mistake: Mistake, copy: Path) -> Iterator[None]:
-    """The mistake stands in a copy of the repository meanwhile."""
-    file = copy / mistake.file
+def planted(mutant: Mutant, copy: Path) -> Iterator[None]:
+    """Apply a mutant to a copy of the repository, and restore the file afterwards."""
+    file = copy / mutant.file
     original = file.read_text(encoding="utf-8")
-    file.write_text(mutated(mistake, copy), encoding="utf-8")
+    file.write_text(mutated(mutant, copy), encoding="utf-8")
     try:
         yield
     finally:

@@ -6,7 +6,7 @@
     python -m benchmarks.splatting --full              slow renderers in more cases, everything more often
 
 Writes splatting.md, images/splatting_*.png, splatting.csv and splatting.json to the output folder; without
--o, the page and its pictures go to docs/ and the two others to runs/.
+-o, the page and its images go to docs/ and the two others to runs/.
 """
 
 from __future__ import annotations

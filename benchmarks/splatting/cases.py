@@ -96,7 +96,7 @@ COLOUR = 3
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """Surfels, what they carry, and the camera."""
+    """Surfels, their features, and the camera."""
 
     name: str
     spread: float | None
@@ -133,7 +133,7 @@ class Workload:
 
 
 def device_camera(p: PinholeCamera) -> Camera:
-    """The splatter's camera of the oracle's."""
+    """The splatter's camera of the float64 reference's."""
     return Camera.from_pose(p.width, p.height, p.fx, p.fy, p.cx, p.cy, p.to_world, p.near)
 
 

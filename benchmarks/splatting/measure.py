@@ -34,7 +34,7 @@ from mi_refgs.surfels.primitives.surfel import Surfel
 
 FLOPS = {"forward": 60, "both": 260}
 CHAINS = 16
-"""Independent sums a lane: more than latency times ports of any CPU's multiply-add unit."""
+"""Independent sums per lane: more than latency times ports of any CPU's multiply-add unit."""
 STEPS = 4096
 PACKETS = 256
 """Packets of 16 lanes: enough blocks for every thread."""
@@ -89,7 +89,7 @@ def lower_bound(counts: Counts, gflops: float) -> dict[str, float]:
 
 
 MARGIN = 16
-"""Pixels around the part whose surfels the oracle looks at too: those that wrongly miss a tile are seen."""
+"""Pixels around the part whose surfels the reference considers too: those that miss a tile are seen."""
 CLASSES = ("position", "rotation", "scale", "opacity", "radiance_sh")
 
 
@@ -106,10 +106,10 @@ def crop(workload: Workload, size: int, margin: int = 0) -> Workload:
 
 
 def compare(workload: Workload, size: int) -> dict[str, float]:
-    """Errors of the part, as `stability.measure` defines them; the oracle blends in the product's order.
+    """Errors of the part, as `stability.measure` defines them; the reference blends in the product's order.
 
     order: largest relative depth difference of two surfels in the wrong order where they show; left_out:
-    share of the pixels in the oracle's declared band; image: largest error of radiance and alpha;
+    share of the pixels in the float64 reference's declared band; image: largest error of radiance and alpha;
     gradient_…: of each class of parameters.
     """
     around = crop(workload, size, MARGIN)

@@ -141,16 +141,16 @@ class Volprim:
         dr.eval(self.weights)
 
     def forward(self) -> Any:
-        """The picture (H, W, 3)."""
+        """The image (H, W, 3)."""
         return mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=1)
 
     def both(self) -> list[Any]:
-        """The gradients of every parameter for fixed adjoints of the picture."""
+        """The gradients of every parameter for fixed adjoints of the image."""
         for key in self.keys:
             self.params[key] = dr.detach(self.params[key])
             dr.enable_grad(self.params[key])
-        picture = mi.render(self.scene, self.params, sensor=self.sensor, integrator=self.integrator, spp=1)
-        dr.backward(dr.sum(picture * self.weights))
+        image = mi.render(self.scene, self.params, sensor=self.sensor, integrator=self.integrator, spp=1)
+        dr.backward(dr.sum(image * self.weights))
         return [dr.grad(self.params[key]) for key in self.keys]
 
 
@@ -159,7 +159,7 @@ def _tensor(values: np.ndarray) -> Any:
 
 
 def _sensor(p: PinholeCamera) -> dict[str, Any]:
-    """Mitsuba's camera of the oracle's; square pixels, the principal point in the middle."""
+    """Mitsuba's camera of the float64 reference's; square pixels, the principal point in the middle."""
     return {
         "type": "perspective",
         "fov": float(np.degrees(2 * np.arctan(0.5 * p.width / abs(p.fx)))),

@@ -6,7 +6,7 @@
     python -m benchmarks.splitsum --envmap sky.exr --shape sphere -o out   your light beside the built-in ones
 
 Writes splitsum.md, images/splitsum_*.png, splitsum.csv and splitsum.json to the output folder; without -o,
-the page and its pictures go to docs/ and the two others to runs/.
+the page and its images go to docs/ and the two others to runs/.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--light", action="append", choices=BUILT_IN, help="only these built-in lights; repeatable"
     )
     parser.add_argument("--shape", action="append", choices=CONVEX, help="only these shapes; repeatable")
-    parser.add_argument("--size", type=int, help="edge of the pictures whose error is measured, pixels")
+    parser.add_argument("--size", type=int, help="edge of the images whose error is measured, pixels")
     options = parser.parse_args(arguments)
     settings = options.settings
     settings = replace(settings, lights=(*(options.light or settings.lights), *options.envmap))

@@ -57,7 +57,7 @@ def budgets(setup: Exact) -> list[Row]:
 def _chain(
     setup: Exact, roughness: float, metallic: float, light: Any, finest: Any, lobe: np.ndarray
 ) -> list[Step]:
-    """From the product's own picture to the exact one; `lobe`: the exact average around the mirror."""
+    """From the product's own image to the exact one; `lobe`: the exact average around the mirror."""
     points, f0 = setup.points, reflectance(metallic)
     material = setup.set_material(metallic, roughness)
     mirror = reflect(points.view, points.normal)
@@ -114,7 +114,7 @@ def sphere_surfels(count: int) -> Surfels:
 
 
 def surfel_budget(setup: Exact) -> dict[str, Any]:
-    """Budget of the surfels' picture of a sphere, where they cover its pixels."""
+    """Budget of the surfels' image of a sphere, where they cover its pixels."""
     settings = setup.settings
     height = settings.heights[-1]
     light = setup.light.prefiltered(height)
@@ -155,7 +155,7 @@ def surfel_budget(setup: Exact) -> dict[str, Any]:
 
 
 def _at(maps: list[Any], points: Points) -> np.ndarray:
-    """Values (P, K) of K full pictures at the points."""
+    """Values (P, K) of K full images at the points."""
     return np.stack([np.array(x, np.float64) for x in maps], axis=-1)[points.pixel.numpy()]
 
 

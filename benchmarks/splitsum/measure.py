@@ -19,7 +19,7 @@ from benchmarks.common.errors import CLEAR
 from benchmarks.common.report import Row, where
 from benchmarks.common.setup import path_tracer
 from benchmarks.common.view import Light, make_light, view_bins
-from benchmarks.common.view import rows as picture_values
+from benchmarks.common.view import rows as image_values
 from benchmarks.splitsum import budget
 from benchmarks.splitsum.setup import CONVEX, LEVEL_SETS, OPTIONS, SHIPPED, Exact, Settings, split_sum
 
@@ -40,7 +40,7 @@ def line(times: dict[int, float]) -> Callable[[float], float]:
 
 
 def time_of(times: Times, row: Row) -> float | None:
-    """Of a row: measured, or on the straight line through the measured ones."""
+    """Time of a row: measured, or on the straight line through the measured ones."""
     known = times.get((row["shape"], row["light"], row["method"]), {})
     if row["setting"] in known:
         return known[row["setting"]]
@@ -97,7 +97,7 @@ LEVELS_HEIGHT = 128
 TIMED = (0.5, 0.3)
 """Metallic and roughness on which times are taken; a kernel is the same for every other."""
 Calls = dict[tuple[str, int], Callable[[], Any]]
-"""What makes the timed picture, by method and setting."""
+"""What makes the timed image, by method and setting."""
 
 
 @dataclass
@@ -122,7 +122,7 @@ class Run:
     def add(
         self, setup: Exact, method: str, setting: int, roughness: float, metallic: float, values: np.ndarray
     ) -> None:
-        """Book the errors of a picture (P, 3), for the split sum also by view angle."""
+        """Book the errors of an image (P, 3), for the split sum also by view angle."""
         reference = setup.integrals(roughness).radiance(metallic)
         points = setup.points
         flip, self.flip_reason = errors.flip(points.image(values), points.image(reference.mean))
@@ -185,12 +185,12 @@ def _samplers() -> dict[str, Any]:
 
 
 def _sampled(run: Run, setup: Exact, roughness: float, metallic: float) -> None:
-    """Pictures of the path tracer and of plain Monte Carlo."""
+    """Images of the path tracer and of plain Monte Carlo."""
     settings, seed = run.settings, 1 + len(run.rows)
     setup.set_material(metallic, roughness)
     counts = {"path": settings.spp, "monte_carlo": settings.samples}
     if metallic != settings.metallic[len(settings.metallic) // 2]:
-        del counts["monte_carlo"]  # it only serves the plots of speed against error, which show one metal
+        del counts["monte_carlo"]  # only for the plots of speed against error, which show one metal
     for method, integrator in _samplers().items():
         for spp in counts.get(method, ()):
             values = setup.render(integrator, spp, seed + spp)
@@ -201,7 +201,7 @@ def _sampled(run: Run, setup: Exact, roughness: float, metallic: float) -> None:
 
 
 def _sampled_calls(setup: Exact) -> Calls:
-    """Calls that make the timed pictures of both."""
+    """Calls that make the timed images of both."""
     setup.set_material(*TIMED)
     return {
         (method, spp): functools.partial(
@@ -264,13 +264,13 @@ def _split_sums(
     filtered: dict[tuple[str, int], Any],
     materials: list[tuple[float, float]],
 ) -> Calls:
-    """Book pictures of the split sums of a setup; calls that make the timed ones."""
+    """Book images of the split sums of a setup; calls that make the timed ones."""
     calls: Calls = {}
     for variant in variants:
         light, option = filtered[setup.light.name, variant.height], variant.option
         for roughness, metallic in materials:
             radiance = split_sum(setup.points, setup.set_material(metallic, roughness), light, option)
-            run.add(setup, variant.method, variant.height, roughness, metallic, picture_values(radiance))
+            run.add(setup, variant.method, variant.height, roughness, metallic, image_values(radiance))
         shader = functools.partial(split_sum, material=setup.set_material(*TIMED), light=light, option=option)
         calls[variant.method, variant.height] = setup.with_primary_rays(shader)
     return calls

@@ -34,7 +34,7 @@ def best_height(result: dict[str, Any]) -> int:
     return int(max(result["settings"]["heights"]))
 
 
-def picture_metallic(result: dict[str, Any]) -> float:
+def shown_metallic(result: dict[str, Any]) -> float:
     """The metal that plots show, if it was measured."""
     found = list(result["settings"]["metallic"])
     return PICTURE_METALLIC if PICTURE_METALLIC in found else float(found[-1])
@@ -132,7 +132,7 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
         "surfels": f"{s['surfels']:,}",
         "covered": percent(min(row["covered"] for row in result["surfel_budgets"])),
         "price_case": f"{convex(result)[0]} under `{pareto_light(result)}`, "
-        f"metallic {picture_metallic(result):g}",
+        f"metallic {shown_metallic(result):g}",
     }
 
 
@@ -172,7 +172,7 @@ def _price(result: dict[str, Any]) -> str:
         result["rows"],
         shape=convex(result)[0],
         light=pareto_light(result),
-        metallic=picture_metallic(result),
+        metallic=shown_metallic(result),
         n_dot_v="all",
     )
     rows = []
@@ -210,7 +210,7 @@ def _dominant(result: dict[str, Any]) -> str:
 
 
 def _budgets(result: dict[str, Any]) -> str:
-    """Of the most metallic material: a table for each shape, for the first one at both heights."""
+    """Budgets of the most metallic material: a table for each shape, for the first one at both heights."""
     budgets, order = result["budgets"], lights(result)
     if not budgets:
         return table([], [])
@@ -232,7 +232,7 @@ Result = dict[str, Any]
 
 
 def plot(result: Result, folder: Path) -> None:
-    """Write splitsum_NAME.png for each picture of the page."""
+    """Write splitsum_NAME.png for each image of the page."""
     made = {
         "pareto": pareto_plot,
         "lights": over_lights,
@@ -254,7 +254,7 @@ def pareto_plot(result: Result) -> Any:
     """Error over time, one panel a roughness."""
     light, shape = pareto_light(result), convex(result)[0]
     panels = {f"roughness {r:g}": (light, r) for r in result["settings"]["roughness"]}
-    return _fronts(result, panels, 4, f"{shape}, light: {light}, metallic {picture_metallic(result):g}")
+    return _fronts(result, panels, 4, f"{shape}, light: {light}, metallic {shown_metallic(result):g}")
 
 
 def over_lights(result: Result) -> Any:
@@ -268,7 +268,7 @@ def over_lights(result: Result) -> Any:
 def _fronts(result: Result, panels: dict[str, tuple[str, float]], columns: int, title: str) -> Any:
     """All methods on one convex surface, a panel for each light and roughness."""
     figure, axes = figures.grid(list(panels), columns, 2.9, 2.6, "ms per megapixel", "relMSE")
-    fixed = {"shape": convex(result)[0], "metallic": picture_metallic(result), "n_dot_v": "all"}
+    fixed = {"shape": convex(result)[0], "metallic": shown_metallic(result), "n_dot_v": "all"}
     for ax, (light, roughness) in zip(axes, panels.values(), strict=True):
         _front(ax, where(result["rows"], light=light, roughness=roughness, **fixed))
     figures.legend(figure, axes, f"{title} (grey: below the reference's noise)", 4)
@@ -399,7 +399,7 @@ def _percent(row: Row | None) -> str:
 
 
 def least_speed_up(result: Result, shape: str, light: str, roughness: float) -> Row:
-    """Of the metals, for the finest light."""
+    """Plot the metals, for the finest light."""
     found = where(
         result["speed_ups"], shape=shape, light=light, roughness=roughness, height=best_height(result)
     )

@@ -48,7 +48,7 @@ class Settings:
     lights: tuple[str, ...] = BUILT_IN
     roughness: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
     metallic: tuple[float, ...] = (0.0, 0.5, 1.0)
-    size: int = 48  # edge of the pictures whose error is measured
+    size: int = 48  # edge of the images whose error is measured
     timing_size: int = 512  # of those that are timed: large enough that launching a kernel costs nothing
     truth_height: int = 512
     heights: tuple[int, ...] = (16, 32, 64, 128, 256)
@@ -141,7 +141,7 @@ class Integrals:
     table: tuple[np.ndarray, np.ndarray]  # (A, B), (P, 1) each: the first two under a constant light of 1
 
     def radiance(self, metallic: float) -> Estimate:
-        """Outgoing radiance: the integrals do not depend on F0 and albedo, so one set serves every metal.
+        """Outgoing radiance: the integrals do not depend on F0 and albedo: one set is used for every metal.
 
         Both specular integrals come from the same samples: their errors add, not the squares.
         """

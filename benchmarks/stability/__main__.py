@@ -1,8 +1,8 @@
-"""Hard cases against a float64 oracle, beside the textbook formulas in float32.
+"""Hard cases against a float64 reference, compared with textbook formulas in float32.
 
     python -m benchmarks.stability                     the page docs/stability.md, in 15 minutes on 2 cores
     python -m benchmarks.stability --quick -o out      without large cases, fits, the method's own error
-    python -m benchmarks.stability --only light -o out cases whose name holds a word; repeatable
+    python -m benchmarks.stability --only light -o out cases whose name contains a word; repeatable
 
 Writes stability.md, stability.csv and stability.json to the output folder; without -o, the page goes to docs/
 and the two others to runs/. The exit code is 1 if a case fails.

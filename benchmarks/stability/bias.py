@@ -1,4 +1,4 @@
-"""Error of the method, not of its implementation: what each rule of sorting and cutting does to a picture.
+"""Error of the method, not of its implementation: what each rule of sorting and cutting does to an image.
 
 Everything here is float64: the same scene with one rule replaced by what it stands for.
 """
@@ -124,7 +124,7 @@ def _by_pixel(scene: oracle.Scene) -> Array:
 
 
 def _supersampled(case: Case, light: oracle.Light | None) -> oracle.Image:
-    """Means over SAMPLES² rays a pixel, without the low-pass."""
+    """Means over SAMPLES² rays per pixel, without the low-pass."""
     c = case.camera
     fine = replace(
         c, width=SAMPLES * c.width, height=SAMPLES * c.height, fx=SAMPLES * c.fx, fy=SAMPLES * c.fy,
@@ -138,9 +138,9 @@ def _supersampled(case: Case, light: oracle.Light | None) -> oracle.Image:
             raw, fine, pixels, np.empty((0, 0), int), case.at, case.reflectance, case.diffuse, light,
             rules=oracle.Rules(low_pass=None),
         )  # fmt: skip
-        picture = oracle.render(replace(scene, order=_by_pixel(scene)))
+        image = oracle.render(replace(scene, order=_by_pixel(scene)))
         for name, found in maps.items():
-            blocks = picture.maps[name].reshape(SAMPLES, c.width, SAMPLES, -1)
+            blocks = image.maps[name].reshape(SAMPLES, c.width, SAMPLES, -1)
             found.append(blocks.mean((0, 2)))
     joined = {name: np.concatenate(found) for name, found in maps.items()}
     return oracle.Image(joined, np.zeros(c.width * c.height, bool), np.empty((0, 0), bool))

@@ -33,9 +33,11 @@ class Case:
     reflectance: str = "split_sum"
     diffuse: str = "sh"
     mesh: Callable[[], Mesh] | None = None  # made when it is needed
-    surface: Any = None  # vertices and faces of the mesh, and offset of rays: what the oracle traces
+    surface: Any = (
+        None  # vertices and faces of the mesh, and offset of rays: what the float64 reference traces
+    )
     further: float = 0.0  # rays may start so much further off the surface: nothing is compared there
-    pixels: int | None = None  # the oracle sees a random subset of this size; None: all
+    pixels: int | None = None  # the float64 reference sees a random subset of this size; None: all
     offset: tuple[int, int] = (0, 0)  # of a crop window in its film
     quick: bool = True  # cheap enough for every test run
     near: float | None = None  # the camera's near plane, if the case is about it
@@ -122,12 +124,12 @@ def plain(name: str, **changes: Any) -> Case:
 
 LN = np.log
 EYE = np.array([3.0, 1.0, 2.0])
-"""Of the plain camera."""
+"""Position of the plain camera."""
 
 
 def catalogue() -> list[Case]:
     """Every case, groups in the order of the page."""
-    groups = (_ends, _normals, _scales, _places, _many, _worlds, _lights, _pictures, _cameras, _meshes)
+    groups = (_ends, _normals, _scales, _places, _many, _worlds, _lights, _images, _cameras, _meshes)
     return [case for group in groups for case in group()]
 
 
@@ -305,10 +307,10 @@ def _lights() -> Iterator[Case]:
     below[13, 5] = 1e6
     sheet, above = _level((0, 1, 0)) | filled(roughness=-1), camera((1.5, 4, 0.5))
     yield plain("a sun of 1e6 below the horizon", raw=sheet, camera=above, light=raw_light(below))
-    # Seen from above, mirrors around the top reflect the pole; from -z, those before the camera the seam.
+    # Mirrors seen from above reflect the pole; from -z, those before the camera the map's seam.
     mirrors = {
         "a pole": ((0, 1, 0), (0.05, 4, 0.02)),
-        "the seam": ((0, 0, -1), (0, 0.4, -4)),
+        "the seam of the map": ((0, 0, -1), (0, 0.4, -4)),
         "the other half": ((0, 0, 1), (0, 0.4, 4)),
     }
     for name, (normal, eye) in mirrors.items():
@@ -324,17 +326,17 @@ def _level(normal: tuple[float, ...]) -> Raw:
     return {"position": flat - np.sum(flat * axis, 1, keepdims=True) * axis, "rotation": facing(unit(n))}
 
 
-# ---------------- pictures and cameras ----------------
+# ---------------- images and cameras ----------------
 
 
-def _pictures() -> Iterator[Case]:
+def _images() -> Iterator[Case]:
     for width, height in ((1, 1), (1, 17), (17, 1), (13, 7)):
         focal = camera().fx * max(width, 4) / WIDTH
         eye = replace(camera(width=width, height=height), fx=focal, fy=focal)
-        yield plain(f"a picture of {width} × {height}", camera=eye, quick=width == 1)
+        yield plain(f"an image of {width} × {height}", camera=eye, quick=width == 1)
     flat: dict[str, Any] = {"at": "surfel", "reflectance": "radiance"}
     large = camera(width=4096, height=4096)
-    yield plain("a picture of 4096²", camera=large, pixels=600, quick=False, **flat)
+    yield plain("an image of 4096²", camera=large, pixels=600, quick=False, **flat)
     one = {n: x[:1] for n, x in sphere().items()} | {"position": np.zeros((1, 3))}
     yield plain("one surfel", raw=one)
     none = {n: x[:0] for n, x in sphere().items()}

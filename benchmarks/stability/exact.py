@@ -44,7 +44,7 @@ def softplus(raw: Array) -> Array:
 
 
 def light_of(raw: Array) -> oracle.Light:
-    """The oracle's light."""
+    """The float64 reference's light."""
     radiance = softplus(raw)
     flat = radiance.reshape(-1, 3)
     levels = [(m @ flat) for m in _operator(len(raw))]
@@ -82,7 +82,7 @@ def product_order(case: Case, pixels: Array) -> Array:
 
 
 def scene_of(case: Case, pixels: Array, order: Array, light: oracle.Light | None = None) -> oracle.Scene:
-    """The oracle's scene of a case."""
+    """The float64 reference's scene of a case."""
     visibility = None
     if case.surface is not None:
         visibility = functools.partial(visibility_of, case)

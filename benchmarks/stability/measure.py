@@ -1,4 +1,4 @@
-"""One case by the product, by the float64 oracle, and by the textbook: errors, non-finite values, verdict."""
+"""Render a case by the product, the float64 reference and the textbook: errors, verdict."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ NEGLIGIBLE = 1e-5
 """A class whose gradient is smaller than this share of the largest class's (positions in units of the
 scene's extent) is compared with that share: GRADIENT_LIMIT of it is float32's resolution of the largest."""
 KEPT = 0.4
-"""Share of the pixels that show something which must lie outside the oracle's declared bands."""
+"""Share of the pixels that show something which must lie outside the float64 reference's declared bands."""
 LOSS_MAPS = ("radiance", "alpha", "depth", "normal")
 GRADIENTS = (
     "position", "rotation", "scale", "opacity", "radiance_sh", "albedo", "metallic", "roughness",
@@ -69,7 +69,7 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """ "holds", "ill-conditioned", or what fails."""
+        """Return "within limits", "ill-conditioned", or what fails."""
         failed: list[str] = []
         ill: list[str] = []
         if self.non_finite:
@@ -85,7 +85,7 @@ class Row:
                 (ill if error <= ILL * floor else failed).append(f"{name} {error:.1e}")
         if failed:
             return "FAILS: " + ", ".join(failed)
-        return "ill-conditioned: " + ", ".join(ill) if ill else "holds"
+        return "ill-conditioned: " + ", ".join(ill) if ill else "within limits"
 
 
 # ---------------- the product ----------------
@@ -151,7 +151,7 @@ def _plane(x: Any, pixels: int) -> Array:
 
 
 def chosen_pixels(case: Case) -> Array:
-    """Raster indices that the oracle looks at."""
+    """Raster indices that the float64 reference looks at."""
     every = case.camera.width * case.camera.height
     if case.pixels is None or case.pixels >= every:
         return np.arange(every)
@@ -306,10 +306,10 @@ def condition(
             camera=replace(scene.camera, to_world=pose),
             light=light,
         )
-        picture = oracle.render(moved, weights)
-        images.append(max(map_errors(picture.maps, truth.maps, ~band)))
+        image = oracle.render(moved, weights)
+        images.append(max(map_errors(image.maps, truth.maps, ~band)))
         gradients.append(
-            gradient_errors(_gradients(replace(case, light=raw_light), moved, picture), exact, scene.raw)
+            gradient_errors(_gradients(replace(case, light=raw_light), moved, image), exact, scene.raw)
         )
     return max(images), {n: max(g[n] for g in gradients) for n in gradients[0]}
 

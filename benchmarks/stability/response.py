@@ -16,10 +16,10 @@ from mi_refgs.reference import losses as oracle
 from mi_refgs.render import display
 
 SIZE = (11, 9)
-"""Height and width of the pictures."""
+"""Height and width of the images."""
 NOISE = 1e-4
 """Below this a gradient of the loss is compared absolutely: differences of float64 tell no more, and a
-pixel of the plain picture has 1e-2."""
+pixel of the plain image has 1e-2."""
 JOINT = 0.0031308
 CURVE = {
     "0": 0.0,
@@ -34,9 +34,9 @@ CURVE = {
 
 
 def measure() -> dict[str, Any]:
-    """Rows of the sRGB curve, and of losses under extreme pictures."""
+    """Rows of the sRGB curve, and of losses under extreme images."""
     curve = [_curve(name, x) for name, x in CURVE.items()]
-    return {"curve": curve, "losses": [_loss(*x) for x in pictures()]}
+    return {"curve": curve, "losses": [_loss(*x) for x in images()]}
 
 
 def _curve(name: str, at: float) -> dict[str, Any]:
@@ -70,7 +70,7 @@ def _relative(found: Any, exact: float) -> float:
     return abs(found - exact) / abs(exact) if exact else abs(found)
 
 
-def pictures() -> list[tuple[str, Array, Array, Array, Array]]:
+def images() -> list[tuple[str, Array, Array, Array, Array]]:
     """Name, radiance (H, W, 3) premultiplied, alpha (H, W), target (H, W, 3) encoded, target alpha."""
     rng = np.random.default_rng(31)
     h, w = SIZE

@@ -50,17 +50,17 @@ FITS: dict[str, dict[str, Any]] = {
     "a texel of the light starts at 1e6": {"light": lambda raw: np.where(np.arange(raw.size) < 3, 1e6, raw)},
     "the whole light starts at 1e6": {"light": lambda raw: np.full_like(raw, 1e6)},
     "the light starts black (raw -80)": {"light": lambda raw: np.full_like(raw, -80.0)},
-    "a pixel of 1e6 in linear pictures": {"view": _with_peak},
-    "over-exposed pictures": {"view": lambda v: {"image": np.ones_like(v.image)}},
-    "under-exposed pictures": {"view": lambda v: {"image": 1 - v.alpha[..., None] + 0 * v.image}},
-    "all-transparent pictures": {
+    "a pixel of 1e6 in linear images": {"view": _with_peak},
+    "over-exposed images": {"view": lambda v: {"image": np.ones_like(v.image)}},
+    "under-exposed images": {"view": lambda v: {"image": 1 - v.alpha[..., None] + 0 * v.image}},
+    "all-transparent images": {
         "view": lambda v: {"image": np.ones_like(v.image), "alpha": np.zeros_like(v.alpha)}
     },
 }
 
 
 def fit(name: str) -> dict[str, Any]:
-    """STEPS steps in each stage of the full method; pictures change after the start, which needs masks."""
+    """STEPS steps in each stage of the full method; images change after the start, which needs masks."""
     trainer, method = make_trainer(SURFELS, sphere_data(SIZE, VIEWS, np.random.default_rng(0)))
     case = FITS[name]
     if "view" in case:
@@ -90,7 +90,7 @@ def fit(name: str) -> dict[str, Any]:
 
 
 def measure(quick: bool = False, only: list[str] | None = None, quiet: bool = False) -> dict[str, Any]:
-    """Everything that the page shows; `only`: cases whose name holds one of these words, and nothing else."""
+    """Measure everything on the page; `only`: cases whose name contains one of these words."""
     begin = time.perf_counter()
     chosen = [case for case in catalogue() if case.quick or not quick]
     if only:
@@ -98,7 +98,7 @@ def measure(quick: bool = False, only: list[str] | None = None, quiet: bool = Fa
     rows = []
     for case in tqdm(chosen, desc="cases", disable=quiet):
         rows.append(record(measure_case(case, floors=case.quick)))
-        dr.flush_malloc_cache()  # a picture of 4096² leaves gigabytes
+        dr.flush_malloc_cache()  # an image of 4096² leaves gigabytes
     result: dict[str, Any] = {"machine": report.machine(), "rows": rows}
     if not only:
         result |= {name: [_finite(row) for row in found] for name, found in response.measure().items()}
@@ -161,7 +161,7 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
     keys = ("value", "slope", "textbook_value", "textbook_slope")
     return dict(zip(names, map(_e, limits), strict=True)) | {
         "count": len(rows),
-        "hold": sum(row["verdict"] == "holds" for row in rows),
+        "hold": sum(row["verdict"] == "within limits" for row in rows),
         "ill": sum(row["verdict"].startswith("ill") for row in rows),
         "failed": len(failures(result)),
         "non_finite": sum(row["non_finite"] for row in [*rows, *result["losses"], *result["fits"]]),
@@ -178,7 +178,7 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
             [[row["at"], *(_e(row[key]) for key in keys)] for row in result["curve"]],
         ),
         "losses": table(
-            ["picture", "loss", "gradient", "not finite"],
+            ["image", "loss", "gradient", "not finite"],
             [[r["name"], _e(r["value"]), _e(r["slope"]), r["non_finite"]] for r in result["losses"]],
         ),
         "fits": table(

@@ -5,7 +5,7 @@
     python -m benchmarks.visibility --mesh bob.obj -o out your closed mesh beside the built-in scenes
 
 Writes visibility.md, images/visibility_*.png, visibility.csv and visibility.json to the output folder;
-without -o, the page and its picture go to docs/ and the two others to runs/.
+without -o, the page and its image go to docs/ and the two others to runs/.
 """
 
 from __future__ import annotations

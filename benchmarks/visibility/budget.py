@@ -1,17 +1,17 @@
-"""The error of the specular term in concave scenes taken apart, up to the path tracer at full depth.
+"""Decompose the error of the specular term in concave scenes, up to the path tracer at full depth.
 
-The picture by the paper's rule is V(r) L(r) S + (1 - V(r)) I(r) S: free light L as prefiltered, visibility V
+The image by the paper's rule is V(r) L(r) S + (1 - V(r)) I(r) S: free light L as prefiltered, visibility V
 and indirect light I along the one mirror direction r. What is exact is the integral of the reflectance w over
 all directions l of the lobe, ∫ w V L + ∫ w (1 - V) I. Between the two, in this order:
 
 - V(r) gives way to the exact share of the lobe that is free, of which its rays are estimates;
-- I(r) to the mean of the same harmonics over the blocked directions of the lobe;
-- the harmonics in them to the true light;
+- I(r) to the mean of the same spherical harmonics over the blocked directions of the lobe;
+- the spherical harmonics in them to the true light;
 - the split sum of the free light to its integral, as if nothing stood in the way;
 - and the product of that and the visibility to the integral of their product.
 
-Harmonics have a value wherever the mirror ray is free, and true indirect light has none there: so visibility
-goes first.
+Spherical harmonics have a value wherever the mirror ray is free, and true indirect light has none there: so
+visibility goes first.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mi_refgs.surfels.attributes import MAX_SH_DEGREE
 
 MIRROR = "mirror-ray visibility"
 DIRECTION = "one direction of indirect light"
-HARMONICS = "indirect light by harmonics"
+HARMONICS = "indirect light by spherical harmonics"
 SPLIT = "split sum of the free light"
 APART = "visibility apart from the light"
 RAY = "one mirror ray for the lobe"
@@ -61,8 +61,8 @@ class Exact:
 
 
 @dataclass(frozen=True)
-class TrainedScene:
-    """Indirect light by harmonics: along the mirror direction, and ∫ w (1 - V) I over the lobe (P, 3)."""
+class FittedHarmonics:
+    """Indirect light by SH: along the mirror direction, and ∫ w (1 - V) I over the lobe (P, 3)."""
 
     mirror: np.ndarray
     lobe: np.ndarray
@@ -71,23 +71,23 @@ class TrainedScene:
 
 @dataclass(frozen=True)
 class Shipped:
-    """The product's pictures (P, 3)."""
+    """The product's images (P, 3)."""
 
     free: np.ndarray  # the split sum, nothing in the way
     reflectance: np.ndarray  # S
-    paper: np.ndarray  # mirror ray, harmonics
+    paper: np.ndarray  # mirror ray, spherical harmonics
 
 
 @dataclass(frozen=True)
 class Traced:
-    """Traced light of some bounces (P, 3): the product's pictures, and the path tracer's indirect light."""
+    """Traced light of some bounces (P, 3): the product's images, and the path tracer's indirect light."""
 
     ray: np.ndarray  # by the mirror ray
-    lobe: np.ndarray  # by many rays of the lobe
+    lobe: np.ndarray  # by many specular-lobe samples
     indirect: np.ndarray  # after as many further reflections
 
 
-def by_harmonics(shipped: Shipped, exact: Exact, fitted: TrainedScene) -> list[Step]:
+def by_harmonics(shipped: Shipped, exact: Exact, fitted: FittedHarmonics) -> list[Step]:
     """From the paper's rule to the reference."""
     visible = exact.visibility * shipped.free
     blocked = (1 - exact.visibility) * shipped.reflectance
@@ -125,20 +125,20 @@ def bounces_shown(settings: Settings) -> list[int]:
 def budgets(
     setup: Setup, roughness: float, references: Mapping[str, np.ndarray], depth: int
 ) -> list[dict[str, Any]]:
-    """The budgets of a scene, for JSON: by harmonics, and by few and many bounces of traced light.
+    """The budgets of a scene, for JSON: by spherical harmonics, and by few and many bounces of traced light.
 
     `references` are the path tracer's batches at depths 2 ("direct") and `depth` ("full"). `floor` is what
     their noise may be all of.
     """
     fitted, exact = fit(setup, depth), exact_light(setup, references)
-    shipped = Shipped(setup.picture(Rule(0)), reflectance(setup), setup.picture(PAPER, fitted.mirror))
-    # Half the difference of two pictures of half the samples each is one standard error of that of all.
-    first, second = (setup.picture(PAPER, half) for half in fitted.halves)
+    shipped = Shipped(setup.image(Rule(0)), reflectance(setup), setup.image(PAPER, fitted.mirror))
+    # Half the difference of two images of half the samples each is one standard error of that of all.
+    first, second = (setup.image(PAPER, half) for half in fitted.halves)
     chains = {"harmonics": (by_harmonics(shipped, exact, fitted), 0.5 * (first - second))}
     for bounces in bounces_shown(setup.settings):
         light = (setup.reference(2 + bounces) - references["direct"]).mean(0)
         traced = Traced(
-            setup.picture(Rule(1, bounces)), setup.picture(Rule(setup.settings.counts[-1], bounces)), light
+            setup.image(Rule(1, bounces)), setup.image(Rule(setup.settings.counts[-1], bounces)), light
         )
         chains[bounces_name(bounces)] = by_tracing(shipped, exact, traced), np.zeros_like(light)
     return [
@@ -154,7 +154,7 @@ def budgets(
 
 
 def bounces_name(bounces: int) -> str:
-    """Of a budget with traced light."""
+    """Steps of a budget with traced light."""
     return f"{bounces} bounce{'s' * (bounces > 1)}"
 
 
@@ -162,9 +162,9 @@ def bounces_name(bounces: int) -> str:
 
 
 def exact_light(setup: Setup, batches: Mapping[str, np.ndarray]) -> Exact:
-    """By quadrature, and by the path tracer's pictures: batches (B, P, 3) of each depth, of equal seeds.
+    """By quadrature, and by the path tracer's images: batches (B, P, 3) of each depth, of equal seeds.
 
-    The random numbers of two depths are the same: their pictures differ by the added reflections alone.
+    The random numbers of two depths are the same: their images differ by the added reflections alone.
     """
     environment = setup.scene.environment()
     blocked, open_ = (setup.reflected(setup.constant, scene).mean(0) for scene in (setup.scene, None))
@@ -176,8 +176,8 @@ def exact_light(setup: Setup, batches: Mapping[str, np.ndarray]) -> Exact:
     )
 
 
-def fit(setup: Setup, depth: int) -> TrainedScene:
-    """The best harmonics for the light of the path tracer's `max_depth`, looked up."""
+def fit(setup: Setup, depth: int) -> FittedHarmonics:
+    """The best spherical harmonics for the light of the path tracer's `max_depth`, looked up."""
     settings, points = setup.settings, setup.points
     parts = [
         traced(setup.scene, points, depth, settings.lattice, seed) for seed in range(1, settings.batches + 1)
@@ -185,9 +185,9 @@ def fit(setup: Setup, depth: int) -> TrainedScene:
     mirror = reflect(points.view, points.normal)
     whole, even, odd = (mean(some).solve() for some in (parts, parts[::2], parts[1::2]))
     looked_up, first, second = (rows(along(coefficients, mirror)) for coefficients in (whole, even, odd))
-    light = Surroundings(whole)
+    light = HarmonicsEmitter(whole)
     open_, free = (setup.reflected(light, scene).mean(0) for scene in (None, setup.scene))
-    return TrainedScene(looked_up, open_ - free, (first, second))
+    return FittedHarmonics(looked_up, open_ - free, (first, second))
 
 
 def reflectance(setup: Setup) -> np.ndarray:
@@ -198,16 +198,16 @@ def reflectance(setup: Setup) -> np.ndarray:
 
 
 DEGREE = MAX_SH_DEGREE
-"""Of the product's indirect channel, unless told otherwise."""
+"""SH degree of the product's indirect channel."""
 RIDGE = 1e-3
 """Penalty on the coefficients, in multiples of what all directions of a hemisphere weigh: it decides where
-hardly any direction is blocked. From 1e-4 to 1e-2 the relMSE of the picture changes by less than a tenth in
+hardly any direction is blocked. From 1e-4 to 1e-2 the relMSE of the image changes by less than a tenth in
 the bowls and for rough plates; for plates of roughness 0.1 it goes from 0.04 to 0.08, and is 0.06 here."""
 
 
 @dataclass(frozen=True)
 class Sums:
-    """Of the least squares at P points, K coefficients: A'A (P, K, K) and A'b (P, K, 3) per direction."""
+    """Sums of the least squares at P points, K coefficients: A'A (P, K, K), A'b (P, K, 3) per direction."""
 
     normal: np.ndarray
     right: np.ndarray
@@ -220,12 +220,12 @@ class Sums:
 
 
 def mean(parts: list[Sums]) -> Sums:
-    """Of as many directions each."""
+    """Batches of equally many directions."""
     return Sums(np.mean([part.normal for part in parts], 0), np.mean([part.right for part in parts], 0))
 
 
 def sums(basis: np.ndarray, radiance: np.ndarray, blocked: np.ndarray) -> Sums:
-    """Of D directions: basis (P, D, K), radiance (P, D, 3), blocked (P, D)."""
+    """Sample D directions: basis (P, D, K), radiance (P, D, 3), blocked (P, D)."""
     rows = np.swapaxes(basis * blocked[..., None], 1, 2)
     return Sums(
         (rows @ basis).astype(np.float64) / basis.shape[1],
@@ -236,7 +236,7 @@ def sums(basis: np.ndarray, radiance: np.ndarray, blocked: np.ndarray) -> Sums:
 def traced(scene: Any, points: Points, depth: int, directions: int, seed: int) -> Sums:
     """One path of Mitsuba's `path` into each direction of a lattice that every point shifts at random.
 
-    `depth` is the `max_depth` of the picture that this light is a part of: one reflection, at the point, is
+    `depth` is the `max_depth` of the image that this light is a part of: one reflection, at the point, is
     behind the path already. `directions` is one of `montecarlo.LATTICES`.
     """
     path = mi.load_dict({"type": "path", "max_depth": depth - 1, "rr_depth": 1000, "hide_emitters": True})
@@ -268,8 +268,8 @@ def along(coefficients: np.ndarray, direction: Any) -> Any:
     return clamp_positive(eval_sh(columns, direction))
 
 
-class Surroundings:
-    """Harmonics at each of P points as an emitter for `montecarlo.integrate`, which is never sampled itself.
+class HarmonicsEmitter:
+    """SH at each of P points as an emitter for `montecarlo.integrate`, which is never sampled itself.
 
     Lane i is point i modulo P, as there.
     """

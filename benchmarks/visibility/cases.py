@@ -15,10 +15,10 @@ from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.shade.options import ShadingOptions
 
 METALLIC = 1.0
-"""A metal has no diffuse term: the whole picture is the specular one."""
+"""A metal has no diffuse term: the whole image is the specular one."""
 VOXEL = 5e-5
 """Resolution the occluder is told, for objects of size 2. Mesh and points are exact: a ray
-leaves the surface by no more than rounding asks for. Ten times as much keeps many rays from the exact
+leaves the surface by no more than rounding requires. Ten times as much keeps many rays from the exact
 visibility: they then differ from it by 0.003 instead of 0.0004 (plates, roughness 0.1)."""
 
 
@@ -32,7 +32,7 @@ class Settings:
     rays: tuple[int, ...] = (3, 4, 8)  # of the lobe, measured and timed
     more_rays: tuple[int, ...] = (16, 64, 256)  # for the curve, and the most for the errors; not timed
     limit: int = 2048  # rays that stand for infinitely many
-    size: int = 48  # edge of the pictures whose error is measured
+    size: int = 48  # edge of the images whose error is measured
     timing_size: int = 192  # of those that are timed
     light_height: int = 128  # rows, for the path tracer and the prefiltered light alike
     spp: int = 64  # of each batch of the references

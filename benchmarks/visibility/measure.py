@@ -57,25 +57,25 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
 
 def _errors(setup: Setup, roughness: float, references: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """A row for each rule and depth."""
-    pictures = {rule: setup.picture(rule) for rule in rules(setup.settings)}
+    images = {rule: setup.image(rule) for rule in rules(setup.settings)}
     rows = []
     for name, batches in references.items():
         reference = mc.estimate(batches)
-        for rule, values in pictures.items():
+        for rule, values in images.items():
             case = {"scene": setup.name, "roughness": roughness, "method": rule.name, "depth": name}
             rows.append(case | vars(rule) | errors.compare(values, reference).record())
     return rows
 
 
 def _curve(setup: Setup, roughness: float) -> list[dict[str, Any]]:
-    """Over rays: distance of the visibility to the exact one, and of the picture to that of many rays."""
+    """Over rays: distance of the visibility to the exact one, and of the image to that of many rays."""
     exact, noise = setup.visibility()
-    limit = setup.picture(Rule(setup.settings.limit, bounces=1))
+    limit = setup.image(Rule(setup.settings.limit, bounces=1))
     weight = errors.weight(limit)
     found = []
     for rays in (*setup.settings.counts, setup.settings.limit):
         visibility = np.array(setup.seen(setup.points, Rule(rays)).visibility, np.float64)
-        picture = setup.picture(Rule(rays, bounces=1))
+        image = setup.image(Rule(rays, bounces=1))
         found.append(
             {
                 "scene": setup.name,
@@ -84,7 +84,7 @@ def _curve(setup: Setup, roughness: float) -> list[dict[str, Any]]:
                 "visibility_rms": float(np.sqrt(np.mean((visibility - exact) ** 2))),
                 "visibility_floor": float(np.sqrt(np.mean(noise**2))),
                 "visibility_bias": float(np.mean(visibility - exact)),
-                "to_limit": float(np.mean((picture - limit) ** 2 * weight)),
+                "to_limit": float(np.mean((image - limit) ** 2 * weight)),
             }
         )
     return found

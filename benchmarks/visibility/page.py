@@ -18,7 +18,7 @@ PAPER = "harmonics"
 BUDGET = 3.0
 """Times of the mirror ray alone that a setting may take."""
 TIMES = ("ms", "frame_ms")
-"""Of visibility and shading on a mesh; of the product's frame of surfels."""
+"""Times of visibility and shading on a mesh, and of the product's frame of surfels."""
 
 
 def tradeoffs(rows: list[Row], budgets: list[Row]) -> list[Row]:
@@ -129,7 +129,7 @@ def _gains(tradeoffs: list[Row]) -> str:
 
 
 def _limits(result: dict[str, Any]) -> str:
-    """What is left with the most rays where the setting within the budget is worse than harmonics."""
+    """Errors with the most rays where the setting within the budget is worse than SH."""
     most, rows = max(result["settings"]["bounces"]), []
     for case in where(result["tradeoffs"], time="frame_ms"):
         if case["gain"] < 1:
@@ -232,9 +232,9 @@ def _convergence(ax: Any, result: dict[str, Any], scene: str) -> None:
         rows = where(result["curve"], scene=scene, roughness=roughness)
         colour = SHADES[k % len(SHADES)]
         near = [(row["rays"], row["visibility_rms"], None) for row in rows]
-        picture = [(row["rays"], row["to_limit"] ** 0.5, None) for row in rows[:-1]]
+        image = [(row["rays"], row["to_limit"] ** 0.5, None) for row in rows[:-1]]
         figures.series(ax, near, "o-", colour, f"visibility, r = {roughness:g}", markersize=3)
-        figures.series(ax, picture, "s--", colour, f"traced picture, r = {roughness:g}", markersize=3)
+        figures.series(ax, image, "s--", colour, f"traced image, r = {roughness:g}", markersize=3)
         ax.axhline(rows[0]["visibility_floor"], color=colour, lw=0.8, ls=":", zorder=0)
-    ax.set(xlabel="rays of the lobe", ylabel="distance to the traced answer")
+    ax.set(xlabel="specular-lobe samples", ylabel="distance to the traced answer")
     ax.set_title(scene)

@@ -73,7 +73,7 @@ class Setup(setup.Setup):
         """Outgoing radiance (mi.Color3f)."""
         return shade(self.seen(points, rule), self.light, rule.options()).total()
 
-    def picture(self, rule: Rule, indirect: np.ndarray | None = None) -> np.ndarray:
+    def image(self, rule: Rule, indirect: np.ndarray | None = None) -> np.ndarray:
         """(P, 3); with indirect light (P, 3) of blocked rays in place of the rule's own."""
         at = self.seen(self.points, rule)
         if indirect is not None:
@@ -82,7 +82,7 @@ class Setup(setup.Setup):
         return rows(shaded.total())
 
     def reference(self, depth: int) -> np.ndarray:
-        """The path tracer's pictures: batches (B, P, 3), whose random numbers are those of other depths."""
+        """The path tracer's images: batches (B, P, 3), whose random numbers are those of other depths."""
         path, settings = setup.path_tracer(depth), self.settings
         return np.stack([self.render(path, settings.spp, seed) for seed in range(1, settings.batches + 1)])
 
@@ -99,7 +99,7 @@ class Setup(setup.Setup):
         return blocked.mean(0), blocked.std(0, ddof=1) / np.sqrt(len(blocked))
 
     def shading_call(self, rule: Rule) -> Callable[[], Any]:
-        """The timed picture of the mesh: a primary ray through every pixel, visibility, shading."""
+        """The timed image of the mesh: a primary ray through every pixel, visibility, shading."""
         return self.with_primary_rays(lambda points: self.shaded(points, rule))
 
     def frame_call(self, rule: Rule) -> Callable[[], Any]:

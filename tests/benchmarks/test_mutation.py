@@ -1,4 +1,4 @@
-"""The planted mistakes can be planted, and their tests exist. `python -m benchmarks.mutation` runs them."""
+"""Every mutant applies, and its test exists. `python -m benchmarks.mutation` runs them."""
 
 from __future__ import annotations
 
@@ -8,35 +8,35 @@ from functools import cache
 from benchmarks.mutation.planting import catalogue, mutated
 from tests.benchmarks.benchmark_runs import ROOT
 
-MISTAKES = catalogue()
-WITHOUT_MISTAKES = {"gallery", "reference"}
-"""Pictures of the documentation, and the float64 reference that the others are tested against."""
+MUTANTS = catalogue()
+WITHOUT_MUTANTS = {"reference"}
+"""The float64 reference that the others are tested against."""
 
 
-def test_a_mistake_changes_what_its_file_does() -> None:
-    """What it replaces stands in the file once, and the result is other, valid source."""
-    for mistake in MISTAKES:
-        before = ast.dump(ast.parse((ROOT / mistake.file).read_text(encoding="utf-8")))
-        assert ast.dump(ast.parse(mutated(mistake))) != before, mistake.name
+def test_mutant_changes_its_source() -> None:
+    """The replaced text occurs once, and the result is different, valid source."""
+    for mutant in MUTANTS:
+        before = ast.dump(ast.parse((ROOT / mutant.file).read_text(encoding="utf-8")))
+        assert ast.dump(ast.parse(mutated(mutant))) != before, mutant.name
 
 
-def test_the_tests_exist() -> None:
+def test_named_tests_exist() -> None:
     @cache
     def functions(file: str) -> set[str]:
         tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
         return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
 
-    for mistake in MISTAKES:
-        file, _, name = mistake.test.partition("::")
-        assert not name or name.partition("[")[0] in functions(file), mistake.name
+    for mutant in MUTANTS:
+        file, _, name = mutant.test.partition("::")
+        assert not name or name.partition("[")[0] in functions(file), mutant.name
 
 
-def test_names_are_unique() -> None:
-    names = [mistake.name for mistake in MISTAKES]
+def test_mutant_names_are_unique() -> None:
+    names = [mutant.name for mutant in MUTANTS]
     assert sorted(set(names)) == sorted(names)
 
 
-def test_every_package_has_mistakes() -> None:
-    """A new package gets some, or is listed as one that computes nothing of its own."""
+def test_every_room_has_mutants() -> None:
+    """A new room gets mutants, or is listed as one that computes nothing of its own."""
     packages = {path.parent.name for path in (ROOT / "mi_refgs").glob("*/__init__.py")}
-    assert packages - {mistake.file.split("/")[1] for mistake in MISTAKES} <= WITHOUT_MISTAKES
+    assert packages - {mutant.file.split("/")[1] for mutant in MUTANTS} <= WITHOUT_MUTANTS

@@ -1,4 +1,4 @@
-"""The tables of the paper: its figures agree with each other, ours stand below them."""
+"""The tables of the paper: its figures agree with each other, ours are below them."""
 
 from __future__ import annotations
 

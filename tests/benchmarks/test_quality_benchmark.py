@@ -34,10 +34,10 @@ def test_seconds_to_a_level(folder: Path) -> None:
 
 
 def test_the_table_and_the_plot(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = folder / "quality.png"
-    assert quality.main([str(folder), "--at", "33", "36", "-o", str(picture)]) == 0
+    image = folder / "quality.png"
+    assert quality.main([str(folder), "--at", "33", "36", "-o", str(image)]) == 0
     row = capsys.readouterr().out.splitlines()[1].split()
     assert row == ["chair", "ref_gaussian", "seed0", "after", "35", "–", "60", "33.25"]
-    assert picture.stat().st_size > 5_000
+    assert image.stat().st_size > 5_000
     with pytest.raises(SystemExit):
         quality.main([str(folder.parent)])

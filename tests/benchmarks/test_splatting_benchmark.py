@@ -105,7 +105,7 @@ def test_bad_input_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 def exact(workload: Workload) -> np.ndarray:
-    """What contributes (N, P) by the oracle in the product's order."""
+    """What contributes (N, P) by the float64 reference in the product's order."""
     raw = workload.raw | {"radiance_sh": workload.features[:, :3]}
     case = Case("view", raw, workload.pinhole, sky(), at="surfel", reflectance="radiance")
     pixels = np.arange(workload.pixels)
@@ -148,14 +148,14 @@ def test_surfels_are_tangential_discs() -> None:
 
 
 def test_volprim_shows_the_same_object() -> None:
-    """White surfels: its picture is the coverage, up to where in a pixel it samples and its own cut."""
+    """White surfels: its image is the coverage, up to where in a pixel it samples and its own cut."""
     workload = sphere(500, 48, 1.5)
     white = replace(workload, features=np.ones_like(workload.features))
     alpha = Ours.of(white, 3).forward()[-1].numpy().reshape(48, 48)
-    picture = Volprim(white).forward().numpy().mean(axis=2)
+    image = Volprim(white).forward().numpy().mean(axis=2)
     inner = alpha > 0.999
-    assert inner.mean() > 0.3 and np.abs(alpha - picture)[inner].mean() < 0.01
-    assert picture.mean() == pytest.approx(alpha.mean(), rel=0.05)
+    assert inner.mean() > 0.3 and np.abs(alpha - image)[inner].mean() < 0.01
+    assert image.mean() == pytest.approx(alpha.mean(), rel=0.05)
     gradients = Volprim(white).both()
     assert all(np.abs(gradient.numpy()).max() > 0 for gradient in gradients)
 

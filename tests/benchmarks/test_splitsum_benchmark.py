@@ -71,7 +71,7 @@ def test_reports_are_written(folder: Path, result: dict[str, Any]) -> None:
 
 
 def test_flip_is_there_where_it_is_installed(folder: Path, result: dict[str, Any]) -> None:
-    """Of whole pictures; and more samples look better."""
+    """FLIP of whole images; more samples look better."""
     installed = importlib.util.find_spec("flip_evaluator") is not None
     assert all((row["flip"] is not None) == (installed and row["n_dot_v"] == "all") for row in result["rows"])
     assert ("(FLIP: not installed" in (folder / "splitsum.md").read_text()) == (not installed)

@@ -115,7 +115,7 @@ def test_budgets_are_above_the_noise_and_add_up(result: dict[str, Any], scene: s
 
 @pytest.mark.parametrize("scene", ["bowl", "plates"])
 def test_the_budget_takes_the_error_of_the_rule_apart(result: dict[str, Any], scene: str) -> None:
-    """Its reference differs from that of the rows by noise; the best harmonics beat no indirect light."""
+    """Its reference differs from that of the rows by noise; the best SH beat no indirect light."""
     error = errors_of(result, scene, "full")
     total = {row["indirect"]: row["total"] for row in where(result["budgets"], scene=scene)}
     assert total["1 bounce"] == pytest.approx(error["mirror ray, 1 bounce"], rel=0.1)
@@ -131,7 +131,7 @@ def test_bounces_approach_the_path_tracer_at_full_depth() -> None:
     setup = Setup(cases.make_scene("bowl", settings.detail), settings)
     setup.material(0.3)
     reference = estimate(setup.reference(12))
-    found = [compare(setup.picture(Rule(64, bounces)), reference) for bounces in (0, 1, 2, 4, 8)]
+    found = [compare(setup.image(Rule(64, bounces)), reference) for bounces in (0, 1, 2, 4, 8)]
     bias, relmse = [x.bias for x in found], [x.relmse for x in found]
     print(f"bias {np.round(bias, 3)}, relMSE {np.round(relmse, 3)}")
     assert bias == sorted(bias) and bias[0] < -0.3 and abs(bias[-1]) < 0.04

@@ -65,18 +65,18 @@ def studio(plates: Setup) -> dict[str, dict[str, float]]:
 
 
 def random_chains(rng: np.random.Generator) -> list[list[Step]]:
-    """Of pictures that have nothing to do with one another."""
+    """Decompose images that have nothing to do with one another."""
 
-    def picture() -> np.ndarray:
+    def image() -> np.ndarray:
         return rng.uniform(0.1, 1, (50, 3))
 
     def light() -> budget.mc.Estimate:
-        return budget.mc.Estimate(picture(), 0.01 * picture())
+        return budget.mc.Estimate(image(), 0.01 * image())
 
-    exact = budget.Exact(picture(), light(), light(), light())
-    shipped = budget.Shipped(picture(), picture(), picture())
-    fitted = budget.TrainedScene(picture(), picture(), (picture(), picture()))
-    traced = budget.Traced(picture(), picture(), picture())
+    exact = budget.Exact(image(), light(), light(), light())
+    shipped = budget.Shipped(image(), image(), image())
+    fitted = budget.FittedHarmonics(image(), image(), (image(), image()))
+    traced = budget.Traced(image(), image(), image())
     return [budget.by_harmonics(shipped, exact, fitted), budget.by_tracing(shipped, exact, traced)]
 
 
@@ -90,21 +90,21 @@ def test_a_chain_adds_up_at_every_pixel(rng: np.random.Generator) -> None:
 
 
 def test_both_chains_end_alike(rng: np.random.Generator) -> None:
-    """At the path tracer's picture, and the last two parts are the same."""
+    """At the path tracer's image, and the last two parts are the same."""
     first, second = random_chains(rng)
     for a, b in zip(first[-3:], second[-3:], strict=True):
         np.testing.assert_array_equal(a.values, b.values)
 
 
 def test_they_begin_with_what_ships_and_end_with_the_path_tracer(plates: Setup) -> None:
-    """The paper's rule is V L S + (1 - V) I S; the end is Mitsuba's picture but for noise."""
+    """The paper's rule is V L S + (1 - V) I S; the end is Mitsuba's image but for noise."""
     batches = references(plates)
     fitted = budget.fit(plates, DEPTHS["full"])
     exact = budget.exact_light(plates, batches)
     visibility = np.array(plates.seen(plates.points, PAPER).visibility)[:, None]
-    free = plates.picture(Rule(0))
+    free = plates.image(Rule(0))
     wanted = visibility * free + (1 - visibility) * fitted.mirror * budget.reflectance(plates)
-    np.testing.assert_allclose(plates.picture(PAPER, fitted.mirror), wanted, atol=2e-5)
+    np.testing.assert_allclose(plates.image(PAPER, fitted.mirror), wanted, atol=2e-5)
     path = budget.mc.estimate(batches["full"])
     score = (exact.whole - path.mean) / np.hypot(path.error, exact.direct.error)
     assert np.sqrt(np.mean(score**2)) < 1.5
@@ -128,7 +128,7 @@ def test_inputs_that_agree_leave_nothing(rng: np.random.Generator) -> None:
 
     exact = budget.Exact(visibility, light(free), light(visibility * free), light(blocked))
     shipped = budget.Shipped(free, scale, whole)
-    fitted = budget.TrainedScene(sh, blocked, (sh, sh))
+    fitted = budget.FittedHarmonics(sh, blocked, (sh, sh))
     traced = budget.Traced(whole, whole, blocked)
     cases = {
         (): (shipped, exact, traced),
@@ -137,8 +137,8 @@ def test_inputs_that_agree_leave_nothing(rng: np.random.Generator) -> None:
         (budget.HIT, budget.FURTHER): (shipped, exact, replace(traced, indirect=other)),
         (budget.APART,): (shipped, replace(exact, direct=light(other)), traced),
     }
-    for off, (pictures, lit, seen) in cases.items():
-        for steps in (budget.by_harmonics(pictures, lit, fitted), budget.by_tracing(pictures, lit, seen)):
+    for off, (images, lit, seen) in cases.items():
+        for steps in (budget.by_harmonics(images, lit, fitted), budget.by_tracing(images, lit, seen)):
             for before, after in itertools.pairwise(steps):
                 distance = np.abs(before.values - after.values).max()
                 assert (distance > 0.1) == (after.replaced in off), (off, after.replaced)
@@ -153,7 +153,7 @@ def test_nothing_in_the_way_leaves_the_split_sum() -> None:
 
 
 def test_light_alike_everywhere_leaves_nothing(studio: dict[str, dict[str, float]]) -> None:
-    """A white furnace: whatever a plate's ray meets sends back what the light would, as harmonics can say."""
+    """In a white furnace a plate reflects what the light would send, which SH can represent."""
     furnace = parts_of(Setup(make_scene("plates", 0), TINY, "constant", WHITE), 0.1)["harmonics"]
     assert furnace["total"] < 5e-4 < 0.03 < studio["harmonics"]["total"], furnace
     for name in (budget.MIRROR, budget.DIRECTION, budget.HARMONICS):
@@ -166,7 +166,7 @@ def test_a_constant_light_is_apart_from_visibility() -> None:
     assert max(found[budget.APART], found[budget.SPLIT]) < 1e-5 < 1e-3 < found[budget.MIRROR]
 
 
-# ---------- Harmonics ----------
+# ---------- Spherical harmonics ----------
 
 
 def directions(rng: np.random.Generator, points: int, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -180,7 +180,7 @@ def directions(rng: np.random.Generator, points: int, count: int) -> tuple[np.nd
 
 
 def test_harmonics_that_harmonics_can_say_are_found(rng: np.random.Generator) -> None:
-    """From blocked directions alone: what stands in free ones is nonsense. And a constant is a constant."""
+    """From blocked directions alone: values in free ones are nonsense. And a constant is a constant."""
     d, basis = directions(rng, 5, 4000)
     wanted = rng.normal(size=(5, basis.shape[-1], 3)) * 0.1
     wanted[:, 0] = 5
@@ -199,7 +199,7 @@ def test_harmonics_over_the_lobe_are_their_radiance(plates: Setup) -> None:
     coefficients[:, 0] = np.linspace(1, 2, count)[:, None] * np.array([1, 2, 3])
     constant = np.sqrt(1 / (4 * np.pi)) * coefficients[:, 0]
     lobe = plates.reflected(plates.constant, None).mean(0)
-    found = plates.reflected(budget.Surroundings(coefficients), None).mean(0)
+    found = plates.reflected(budget.HarmonicsEmitter(coefficients), None).mean(0)
     np.testing.assert_allclose(found, constant * lobe, rtol=5e-3)
     coefficients[:, 2] = 0.5
     mirror = reflect(plates.points.view, plates.points.normal)
@@ -207,7 +207,7 @@ def test_harmonics_over_the_lobe_are_their_radiance(plates: Setup) -> None:
     tilt = 0.5 * np.sqrt(3 / (4 * np.pi)) * np.array(mirror.z)[:, None]
     np.testing.assert_allclose(along, np.maximum(constant + tilt, 0), atol=1e-5)
     plates.roughness = dr.opaque(mi.Float, 0.05)
-    narrow = plates.reflected(budget.Surroundings(coefficients), None).mean(0)
+    narrow = plates.reflected(budget.HarmonicsEmitter(coefficients), None).mean(0)
     lobe = plates.reflected(plates.constant, None).mean(0)
     assert np.median(np.abs(narrow / lobe - along)) < 0.01
     plates.material(0.3)

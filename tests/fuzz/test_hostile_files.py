@@ -199,7 +199,7 @@ def test_a_log_of_anything(tmp_path: Path) -> None:
 
 
 class Properties(dict[str, Any]):
-    """What the plugin asks of mi.Properties."""
+    """The interface of mi.Properties that the plugin uses."""
 
     def objects(self) -> list[Any]:
         return []

@@ -35,7 +35,7 @@ ILL_CONDITIONED = {
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_case(case: Case) -> None:
     row = measure(case, floors=False, book=False)
-    assert row.verdict == "holds" or case.name in ILL_CONDITIONED, row
+    assert row.verdict == "within limits" or case.name in ILL_CONDITIONED, row
     assert "FAILS" not in row.verdict, row
 
 
@@ -53,9 +53,9 @@ def test_response_curve(row: str) -> None:
     assert max(found["value"], found["slope"]) <= IMAGE_LIMIT
 
 
-@pytest.mark.parametrize("picture", response.pictures(), ids=lambda picture: picture[0])
-def test_losses_of_extreme_pictures(picture: Any) -> None:
-    found = response._loss(*picture)
+@pytest.mark.parametrize("image", response.images(), ids=lambda image: image[0])
+def test_losses_of_extreme_images(image: Any) -> None:
+    found = response._loss(*image)
     assert not found["non_finite"] and max(found["value"], found["slope"]) <= IMAGE_LIMIT, found
 
 
@@ -127,7 +127,7 @@ def test_verdicts() -> None:
         }  # fmt: skip
         return Row(**(given | changes)).verdict
 
-    assert verdict() == "holds"
+    assert verdict() == "within limits"
     assert verdict(image=2e-4).startswith("FAILS: image")
     assert verdict(image=2e-4, image_floor=1e-4).startswith("ill-conditioned: image")
     assert verdict(image=float("nan"), image_floor=1e-4).startswith("FAILS: image")

@@ -19,7 +19,7 @@ from tests.helpers import ROOT, command_names, command_options
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [*ROOT.glob("*.md"), ROOT / "scenes" / "README.md", *(ROOT / "docs").rglob("*.md")]
-"""Every page that a person wrote."""
+"""Every hand-written page."""
 MADE = {
     "api.md",
     "changelog.md",
@@ -188,7 +188,7 @@ def test_site_has_every_setting(site: Path) -> None:
 
 
 def test_site_asks_no_other_server_for_anything(site: Path) -> None:
-    """Neither scripts nor styles, fonts or pictures: it works without a network."""
+    """Neither scripts nor styles, fonts or images: it works without a network."""
     for page in site.rglob("*.html"):
         text = re.sub(r'<link rel="canonical"[^>]*>', "", page.read_text(encoding="utf-8"))
         assert not re.findall(r'<(?:script|img|iframe|source|video)[^>]*src="(?:https?:)?//[^"]*"', text), (

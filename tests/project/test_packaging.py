@@ -34,9 +34,9 @@ LEFT_OUT = {".git", ".venv", "runs", "data", "site", "build", "dist"}
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the sdist, and the wheel that was built of the sdist; without a network, from a copy."""
-    needed = 77  # the setuptools that knows licence expressions, as pyproject.toml requires
+    needed = 77  # the first setuptools with licence expressions, as pyproject.toml requires
     if int(importlib.metadata.version("setuptools").split(".")[0]) < needed:
-        pytest.skip(f"building needs setuptools {needed} (the dev extra brings it)")
+        pytest.skip(f"building needs setuptools {needed} (the dev extra installs it)")
     source = tmp_path_factory.mktemp("source") / "checkout"
     ignore = shutil.ignore_patterns("__pycache__", "*.egg-info", ".*_cache", ".hypothesis")
     source.mkdir()
@@ -153,7 +153,7 @@ def test_sdist_holds_all_that_the_checks_need(sdist: Path) -> None:
 
 @pytest.fixture(scope="module")
 def unpacked(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that holds the wheel's contents."""
+    """A folder with the wheel's contents."""
     folder = tmp_path_factory.mktemp("unpacked")
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(folder)
@@ -210,7 +210,7 @@ IMPORT_NAMES = {
     "dask": "distributed",
     "openexr": "imath",
 }
-"""What a distribution brings under another name than its own, in lower case."""
+"""Modules that a distribution installs under another name than its own, in lower case."""
 
 
 def imported(source: str) -> set[str]:

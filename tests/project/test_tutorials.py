@@ -21,7 +21,7 @@ FOLDER = ROOT / "docs" / "tutorials"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 MOST_BYTES = 300_000
 MOST_SECONDS = 60
-"""Of a processor that has nothing else to do; a busy one counts up to twice as many."""
+"""Seconds of CPU time on an idle machine; a busy one counts up to twice as many."""
 
 
 def cells(path: Path) -> list[Any]:
@@ -55,17 +55,17 @@ def test_a_tutorial_runs(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_what_is_kept_is_small_and_shows_pictures(path: Path) -> None:
-    """Pictures that are not of one colour; no errors, messages, numbers of runs, addresses or paths."""
+def test_what_is_kept_is_small_and_shows_images(path: Path) -> None:
+    """Images that are not of one colour; no errors, messages, numbers of runs, addresses or paths."""
     assert path.stat().st_size < MOST_BYTES
     found = outputs(path)
     assert {output.output_type for output in found} <= {"display_data", "execute_result", "stream"}
     assert not [output for output in found if output.get("name") == "stderr"]
     data = [output.data for output in found if "data" in output]
-    pictures = [Image.open(io.BytesIO(base64.b64decode(d["image/jpeg"]))) for d in data if "image/jpeg" in d]
-    assert len(pictures) >= 2
-    for picture in pictures:
-        assert min(np.ptp(np.asarray(picture.convert("RGB")), axis=(0, 1))) > 100
+    images = [Image.open(io.BytesIO(base64.b64decode(d["image/jpeg"]))) for d in data if "image/jpeg" in d]
+    assert len(images) >= 2
+    for image in images:
+        assert min(np.ptp(np.asarray(image.convert("RGB")), axis=(0, 1))) > 100
     text = path.read_text(encoding="utf-8")
     text = re.sub(r'"image/jpeg": "[^"]*"', "", text)
     assert not re.search(r"/(home|tmp|root|work|usr|Users)/|0x[0-9a-f]{6,}", text)
@@ -74,7 +74,7 @@ def test_what_is_kept_is_small_and_shows_pictures(path: Path) -> None:
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_every_cell_ran(path: Path) -> None:
-    """A cell that ends with a picture or a print has kept it."""
+    """A cell that ends with an image or a print has kept it."""
     for cell in cells(path):
         if re.search(r"^(show|print|plt\.show)\(", cell.source, re.MULTILINE):
             assert cell.outputs, cell.source

@@ -44,7 +44,7 @@ def corner(cells: int = 8) -> Mesh:
 
 
 def channel() -> Mesh:
-    """A `corner` with another wall across the floor (x = FLOOR): rays go to and fro till they leave above."""
+    """A `corner` with a second wall at x = FLOOR: rays go back and forth until they leave above."""
     base = corner()
     wall = len(base.vertices) // 2
     vertices = base.vertices[wall:] + np.array([FLOOR, 0, 0], np.float32)

@@ -23,7 +23,7 @@ DISTANCE = 3.0
 
 @dataclass(frozen=True)
 class Shot:
-    """One camera and its picture."""
+    """One camera and its image."""
 
     name: str
     index: int
@@ -45,7 +45,7 @@ class Shot:
 
     @property
     def translation(self) -> np.ndarray:
-        """Of world points, after the rotation: the world's origin lies before the camera, off the axis."""
+        """Translation of world points, after the rotation: the world's origin is in view, off the axis."""
         return np.array([0.05, -0.03, DISTANCE])
 
     @property
@@ -55,7 +55,7 @@ class Shot:
         matrix[:3, :3], matrix[:3, 3] = self.rotation.T, -self.rotation.T @ self.translation
         return matrix
 
-    def picture(self) -> np.ndarray:
+    def image(self) -> np.ndarray:
         """The dots through the lens: (H, W) 0 … 1."""
         x, y, z = self.rotation @ POINTS.T + self.translation[:, None]
         x, y = self.lens.distort(x / z, y / z)
@@ -63,9 +63,9 @@ class Shot:
         return dots(self.width, self.height, fx * x + cx, fy * y + cy, SIGMA)
 
     def write(self, folder: Path) -> Path:
-        """The picture as PNG."""
+        """The image as PNG."""
         (folder / self.name).parent.mkdir(parents=True, exist_ok=True)
-        write_png(folder / self.name, np.repeat(self.picture()[..., None], 3, axis=-1))
+        write_png(folder / self.name, np.repeat(self.image()[..., None], 3, axis=-1))
         return folder / self.name
 
 
@@ -78,7 +78,7 @@ def dots(width: int, height: int, across: np.ndarray, down: np.ndarray, sigma: f
 
 
 def check(view: View, shot: Shot, tolerance: float = 0.03) -> None:
-    """The view's picture has the dots where the view's camera sees the points."""
+    """The view's image has the dots where the view's camera sees the points."""
     view = view.load()
     row, column, seen = view.project(POINTS)
     assert seen.sum() >= 7

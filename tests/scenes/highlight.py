@@ -52,7 +52,7 @@ alpha = 0.1
 
 def ball(size: int = SIZE, views: int = 6) -> Dataset:
     """A ball with a sharp highlight that moves with the camera, from a ring of views."""
-    focal, pictures = 1.6 * size, []
+    focal, images = 1.6 * size, []
     y, x = (np.mgrid[0:size, 0:size] + 0.5 - size / 2) / focal
     for i in range(views):
         angle = 2 * np.pi * i / views
@@ -64,7 +64,7 @@ def ball(size: int = SIZE, views: int = 6) -> Dataset:
         colour = np.stack([0.3 + 0.6 * shine, 0.4 + x, 0.5 + 0.5 * shine + y], axis=-1)
         image = (alpha[..., None] * colour + 1 - alpha[..., None]).clip(0, 1).astype(np.float32)
         c = size / 2
-        pictures.append(
+        images.append(
             View(
                 f"{i}",
                 size,
@@ -81,7 +81,7 @@ def ball(size: int = SIZE, views: int = 6) -> Dataset:
                 is_linear_radiance=False,
             )
         )
-    return Dataset(Path("ball"), "train", tuple(pictures), np.ones(3, np.float32), False, None)
+    return Dataset(Path("ball"), "train", tuple(images), np.ones(3, np.float32), False, None)
 
 
 def run_folder(path: Path, method: Method) -> Run:

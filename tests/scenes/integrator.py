@@ -192,7 +192,7 @@ def camera_at(focal: float, offset: tuple[int, int] = (0, 0)) -> Camera:
 
 
 def two_balls() -> Mesh:
-    """A ball below the discs, and one that stands beside it in the way of its mirror rays."""
+    """A ball below the discs, and one beside it that blocks its mirror rays."""
     balls = [trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.8, 1.2)]
     vertices = [np.asarray(ball.vertices, np.float32) for ball in balls]
     faces = np.asarray(balls[0].faces, np.uint32)

@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates, zoom
 
 WIDTH, HEIGHT, FOCAL = 256, 192, 260.0
 BLOCK = np.array([0.7, 0.5, 0.8])
-"""Half widths and the height of the block, which stands on z = 0."""
+"""Half widths and the height of the block, whose bottom is at z = 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ PATTERNS = [noise(seed) for seed in range(4)]
 
 
 def photograph(shot: Shot, k1: float = 0.0, samples: int = 1) -> np.ndarray:
-    """The picture (HEIGHT, WIDTH, 3) uint8 of a camera whose lens has the radial coefficient k1."""
+    """The image (HEIGHT, WIDTH, 3) uint8 of a camera whose lens has the radial coefficient k1."""
     rows, columns = np.indices((HEIGHT * samples, WIDTH * samples))
     x = ((columns + 0.5) / samples - WIDTH / 2) / FOCAL
     y = ((rows + 0.5) / samples - HEIGHT / 2) / FOCAL
@@ -86,13 +86,13 @@ def photograph(shot: Shot, k1: float = 0.0, samples: int = 1) -> np.ndarray:
 
 
 def save(path: Path, pixels: np.ndarray, **exif: Any) -> None:
-    """A file of a picture; `orientation`, `focal35`: EXIF."""
+    """A file of an image; `orientation`, `focal35`: EXIF."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    picture = Image.fromarray(pixels)
+    image = Image.fromarray(pixels)
     data = Image.Exif()
     data[0x010F] = "Camera"  # without a tag of its own, the detail below would not be written
     if "orientation" in exif:
         data[0x0112] = exif["orientation"]
     if "focal35" in exif:
         data.get_ifd(0x8769)[0xA405] = exif["focal35"]
-    picture.save(path, exif=data, quality=95)
+    image.save(path, exif=data, quality=95)

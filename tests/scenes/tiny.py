@@ -18,7 +18,7 @@ SIZE = 20
 FOCAL = 24.0  # pixels
 RADIUS, DISTANCE = 0.5, 1.5
 REGION = Region((0.0, 0.0, 0.0), 0.7)
-"""Of `write_open_data`."""
+"""Region of interest that `write_open_data` writes."""
 
 METHOD = f"""
 iterations = {PRESETS["quick"].iterations}
@@ -66,8 +66,8 @@ def write_data(folder: Path, views: int = 3, truth: bool = True) -> Path:
             origin = DISTANCE * np.array([np.cos(angle), np.sin(angle), 0.5]) / np.sqrt(1.25)
             pose = look_at(origin, np.zeros(3)) @ MITSUBA_FROM_OPENGL
             alpha, normal = _ball(pose)
-            picture = np.concatenate([0.5 + 0.4 * normal, alpha[..., None]], axis=-1)
-            write_png(folder / split / f"r_{i}.png", picture)
+            image = np.concatenate([0.5 + 0.4 * normal, alpha[..., None]], axis=-1)
+            write_png(folder / split / f"r_{i}.png", image)
             frame = {"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()}
             if truth:
                 write_exr(folder / split / f"r_{i}_normal.exr", normal, names="XYZ")
