@@ -122,4 +122,4 @@ silhouette."""
 # ---------------- fits ----------------
 
 DEFAULT_PRESET = "standard"
-"""How long a fit takes where nothing is said: the preset for everyday use (`methods.presets`)."""
+"""How long a fit takes where nothing is said: the preset for everyday use (`methods.read`)."""

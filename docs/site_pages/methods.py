@@ -6,8 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.methods.presets import PRESETS
-from mi_refgs.methods.read import load
+from mi_refgs.methods.read import PRESETS, load
 from site_pages import ROOT, table
 
 FIRST = "ref_gaussian"

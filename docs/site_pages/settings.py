@@ -9,11 +9,13 @@ import re
 import typing
 from typing import Any
 
+from mi_refgs.methods.build import FLAT
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.window import Window
+from mi_refgs.shade.options import NOT_A_SETTING
 from site_pages import table
 
-FILLED_IN = ("variant", "file", "preset", "assignments", "terms")
+FILLED_IN = ("name", "file", "preset", "assignments", "components")
 """Fields of `Method` that no file gives: `load` fills them in."""
 SMALL = 4
 """Fields from which on a class is a table of its own; one with fewer, as a window, is a value."""
@@ -52,7 +54,9 @@ def tables() -> dict[str, type]:
     waiting: list[tuple[str, type]] = [("", Method)]
     while waiting:
         prefix, kind = waiting.pop(0)
-        for name, hint in typing.get_type_hints(kind).items():
+        hints = typing.get_type_hints(kind)
+        for name in (field.name for field in dataclasses.fields(kind) if field.metadata != FLAT):
+            hint = hints[name]
             for inner, suffix in _classes(hint):
                 if len(dataclasses.fields(inner)) >= SMALL or suffix:
                     found[f"{prefix}{name}{suffix}"] = inner
@@ -71,13 +75,18 @@ def _classes(hint: Any) -> list[tuple[type, str]]:
 def fields(kind: type) -> list[tuple[str, str, str, str]]:
     """Name, type, default and remark of each field; the remark is the comment beside it in the source."""
     found = []
-    source = inspect.getsource(kind)
-    for field in dataclasses.fields(kind):
+    source, hints = inspect.getsource(kind), typing.get_type_hints(kind)
+    for field in (one for one in dataclasses.fields(kind) if one.metadata != NOT_A_SETTING):
+        if field.metadata == FLAT:
+            found += fields(hints[field.name])
+            continue
         line = re.search(
             rf"^    {field.name}: (?P<type>.*?)(?: = .*?)?(?:  # (?P<remark>.*))?$", source, re.M
         )
         assert line is not None, f"{kind.__name__}.{field.name}: its declaration is not one line"
-        found.append((field.name, _plain(line["type"]), _shown(field.default), line["remark"] or ""))
+        found.append(
+            (field.name, _plain(line["type"], hints[field.name]), _shown(field.default), line["remark"] or "")
+        )
     return found
 
 
@@ -98,7 +107,9 @@ def _shown(default: Any) -> str:
     return f"{default:_}" if isinstance(default, int) else f"{default:g}"
 
 
-def _plain(annotation: str) -> str:
+def _plain(annotation: str, hint: Any) -> str:
     """A type as a writer of TOML thinks of it."""
+    if typing.get_origin(hint) is typing.Literal:
+        return " or ".join(map(json.dumps, typing.get_args(hint)))
     annotation = annotation.replace(" | None", "").replace("Window", "window")
     return re.sub(r"Literal\[(.*?)\]", lambda m: " or ".join(m[1].split(", ")), annotation)

@@ -74,7 +74,8 @@ class Train:
 
         data: dict[str, Any] = {
             "run": str(self.output),
-            "variant": trainer.method.variant,
+            "method": trainer.method.name,
+            "variant": trainer.method.name,
             "preset": trainer.method.preset,
             "iterations": trainer.iteration,
             "seconds": round(trainer.seconds, 3),
@@ -91,6 +92,6 @@ class Train:
             f"{trainer.surfels.count} surfels; next: refgs eval {self.output}"
         )
         if trainer.decisions:
-            data |= {"terms": list(trainer.method.terms), "decisions": trainer.decisions}
+            data |= {"terms": list(trainer.method.components), "decisions": trainer.decisions}
             text = f"{table(trainer.decisions)}\n{text}"
         return Result(data, text)

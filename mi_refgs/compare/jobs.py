@@ -15,9 +15,8 @@ from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.fitting.plan import sized
 from mi_refgs.fitting.targets import read_views
 from mi_refgs.io.files import read_json
-from mi_refgs.methods.difference import differences
 from mi_refgs.methods.method import DataOptions, Method
-from mi_refgs.methods.read import load
+from mi_refgs.methods.read import differences, load
 from mi_refgs.runs.run import Run
 
 RUNS = "runs"
@@ -168,7 +167,7 @@ def require_same(job: Job) -> None:
         return
     made = job.run.method()
     # The terms are what the run has chosen.
-    for key, (before, now) in differences(made, job.method(made.terms)).items():
+    for key, (before, now) in differences(made, job.method(made.components)).items():
         raise InputError(
             f"{job.folder}/config.toml: {key}: the run was made with {before}, and now --methods, "
             f"--preset or --set would make it {now}; choose another -o, or remove that run"

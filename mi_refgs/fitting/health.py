@@ -13,8 +13,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.optim import Skipped
 from mi_refgs.fitting.state import FitSetup, FitState
-from mi_refgs.methods.method import LIGHT
-from mi_refgs.methods.surroundings import BACKGROUND
+from mi_refgs.methods.method import BACKGROUND, LIGHT
 from mi_refgs.runs.checkpoint import channels_of
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels

@@ -10,8 +10,7 @@ from mi_refgs.data import hull
 from mi_refgs.data.dataset import Dataset, PointCloud
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
-from mi_refgs.methods.method import LIGHT, LightOptions, Method
-from mi_refgs.methods.surroundings import AROUND, BACKGROUND
+from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, LightOptions, Method
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels import init

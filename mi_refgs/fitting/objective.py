@@ -15,7 +15,7 @@ import mitsuba as mi
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.fitting import losses
 from mi_refgs.fitting.targets import Target
-from mi_refgs.methods.weights import LossWeights
+from mi_refgs.methods.method import LossWeights
 from mi_refgs.registry import Registry
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.display import displayed

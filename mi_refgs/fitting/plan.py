@@ -26,7 +26,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.device import machine, simd_width
 from mi_refgs.methods.build import plain
 from mi_refgs.methods.method import Method, Refine
-from mi_refgs.methods.presets import PRESETS
+from mi_refgs.methods.read import PRESETS
 
 VIEWS = 6
 COVERED = 0.35

@@ -249,12 +249,12 @@ def _require_same(
     """Raise InputError if what is given for a run that is resumed would have made another method of it."""
     changes, file = methods.assignments(settings), made.file
     if isinstance(wanted, Method):
-        if wanted.select is not None and wanted.terms != made.terms:
-            wanted = methods.load(wanted.file, wanted.preset, wanted.assignments, made.terms)
+        if wanted.select is not None and wanted.components != made.components:
+            wanted = methods.load(wanted.file, wanted.preset, wanted.assignments, made.components)
         _require(folder, "method", made, wanted)
     elif wanted is not None:
         file = wanted
-        now = methods.load(file, made.preset or DEFAULT_PRESET, made.assignments, made.terms)
+        now = methods.load(file, made.preset or DEFAULT_PRESET, made.assignments, made.components)
         _require(folder, "--method (--for)", made, now)
     if preset is not None and preset != made.preset:
         raise InputError(
@@ -262,7 +262,7 @@ def _require_same(
             f"'{preset}'; drop --preset or choose another -o"
         )
     if changes and tuple(changes) != made.assignments:
-        _require(folder, "--set", made, methods.load(file, made.preset, changes, made.terms))
+        _require(folder, "--set", made, methods.load(file, made.preset, changes, made.components))
     if minutes is not None:
         free = replace(made, data=replace(made.data, downscale=None))
         _require(folder, "--minutes", made, planned(free, data, 60 * minutes)[0])

@@ -11,8 +11,7 @@ import numpy as np
 
 from mi_refgs.fitting.optim import Group
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import LIGHT, Method
-from mi_refgs.methods.surroundings import AROUND, BACKGROUND
+from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, Method
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.shading import Shading

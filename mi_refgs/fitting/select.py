@@ -22,8 +22,7 @@ from mi_refgs.fitting.exposure import displayed_of, image_of, psnr
 from mi_refgs.fitting.initial import first_light
 from mi_refgs.fitting.state import FitSetup
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.method import LIGHT, Method, Selection
-from mi_refgs.methods.surroundings import AROUND, BACKGROUND
+from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, Method, Selection
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import resample
@@ -143,7 +142,9 @@ def select_components(trainer: Trainer, tell: Callable[[str], None] = lambda _: 
         trainer.adopt(FitSetup(trainer.method, replace(whole, views=kept)), trainer.state())
 
     def before_step(trainer: Trainer) -> None:
-        while (names := _undecided(trainer, select)) and trainer.iteration >= select.term[names[0]].after:
+        while (names := _undecided(trainer, select)) and trainer.iteration >= select.component[
+            names[0]
+        ].after:
             seconds, begin = trainer.fit.seconds, time.perf_counter()
             decision = _try(trainer, names[0], select, judges)
             trainer.fit.decisions.append(asdict(decision))
@@ -166,12 +167,12 @@ def _undecided(trainer: Trainer, select: Selection) -> list[str]:
 
 
 def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Decision:
-    component, method, iteration = select.term[name], trainer.method, trainer.iteration
-    if missing := [needed for needed in component.needs if needed not in method.terms]:
+    component, method, iteration = select.component[name], trainer.method, trainer.iteration
+    if missing := [needed for needed in component.needs if needed not in method.components]:
         return Decision(name, iteration, False, f"needs {missing[0]}")
-    if present := [other for other in component.unless if other in method.terms]:
+    if present := [other for other in component.unless if other in method.components]:
         return Decision(name, iteration, False, f"nothing to do beside {present[0]}")
-    made = methods.load(method.file, method.preset, method.assignments, (*method.terms, name))
+    made = methods.load(method.file, method.preset, method.assignments, (*method.components, name))
     candidate = replace(made, data=method.data)
     if iteration + component.trial > method.iterations:
         return Decision(name, iteration, False, "too late in the fit")
@@ -253,6 +254,6 @@ def table(decisions: list[dict[str, Any]]) -> str:
 def with_components(method: Method, decisions: list[dict[str, Any]]) -> Method:
     """The method with the terms that decisions have left in it."""
     names = tuple(row["term"] for row in decisions if row["stays"])
-    if method.select is None or names == method.terms:
+    if method.select is None or names == method.components:
         return method
     return replace(methods.load(method.file, method.preset, method.assignments, names), data=method.data)

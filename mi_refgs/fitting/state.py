@@ -27,8 +27,7 @@ from mi_refgs.fitting.optim import Adam, Group
 from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.fitting.schedule import Schedule, SharedPrefilter
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import GAIN, LIGHT, ExposureOptions, Method
-from mi_refgs.methods.surroundings import AROUND, BACKGROUND
+from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, ExposureOptions, Method
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import VertexSurfels
 from mi_refgs.occlusion.vertex_colours import VertexColours

@@ -67,7 +67,7 @@ def method_of(trained: TrainedScene, name: str) -> Method:
     options = SurfelOptions(surfels.primitive.name, ("radiance_sh",), count, count, degree=degree)
     stages = {"imported": Stage(1, shading)}
     data = DataOptions(downscale=1)
-    return Method(1, stages, surfels=options, data=data, variant=name, preset="standard")
+    return Method(1, stages, surfels=options, data=data, name=name, preset="standard")
 
 
 def _require_splat_file(path: Path) -> None:

@@ -1,10 +1,16 @@
-"""A method as data: what the TOML files of `variants/` say, read strictly, scaled to a preset."""
+"""Methods as data: the TOML files of `variants/`, read strictly and scaled to a preset."""
 
-from mi_refgs.methods.difference import differences
-from mi_refgs.methods.method import LightOptions, Method, Refine, Stage, SurfelOptions
-from mi_refgs.methods.presets import PRESETS
-from mi_refgs.methods.read import assignments, dump, for_purpose, load, load_resolved, names
-from mi_refgs.methods.weights import LossWeights
+from mi_refgs.methods.method import LightOptions, LossWeights, Method, Refine, Stage, SurfelOptions
+from mi_refgs.methods.read import (
+    PRESETS,
+    assignments,
+    differences,
+    dump,
+    for_purpose,
+    load,
+    load_resolved,
+    names,
+)
 from mi_refgs.methods.window import Window
 
 __all__ = [

@@ -10,39 +10,30 @@ from typing import Any, Literal
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.shade.options import NOT_A_SETTING
 
 FLAT = {"flat": True}
 """Metadata of a field, a dataclass, whose settings are keys of the table that contains it."""
 
 
+def settings(kind: Any) -> dict[str, Any]:
+    """Keys of a dataclass in a file, with their types; those of FLAT fields are keys of the same table."""
+    hints = typing.get_type_hints(kind)
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(kind):
+        if field.metadata == FLAT:
+            found |= settings(hints[field.name])
+        elif field.metadata != NOT_A_SETTING:
+            found[field.name] = hints[field.name]
+    return found
+
+
 def build(kind: Any, value: Any, where: str) -> Any:
-    """Turn plain TOML data into `kind`, strictly; `where` names the file and the key so far."""
+    """Convert plain TOML data to `kind`; raises InputError that begins with `where`, a file and a key."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind):
-        if not isinstance(value, dict):
-            raise InputError(
-                f"{where}: expected a table, found {abbreviated(value)}; the files of variants/ show the form"
-            )
-        hints = settings(kind)
-        for key in value:
-            if key not in hints:
-                raise InputError(f"{where}: unknown key '{key}'; use one of {', '.join(hints)}")
-        for required in dataclasses.fields(kind):
-            if required.default is required.default_factory is MISSING and required.name not in value:
-                raise InputError(f"{where}: missing key '{required.name}'; add it")
-        found = {key: build(hints[key], inner, f"{where}: {key}") for key, inner in value.items()}
-        for flat in (one for one in dataclasses.fields(kind) if one.metadata == FLAT):
-            inner = typing.get_type_hints(kind)[flat.name]
-            given = {key: found.pop(key) for key in settings(inner) if key in found}
-            try:
-                found[flat.name] = inner(**given)
-            except InputError as error:
-                raise InputError(f"{where}: {error}") from error
-        try:
-            return typing.cast(Any, kind)(**found)
-        except ValueError as error:
-            raise InputError(f"{where}: {error}") from error
+        return _build_dataclass(kind, value, where)
     if origin in (types.UnionType, typing.Union):
         return build(next(option for option in arguments if option is not type(None)), value, where)
     if origin is dict:
@@ -69,16 +60,27 @@ def build(kind: Any, value: Any, where: str) -> Any:
     return value
 
 
-def settings(kind: Any) -> dict[str, Any]:
-    """Keys of a dataclass in a file, with their types; those of FLAT fields are keys of the same table."""
-    hints = typing.get_type_hints(kind)
-    found: dict[str, Any] = {}
+def _build_dataclass(kind: Any, value: Any, where: str) -> Any:
+    if not isinstance(value, dict):
+        raise InputError(
+            f"{where}: expected a table, found {abbreviated(value)}; the files of variants/ show the form"
+        )
+    known, hints = settings(kind), typing.get_type_hints(kind)
+    for key in value:
+        if key not in known:
+            raise InputError(f"{where}: unknown key '{key}'; use one of {', '.join(known)}")
     for field in dataclasses.fields(kind):
-        if field.metadata == FLAT:
-            found |= settings(hints[field.name])
-        elif field.metadata != NOT_A_SETTING:
-            found[field.name] = hints[field.name]
-    return found
+        if field.default is field.default_factory is MISSING and field.name not in value:
+            raise InputError(f"{where}: missing key '{field.name}'; add it")
+    found = {key: build(known[key], inner, f"{where}: {key}") for key, inner in value.items()}
+    try:
+        for field in dataclasses.fields(kind):
+            if field.metadata == FLAT:
+                inner = hints[field.name]
+                found[field.name] = inner(**{key: found.pop(key) for key in settings(inner) if key in found})
+        return kind(**found)
+    except (InputError, ValueError) as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def plain(value: Any) -> Any:
@@ -94,6 +96,24 @@ def plain(value: Any) -> Any:
         return found
     if isinstance(value, dict):
         return {key: plain(inner) for key, inner in value.items()}
+    return [plain(inner) for inner in value] if isinstance(value, tuple) else value
+
+
+def scaled(value: Any, factor: float) -> Any:
+    """Scale windows exactly, and fields whose metadata is ITERATIONS to whole numbers of at least 1."""
+    if isinstance(value, dict):
+        return {name: scaled(inner, factor) for name, inner in value.items()}
     if isinstance(value, tuple):
-        return [plain(inner) for inner in value]
-    return value
+        return tuple(scaled(inner, factor) for inner in value)
+    if isinstance(value, Window):
+        return Window(factor * value.start, factor * value.until, factor * value.every)
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return value
+    fields = {}
+    for field in dataclasses.fields(value):
+        inner = getattr(value, field.name)
+        if field.metadata != ITERATIONS:
+            fields[field.name] = scaled(inner, factor)
+        elif inner > 0:
+            fields[field.name] = max(round(inner * factor), 1)
+    return dataclasses.replace(value, **fields)

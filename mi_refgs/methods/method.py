@@ -1,4 +1,4 @@
-"""A method as data: what a file of `variants/` says, in frozen dataclasses.
+"""A method as data: the contents of a file of `variants/`, in frozen dataclasses.
 
 Iteration numbers in a file are written for the file's own `iterations`; a preset gives the number to run, and
 every window, stage and interval is scaled with it (`methods.read`).
@@ -10,101 +10,125 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from mi_refgs.methods.build import FLAT
-from mi_refgs.methods.surroundings import BACKGROUND, SurroundingsOptions
-from mi_refgs.methods.weights import LossWeights
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE, attribute
 from mi_refgs.surfels.primitives import PRIMITIVES
 
 LIGHT = "light"
-"""Name of the environment among the parameters of a fit, beside the channels of the surfels."""
+"""Name of the environment map among the parameters of a fit, beside the attributes of the surfels."""
 GAIN = "gain"
-"""Name of the log gains of the training views among them."""
+"""Name of the log exposure gains of the training views among them."""
+BACKGROUND, AROUND = "background", "surroundings/"
+"""Name of the background environment among them, and the prefix of the background Gaussians' attributes."""
 APART = (LIGHT, GAIN, BACKGROUND)
-"""Parameters that are no channels of surfels."""
+"""Parameters that are not attributes of surfels."""
 AT_ONCE = Window(0, 3, 1)
-"""One degree of spherical harmonics more in each of the first three iterations."""
+"""One SH degree more in each of the first three iterations."""
 MESH_WINDOW = Window(20_000, 50_000, 2_000)
 """When the released Ref-Gaussian code extracts its mesh on synthetic scenes."""
 
 
 @dataclass(frozen=True)
 class About:
-    """What the file stands for."""
+    """What the file reproduces."""
 
     name: str = ""
     paper: str = ""
     deviations: tuple[str, ...] = ()
-    purpose: str = ""  # a word, one file's alone, by which `refgs train --for` finds it
-    paper_row: str = ""  # what the paper's tables call it, as in compare/paper.json
+    purpose: str = ""  # one word, in one file only, by which `refgs train --for` finds it
+    paper_row: str = ""  # its row in the paper's tables
 
 
 @dataclass(frozen=True)
 class SurfelOptions:
-    """The table of surfels at the start, and its limits."""
+    """The surfels at the start, and their largest number."""
 
     primitive: str = "surfel"  # what is splatted
     channels: tuple[str, ...] = ("radiance_sh", "albedo", "metallic", "roughness", "indirect_sh")
     count: int = 20_000  # initial surfels
     max_count: int = 40_000  # densification stops here
-    inside: float = 0.0  # share of the initial surfels in the visual hull's volume; the others on its surface
-    degree: dict[str, int] = field(default_factory=dict)  # of spherical harmonics by channel; else 3
-    sh_raise: Window = AT_ONCE  # one more degree of radiance_sh each time it is due
-    initial: dict[str, float] = field(default_factory=dict)  # activated, by channel; else the channel's own
-    from_pictures: tuple[Literal["albedo"], ...] = ()  # channels that start with the hue of the pictures
+    inside: float = 0.0  # fraction of initial surfels in the visual hull's volume; the others on its surface
+    degree: dict[str, int] = field(default_factory=dict)  # SH degree by attribute; else 3
+    sh_raise: Window = AT_ONCE  # one SH degree of radiance_sh more at each event
+    initial: dict[str, float] = field(default_factory=dict)  # activated, by attribute; else its own default
+    from_pictures: tuple[Literal["albedo"], ...] = ()  # attributes that start with the hue of the images
 
     def degree_of(self, name: str) -> int:
-        """Degree of the spherical harmonics of a channel."""
+        """SH degree of an attribute."""
         return self.degree.get(name, MAX_SH_DEGREE)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All channels, those of the primitive first; raises InputError for an unknown primitive."""
+        """All attributes, those of the primitive first; raises InputError for an unknown primitive."""
         return (*PRIMITIVES.find(self.primitive, "primitive").widths, *self.channels)
 
     def columns(self, name: str) -> int:
-        """Raw columns of a channel."""
+        """Raw columns of an attribute."""
         widths = PRIMITIVES.find(self.primitive, "primitive").widths
         return widths[name] if name in widths else attribute(name).width(self.degree_of(name))
 
     def start(self, name: str) -> float:
-        """Initial value of a channel, activated."""
+        """Initial value of an attribute, activated."""
         return self.initial.get(name, attribute(name).initial)
 
 
 @dataclass(frozen=True)
+class SurroundingsOptions:
+    """The scene outside the region of interest, for images without alpha: background Gaussians of the
+    object's primitive with radiance_sh only, and a lat-long environment behind everything.
+    """
+
+    count: int = 20_000  # initial surfels
+    max_count: int = 40_000  # densification stops here
+    degree: int = 2  # of radiance_sh
+    scattered: float = 0.5  # fraction of the initial surfels anywhere; the others at sparse points
+    opacity: float = 0.1  # initial, of object and background: a cloud of 0.3 closes before the object forms
+    size: float = 0.1  # largest initial size, in distances from the region's centre
+    prune_extent: float = 0.5  # distances from the region's centre; larger surfels are removed
+    reach: float = 2.0  # factor of the learning rates of positions, in scene extents
+    height: int = 32  # texels of the environment; width is twice that
+    rate: float = 0.01  # Adam learning rate of the environment's texels
+
+    def names(self, primitive: str) -> tuple[str, ...]:
+        """All attributes of background Gaussians of a primitive."""
+        return (*PRIMITIVES.find(primitive, "primitive").widths, "radiance_sh")
+
+
+@dataclass(frozen=True)
 class LightOptions:
-    """The learnable lat-long environment; absent channels and light cost nothing."""
+    """The learnable lat-long environment map; without this table there is no light."""
 
     height: int = 64  # texels; width is twice that
     radiance: float = 0.5  # initial, everywhere
-    every: int = 1  # iterations that share one filtered light; it learns from all of them at once
+    every: int = 1  # iterations that share one prefiltered light, which then receives all their gradients
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stretch of the schedule with its own way to shade, up to and including iteration `until`."""
+    """One part of the schedule with its own shading, up to and including iteration `until`."""
 
     until: int = field(metadata=ITERATIONS)
-    shading: ShadingOptions = field(default_factory=ShadingOptions, metadata=FLAT)  # keys of the stage itself
+    shading: ShadingOptions = field(default_factory=ShadingOptions, metadata=FLAT)
     samples: int = 1  # per pixel, k × k, in the steps of a fit
-    restart: tuple[str, ...] = ()  # channels, and `light`, that start anew when the stage begins
-    rates: dict[str, float] = field(default_factory=dict)  # factors of the rates of channels, and of `light`
+    restart: tuple[str, ...] = ()  # attributes, and `light`, reset to initial values when the stage begins
+    rates: dict[str, float] = field(
+        default_factory=dict
+    )  # factors of learning rates, by attribute or `light`
 
 
 @dataclass(frozen=True)
 class Propagation:
-    """Normal propagation: opaque surfels, of which the reflective grow over their neighbours.
+    """Normal propagation: surfels become opaque, and reflective ones grow over their neighbours.
 
-    [3DGS-DR, Ye et al. 2024, §3.3; aware of the material: Ref-Gaussian §3.4]
+    [3DGS-DR, Ye et al. 2024, §3.3; material-aware: Ref-Gaussian §3.4]
     """
 
     when: Window
-    opacity: float = 0.9  # all surfels are made at least this opaque
-    scale: float = 1.5  # factor of the sizes of the reflective
-    metallic: float = 0.02  # reflective is what is at least this metallic …
-    roughness: float | None = None  # … and at most this rough; absent: however rough
+    opacity: float = 0.9  # all surfels become at least this opaque
+    scale: float = 1.5  # factor of the scales of reflective surfels
+    metallic: float = 0.02  # reflective: at least this metallic …
+    roughness: float | None = None  # … and at most this rough; absent: any roughness
     noise: float = 0.0  # half the width of the noise on the constant colour of the others, in coefficients
     noise_metallic: float = 0.05  # which are at most this metallic
     hold: int = field(default=200, metadata=ITERATIONS)  # iterations without opacity learning afterwards
@@ -112,76 +136,121 @@ class Propagation:
 
 @dataclass(frozen=True)
 class Relocation:
-    """Idle surfels move onto seen ones, and positions take random steps. [3DGS-MCMC, Kheradmand et al. 2024]
+    """Transparent surfels move onto visible ones, and positions take random steps until the window ends.
 
-    The steps end with the window.
+    [3DGS-MCMC, Kheradmand et al. 2024]
     """
 
     when: Window
-    opacity: float = 0.005  # at most; what is as transparent is idle
-    grow: float = 0.0  # share of the table that is added each time, up to max_count
+    opacity: float = 0.005  # surfels of at most this opacity are moved
+    grow: float = 0.0  # fraction of the surfels that is added at each event, up to max_count
     noise: float = 1e7  # of positions: 5e5 per squared unit where the extent is 4.5 units; 0: none
 
 
 @dataclass(frozen=True)
 class Refine:
-    """Adaptive control of the table [3DGS §5.2, 2DGS; Ref-Gaussian §3.4]."""
+    """Adaptive density control [3DGS §5.2, 2DGS; Ref-Gaussian §3.4]."""
 
     densify: Window | None = None
-    gradient: float = 2e-4  # NDC units; a mean over views, which no number of iterations changes
+    gradient: float = 2e-4  # NDC units; a mean over views, independent of the number of iterations
     dense_extent: float = 0.01  # clone below, split above, in scene extents
     prune_opacity: float = 0.05
-    prune_extent: float = 0.1  # scene extents; larger surfels go
+    prune_extent: float = 0.1  # scene extents; larger surfels are removed
     reset: Window | None = None  # opacity to at most reset_opacity
     reset_opacity: float = 0.01
-    reset_raise: tuple[str, ...] = ()  # channels that it lifts to at least their initial value
+    reset_raise: tuple[str, ...] = ()  # attributes that a reset raises to at least their initial value
     propagate: Propagation | None = None
     relocate: Relocation | None = None
 
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """Extraction of the occluding mesh, when due."""
+    """When and how the occluding mesh is extracted."""
 
     extract: Window = MESH_WINDOW
-    resolution: int = 128  # voxels along the longest side; unbounded, along the region's diameter
-    unbounded: bool = False  # of pictures without alpha: with the surroundings, in all of space
+    resolution: int = 128  # voxels along the longest side; unbounded: along the region's diameter
+    unbounded: bool = False  # for images without alpha: include the background, in contracted space
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam learning rates, raw units a step; of positions in scene extents."""
+    """Adam learning rates, raw units per step; those of positions in scene extents."""
 
-    channel: dict[str, float] = field(default_factory=dict)  # by channel; else the channel's own
-    rest: dict[str, float] = field(default_factory=dict)  # factor of the higher degrees; likewise
-    light: float = 0.01  # texels of the environment
-    light_relative: bool = False  # those brighter than 1: times their radiance, so that they grow to lamps
+    channel: dict[str, float] = field(default_factory=dict)  # by attribute; else its own default
+    rest: dict[str, float] = field(default_factory=dict)  # factor for SH degrees of 1 and above; likewise
+    light: float = 0.01  # texels of the environment map
+    light_relative: bool = False  # texels brighter than 1: times their radiance, so that lamps can form
     position_final: float = 1.6e-6  # of positions, at 0.6 of the iterations
-    decay: float = 1.0  # factor that all but the position's rate reach, log-linearly, at the last iteration
+    decay: float = 1.0  # log-linear factor of all other rates at the last iteration
 
     def of(self, name: str) -> float:
-        """Rate of a channel."""
+        """Learning rate of an attribute."""
         return self.channel.get(name, attribute(name).rate)
 
     def rest_of(self, name: str) -> float:
-        """Factor of that for harmonics of degree 1 and above."""
+        """Factor of that for SH degrees of 1 and above."""
         return self.rest.get(name, attribute(name).rest_rate)
 
 
 @dataclass(frozen=True)
-class ExposureOptions:
-    """A gain a channel of each training view, on the linear radiance; decided once (`fitting.exposure`)."""
+class LossWeight:
+    """Weight of one loss over the iterations."""
 
-    gains: Literal["judged", "on", "off"] = "judged"  # judged: if they pay
-    after: int = field(default=1_200, metadata=ITERATIONS)  # iterations, then it is decided
-    worth: float = 0.5  # dB that the training views must gain, on pixels that the gains were not fitted to
-    rate: float = 3e-3  # of log gains, a step; a tenth at the end
+    weight: float
+    start: int = field(default=0, metadata=ITERATIONS)  # iterations without the loss
+    rise: int = field(default=0, metadata=ITERATIONS)  # then its weight rises linearly from 0
+    until: int = field(default=2**31, metadata=ITERATIONS)  # last iteration with the loss
+
+    def at(self, iteration: int) -> float:
+        """The weight in this (1-based) iteration."""
+        if not self.start < iteration <= self.until:
+            return 0.0
+        return self.weight * (min((iteration - self.start) / self.rise, 1) if self.rise else 1)
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """L = (1 - ssim) L1 + ssim (1 - SSIM) + normal L_n + smooth L_s + alpha L_α, and priors.
+
+    Priors have the names of their functions in `fitting.losses`. Those on material maps apply to deferred
+    stages only: forward shading blends no materials.
+    """
+
+    ssim: float = 0.2
+    normal: float = 0.05
+    normal_start: int = field(default=0, metadata=ITERATIONS)  # iterations without L_n
+    normal_rise: int = field(default=0, metadata=ITERATIONS)  # iterations in which its weight then rises
+    smooth: float = 0.0
+    smooth_until: int = field(default=18_000, metadata=ITERATIONS)
+    alpha: float = 0.0
+    half_metal: float = 0.0  # prefers metallic near 0 or 1
+    half_metal_start: int = field(default=0, metadata=ITERATIONS)  # iterations without it
+    half_metal_rise: int = field(default=0, metadata=ITERATIONS)  # iterations in which its weight then rises
+    materials: float = 0.0  # neighbouring pixels of similar colour share roughness and metallic
+    light_colour: float = 0.0  # prefers a grey light over a grey albedo
+    registered: dict[str, LossWeight] = field(default_factory=dict)  # losses of `register_loss`, by name
+
+    def of(self, name: str) -> LossWeight:
+        """Weight and window of a loss by its name."""
+        if name in self.registered:
+            return self.registered[name]
+        window = {end: getattr(self, f"{name}_{end}", None) for end in ("start", "rise", "until")}
+        return LossWeight(getattr(self, name, 0.0), **{end: x for end, x in window.items() if x is not None})
+
+
+@dataclass(frozen=True)
+class ExposureOptions:
+    """Per-image exposure compensation: a gain per channel on linear radiance (`fitting.exposure`)."""
+
+    gains: Literal["judged", "on", "off"] = "judged"  # judged: kept if they improve PSNR by `worth`
+    after: int = field(default=1_200, metadata=ITERATIONS)  # iterations before that decision
+    worth: float = 0.5  # dB gained on pixels of the training views that the gains were not fitted to
+    rate: float = 3e-3  # learning rate of log gains, per step; a tenth of it at the end
 
 
 @dataclass(frozen=True)
 class CoarsePictures:
-    """Pictures of fewer pixels for the iterations up to `until`; of several such tables the one that ends
-    first counts."""
+    """Downscaled images for the iterations up to `until`; the table that ends first applies."""
 
     until: int = field(metadata=ITERATIONS)  # iterations
     block: int = 2  # pixels along a side of the squares that are averaged into one
@@ -189,61 +258,61 @@ class CoarsePictures:
 
 @dataclass(frozen=True)
 class DataOptions:
-    """How pictures are read, and how large they are in the course of a fit."""
+    """How images are read, and their resolution in the course of a fit."""
 
     images: Literal["png", "exr"] = "png"
     background: Literal["white", "black"] = "white"
-    downscale: int | None = None  # pixels of a file along a pixel's side; absent: what the preset can afford
+    downscale: int | None = None  # pixels of a file per pixel, along a side; absent: as the preset allows
     coarse: tuple[CoarsePictures, ...] = ()
 
     def block_at(self, iteration: int) -> int:
-        """Pixels along a side of what a (1-based) iteration takes for one pixel; 1 is a whole picture."""
-        due = [pictures for pictures in self.coarse if iteration <= pictures.until]
-        return min(due, key=lambda pictures: pictures.until).block if due else 1
+        """Pixels along a side that a (1-based) iteration averages into one; 1: full resolution."""
+        due = [images for images in self.coarse if iteration <= images.until]
+        return min(due, key=lambda images: images.until).block if due else 1
 
 
 @dataclass(frozen=True)
-class Term:
-    """Something that a method can do without, as changes of its file, and when a fit tries it."""
+class MethodComponent:
+    """An optional component of a method, as changes of its file, and when a fit tries it."""
 
     after: int = field(metadata=ITERATIONS)  # iterations before it is tried
-    trial: int = field(metadata=ITERATIONS)  # iterations with it, and without it, that are compared
+    trial: int = field(metadata=ITERATIONS)  # iterations with and without it that are compared
     change: dict[str, Any] = field(default_factory=dict)  # tables merged over the method's
-    drop: tuple[str, ...] = ()  # keys that it removes before, where they are there
-    needs: tuple[str, ...] = ()  # terms that must be in use
-    unless: tuple[str, ...] = ()  # terms that must not
+    drop: tuple[str, ...] = ()  # keys removed before that, where they exist
+    needs: tuple[str, ...] = ()  # components that must be in use
+    unless: tuple[str, ...] = ()  # components that must not be in use
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Terms that a fit tries on training views held out for it, and what each must bring to stay.
+    """Optional components that a fit tries on validation views, and the gain that keeps them.
 
-    A term stays if the PSNR of these views rises by the price of the time of a step and of the memory that it
-    costs, and by `gain` if it costs anything; one that saves time and memory may lose as much.
+    A component stays if the PSNR of these views rises by the price of the step time and memory that it costs,
+    and by `gain` if it costs anything; one that saves time and memory may lose as much.
     """
 
-    term: dict[str, Term]
-    holdout: int = 8  # every so many training views judge
+    component: dict[str, MethodComponent]
+    holdout: int = 8  # every so many training views validate
     gain: float = 0.02  # dB
-    gain_per_ms: float = 0.003  # dB for each millisecond of a step
-    gain_per_mb: float = 0.001  # dB for each MB of parameters and their moments
+    gain_per_ms: float = 0.003  # dB per millisecond of a step
+    gain_per_mb: float = 0.001  # dB per MB of parameters and their moments
 
     @property
     def order(self) -> list[str]:
-        """The terms in the order in which they are tried: as they fall due, then as the file has them."""
-        return sorted(self.term, key=lambda name: self.term[name].after)
+        """The components in the order of their trials: by `after`, then as in the file."""
+        return sorted(self.component, key=lambda name: self.component[name].after)
 
 
 @dataclass(frozen=True)
 class Method:
-    """Everything that describes a fit; the resolved copy is saved with the run."""
+    """All settings of a fit; the resolved copy is saved with the run."""
 
     iterations: int = field(metadata=ITERATIONS)
     stage: dict[str, Stage]
     about: About = About()
     surfels: SurfelOptions = SurfelOptions()
     light: LightOptions | None = None
-    surroundings: SurroundingsOptions | None = None  # absent: everything is of the object
+    surroundings: SurroundingsOptions | None = None  # absent: the object is everything
     refine: Refine = Refine()
     mesh: MeshOptions | None = None
     loss: LossWeights = field(default_factory=LossWeights)
@@ -252,11 +321,11 @@ class Method:
     exposure: ExposureOptions | None = None
     seed: int = 0
     checkpoint_every: int = 1_000  # iterations; a kill loses at most so many
-    preview_every: int = 1_000
-    log_every: int = 50
+    preview_every: int = 1_000  # iterations
+    log_every: int = 50  # iterations
     select: Selection | None = None
-    terms: tuple[str, ...] = ()  # of `select`, in use
-    variant: str = ""  # filled in by `load`, as the others below: the file's stem
+    components: tuple[str, ...] = ()  # of `select`, in use
+    name: str = ""  # filled in by `load`, as the others below: the file's stem
     file: str = ""
     preset: str = ""
     assignments: tuple[str, ...] = ()
@@ -272,5 +341,5 @@ class Method:
         return sorted(self.stage.items(), key=lambda item: item[1].until)
 
     def stage_at(self, iteration: int) -> tuple[str, Stage]:
-        """The stage a (1-based) iteration belongs to."""
+        """The stage that contains a (1-based) iteration."""
         return next((item for item in self.stages() if iteration <= item[1].until), self.stages()[-1])

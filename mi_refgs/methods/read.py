@@ -1,4 +1,4 @@
-"""Reads methods strictly from TOML: a file, those that it extends, `key=value` assignments, a preset.
+"""Read methods strictly from TOML: a file, those that it extends, `key=value` assignments, a preset.
 
 No other module opens a TOML file, and none contains a method's name.
 """
@@ -6,8 +6,10 @@ No other module opens a TOML file, and none contains a method's name.
 from __future__ import annotations
 
 import contextlib
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,156 +19,76 @@ from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import is_file
 from mi_refgs.io.resources import resource_dir
-from mi_refgs.methods.build import build, plain
-from mi_refgs.methods.method import LIGHT, Method, Selection, Term
-from mi_refgs.methods.presets import PRESETS, scaled
+from mi_refgs.methods.build import build, plain, scaled
+from mi_refgs.methods.method import LIGHT, About, Method, MethodComponent, Selection
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, is_height
 from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.attributes import ATTRIBUTES
+from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE
 
 MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
 
+RENAMED = {"select.term": "select.component", "terms": "components", "variant": "name"}
+"""Keys of version 0.1 → what they are called now; files may have either."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How long to run, and how large to grow."""
+
+    iterations: int
+    surfels: int
+    max_surfels: int
+    pixels: int  # per image; larger ones are downscaled when methods are compared, or without `minutes`
+    minutes: float | None = None  # per fit at most, on two cores; larger images are downscaled for that
+
+
+# About 4 and 11 minutes for 200² images on one AVX-512 core; the last follows from these. A step of 256²
+# pixels takes 1.14 times as long as one of 200², one of 400² 1.9 times; the paper's images have 800².
+PRESETS = {
+    "quick": Preset(2_000, 15_000, 20_000, 256 * 256, 5.0),
+    "standard": Preset(4_000, 25_000, 40_000, 256 * 256, 30.0),
+    "paper": Preset(50_000, 30_000, 100_000, 800 * 800),
+}
+
 
 def load(
-    variant: str,
+    name: str,
     preset: str = DEFAULT_PRESET,
     assignments: Sequence[str] | None = None,
-    terms: Sequence[str] = (),
+    components: Sequence[str] = (),
 ) -> Method:
-    """Read a method by name or TOML path, with some of its terms; scale it to a preset, apply `key=value`.
+    """Read a method by name or TOML path, with some of its components, scaled to a preset.
 
-    Raises InputError naming the file and the key for anything unknown or of the wrong type.
+    `assignments` are `key=value`, applied last and not scaled. Raises InputError that names the file and the
+    key for anything unknown or of the wrong type.
     """
     if preset not in PRESETS:
         raise InputError(f"--preset: {preset}: unknown; use one of {', '.join(PRESETS)}")
-    path = _find(variant, "--method", Path())
+    path = _find(name, "--method", Path())
     table = _extended(path, [])
-    for name in terms:
-        table = _with_term(table, name, path)
+    for component in components:
+        table = _with_component(table, component, path)
     chosen = PRESETS[preset]
     method = build(Method, table, str(path))
-    method = scaled(method, chosen.iterations / method.iterations)
-    table = plain(method)
-    for name in ("surfels", "surroundings"):
-        if name in table:
-            table[name] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
+    table = plain(scaled(method, chosen.iterations / method.iterations))
+    for part in table.keys() & {"surfels", "surroundings"}:
+        table[part] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
     for assignment in assignments or []:
         _assign(table, assignment)
-    where = "--set" if assignments else str(path)
-    file = str(path.resolve()) if variant.endswith(".toml") else variant
-    made = {"variant": path.stem, "file": file, "preset": preset, "terms": [*terms]}
-    made["assignments"] = [*(assignments or [])]
-    method = _checked(build(Method, table | made, where), str(path))
-    if method.select is not None and not terms:
-        _check_terms(method, str(path))
+    table |= {
+        "name": path.stem,
+        "file": str(path.resolve()) if name.endswith(".toml") else name,
+        "preset": preset,
+        "components": [*components],
+        "assignments": [*(assignments or [])],
+    }
+    method = build(Method, table, "--set" if assignments else str(path))
+    _require_consistent(method, str(path))
+    if method.select is not None and not components:
+        _require_selectable(method, method.select, str(path))
     return method
-
-
-def _check_terms(method: Method, where: str) -> None:
-    """Raise InputError for a selection that cannot be made; each term is loaded with those that it needs."""
-    select = method.select
-    assert select is not None
-    if select.holdout < 2:
-        raise InputError(f"{where}: select.holdout: {select.holdout} leaves no views to fit; give 2 or more")
-    for name, term in select.term.items():
-        if unknown := [other for other in (*term.needs, *term.unless) if other not in select.term]:
-            raise InputError(f"{where}: select.term.{name}: needs: there is no '{unknown[0]}'; name a term")
-        load(method.file, method.preset, method.assignments, [*_needed(select, name), name])
-
-
-def _needed(select: Selection, name: str) -> list[str]:
-    """The terms that one needs, and those that they need, in the order in which they are tried."""
-    found: list[str] = []
-    for needed in select.term[name].needs:
-        if needed not in select.order[: select.order.index(name)]:
-            raise InputError(f"select.term.{name}: needs: '{needed}' is tried later; try it before")
-        found += [other for other in (*_needed(select, needed), needed) if other not in found]
-    return found
-
-
-def _with_term(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
-    """The table of a file with the changes of one of its terms."""
-    try:
-        term = build(Term, table["select"]["term"][name], f"{path}: select.term.{name}")
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path}: select.term: there is no '{name}'; use one of its terms") from error
-    for key in term.drop:
-        with contextlib.suppress(InputError):  # another term, or a file below this one, may have dropped it
-            _drop(table, key, path)
-    return _merge(table, term.change)
-
-
-def _checked(method: Method, where: str) -> Method:
-    """The method; raises InputError for unknown channels and a stage that channels and light cannot serve."""
-    surfels, rates = method.surfels, method.rates
-    try:
-        channels = {*surfels.names}
-    except InputError as error:
-        raise InputError(f"{where}: surfels.{error}") from error
-    bounded = {name for name in channels & ATTRIBUTES.keys() if ATTRIBUTES[name].activation == "sigmoid"}
-    for key, named, known in (
-        ("surfels.channels", surfels.channels, {name for name, x in ATTRIBUTES.items() if not x.geometry}),
-        ("surfels.initial", surfels.initial, channels),
-        ("surfels.degree", surfels.degree, {name for name in ATTRIBUTES if ATTRIBUTES[name].harmonics}),
-        ("surfels.from_pictures", surfels.from_pictures, {*surfels.channels}),
-        ("rates.channel", rates.channel, set(ATTRIBUTES)),
-        ("rates.rest", rates.rest, {name for name in ATTRIBUTES if ATTRIBUTES[name].harmonics}),
-        ("refine.reset_raise", method.refine.reset_raise, bounded),
-    ):
-        if unknown := [name for name in named if name not in known]:
-            allowed = ", ".join(name for name in ATTRIBUTES if name in known)
-            raise InputError(f"{where}: {key}: '{unknown[0]}' is unknown; use some of {allowed}")
-    if method.light is not None and not is_height(method.light.height):
-        raise InputError(
-            f"{where}: light.height: {method.light.height} is no multiple of 4 from {MIN_HEIGHT}; give one"
-        )
-    if method.light is not None and method.light.every < 1:
-        raise InputError(f"{where}: light.every: {method.light.every} is no number of steps; give 1 or more")
-    if too_small := [pictures.block for pictures in method.data.coarse if pictures.block < 2]:
-        raise InputError(f"{where}: data.coarse: a block of {too_small[0]} averages nothing; give 2 or more")
-    for name, stage in method.stages():
-        try:
-            Shading.resolve(stage.shading, method.mesh is not None).require_inputs(
-                channels, method.light is not None
-            )
-            samples_per_axis(stage.samples)
-        except InputError as error:
-            raise InputError(f"{where}: stage.{name}: {error}") from error
-        light = {LIGHT} if method.light is not None else set()
-        for key, named, there in (
-            ("restart", stage.restart, {*surfels.channels} | light),
-            ("rates", stage.rates, channels | light),
-        ):
-            if absent := [one for one in named if one not in there]:
-                raise InputError(f"{where}: stage.{name}: {key}: there is no '{absent[0]}'; remove it")
-        if worst := [one for one, factor in stage.rates.items() if not 0 <= factor < float("inf")]:
-            found = f"{worst[0]}: {stage.rates[worst[0]]}"
-            raise InputError(f"{where}: stage.{name}: rates: {found} is no factor; give 0 or more")
-    _check_priors(method, where)
-    if method.exposure is not None and method.exposure.rate < 0:
-        raise InputError(f"{where}: exposure.rate: {method.exposure.rate} is no rate; give 0 or more")
-    if method.surroundings is not None and (fault := method.surroundings.fault()):
-        raise InputError(f"{where}: surroundings.{fault}")
-    relocate = method.refine.relocate
-    if relocate is not None and relocate.grow < 0:
-        raise InputError(f"{where}: refine.relocate.grow: {relocate.grow} is no share; give 0 or more")
-    if method.refine.propagate is not None and "metallic" not in surfels.channels:
-        raise InputError(f"{where}: refine.propagate: there is no channel 'metallic'; add it, or drop this")
-    return method
-
-
-def _check_priors(method: Method, where: str) -> None:
-    """Raise InputError for a prior on what the method does not have."""
-    loss, pixels = method.loss, any(stage.shading.at == "pixel" for _, stage in method.stages())
-    for name, needed in (("half_metal", {"metallic"}), ("materials", {"metallic", "roughness"})):
-        if getattr(loss, name) and not (pixels and needed <= {*method.surfels.channels}):
-            raise InputError(
-                f"{where}: loss.{name}: needs {' and '.join(sorted(needed))}, and a stage at = pixel; drop it"
-            )
-    if loss.light_colour and method.light is None:
-        raise InputError(f"{where}: loss.light_colour: there is no light; drop it")
 
 
 def load_resolved(path: Path) -> Method:
@@ -185,7 +107,7 @@ def names() -> list[str]:
 
 
 def for_purpose(purpose: str) -> str:
-    """The shipped method that says it is for this; raises InputError if none is."""
+    """The shipped method with this `about.purpose`; raises InputError if there is none."""
     found = {_read(path).get("about", {}).get("purpose"): path.stem for path in _shipped()}
     if not purpose or purpose not in found:
         known = ", ".join(sorted(filter(None, found)))
@@ -193,22 +115,66 @@ def for_purpose(purpose: str) -> str:
     return found[purpose]
 
 
+def differences(before: Method, now: Method) -> dict[str, tuple[Any, Any]]:
+    """Dotted keys by which two resolved methods differ, each with both values, None for no such key.
+
+    The table `about`, the file's place and how changes were written are not compared.
+    """
+    first, second = (
+        _flat(plain(replace(method, about=About(), file="", assignments=()))) for method in (before, now)
+    )
+    keys = sorted(first.keys() | second.keys())
+    return {key: (first.get(key), second.get(key)) for key in keys if first.get(key) != second.get(key)}
+
+
+def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted keys → values of nested dictionaries."""
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return flat
+
+
+# ---------------- files ----------------
+
+
 def _shipped() -> list[Path]:
     return sorted(resource_dir("variants").glob("*.toml"))
 
 
-def _find(variant: str, where: str, folder: Path) -> Path:
+def _find(name: str, where: str, folder: Path) -> Path:
     """A shipped method by its name, one of scenes/ by its path there, or a .toml in `folder`."""
-    shipped = resource_dir("scenes" if "/" in variant else "variants")
-    path = folder / variant if variant.endswith(".toml") else shipped / f"{variant}.toml"
+    shipped = resource_dir("scenes" if "/" in name else "variants")
+    path = folder / name if name.endswith(".toml") else shipped / f"{name}.toml"
     if not is_file(path):
-        known = ", ".join(names())
-        raise InputError(f"{where}: {variant}: no such method; use one of {known}, or a path to a .toml")
+        raise InputError(
+            f"{where}: {name}: no such method; use one of {', '.join(names())}, or a path to a .toml"
+        )
     return path
 
 
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        if len(text) > MAX_TEXT or max(map(len, text.splitlines()), default=0) > MAX_LINE:
+            raise ValueError("too long")
+        table = tomllib.loads(text)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except (ValueError, RecursionError) as error:  # TOML, UTF-8, long numbers; deep nesting
+        raise InputError(f"{path}: not valid TOML ({error}); correct that line") from error
+    for old, new in RENAMED.items():
+        *parents, last = old.split(".")
+        inner: Any = table
+        for parent in parents:
+            inner = inner.get(parent) if isinstance(inner, dict) else None
+        if isinstance(inner, dict) and last in inner:
+            inner[new.rpartition(".")[2]] = inner.pop(last)
+    return table
+
+
 def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
-    """The table of a file, with those that it `extends`; paths are relative to the file that names them.
+    """The table of a file merged over the one that it `extends`; paths are relative to the file.
 
     `above` are the files that extend this one, resolved.
     """
@@ -222,27 +188,28 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
         raise InputError(
             f"{path}: extends: expected a name or a path in quotes, found {abbreviated(base)}; correct it"
         )
-    if not isinstance(dropped, list) or not all(isinstance(name, str) for name in dropped):
+    if not isinstance(dropped, list) or not all(isinstance(key, str) for key in dropped):
         raise InputError(f"{path}: drop: expected a list of keys, such as ['mesh', 'loss.alpha']; correct it")
     parent = _extended(_find(base, f"{path}: extends", path.parent), [*above, path.resolve()])
-    if "about" in table:  # what another file deviates from is not what this one does
+    if "about" in table:  # another file's deviations and purpose are not this one's
         for key in ("deviations", "purpose"):
             parent.get("about", {}).pop(key, None)
-    for name in dropped:
-        _drop(parent, name, path)
+    for key in dropped:
+        _drop(parent, key, path)
     return _merge(parent, table)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _with_component(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
+    """The table of a file with the changes of one of its components."""
+    where = f"{path}: select.component"
     try:
-        text = path.read_text(encoding="utf-8")
-        if len(text) > MAX_TEXT or max(map(len, text.splitlines()), default=0) > MAX_LINE:
-            raise ValueError("too long")
-        return tomllib.loads(text)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-    except (ValueError, RecursionError) as error:  # of TOML, UTF-8, long numbers; deep nesting
-        raise InputError(f"{path}: not valid TOML ({error}); correct that line") from error
+        component = build(MethodComponent, table["select"]["component"][name], f"{where}.{name}")
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{where}: there is no '{name}'; use one of its components") from error
+    for key in component.drop:
+        with contextlib.suppress(InputError):  # another component or a base file may have dropped it
+            _drop(table, key, path)
+    return _merge(table, component.change)
 
 
 def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -253,18 +220,26 @@ def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _drop(table: dict[str, Any], name: str, path: Path) -> None:
-    *parents, last = name.split(".")
+def _keys(dotted: str) -> list[str]:
+    """The parts of a dotted key, old ones by their new names."""
+    for old, new in RENAMED.items():
+        if dotted == old or dotted.startswith(f"{old}."):
+            dotted = new + dotted[len(old) :]
+    return dotted.split(".")
+
+
+def _drop(table: dict[str, Any], key: str, path: Path) -> None:
+    *parents, last = _keys(key)
     for parent in parents:
         inner = table.get(parent)
         table = inner if isinstance(inner, dict) else {}
     if last not in table:
-        raise InputError(f"{path}: drop: no key '{name}' in the extended file; remove it from `drop`")
+        raise InputError(f"{path}: drop: no key '{key}' in the extended file; remove it from `drop`")
     del table[last]
 
 
 def assignments(settings: Mapping[str, object] | Sequence[str]) -> list[str]:
-    """Changes of a method as `key=value` with values of TOML; what is a list of such is that list.
+    """Changes of a method as `key=value` with TOML values; a list of such is returned as it is.
 
     Raises InputError for a value that TOML does not have.
     """
@@ -284,10 +259,129 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         value = text
-    *parents, last = key.strip().split(".")
+    *parents, last = _keys(key.strip())
     for parent in parents:
         inner = table.setdefault(parent, {})
         if not isinstance(inner, dict):
             raise InputError(f"--set: {key}: '{parent}' is not a table; check the key")
         table = inner
     table[last] = value
+
+
+# ---------------- what is not allowed ----------------
+
+
+def _require_consistent(method: Method, where: str) -> None:
+    """Raise InputError for unknown names, values out of range, and stages without what they need."""
+    surfels, light, loss, relocate = method.surfels, method.light, method.loss, method.refine.relocate
+    try:
+        attributes = {*surfels.names}
+    except InputError as error:
+        raise InputError(f"{where}: surfels.{error}") from error
+    _require_known_names(method, attributes, where)
+
+    # Stages: what their shading needs, samples, and names of parameters.
+    parameters = {LIGHT} if light is not None else set()
+    for name, stage in method.stages():
+        try:
+            shading = Shading.resolve(stage.shading, method.mesh is not None)
+            shading.require_inputs(attributes, light is not None)
+            samples_per_axis(stage.samples)
+        except InputError as error:
+            raise InputError(f"{where}: stage.{name}: {error}") from error
+        for key, named, known in (
+            ("restart", stage.restart, {*surfels.channels} | parameters),
+            ("rates", stage.rates, attributes | parameters),
+        ):
+            if absent := [one for one in named if one not in known]:
+                raise InputError(f"{where}: stage.{name}: {key}: there is no '{absent[0]}'; remove it")
+
+    # Numbers: (key, value, whether it is allowed, what is).
+    ranges = [
+        (f"stage.{name}.rates.{one}", factor, 0 <= factor < math.inf, "0 or more")
+        for name, stage in method.stages()
+        for one, factor in stage.rates.items()
+    ]
+    ranges += [
+        ("data.coarse.block", images.block, images.block >= 2, "2 or more") for images in method.data.coarse
+    ]
+    if light is not None:
+        ranges.append(("light.height", light.height, is_height(light.height), HEIGHT))
+        ranges.append(("light.every", light.every, light.every >= 1, "1 or more"))
+    if method.exposure is not None:
+        ranges.append(("exposure.rate", method.exposure.rate, method.exposure.rate >= 0, "0 or more"))
+    if relocate is not None:
+        ranges.append(("refine.relocate.grow", relocate.grow, relocate.grow >= 0, "0 or more"))
+    if (around := method.surroundings) is not None:
+        ranges += [
+            (f"surroundings.{key}", getattr(around, key), allowed, wanted)
+            for key, allowed, wanted in (
+                ("count", around.count >= 1, "1 or more"),
+                ("degree", 0 <= around.degree <= MAX_SH_DEGREE, f"0 to {MAX_SH_DEGREE}"),
+                ("scattered", 0 <= around.scattered <= 1, "a fraction from 0 to 1"),
+                ("opacity", 0 < around.opacity < 1, "a number between 0 and 1"),
+                ("size", around.size > 0, "more than 0"),
+                ("prune_extent", around.prune_extent > 0, "more than 0"),
+                ("reach", around.reach > 0, "more than 0"),
+                ("height", is_height(around.height), HEIGHT),
+            )
+        ]
+    for key, value, allowed, wanted in ranges:
+        if not allowed:
+            raise InputError(f"{where}: {key}: {value} is out of range; give {wanted}")
+
+    # Losses and operations that need attributes, a deferred stage or a light.
+    deferred = any(stage.shading.at == "pixel" for _, stage in method.stages())
+    for name, needed in (("half_metal", {"metallic"}), ("materials", {"metallic", "roughness"})):
+        if getattr(loss, name) and not (deferred and needed <= attributes):
+            raise InputError(
+                f"{where}: loss.{name}: needs {' and '.join(sorted(needed))}, and a stage at = pixel; drop it"
+            )
+    if loss.light_colour and light is None:
+        raise InputError(f"{where}: loss.light_colour: there is no light; drop it")
+    if method.refine.propagate is not None and "metallic" not in attributes:
+        raise InputError(f"{where}: refine.propagate: there is no channel 'metallic'; add it, or drop this")
+
+
+HEIGHT = f"a multiple of 4 from {MIN_HEIGHT}"
+
+
+def _require_known_names(method: Method, attributes: set[str], where: str) -> None:
+    """Raise InputError for a name of an attribute that does not exist or does not fit the key."""
+    surfels, rates = method.surfels, method.rates
+    harmonics = {name for name, attribute in ATTRIBUTES.items() if attribute.harmonics}
+    bounded = {name for name in attributes & {*ATTRIBUTES} if ATTRIBUTES[name].activation == "sigmoid"}
+    for key, named, known in (
+        ("surfels.channels", surfels.channels, {name for name, x in ATTRIBUTES.items() if not x.geometry}),
+        ("surfels.initial", surfels.initial, attributes),
+        ("surfels.degree", surfels.degree, harmonics),
+        ("surfels.from_pictures", surfels.from_pictures, {*surfels.channels}),
+        ("rates.channel", rates.channel, {*ATTRIBUTES}),
+        ("rates.rest", rates.rest, harmonics),
+        ("refine.reset_raise", method.refine.reset_raise, bounded),
+    ):
+        if unknown := [name for name in named if name not in known]:
+            allowed = ", ".join(name for name in ATTRIBUTES if name in known)
+            raise InputError(f"{where}: {key}: '{unknown[0]}' is unknown; use some of {allowed}")
+
+
+def _require_selectable(method: Method, select: Selection, where: str) -> None:
+    """Raise InputError for a selection that cannot be made; each component is loaded with those it needs."""
+    if select.holdout < 2:
+        raise InputError(f"{where}: select.holdout: {select.holdout} leaves no views to fit; give 2 or more")
+    for name, component in select.component.items():
+        if unknown := [one for one in (*component.needs, *component.unless) if one not in select.component]:
+            raise InputError(
+                f"{where}: select.component.{name}: needs: there is no '{unknown[0]}'; name a component"
+            )
+        load(method.file, method.preset, method.assignments, [*_needed(select, name), name])
+
+
+def _needed(select: Selection, name: str) -> list[str]:
+    """The components that one needs, and those that they need, in the order of their trials."""
+    found: list[str] = []
+    for needed in select.component[name].needs:
+        if needed not in select.order[: select.order.index(name)]:
+            raise InputError(f"select.component.{name}: needs: '{needed}' is tried later; try it before")
+        found += [other for other in (*_needed(select, needed), needed) if other not in found]
+    return found

@@ -120,7 +120,7 @@ class ProgressBar(Previews):
         super().begin(trainer)
         # A short memory: the first steps compile kernels.
         options: dict[str, Any] = {"initial": trainer.iteration, "smoothing": 0.05}
-        self.bar = progress_bar(trainer.method.iterations, trainer.method.variant, **options)
+        self.bar = progress_bar(trainer.method.iterations, trainer.method.name, **options)
 
     def step(self, trainer: Trainer) -> None:
         if trainer.iteration % trainer.method.log_every == 0:

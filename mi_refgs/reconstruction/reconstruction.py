@@ -61,7 +61,7 @@ class Reconstruction:
             f"light = {None if light is None else f'{light.height} × {2 * light.height}'}",
             f"mesh = {None if mesh is None else f'{len(mesh.faces)} triangles'}",
             *([] if around is None else [f"surroundings = {around.surfels.count}"]),
-            f"method = {self.method.variant}, {self.trained.iteration} iterations",
+            f"method = {self.method.name}, {self.trained.iteration} iterations",
             f"folder = {self.folder}",
         ]
         return "Reconstruction[\n  " + ",\n  ".join(parts) + "\n]"

@@ -17,8 +17,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload_tensor
-from mi_refgs.methods.method import APART, LIGHT
-from mi_refgs.methods.surroundings import AROUND, BACKGROUND
+from mi_refgs.methods.method import APART, AROUND, BACKGROUND, LIGHT
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels

@@ -45,9 +45,9 @@ class ShadingOptions:
     Raises InputError for a value of another type or out of range; `Shading` refuses combinations.
     """
 
-    at: Order = "pixel"
+    at: Order = "pixel"  # deferred shading per pixel or forward shading per surfel
     reflectance: str = "split_sum"  # a name in `reflectance.MODELS`
-    diffuse: Diffuse = "sh"
+    diffuse: Diffuse = "sh"  # fitted SH radiance, or albedo times the irradiance of the light
     occlusion: bool = field(default=False, metadata=NOT_A_SETTING)  # trace visibility; follows from a mesh
     dominant: bool = False  # look the light up along the lobe's dominant direction, not the mirror direction
     multiscatter: bool = False  # add light that leaves after several bounces between microfacets

@@ -22,8 +22,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr
 from mi_refgs.io.images import read_png, srgb_from_linear, write_png
 from mi_refgs.io.ownership import RECORD
-from mi_refgs.methods.presets import PRESETS
-from mi_refgs.methods.read import load_resolved, names
+from mi_refgs.methods.read import PRESETS, load_resolved, names
 from tests.helpers import ROOT, command_names, command_options, refused
 from tests.scenes.tiny import SIZE, train_command
 
@@ -106,7 +105,7 @@ def test_train_writes_a_run_folder(finished: Path) -> None:
         assert (finished / name).stat().st_size > 0, name
     assert [path.name for path in (finished / "previews").iterdir()] == ["0000004.png"]
     assert (finished / "checkpoints" / "0000006.npz").is_file()
-    assert load_resolved(finished / "config.toml").variant == "tiny"
+    assert load_resolved(finished / "config.toml").name == "tiny"
     lines = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [2, 4, 6]
     left_over = [path.name for path in finished.rglob("*") if path.name.startswith(".")]

@@ -450,13 +450,13 @@ def test_a_run_that_chose_its_terms_is_still_the_same(ball: Path, tmp_path: Path
     """A finished fit of a method that selects its terms is not taken for one of other settings."""
     variant = tmp_path / "choosing.toml"
     variant.write_text(
-        'extends = "base_2dgs"\n[select.term.colour]\nafter = 1\ntrial = 1\n'
+        'extends = "base_2dgs"\n[select.component.colour]\nafter = 1\ntrial = 1\n'
         "change = { surfels = { degree = { radiance_sh = 0 } } }\n"
     )
     job = jobs.plan(tmp_path / "out", [ball], [str(variant)], [0], Shared("quick", threads=1))[0]
     chosen = job.method(["colour"])
     job.run.create(chosen, str(ball))
-    assert chosen.terms == ("colour",) and chosen.surfels.degree_of("radiance_sh") == 0
+    assert chosen.components == ("colour",) and chosen.surfels.degree_of("radiance_sh") == 0
     jobs.require_same(job)
     job.run.write_method(dataclasses.replace(chosen, seed=3))
     with pytest.raises(InputError, match=r"seed: the run was made with 3"):

@@ -23,8 +23,7 @@ from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import EXIF_IFD, srgb_from_linear
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import GAIN, DataOptions, ExposureOptions, Method, Refine
-from mi_refgs.methods.weights import LossWeights
+from mi_refgs.methods.method import GAIN, DataOptions, ExposureOptions, LossWeights, Method, Refine
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.run import Run

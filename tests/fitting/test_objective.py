@@ -18,7 +18,7 @@ from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.weights import LossWeights
+from mi_refgs.methods.method import LossWeights
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light.envmap import EnvironmentLight

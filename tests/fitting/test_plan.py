@@ -15,9 +15,8 @@ from mi_refgs.data.images import ImageFile
 from mi_refgs.fitting import cost_model, plan
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels import memory
-from mi_refgs.methods.method import CoarsePictures, DataOptions, Method, Rates
-from mi_refgs.methods.presets import PRESETS
-from mi_refgs.methods.surroundings import SurroundingsOptions
+from mi_refgs.methods.method import CoarsePictures, DataOptions, Method, Rates, SurroundingsOptions
+from mi_refgs.methods.read import PRESETS
 from mi_refgs.splat import Camera
 from tests.scenes.highlight import METHOD
 from tests.scenes.tiny import write_data

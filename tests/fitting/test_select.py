@@ -46,25 +46,25 @@ until = 2_000
 [select]
 holdout = 3
 
-[select.term.degree]
+[select.component.degree]
 after = 2
 trial = 2
 change = { surfels = { degree = { radiance_sh = 1 } } }
 
-[select.term.specular]
+[select.component.specular]
 after = 5
 trial = 2
 drop = ["stage"]
-[select.term.specular.change]
+[select.component.specular.change]
 surfels = { channels = ["radiance_sh", "albedo", "metallic", "roughness"] }
 light = { height = 8 }
 stage = { deferred = { until = 2_000, light_levels = 3 } }
 
-[select.term.interreflection]
+[select.component.interreflection]
 after = 8
 trial = 2
 needs = ["specular"]
-[select.term.interreflection.change]
+[select.component.interreflection.change]
 surfels = { channels = ["radiance_sh", "albedo", "metallic", "roughness", "indirect_sh"] }
 mesh = { extract = { start = 8, until = 20, every = 4 }, resolution = 12 }
 """
@@ -121,7 +121,7 @@ def test_terms_stay_if_they_earn_their_price(
         ("interreflection", 8, True),
     ]
     assert seen == [6] * 6 and len(trainer.data.views) == 9 and trainer.iteration == 12
-    assert trainer.method.terms == ("specular", "interreflection")
+    assert trainer.method.components == ("specular", "interreflection")
     assert {*trainer.params} >= {LIGHT, "indirect_sh"} and not trainer.fit.occluder.empty
     assert trainer.surfels.sh_degree() == 0
 
@@ -216,7 +216,7 @@ def test_an_interrupted_selection_resumes_where_it_was(
         trainer.train()
     judged(monkeypatch, scores[4:])
     resumed = begin(run.method(), views, run)
-    assert len(resumed.decisions) == 2 and resumed.method.terms == ("specular",)
+    assert len(resumed.decisions) == 2 and resumed.method.components == ("specular",)
     resumed.train()
     assert [row["stays"] for row in resumed.decisions] == [row["stays"] for row in straight.decisions]
     for name, tensor in straight.params.items():
@@ -236,7 +236,7 @@ def test_a_run_keeps_its_decisions(
     rows = json.loads((run / "decisions.json").read_text())
     method = Run(run).method()
     assert [row["term"] for row in rows] == ["degree", "specular", "interreflection"]
-    assert method.terms == tuple(row["term"] for row in rows if row["stays"])
+    assert method.components == tuple(row["term"] for row in rows if row["stays"])
     assert {*read_ply(run / "surfels.ply").raw} == {*method.surfels.names}
     assert main(["eval", str(run)]) == 0
 
@@ -317,7 +317,7 @@ def test_trials_end_with_the_fit(
     trainer = begin(methods.load(variant, "quick", settings), views, Run(tmp_path / "run"))
     trainer.train()
     assert trainer.iteration == 7 and len(trainer.decisions) == 2
-    assert Run(tmp_path / "run").method().terms == ("degree",)
+    assert Run(tmp_path / "run").method().components == ("degree",)
 
 
 def test_a_rival_that_fails_is_left_out(

@@ -171,7 +171,7 @@ def test_python_imports_what_the_command_does(theirs: Path, tmp_path: Path, line
     import mi_refgs
 
     made = mi_refgs.import_splats(str(theirs), linear=linear)
-    assert made.folder is None and made.method.variant == "theirs" and len(made.cameras()) == 4
+    assert made.folder is None and made.method.name == "theirs" and len(made.cameras()) == 4
     picture = made.render(1, size=32)
     assert picture[..., :3].max() > 0.1
     np.testing.assert_array_equal(made.save(tmp_path / "saved").render(1, size=32), picture)

@@ -19,7 +19,7 @@ from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import refine
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.presets import scaled
+from mi_refgs.methods.build import scaled
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.highlight import ball
@@ -74,7 +74,7 @@ def test_only_declared_fields_are_scaled() -> None:
 
 def test_every_number_of_iterations_is_declared() -> None:
     """The intervals of checkpoints, previews and logs are of the run, not of its schedule."""
-    names = {"until", "hold", "after", "trial", "iterations"}
+    names = {"start", "rise", "until", "hold", "after", "trial", "iterations"}
     waiting: list[Any] = [methods.Method]
     for kind in waiting:
         hints = typing.get_type_hints(kind) if dataclasses.is_dataclass(kind) and kind is not Window else {}
@@ -220,7 +220,7 @@ def test_assignments_are_applied_unscaled() -> None:
         ),
         (
             "iterations = 10\n[stage.a]\nuntil = 10\n[data]\ncoarse = [{ until = 5, block = 1 }]",
-            ["own.toml", "data.coarse", "block of 1", "2 or more"],
+            ["own.toml", "data.coarse.block: 1", "2 or more"],
         ),
         (
             "iterations = 10\n[stage.a]\nuntil = 10\n[light]\nevery = 0",
@@ -254,8 +254,8 @@ def test_extends_changes_only_what_it_says(tmp_path: Path) -> None:
     child.write_text('extends = "ref_gaussian"\n[loss]\nssim = 0.5\n')
     base, changed = methods.load("ref_gaussian"), methods.load(str(child))
     assert changed.loss == dataclasses.replace(base.loss, ssim=0.5)
-    assert dataclasses.replace(changed, loss=base.loss, variant=base.variant, file=base.file) == base
-    assert Path(child).stem == changed.variant
+    assert dataclasses.replace(changed, loss=base.loss, name=base.name, file=base.file) == base
+    assert Path(child).stem == changed.name
 
 
 @pytest.mark.parametrize("base", methods.names())
@@ -268,7 +268,7 @@ def test_extends_takes_every_shipped_method_and_own_files(base: str, tmp_path: P
     shipped, changed = methods.load(base), methods.load(str(grandchild))
     assert changed.loss == dataclasses.replace(shipped.loss, ssim=0.5, normal=0.3)
     assert changed.refine.densify is None and changed.refine.reset is None
-    same = dataclasses.replace(changed, loss=shipped.loss, refine=shipped.refine, variant=base, file=base)
+    same = dataclasses.replace(changed, loss=shipped.loss, refine=shipped.refine, name=base, file=base)
     assert same == shipped
 
 
@@ -321,8 +321,8 @@ def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
     ("assignment", "words"),
     [
         ("stage.deferred.rates.tint=2.0", "rates: there is no 'tint'"),
-        ("stage.deferred.rates.metallic=-1.0", "metallic: -1.0 is no factor"),
-        ("stage.deferred.rates.light=nan", "out of range|no factor"),
+        ("stage.deferred.rates.metallic=-1.0", "metallic: -1.0 is out of range"),
+        ("stage.deferred.rates.light=nan", "out of range"),
         ("surfels.from_pictures=['metallic']", "metallic"),
         ("surfels.channels=['metallic', 'roughness']", "albedo"),
         ("refine.relocate={when={start=0, until=9, every=3}, grow=-0.1}", r"relocate\.grow: -0\.1"),

@@ -137,7 +137,7 @@ DIFFERENCES: dict[str, set[str]] = {
 def entries(variant: str) -> dict[str, Any]:
     """The resolved, unscaled keys of a method to the second level."""
     method = plain(methods.load(variant, "standard"))
-    for name in ("about", "variant", "file", "preset", "assignments", "terms"):
+    for name in ("about", "name", "file", "preset", "assignments", "components"):
         method.pop(name)
     found: dict[str, Any] = {}
     for key, value in method.items():

@@ -180,7 +180,7 @@ def test_site_has_every_method_with_its_deviations(site: Path) -> None:
 
 
 def test_site_has_every_setting(site: Path) -> None:
-    from mi_refgs.methods.weights import LossWeights
+    from mi_refgs.methods.method import LossWeights
 
     text = (site / "settings" / "index.html").read_text(encoding="utf-8")
     for field in LossWeights.__dataclass_fields__:

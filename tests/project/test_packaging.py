@@ -116,7 +116,7 @@ from mi_refgs.methods.read import load
 from mi_refgs.io.resources import resource_dir
 scenes = resource_dir("scenes")
 scene = (scenes / "glossy_demo.xml").is_file()
-print(json.dumps([mi_refgs.__file__, str(scenes), load("relighting").variant, scene]))
+print(json.dumps([mi_refgs.__file__, str(scenes), load("relighting").name, scene]))
 """
     module, scenes, variant, scene = json.loads(run_in(environment, "python", "-c", code))
     package = Path(module).parent

@@ -11,7 +11,7 @@ from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import read_png, write_png
-from mi_refgs.methods.presets import PRESETS
+from mi_refgs.methods.read import PRESETS
 from mi_refgs.reference.camera import look_at
 
 SIZE = 20
