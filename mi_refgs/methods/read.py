@@ -280,22 +280,6 @@ def _require_consistent(method: Method, where: str) -> None:
         raise InputError(f"{where}: surfels.{error}") from error
     _require_known_names(method, attributes, where)
 
-    # Stages: what their shading needs, samples, and names of parameters.
-    parameters = {LIGHT} if light is not None else set()
-    for name, stage in method.stages():
-        try:
-            shading = Shading.resolve(stage.shading, method.mesh is not None)
-            shading.require_inputs(attributes, light is not None)
-            samples_per_axis(stage.samples)
-        except InputError as error:
-            raise InputError(f"{where}: stage.{name}: {error}") from error
-        for key, named, known in (
-            ("restart", stage.restart, {*surfels.channels} | parameters),
-            ("rates", stage.rates, attributes | parameters),
-        ):
-            if absent := [one for one in named if one not in known]:
-                raise InputError(f"{where}: stage.{name}: {key}: there is no '{absent[0]}'; remove it")
-
     # Numbers: (key, value, whether it is allowed, what is).
     ranges = [
         (f"stage.{name}.rates.{one}", factor, 0 <= factor < math.inf, "0 or more")
@@ -329,6 +313,22 @@ def _require_consistent(method: Method, where: str) -> None:
     for key, value, allowed, wanted in ranges:
         if not allowed:
             raise InputError(f"{where}: {key}: {value} is out of range; give {wanted}")
+
+    # Stages: what their shading needs, samples, and names of parameters.
+    parameters = {LIGHT} if light is not None else set()
+    for name, stage in method.stages():
+        try:
+            shading = Shading.resolve(stage.shading, method.mesh is not None)
+            shading.require_inputs(attributes, light is not None)
+            samples_per_axis(stage.samples)
+        except InputError as error:
+            raise InputError(f"{where}: stage.{name}: {error}") from error
+        for key, named, known in (
+            ("restart", stage.restart, {*surfels.channels} | parameters),
+            ("rates", stage.rates, attributes | parameters),
+        ):
+            if absent := [one for one in named if one not in known]:
+                raise InputError(f"{where}: stage.{name}: {key}: there is no '{absent[0]}'; remove it")
 
     # Losses and operations that need attributes, a deferred stage or a light.
     deferred = any(stage.shading.at == "pixel" for _, stage in method.stages())

@@ -299,7 +299,7 @@ def test_an_unknown_primitive_is_refused() -> None:
     chosen = methods.load("ref_gaussian", "quick", ["surfels.primitive='gaussian'"])
     assert chosen.surfels.columns("scale") == 3
     with pytest.raises(
-        InputError, match=r"surfels\.primitive: 'ball' is unknown; use one of surfel, gaussian"
+        InputError, match=r"surfels\.primitive: 'ball' is unknown; use surfel or gaussian"
     ):
         methods.load("ref_gaussian", "quick", ["surfels.primitive='ball'"])
 
