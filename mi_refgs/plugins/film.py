@@ -25,7 +25,7 @@ alpha: R, G, B, (A), the weight and the AOVs, as the film's blocks have them."""
 
 
 @dataclass(frozen=True)
-class Picture:
+class FilmImage:
     """The image of a `view` through a sensor's film, and its derivatives in both modes, in passes.
 
     A sample count n (`spp`, or 0 for that of the sampler) gives k × k regular samples per pixel, k = ⌈√n⌉,

@@ -1,11 +1,13 @@
-"""The `refgs` integrator: Gaussian surfels and deferred shading behind `mi.render`.
+"""The `refgs` integrator: Gaussian surfels and deferred shading for `mi.render`.
 
 Imported or reloaded for each variant: see `mi_refgs.plugins`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import math
+import time
+import warnings
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -13,22 +15,33 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.plugins.aovs import aov_values
-from mi_refgs.plugins.film import Picture
-from mi_refgs.plugins.light import FilteredOnce
-from mi_refgs.plugins.properties import read_aovs, read_light, read_shading, read_surfels, read_terms
-from mi_refgs.plugins.surroundings import Around
-from mi_refgs.plugins.unusable import UnusableValues
+from mi_refgs.plugins.film import FilmImage
+from mi_refgs.plugins.light import light_of
+from mi_refgs.plugins.properties import (
+    BackgroundProperties,
+    read_aovs,
+    read_light,
+    read_shading,
+    read_surfels,
+    read_terms,
+)
 from mi_refgs.render.display import composited
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.shade.ambient import update_occluder_caches
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.primitives import require_known_primitive
 from mi_refgs.surfels.table import Surfels
+
+CHECK_SECONDS = 1.0
+"""Least time between two checks for unusable values: each waits for the device."""
 
 
 class RefGSIntegrator(mi.SamplingIntegrator):
@@ -43,8 +56,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
      * - filename
        - |string|
        - PLY file with the surfels, or with 3D Gaussians: the properties of 2DGS or 3DGS, and those of the
-         other channels below, all raw (before the activation). In Python, channels may be given instead, or
-         replaced, by tensors under their names.
+         other attributes below, all raw (before the activation). In Python, attributes may also be given, or
+         replaced, as tensors under their names.
 
      * - light *or any name*
        - |emitter|
@@ -58,21 +71,22 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
      * - occlusion
        - |bool|
-       - Trace visibility along the mirror direction, and show the surfels' indirect light where it is
+       - Trace visibility along the mirror direction, and use the surfels' indirect light where it is
          blocked; ``monte_carlo`` traces each of its directions. (Default: whether there is a ``mesh``)
 
      * - shade_at
        - |string|
-       - ``pixel`` (blend attributes, then shade) or ``surfel`` (shade, then blend radiance). (Default:
-         ``pixel``; ``surfel`` with ``gaussian_shader`` and ``monte_carlo``, which have no other)
+       - ``pixel`` (deferred: blend attributes, then shade) or ``surfel`` (forward: shade, then blend
+         radiance). (Default: ``pixel``; ``surfel`` with ``gaussian_shader`` and ``monte_carlo``, which have
+         no other)
 
      * - reflectance
        - |string|
        - ``split_sum`` (diffuse and GGX specular), ``radiance`` (the SH colour alone, needs no light; the two
          orders of shading are then the same), ``mirror`` (the SH colour mixed with a perfect mirror by
          ``metallic``, 3DGS-DR), ``gaussian_shader`` (SH colour, diffuse and tinted specular layer) or
-         ``monte_carlo`` (light summed over the hemisphere, R3DG). (Default: the first of these whose channels
-         the surfels have)
+         ``monte_carlo`` (light summed over the hemisphere, R3DG). (Default: the first of these whose
+         attributes the surfels have)
 
      * - diffuse
        - |string|
@@ -81,28 +95,29 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
      * - dominant, multiscatter, antialias
        - |bool|
-       - Buy accuracy: look the light up along the GGX lobe's dominant direction; add what bounces between
-         facets; widen roughness by how much normals turn within a pixel. (Default: false)
+       - More accuracy for more time: look the light up along the GGX lobe's dominant direction; add
+         interreflection between microfacets; widen roughness by the variance of normals within a pixel.
+         (Default: false)
 
      * - visibility_rays, traced_bounces, ambient_rays
        - |int|
-       - Rays of the lobe that visibility is averaged over, 1 is the mirror ray; how often what blocks rays is
-         shaded, in place of the surfels' indirect light; and rays from each vertex of the mesh for the share
-         of diffuse light that arrives, with ``irradiance``. (Default: 1, 0, 0: all of it)
+       - Specular-lobe samples of the visibility, 1 is the mirror ray; traced bounces, in place of the
+         surfels' indirect light; and rays per vertex of the mesh for the ambient visibility of diffuse light,
+         with ``irradiance``. (Default: 1, 0, 0: fully visible)
 
      * - directions, light_levels
        - |int|
-       - Directions that ``monte_carlo`` takes light from; levels of roughness that ``split_sum`` filters the
-         light to. Fewer cost less. (Default: 24, 7)
+       - Directions that ``monte_carlo`` samples; roughness levels of the light that ``split_sum`` prefilters.
+         Fewer are faster. (Default: 24, 7)
 
      * - terms
        - |string|
-       - Terms in the image, out of ``diffuse,specular,indirect``. (Default: all)
+       - Terms of the radiance in the image, out of ``diffuse,specular,indirect``. (Default: all)
 
      * - surroundings
        - |string|
        - PLY file with the surfels around the object, splatted with it: geometry and ``radiance_sh``. Also
-         tensors, ``surroundings_position`` and so on. (Default: none, the object alone)
+         tensors, ``surroundings_position`` and so on. (Default: none, the object only)
 
      * - background
        - |color| or |string|
@@ -116,9 +131,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
          ``alpha``, ``visibility``, ``diffuse``, ``specular``, ``indirect``. (Default: none)
 
      * - position, rotation, scale, opacity, radiance_sh, albedo, metallic, roughness, indirect_sh, tint,
-         normal_offset *or any registered channel*
+         normal_offset *or any registered attribute*
        - |tensor|
-       - Raw channels of shape (N, D). They may be replaced by ones with another N, all in one update. A
+       - Raw attributes of shape (N, D). They may be replaced by ones with another N, all in one update. A
          ``scale`` of three columns makes the rows 3D Gaussians.
        - |exposed|, |differentiable|
 
@@ -131,22 +146,22 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
      * - surroundings_position, …, surroundings_radiance_sh, background
        - |tensor|
-       - Raw channels of the surroundings, and raw map of the background as of ``light``, if there are any.
+       - Raw attributes of the surroundings, and raw map of the background as of ``light``, if there are any.
        - |exposed|, |differentiable|
 
     The keys start with the integrator's id, `refgs` unless the scene sets one: ``params['refgs.roughness']``.
 
     This integrator splats surfels in the view of a `perspective` sensor. It does not see the scene's
-    shapes, and shows the environment only as reflections. Without noise, it ignores the seed. A sample
+    shapes, and shows the environment only in reflections. It has no noise, and ignores the seed. A sample
     count n (of ``mi.render``, else of the sensor's sampler, whose default is 4) gives k × k regular samples
-    a pixel, k = ⌈√n⌉, box filtered; n = 1 takes pixel centres. `mi.render` differentiates it in both modes
-    with respect to the parameters above and to ``data``, ``scale`` or ``radiance.value`` of the scene's
+    per pixel, k = ⌈√n⌉, box filtered; n = 1 takes pixel centres. `mi.render` differentiates it in both
+    modes with respect to the parameters above and to ``data``, ``scale`` or ``radiance.value`` of the scene's
     environment, but not to sensors, background or mesh; `mi_refgs.splat.composite` lists the derivatives that
     are absent.
 
-    A surfel with a value that is NaN or infinite in any channel, or beyond 1e18 in position or harmonics,
-    covers no pixel and gets zero gradient; such a value of the light is black. A warning names the channel,
-    once.
+    A surfel with a value that is NaN or infinite in any attribute, or beyond 1e18 in position or spherical
+    harmonics, covers no pixel and gets zero gradient; such a value of the light is black. One warning names
+    the attribute.
 
     .. tabs::
         .. code-tab:: xml
@@ -175,39 +190,62 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             self.set_id("refgs")  # an address otherwise, and with it every parameter's key
         self.surfels = read_surfels(props)
         self.light, self.light_rotation = read_light(props)
+        self.filtered_light: Light | None = None  # of images without derivatives, until it changes
         self.shading, self.occluder = read_shading(props, self.surfels)
-        self.terms = read_terms(props)
-        self.around = Around.of(props, self.surfels)
-        self.aovs = read_aovs(props)
-        self.filtered = FilteredOnce()
         self.caches_valid = False  # occluder materials and ambient ratios are up to date
+        self.terms = read_terms(props)
+        self.background = BackgroundProperties.read(props, self.surfels)
+        self.aovs = read_aovs(props)
         self.check()
-        self.unusable = UnusableValues(self.around.values(self.surfels, self.light))
+        self.unusable = UnusableValues()
+        self.unusable.warn(*self._values())
 
     def check(self) -> None:
-        """Raise InputError for shapes that do not fit and for channels that are needed but absent."""
+        """Raise InputError for shapes that do not fit and for attributes that are required but absent."""
         Surfels(self.surfels.raw)  # checks shapes; values are checked where a file is read
         require_known_primitive(self.surfels.raw)
         self.shading.require_inputs(self.surfels.raw)
         for name in (aov.type for aov in self.aovs if aov.type in ATTRIBUTES):
             if not self.surfels.has(name):
-                raise InputError(f"refgs: {name}: the surfels have no such channel; add it, or do without it")
-        self.around.check(self.surfels, self.light)
+                raise InputError(
+                    f"refgs: {name}: the surfels have no such attribute; add it, or do without it"
+                )
+        self.background.require_fit(self.surfels)
+        for name, found in self._values()[1].items():
+            shape = tuple(found.raw.shape)
+            if len(shape) != 3 or shape[2] != 3 or shape[1] != 2 * shape[0] or shape[0] % 4:
+                raise InputError(f"refgs: {name}: shape {shape}, expected (h, 2h, 3) with h a multiple of 4")
+
+    def _values(self) -> tuple[dict[str, Surfels], dict[str, EnvironmentLight]]:
+        """Surfel models, and lat-long maps, by name."""
+        models = {"surfels": self.surfels, "surroundings": self.background.surfels}
+        maps = {"light": self.light, "background": self.background.map}
+        return (
+            {name: model for name, model in models.items() if model is not None},
+            {name: found for name, found in maps.items() if found is not None},
+        )
+
+    @property
+    def surfel_count(self) -> int:
+        """Number of surfels of the object and its surroundings."""
+        return sum(model.count for model in self._values()[0].values())
 
     # ---------------- parameters ----------------
 
     def traverse(self, cb: Any) -> None:
-        for name, tensor in self.around.parameters(self.surfels, self.light).items():
+        light = {} if self.light is None else {"light": self.light.raw}
+        for name, tensor in {**self.surfels.raw, **light, **self.background.parameters()}.items():
             cb.put(name, tensor, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
         self.check()
         self.unusable.changed = True
-        self.filtered.forget()
-        self.caches_valid = self.caches_valid and not self.shading.ambient_rays
-        self.caches_valid = (
-            self.caches_valid and {*keys}.isdisjoint(self.surfels.primitive.widths) and bool(keys)
-        )
+        self.filtered_light = None
+        # The materials that the occluder caches are gathered from surfels near its vertices: they depend on
+        # geometry. Ambient ratios depend on everything. Without keys, anything may have changed.
+        geometry_changed = not keys or not {*keys}.isdisjoint(self.surfels.primitive.widths)
+        if geometry_changed or self.shading.ambient_rays:
+            self.caches_valid = False
 
     def aov_names(self) -> list[str]:
         return [channel for aov in self.aovs for channel in aov.channels()]
@@ -224,8 +262,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         evaluate: bool = True,
     ) -> Any:
         """The image (h, w, c) of a sensor; see the class for its channels."""
-        self.unusable.look(self.around.values(self.surfels, self.light))
-        image = self._picture(scene, sensor, spp, derivatives=False).image()
+        self.unusable.check(*self._values())
+        image = self._image(scene, sensor, spp, forward_only=True).image()
         if evaluate:
             dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -233,14 +271,14 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
         """Tangent of the image for the tangents of the parameters."""
         with dr.resume_grad():
-            return self._picture(scene, sensor, spp).tangent()
+            return self._image(scene, sensor, spp).tangent()
 
     def render_backward(
         self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
     ) -> None:
         """Accumulate the adjoints of the parameters for the adjoint of the image."""
         with dr.resume_grad():
-            for image, δ in self._picture(scene, sensor, spp).adjoints(grad_in):
+            for image, δ in self._image(scene, sensor, spp).adjoints(grad_in):
                 dr.set_grad(image, δ)
                 dr.enqueue(dr.ADMode.Backward, image)
                 dr.traverse(dr.ADMode.Backward)
@@ -249,15 +287,17 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def sample(self, *args: Any, **kwargs: Any) -> Any:
         raise InputError("refgs: sample: renders whole images only; do not nest it, use its own `aovs`")
 
-    def _picture(self, scene: Any, sensor: Any, spp: int, derivatives: bool = True) -> Picture:
+    def _image(self, scene: Any, sensor: Any, spp: int, forward_only: bool = False) -> FilmImage:
         """The image through the sensor's film."""
         if mi.variant() != self.variant:
             made = f"made under {self.variant}, not {mi.variant()}"
             raise InputError(f"refgs: variant: {made}; load the scene again")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        view = partial(self.frame, scene, derivatives, {aov.type for aov in self.aovs}, self.around)
-        neighbours, count = self.shading.neighbours, self.around.count(self.surfels)
-        return Picture(sensor, spp, view, self._channels, self.aov_names(), neighbours, count)
+        request = Request({aov.type for aov in self.aovs}, forward_only)
+        view = partial(self.frame, scene, request, self.background)
+        return FilmImage(
+            sensor, spp, view, self._channels, self.aov_names(), self.shading.neighbours, self.surfel_count
+        )
 
     def _channels(self, frame: Frame, camera: Camera, alpha: bool) -> list[Any]:
         """R, G, B, (A), W and the AOVs, as the film's blocks have them."""
@@ -265,28 +305,67 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         more = [value for aov in self.aovs for value in aov_values(aov.type, frame, camera)]
         return [*rgb, *([coverage] if alpha else []), mi.Float(1), *more]
 
-    def frame(
-        self, scene: Any, derivatives: bool, aovs: Collection[str], around: Around, camera: Camera
-    ) -> Frame:
-        """One sample per pixel of an image with these types of AOVs, `around` the object being that."""
-        asked = {*aovs} | {*(self.terms if len(self.terms) < len(TERMS) else ())}
-        light = self.filtered.of(self.shading, self.light, self.light_rotation, scene, derivatives)
+    def frame(self, scene: Any, request: Request, background: BackgroundProperties, camera: Camera) -> Frame:
+        """Render one sample per pixel, with this background instead of the integrator's own."""
+        light = self._light(scene, request.forward_only)
         if self.occluder is not None and not self.caches_valid:
             update_occluder_caches(self.occluder, self.surfels.detach(), light, self.shading)
-            # No one is told when a light of the scene changes.
+            # Mitsuba does not announce changes of the scene's light, on which ambient ratios depend.
             self.caches_valid = self.light is not None or not self.shading.ambient_rays
-        surfels, surroundings = Surfels(self.surfels.raw, screened=True), around.splatted(self.surfels)
+        surfels, surroundings = Surfels(self.surfels.raw, screened=True), background.splatted(self.surfels)
         rendered = SurfelScene(surfels, self.shading, light, self.occluder, surroundings)
-        frame = render(rendered, camera, Request(asked, forward_only=not derivatives))
-        if len(self.terms) < len(TERMS):  # of the object alone
-            radiance = sum((getattr(frame.terms, name) for name in self.terms), start=mi.Color3f(0))
+        chosen = () if len(self.terms) == len(TERMS) else self.terms
+        frame = render(rendered, camera, replace(request, aovs={*request.aovs, *chosen}))
+        if chosen:  # of the object only
+            radiance = sum((getattr(frame.terms, name) for name in chosen), start=mi.Color3f(0))
             frame = replace(frame, radiance=radiance)
-        return replace(frame.only(aovs), background=around.behind(frame))
+        return replace(frame.only(request.aovs), background=background.behind(frame))
+
+    def _light(self, scene: Any, forward_only: bool) -> Light | None:
+        """The light as the shading looks it up; its own is filtered once for images without derivatives."""
+        if not forward_only or self.light is None:
+            return light_of(self.shading, self.light, self.light_rotation, scene)
+        if self.filtered_light is None:
+            with dr.suspend_grad():
+                self.filtered_light = light_of(self.shading, self.light, self.light_rotation, scene)
+        return self.filtered_light
 
     def to_string(self) -> str:
         size = "x".join(str(x) for x in self.light.raw.shape[:2]) if self.light is not None else "the scene's"
-        what = f"surfels = {self.surfels.count},\n  channels = {', '.join(self.surfels.raw)}"
+        what = f"surfels = {self.surfels.count},\n  attributes = {', '.join(self.surfels.raw)}"
         return f"RefGSIntegrator[\n  {what},\n  light = {size},\n  shading = {self.shading}\n]"
+
+
+class UnusableValues:
+    """Warn once of values that are NaN, infinite or too large: after construction, or after a change."""
+
+    def __init__(self) -> None:
+        self.changed = False  # since the last check
+        self._next = -math.inf  # seconds of the monotonic clock: earliest time of the next check
+
+    def check(self, models: dict[str, Surfels], maps: dict[str, EnvironmentLight]) -> None:
+        """Check again if something changed and the last such check is CHECK_SECONDS ago."""
+        now = time.monotonic()
+        if self.changed and now >= self._next:
+            self.changed, self._next = False, now + CHECK_SECONDS
+            self.warn(models, maps)
+
+    def warn(self, models: dict[str, Surfels], maps: dict[str, EnvironmentLight]) -> None:
+        """Warn if there are such values, and never check again."""
+        found = [
+            f"{len(rows)} {kind} in {name} (first: {rows[0]})"
+            for kind, model in models.items()
+            for name, rows in model.unusable().items()
+        ]
+        found += [f"{black} values of {name}" for name, light in maps.items() if (black := light.unusable())]
+        if found:
+            self._next = math.inf
+            warnings.warn(
+                f"refgs: values are NaN, infinite or beyond {RAW_LIMIT:g}: {', '.join(found)}; these surfels "
+                "are left out, and such light is black",
+                RuntimeWarning,
+                stacklevel=3,
+            )
 
 
 mi.register_integrator("refgs", RefGSIntegrator)

@@ -83,31 +83,6 @@ def light_of(shading: Shading, own: EnvironmentLight | None, rotation: Any, scen
     return emitter_light(emitter, wanted == "filtered", shading.levels)
 
 
-class FilteredOnce:
-    """The integrator's own light as `light_of` gives it, filtered once for all pictures without derivatives.
-
-    Light of the scene is filtered for each: no one is told when it changes.
-    """
-
-    def __init__(self) -> None:
-        self._kept: Light | None = None
-
-    def forget(self) -> None:
-        """The light or its lookup have changed."""
-        self._kept = None
-
-    def of(
-        self, shading: Shading, own: EnvironmentLight | None, rotation: Any, scene: Any, derivatives: bool
-    ) -> Light | None:
-        """See `light_of`."""
-        if derivatives or own is None:
-            return light_of(shading, own, rotation, scene)
-        if self._kept is None:
-            with dr.suspend_grad():
-                self._kept = light_of(shading, own, rotation, scene)
-        return self._kept
-
-
 def rotated(light: Light, light_from_world: Any) -> Light:
     """The light through a rotation, as `own_light` gives it; None turns nothing."""
     return light if light_from_world is None else RotatedLight(light, light_from_world)

@@ -1,11 +1,11 @@
-"""The properties of the `refgs` integrator, read once while it is made.
+"""The properties of the `refgs` integrator, read once while it is constructed.
 
-No Mitsuba class is defined here, so that this module need not be reloaded when the variant changes.
+This module defines no Mitsuba class, so that it need not be reloaded when the variant changes.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,8 @@ from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.plugins.aovs import AOV, parse_aovs
 from mi_refgs.plugins.light import own_light
-from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.options import DIFFUSE, QUALITY, ShadingOptions
 from mi_refgs.shade.points import TERMS
@@ -25,13 +26,14 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Color3f
 
 AROUND = "surroundings_"
-"""What the names of the surroundings' channels begin with."""
+"""Prefix of the parameters of the surroundings' surfels."""
 
 
 def _get(props: Any, name: str, default: Any) -> Any:
-    """A property, or the default where it is absent."""
+    """Return a property, or the default where it is absent."""
     try:
         return props.get(name, default)
     except UnicodeError as error:
@@ -39,12 +41,12 @@ def _get(props: Any, name: str, default: Any) -> Any:
 
 
 def read_aovs(props: Any) -> list[AOV]:
-    """The maps that are asked for besides the image."""
+    """Read the AOVs that are appended to the image."""
     return parse_aovs(str(_get(props, "aovs", "")))
 
 
 def _path(props: Any, name: str) -> str | None:
-    """A file property, searched beside the XML first; Mitsuba searches there only while it makes plugins."""
+    """Return a file property; Mitsuba resolves it beside the XML only while it constructs plugins."""
     value = _get(props, name, None)
     return None if value is None else str(mi.file_resolver().resolve(str(value)))
 
@@ -64,7 +66,7 @@ def _flag(props: Any, name: str, default: bool) -> bool:
 
 
 def _tensor(props: Any, name: str) -> Any:
-    """A tensor property as mi.TensorXf; None where it is absent."""
+    """Return a tensor property as mi.TensorXf; None where it is absent."""
     value = _get(props, name, None)
     if value is None:
         return None
@@ -81,8 +83,73 @@ def _tensor(props: Any, name: str) -> Any:
         ) from error
 
 
+def read_surfels(props: Any) -> Surfels:
+    """Read the surfels of the PLY file; attributes given as tensors replace its own."""
+    raw = _attributes(props, "filename", "")
+    if not raw:
+        raise InputError(
+            "refgs: filename: there are no surfels; name a PLY file, or give the attributes as tensors"
+        )
+    return Surfels(raw)
+
+
+def _attributes(props: Any, file: str, prefix: str) -> dict[str, Any]:
+    """Raw attributes of the PLY file that a property names, and of tensors named `prefix` + attribute."""
+    path = _path(props, file)
+    raw = {} if path is None else dict(read_ply(path).raw)
+    for name in ATTRIBUTES:
+        value = _tensor(props, prefix + name)
+        if value is not None:
+            raw[name] = value
+    return raw
+
+
+@dataclass(frozen=True)
+class BackgroundProperties:
+    """What the integrator shows around and behind the object: surfels, and a colour or a map."""
+
+    surfels: Surfels | None = None  # splatted together with the object's
+    colour: Color3f = None  # behind everything; transparent without a colour and a map
+    map: EnvironmentLight | None = None
+
+    @staticmethod
+    def read(props: Any, surfels: Surfels) -> BackgroundProperties:
+        """Read the properties; raises InputError for what does not fit the object's surfels."""
+        behind = read_background(props)
+        colour, light = (None, behind) if isinstance(behind, EnvironmentLight) else (behind, None)
+        raw = _attributes(props, "surroundings", AROUND)
+        if not raw:
+            return BackgroundProperties(None, colour, light)
+        names = (*surfels.primitive.widths, "radiance_sh")
+        found = BackgroundProperties(Surfels({n: raw[n] for n in names if n in raw}), colour, light)
+        found.require_fit(surfels)
+        return found
+
+    def require_fit(self, surfels: Surfels) -> None:
+        """Raise InputError unless these can surround an object of these surfels."""
+        if self.surfels is not None:
+            Surroundings(Surfels(self.surfels.raw)).check(surfels)
+
+    def parameters(self) -> dict[str, Any]:
+        """Raw tensors by the names of the integrator's parameters."""
+        raw = {} if self.surfels is None else self.surfels.raw
+        found = {AROUND + name: tensor for name, tensor in raw.items()}
+        return found if self.map is None else {**found, "background": self.map.raw}
+
+    def splatted(self, surfels: Surfels) -> Surroundings | None:
+        """What is splatted together with the object's surfels, and the map; None without both."""
+        if self.surfels is None and self.map is None:
+            return None
+        around = nothing_around(surfels) if self.surfels is None else self.surfels
+        return Surroundings(Surfels(around.raw, screened=True), self.map)
+
+    def behind(self, frame: Frame) -> Color3f:
+        """Radiance behind everything; None where that is transparent."""
+        return frame.background if self.map is not None else self.colour
+
+
 def read_background(props: Any) -> Any:
-    """What is behind everything: a colour (mi.Color3f), an EnvironmentLight, or None: transparent."""
+    """Read what is behind everything: mi.Color3f, an EnvironmentLight, or None for transparency."""
     value = _get(props, "background", None)
     if isinstance(value, str):
         try:
@@ -101,39 +168,8 @@ def read_background(props: Any) -> Any:
         ) from error
 
 
-def read_surfels(props: Any) -> Surfels:
-    """The table of the PLY file, with channels replaced by those given as tensors."""
-    raw = _channels(props, "filename", "")
-    if not raw:
-        raise InputError(
-            "refgs: filename: there are no surfels; name a PLY file, or give the channels as tensors"
-        )
-    return Surfels(raw)
-
-
-def read_surroundings(props: Any, surfels: Surfels) -> Surfels | None:
-    """The surfels around the object, of a PLY file or tensors likewise; None without either."""
-    raw = _channels(props, "surroundings", AROUND)
-    if not raw:
-        return None
-    found = Surfels({name: raw[name] for name in (*surfels.primitive.widths, "radiance_sh") if name in raw})
-    Surroundings(found).check(surfels)
-    return found
-
-
-def _channels(props: Any, file: str, prefix: str) -> dict[str, Any]:
-    """Raw channels of the PLY file that a property names, and those given as tensors, `prefix` + name."""
-    path = _path(props, file)
-    raw = {} if path is None else dict(read_ply(path).raw)
-    for name in ATTRIBUTES:
-        value = _tensor(props, prefix + name)
-        if value is not None:
-            raw[name] = value
-    return raw
-
-
 def read_light(props: Any) -> tuple[Any, Any]:
-    """The integrator's own EnvironmentLight and its rotation (see `own_light`), or None twice."""
+    """Read the integrator's own EnvironmentLight and its rotation (see `own_light`), or None twice."""
     emitters = [child for _, child in props.objects() if isinstance(child, mi.Emitter)]
     if len(emitters) > 1:
         raise InputError("refgs: light: two emitters are nested in the integrator; keep one")
@@ -144,7 +180,7 @@ def read_light(props: Any) -> tuple[Any, Any]:
 
 
 def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None]:
-    """How to shade, by defaults that fit the channels; and the occluder if that traces visibility."""
+    """Read the shading, whose defaults fit the attributes, and the occluder if it traces visibility."""
     default = Shading.default_reflectance(surfels.raw)
     reflectance = _choice(props, "reflectance", default, tuple(MODELS))
     diffuse = _choice(props, "diffuse", Shading.default_diffuse(reflectance, surfels.raw), DIFFUSE)
@@ -155,13 +191,11 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     quality = {name: _get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
     shading = replace(shading, occlusion=occlusion, **quality)
     shading.require_inputs(surfels.raw, mesh=mesh is not None)
-    if not (occlusion and mesh):
-        return shading, None
-    return shading, Occluder(read_mesh(mesh))
+    return shading, Occluder(read_mesh(mesh)) if occlusion and mesh else None
 
 
 def read_terms(props: Any) -> list[str]:
-    """The terms that the image sums, by name."""
+    """Read the names of the terms that the image sums."""
     text = str(_get(props, "terms", ",".join(TERMS)))
     names = [name.strip() for name in text.split(",") if name.strip()]
     for name in names:

@@ -11,7 +11,8 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.plugins.aovs import suffixes
-from mi_refgs.plugins.surroundings import Around
+from mi_refgs.plugins.properties import BackgroundProperties
+from mi_refgs.render.pipeline import Request
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
@@ -24,7 +25,7 @@ from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScen
 
 CLIP = 1e-3, 1e4
 """Near and far plane, in radii of the scene."""
-OBJECT_ONLY = Around(None, None, None)
+OBJECT_ONLY = BackgroundProperties()
 """No background."""
 
 
@@ -46,7 +47,7 @@ class MitsubaScene(ViewerScene):
         else:
             prefixes = dict.fromkeys(name.partition(".")[0] for name in integrator.aov_names())
             self.variables = (IMAGE, *(name for name in prefixes if name in suffixes()))
-        self._background = integrator.around if self._is_refgs else OBJECT_ONLY
+        self._background = integrator.background if self._is_refgs else OBJECT_ONLY
         has_background = any(part is not None for part in vars(self._background).values())
         self.backdrops = backdrops_of(has_background, light=False)
 
@@ -94,7 +95,7 @@ class MitsubaScene(ViewerScene):
         camera, integrator = sample.camera(), self.scene.integrator()
         background = OBJECT_ONLY if sample.look.object_only else self._background
         with dr.suspend_grad():
-            frame = integrator.frame(self.scene, False, sample.aovs, background, camera)
+            frame = integrator.frame(self.scene, Request(sample.aovs, forward_only=True), background, camera)
             return SampleResult(planes_of(frame, camera, sample.look, None), frame.depth)
 
     def fine(self, request: SampleRequest) -> list[Float]:
@@ -106,7 +107,7 @@ class MitsubaScene(ViewerScene):
     def cost(self) -> tuple[Shading, int]:
         """See `ViewerScene`."""
         integrator = self.scene.integrator()
-        return integrator.shading, integrator.around.count(integrator.surfels)
+        return integrator.shading, integrator.surfel_count
 
     def _planes(self, request: SampleRequest, spp: int) -> list[Float]:
         """Render by Mitsuba, and return planes as `tonemap.planes_of` does."""
