@@ -66,10 +66,11 @@ class Render:
                 f"{self.scene}: sensor: the scene has none; add one, or give a file with --camera"
             )
         if not 0 <= self.sensor < len(sensors):
-            where, noun = (self.scene, "sensor") if cameras is None else (self.camera, "frame")
+            found = f"the scene has {counted(len(sensors), 'sensor')}"
+            if cameras is not None:
+                found = f"the file has {counted(len(sensors), 'frame')}"
             raise InputError(
-                f"{where}: --sensor: {self.sensor}: there {'is' if len(sensors) == 1 else 'are'} "
-                f"{counted(len(sensors), noun)}; give 0 to {len(sensors) - 1}"
+                f"{self.camera or self.scene}: --sensor: {self.sensor}: {found}; give 0 to {len(sensors) - 1}"
             )
 
         sensor, samples = sensors[self.sensor], self.samples or 0

@@ -251,7 +251,7 @@ def test_nothing_is_pruned_for_good(
     before = (run / "surfels.ply").read_bytes()
     for more in ([], ["-o", f"{run}/../run"]):
         assert main(["export", str(run), "--prune", *more]) == 2
-        assert "checkpoints: none is left" in capsys.readouterr().err
+        assert "checkpoints: none, from which" in capsys.readouterr().err
     assert main(["export", str(run), "--prune", "--limit", "25", "-o", str(tmp_path / "out")]) == 0
     assert (run / "surfels.ply").read_bytes() == before
     assert (tmp_path / "out" / "surfels.ply").stat().st_size < len(before)

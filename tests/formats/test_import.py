@@ -152,7 +152,7 @@ def test_one_gaussian_is_said_in_the_singular(
     path = tmp_path / "one.ply"
     path.write_bytes(header.replace(b"vertex 40", b"vertex 1") + end + body[: len(body) // COUNT])
     assert main(["import", str(path), "-o", str(run)]) == 0
-    assert f"{run}: 1 gaussian of degree 0, 4 cameras in scene.xml" in capsys.readouterr().out
+    assert f"{run}: 1 gaussian of SH degree 0, 4 cameras in scene.xml" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("form", ["gltf-mesh", "mitsuba"])

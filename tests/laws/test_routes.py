@@ -324,7 +324,7 @@ def edited(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
         str(out),
         "--where",
         "x > 0.2",
-        "--azimuth",
+        "--rotate",
         "z",
         "20",
         "--scale",

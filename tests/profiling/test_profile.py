@@ -320,7 +320,7 @@ def test_a_run_without_checkpoints_has_pictures(
     assert main(["profile", str(run), "--size", "12", "16"]) == 0
     head, *rows = capsys.readouterr().out.splitlines()
     assert head.split()[-2:] == ["12x12", "16x16"] and "training" not in head
-    assert rows[0].split()[:3] == ["radiance", "and", "alpha"] and any("depth adds" in row for row in rows)
+    assert rows[0].split()[:3] == ["radiance", "and", "alpha"] and any("+ depth" in row for row in rows)
     (run / "model.json").unlink()
     assert main(["profile", str(run)]) == 2
     assert "checkpoints: none yet" in capsys.readouterr().err
