@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.capture.compare import PoseErrors, pose_errors
+from mi_refgs.capture.frame import PoseErrors, pose_errors
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError

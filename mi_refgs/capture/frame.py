@@ -1,33 +1,36 @@
-"""A world to work in: +z against gravity, the region of interest the unit ball around the origin.
+"""World frame of a capture: +z against gravity, the region of interest is the unit ball around the origin.
 
-Structure from motion leaves direction, place and scale of its world open; the way people hold a camera and
-what they point it at say them.
+Structure from motion leaves rotation, position and scale of its world undetermined; they are estimated from
+how cameras are held and from the point at which they look.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mi_refgs.capture.solved import Solved
+from mi_refgs.capture.colmap import Solved
 from mi_refgs.data.region import Region, region_radius
+from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
 ROUNDS = 50
-"""Iterations of reweighted least squares, which approach the least sum of absolute values."""
+"""Iterations of reweighted least squares, which converge to the least sum of absolute values."""
 LEVEL_SPREAD = 0.02
-"""Share of the cameras' right-hand directions off their main line below which they fix no plane: ± 8°."""
+"""Variance of the cameras' right-hand directions off their main line, relative, below which they determine no
+plane: ± 8°."""
 AXES_SPREAD = 1e-3
 """Smallest singular value of the mean of I − a aᵀ over view axes a that meet; 0 for parallel ones."""
 SEEN_SHARE = 0.5
-"""Share of the cameras whose pictures must show a point; other points are surroundings."""
+"""Fraction of the cameras whose images must show a point; other points are background."""
 REGION_POINTS = 50
 """Number of points that determine the region's radius; with fewer, the cameras alone do."""
 REGION_QUANTILE = 0.9
-"""Share of the points around the focus that the region takes in."""
+"""Fraction of the points around the focus that the region contains."""
 LEAST_SHARE = 0.5
-"""Least radius of the region as part of the radius that the cameras suggest: points lie only where the object
+"""Smallest radius of the region over the radius estimated from the cameras: points are only where the object
 has texture."""
 
 
@@ -45,12 +48,11 @@ class Similarity:
 
 
 def up_direction(solved: Solved, up: np.ndarray) -> np.ndarray:
-    """The direction (3,) against gravity; `up` (V, 2): right and down of what was up in each picture.
+    """The direction (3,) against gravity; `up` (V, 2): (right, down) of the upward direction in each image.
 
-    People hold a camera level, whichever way they tilt it: the direction that is orthogonal to the right-hand
-    direction of all pictures, by least absolute values, so that some rolled ones do not matter. Where all
-    look the same way that leaves the tilt open; then it is the mean of what was up, orthogonal to the mean
-    right.
+    Cameras are mostly held level, whatever their tilt: the direction orthogonal to the right-hand directions
+    of all images, by least absolute values, which is robust to rolled ones. If all cameras look the same way,
+    the tilt is undetermined: then it is the mean upward direction, orthogonal to the mean right.
     """
     right = np.stack([-up[:, 1], up[:, 0]], axis=1)
     to_world = solved.rotation.transpose(0, 2, 1)[:, :, :2]
@@ -69,8 +71,7 @@ def up_direction(solved: Solved, up: np.ndarray) -> np.ndarray:
 
 
 def focus_of(solved: Solved) -> np.ndarray:
-    """The point (3,) with the least sum of distances to the view axes; the median point where they are
-    parallel."""
+    """The point (3,) with the least sum of distances to the view axes; the median point for parallel axes."""
     projectors = np.eye(3) - solved.axis[:, :, None] * solved.axis[:, None, :]
     if np.linalg.svd(projectors.mean(axis=0), compute_uv=False)[-1] < AXES_SPREAD:
         return np.median(solved.points, axis=0)
@@ -84,7 +85,7 @@ def focus_of(solved: Solved) -> np.ndarray:
 
 
 def seen_share(solved: Solved, points: np.ndarray) -> np.ndarray:
-    """Share (N,) of the cameras that have the points (N, 3) in the cone that fits into their picture."""
+    """Fraction (N,) of the cameras that see points (N, 3) within the largest cone inside their image."""
     share = np.zeros(len(points))
     for origin, axis, angle in zip(solved.origin, solved.axis, solved.half_angle, strict=True):
         offset = points - origin
@@ -93,19 +94,16 @@ def seen_share(solved: Solved, points: np.ndarray) -> np.ndarray:
 
 
 def region_of_interest(solved: Solved) -> Region:
-    """A sphere around what most cameras look at.
+    """A sphere around the point at which most cameras look.
 
-    Its centre is the focus: points lie on the sides that were photographed, and on what stands behind. Its
-    radius is what the median camera sees whole, or less where the points that at least half of the cameras
-    have in their picture, each as often as it was seen, lie closer.
+    Its radius is that of `region_radius`, or smaller if the points in the images of at least half of the
+    cameras, weighted by track length, are closer.
     """
     focus = focus_of(solved)
     distance = np.linalg.norm(solved.origin - focus, axis=1)
     radius = region_radius(distance, solved.half_angle)
     if not radius > 0:
-        raise InputError(
-            "photographs: a camera stands in the middle of what all look at; walk around an object"
-        )
+        raise InputError("photographs: a camera is at the point at which all look; walk around an object")
     offset = np.linalg.norm(solved.points - focus, axis=1)
     near = offset < radius
     near[near] = seen_share(solved, solved.points[near]) >= SEEN_SHARE
@@ -125,7 +123,7 @@ def _weighted_quantile(values: np.ndarray, weights: np.ndarray, share: float) ->
 def upright_unit(solved: Solved, up: np.ndarray) -> Similarity:
     """The similarity to a world with +z up in which the region of interest is the unit ball around 0.
 
-    The first camera looks along +y, as seen from above. `up` as in `up_direction`.
+    The first camera looks along +y when seen from above. `up` as in `up_direction`.
     """
     z = up_direction(solved, up)
     forward = solved.axis[0] - (solved.axis[0] @ z) * z
@@ -146,3 +144,42 @@ def moved(solved: Solved, similarity: Similarity) -> Solved:
         origin=similarity.apply(solved.origin),
         points=similarity.apply(solved.points),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Camera errors of the views that both data sets have, after the best similarity."""
+
+    count: int
+    rotation: np.ndarray  # (V,) degrees
+    position: np.ndarray  # (V,) over the extent: the largest distance of a true camera from their mean
+    focal: np.ndarray  # (V,) of the focal length, relative
+
+
+def best_similarity(points: np.ndarray, wanted: np.ndarray) -> Similarity:
+    """The least-squares similarity from points (N, 3) to the wanted ones. [Umeyama 1991]"""
+    mean, wanted_mean = points.mean(axis=0), wanted.mean(axis=0)
+    covariance = (wanted - wanted_mean).T @ (points - mean) / len(points)
+    u, singular, vt = np.linalg.svd(covariance)
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = u @ mirror @ vt
+    scale = float(np.trace(np.diag(singular) @ mirror) / ((points - mean) ** 2).sum(axis=1).mean())
+    return Similarity(scale, rotation, wanted_mean - scale * rotation @ mean)
+
+
+def pose_errors(views: Sequence[View], truth: Sequence[View]) -> PoseErrors:
+    """Errors of the views whose names occur in `truth`; raises KeyError if fewer than three do."""
+    true = {view.name: view for view in truth}
+    pairs = [(view, true[view.name]) for view in views if view.name in true]
+    if len(pairs) < 3:
+        raise KeyError("fewer than three views have a name of a ground-truth view")
+    found, wanted = (np.array([pair[i].to_world for pair in pairs]) for i in (0, 1))
+    similarity = best_similarity(found[:, :3, 3], wanted[:, :3, 3])
+    extent = np.linalg.norm(wanted[:, :3, 3] - wanted[:, :3, 3].mean(axis=0), axis=1).max()
+    position = np.linalg.norm(similarity.apply(found[:, :3, 3]) - wanted[:, :3, 3], axis=1) / extent
+    turned = similarity.rotation @ found[:, :3, :3]
+    # The angle by the chord |A − B| = 2 √2 sin(angle / 2): exact for small ones, too.
+    chord = np.linalg.norm(turned - wanted[:, :3, :3], axis=(1, 2)) / np.sqrt(8)
+    rotation = 2 * np.degrees(np.arcsin(np.clip(chord, 0, 1)))
+    focal = np.array([a.fx * b.width / (b.fx * a.width) - 1 for a, b in pairs])
+    return PoseErrors(len(pairs), rotation, position, focal)

@@ -1,4 +1,4 @@
-"""Photographs as a camera left them: which way up, of which focal length, and reduced copies to work on."""
+"""Photographs and their masks: orientation, focal length, and reduced copies for feature detection."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from mi_refgs.data.dataset import MAX_SIZES
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import replace_file
-from mi_refgs.io.images import ENDINGS, exif_tags, open_image
+from mi_refgs.io.images import ENDINGS, exif_tags, open_image, read_mask, to_8_bits
 
 OTHER_ENDINGS = (
     ".heic",
@@ -33,7 +33,7 @@ OTHER_ENDINGS = (
 )
 """Formats of cameras that are not read here, for a message that says what to do."""
 FEWEST = 3
-"""Photographs with which a triangulated point can be checked by a third view."""
+"""Smallest number of photographs: a third view checks a triangulated point."""
 DIAGONAL_35MM = 43.2666
 """Diagonal of a frame of 36 mm × 24 mm, mm, to which EXIF's 35 mm equivalent of a focal length relates."""
 ORIENTATION, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x920A, 0xA405
@@ -54,21 +54,23 @@ SIDEWAYS = (5, 6, 7, 8)
 
 @dataclass(frozen=True)
 class Photograph:
-    """A picture file, and how its pixels lie in the data set."""
+    """An image file, and the orientation of its pixels in the data set."""
 
     path: Path
     digest: str  # SHA-256 of the file
     size: tuple[int, int]  # width and height as displayed, pixels
-    focal: float | None  # focal length over the picture's diagonal, where EXIF tells it
-    device: str  # what took it: pictures of one camera and lens share it
+    focal: float | None  # focal length over the image's diagonal, where EXIF tells it
+    device: str  # camera and lens: photographs with the same one share intrinsics
     plain: bool = True  # colour or grey without alpha
     orientation: int = 1  # EXIF's: how the stored pixels are turned for display
-    lying: bool = False  # whether it is kept a quarter turn anticlockwise, as the others' sensor lay
-    number: int = 0  # its place in the order of names
+    lying: bool = (
+        False  # rotated by 90° anticlockwise in the data set, so that its sensor is as in the others
+    )
+    number: int = 0  # index in the order of names
 
     @property
     def name(self) -> str:
-        """File name of its picture in the data set."""
+        """File name of its image in the data set."""
         return self.path.name
 
     @property
@@ -83,17 +85,17 @@ class Photograph:
 
     @property
     def as_displayed(self) -> bool:
-        """Whether the file can serve as it is: its pixels lie as those of the data set and are opaque."""
+        """Whether the file can be copied: its pixels are oriented as in the data set, and opaque."""
         return self.orientation == 1 and not self.lying and self.plain
 
     @property
     def kept_size(self) -> tuple[int, int]:
-        """Width and height in the data set, before its lens is undone."""
+        """Width and height in the data set, before undistortion."""
         return self.size[::-1] if self.lying else self.size
 
     @property
     def up(self) -> tuple[float, float]:
-        """The direction that was up when it was taken, in pixels (right, down) of the data set's picture."""
+        """The upward direction when it was taken, (right, down) in the data set's image."""
         return (-1.0, 0.0) if self.lying else (0.0, -1.0)
 
     def focal_pixels(self, size: tuple[int, int]) -> float | None:
@@ -101,29 +103,29 @@ class Photograph:
         return None if self.focal is None else self.focal * float(np.hypot(*size))
 
     def load(self, longest: int | None = None) -> Any:
-        """The picture as it lies in the data set, an RGB PIL image of at most so many pixels a side.
+        """The image as oriented in the data set: an RGB PIL image of at most `longest` pixels per side.
 
-        Raises InputError for a file that is no readable picture of 8 bits a channel.
+        Raises InputError for a file that is no readable image of 8 bits a channel.
         """
         from PIL import Image
 
-        with open_image(self.path) as picture:
-            if picture.mode.startswith(("I", "F")):
+        with open_image(self.path) as image:
+            if image.mode.startswith(("I", "F")):
                 raise InputError(
                     f"{self.path}: pixels: more than 8 bits per channel; save it as JPEG or 8-bit PNG"
                 )
-            factor = 1.0 if longest is None else max(1.0, max(picture.size) / longest)
-            wanted = tuple(max(1, round(side / factor)) for side in picture.size)
+            factor = 1.0 if longest is None else max(1.0, max(image.size) / longest)
+            wanted = tuple(max(1, round(side / factor)) for side in image.size)
             if factor >= 2:
-                picture.draft("RGB", wanted)  # JPEG decodes smaller for less
-            copy = picture.convert("RGB")
+                image.draft("RGB", wanted)  # JPEG decodes smaller for less
+            copy = image.convert("RGB")
             copy.info = {}
         if copy.size != wanted:
             copy = copy.resize(wanted, Image.Resampling.LANCZOS)
         return self.turned(copy)
 
     def turned(self, stored: Any) -> Any:
-        """A PIL image that lies as the stored pixels do, turned as the picture lies in the data set."""
+        """Rotate a PIL image from the stored orientation to that of the data set."""
         from PIL.Image import Transpose
 
         upright = (
@@ -132,10 +134,10 @@ class Photograph:
         return upright.transpose(Transpose.ROTATE_90) if self.lying else upright
 
     def exif(self) -> bytes:
-        """The EXIF data of a picture that lies as displayed; empty where the file's are broken."""
-        with open_image(self.path) as picture:
+        """The EXIF data for an image in display orientation; empty if the file's are broken."""
+        with open_image(self.path) as image:
             try:
-                data = picture.getexif()
+                data = image.getexif()
                 data[ORIENTATION] = 1
                 return bytes(data.tobytes())
             except Exception:  # Pillow raises many types for broken EXIF data
@@ -143,12 +145,12 @@ class Photograph:
 
 
 def find_photographs(folder: Path) -> list[Photograph]:
-    """The pictures of a folder by name, all lying as most of them do.
+    """The photographs of a folder by name, oriented as most of them are.
 
-    Portraits among landscapes of one camera, and the reverse, are kept lying on their side: they have the
-    same sensor, so one size and one lens serve all.
+    Portraits among landscapes of one camera, and the reverse, are rotated by 90°: with the same sensor, all
+    have one size and one lens.
 
-    Raises InputError for no folder, too few pictures, pictures of many sizes, and files that are none.
+    Raises InputError for a missing folder, too few images, images of many sizes, and unreadable files.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: photographs: no such folder; give one with JPEG or PNG files")
@@ -161,7 +163,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
             if other
             else "photograph the object from all sides, 30 to 100 times"
         )
-        found = {0: "no JPEG or PNG file", 1: "one picture"}.get(len(paths), f"{len(paths)} pictures")
+        found = {0: "no JPEG or PNG file", 1: "one image"}.get(len(paths), f"{len(paths)} images")
         raise InputError(f"{folder}: photographs: {found}; {remedy}")
     found_all = [_photograph(path) for path in paths]
     most = Counter(photograph.size for photograph in found_all).most_common(1)[0][0]
@@ -179,9 +181,9 @@ def find_photographs(folder: Path) -> list[Photograph]:
 
 
 def _photograph(path: Path) -> Photograph:
-    with open_image(path) as picture:
-        exif, detail = exif_tags(picture)
-        size, plain = picture.size, picture.mode in ("RGB", "L")
+    with open_image(path) as image:
+        exif, detail = exif_tags(image)
+        size, plain = image.size, image.mode in ("RGB", "L")
     said = exif.get(ORIENTATION, 1)
     orientation = int(said) if said in range(1, 9) else 1
     size = size[::-1] if orientation in SIDEWAYS else size
@@ -193,7 +195,7 @@ def _photograph(path: Path) -> Photograph:
 
 
 def _positive(value: Any) -> float | None:
-    """A number of EXIF, which may be a fraction with a denominator of 0, or anything."""
+    """A positive number in EXIF data, else None; it may be a fraction with denominator 0, or anything."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
@@ -202,18 +204,64 @@ def _positive(value: Any) -> float | None:
 
 
 def write_copies(photographs: Sequence[Photograph], folder: Path, longest: int, progress: Any) -> None:
-    """Copies to work on, of at most `longest` pixels a side, those that are not there yet."""
+    """Write missing working copies of at most `longest` pixels per side."""
     folder.mkdir(parents=True, exist_ok=True)
     for photograph in progress(photographs):
         file = folder / photograph.copy
         if not file.is_file():
-            picture = photograph.load(longest)
-            replace_file(file, partial(picture.save, format="PNG", compress_level=1))
+            image = photograph.load(longest)
+            replace_file(file, partial(image.save, format="PNG", compress_level=1))
 
 
 def cameras_of(photographs: Sequence[Photograph]) -> list[list[Photograph]]:
-    """The photographs by the camera and lens that took them: of one size, device and focal length."""
+    """Group photographs by camera and lens: by size, device and focal length."""
     groups: dict[tuple[Any, ...], list[Photograph]] = {}
     for photograph in photographs:
         groups.setdefault((photograph.kept_size, photograph.device, photograph.focal), []).append(photograph)
     return list(groups.values())
+
+
+def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:
+    """The mask of each photograph by the photograph's name; empty without a folder.
+
+    The mask of PHOTO.jpg is PHOTO.png, PHOTO.jpg.png or PHOTO.jpg, of its stored or displayed size.
+    Raises InputError for a photograph without a mask and for a mask of another size.
+    """
+    if folder is None:
+        return {}
+    if not folder.is_dir():
+        raise InputError(f"{folder}: --masks: no such folder; give one with a PNG file for each photograph")
+    there = {path.name.lower(): path for path in sorted(folder.iterdir()) if path.is_file()}
+    masks: dict[str, Path] = {}
+    for photograph in photographs:
+        name, stem = photograph.name.lower(), photograph.path.stem.lower()
+        candidates = [name + ".png", *(stem + ending for ending in ENDINGS)]
+        path = next((there[candidate] for candidate in candidates if candidate in there), None)
+        if path is None:
+            raise InputError(
+                f"{folder}: --masks: none for {photograph.name}; add {photograph.path.stem}.png, white where "
+                "the object is"
+            )
+        with open_image(path) as image:
+            size = image.size
+        if size not in (photograph.size, photograph.stored_size):
+            raise InputError(
+                f"{path}: --masks: {size[0]} × {size[1]} pixels, but {photograph.name} has "
+                f"{photograph.size[0]} × {photograph.size[1]}; make masks of the photographs' size"
+            )
+        masks[photograph.name] = path
+    return masks
+
+
+def mask_pixels(path: Path, photograph: Photograph) -> np.ndarray:
+    """The mask as oriented in the data set, (H, W, 1) uint8, 255 on the object.
+
+    A mask of the stored size is rotated like the photograph, unless that is also the displayed size. Raises
+    InputError as `read_mask` does.
+    """
+    from PIL import Image
+
+    mask = Image.fromarray(to_8_bits(read_mask(path)))
+    displayed = mask.size == photograph.size
+    turned = (replace(photograph, orientation=1) if displayed else photograph).turned(mask)
+    return np.asarray(turned)[..., None]

@@ -1,7 +1,7 @@
-"""A whole capture: photographs in, a COLMAP data set with cameras, points and a region of interest out.
+"""The capture pipeline: from photographs to a COLMAP data set with cameras, points and a region of interest.
 
-What a step makes has a name with the hash of all that went into it, and appears whole or not at all: a run
-that was interrupted, or repeated with other pictures or options, does again only what has changed.
+The result of a step is named by the hash of its inputs and written atomically: a run that was interrupted, or
+is repeated with other photographs or options, computes only what has changed.
 """
 
 from __future__ import annotations
@@ -18,31 +18,45 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.capture import colmap, failure, output
-from mi_refgs.capture.folder import WORK, holds, prepare, replace_output
+from mi_refgs.capture import colmap, output
+from mi_refgs.capture.colmap import Solved
 from mi_refgs.capture.frame import moved, upright_unit
-from mi_refgs.capture.masks import find_masks
-from mi_refgs.capture.pairs import pairs_to_match
-from mi_refgs.capture.photographs import Photograph, cameras_of, find_photographs, write_copies
-from mi_refgs.capture.report import Report, draw
-from mi_refgs.capture.solved import Solved, adjust, best_lens
+from mi_refgs.capture.output import Straight
+from mi_refgs.capture.photographs import Photograph, cameras_of, find_masks, find_photographs, write_copies
 from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.region import Region, write_region
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import read_json, write_json
+from mi_refgs.io.files import read_json, replace_file, write_json
+from mi_refgs.io.images import image_size, read_png
 
 REPORT, PLOT = "capture.json", "capture.png"
 VERSION = 2
-"""Number of the algorithm of the steps. Results of another number are made anew."""
+"""Version of the steps' algorithms. Results of other versions are computed again."""
 
 FIRST_MODEL = "SIMPLE_RADIAL"
-"""Lens model with which pictures are placed where none is asked for. It has one parameter, which few matches
-determine."""
+"""Lens model with which images are registered by default; few matches determine its one parameter."""
+
+SHOWN_RADII = 6.0
+"""Half the width of the plot in radii of the region, unless the cameras need more; far points are cut off."""
+GOOD_ERROR = 1.0
+"""Mean reprojection error, pixels, above which something is wrong: lens, rolling shutter, moving objects."""
+FEW_FEATURES = 60
+"""Smallest number of features in the median image: a pair needs 15 consistent matches, and a quarter of the
+features is a good fraction."""
+FLAT_CONTRAST = 0.04
+"""Standard deviation of brightness, 0 … 1, below which an image is uniform."""
+LEAST_PLACED = 0.5
+"""Fraction of the photographs that must be registered in one group."""
+TURN_SHARE = 0.8
+"""Fraction of the matched pairs explained by a rotation or a plane from which the camera probably only
+rotated."""
+NAMED = 5
+"""Largest number of photographs that a message names."""
 
 
 @dataclass(frozen=True)
-class Job:
-    """What is captured, and where to."""
+class CaptureJob:
+    """Photographs and masks of a capture, its folders and options."""
 
     photographs: list[Photograph]
     masks: dict[str, Path]
@@ -52,7 +66,7 @@ class Job:
 
     @property
     def work(self) -> Path:
-        return self.folder / WORK
+        return self.folder / output.WORK
 
     @property
     def copies(self) -> dict[str, Photograph]:
@@ -60,7 +74,7 @@ class Job:
         return {photograph.copy: photograph for photograph in self.photographs}
 
     def key(self, *more: Any) -> str:
-        """A hash of the photographs, how they lie, and what else a step depends on."""
+        """A hash of the photographs, their orientation, and the other inputs of a step."""
         parts = [VERSION, [(p.name, p.digest, p.lying) for p in self.photographs], *more]
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
 
@@ -74,24 +88,24 @@ def capture(
     region: Region | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Report:
-    """Place the photographs of folder `source` and write the data set `folder`.
+    """Reconstruct the cameras of the photographs in folder `source` and write the data set `folder`.
 
     `masks`: a folder as in `find_masks`. `camera`: COLMAP's name of the lens model, or None for the
-    simplest of three that fits. `region`: of interest, in the data set's world, in place of the one that is
-    found. `tell` is called with what is done.
+    simplest of three that fits. `region`: of interest, in the data set's world, instead of the estimated one.
+    `tell` is called with messages.
 
-    Raises InputError for unusable input, with the remedy, and where pycolmap is missing.
+    Raises InputError for unusable input, with the remedy, and without pycolmap.
     """
     colmap.load()
     if camera not in (None, *MODELS):
         raise InputError(f"--camera: {camera}: unknown lens model; give one of {', '.join(MODELS)}")
     photographs = find_photographs(source)
-    job = Job(photographs, find_masks(masks, photographs), source, folder, camera)
-    prepare(folder, [source] if masks is None else [source, masks])
+    job = CaptureJob(photographs, find_masks(masks, photographs), source, folder, camera)
+    output.prepare(folder, [source] if masks is None else [source, masks])
     began = time.perf_counter()
     result = _solve(job, tell)
     model, groups = colmap.load().Reconstruction(result), read_json(result / "groups.json")["groups"]
-    failure.check_placed(source, len(photographs), groups, _beside_gap(job, groups[0]))
+    require_placed(source, len(photographs), groups, _beside_gap(job, groups[0]))
     straight = output.straighten(model, job.copies)
     solved = Solved.of(model)
     similarity = upright_unit(solved, np.array([job.copies[name].up for name in solved.names]))
@@ -99,15 +113,15 @@ def capture(
     found = region or Region((0.0, 0.0, 0.0), 1.0)
     lenses = [(name, repr(straight[name])) for name in solved.names]
     key = job.key(lenses, _digests(sorted(result.glob("*.bin"))), _digests(job.masks.values()))
-    if not holds(folder, key):
+    if not output.is_complete(folder, key):
         made = job.work / f"output-{key}"
         for stale in {*job.work.glob("output-*")} - {made}:
             shutil.rmtree(stale)
         placed = [job.copies[name] for name in solved.names]
         write = colmap.progress("undistorted")
-        output.write_pictures(placed, lambda p: straight[p.copy], job.masks, made, write)
+        output.write_images(placed, lambda p: straight[p.copy], job.masks, made, write)
         output.write_model(model, job.copies, straight, similarity, made / "sparse" / "0")
-        replace_output(folder, made, key)
+        output.replace_output(folder, made, key)
         shutil.rmtree(made)
     write_region(folder, found)
     report = Report.of(job, model, world, groups, straight, found, key, time.perf_counter() - began)
@@ -121,42 +135,42 @@ def _digests(files: Iterable[Path]) -> list[str]:
     return [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
 
 
-def _solve(job: Job, tell: Callable[[str], None]) -> Path:
-    """The folder of the largest group's reconstruction, its lens decided, and groups.json: names in each."""
+def _solve(job: CaptureJob, tell: Callable[[str], None]) -> Path:
+    """The folder with the largest group's reconstruction and groups.json, the names in each group."""
     pycolmap = colmap.load()
     size, names = colmap.WORKING_SIZE, sorted(job.copies)
-    pictures = job.work / f"pictures-{job.key(size)}"
+    images = job.work / f"pictures-{job.key(size)}"
     features = job.key(size, colmap.MOST_FEATURES, pycolmap.__version__, _first_model(job))
     database, result = (
         job.work / f"features-{features}.db",
         job.work / f"model-{job.key(features, job.camera)}",
     )
     if not result.is_dir():
-        for path in job.work.iterdir():  # of other pictures or options
-            if path != pictures and not path.name.startswith(database.stem):
+        for path in job.work.iterdir():  # of other images or options
+            if path != images and not path.name.startswith(database.stem):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
-        write_copies(job.photographs, pictures, size, colmap.progress("pictures"))
+        write_copies(job.photographs, images, size, colmap.progress("images"))
         if not database.is_file():
-            colmap.begin(database, pictures, _groups(job, pictures))
-        colmap.extract(database, pictures, names)
+            colmap.begin(database, images, _groups(job, images))
+        colmap.extract(database, images, names)
         found = colmap.features(database)
-        failure.check_features(job.source, [len(found[name]) for name in names], _contrast(pictures, names))
-        pairs = pairs_to_match(found)
+        require_features(job.source, [len(found[name]) for name in names], _contrast(images, names))
+        pairs = colmap.pairs_to_match(found)
         tell(
             f"{len(names)} photographs, {sum(map(len, found.values()))} features, {len(pairs)} pairs to match"
         )
         colmap.match(database, pairs)
         raw = job.work / "unfinished"
         shutil.rmtree(raw, ignore_errors=True)
-        models = colmap.reconstruct(database, pictures, raw, len(names))
+        models = colmap.reconstruct(database, images, raw, len(names))
         if not models:
-            raise failure.no_model(job.source, len(names), colmap.verified(database))
+            raise no_model(job.source, len(names), colmap.verified(database))
         groups = [Solved.of(model).names for model in models]
         best = models[0]
         if job.camera is None:
-            best = best_lens(best)
+            best = colmap.best_lens(best)
         else:
-            adjust(best)
+            colmap.adjust(best)
         shutil.rmtree(raw)
         raw.mkdir()
         best.write_binary(raw)
@@ -165,19 +179,16 @@ def _solve(job: Job, tell: Callable[[str], None]) -> Path:
     return result
 
 
-def _first_model(job: Job) -> str:
+def _first_model(job: CaptureJob) -> str:
     return job.camera or FIRST_MODEL
 
 
-def _groups(job: Job, pictures: Path) -> list[tuple[list[str], str, list[float]]]:
-    """Pictures, lens model and first parameters of each camera; no parameters where EXIF tells no focal
-    length."""
-    from mi_refgs.io.images import image_size
-
+def _groups(job: CaptureJob, images: Path) -> list[tuple[list[str], str, list[float]]]:
+    """Images, lens model and initial parameters of each camera; none without a focal length in EXIF."""
     groups = []
     for photographs in cameras_of(job.photographs):
         copies = [photograph.copy for photograph in photographs]
-        size = image_size(pictures / copies[0])
+        size = image_size(images / copies[0])
         focal, model = photographs[0].focal_pixels(size), _first_model(job)
         parameters: list[float] = []
         if focal is not None:
@@ -187,17 +198,169 @@ def _groups(job: Job, pictures: Path) -> list[tuple[list[str], str, list[float]]
     return groups
 
 
-def _contrast(pictures: Path, names: Sequence[str]) -> float:
-    """Standard deviation of brightness, 0 … 1, of the median picture."""
-    from mi_refgs.io.images import read_png
-
+def _contrast(images: Path, names: Sequence[str]) -> float:
+    """Median over images of the standard deviation of brightness, 0 … 1."""
     few = names[:: max(1, len(names) // 10)]
-    return float(np.median([read_png(pictures / name).mean(axis=2).std() for name in few]))
+    return float(np.median([read_png(images / name).mean(axis=2).std() for name in few]))
 
 
-def _beside_gap(job: Job, placed: Sequence[str]) -> str:
-    """The first photograph that was not placed next to one that was."""
+def _beside_gap(job: CaptureJob, placed: Sequence[str]) -> str:
+    """The first name at a boundary between registered photographs and others."""
     known = {job.copies[name].name for name in placed}
     names = [photograph.name for photograph in job.photographs]
     edges = [b for a, b in pairwise(names) if (a in known) != (b in known)]
     return edges[0] if edges else names[-1]
+
+
+@dataclass(frozen=True)
+class Report:
+    """The content of capture.json."""
+
+    content: dict[str, Any]
+
+    @classmethod
+    def of(
+        cls,
+        job: CaptureJob,
+        model: Any,
+        world: Solved,
+        groups: Sequence[Sequence[str]],
+        straight: dict[str, Straight],
+        region: Region,
+        key: str,
+        seconds: float,
+    ) -> Report:
+        """Report on a reconstruction and its data set."""
+        placed = {job.copies[name].name for name in world.names}
+        cameras = {(s.size, s.focal): s for s in straight.values()}
+        return cls(
+            {
+                "key": key,
+                "photographs": len(job.photographs),
+                "placed": len(placed),
+                "not_placed": [p.name for p in job.photographs if p.name not in placed],
+                "other_groups": [[job.copies[name].name for name in group] for group in groups[1:]],
+                "points": len(world.points),
+                "observations": int(world.length.sum()),
+                "mean_track_length": float(world.length.mean()) if len(world.length) else 0.0,
+                "mean_reprojection_error": float(model.compute_mean_reprojection_error()),
+                "lens": {
+                    "model": next(iter(model.cameras.values())).model_name,
+                    "cameras": [
+                        {"width": c.width, "height": c.height, "parameters": [float(x) for x in c.params]}
+                        for c in model.cameras.values()
+                    ],
+                },
+                "pinholes": [
+                    {"size": s.size, "focal": [*map(float, s.focal)], "centre": [*map(float, s.centre)]}
+                    for s in cameras.values()
+                ],
+                "region": {"centre": region.centre, "radius": region.radius},
+                "masks": bool(job.masks),
+                "seconds": round(seconds, 1),
+            }
+        )
+
+    def text(self, folder: Path) -> str:
+        """The report as text."""
+        c = self.content
+        lines = [
+            f"{folder}: {c['placed']} of {c['photographs']} photographs placed, {c['points']} points, "
+            f"each seen by {c['mean_track_length']:.1f} images on average; mean reprojection error "
+            f"{c['mean_reprojection_error']:.2f} pixels; lens {c['lens']['model']}"
+        ]
+        if c["not_placed"]:
+            lines.append(
+                f"not placed: {abbreviated_names(c['not_placed'])}; take more images between them and the others"
+            )
+        if c["mean_reprojection_error"] > GOOD_ERROR:
+            lines.append("the error is high: something moved, or the lens needs another --camera")
+        lines.append(f"look at {folder / 'capture.png'}; next: refgs train {folder} -o runs/{folder.name}")
+        return "\n".join(lines)
+
+
+def draw(path: Path, world: Solved, region: Region) -> None:
+    """Plot cameras, points and region from above and from the side."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    centre = np.array(region.centre)
+    reach = float(np.abs(world.origin - centre).max())
+    half = 1.1 * max(reach, min(SHOWN_RADII * region.radius, 2 * reach))
+    near = world.points[(np.abs(world.points - centre) < half).all(axis=1)]
+    step = half / 12
+    figure = Figure(figsize=(12, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (across, up), title in zip(
+        figure.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side"), strict=True
+    ):
+        axes.scatter(near[:, across], near[:, up], s=0.5, c="0.5", linewidths=0)
+        ends = world.origin + step * world.axis
+        axes.plot(
+            *np.stack([world.origin, ends], axis=2)[:, [across, up]].transpose(1, 2, 0), color="C0", lw=0.8
+        )
+        axes.scatter(world.origin[:, across], world.origin[:, up], s=8, color="C0")
+        angle = np.linspace(0, 2 * np.pi, 100)
+        axes.plot(
+            centre[across] + region.radius * np.cos(angle),
+            centre[up] + region.radius * np.sin(angle),
+            color="C3",
+        )
+        axes.set(title=title, xlabel="xyz"[across], ylabel="xyz"[up], aspect="equal")
+        axes.set_xlim(centre[across] - half, centre[across] + half)
+        axes.set_ylim(centre[up] - half, centre[up] + half)
+    figure.suptitle(
+        f"{len(world.names)} cameras (blue), {len(world.points)} points, region of interest (red)"
+    )
+    replace_file(path, lambda temporary: figure.savefig(temporary, dpi=100))
+
+
+def require_features(folder: Path, counts: Sequence[int], contrast: float) -> None:
+    """Raise InputError if the median image has hardly any features; `contrast`: its standard deviation."""
+    median = int(np.median(counts))
+    if median >= FEW_FEATURES:
+        return
+    if contrast < FLAT_CONTRAST:
+        reason = "they are uniform"
+        remedy = "put the object on a patterned ground, such as a newspaper,"
+    else:
+        reason = "they are blurred, or show hardly any texture"
+        remedy = "hold still, use more light, put a patterned ground below the object,"
+    raise InputError(
+        f"{folder}: photographs: half of them have no more than {median} features: {reason}; "
+        f"{remedy} and photograph it anew"
+    )
+
+
+def no_model(folder: Path, count: int, pairs: Sequence[tuple[str, str, int, bool]]) -> InputError:
+    """The InputError if no pair of images can be the initial one; `pairs`: from `colmap.verified`."""
+    if not pairs:
+        reason = f"no two of the {count} show the same points"
+        remedy = "take more, so close that each shows two thirds of the one before"
+    elif np.mean([flat for *_, flat in pairs]) >= TURN_SHARE:
+        reason = "they seem to be taken from one place, so nothing shows depth"
+        remedy = "walk around the object instead of turning the camera"
+    else:
+        reason = f"of the {count}, no two with enough in common look from different enough sides"
+        remedy = "take more on a circle around the object, 5° to 10° apart"
+    return InputError(f"{folder}: photographs: {reason}; {remedy}")
+
+
+def require_placed(folder: Path, count: int, groups: Sequence[Sequence[str]], longest_gap: str) -> None:
+    """Raise InputError unless the largest group has half of the images; `longest_gap`: a boundary name."""
+    if len(groups[0]) >= LEAST_PLACED * count:
+        return
+    sizes = ", ".join(str(len(group)) for group in groups)
+    apart = (
+        f"{len(groups)} groups that share nothing ({sizes} images)" if len(groups) > 1 else f"{sizes} images"
+    )
+    raise InputError(
+        f"{folder}: photographs: of {count}, only {apart} could be placed; take images that lead from one "
+        f"group to the next in small steps, as around {longest_gap}"
+    )
+
+
+def abbreviated_names(names: Sequence[str]) -> str:
+    """Abbreviate a list of names for a message."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more

@@ -1,4 +1,4 @@
-"""Points on what pictures of known cameras show, for a fit to start from where the data set has none."""
+"""Triangulated initial points of a fit for data sets with known cameras but without points."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from mi_refgs.io.ownership import RUN, OutputFolder
 POINTS_FILE = "points.npz"
 """File in a run's folder: position (P, 3), colour (P, 3) linear, and key, a hash of their source."""
 DAMAGED = (OSError, ValueError, KeyError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error)
-"""Errors of a file that is missing or damaged."""
+"""Exceptions for a file that is missing or damaged."""
 PIXELS = 1600 * 1200
-"""Largest number of pixels of a picture in which features are found."""
+"""Largest number of pixels of an image in which features are detected."""
 LEAST_SIDE = 96
-"""Shortest side, pixels, of pictures in which features are found: smaller ones have too few."""
+"""Shortest side, pixels, of images in which features are detected: smaller ones have too few."""
 CLOSE, APART = 6, range(8, 24, 4)
-"""Each view is matched with its CLOSE nearest views and with some further ones, whose wider baselines place
-points better. On 43 hand-held pictures 303 pairs give as many points as all 903."""
+"""Each view is matched with its CLOSE nearest views and with some farther ones, whose wider baselines give
+more accurate points. On 43 hand-held images 303 pairs give as many points as all 903."""
 MIN_LENGTH, MIN_POINTS = 3, 100
-"""Number of pictures that must have seen a point, and number of points below which two pictures suffice."""
+"""Smallest track length, and number of points below which a track of two is enough."""
 MAX_ERROR, MIN_ANGLE = 2.0, 1.5
-"""Largest mean reprojection error of a point, pixels, and least angle between its rays, degrees."""
+"""Largest mean reprojection error of a point, pixels, and smallest angle between its rays, degrees."""
 
 
 def with_points(data: Dataset, folder: Path, tell: Callable[[str], None]) -> PointCloud | None:
-    """The points that a fit of `data` starts from: its own, or those that `triangulated` finds.
+    """The initial points of a fit of `data`: its own, or those of `triangulated`.
 
-    None where pictures have alpha, whose outlines say more, and where there are none to be found. They are
-    kept in `folder` for an interrupted start. `tell` is called with what was done, or what would help.
+    None for images with alpha, which have a visual hull, and if none are found. Points are kept in `folder`
+    for an interrupted start. `tell` is called with messages.
     """
     enough = len(data.views) >= MIN_LENGTH and min(min(v.width, v.height) for v in data.views) >= LEAST_SIDE
     if data.points is not None or not enough or data.has_alpha:
@@ -63,7 +63,7 @@ def with_points(data: Dataset, folder: Path, tell: Callable[[str], None]) -> Poi
     began = time.perf_counter()
     points = triangulated(data)
     if points is None:
-        tell("no points to start from: the pictures have too little texture in common")
+        tell("no points to start from: the images have too little texture in common")
         return None
     seconds = time.perf_counter() - began
     tell(
@@ -85,12 +85,12 @@ def _key(data: Dataset) -> str:
 
 
 def triangulated(data: Dataset) -> PointCloud | None:
-    """Points of features that match between views, triangulated with the known cameras; None without any.
+    """Triangulate matched features with the known cameras; None without points.
 
-    Pictures are read again, as large as PIXELS allows. A point counts where three pictures saw it (two, where
-    hardly any has three), its mean reprojection error is at most 2 pixels and its rays meet at 1.5° or more.
+    Images are read again, as large as PIXELS allows. Points have a track of three images (two if there
+    are few such points), a mean reprojection error of at most 2 pixels, and rays at 1.5° or more.
 
-    Raises InputError as `read_dataset` does, and where pycolmap is missing.
+    Raises InputError as `read_dataset` does, and without pycolmap.
     """
     kind = "exr" if data.is_linear_radiance else "png"
     factor, _, _ = fitting_downscale(data.path, kind, PIXELS)
@@ -98,23 +98,23 @@ def triangulated(data: Dataset) -> PointCloud | None:
     names = [f"{i:06}.png" for i in range(len(views))]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        pictures, database, output = folder / "pictures", folder / "features.db", folder / "model"
-        for part in (pictures, output):
+        images, database, output = folder / "images", folder / "features.db", folder / "model"
+        for part in (images, output):
             part.mkdir()
         for file, view in zip(names, views, strict=True):
-            write_png(pictures / file, view.load().displayed)
-        colmap.begin(database, pictures, _cameras(names, views))
-        colmap.extract(database, pictures, names)
+            write_png(images / file, view.load().displayed)
+        colmap.begin(database, images, _cameras(names, views))
+        colmap.extract(database, images, names)
         colmap.match(database, [(names[i], names[j]) for i, j in near_pairs(views)])
         try:
-            model = colmap.triangulate(database, pictures, output, poses(names, views))
+            model = colmap.triangulate(database, images, output, poses(names, views))
         except (RuntimeError, ValueError):  # nothing that matches
             return None
     return _cloud(model)
 
 
 def near_pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """Pairs of views to match: near each other, and with like directions."""
+    """Pairs of views to match: close to each other, with similar directions."""
     origins = np.array([view.to_world[:3, 3] for view in views])
     axes = np.array([view.to_world[:3, 2] for view in views])
     extent = np.linalg.norm(origins - origins.mean(axis=0), axis=1).max() or 1.0
@@ -126,7 +126,7 @@ def near_pairs(views: Sequence[View]) -> list[tuple[int, int]]:
 
 
 def poses(names: Sequence[str], views: Sequence[View]) -> dict[str, np.ndarray]:
-    """Camera from world (3, 4) with COLMAP's axes by the picture's name."""
+    """Camera from world (3, 4) with COLMAP's axes by image name."""
     result = {}
     for name, view in zip(names, views, strict=True):
         to_world = view.to_world @ MITSUBA_FROM_OPENCV
@@ -136,7 +136,7 @@ def poses(names: Sequence[str], views: Sequence[View]) -> dict[str, np.ndarray]:
 
 
 def _cameras(names: Sequence[str], views: Sequence[View]) -> list[tuple[list[str], str, list[float]]]:
-    """The pictures of each pinhole, with its model and parameters."""
+    """The images of each pinhole camera, with model and parameters."""
     groups: dict[tuple[float, ...], list[str]] = {}
     for name, view in zip(names, views, strict=True):
         groups.setdefault((view.width, view.height, view.fx, view.fy, view.cx, view.cy), []).append(name)
@@ -144,7 +144,7 @@ def _cameras(names: Sequence[str], views: Sequence[View]) -> list[tuple[list[str
 
 
 def _cloud(model: Any) -> PointCloud | None:
-    """The good points of a reconstruction."""
+    """The reliable points of a reconstruction."""
     model.update_point_3d_errors()
     centre = {image: model.images[image].projection_center() for image in model.reg_image_ids()}
     points = list(model.points3D.values())

@@ -15,14 +15,18 @@ import pytest
 from PIL import Image
 
 from benchmarks import capture as capture_benchmark
-from mi_refgs.capture import colmap, failure, output
-from mi_refgs.capture.compare import best_similarity, pose_errors
-from mi_refgs.capture.folder import LAST, holds, prepare, replace_output
-from mi_refgs.capture.frame import Similarity, region_of_interest, up_direction
-from mi_refgs.capture.masks import find_masks, mask_pixels
-from mi_refgs.capture.pairs import EXHAUSTIVE, pairs_to_match
-from mi_refgs.capture.photographs import find_photographs
-from mi_refgs.capture.solved import Solved
+from mi_refgs.capture import colmap, output
+from mi_refgs.capture.colmap import EXHAUSTIVE, Solved, pairs_to_match
+from mi_refgs.capture.frame import (
+    Similarity,
+    best_similarity,
+    pose_errors,
+    region_of_interest,
+    up_direction,
+)
+from mi_refgs.capture.output import LAST, is_complete, prepare, replace_output
+from mi_refgs.capture.photographs import find_masks, find_photographs, mask_pixels
+from mi_refgs.capture.pipeline import require_placed
 from mi_refgs.cli import main
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
@@ -267,16 +271,16 @@ def test_a_capture_removes_what_the_last_one_wrote(tmp_path: Path, monkeypatch: 
     prepare(data, [tmp_path / "photographs"])
     first = ("images/a.png", "images/b.png", "masks/a.png", LAST)
     replace_output(data, _output(tmp_path / "1", *first, "images/.a.png.0123456789ab.tmp.png"), "1")
-    assert _files(data) == dict.fromkeys(first, "1") and holds(data, "1") and not holds(data, "2")
+    assert _files(data) == dict.fromkeys(first, "1") and is_complete(data, "1") and not is_complete(data, "2")
     for name, text in own.items():
         (data / name).write_text(text)
     prepare(data, [])
     second = ("images/a.png", "images/c.png", LAST)
     replace_output(data, _output(tmp_path / "2", *second), "2")
-    assert _files(data) == dict.fromkeys(second, "2") | own and holds(data, "2")
+    assert _files(data) == dict.fromkeys(second, "2") | own and is_complete(data, "2")
     with pytest.raises(InputError, match=r"masks/x\.png: output: not written by a capture; move it"):
         replace_output(data, _output(tmp_path / "3", "masks/x.png", LAST), "3")
-    assert _files(data) == dict.fromkeys(second, "2") | own and holds(data, "2")
+    assert _files(data) == dict.fromkeys(second, "2") | own and is_complete(data, "2")
     # Between two files of the next output the process ends; the next one completes it.
     whole = Path.rename
     moved: list[Path] = []
@@ -290,12 +294,12 @@ def test_a_capture_removes_what_the_last_one_wrote(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(Path, "rename", interrupted)
     with pytest.raises(KeyboardInterrupt):
         replace_output(data, _output(tmp_path / "4", *first), "4")
-    assert not (data / LAST).exists() and not holds(data, "4")
+    assert not (data / LAST).exists() and not is_complete(data, "4")
     monkeypatch.setattr(Path, "rename", whole)
     replace_output(data, _output(tmp_path / "4", *first), "4")
-    assert _files(data) == dict.fromkeys(first, "4") | own and holds(data, "4")
+    assert _files(data) == dict.fromkeys(first, "4") | own and is_complete(data, "4")
     (data / "images" / "b.png").unlink()
-    assert not holds(data, "4")
+    assert not is_complete(data, "4")
 
 
 @needs_colmap
@@ -303,8 +307,8 @@ def test_a_folder_that_is_read_is_not_written(captured: Path) -> None:
     data, photographs = captured / "data", captured / "photographs"
     before = sorted(data.rglob("*"))
     for arguments in [(data / "images", "-o", data), (photographs, "-o", captured)]:
-        refused(["capture", *arguments], "are read, and lie in it; choose another")
-    refused(["capture", photographs, "-o", data, "--masks", data / "masks"], "are read")
+        refused(["capture", *arguments], "which is read; choose another")
+    refused(["capture", photographs, "-o", data, "--masks", data / "masks"], "which is read")
     assert sorted(data.rglob("*")) == before
 
 
@@ -364,9 +368,9 @@ def test_a_set_that_cannot_be_placed_says_what_to_do(
 
 
 def test_groups_that_share_nothing_are_counted(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"2 groups that share nothing \(4, 3 pictures\).*around c\.jpg"):
-        failure.check_placed(tmp_path, 9, [["a"] * 4, ["b"] * 3], "c.jpg")
-    failure.check_placed(tmp_path, 8, [["a"] * 4, ["b"] * 3], "c.jpg")
+    with pytest.raises(InputError, match=r"2 groups that share nothing \(4, 3 images\).*around c\.jpg"):
+        require_placed(tmp_path, 9, [["a"] * 4, ["b"] * 3], "c.jpg")
+    require_placed(tmp_path, 8, [["a"] * 4, ["b"] * 3], "c.jpg")
 
 
 def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:

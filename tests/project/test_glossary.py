@@ -85,7 +85,6 @@ NOT_CLEAN_YET = {
     "docs/gallery/README.md",
     "docs/releasing.md",
     "mi_refgs/__init__.py",
-    "mi_refgs/capture",
     "mi_refgs/cli",
     "mi_refgs/compare",
     "mi_refgs/constants.py",
