@@ -271,7 +271,7 @@ class Report:
         ]
         if c["not_placed"]:
             lines.append(
-                f"not placed: {abbreviated_names(c['not_placed'])}; take more images between them and the others"
+                f"not placed: {abbreviated_names(c['not_placed'])}; take more between them and the others"
             )
         if c["mean_reprojection_error"] > GOOD_ERROR:
             lines.append("the error is high: something moved, or the lens needs another --camera")
