@@ -18,8 +18,8 @@ from mi_refgs.surfels.table import Surfels
 def join(first: TrainedScene, second: TrainedScene) -> tuple[TrainedScene, list[str]]:
     """Return both scenes as one, the surfels of `first` before those of `second`, and notes for the user.
 
-    Light, background and shading options are those of the first. Of the second are the light if the first has
-    none, and the options for rays if the first traces none. SH that one of them lacks, such as indirect_sh,
+    Light, background and shading options are those of the first; it takes the light of the second if it has
+    none, and the options for rays if it traces none. SH that one of them lacks, such as indirect_sh,
     are zero there, which changes none of its images. The meshes of both occlude and reflect each other.
 
     Raises InputError for scenes of different primitives, reflectance or diffuse terms: one would look wrong.

@@ -84,7 +84,7 @@ def painted(scene: TrainedScene, camera: Camera, mask: np.ndarray) -> np.ndarray
     with dr.suspend_grad():
         depth, _ = render_depth(own, camera, others)
     weights = [upload(mask.astype(np.float32)), mi.Float(1), depth]
-    # The gradient of a blended feature, times an image, is the blended weight per surfel times it.
+    # The gradient of a weighted sum of a blended feature is the blended weight per surfel, so weighted.
     features = [dr.opaque(mi.Float, 0, table.count) for _ in weights]
     for feature in features:
         dr.enable_grad(feature)

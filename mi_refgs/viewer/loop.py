@@ -29,7 +29,7 @@ FAR = 160.0
 """Largest depth that pages can represent, scene units: viser packs it into 24 bits of 1e-5."""
 
 Comparison = Callable[[ViewerScene, DisplayOptions, tuple[int, int]], np.ndarray]
-"""Draws an image that a page displays instead, (H, W, 3) uint8, for a window's width and height."""
+"""Renders what a page displays instead, (H, W, 3) uint8, for a window's width and height."""
 
 
 @dataclass(frozen=True, eq=False)

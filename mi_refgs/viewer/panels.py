@@ -46,14 +46,14 @@ if (!window.refgsDrop) {
 no script of a page except in an event handler."""
 
 STEP = 0.01
-"""Of the sliders of materials."""
+"""Step of the sliders of materials."""
 PUNCTUATION = re.compile(r"([\\`*_{}\[\]<>#])")
 """What has a meaning in Markdown."""
 
 FRUSTUM = 0.08
 """Size of a camera's frustum, in radii of the object."""
 THICKNESS = 1.5
-"""Of its lines, pixels."""
+"""Thickness of its lines, pixels."""
 TRAINING, TEST = (90, 160, 255), (255, 160, 60)
 """Colours of cameras."""
 MESH_COLOUR, MESH_OPACITY = (200, 200, 205), 0.55

@@ -76,7 +76,7 @@ def write_view(scene: ViewerScene, request: SampleRequest, folder: Path, suffix:
 def write_camera(folder: Path, content: Callable[[str], str]) -> Path:
     """Write the file with the next number, its text depending on its name; other files stay as they are.
 
-    The number belongs to whoever creates the file first, so two viewers may save into one folder. Raises
+    The viewer that creates the file first gets the number, so two viewers may save into one folder. Raises
     InputError if it cannot be written.
     """
     stems = {path.name.partition(".")[0] for path in folder.iterdir()}

@@ -54,7 +54,7 @@ def random_sh(count: int, degree: int, seed: int, size: float = 0.1) -> np.ndarr
 
 
 def balls(light: Any = None, **shading: Any) -> TrainedScene:
-    """A metal ball at x < 0 and one of clay, as surfels with their mesh; harmonics of a few degrees."""
+    """A metal ball at x < 0 and one of clay, as surfels with their mesh and SH of a few degrees."""
     raw = known_surfels().to_numpy()
     raw["radiance_sh"] = random_sh(len(raw["position"]), 2, 1)
     raw["indirect_sh"] = random_sh(len(raw["position"]), 1, 2)
