@@ -29,8 +29,7 @@ from mi_refgs.fitting.schedule import Schedule, SharedPrefilter
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, ExposureOptions, Method
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.occlusion.surface_materials import VertexSurfels
-from mi_refgs.occlusion.vertex_colours import VertexColours
+from mi_refgs.occlusion.surface_materials import VertexColours, VertexSurfels
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.checkpoint import (

@@ -20,6 +20,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Bool, Color3f, Float, Point2f, UInt32, Vector3f
 
 NEIGHBOURS = 4
 """Surfels that a vertex mixes: those that overlap at a point of a fitted surface with visible weight."""
@@ -137,11 +138,9 @@ class Surface:
 
     def at(self, triangle: mi.UInt32, barycentric: mi.Point2f, active: mi.Bool) -> SurfaceSample:
         """Attributes at the barycentric coordinates `barycentric` (of the second and third corner)."""
-        shares = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)
         near, far = mi.Vector4f(0), mi.Vector4f(0)
         closest, largest = mi.UInt32(0), mi.Float(-1)
-        for corner, share in enumerate(shares):
-            vertex = dr.gather(mi.UInt32, self.vertex_surfels.faces, 3 * triangle + corner, active)
+        for vertex, share in _corners(self.vertex_surfels.faces, triangle, barycentric, active):
             near += share * dr.gather(mi.Vector4f, self.rows, 2 * vertex, active)
             far += share * dr.gather(mi.Vector4f, self.rows, 2 * vertex + 1, active)
             closest = dr.select(share > largest, vertex, closest)
@@ -149,6 +148,17 @@ class Surface:
         surfel = dr.gather(mi.UInt32, self.vertex_surfels.surfel[0], closest, active)
         normal = mi.Vector3f(far.y, far.z, far.w)
         return SurfaceSample(mi.Color3f(near.x, near.y, near.z), near.w, far.x, normal, surfel)
+
+
+def _corners(
+    faces: UInt32, triangle: UInt32, barycentric: Point2f, active: Bool
+) -> list[tuple[UInt32, Float]]:
+    """Vertex and barycentric weight of the three corners of triangles (N,)."""
+    shares = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)
+    return [
+        (dr.gather(mi.UInt32, faces, 3 * triangle + corner, active), share)
+        for corner, share in enumerate(shares)
+    ]
 
 
 def _normals(mesh: Mesh, neighbours: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -161,3 +171,27 @@ def _normals(mesh: Mesh, neighbours: np.ndarray, weight: np.ndarray) -> np.ndarr
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     agrees = (mean * own).sum(1, keepdims=True) > NORMAL_AGREEMENT
     return np.where(agrees, mean, own)
+
+
+@dataclass(frozen=True)
+class VertexColours:
+    """One colour a vertex, linear over each face; detached."""
+
+    faces: Any  # mi.UInt32 (3 F)
+    rows: Any  # mi.Float (3 V)
+
+    @staticmethod
+    def of(mesh: Mesh, colours: np.ndarray) -> VertexColours:
+        """Colours (V, 3) of the vertices of a mesh."""
+        return VertexColours(upload(mesh.faces.ravel(), mi.UInt32), upload(np.asarray(colours).ravel()))
+
+    def at(self, triangle: Any, barycentric: Any, active: Any) -> Any:
+        """mi.Color3f at the barycentric coordinates of the second and third corner; 0 where not `active`."""
+        colour = mi.Color3f(0)
+        for vertex, share in _corners(self.faces, triangle, barycentric, active):
+            colour += share * dr.gather(mi.Color3f, self.rows, vertex, active)
+        return colour
+
+    def numpy(self) -> np.ndarray:
+        """The colours (V, 3)."""
+        return np.array(self.rows).reshape(-1, 3)

@@ -7,13 +7,43 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.occlusion.mesh_compat import make_mesh, update_mesh
-from mi_refgs.occlusion.surface_materials import Surface, VertexSurfels
-from mi_refgs.occlusion.vertex_colours import VertexColours
+from mi_refgs.occlusion.surface_materials import Surface, VertexColours, VertexSurfels
 from mi_refgs.surfels.table import Surfels
+
+
+def _is_3_9() -> bool:
+    return hasattr(mi.Mesh, "vertex_positions_buffer")
+
+
+def mesh_values(vertices: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
+    """Parameters of a `mi.Mesh` (by `mi.traverse` name) for (V, 3) world vertices and (F, 3) indices."""
+    if _is_3_9():
+        return {"vertex_positions": upload(vertices), "faces": upload(faces, mi.UInt32)}
+    return {"positions": upload_tensor(vertices), "faces": upload_tensor(faces, mi.TensorXu)}
+
+
+def make_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """A `mi.Mesh` with flat shading normals; its winding is its orientation. At least one face."""
+    values = mesh_values(vertices, faces)
+    if not _is_3_9():
+        return mi.Mesh(name, **values)
+    mesh = mi.Mesh(name, len(vertices), len(faces))
+    update_mesh(mi.traverse(mesh), "", vertices, faces)
+    return mesh
+
+
+def update_mesh(params: Any, prefix: str, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Replace a mesh in place, counts included, through the parameters of it (prefix "") or its scene
+    ("name.")."""
+    for name, value in mesh_values(vertices, faces).items():
+        params[prefix + name] = value
+    params.update()
+
 
 OFFSET_VOXELS = 2.0
 """Voxels by which a ray's origin leaves the surface along the normal. What it must cover: the mesh's own

@@ -19,10 +19,10 @@ from mi_refgs.shade.light.envmap import (
     EnvironmentLight,
     PrefilteredLight,
     UnfilteredLight,
+    bounded,
 )
 from mi_refgs.shade.light.light import ConstantLight, Light, RotatedLight
 from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels, resample
-from mi_refgs.shade.light.positive import bounded
 from mi_refgs.shade.light.prefilter import prefilter
 from mi_refgs.shade.shading import Shading
 

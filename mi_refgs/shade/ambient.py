@@ -10,7 +10,7 @@ shadows of the present light, not only how open a place is, and the diffuse term
 the pixel's normal × ratio. Where nothing is in the way it is 1, whatever the rays.
 
 L is looked up in the lobe that is as wide as the part of the hemisphere a ray stands for, so that no lamp
-falls between them. B is shaded by the split sum as traced light is (`shade.traced_light`), with the ratios
+falls between them. B is shaded by the split sum as traced light is (`shade.reflection`), with the ratios
 of the round before at what is hit, 1 in the first: each of BOUNCES rounds adds a bounce. Ratios are detached,
 and stay until they are found again.
 """
@@ -24,13 +24,13 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
-from mi_refgs.occlusion.vertex_colours import VertexColours
+from mi_refgs.occlusion.surface_materials import VertexColours
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.ggx_sampling import lobe_point, lobe_turn
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import safe_normalize
-from mi_refgs.shade.traced_light import MeshRadiance
+from mi_refgs.shade.reflection import MeshRadiance
 from mi_refgs.surfels.table import Surfels
 
 BOUNCES = 2

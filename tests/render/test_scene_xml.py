@@ -20,8 +20,8 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.options import QUALITY, ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
+from mi_refgs.shade.reflection import mirror_visibility
 from mi_refgs.shade.shading import Shading
-from mi_refgs.shade.visibility import mirror_visibility
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.integrator import (

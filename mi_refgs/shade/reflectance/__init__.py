@@ -1,20 +1,17 @@
 """Reflectance models, one file each; importing this package registers those that ship."""
 
-from mi_refgs.shade.reflectance import displayed, gaussian_shader, mirror, monte_carlo, radiance, split_sum
-from mi_refgs.shade.reflectance.model import (
-    MODELS,
-    Reflectance,
-    SurfelView,
-    TraceContext,
-    register,
-    unregister,
-)
+from mi_refgs.shade.reflectance import gaussian_shader, mirror, monte_carlo, radiance, split_sum
+from mi_refgs.shade.reflectance.model import MODELS, Reflectance, SurfelView, register, unregister
+from mi_refgs.shade.reflection import TraceContext
 
-register(split_sum.SplitSum())
-register(radiance.Radiance())
-register(mirror.Mirror())
-register(gaussian_shader.GaussianShader())
-register(monte_carlo.MonteCarlo())
-register(displayed.Displayed())
+for _model in (
+    split_sum.SplitSum(),
+    radiance.Radiance(),
+    mirror.Mirror(),
+    gaussian_shader.GaussianShader(),
+    monte_carlo.MonteCarlo(),
+    radiance.Displayed(),
+):
+    register(_model)
 
 __all__ = ["MODELS", "Reflectance", "SurfelView", "TraceContext", "register", "unregister"]

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from mi_refgs.errors import InputError, abbreviated
-from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.registry import Registry
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import QUALITY, Order, ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
+from mi_refgs.shade.reflection import TraceContext, mirror_visibility
 from mi_refgs.shade.sh import clamp_positive, eval_sh
-from mi_refgs.shade.visibility import mirror_visibility
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Bool, Color3f, Point3f, UInt32, Vector3f
+from mi_refgs.types import Color3f, Vector3f
 
 Lookup = Literal["none", "radiance", "filtered"]
 Rays = Literal["none", "mirror", "own"]
@@ -33,19 +32,6 @@ class SurfelView:
         if self.sh_degree is not None:
             coefficients = coefficients[: (self.sh_degree + 1) ** 2]
         return clamp_positive(eval_sh(coefficients, self.direction) + 0.5)
-
-
-@dataclass(frozen=True)
-class TraceContext:
-    """The scene that rays from N shading points are traced in, and the primary rays to the points."""
-
-    occluder: Occluder
-    surfels: Surfels
-    light: Any  # a `Light`, or None if the model looks none up
-    origin: Point3f  # (1,) the camera; (N,) surfel positions in forward shading
-    ray: Vector3f  # (N,) to the points from `origin`, or from the camera in forward shading; not unit
-    covered: Bool = True  # (N,) or a literal; nothing is traced for the other points
-    pixel: UInt32 = None  # (N,) image index that seeds the random numbers; None: 0 … N - 1
 
 
 class Reflectance:

@@ -12,7 +12,8 @@ from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, safe_normalize
-from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, TraceContext
+from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
+from mi_refgs.shade.reflection import TraceContext
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
 

@@ -9,8 +9,8 @@ from mi_refgs.shade.ambient import ambient_of_pixels
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect
-from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, TraceContext
-from mi_refgs.shade.reflection import reflection
+from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
+from mi_refgs.shade.reflection import TraceContext, reflection
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
 
