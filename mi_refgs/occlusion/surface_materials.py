@@ -20,7 +20,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Bool, Color3f, Float, Point2f, UInt32, Vector3f
+from mi_refgs.types import Bool, Float, Point2f, UInt32
 
 NEIGHBOURS = 4
 """Surfels that a vertex mixes: those that overlap at a point of a fitted surface with visible weight."""
