@@ -99,7 +99,7 @@ def test_a_scaled_case_takes_its_mesh_along() -> None:
     assert small.mesh is not None and small.mesh().voxel == pytest.approx(1e-6)
 
 
-def test_a_planted_mistake_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_footprint_gradients_fail(monkeypatch: pytest.MonkeyPatch) -> None:
     original = FootprintAdjoint.columns
 
     def wrong(self: FootprintAdjoint, row: list[Any]) -> list[Any]:
@@ -114,7 +114,7 @@ def test_page(tmp_path: Path) -> None:
     assert main(["--only", "one surfel", "-o", str(tmp_path), "--quiet"]) == 0
     page = (tmp_path / "stability.md").read_text()
     assert "| one surfel |" in page
-    assert "of 1 hard cases 1 hold, 0 are ill-conditioned, 0 fail; 0 values are not finite" in page
+    assert "of 1 hard cases 1 are within the limits, 0 are ill-conditioned, 0 fail; 0 values are not finite" in page
     assert not re.search(r"\bnan\b|\binf\b|\bNone\b", page)
 
 
