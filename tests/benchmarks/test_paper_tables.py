@@ -31,12 +31,12 @@ from tests.benchmarks.benchmark_runs import run_benchmark
         ("data/glossy", None),
     ],
 )
-def test_scenes_are_recognised_by_their_folders(folder: str, place: tuple[str, str] | None) -> None:
+def test_scenes_are_recognised_by_folder_name(folder: str, place: tuple[str, str] | None) -> None:
     found = place_of(Path(folder), Figures.read())
     assert (found and (found.data_set, found.scene)) == place
 
 
-def test_the_figures_of_the_paper_agree_with_each_other() -> None:
+def test_paper_figures_are_consistent() -> None:
     """Averages that its smaller tables print are those of Table 1, up to what the paper rounds."""
     figures = Figures.read()
     for table in figures.tables.values():
@@ -71,7 +71,7 @@ def test_the_figures_of_the_paper_agree_with_each_other() -> None:
     assert figures.of(Place("Shiny Blender", "teapot"), "w/o 2DGS") == {"psnr": 44.25}
 
 
-def test_variants_name_rows_of_the_paper() -> None:
+def test_methods_name_rows_of_the_paper() -> None:
     figures = Figures.read()
     known = {s for t in figures.tables.values() for systems in t.metrics.values() for s in systems}
     rows = {name: load(name).about.paper_row for name in names()}
@@ -87,7 +87,7 @@ def scene_of(name: str, psnr: float, seconds: float) -> Scene:
     return Scene(name, name, rows=[row])
 
 
-def test_a_table_of_the_paper_with_our_figures() -> None:
+def test_paper_table_contains_our_figures() -> None:
     figures = Figures.read()
     ours = Table([scene_of("ball", 36.0, 1800), scene_of("car", 30.0, 5400)])
     found = paper_tables.compared(1, ours, figures)
@@ -112,7 +112,7 @@ def test_a_table_of_the_paper_with_our_figures() -> None:
     assert hours["  ours: mine"] == (1.0,)
 
 
-def test_the_command_prints_a_table_without_runs() -> None:
+def test_command_prints_table_without_runs() -> None:
     done = run_benchmark("paper_tables", "5")
     assert (
         "NeRO (published)" in done.stdout

@@ -25,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "after"
 
 
-def test_seconds_to_a_level(folder: Path) -> None:
+def test_seconds_to_reach_psnr(folder: Path) -> None:
     (fit,) = quality.fits(folder)
     assert (fit.folder, fit.data, fit.method, fit.seed) == ("after", "chair", "ref_gaussian", "seed0")
     assert fit.reached(15.0) == 10 and fit.reached(36.0) is None
@@ -33,7 +33,7 @@ def test_seconds_to_a_level(folder: Path) -> None:
     assert fit.final == 33.25
 
 
-def test_the_table_and_the_plot(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_and_plot_are_written(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = folder / "quality.png"
     assert quality.main([str(folder), "--at", "33", "36", "-o", str(image)]) == 0
     row = capsys.readouterr().out.splitlines()[1].split()

@@ -113,7 +113,7 @@ def exact(workload: Workload) -> np.ndarray:
 
 
 @pytest.mark.parametrize("make", [opaque, sphere])
-def test_counts_are_the_oracle_s(make: Any) -> None:
+def test_counts_match_reference(make: Any) -> None:
     workload = make(300, 30, 1.5)
     counts, shown = Ours.of(workload, 0).counts(), exact(workload)
     assert counts.contributing == pytest.approx(shown.sum(), rel=2e-3)  # float32 may decide otherwise
@@ -127,7 +127,7 @@ def test_counts_are_the_oracle_s(make: Any) -> None:
         assert counts.visited < 0.9 * counts.pairs  # or this would not test that pixels end
 
 
-def test_bytes_and_bound_grow_with_what_they_stand_for() -> None:
+def test_bytes_and_lower_bound_are_linear_in_counts() -> None:
     counts = Counts(10, 16, 16, 100, 50, 400, 16, None)
     forward = measure.bytes_moved(counts, 14)["forward"]
     assert forward == 24 * 100 + (4 + 4 * 24) * 50 + 4 * 16 * 16
@@ -164,7 +164,7 @@ def test_volprim_shows_the_same_object() -> None:
 
 
 @pytest.mark.parametrize("name", measure.CLASSES)
-def test_a_planted_gradient_error_is_seen(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradient_error_is_detected(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     original = stability.product
 
     def spoilt(*arguments: Any) -> stability.Found:
@@ -178,13 +178,13 @@ def test_a_planted_gradient_error_is_seen(name: str, monkeypatch: pytest.MonkeyP
     assert measure.compare(workload, 16)[f"gradient_{name}"] > 1e-2
 
 
-def test_a_wrong_order_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_order_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     original = stability.product_order
     monkeypatch.setattr(stability, "product_order", lambda *arguments: original(*arguments)[::-1])
     assert measure.compare(sphere(300, 48, 1.5), 16)["order"] > 1e-3
 
 
-def test_the_oracle_looks_at_surfels_around_the_part() -> None:
+def test_reference_includes_surfels_around_the_crop() -> None:
     """Else it would not miss one that no tile lists."""
     workload, listed = sphere(300, 48, 1.5), []
     for margin in (0, measure.MARGIN):
@@ -197,7 +197,7 @@ def test_the_oracle_looks_at_surfels_around_the_part() -> None:
 # ---------- Fits, turns ----------
 
 
-def test_fits_find_what_was_put_in() -> None:
+def test_linear_fit_recovers_coefficients() -> None:
     rng = np.random.default_rng(0)
     rows = [dict(zip("abc", rng.uniform(1, 1e6, size=3), strict=True)) for _ in range(12)]
     for row in rows:
@@ -208,7 +208,7 @@ def test_fits_find_what_was_put_in() -> None:
     assert found["c"] < 1e-2 and found["r2"] > 0.9999
 
 
-def test_slow_calls_take_fewer_turns() -> None:
+def test_slow_calls_run_in_fewer_rounds() -> None:
     met: list[str] = []
     slow = {"slow": (lambda: met.append("s"), 2)}
     found = milliseconds({"fast": lambda: met.append("f")}, 1e-9, 5, slow)

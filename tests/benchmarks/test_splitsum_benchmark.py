@@ -70,7 +70,7 @@ def test_reports_are_written(folder: Path, result: dict[str, Any]) -> None:
     assert all(set(by) == set(settings["heights"]) for by in split.values())
 
 
-def test_flip_is_there_where_it_is_installed(folder: Path, result: dict[str, Any]) -> None:
+def test_flip_is_measured_if_installed(folder: Path, result: dict[str, Any]) -> None:
     """FLIP of whole images; more samples look better."""
     installed = importlib.util.find_spec("flip_evaluator") is not None
     assert all((row["flip"] is not None) == (installed and row["n_dot_v"] == "all") for row in result["rows"])
@@ -85,7 +85,7 @@ def test_every_method_has_a_time(result: dict[str, Any]) -> None:
     assert all(row["ms_per_mpx"] > 0 for row in result["rows"])
 
 
-def test_the_path_tracer_agrees_with_the_reference(result: dict[str, Any]) -> None:
+def test_path_tracer_agrees_with_reference(result: dict[str, Any]) -> None:
     """Mean errors in standard errors: within 4 each, and with a spread of about 1."""
     scores = np.array([row["score"] for row in result["scores"]])
     assert np.abs(scores).max() < 4
@@ -120,7 +120,7 @@ def test_more_rows_are_not_worse(result: dict[str, Any]) -> None:
             assert values[-1] < max(1.25 * values[0] + floor, 1e-5), key
 
 
-def test_a_constant_light_has_no_error(result: dict[str, Any]) -> None:
+def test_constant_light_has_no_error(result: dict[str, Any]) -> None:
     """The table is exact for it: only its own interpolation is left, 5e-4 of the radiance."""
     for key, by in cases(result, "split_sum").items():
         if key[1] == "constant":
@@ -253,7 +253,7 @@ def test_lobe_average_is_the_reference_one(roughness: float) -> None:
         assert (np.abs(estimate.mean[k] - wanted) < 6 * estimate.error[k] + 2e-3 * wanted).all()
 
 
-def test_the_standard_error_is_honest() -> None:
+def test_standard_error_matches_scatter() -> None:
     """Two independent estimates differ by as much as they say: root mean square of the scores near 1."""
     scene, points = sphere(24)
     α = dr.opaque(mi.Float, 0.25)
@@ -286,7 +286,7 @@ def test_lights_have_a_mean_of_one_and_rise_in_frequency() -> None:
         common.make_light("nowhere.exr", 64)
 
 
-def test_errors_know_their_floor() -> None:
+def test_errors_report_their_noise_floor() -> None:
     rng = np.random.default_rng(3)
     truth = rng.uniform(0.5, 1.5, (4000, 3))
     reference = mc.Estimate(truth + 0.01 * rng.normal(size=truth.shape), np.full(truth.shape, 0.01))
@@ -298,7 +298,7 @@ def test_errors_know_their_floor() -> None:
     assert off.relmse == pytest.approx(0.05**2, rel=0.1) and off.mape == pytest.approx(0.05, rel=0.05)
 
 
-def test_a_budget_of_known_parts() -> None:
+def test_budget_recovers_known_parts() -> None:
     """Two orthogonal errors and two that cancel."""
     exact = np.ones((2, 3))
     a, b = np.array([[0.1], [0.0]]), np.array([[0.0], [0.2]])
@@ -314,7 +314,7 @@ def test_a_budget_of_known_parts() -> None:
     assert found.correlation == pytest.approx(-1)
 
 
-def test_a_budget_knows_its_pair() -> None:
+def test_budget_names_the_interacting_pair() -> None:
     """Three parts, of which the last two cancel at the second of two points: one part, they add up."""
     exact = np.ones((2, 3))
     a, b = np.array([[0.3], [0.0]]), np.array([[0.0], [0.2]])
@@ -346,7 +346,7 @@ def test_equal_error_is_interpolated() -> None:
     assert measure.error_times_samples(noisy) == pytest.approx(0.8)
 
 
-def test_other_levels_are_filtered_beside_the_shipped_ones() -> None:
+def test_other_level_sets_are_filtered() -> None:
     """A light with other levels has their texels and mixes by their roughness."""
     light = common.make_light("gradient", 16).environment(16)
     shipped, few = light.prefilter(), light.prefilter(setup.LEVEL_SETS["few"])
@@ -360,7 +360,7 @@ def test_other_levels_are_filtered_beside_the_shipped_ones() -> None:
     assert not np.allclose(a, b, rtol=1e-4)
 
 
-def test_a_missing_light_is_one_sentence(tmp_path: Path) -> None:
+def test_missing_light_is_refused(tmp_path: Path) -> None:
     done = run_benchmark("splitsum", "--small", "--envmap", "nowhere.exr", "-o", tmp_path)
     assert done.returncode == 2
     assert "nowhere.exr: light" in done.stderr

@@ -7,7 +7,7 @@ import json
 from tests.benchmarks.benchmark_runs import run_benchmark
 
 
-def test_a_fit_that_is_killed_goes_on() -> None:
+def test_killed_fit_resumes() -> None:
     """Two SIGKILLs, one of them while a checkpoint is written, and a SIGTERM, at the moments of seed 1."""
     done = run_benchmark("survival", "kill", "--times", 2, "--seed", 1)
     assert done.returncode == 0, done.stdout + done.stderr[-3000:]

@@ -88,7 +88,7 @@ def test_the_path_tracer_adds_light_with_depth(result: dict[str, Any], scene: st
 
 
 @pytest.mark.parametrize("scene", ["bowl", "plates"])
-def test_many_rays_are_the_traced_answer(result: dict[str, Any], scene: str) -> None:
+def test_many_rays_converge_to_exact_visibility(result: dict[str, Any], scene: str) -> None:
     curve = {row["rays"]: row for row in where(result["curve"], scene=scene)}
     most = max(curve)
     distance = [curve[k]["visibility_rms"] for k in (1, 4, 64, most)]
@@ -98,7 +98,7 @@ def test_many_rays_are_the_traced_answer(result: dict[str, Any], scene: str) -> 
     assert curve[64]["to_limit"] < 0.2 * curve[4]["to_limit"]
 
 
-def test_the_noise_is_below_what_is_compared(result: dict[str, Any]) -> None:
+def test_noise_is_below_compared_errors(result: dict[str, Any]) -> None:
     for row in where(result["rows"], depth="full"):
         assert not row["below_floor"]
 
@@ -114,7 +114,7 @@ def test_budgets_are_above_the_noise_and_add_up(result: dict[str, Any], scene: s
 
 
 @pytest.mark.parametrize("scene", ["bowl", "plates"])
-def test_the_budget_takes_the_error_of_the_rule_apart(result: dict[str, Any], scene: str) -> None:
+def test_budget_decomposes_the_error_of_the_rule(result: dict[str, Any], scene: str) -> None:
     """Its reference differs from that of the rows by noise; the best SH beat no indirect light."""
     error = errors_of(result, scene, "full")
     total = {row["indirect"]: row["total"] for row in where(result["budgets"], scene=scene)}
@@ -138,7 +138,7 @@ def test_bounces_approach_the_path_tracer_at_full_depth() -> None:
     assert relmse == sorted(relmse, reverse=True) and relmse[-1] < 0.15 * relmse[0]
 
 
-def test_payoff_is_chosen_elsewhere_within_the_budget() -> None:
+def test_setting_is_chosen_on_other_scenes_within_budget() -> None:
     """`lucky` is best here, `steady` on the other scene, which decides; `dear` is over the budget."""
     here = {"mirror ray": (1.0, 10.0), "lucky": (0.1, 29.0), "steady": (0.2, 20.0), "dear": (0.01, 31.0)}
     there = {"mirror ray": 1.0, "lucky": 0.9, "steady": 0.3, "dear": 0.01, "untimed": 1e-3}
@@ -174,13 +174,13 @@ def test_scenes_are_closed_and_face_outwards(name: str) -> None:
     assert np.abs(np.linalg.norm(mesh.vertex_normals, axis=1) - 1).max() < 1e-6
 
 
-def test_a_mesh_of_a_file_is_scaled() -> None:
+def test_mesh_file_is_scaled() -> None:
     concave = cases.make_scene(str(ROOT / "scenes" / "meshes" / "trefoil.ply"), 0)
     assert concave.name == "trefoil" and concave.mesh.volume > 0
     assert np.linalg.norm(concave.mesh.vertices, axis=1).max() == pytest.approx(1)
 
 
-def test_a_bad_mesh_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unreadable_mesh_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--small", "--quiet", "--mesh", str(tmp_path / "none.ply"), "-o", str(tmp_path)]
     assert main(arguments) == 2
     assert "none.ply" in capsys.readouterr().err

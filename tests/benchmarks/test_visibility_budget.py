@@ -80,7 +80,7 @@ def random_chains(rng: np.random.Generator) -> list[list[Step]]:
     return [budget.by_harmonics(shipped, exact, fitted), budget.by_tracing(shipped, exact, traced)]
 
 
-def test_a_chain_adds_up_at_every_pixel(rng: np.random.Generator) -> None:
+def test_chain_adds_up_at_every_pixel(rng: np.random.Generator) -> None:
     for steps in random_chains(rng):
         signed = [before.values - after.values for before, after in itertools.pairwise(steps)]
         np.testing.assert_allclose(sum(signed), steps[0].values - steps[-1].values, atol=1e-15)
@@ -89,14 +89,14 @@ def test_a_chain_adds_up_at_every_pixel(rng: np.random.Generator) -> None:
         assert found.sum + found.interaction == pytest.approx(found.total)
 
 
-def test_both_chains_end_alike(rng: np.random.Generator) -> None:
+def test_both_chains_end_with_the_path_tracer(rng: np.random.Generator) -> None:
     """At the path tracer's image, and the last two parts are the same."""
     first, second = random_chains(rng)
     for a, b in zip(first[-3:], second[-3:], strict=True):
         np.testing.assert_array_equal(a.values, b.values)
 
 
-def test_they_begin_with_what_ships_and_end_with_the_path_tracer(plates: Setup) -> None:
+def test_chains_begin_with_the_shipped_image(plates: Setup) -> None:
     """The paper's rule is V L S + (1 - V) I S; the end is Mitsuba's image but for noise."""
     batches = references(plates)
     fitted = budget.fit(plates, DEPTHS["full"])
@@ -115,7 +115,7 @@ def test_they_begin_with_what_ships_and_end_with_the_path_tracer(plates: Setup) 
 # ---------- Parts without a cause ----------
 
 
-def test_inputs_that_agree_leave_nothing(rng: np.random.Generator) -> None:
+def test_equal_images_have_no_error(rng: np.random.Generator) -> None:
     """A lobe as free as its mirror ray, light as it is fitted and traced, a split sum as its integral:
     every part is nothing; and the input that then is off is its own part alone."""
     visibility = (rng.uniform(0, 1, (50, 1)) < 0.5) * np.ones(3)
@@ -145,14 +145,14 @@ def test_inputs_that_agree_leave_nothing(rng: np.random.Generator) -> None:
                 assert distance > 0.1 or distance < 1e-12
 
 
-def test_nothing_in_the_way_leaves_the_split_sum() -> None:
+def test_without_occlusion_only_the_split_sum_errs() -> None:
     """A convex object: no visibility and no indirect light has an error, exactly; the split sum has."""
     for found in parts_of(Setup(box(), TINY), 0.3).values():
         assert found.pop(budget.SPLIT) == pytest.approx(found.pop("total")) and found
         assert all(value == 0 for value in found.values()), found
 
 
-def test_light_alike_everywhere_leaves_nothing(studio: dict[str, dict[str, float]]) -> None:
+def test_white_furnace_has_no_error(studio: dict[str, dict[str, float]]) -> None:
     """In a white furnace a plate reflects what the light would send, which SH can represent."""
     furnace = parts_of(Setup(make_scene("plates", 0), TINY, "constant", WHITE), 0.1)["harmonics"]
     assert furnace["total"] < 5e-4 < 0.03 < studio["harmonics"]["total"], furnace
@@ -160,7 +160,7 @@ def test_light_alike_everywhere_leaves_nothing(studio: dict[str, dict[str, float
         assert furnace[name] < 5e-4 < 1e-3 < studio["harmonics"][name], (name, furnace)
 
 
-def test_a_constant_light_is_apart_from_visibility() -> None:
+def test_constant_light_separates_from_visibility() -> None:
     """Visibility times light averages as the product of averages where the light is constant."""
     found = parts_of(Setup(make_scene("plates", 0), TINY, "constant"), 0.3)["harmonics"]
     assert max(found[budget.APART], found[budget.SPLIT]) < 1e-5 < 1e-3 < found[budget.MIRROR]
@@ -179,7 +179,7 @@ def directions(rng: np.random.Generator, points: int, count: int) -> tuple[np.nd
     return d, np.stack(columns, -1).reshape(points, count, -1)
 
 
-def test_harmonics_that_harmonics_can_say_are_found(rng: np.random.Generator) -> None:
+def test_sh_radiance_is_recovered(rng: np.random.Generator) -> None:
     """From blocked directions alone: values in free ones are nonsense. And a constant is a constant."""
     d, basis = directions(rng, 5, 4000)
     wanted = rng.normal(size=(5, basis.shape[-1], 3)) * 0.1
@@ -192,7 +192,7 @@ def test_harmonics_that_harmonics_can_say_are_found(rng: np.random.Generator) ->
     np.testing.assert_array_equal(budget.sums(basis, radiance, np.zeros_like(blocked)).solve(), 0)
 
 
-def test_harmonics_over_the_lobe_are_their_radiance(plates: Setup) -> None:
+def test_sh_integrated_over_the_lobe_equals_radiance(plates: Setup) -> None:
     """A constant one gives its radiance times the lobe; a tilted one, along the mirror, what `along` says."""
     count = plates.points.count
     coefficients = np.zeros((count, 16, 3))

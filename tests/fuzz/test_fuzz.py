@@ -19,7 +19,9 @@ pytestmark = pytest.mark.filterwarnings("ignore")
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_mutated_files(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mutated_files_are_read_or_refused(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(worker, "SECONDS", 60)  # the machine may do other things
     monkeypatch.chdir(tmp_path)
     reader = READERS[name]
@@ -59,12 +61,14 @@ def refuse(folder: Path) -> None:
         (lambda folder: worker.Watch.hook("pickle.find_class", ("os", "system")), "escape"),
     ],
 )
-def test_failures_are_seen(read: Any, result: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failures_are_detected(
+    read: Any, result: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(worker, "SECONDS", 1 if result == "hang" else 60)
     assert worker.outcome(broken(read), tmp_path, b"")["result"] == result
 
 
-def test_a_seed_makes_the_same_file(tmp_path: Path) -> None:
+def test_same_seed_makes_same_file(tmp_path: Path) -> None:
     reader = READERS["transforms"]
     samples = reader.samples(tmp_path)
     files = [[worker.mutated(reader, samples, seed, i) for i in range(20)] for seed in (1, 1, 2)]

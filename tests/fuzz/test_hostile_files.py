@@ -46,7 +46,7 @@ def refuse_file(read: Callable[[Path], Any], path: Path, data: bytes, *words: st
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("read", [read_ply, read_mesh])
-def test_ply_that_promises_much(read: Callable[[Path], Any], kind: str, tmp_path: Path) -> None:
+def test_ply_with_huge_counts_is_refused(read: Callable[[Path], Any], kind: str, tmp_path: Path) -> None:
     for body in (
         f"element vertex {MUCH}\n{XYZ}",
         f"element vertex 3\n{XYZ}element face {MUCH}\n{LIST}",
@@ -56,20 +56,20 @@ def test_ply_that_promises_much(read: Callable[[Path], Any], kind: str, tmp_path
         refuse_file(read, tmp_path / "a.ply", ply(kind, body, TRIANGLE))
 
 
-def test_mesh_whose_faces_name_other_memory(tmp_path: Path) -> None:
+def test_mesh_faces_out_of_range_are_refused(tmp_path: Path) -> None:
     body = f"element vertex 3\n{XYZ}element face 1\n{LIST}"
     for face in ("3 0 1 3", "3 0 1 1000000000", "3 0 1 -1"):
         refuse_file(read_mesh, tmp_path / "a.ply", ply("ascii", body, f"{TRIANGLE}{face}\n"))
     refuse_file(read_mesh, tmp_path / "a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
 
 
-def test_mesh_beyond_single_precision(tmp_path: Path) -> None:
+def test_mesh_beyond_single_precision_is_refused(tmp_path: Path) -> None:
     body = f"element vertex 3\n{XYZ.replace('float', 'double')}element face 1\n{LIST}"
     data = ply("ascii", body, TRIANGLE.replace("1", "1e300") + "3 0 1 2\n")
     refuse_file(read_mesh, tmp_path / "a.ply", data)
 
 
-def test_a_mesh_names_no_other_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mesh_reader_opens_no_other_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither materials nor textures are opened."""
     (tmp_path / "in").mkdir()
     (tmp_path / "secret.mtl").write_text("newmtl a\nmap_Kd secret.png\n")
@@ -97,7 +97,7 @@ def png(width: int, height: int) -> bytes:
     )
 
 
-def test_pictures_that_promise_much(tmp_path: Path) -> None:
+def test_images_with_huge_sizes_are_refused(tmp_path: Path) -> None:
     for read in (read_png, image_size):
         refuse_file(read, tmp_path / "a.png", png(100_000, 100_000))
         refuse_file(read, tmp_path / "a.png", png(12_000, 12_000), "12000 × 12000", "hold")
@@ -112,14 +112,14 @@ def test_pictures_that_promise_much(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("first", [b"#?RADIANCE\n\n-Y 100000 +X 100000\n", b"PF\n100000 100000\n-1.0\n"])
-def test_lights_that_promise_much(first: bytes, tmp_path: Path) -> None:
+def test_lights_with_huge_sizes_are_refused(first: bytes, tmp_path: Path) -> None:
     refuse_file(EnvironmentLight.from_file, tmp_path / "a.hdr", first + b"\0" * 100)
 
 
 @pytest.mark.parametrize(
     "text", ["[" * 10**5, '{"a":' * 10**5, "[]", "", "\ud800", '{"a": ' + "9" * 5000 + "}"]
 )
-def test_json_that_is_no_object(text: str, tmp_path: Path) -> None:
+def test_json_other_than_objects_is_refused(text: str, tmp_path: Path) -> None:
     refuse_file(read_json, tmp_path / "a.json", text.encode(errors="surrogatepass"), "JSON")
 
 
@@ -142,7 +142,7 @@ def test_json_that_is_no_object(text: str, tmp_path: Path) -> None:
         "iterations = 100\n[stage.a]\nuntil = 9\nat = ['pixel']",
     ],
 )
-def test_methods_that_make_no_sense(text: str, tmp_path: Path) -> None:
+def test_invalid_methods_are_refused(text: str, tmp_path: Path) -> None:
     refuse_file(lambda path: methods.load(str(path)), tmp_path / "a.toml", text.encode())
 
 
@@ -165,7 +165,7 @@ def test_methods_that_make_no_sense(text: str, tmp_path: Path) -> None:
         {"shading": [1]},
     ],
 )
-def test_models_that_make_no_sense(content: dict[str, Any], tmp_path: Path) -> None:
+def test_invalid_models_are_refused(content: dict[str, Any], tmp_path: Path) -> None:
     whole = {"iteration": 1, "seconds": 1.0, "shading": {"reflectance": "radiance"}} | content
     refuse_file(
         lambda path: TrainedScene.read(path.parent), tmp_path / "model.json", json.dumps(whole).encode()
@@ -173,19 +173,19 @@ def test_models_that_make_no_sense(content: dict[str, Any], tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("place", [3, None, "a" * 5000, "a\0b", "\ud800", ["a"]])
-def test_runs_whose_data_is_nowhere(place: Any, tmp_path: Path) -> None:
+def test_runs_with_invalid_data_paths_are_refused(place: Any, tmp_path: Path) -> None:
     def read(path: Path) -> None:
         load_split(Run(path.parent), methods.load("ref_gaussian"), "train")
 
     refuse_file(read, tmp_path / "dataset.json", json.dumps({"path": place}).encode(), "path")
 
 
-def test_meshes_that_cannot_be(tmp_path: Path) -> None:
+def test_invalid_meshes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_mesh(tmp_path / ("x" * 5000))
 
 
-def test_a_log_of_anything(tmp_path: Path) -> None:
+def test_log_with_invalid_lines_is_read(tmp_path: Path) -> None:
     lines = [
         '{"iteration": 1}',
         '{"iteration": 1e999}',
@@ -218,7 +218,7 @@ class Properties(dict[str, Any]):
         ("traced_bounces", 10**9, lambda props: read_shading(props, read_surfels(props))),
     ],
 )
-def test_properties_of_another_type(
+def test_properties_of_wrong_type_are_refused(
     name: str, value: Any, read: Callable[[Any], Any], tmp_path: Path
 ) -> None:
     props = Properties({"metallic": mi.TensorXf([0.0], (1, 1))}) | {name: value}
@@ -226,13 +226,13 @@ def test_properties_of_another_type(
         read(Properties(props))
 
 
-def test_shading_is_what_it_says() -> None:
+def test_shading_options_of_wrong_type_are_refused() -> None:
     assert Shading("surfel", "radiance", "sh").at == "surfel"
     with pytest.raises(InputError, match=r"shading: occlusion: 'yes'"):
         Shading(occlusion="yes")  # type: ignore[arg-type]
 
 
-def test_what_messages_show() -> None:
+def test_messages_abbreviate_values() -> None:
     endless: list[Any] = []
     endless.append(endless)
     assert abbreviated("a") == "'a'" and len(abbreviated("a" * 500)) == 81

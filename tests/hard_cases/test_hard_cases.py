@@ -40,7 +40,7 @@ def test_case(case: Case) -> None:
 
 
 @pytest.mark.parametrize("name", ["roughness 0", "mirrors that reflect a pole"])
-def test_slope_where_the_split_sum_table_is_flat(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slope_at_flat_split_sum_table(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The gradient of a mirror's roughness is tiny, and right: not the rounding of interpolated values."""
     monkeypatch.setattr(module, "NEGLIGIBLE", 0.0)
     case = next(case for case in CASES if case.name == name)
@@ -62,7 +62,7 @@ def test_losses_of_extreme_images(image: Any) -> None:
 # ---------------- the measurement itself ----------------
 
 
-def test_gradients_of_the_oracle_are_its_own_differences() -> None:
+def test_reference_gradients_match_differences() -> None:
     """Complex steps and sums, against central differences of the loss, for every class of parameters."""
     case = plain("plain").rounded()
     pixels = module.chosen_pixels(case)
@@ -90,7 +90,7 @@ def test_gradients_of_the_oracle_are_its_own_differences() -> None:
         assert np.sum(exact[name] * direction) == pytest.approx(expected, rel=1e-4, abs=1e-6), name
 
 
-def test_a_scaled_case_takes_its_mesh_along() -> None:
+def test_scaled_case_scales_its_mesh() -> None:
     small, plates = (
         next(c for c in CASES if c.name == n) for n in ("mesh and scene times 1e-3", "two plates")
     )
@@ -114,7 +114,10 @@ def test_page(tmp_path: Path) -> None:
     assert main(["--only", "one surfel", "-o", str(tmp_path), "--quiet"]) == 0
     page = (tmp_path / "stability.md").read_text()
     assert "| one surfel |" in page
-    assert "of 1 hard cases 1 are within the limits, 0 are ill-conditioned, 0 fail; 0 values are not finite" in page
+    assert (
+        "of 1 hard cases 1 are within the limits, 0 are ill-conditioned, 0 fail; 0 values are not finite"
+        in page
+    )
     assert not re.search(r"\bnan\b|\binf\b|\bNone\b", page)
 
 

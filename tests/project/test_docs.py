@@ -90,13 +90,13 @@ def test_commands_exist(page: Path) -> None:
             parse(shlex.split(line, comments=True)[1:])
 
 
-def test_setup_commands_of_the_readme_are_those_of_ci() -> None:
+def test_readme_setup_commands_match_ci() -> None:
     assert "bash setup.sh test" in README and "bash setup.sh demo" in README
     assert "bash setup.sh test" in (ROOT / ".ci" / "run").read_text()
 
 
 @pytest.mark.parametrize("page", [pytest.param(page, id=name(page)) for page in PAGES])
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_resolve(page: Path) -> None:
     """To a file; or, within docs/, to a page that is made. The build of the site checks their anchors."""
     text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     for target in re.findall(r"\]\(([^)#\s]+)", text):
@@ -187,7 +187,7 @@ def test_site_has_every_setting(site: Path) -> None:
         assert f"<code>{field}</code>" in text
 
 
-def test_site_asks_no_other_server_for_anything(site: Path) -> None:
+def test_site_loads_nothing_from_other_servers(site: Path) -> None:
     """Neither scripts nor styles, fonts or images: it works without a network."""
     for page in site.rglob("*.html"):
         text = re.sub(r'<link rel="canonical"[^>]*>', "", page.read_text(encoding="utf-8"))
@@ -197,7 +197,7 @@ def test_site_asks_no_other_server_for_anything(site: Path) -> None:
         assert not re.findall(r'<link[^>]*href="(?:https?:)?//[^"]*"', text), page
 
 
-def test_site_lists_the_links_that_leave_it(site: Path) -> None:
+def test_site_lists_external_links(site: Path) -> None:
     listed = (site / "external_links.txt").read_text().split()
     assert "https://www.mitsuba-renderer.org" in listed
 

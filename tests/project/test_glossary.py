@@ -234,7 +234,7 @@ def test_rooms_do_not_use_other_words() -> None:
         ('"""It is a pixel, has a step; of course."""', []),
     ],
 )
-def test_planted_words_are_found(source: str, words: list[str], tmp_path: Path) -> None:
+def test_forbidden_words_are_found(source: str, words: list[str], tmp_path: Path) -> None:
     path = tmp_path / "planted.py"
     path.write_text(source)
     found = findings(path)

@@ -247,13 +247,13 @@ def test_only_the_configuration_opens_toml() -> None:
     assert readers <= {"methods.read"}
 
 
-def test_the_reference_is_plain_numpy() -> None:
+def test_reference_imports_neither_drjit_nor_mitsuba() -> None:
     for module, source in sources().items():
         if module.partition(".")[0] == "reference":
             assert not {"drjit", "mitsuba"} & imported_packages(source), module
 
 
-def test_no_code_knows_a_variant_by_name() -> None:
+def test_no_code_names_a_method() -> None:
     """A method is data: nothing under the package may compare with, or choose, a variant's name."""
     names = variant_names()
     for module, source in sources().items():
@@ -280,7 +280,7 @@ def test_no_files_import_each_other() -> None:
     ] == []
 
 
-def test_the_root_of_the_package_has_few_modules() -> None:
+def test_package_root_has_few_modules() -> None:
     names = {path.stem for path in (ROOT / PACKAGE).glob("*.py")} - KNOWN_ROOT_MODULES
     assert len(names) <= ROOT_MODULES, sorted(names)
 
@@ -313,7 +313,7 @@ def test_no_test_module_imports_a_test_module() -> None:
         ("novelty", "import numpy"),
     ],
 )
-def test_a_planted_import_is_found(module: str, source: str) -> None:
+def test_forbidden_import_is_found(module: str, source: str) -> None:
     assert layer_breaches({module: source})
 
 
@@ -329,7 +329,7 @@ def test_a_planted_import_is_found(module: str, source: str) -> None:
         },
     ],
 )
-def test_a_planted_cycle_is_found(modules: dict[str, str]) -> None:
+def test_import_cycle_is_found(modules: dict[str, str]) -> None:
     assert import_cycles(modules) == [set(modules)]
     last = list(modules)[-1]
     assert import_cycles(modules | {last: "import numpy"}) == []
@@ -346,11 +346,11 @@ def test_a_planted_cycle_is_found(modules: dict[str, str]) -> None:
         ("render.pipeline", "from mi_refgs import splat\nimport numpy as np"),
     ],
 )
-def test_a_permitted_import_is_not(module: str, source: str) -> None:
+def test_permitted_import_is_not_found(module: str, source: str) -> None:
     assert layer_breaches({module: source}) == []
 
 
-def test_a_planted_name_is_found() -> None:
+def test_method_name_in_code_is_found() -> None:
     source = (
         '"""Cites two_d."""\ndef f(x):\n    """Cites two_d."""\n    return x == "two_d" or f"{x} no two_d"\n'
     )
@@ -371,7 +371,7 @@ def test_a_planted_name_is_found() -> None:
         "y = 2 * a; z = y[3:]; mi.Float(z)",
     ],
 )
-def test_a_planted_wrapped_array_is_found(body: str) -> None:
+def test_wrapped_array_is_found(body: str) -> None:
     source = f"def f(a: np.ndarray, x):\n    {body}"
     assert wrapped_arrays(source, {"fresh", "faces"})
 
@@ -387,5 +387,5 @@ def test_a_planted_wrapped_array_is_found(body: str) -> None:
         "y = a; y = x; mi.Float(y)",
     ],
 )
-def test_what_is_not_flat_or_not_of_numpy_is_no_wrapped_array(body: str) -> None:
+def test_other_calls_are_not_wrapped_arrays(body: str) -> None:
     assert not wrapped_arrays(f"def f(a: np.ndarray, x):\n    {body}", {"fresh"})

@@ -138,7 +138,7 @@ print(type(mi.load_dict({"type": "refgs_bsdf"})).__name__)
     assert run_in(environment, "python", "-W", "error", "-c", code).strip() == "RefGSBSDF"
 
 
-def test_sdist_holds_all_that_the_checks_need(sdist: Path) -> None:
+def test_sdist_contains_all_that_checks_need(sdist: Path) -> None:
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert {"setup.sh", "mkdocs.yml", ".ci/run", "CITATION.cff", "CHANGELOG.md", "pyproject.toml"} <= names
@@ -160,7 +160,7 @@ def unpacked(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_wheel_holds_every_module_and_data_file(wheel: Path) -> None:
+def test_wheel_contains_every_module_and_data_file(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         packed = set(archive.namelist())
     expected = {str(path.relative_to(ROOT)) for path in (ROOT / "mi_refgs").rglob("*.py")}
@@ -173,7 +173,7 @@ def test_wheel_holds_every_module_and_data_file(wheel: Path) -> None:
     assert expected | {"mi_refgs/py.typed", "mi_refgs/__init__.pyi"} <= packed
 
 
-def test_wheel_holds_nothing_else(wheel: Path) -> None:
+def test_wheel_contains_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         tops = {name.split("/")[0] for name in archive.namelist()}
     assert tops == {"mi_refgs", *(top for top in tops if top.endswith(".dist-info"))}
@@ -236,7 +236,7 @@ def test_every_import_is_declared() -> None:
         assert not missing, f"{path.name} imports {missing}, which pyproject.toml does not declare"
 
 
-def test_doctor_looks_for_what_the_extras_bring() -> None:
+def test_doctor_checks_modules_of_the_extras() -> None:
     extras = PROJECT["project"]["optional-dependencies"]
     for name, distribution in EXTRAS.items():
         assert any(line.startswith(distribution) for line in extras[name]), name
@@ -252,6 +252,6 @@ def test_checkout_finds_its_data(name: str) -> None:
     assert resource_dir(name) == ROOT / name
 
 
-def test_missing_data_is_one_sentence() -> None:
+def test_missing_data_is_refused() -> None:
     with pytest.raises(InputError, match="absent: the folder is missing from this installation"):
         resource_dir("absent")

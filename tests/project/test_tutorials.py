@@ -34,12 +34,12 @@ def outputs(path: Path) -> list[Any]:
     return [output for cell in cells(path) for output in cell.outputs]
 
 
-def test_there_are_four() -> None:
+def test_there_are_four_tutorials() -> None:
     assert len(NOTEBOOKS) == 4
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_tutorial_runs(path: Path) -> None:
+def test_tutorial_runs(path: Path) -> None:
     """In its own process and folder; every one asserts what it shows."""
     done = subprocess.run(
         [sys.executable, FOLDER / "run.py", "--check", path],
@@ -55,7 +55,7 @@ def test_a_tutorial_runs(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_what_is_kept_is_small_and_shows_images(path: Path) -> None:
+def test_stored_outputs_are_small_and_contain_images(path: Path) -> None:
     """Images that are not of one colour; no errors, messages, numbers of runs, addresses or paths."""
     assert path.stat().st_size < MOST_BYTES
     found = outputs(path)
