@@ -105,7 +105,7 @@ def measure(quick: bool = False, only: list[str] | None = None, quiet: bool = Fa
     else:
         result |= {"curve": [], "losses": []}
     more = not (only or quick)
-    result["fits"] = measure() if more else []
+    result["fits"] = measure_fits() if more else []
     result |= bias.measure() if more else {"rules": [], "gradient": []}
     return result | {"seconds": time.perf_counter() - begin}
 
