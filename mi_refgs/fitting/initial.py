@@ -14,7 +14,7 @@ from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, LightOptions, Met
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels import init
-from mi_refgs.surfels.order import morton_order
+from mi_refgs.surfels.init import morton_order
 from mi_refgs.surfels.table import Surfels
 
 FARTHEST = 1.95

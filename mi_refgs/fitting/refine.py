@@ -19,7 +19,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.method import Propagation, Refine, Relocation
 from mi_refgs.surfels.attributes import attribute, logit, sigmoid
-from mi_refgs.surfels.order import morton_order
+from mi_refgs.surfels.init import morton_order
 from mi_refgs.surfels.primitives import Primitive, primitive_of
 from mi_refgs.surfels.table import Surfels
 

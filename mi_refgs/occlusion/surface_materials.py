@@ -121,7 +121,7 @@ class VertexSurfels:
                 f"occluder: surfels: there are {surfels.count}, but the mesh was given {self.count}; call "
                 "Occluder.set_materials whenever their number changes"
             )
-        columns = [*surfels.albedo(), surfels.metallic(), surfels.roughness()]
+        columns = [*surfels.value("albedo"), surfels.value("metallic"), surfels.value("roughness")]
         mixed = [mi.Float(0) for _ in columns]
         for surfel, weight in zip(self.surfel, self.weight, strict=True):
             for i, column in enumerate(columns):

@@ -104,15 +104,15 @@ def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> S
         surfels = surfels.cleaned()
         normal, vertex = outward(surfels, mesh)
         facing = mi.Vector3f(normal.T)
-        coefficients = surfels.radiance_sh()
+        coefficients = surfels.value("radiance_sh")
         basis = sh_basis(-facing, surfels.sh_degree())
         radiance = mi.Color3f(0.5)
         for index, (coefficient, function) in enumerate(zip(coefficients, basis, strict=True)):
             radiance += COSINE_LOBE[int(index**0.5)] * function * coefficient
-        scale, bias = split_sum(mi.Float(1), surfels.roughness())
+        scale, bias = split_sum(mi.Float(1), surfels.value("roughness"))
         arrives = light.irradiance(facing) * (1 - (DIELECTRIC_F0 * scale + bias))
         radiance_, arrives_, metallic, albedo = (
-            _rows(x) for x in (radiance, arrives, surfels.metallic(), surfels.albedo())
+            _rows(x) for x in (radiance, arrives, surfels.value("metallic"), surfels.value("albedo"))
         )
         floor = IRRADIANCE_FLOOR * arrives_.max()
 

@@ -104,7 +104,7 @@ class MeshRadiance:
         """Take the present values of all arguments, and evaluate them."""
         surfels = surfels.cleaned()  # one that became unusable after `set_materials` may still be looked up
         surface = occluder.surface(surfels)
-        coefficients = surfels.radiance_sh() if options.diffuse == "sh" else []
+        coefficients = surfels.value("radiance_sh") if options.diffuse == "sh" else []
         # In rows: the adjoint of a hit's gather is then a table of its own. Columns themselves, whose adjoint
         # writes packets, must not be written to in the same kernel.
         harmonics = dr.ravel(mi.ArrayXf([x for c in coefficients for x in c])) if coefficients else mi.Float()

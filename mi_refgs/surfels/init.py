@@ -1,4 +1,4 @@
-"""Initial surfels: one for each of the points that a scene starts from; `data.hull` finds such points."""
+"""Initial surfels, one per point; `data.hull` finds such points. The order of surfels in memory."""
 
 from __future__ import annotations
 
@@ -13,11 +13,18 @@ from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE, SH_DC, attrib
 from mi_refgs.surfels.primitives import PRIMITIVES
 from mi_refgs.surfels.table import Surfels
 
-# Least distance to the neighbours, as part of the points' extent: keeps the log scale of doubled points
-# finite. 2DGS has 3e-4 scene units, whatever the unit.
 DISTANCE_FLOOR = 1e-4
-# Neighbours whose mean squared distance gives the scale. [3DGS]
+"""Least distance to the neighbours, in extents of the points: keeps the log scale of doubled points finite.
+2DGS has 3e-4 scene units, whatever the unit."""
+
 NEIGHBOURS = 3
+"""Neighbours whose mean squared distance gives the scale. [3DGS]"""
+
+MORTON_BITS = 10
+"""Log₂ of the cells along an axis: they are smaller than the distance of surfels."""
+
+MORTON_OUTLIERS = 0.01
+"""Fraction of points at either end of an axis that are put into the outermost cells."""
 
 
 def from_points(
@@ -33,14 +40,14 @@ def from_points(
     largest: np.ndarray | None = None,  # (N,)
     **initial: float | np.ndarray,
 ) -> Surfels:
-    """One `primitive` per point: size from its 3 nearest neighbours, normal as given or uniform at random.
+    """Surfels at points: scale from the 3 nearest neighbours, normal as given or uniform at random.
 
-    Sizes are at most `largest`. The tangents are turned at random about the normal. `channels` beside the
-    geometry (default: all that are declared); `degree` of spherical harmonics by channel, 0 by default;
-    `initial` activated values by channel, such as `roughness=0.3`, by default those of `surfels.channels`.
-    `colours` fill the DC of radiance_sh (grey 0.5 by default). Rotations are uniform over SO(3), not over
-    positive components as in the released Ref-Gaussian. Raises InputError for wrong shapes, NaN, unknown
-    channels or values out of range.
+    largest: bound of the scales. The tangents are turned at random about the normal. channels: attributes
+    beside the geometry (default: all). degree: of spherical harmonics by attribute, 0 by default. initial:
+    activated values by attribute, such as `roughness=0.3`; defaults are those of `surfels.attributes`.
+    `colours` fill the constant coefficient of radiance_sh (grey 0.5 by default). Rotations are uniform over
+    SO(3), not over positive components as in the released Ref-Gaussian. Raises InputError for wrong shapes,
+    NaN, unknown attributes or values out of range.
     """
     points = _check("points", points, np.shape(points)[:1])
     count = len(points)
@@ -69,8 +76,8 @@ def from_points(
 def neighbour_scale(points: np.ndarray) -> np.ndarray:
     """Root mean squared distance (N,) of each point to its 3 nearest neighbours.
 
-    It is at least DISTANCE_FLOOR of the points' extent, the longest side of their box; where they are all at
-    one place, of its distance from the origin, or of 1.
+    At least DISTANCE_FLOOR times the longest side of the points' box; if they are all at one place, times
+    its distance from the origin, or 1.
     """
     if not len(points):
         return np.zeros(0)
@@ -101,6 +108,23 @@ def quaternions(normals: np.ndarray | None, count: int, rng: np.random.Generator
     tangent[short] = np.cross(n[short], np.eye(3)[np.argmin(np.abs(n[short]), axis=1)])
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     return Rotation.from_matrix(np.stack([tangent, np.cross(n, tangent), n], axis=-1)).as_quat()
+
+
+def morton_order(points: np.ndarray) -> np.ndarray:
+    """Order (N,) of points (N, 3) along a Z-shaped space-filling curve; stable. [Morton 1966]
+
+    What a tile reads is then close together in memory.
+    """
+    if len(points) == 0:
+        return np.zeros(0, dtype=np.int64)
+    low, high = np.quantile(points, (MORTON_OUTLIERS, 1 - MORTON_OUTLIERS), axis=0)
+    edge = max(float((high - low).max()), np.finfo(np.float32).tiny)
+    cell = np.clip((points - low) / edge * 2**MORTON_BITS, 0, 2**MORTON_BITS - 1).astype(np.uint32)
+    cell_index = np.zeros(len(points), dtype=np.uint32)
+    for bit in range(MORTON_BITS):
+        for axis in range(3):
+            cell_index |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(cell_index, kind="stable")
 
 
 def _check(name: str, values: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:

@@ -6,8 +6,8 @@
     albedo_0..2           logit                  metallic, roughness     logit
     ind_dc_*, ind_rest_*  indirect_sh
 
-Everything is raw (before the activation). Spherical harmonics are channel-major: the DC of r, g, b, then
-every other coefficient of r, of g, of b. The table's own column order is 3 coefficient + rgb.
+Everything is raw (before the activation). Spherical harmonics are colour-major: the constant coefficients of
+r, g, b, then all others of r, of g, of b. The column order of a surfel model is 3 coefficient + rgb.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from mi_refgs.surfels.table import Surfels
 def read_ply(path: str | Path) -> Surfels:
     """Read surfels from a binary or ASCII PLY file; unknown properties are ignored.
 
-    Absent groups give absent channels. Raises InputError, naming file, property and remedy, if the file is
-    missing, truncated or no PLY, if part of a group or, as x y z, opacity, scale_0..2 or rot_0..3, a channel
-    of its primitive is missing, or if a value is not finite.
+    Attributes without properties are absent. Raises InputError that names file, property and remedy if the
+    file is missing, truncated or no PLY, if a property of an attribute or an attribute of the primitive is
+    missing, or if a value is not finite.
     """
     path = Path(path)
     try:
@@ -42,15 +42,15 @@ def read_ply(path: str | Path) -> Surfels:
 
     names = vertices.dtype.names or ()
     arrays = {}
-    for name, channel in ATTRIBUTES.items():
-        if channel.harmonics:
-            prefix = channel.properties[0]
+    for name, attribute in ATTRIBUTES.items():
+        if attribute.harmonics:
+            prefix = attribute.properties[0]
             if any(found.startswith(f"{prefix}_") for found in names):
                 degree = _sh_degree(path, names, prefix)
                 arrays[name] = _columns(path, vertices, _sh_properties(prefix, degree))
-        elif there := [i for i, found in enumerate(channel.properties) if found in names]:
-            width = min(width for width in channel.widths if width > max(there))
-            arrays[name] = _columns(path, vertices, channel.properties[:width])
+        elif there := [i for i, found in enumerate(attribute.properties) if found in names]:
+            width = min(width for width in attribute.widths if width > max(there))
+            arrays[name] = _columns(path, vertices, attribute.properties[:width])
     primitive, missing = nearest_primitive(arrays)
     for name in missing:
         _columns(
@@ -88,7 +88,7 @@ def _sh_degree(path: Path, names: tuple[str, ...], prefix: str) -> int:
 
 
 def _sh_properties(prefix: str, degree: int) -> tuple[str, ...]:
-    """Property names in the table's column order (3 coefficient + rgb)."""
+    """Property names in the column order 3 coefficient + rgb."""
     others = (degree + 1) ** 2 - 1
     rest = tuple(f"{prefix}_rest_{rgb * others + k}" for k in range(others) for rgb in range(3))
     return (*(f"{prefix}_dc_{rgb}" for rgb in range(3)), *rest)
@@ -110,10 +110,10 @@ def encode_ply(surfels: Surfels) -> bytes:
     """The bytes of the PLY file; raises InputError if a value is not finite."""
     surfels.validate()
     values: dict[str, np.ndarray] = {}
-    for channel, table in surfels.to_numpy().items():
-        properties = ATTRIBUTES[channel].properties[: table.shape[1]]
-        if ATTRIBUTES[channel].harmonics:
-            properties = _sh_properties(properties[0], surfels.sh_degree(channel))
+    for attribute, table in surfels.to_numpy().items():
+        properties = ATTRIBUTES[attribute].properties[: table.shape[1]]
+        if ATTRIBUTES[attribute].harmonics:
+            properties = _sh_properties(properties[0], surfels.sh_degree(attribute))
         values |= {name: table[:, column] for column, name in enumerate(properties)}
     names = _file_order(values)
     rows = np.zeros(surfels.count, dtype=[(name, "<f4") for name in names])
@@ -136,11 +136,11 @@ def _file_order(values: dict[str, np.ndarray]) -> list[str]:
 
     order = ["x", "y", "z", "nx", "ny", "nz", *numbered("f_dc_"), *numbered("f_rest_"), "opacity"]
     order += [*numbered("scale_"), *numbered("rot_")]
-    others = [channel for channel in ATTRIBUTES.values() if channel.properties[0] not in (*order, "f")]
-    for channel in sorted(others, key=lambda channel: channel.harmonics):
-        prefix = channel.properties[0]
-        if channel.harmonics:
+    others = [attribute for attribute in ATTRIBUTES.values() if attribute.properties[0] not in (*order, "f")]
+    for attribute in sorted(others, key=lambda attribute: attribute.harmonics):
+        prefix = attribute.properties[0]
+        if attribute.harmonics:
             order += [*numbered(f"{prefix}_dc_"), *numbered(f"{prefix}_rest_")]
         else:
-            order += [name for name in channel.properties if name in values]
+            order += [name for name in attribute.properties if name in values]
     return order

@@ -1,9 +1,9 @@
-"""The table of surfels: named raw channels, and what they mean after the activation.
+"""The surfel model: named raw attributes of N surfels, and their activated values.
 
-Letters: N surfels, D columns of a channel, q quaternion (x, y, z, w), t_u t_v n columns of its matrix.
+Letters: N surfels, D columns of an attribute, q quaternion (x, y, z, w), t_u t_v n columns of its matrix.
 A surfel is the point p(u, v) = position + s_u u t_u + s_v v t_v, n = t_u × t_v. [2DGS, Huang 2024, §4.1]
 
-Named rules for degenerate rows (each keeps values and gradients finite for every finite input):
+Named rules for degenerate values (each keeps values and gradients finite for every finite input):
   zero quaternion   every |component| < QUATERNION_FLOOR: the identity rotation, with gradient 0
   scale limit       the log scale is clamped to ±LOG_SCALE_LIMIT, with gradient 0 beyond
   logit limit       logits are clamped to ±LOGIT_LIMIT (sigmoid 0 or 1 in float32), with gradient 0 beyond
@@ -25,16 +25,20 @@ from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.kernels.rows import columns_of
 from mi_refgs.surfels.attributes import ATTRIBUTES, attribute
 from mi_refgs.surfels.primitives import Primitive, primitive_of, require_known_primitive
+from mi_refgs.types import Bool, Float, Point3f, Quaternion4f, TensorXf, Vector3f
 
-# Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is worthless.
 QUATERNION_FLOOR = 1e-12
-# Beyond it the reciprocal is a subnormal number, which processors may flush to zero.
+"""Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is useless."""
+
 QUATERNION_LARGE = 1e37
-# e^±40 = 4e-18 … 2e17 scene units: float32 holds them and their squares. `primitives` bound the size of
-# a surfel relative to its depth, which is what pictures depend on.
+"""Above it the reciprocal is a subnormal number, which processors may flush to zero."""
+
 LOG_SCALE_LIMIT = 40.0
-# 1 / (1 + e^-40) is 1 in float32, and e^40 squared still fits float32 (the derivative needs it).
+"""e^±40 = 4e-18 … 2e17 scene units: float32 contains them and their squares. `primitives` bound the size of
+a surfel relative to its depth, on which images depend."""
+
 LOGIT_LIMIT = 40.0
+"""1 / (1 + e^-40) is 1 in float32, and e^40 squared is finite in float32 (the derivative needs it)."""
 
 
 def sigmoid(x: Any) -> Any:
@@ -49,22 +53,20 @@ def _exp(x: Any) -> Any:
 
 
 class Surfels:
-    """N surfels as named raw channels, each an `mi.TensorXf` of shape (N, D), often a leaf of the AD graph.
+    """N surfels, 3D Gaussians or other primitives: raw attributes by name, which decide the `primitive`.
 
-    Its channels say whether the rows are surfels, 3D Gaussians or another `primitive`. `raw` maps channel
-    names to tensors in the order of ATTRIBUTES; a channel that a scene does not use is absent and costs
-    nothing. Accessors return activated values as Dr.Jit arrays of width N; gradients flow to the raw tensors
-    in both modes.
+    `raw` is in the order of ATTRIBUTES; an attribute that a scene does not use is absent and costs nothing.
+    Accessors return activated values as Dr.Jit arrays of width N; gradients flow to the raw tensors in both
+    modes.
     """
 
-    raw: dict[str, Any]
+    raw: dict[str, TensorXf]  # (N, D) each, often leaves of the AD graph
 
-    def __init__(self, raw: Mapping[str, Any], screened: bool = False) -> None:
+    def __init__(self, raw: Mapping[str, TensorXf], screened: bool = False) -> None:
         """Adopt raw tensors of shape (N, D); raises InputError for unknown names or wrong shapes.
 
-        `screened`: opacities are 0 where the surfel is not `usable`, whatever its channel. To look at every
-        channel takes 3 % of a training step, whose optimiser keeps values finite; values that come from
-        elsewhere need it.
+        `screened`: opacity is 0 where any value of a surfel is not `usable`. Checking all attributes takes
+        3 % of a training step, whose optimiser keeps values finite; values of another origin need it.
         """
         for name in raw:
             attribute(name)
@@ -74,7 +76,7 @@ class Surfels:
 
     @staticmethod
     def from_numpy(arrays: Mapping[str, np.ndarray]) -> Surfels:
-        """Build a table from raw float arrays of shape (N, D), or (N,) for a one-column channel."""
+        """Surfels of raw float arrays of shape (N, D), or (N,) for an attribute of one column."""
         raw = {}
         for name, values in arrays.items():
             table = np.asarray(values, dtype=np.float32)
@@ -83,7 +85,7 @@ class Surfels:
         return Surfels(raw)
 
     def to_numpy(self) -> dict[str, np.ndarray]:
-        """Raw channels as float32 arrays (N, D): copies, since Dr.Jit's own view shares the memory."""
+        """Raw attributes as float32 arrays (N, D): copies, since Dr.Jit's own view shares the memory."""
         return {name: np.array(tensor.numpy()).reshape(tensor.shape) for name, tensor in self.raw.items()}
 
     # ---------------- shape ----------------
@@ -94,7 +96,7 @@ class Surfels:
         return int(next(iter(self.raw.values())).shape[0]) if self.raw else 0
 
     def has(self, name: str) -> bool:
-        """Whether the channel is present."""
+        """Whether an attribute is present."""
         return name in self.raw
 
     def sh_degree(self, name: str = "radiance_sh") -> int:
@@ -115,11 +117,11 @@ class Surfels:
 
     @property
     def primitive(self) -> Primitive:
-        """What its rows are; raises InputError if channels are missing for that."""
+        """The primitive; raises InputError if attributes of it are missing."""
         return primitive_of(self.raw)
 
     def validate(self) -> None:
-        """Raise InputError if a channel of its primitive is missing, a shape is wrong, a value not finite."""
+        """Raise InputError if a shape is wrong, an attribute missing, or a value not finite."""
         self._check_shapes()
         require_known_primitive(self.raw)
         for name, tensor in self.raw.items():
@@ -127,10 +129,10 @@ class Surfels:
             if bad:
                 raise InputError(f"surfels: {name}: {bad} values are NaN or infinite; remove those surfels")
 
-    def usable(self) -> Any:
-        """Which surfels (mi.Bool, width N) have finite raw values, below RAW_LIMIT where unbounded.
+    def usable(self) -> Bool:  # (N,)
+        """Whether each surfel has finite raw values, below RAW_LIMIT where the activation is unbounded.
 
-        In a `screened` table the others cover no pixel and get zero gradient. Detached.
+        If `screened`, the others cover no pixel and get zero gradient. Detached.
         """
         detached, rows = self.detach(), mi.Bool(True)
         for name in self.raw:
@@ -138,10 +140,7 @@ class Surfels:
         return rows
 
     def unusable(self) -> dict[str, np.ndarray]:
-        """The surfels (indices, in order) that `usable` rejects, by the channels with such values.
-
-        Waits for the device.
-        """
+        """Indices of surfels that are not `usable`, by attribute; waits for the device."""
         if not self.count or dr.all(self.usable()):
             return {}
         found = {}
@@ -152,7 +151,7 @@ class Surfels:
         return found
 
     def cleaned(self) -> Surfels:
-        """The same table, under AD, with zeros for all values of the surfels that are not `usable`."""
+        """The same surfels under AD, with zeros for all values of those that are not `usable`."""
         usable, raw = self.usable(), {}
         for name, tensor in self.raw.items():
             row = dr.arange(mi.UInt32, dr.width(tensor.array)) // int(tensor.shape[1])
@@ -162,8 +161,8 @@ class Surfels:
 
     # ---------------- raw columns ----------------
 
-    def columns(self, name: str) -> list[Any]:
-        """Raw columns of a channel as D `mi.Float` of width N, under AD."""
+    def columns(self, name: str) -> list[Float]:
+        """Raw columns (N,) of an attribute, under AD."""
         tensor = self.raw[name]
         rows, width = (int(size) for size in tensor.shape)
         if rows == 0:
@@ -173,10 +172,10 @@ class Surfels:
     # ---------------- activated values ----------------
 
     def value(self, name: str) -> Any:
-        """Activated values of a channel by its declaration.
+        """Activated values of an attribute.
 
-        `mi.Float` for one column, `mi.Color3f` for three, a list of either for harmonics (mi.Color3f a
-        coefficient) and other widths. Geometry has accessors of its own types.
+        mi.Float for one column, mi.Color3f for three, else a list: of mi.Color3f per coefficient of spherical
+        harmonics, of mi.Float for other widths. Geometry has accessors of its own types.
         """
         columns = self.columns(name)
         activate = {"sigmoid": sigmoid, "exp": _exp}.get(attribute(name).activation)
@@ -187,12 +186,12 @@ class Surfels:
             return mi.Color3f(*columns)
         return columns[0] if len(columns) == 1 else columns
 
-    def position(self) -> Any:
-        """World positions (mi.Point3f), scene units."""
+    def position(self) -> Point3f:
+        """World positions, scene units."""
         return mi.Point3f(*self.columns("position"))
 
-    def rotation(self) -> Any:
-        """Unit quaternions (mi.Quaternion4f); a zero quaternion reads as the identity, with gradient 0."""
+    def rotation(self) -> Quaternion4f:
+        """Unit quaternions; a zero quaternion reads as the identity, with gradient 0."""
         if self.count == 0:
             return dr.zeros(mi.Quaternion4f, 0)
         x, y, z, w = self.columns("rotation")
@@ -211,33 +210,17 @@ class Surfels:
         kind = mi.Vector2f if len(columns) == 2 else mi.Vector3f
         return kind(*(_exp(column) for column in columns)) if self.count else dr.zeros(kind, 0)
 
-    def opacity(self) -> Any:
-        """Opacities in [0, 1] (mi.Float); `screened`: 0 with gradient 0 where the surfel is not `usable`."""
+    def opacity(self) -> Float:
+        """Opacities in [0, 1]; if `screened`, 0 with gradient 0 where the surfel is not `usable`."""
         opacity = sigmoid(self.columns("opacity")[0])
         if not self.screened or self.count == 0:
             return opacity
         usable = self.usable()
-        dr.schedule(usable)  # with the footprints; the adjoint would read the whole table again
+        dr.schedule(usable)  # with the footprints; the adjoint would read all attributes again
         return dr.select(usable, opacity, 0)
 
-    def albedo(self) -> Any:
-        """Albedo in [0, 1] (mi.Color3f), linear."""
-        return self.value("albedo")
-
-    def metallic(self) -> Any:
-        """Metallic weight in [0, 1] (mi.Float)."""
-        return self.value("metallic")
-
-    def roughness(self) -> Any:
-        """Perceptual roughness r in [0, 1] (mi.Float); GGX α = r²."""
-        return self.value("roughness")
-
-    def radiance_sh(self) -> list[Any]:
-        """Coefficients (mi.Color3f) of the radiance channel; the colour is max(0, 0.5 + Σ c_k Y_k)."""
-        return self.value("radiance_sh")
-
-    def frame(self) -> tuple[Any, Any, Any]:
-        """World tangents and normal (t_u, t_v, n), the columns of the rotation matrix (three mi.Vector3f).
+    def frame(self) -> tuple[Vector3f, Vector3f, Vector3f]:
+        """World tangents and normal (t_u, t_v, n), the columns of the rotation matrix.
 
         n is not yet turned towards a camera.
         """
@@ -246,8 +229,8 @@ class Surfels:
         q = self.rotation()
         x, y, z, w = q.x, q.y, q.z, q.w
 
-        # Squares of all four on the diagonal, no 1: what rounding does to the norm of q then changes lengths,
-        # by 1e-7, and no direction, on which the far end of a needle depends.
+        # Squares of all four on the diagonal, no 1: rounding of |q| then changes lengths, by 1e-7, and no
+        # direction, on which the far end of a needle depends.
         def entry(a: Any, b: Any, c: Any, d: Any) -> Any:
             return dr.fma(a, b, c * d)
 
@@ -260,10 +243,10 @@ class Surfels:
         n = mi.Vector3f(2 * entry(x, z, y, w), 2 * entry(y, z, -x, w), entry(w, w, z, z) - entry(x, x, y, y))
         return t_u, t_v, n
 
-    # ---------------- rows ----------------
+    # ---------------- copies ----------------
 
     def gather(self, parent: Any) -> Surfels:
-        """Copy rows: row i of the result is row parent[i] (mi.UInt32), detached from the AD graph."""
+        """Copies of surfels, detached: surfel i of the result is surfel parent[i] (mi.UInt32)."""
         return Surfels({name: gather_rows(tensor, parent) for name, tensor in self.raw.items()})
 
     def detach(self) -> Surfels:

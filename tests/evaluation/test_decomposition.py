@@ -352,7 +352,7 @@ def test_albedo_comes_out_of_the_fitted_radiance(data: Path, with_mesh: bool) ->
     assert set(found.surfels.raw) == set(raw) - {"radiance_sh"}
     assert found.shading.diffuse == "irradiance" and found.light is light
     assert (found.shading.ambient_rays > 0) == with_mesh
-    albedo = np.array(found.surfels.albedo()).T
+    albedo = np.array(found.surfels.value("albedo")).T
     far = np.abs(np.array(surfels.position()).T[:, 0]) > 0.45  # from the other ball, which shades and shines
     np.testing.assert_allclose(albedo[clay & far], truth[clay & far], atol=0.04)
     np.testing.assert_allclose(albedo[~clay], 0.5, atol=0.01)  # a metal's is the channel

@@ -88,7 +88,7 @@ def test_vertices_keep_their_normals_and_materials_at_any_scale(tmp_path: Path, 
     rows = np.array(made.surface(surfels).rows).reshape(count, 8)
     sideways = np.abs(ball.vertices[:, 2]) < 0.4
     np.testing.assert_allclose(rows[sideways, 5:], ball.vertices[sideways], atol=0.03)
-    np.testing.assert_allclose(rows[:, 4], surfels.roughness().numpy(), atol=0.04)
+    np.testing.assert_allclose(rows[:, 4], surfels.value("roughness").numpy(), atol=0.04)
 
 
 @pytest.mark.parametrize("noted", [True, False])

@@ -165,7 +165,7 @@ class Complete(Reflectance):
         return ("albedo",)
 
     def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
-        return {"albedo": surfels.albedo()}
+        return {"albedo": surfels.value("albedo")}
 
     def shade(self, points: ShadingPoints, light: Any, options: ShadingOptions) -> RadianceTerms:
         return RadianceTerms(points.albedo)

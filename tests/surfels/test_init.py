@@ -10,7 +10,7 @@ from scipy.stats import kstest
 
 from mi_refgs.errors import InputError
 from mi_refgs.surfels import init
-from mi_refgs.surfels.attributes import Attribute, sigmoid
+from mi_refgs.surfels.attributes import SH_DC, Attribute, sigmoid
 
 
 def test_from_points(rng: np.random.Generator) -> None:
@@ -25,10 +25,11 @@ def test_from_points(rng: np.random.Generator) -> None:
     )
     squared = np.sort(np.sum((points[:, None] - points[None]) ** 2, axis=-1), axis=1)[:, 1:4]
     np.testing.assert_allclose(np.array(surfels.scale())[0], np.sqrt(squared.mean(axis=1)), rtol=1e-5)
-    np.testing.assert_allclose(np.array(surfels.radiance_sh()[0]).T * 0.28209479 + 0.5, colours, atol=1e-6)
+    constant = np.array(surfels.value("radiance_sh")[0]).T
+    np.testing.assert_allclose(constant * SH_DC + 0.5, colours, atol=1e-6)
     np.testing.assert_allclose(np.array(surfels.opacity()), 0.2, rtol=1e-6)
-    np.testing.assert_allclose(np.array(surfels.roughness()), 0.3, rtol=1e-6)
-    assert np.abs(np.array(surfels.albedo()) - 0.5).max() <= 0.0251
+    np.testing.assert_allclose(np.array(surfels.value("roughness")), 0.3, rtol=1e-6)
+    assert np.abs(np.array(surfels.value("albedo")) - 0.5).max() <= 0.0251
     assert np.all(surfels.to_numpy()["indirect_sh"] == 0) and surfels.sh_degree() == 1
 
 
@@ -102,3 +103,28 @@ def test_harmonics_start_with_a_constant_part(rng: np.random.Generator) -> None:
     raw = surfels.to_numpy()["indirect_sh"]
     np.testing.assert_allclose(raw[:, :3] * 0.28209479, 0.4, rtol=1e-6)
     assert np.all(raw[:, 3:] == 0)
+
+
+# ---------------- order in memory ----------------
+
+
+def steps(points: np.ndarray) -> float:
+    """Mean distance from each point to the next."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).mean())
+
+
+@pytest.mark.parametrize("outlier", [False, True])
+def test_morton_order_puts_neighbours_together(rng: np.random.Generator, outlier: bool) -> None:
+    """Consecutive points of 4096 are about a cell apart, 1/16 of the edge."""
+    points = rng.uniform(-1, 3, (4096, 3)).astype(np.float32)
+    if outlier:
+        points[7] = 1e6
+    order = init.morton_order(points)
+    assert sorted(order) == list(range(4096))
+    kept = points[order][:-1] if outlier else points[order]
+    assert steps(kept) < 0.15 * 4 < 0.4 * steps(rng.uniform(-1, 3, (4096, 3)))
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.ones((1, 3)), np.ones((5, 3))])
+def test_morton_order_keeps_points_without_extent(points: np.ndarray) -> None:
+    np.testing.assert_array_equal(init.morton_order(points), np.arange(len(points)))

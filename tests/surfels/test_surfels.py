@@ -34,14 +34,14 @@ def test_activations(count: int, rng: np.random.Generator) -> None:
 
     np.testing.assert_array_equal(np.array(surfels.position()).T, raw["position"])
     np.testing.assert_allclose(np.array(surfels.scale()).T, np.exp(raw["scale"]), rtol=1e-6)
-    np.testing.assert_allclose(np.array(surfels.albedo()).T, sigmoid("albedo"), rtol=1e-6)
+    np.testing.assert_allclose(np.array(surfels.value("albedo")).T, sigmoid("albedo"), rtol=1e-6)
     for name in ("opacity", "metallic", "roughness"):
         np.testing.assert_allclose(np.array(surfels.value(name)), sigmoid(name)[:, 0], rtol=1e-6)
     axes = Rotation.from_quat(raw["rotation"]).as_matrix()
     for column, axis in enumerate(surfels.frame()):
         np.testing.assert_allclose(np.array(axis).T, axes[:, :, column], atol=1e-6)
     assert surfels.sh_degree("radiance_sh") == surfels.sh_degree("indirect_sh") == 2
-    coefficient = surfels.radiance_sh()[4]
+    coefficient = surfels.value("radiance_sh")[4]
     np.testing.assert_array_equal(np.array(coefficient).T, raw["radiance_sh"][:, 12:15])
     for name, values in surfels.to_numpy().items():
         np.testing.assert_array_equal(values, raw[name])
@@ -82,9 +82,10 @@ def test_degenerate_rows_stay_finite() -> None:
 
 def everything(surfels: Surfels) -> object:
     """Every accessor of every channel, with a weight of its own per entry."""
-    arrays = [*surfels.position(), *surfels.scale(), surfels.opacity(), *surfels.albedo(), surfels.metallic()]
-    arrays += [surfels.roughness(), *(entry for axis in surfels.frame() for entry in axis)]
-    arrays += [*surfels.value("tint"), *surfels.value("normal_offset")]
+    arrays = [*surfels.position(), *surfels.scale(), surfels.opacity()]
+    arrays += [surfels.value("metallic"), surfels.value("roughness")]
+    arrays += [entry for axis in surfels.frame() for entry in axis]
+    arrays += [entry for name in ("albedo", "tint", "normal_offset") for entry in surfels.value(name)]
     arrays += [
         part for name in ("radiance_sh", "indirect_sh") for colour in surfels.value(name) for part in colour
     ]
@@ -159,7 +160,7 @@ def test_empty_table(rng: np.random.Generator) -> None:
             surfels.opacity(),
             surfels.scale(),
             *surfels.frame(),
-            *surfels.radiance_sh(),
+            *surfels.value("radiance_sh"),
         ):
             assert dr.width(value) == 0
         assert surfels.gather(mi.UInt32()).count == 0
