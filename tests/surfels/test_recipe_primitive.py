@@ -1,6 +1,6 @@
-"""CONTRIBUTING's recipe "add a primitive", followed: balls with one radius, from points to a fit and a file.
+"""CONTRIBUTING's recipe "a primitive", step by step: balls with one radius, from points to a fit and a file.
 
-One channel, one class and two `register`s are all that is added.
+One attribute, one class, and `register` for both.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The screen footprint of a 3D Gaussian by EWA: the affine approximation of its projection, and a low-pass.
 
 A Gaussian has centre p (camera frame), unit axes t_0 t_1 t_2 and standard deviations s_k. With the slope
-q = (p_x, p_y)/p_z, no further from the picture than GAUSSIAN_SLOPE_MARGIN, one standard deviation along t_k
+q = (p_x, p_y)/p_z, clamped to GAUSSIAN_SLOPE_MARGIN around the image, one standard deviation along t_k
 moves the projected point by f v_k pixels, and the screen covariance is the sum of their outer products:
 
     v_k = (s_k / p_z) (t_k.xy - q t_k.z)          Σ' = Σ_k (f v_k) (f v_k)ᵀ + λ I      [Zwicker 2001, eq. 31;
@@ -36,20 +36,21 @@ from mi_refgs.surfels.primitives.primitive import (
     rectangle,
     rotation_axes,
 )
+from mi_refgs.types import Bool, Float, Point2f, Vector2f, Vector3f
 
 
 @dataclass(frozen=True)
 class GaussianSample:
     """A Gaussian's footprint at one pixel, with the intermediate values that its derivatives reuse."""
 
-    alpha: Any  # after the clamp
-    z: Any  # depth of the centre
-    valid: Any  # contributes: α ≥ ALPHA_MIN
-    gaussian: Any  # exp(-ρ/2)
-    clamped: Any  # α_max was reached: no derivative
-    delta: Any  # pixel offset from the centre
-    u: Any  # a·δ
-    v: Any  # b δ_y
+    alpha: Float  # after the clamp
+    z: Float  # depth of the centre
+    valid: Bool  # contributes: α ≥ ALPHA_MIN
+    gaussian: Float  # exp(-ρ/2)
+    clamped: Bool  # α_max was reached: no derivative
+    delta: Vector2f  # pixel offset from the centre
+    u: Float  # a·δ
+    v: Float  # b δ_y
 
 
 class Gaussian(Primitive):
@@ -60,8 +61,8 @@ class Gaussian(Primitive):
     columns = 7  # a.x a.y b p.z centre.x centre.y opacity
     sizes = ("scale",)
 
-    def project(self, surfels: Any, camera: Any, screen_offset: Any = None) -> Footprints:
-        """Rows, and rectangles that hold every pixel with α ≥ ALPHA_MIN.
+    def project(self, surfels: Any, camera: Any, screen_offset: Point2f | None = None) -> Footprints:
+        """Rows, and rectangles that contain every pixel with α ≥ ALPHA_MIN.
 
         Culled: centre not beyond the near plane, opacity below ALPHA_MIN, non-finite.
         """
@@ -111,8 +112,8 @@ class Gaussian(Primitive):
             )
             return Footprints(columns, *rectangle(centre, -half, half, visible, camera), self)
 
-    def evaluate(self, row: Any, pixel: Any, near: Any) -> GaussianSample:
-        """The two linear forms of the pixel's offset; the centre is beyond the near plane."""
+    def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> GaussianSample:
+        """Evaluate ρ as the sum of two squares; culling has put the centre beyond the near plane."""
         delta = mi.Vector2f(pixel.x - row[4], pixel.y - row[5])
         u, v = dot2(row[0], row[1], delta), row[2] * delta.y
         gaussian = dr.exp(-0.5 * dr.fma(u, u, v * v))
@@ -125,7 +126,9 @@ class Gaussian(Primitive):
         """See `Primitive.adjoint`."""
         return GaussianAdjoint()
 
-    def evaluate_forward(self, row: Any, sample: GaussianSample, drow: Any) -> tuple[Any, Any]:
+    def evaluate_forward(
+        self, row: list[Float], sample: GaussianSample, drow: list[Float]
+    ) -> tuple[Float, Float]:
         """Apply the chain rule, column by column."""
         delta, ddelta = sample.delta, mi.Vector2f(-drow[4], -drow[5])
         du = dot2(drow[0], drow[1], delta) + dot2(row[0], row[1], ddelta)
@@ -133,14 +136,14 @@ class Gaussian(Primitive):
         dalpha = drow[6] * sample.gaussian - sample.alpha * dr.fma(sample.u, du, sample.v * dv)
         return dr.select(sample.clamped, 0, dalpha), drow[3]
 
-    def normal(self, surfels: Any) -> Any:
+    def normal(self, surfels: Any) -> Vector3f:
         """The shortest axis, the third of equal ones; which one it is has no derivative. [3DGS-DR, §3.2]"""
         first, second, third = surfels.frame()
         s = dr.detach(surfels.scale())
         shorter, least = s.x < s.y, dr.minimum(s.x, s.y)
         return dr.select(s.z <= least, third, dr.select(shorter, first, second))
 
-    def overlaps(self, row: list[Any], low: Any, high: Any) -> Any:
+    def overlaps(self, row: list[Float], low: Point2f, high: Point2f) -> Bool:
         """Whether the least ρ of the rectangle, on an edge that faces the centre, is within the contour."""
         a_x, a_y, b, _, x, y, opacity = row[: self.columns]
         r2 = cutoff_radius_squared(opacity) * 1.0005 + 1e-4  # rounding of ρ
@@ -156,13 +159,12 @@ class Gaussian(Primitive):
 
         return inside(near_x, on_x) | inside(on_y, near_y)
 
-    def depth_near(self, row: list[Any], pixel: Any) -> Any:
-        """The centre's depth, wherever the tile is: a Gaussian has no plane, its sample lies there, and files
-        fitted elsewhere were fitted in this order. [3DGS, §6]"""
+    def depth_near(self, row: list[Float], pixel: Point2f) -> Float:
+        """The centre's depth: samples lie there, and other programs fit in this order. [3DGS, §6]"""
         return row[3]
 
     def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
-        """A ball as wide as the neighbours are far, whose third axis is the normal. [3DGS, §5.1]"""
+        """A ball with the neighbours' distance as standard deviation; third axis: the normal. [3DGS, §5.1]"""
         return {"rotation": rotation, "scale": np.repeat(np.log(spacing)[:, None], 3, axis=1)}
 
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +173,7 @@ class Gaussian(Primitive):
 
 
 def _near_picture(slope: Any, camera: Any) -> Any:
-    """Slopes brought to within GAUSSIAN_SLOPE_MARGIN of the picture, with no gradient across the border.
+    """Slopes clamped to GAUSSIAN_SLOPE_MARGIN around the image, without gradient beyond.
 
     A crop window has the borders of its film, or Gaussians would change with the window.
     """
@@ -194,8 +196,8 @@ class GaussianAdjoint:
         self.u, self.v = [mi.Float(0)] * 3, [mi.Float(0)] * 2
         self.depth, self.opacity = mi.Float(0), mi.Float(0)
 
-    def add(self, sample: GaussianSample, δalpha: Any, δz: Any) -> None:
-        """Take in a pixel, by the adjoints of its α and z."""
+    def add(self, sample: GaussianSample, δalpha: Float, δz: Float) -> None:
+        """See `Adjoint.add`."""
         delta = sample.delta
         δalpha = dr.select(sample.clamped, 0, δalpha)
         self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)
@@ -205,7 +207,7 @@ class GaussianAdjoint:
         self.u = [self.u[0] + δu, dr.fma(δu, delta.x, self.u[1]), dr.fma(δu, delta.y, self.u[2])]
         self.v = [self.v[0] + δv, dr.fma(δv, delta.y, self.v[1])]
 
-    def columns(self, row: Any) -> list[Any]:
+    def columns(self, row: list[Float]) -> list[Float]:
         """Adjoint of the seven columns."""
         (u, *δa), (v, δb) = self.u, self.v
         return [*δa, δb, self.depth, -u * row[0], -dr.fma(u, row[1], v * row[2]), self.opacity]

@@ -1,8 +1,7 @@
-"""What is splatted, behind one interface: a primitive has channels of its own and a footprint on the screen.
+"""Interface and registry of primitives: what is splatted, with attributes and a footprint of its own.
 
-A table says itself which primitive it is of, by its channels and their widths: a `scale` of two columns makes
-surfels, one of three makes 3D Gaussians. A new primitive is one file with a subclass of `Primitive`, and its
-`register`.
+The attributes of a surfel model and their widths decide its primitive: surfels have a `scale` of two columns,
+3D Gaussians one of three. A new primitive is one file with a subclass of `Primitive`, and its `register`.
 """
 
 from __future__ import annotations
@@ -19,16 +18,16 @@ import numpy as np
 from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.errors import InputError
 from mi_refgs.registry import Registry
-from mi_refgs.types import Float, Vector2f
+from mi_refgs.types import Bool, Float, Int32, Point2f, Vector2f, Vector3f
 
 
 @dataclass(frozen=True)
 class Footprints:
-    """N footprints: differentiable columns, and the detached pixel rectangles outside which they vanish."""
+    """N footprints: differentiable columns, and the detached pixel rectangles outside which they are 0."""
 
-    columns: list[Any]  # primitive.columns × mi.Float (N,)
-    first: tuple[Any, Any]  # mi.Int32 (N,): first covered pixel column and row
-    last: tuple[Any, Any]  # mi.Int32 (N,): last covered column and row, below `first` if there is none
+    columns: list[Float]  # primitive.columns × (N,)
+    first: tuple[Int32, Int32]  # (N,): first covered pixel column and row
+    last: tuple[Int32, Int32]  # (N,): last covered column and row, below `first` if there is none
     primitive: Primitive
 
 
@@ -36,101 +35,96 @@ class FootprintSample(Protocol):
     """One footprint at one pixel; a primitive adds the intermediate values that its derivatives reuse."""
 
     @property
-    def alpha(self) -> Any:
-        """Opacity there (mi.Float), at most ALPHA_MAX."""
+    def alpha(self) -> Float:
+        """Opacity, at most ALPHA_MAX."""
 
     @property
-    def z(self) -> Any:
-        """Camera-z depth of the sample (mi.Float), scene units."""
+    def z(self) -> Float:
+        """Camera-z depth, scene units."""
 
     @property
-    def valid(self) -> Any:
-        """Whether it contributes (mi.Bool): α ≥ ALPHA_MIN, and beyond the near plane."""
+    def valid(self) -> Bool:
+        """Whether it contributes: α ≥ ALPHA_MIN, and beyond the near plane."""
 
 
 class Adjoint(Protocol):
-    """Adjoint of `Primitive.evaluate`, summed over the pixels of one lane before it becomes the columns'."""
+    """Adjoint of `Primitive.evaluate`: sums over the pixels of one lane, from which `columns` follow."""
 
-    def add(self, sample: Any, δalpha: Any, δz: Any) -> None:
-        """Take in a pixel, by the adjoints of its α and z."""
+    def add(self, sample: Any, δalpha: Float, δz: Float) -> None:
+        """Add a pixel, for adjoints of its α and z."""
 
-    def columns(self, row: Any) -> list[Any]:
+    def columns(self, row: list[Float]) -> list[Float]:
         """Adjoint of the row's columns."""
 
 
 class Primitive(ABC):
-    """One kind of thing to splat. Rows are its columns of one footprint, then features.
+    """A primitive to splat. A row has its columns of one footprint, then features.
 
     The argument `surfels` is a `surfels.table.Surfels`, `camera` a `splat.camera.Camera`, and `raw` maps
-    channels to NumPy arrays (N, D) of raw values.
+    attributes to NumPy arrays (N, D) of raw values.
     """
 
-    name: str
-    """What methods call it."""
-    widths: Mapping[str, int]
-    """Its channels, without which nothing can be splatted, and their raw columns; `position` and `opacity`
-    are among them."""
-    columns: int
-    """Columns of a row."""
-    sizes: tuple[str, ...]
-    """Its channels that are logarithms of standard deviations."""
+    name: str  # in method files
+    widths: Mapping[str, int]  # attributes that it requires, and their columns; with position and opacity
+    columns: int  # of a row
+    sizes: tuple[str, ...]  # attributes that are logarithms of standard deviations
 
     # ---------------- footprints, under AD ----------------
 
     @abstractmethod
     def project(self, surfels: Any, camera: Any, screen_offset: Any = None) -> Footprints:
-        """Footprints of all rows of a table in a camera.
+        """Footprints of all surfels in a camera.
 
         `screen_offset` (mi.Point2f (N,), pixels) is added to the centres: of zeros, it receives the gradient
-        of a screen translation, which densification reads. The rectangles have no derivative. Culled rows
-        cover no pixel, and get zero gradient.
+        of a screen translation, which densification reads. The rectangles have no derivative. Culled surfels
+        cover no pixel and get zero gradient.
         """
 
     @abstractmethod
-    def evaluate(self, row: Any, pixel: Any, near: Any) -> FootprintSample:
-        """Evaluate rows at pixel centres (mi.Point2f)."""
+    def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> FootprintSample:
+        """Evaluate rows at pixel centres."""
 
     @abstractmethod
     def adjoint(self) -> Adjoint:
         """An empty adjoint of `evaluate`."""
 
     @abstractmethod
-    def evaluate_forward(self, row: Any, sample: Any, drow: Any) -> tuple[Any, Any]:
-        """Tangent of `evaluate`: tangents of the columns to those of α and z."""
+    def evaluate_forward(self, row: list[Float], sample: Any, drow: list[Float]) -> tuple[Float, Float]:
+        """Tangents of α and z for tangents of the columns."""
 
     @abstractmethod
-    def normal(self, surfels: Any) -> Any:
-        """Unit normals (mi.Vector3f, world), not yet turned towards a camera."""
+    def normal(self, surfels: Any) -> Vector3f:
+        """Unit normals in the world, not yet turned towards a camera."""
 
     # ---------------- tile lists, without derivatives ----------------
 
     @abstractmethod
-    def overlaps(self, row: list[Any], low: Any, high: Any) -> Any:
-        """Whether footprints may reach ALPHA_MIN inside a rectangle (mi.Point2f `low` to `high`, pixels)."""
+    def overlaps(self, row: list[Float], low: Point2f, high: Point2f) -> Bool:
+        """Whether footprints may reach ALPHA_MIN inside a rectangle from `low` to `high`, pixels."""
 
     @abstractmethod
-    def depth_near(self, row: list[Any], pixel: Any) -> Any:
-        """Depth of rows near given points (mi.Point2f, pixels), the centres of tiles: the sort key."""
+    def depth_near(self, row: list[Float], pixel: Point2f) -> Float:
+        """Depth near given points, the centres of tiles: the sort key."""
 
-    # ---------------- edits of the table, NumPy ----------------
+    # ---------------- edits of the surfel model, NumPy ----------------
 
     @abstractmethod
     def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
-        """Raw channels beside position and opacity of one thing a point.
+        """Raw attributes beside position and opacity, one primitive per point.
 
-        `spacing` (N,) is the distance of neighbours, `rotation` (N, 4) a unit quaternion (x, y, z, w) whose
-        third axis is the normal of the surface there.
+        spacing: (N,) distance of neighbours. rotation: (N, 4) unit quaternion (x, y, z, w) whose third axis
+        is the surface normal.
         """
 
     @abstractmethod
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Orthonormal world axes (N, A, 3) along which its Gaussian extends, and standard deviations (N, A).
+        """Orthonormal world axes (N, A, 3) of its Gaussian, and standard deviations (N, A) along them.
 
-        The children of what is split lie at normal deviates of these.
+        Densification draws the positions of a split primitive's children from this Gaussian.
         """
 
     def resize(self, raw: dict[str, np.ndarray], rows: Any, factor: float) -> None:
-        """Multiply the standard deviations of some rows by a factor, in place."""
+        """Multiply the standard deviations of some primitives by a factor, in place."""
         for name in self.sizes:
             raw[name][rows] += np.float32(np.log(factor))
 
@@ -201,11 +195,11 @@ def dot2(x: Float, y: Float, delta: Vector2f) -> Float:
 
 
 def rectangle(
-    centre: Any, low: Any, high: Any, visible: Any, camera: Any
-) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
-    """First and last pixel column and row (mi.Int32) from `low` to `high` (mi.Vector2f, pixels) of a centre.
+    centre: Vector2f, low: Vector2f, high: Vector2f, visible: Bool, camera: Any
+) -> tuple[tuple[Int32, Int32], tuple[Int32, Int32]]:
+    """First and last pixel column and row of centre + `low` to centre + `high`, pixels.
 
-    The last is below the first where nothing is covered, as where it is not `visible`. `camera` is a
+    The last is below the first where nothing is covered or `visible` is false. `camera` is a
     `splat.camera.Camera`.
     """
     first, last = [], []
@@ -219,7 +213,7 @@ def rectangle(
 
 
 def rotation_axes(rotation: np.ndarray) -> np.ndarray:
-    """Images (N, 3, 3) of the three axes, one a row, under quaternions (N, 4) (x, y, z, w) of any norm."""
+    """Rotated axes (N, 3, 3), one per row, of quaternions (N, 4) (x, y, z, w) of any norm."""
     identity = np.array([0, 0, 0, 1], rotation.dtype)
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
     x, y, z, w = np.where(length > 0, rotation / np.where(length > 0, length, 1), identity).T

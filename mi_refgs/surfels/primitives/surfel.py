@@ -47,22 +47,23 @@ from mi_refgs.surfels.primitives.primitive import (
     rectangle,
     rotation_axes,
 )
+from mi_refgs.types import Bool, Float, Point2f, Vector2f, Vector3f
 
 
 @dataclass(frozen=True)
 class SurfelSample:
     """A surfel's footprint at one pixel, with the intermediate values that its derivatives reuse."""
 
-    alpha: Any  # after the clamp
-    z: Any  # depth of the sample
-    ratio: Any  # of that to the depth of the centre
-    valid: Any  # contributes: α ≥ ALPHA_MIN and beyond the near plane
-    gaussian: Any  # exp(-ρ/2)
-    clamped: Any  # α_max was reached: no derivative
-    low_pass: Any  # the 2D filter decides
-    delta: Any  # pixel offset from the centre
-    u: Any
-    v: Any
+    alpha: Float  # after the clamp
+    z: Float  # depth of the sample
+    ratio: Float  # of that to the depth of the centre
+    valid: Bool  # contributes: α ≥ ALPHA_MIN and beyond the near plane
+    gaussian: Float  # exp(-ρ/2)
+    clamped: Bool  # α_max was reached: no derivative
+    low_pass: Bool  # the 2D filter decides
+    delta: Vector2f  # pixel offset from the centre
+    u: Float
+    v: Float
 
 
 class Surfel(Primitive):
@@ -73,8 +74,8 @@ class Surfel(Primitive):
     columns = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
     sizes = ("scale",)
 
-    def project(self, surfels: Any, camera: Any, screen_offset: Any = None) -> Footprints:
-        """Rows, and rectangles that hold every pixel with α ≥ ALPHA_MIN.
+    def project(self, surfels: Any, camera: Any, screen_offset: Point2f | None = None) -> Footprints:
+        """Rows, and rectangles that contain every pixel with α ≥ ALPHA_MIN.
 
         Culled: centre not beyond the near plane, edge-on by EDGE_ON_COSINE, opacity below ALPHA_MIN,
         non-finite.
@@ -118,8 +119,8 @@ class Surfel(Primitive):
             )
             return Footprints(columns, *rectangle(centre, low, high, visible, camera), self)
 
-    def evaluate(self, row: Any, pixel: Any, near: Any) -> SurfelSample:
-        """The row meets the ray through each pixel; see the comment above."""
+    def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> SurfelSample:
+        """Intersect the ray through each pixel with the surfel's plane; formulas: the module's docstring."""
         delta = mi.Vector2f(pixel.x - row[7], pixel.y - row[8])
         w = dr.fma(row[4], delta.x, dr.fma(row[5], delta.y, 1))
         in_front = w > 0
@@ -142,7 +143,9 @@ class Surfel(Primitive):
         """See `Primitive.adjoint`."""
         return FootprintAdjoint()
 
-    def evaluate_forward(self, row: Any, sample: SurfelSample, drow: Any) -> tuple[Any, Any]:
+    def evaluate_forward(
+        self, row: list[Float], sample: SurfelSample, drow: list[Float]
+    ) -> tuple[Float, Float]:
         """Apply the chain rule, column by column."""
         plane = ~sample.low_pass
         delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
@@ -159,11 +162,11 @@ class Surfel(Primitive):
         dalpha = drow[9] * sample.gaussian - 0.5 * sample.alpha * drho
         return dr.select(sample.clamped, 0, dalpha), dz
 
-    def normal(self, surfels: Any) -> Any:
+    def normal(self, surfels: Any) -> Vector3f:
         """The third axis."""
         return surfels.frame()[2]
 
-    def overlaps(self, row: list[Any], low: Any, high: Any) -> Any:
+    def overlaps(self, row: list[Float], low: Point2f, high: Point2f) -> Bool:
         """With r as in `_extent`, u² + v² ≤ r² is q ≤ 0 for q(δ) = (a·δ)² + (b·δ)² - r² (1 + c·δ)².
 
         The least q of a rectangle lies at the minimum of q itself or on an edge that faces it, where q is a
@@ -197,13 +200,13 @@ class Surfel(Primitive):
         by_screen = LOW_PASS_INV_VARIANCE * dr.fma(beside_x, beside_x, beside_y * beside_y) <= r2
         return ~ellipse | by_plane | by_screen
 
-    def depth_near(self, row: list[Any], pixel: Any) -> Any:
+    def depth_near(self, row: list[Float], pixel: Point2f) -> Float:
         """Depth of the surfel's plane there, up to SORT_REACH standard deviations from its centre.
 
         Beyond (in the affine approximation) the plane says nothing about the surfel. Where neighbours on a
-        curved surface tilt away from each other, the one that is looked at is the nearest; in the order of
-        their centres, those on the camera's side of it would always come first, and the picture would depend
-        on the view as no surface does. [cf. StopThePop, Radl et al. 2024, §4: depth at the tile]
+        curved surface tilt away from each other, the visible one is the nearest; sorted by their centres,
+        those on the camera's side would always come first, and the image would depend on the view as no
+        surface does. [cf. StopThePop, Radl et al. 2024, §4: depth at the tile]
         """
         a_x, a_y, b_x, b_y, c_x, c_y, z, x, y = row[:9]
         delta = mi.Vector2f(pixel.x - x, pixel.y - y)
@@ -212,7 +215,7 @@ class Surfel(Primitive):
         return z / dr.maximum(dr.fma(inside, dot2(c_x, c_y, delta), 1), 1 / SORT_DEPTH_RANGE)
 
     def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
-        """A disc as wide as the neighbours are far, in the tangent plane."""
+        """A disc in the tangent plane, with the neighbours' distance as standard deviation."""
         return {"rotation": rotation, "scale": np.repeat(np.log(spacing)[:, None], 2, axis=1)}
 
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -221,10 +224,9 @@ class Surfel(Primitive):
 
 
 class FootprintAdjoint:
-    """Adjoint of `evaluate`, summed over the pixels of one lane before it becomes that of the columns.
+    """Adjoint of `Surfel.evaluate`: sums over pixels of the adjoints of a·δ, b·δ, c·δ, times 1, δ.x and δ.y.
 
-    The sums are of adjoints times 1, δ.x and δ.y, for the three linear forms a·δ, b·δ, c·δ: all that the
-    pixels of a footprint have in common, the row itself, is applied once at the end.
+    The row, which the pixels of a footprint have in common, is applied once at the end.
     """
 
     def __init__(self) -> None:
@@ -232,8 +234,8 @@ class FootprintAdjoint:
         self.depth, self.opacity = mi.Float(0), mi.Float(0)
         self.screen = [mi.Float(0)] * 2
 
-    def add(self, sample: SurfelSample, δalpha: Any, δz: Any) -> None:
-        """Take in a pixel, by the adjoints of its α and z."""
+    def add(self, sample: SurfelSample, δalpha: Float, δz: Float) -> None:
+        """See `Adjoint.add`."""
         plane = ~sample.low_pass
         delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
         # α = o gaussian, unless clamped;  gaussian = exp(-ρ/2)
@@ -252,7 +254,7 @@ class FootprintAdjoint:
         self.b = _moments(self.b, δb, delta)
         self.c = _moments(self.c, dr.select(plane, δw, 0), delta)
 
-    def columns(self, row: Any) -> list[Any]:
+    def columns(self, row: list[Float]) -> list[Float]:
         """Adjoint of the ten geometry columns."""
         a, b, c = self.a, self.b, self.c
         # δ = pixel - centre enters a·δ, b·δ, c·δ and ρ
@@ -267,13 +269,15 @@ def _moments(total: list[Any], x: Any, delta: Any) -> list[Any]:
     return [total[0] + x, dr.fma(x, delta.x, total[1]), dr.fma(x, delta.y, total[2])]
 
 
-def _extent(depth_u: Any, depth_v: Any, along_u: Any, along_v: Any, opacity: Any) -> tuple[Any, Any]:
-    """Rectangle around the centre, in pixels, that holds every pixel with α ≥ ALPHA_MIN.
+def _extent(
+    depth_u: Float, depth_v: Float, along_u: Vector2f, along_v: Vector2f, opacity: Float
+) -> tuple[Vector2f, Vector2f]:
+    """Rectangle around the centre, in pixels, that contains every pixel with α ≥ ALPHA_MIN.
 
     The contour u² + v² = r², r² = 2 ln(o/α_min), projects to a conic; its bounds per axis follow from the
     tangent lines of the dual conic [2DGS, appendix A, with r for 3 and the origin at the projected centre]. A
-    contour that reaches behind the camera has no bounds: such a surfel is listed everywhere. For σ along t_u
-    and t_v: depth (mi.Float) in depths of the centre, and the way across the screen (mi.Vector2f) in pixels.
+    contour that reaches behind the camera has no bounds: such a surfel is listed everywhere. The arguments
+    are of one standard deviation along t_u and t_v: depth in depths of the centre, and offset in pixels.
     """
     r2 = cutoff_radius_squared(opacity)
     denominator = r2 * (dr.square(depth_u) + dr.square(depth_v)) - 1
