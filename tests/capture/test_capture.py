@@ -1,5 +1,4 @@
-"""From photographs to a data set: cameras of a scene that the tests photograph, and the sentences of those
-that fail."""
+"""`refgs capture`: cameras of a scene that the tests photograph, and error messages."""
 
 from __future__ import annotations
 
@@ -40,18 +39,17 @@ needs_colmap = pytest.mark.skipif(not colmap.installed(), reason='pip install "m
 
 
 @pytest.fixture(scope="module")
-def pictures() -> list[np.ndarray]:
+def images() -> list[np.ndarray]:
     """What a level camera sees from an arc."""
     return [scene.photograph(shot) for shot in scene.around(COUNT)]
 
 
 @pytest.fixture(scope="module")
-def captured(pictures: Sequence[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with photographs, and data made of them: names have spaces, one lies on its side for EXIF to
-    turn, masks are given."""
+def captured(images: Sequence[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with photographs and their data set: names with spaces, one EXIF-rotated photograph, masks."""
     folder = tmp_path_factory.mktemp("with space")
-    for i, picture in enumerate(pictures):
-        stored = np.rot90(picture) if i == 4 else picture
+    for i, image in enumerate(images):
+        stored = np.rot90(image) if i == 4 else image
         options = {"orientation": 6} if i == 4 else {}
         scene.save(folder / "photographs" / NAMES[i], stored, focal35=38, **options)
         mask = np.zeros(stored.shape[:2], dtype=np.uint8)
@@ -86,7 +84,7 @@ def test_cameras_are_found_up_to_a_similarity(captured: Path) -> None:
     turned = solved.rotation @ similarity.rotation.T
     cosine = [(np.trace(a @ b.rotation.T) - 1) / 2 for a, b in zip(turned, shots, strict=True)]
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.5
-    # The world is upright, and its unit ball holds the block.
+    # The world is upright, and its unit ball contains the block.
     assert similarity.rotation[2] @ [0, 0, 1] > np.cos(np.radians(1))
     block = np.array([0, 0, scene.BLOCK[2] / 2])
     assert np.linalg.norm(similarity.translation - block) < 0.5 * similarity.scale
@@ -94,7 +92,7 @@ def test_cameras_are_found_up_to_a_similarity(captured: Path) -> None:
 
 
 @needs_colmap
-def test_points_lie_on_what_was_photographed(captured: Path) -> None:
+def test_captured_points_are_on_the_surfaces(captured: Path) -> None:
     solved = _model(captured / "data")
     similarity = best_similarity(solved.origin, np.array([shot.origin for shot in scene.around(COUNT)]))
     points = similarity.apply(solved.points)
@@ -106,9 +104,7 @@ def test_points_lie_on_what_was_photographed(captured: Path) -> None:
 
 
 @needs_colmap
-def test_the_data_set_holds_pictures_masks_region_and_report(
-    captured: Path, pictures: list[np.ndarray]
-) -> None:
+def test_capture_writes_images_masks_region_and_report(captured: Path, images: list[np.ndarray]) -> None:
     data = captured / "data"
     report = json.loads((data / "capture.json").read_text())
     assert (report["placed"], report["photographs"], report["not_placed"]) == (COUNT, COUNT, [])
@@ -119,8 +115,8 @@ def test_the_data_set_holds_pictures_masks_region_and_report(
     [camera] = model.cameras.values()
     assert camera.model_name == "PINHOLE" and (camera.width, camera.height) == (scene.WIDTH, scene.HEIGHT)
     assert camera.focal_length_x == pytest.approx(scene.FOCAL, rel=0.02)
-    # The picture that lay on its side stands, and its mask with it.
-    assert np.array_equal(read_png(data / "images" / NAMES[4]) * 255, pictures[4])
+    # The rotated photograph is upright, and so is its mask.
+    assert np.array_equal(read_png(data / "images" / NAMES[4]) * 255, images[4])
     mask = np.asarray(Image.open(data / "masks" / f"{NAMES[4]}.png"))
     half = scene.WIDTH // 2
     assert mask.shape == (scene.HEIGHT, scene.WIDTH) and not mask[:, :half].any() and mask[:, half:].all()
@@ -130,7 +126,7 @@ def test_the_data_set_holds_pictures_masks_region_and_report(
 
 
 @needs_colmap
-def test_a_fit_reads_it(captured: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_captured_data_set_is_read(captured: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Cameras, alpha from the masks, points and region, as one set that every eighth view tests."""
     train, test = (read_loaded(captured / "data", split) for split in ("train", "test"))
     assert [view.name for view in test.views] == [NAMES[0], NAMES[8]] and len(train.views) == COUNT - 2
@@ -149,11 +145,11 @@ def test_a_fit_reads_it(captured: Path, capsys: pytest.CaptureFixture[str]) -> N
         pose_errors(train.views, test.views)
     assert capture_benchmark.main([str(captured / "data")] * 2) == 0
     out = capsys.readouterr().out
-    assert f"{COUNT} of {COUNT} pictures placed" in out and "| rotation, degrees | 0.000 | 0.000 |" in out
+    assert f"{COUNT} of {COUNT} images placed" in out and "| rotation, degrees | 0.000 | 0.000 |" in out
 
 
 @needs_colmap
-def test_the_reprojections_of_the_points_are_right(captured: Path) -> None:
+def test_captured_points_reproject_onto_their_observations(captured: Path) -> None:
     """Straightened coordinates, moved cameras and moved points belong together."""
     model = colmap.load().Reconstruction(captured / "data" / "sparse" / "0")
     model.update_point_3d_errors()
@@ -161,9 +157,7 @@ def test_the_reprojections_of_the_points_are_right(captured: Path) -> None:
 
 
 @needs_colmap
-def test_a_second_run_does_nothing_and_finds_the_same(
-    captured: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_second_capture_computes_nothing(captured: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = captured / "data"
     before = {path.name: path.stat().st_mtime_ns for path in (data / "images").iterdir()}
     model = _model(data)
@@ -183,7 +177,9 @@ def test_a_second_run_does_nothing_and_finds_the_same(
 
 
 @needs_colmap
-def test_an_interrupted_run_goes_on(captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_capture_is_continued(
+    captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Features and matches that are there are not made again, and the result is that of one run."""
     photographs, data = captured / "photographs", tmp_path / "data"
     whole, calls = colmap.match, []
@@ -203,7 +199,7 @@ def test_an_interrupted_run_goes_on(captured: Path, tmp_path: Path, monkeypatch:
 
 
 @needs_colmap
-def test_a_distorted_lens_is_found_and_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_distorted_lens_is_estimated_and_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shots = scene.around(10)
     for i, shot in enumerate(shots):
         scene.save(tmp_path / "photographs" / f"{i}.png", scene.photograph(shot, k1=-0.15))
@@ -212,7 +208,7 @@ def test_a_distorted_lens_is_found_and_undone(tmp_path: Path, monkeypatch: pytes
     assert report["lens"]["model"] == "SIMPLE_RADIAL" and report["placed"] == 10
     assert report["lens"]["cameras"][0]["parameters"][3] == pytest.approx(-0.15, abs=0.03)
     [pinhole] = report["pinholes"]
-    # The picture is what a pinhole sees whose focal length is longer by the same factor.
+    # The image is what a pinhole sees whose focal length is longer by the same factor.
     zoom = pinhole["focal"][0] / report["lens"]["cameras"][0]["parameters"][0]
     monkeypatch.setattr(scene, "FOCAL", scene.FOCAL * zoom)
     wanted = scene.photograph(shots[3], samples=2) / 255
@@ -227,10 +223,8 @@ def test_a_distorted_lens_is_found_and_undone(tmp_path: Path, monkeypatch: pytes
 
 
 @needs_colmap
-def test_another_lens_makes_other_pictures(
-    captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Pictures and cameras are of one lens; files that a person added stay, masks go where none are given."""
+def test_other_lens_rewrites_images(captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images and cameras share one lens; files of the user are kept, masks removed if none are given."""
     data = tmp_path / "data"
     shutil.copytree(captured / "data", data)
     (data / "sparse" / "0" / "test.txt").write_text(NAMES[3])
@@ -266,7 +260,9 @@ def _files(folder: Path) -> dict[str, str]:
     return {name: path.read_text() for name, path in files.items() if not name.startswith(".")}
 
 
-def test_a_capture_removes_what_the_last_one_wrote(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_capture_replaces_only_files_of_the_last_capture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data, own = tmp_path / "data", {"masks/x.png": "own", "sparse/0/test.txt": "own"}
     prepare(data, [tmp_path / "photographs"])
     first = ("images/a.png", "images/b.png", "masks/a.png", LAST)
@@ -303,7 +299,7 @@ def test_a_capture_removes_what_the_last_one_wrote(tmp_path: Path, monkeypatch: 
 
 
 @needs_colmap
-def test_a_folder_that_is_read_is_not_written(captured: Path) -> None:
+def test_output_around_the_source_is_refused(captured: Path) -> None:
     data, photographs = captured / "data", captured / "photographs"
     before = sorted(data.rglob("*"))
     for arguments in [(data / "images", "-o", data), (photographs, "-o", captured)]:
@@ -312,7 +308,7 @@ def test_a_folder_that_is_read_is_not_written(captured: Path) -> None:
     assert sorted(data.rglob("*")) == before
 
 
-def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
+def test_foreign_output_folder_is_refused(tmp_path: Path) -> None:
     """Whatever its folders are called."""
     kept = _made(tmp_path / ".work") / "thesis.txt"
     kept.write_text("own")
@@ -324,22 +320,22 @@ def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
 # ---------- The sentences ----------
 
 
-def _flat(i: int, pictures: list[np.ndarray]) -> np.ndarray:
+def _flat(i: int, images: list[np.ndarray]) -> np.ndarray:
     return np.full((96, 128, 3), 100 + i, dtype=np.uint8)
 
 
-def _blurred(i: int, pictures: list[np.ndarray]) -> np.ndarray:
+def _blurred(i: int, images: list[np.ndarray]) -> np.ndarray:
     from scipy.ndimage import gaussian_filter
 
     ramp = np.linspace(0, 255, 128)[None, :, None] * np.ones((96, 1, 3))
     return gaussian_filter(np.roll(ramp, 9 * i, axis=1), (12, 12, 0)).astype(np.uint8)
 
 
-def _unrelated(i: int, pictures: list[np.ndarray]) -> np.ndarray:
+def _unrelated(i: int, images: list[np.ndarray]) -> np.ndarray:
     return (scene.noise(50 + i, 192) * 255).astype(np.uint8)
 
 
-def _one_place(i: int, pictures: list[np.ndarray]) -> np.ndarray:
+def _one_place(i: int, images: list[np.ndarray]) -> np.ndarray:
     """The camera turns on the spot."""
     target = np.array([0.35 * np.cos(i), 0.35 * np.sin(i), 0.3])
     return scene.photograph(scene.look(np.array([3.0, 0.4, 1.6]), tuple(target)))
@@ -353,27 +349,27 @@ def _one_place(i: int, pictures: list[np.ndarray]) -> np.ndarray:
         (_blurred, "hold still"),
         (_unrelated, "two thirds"),
         (_one_place, "walk around"),
-        (lambda i, pictures: pictures[0], "walk around"),
+        (lambda i, images: images[0], "walk around"),
     ],
     ids=["flat", "blurred", "unrelated", "one place", "all alike"],
 )
-def test_a_set_that_cannot_be_placed_says_what_to_do(
-    make: object, words: str, pictures: list[np.ndarray], tmp_path: Path
+def test_failed_reconstruction_names_a_remedy(
+    make: object, words: str, images: list[np.ndarray], tmp_path: Path
 ) -> None:
     for i in range(5):
-        scene.save(tmp_path / "photographs" / f"{i}.png", make(i, pictures))  # type: ignore[operator]
+        scene.save(tmp_path / "photographs" / f"{i}.png", make(i, images))  # type: ignore[operator]
     message = refused(["capture", tmp_path / "photographs", "-o", tmp_path / "data"])
     assert words in message and str(tmp_path / "photographs") in message, message
     assert not (tmp_path / "data" / "sparse").exists()
 
 
-def test_groups_that_share_nothing_are_counted(tmp_path: Path) -> None:
+def test_disconnected_groups_are_counted(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"2 groups that share nothing \(4, 3 images\).*around c\.jpg"):
         require_placed(tmp_path, 9, [["a"] * 4, ["b"] * 3], "c.jpg")
     require_placed(tmp_path, 8, [["a"] * 4, ["b"] * 3], "c.jpg")
 
 
-def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
+def test_unusable_photographs_are_refused(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     photographs = _made(tmp_path / "photographs")
     refused(["capture", tmp_path / "none", "-o", tmp_path / "data"], "no such folder")
@@ -400,7 +396,7 @@ def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
     refused(["capture", photographs, "-o", tmp_path / "data", "--masks", tmp_path / "no"], "no such folder")
 
 
-def test_a_missing_library_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_pycolmap_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
     refused(["capture", tmp_path, "-o", tmp_path / "data"], 'pip install "mi_refgs[capture]"')
 
@@ -408,7 +404,7 @@ def test_a_missing_library_says_how_to_install_it(tmp_path: Path, monkeypatch: p
 # ---------- The parts ----------
 
 
-def test_exif_says_which_way_up_and_how_long_the_lens_is(tmp_path: Path) -> None:
+def test_exif_gives_orientation_and_focal_length(tmp_path: Path) -> None:
     wide = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
     for orientation in range(1, 9):
         scene.save(tmp_path / f"{orientation}.png", wide, orientation=orientation, focal35=43.2666 * 0.75)
@@ -422,14 +418,14 @@ def test_exif_says_which_way_up_and_how_long_the_lens_is(tmp_path: Path) -> None
         assert photograph.focal_pixels((30, 40)) == pytest.approx(
             0.75 * 50, rel=0.05
         )  # EXIF's is whole: 32 mm
-        # All lie one way, and `up` says where the top of the upright picture went.
+        # All lie one way, and `up` says where the top of the upright image went.
         lying = np.rot90(upright) if photograph.lying else upright
         np.testing.assert_array_equal(np.asarray(photograph.load()), lying)
         assert photograph.up == ((-1, 0) if photograph.lying else (0, -1))
     assert len({photograph.kept_size for photograph in found.values()}) == 1
 
 
-def test_broken_exif_data_are_left_out(tmp_path: Path) -> None:
+def test_broken_exif_is_ignored(tmp_path: Path) -> None:
     pixels = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
     for name in ("a.jpg", "b.jpg", "c.png"):
         Image.fromarray(pixels).save(tmp_path / name, exif=b"Exif\0\0garbage")
@@ -440,10 +436,10 @@ def test_broken_exif_data_are_left_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(photograph.load()), pixels)
 
 
-def test_a_mask_has_the_name_and_size_of_its_photograph(tmp_path: Path) -> None:
-    picture = np.zeros((4, 6, 3), dtype=np.uint8)
+def test_masks_match_photographs_by_name_and_size(tmp_path: Path) -> None:
+    image = np.zeros((4, 6, 3), dtype=np.uint8)
     for name in ("a.jpg", "b.jpg", "c.jpg"):
-        scene.save(tmp_path / "p" / name, picture)
+        scene.save(tmp_path / "p" / name, image)
     photographs = find_photographs(tmp_path / "p")
     mask = np.zeros((4, 6), dtype=np.uint8)
     mask[1] = 255
@@ -455,7 +451,7 @@ def test_a_mask_has_the_name_and_size_of_its_photograph(tmp_path: Path) -> None:
     cut = np.dstack([np.full((4, 6, 3), 9, dtype=np.uint8), mask])
     Image.fromarray(cut).save(masks / "c.PNG")
     found = find_masks(masks, photographs)
-    for photograph in photographs:  # white where the object is; where a picture is cut out, its alpha
+    for photograph in photographs:  # white where the object is; where a image is cut out, its alpha
         grey = round(25500 / 257) if photograph.name == "b.jpg" else 255
         np.testing.assert_array_equal(
             mask_pixels(found[photograph.name], photograph)[..., 0], np.where(mask > 0, grey, 0)
@@ -465,8 +461,8 @@ def test_a_mask_has_the_name_and_size_of_its_photograph(tmp_path: Path) -> None:
         find_masks(masks, photographs)
 
 
-def test_large_sets_match_neighbours_and_pictures_alike(rng: np.random.Generator) -> None:
-    """Pictures of ten places, each visited in every tenth picture: likeness finds them, order does not."""
+def test_large_sets_match_neighbours_and_similar_images(rng: np.random.Generator) -> None:
+    """Images of ten places, each visited in every tenth image: likeness finds them, order does not."""
     places = rng.integers(0, 256, (10, 40, 128))
     count = EXHAUSTIVE + 50
     features = {
@@ -490,7 +486,7 @@ def _solved(origin: np.ndarray, target: tuple[float, float, float], points: np.n
 
 
 @pytest.mark.parametrize("arc", [300.0, 5.0], ids=["around", "from the front"])
-def test_up_is_where_level_cameras_say(arc: float, rng: np.random.Generator) -> None:
+def test_up_direction_is_that_of_level_cameras(arc: float, rng: np.random.Generator) -> None:
     """Level cameras, a quarter of which is rolled by up to 60°, in a world that is turned anyhow."""
     origin = np.array([shot.origin for shot in scene.around(40, arc)])
     solved = _solved(origin, (0, 0, 1.5), np.empty((0, 3)))
@@ -510,7 +506,7 @@ def test_up_is_where_level_cameras_say(arc: float, rng: np.random.Generator) -> 
     assert np.degrees(np.arccos(found[2])) < (1 if arc > 90 else 5)
 
 
-def test_the_region_is_what_most_cameras_look_at(rng: np.random.Generator) -> None:
+def test_region_of_interest_is_what_most_cameras_look_at(rng: np.random.Generator) -> None:
     origin = np.array([shot.origin for shot in scene.around(30, 300, radius=4)])
     near = rng.normal((0.2, 0, 0.4), 0.15, (400, 3))
     far = rng.uniform(-30, 30, (4000, 3))
@@ -520,7 +516,7 @@ def test_the_region_is_what_most_cameras_look_at(rng: np.random.Generator) -> No
     assert np.mean(region.contains(near)) > 0.9
 
 
-def test_the_best_similarity_is_found(rng: np.random.Generator) -> None:
+def test_best_similarity_is_recovered(rng: np.random.Generator) -> None:
     points = rng.normal(size=(20, 3))
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation *= np.linalg.det(rotation)

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(not colmap.installed(), reason='pip install "mi_
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """Pictures with the cameras that took them, no points, no alpha."""
+    """Images with the cameras that took them, no points, no alpha."""
     folder, frames = tmp_path_factory.mktemp("known"), []
     for i, shot in enumerate(scene.around(COUNT)):
         scene.save(folder / f"{i}.png", scene.photograph(shot))
@@ -44,14 +44,14 @@ def points(data: Dataset) -> PointCloud:
     return found
 
 
-def test_points_lie_on_what_the_pictures_show(data: Dataset, points: PointCloud) -> None:
+def test_triangulated_points_are_on_the_surfaces(data: Dataset, points: PointCloud) -> None:
     position = points.position
     planes = [abs(position[:, 2]), abs(position[:, 2] - scene.BLOCK[2])]
     planes += [abs(abs(position[:, i]) - scene.BLOCK[i]) for i in (0, 1)]
     assert len(position) > 300
     off = np.min(planes, axis=0)
     assert np.median(off) < 0.005 and np.quantile(off, 0.95) < 0.03
-    # Their colours are linear, and those of the pictures there.
+    # Their colours are linear, and those of the images there.
     view = data.views[COUNT // 2]
     row, column, seen = view.project(position)
     shown = view.colour(data.background)[row[seen].astype(int), column[seen].astype(int)]
@@ -60,15 +60,15 @@ def test_points_lie_on_what_the_pictures_show(data: Dataset, points: PointCloud)
     assert abs(np.median(shown) - np.median(points.colour)) < 0.1
 
 
-def test_a_smaller_fit_has_the_same_points(data: Dataset, points: PointCloud) -> None:
-    """Features come from pictures read again, in full, whatever the size of the fit; and runs are
+def test_triangulated_points_are_independent_of_downscale(data: Dataset, points: PointCloud) -> None:
+    """Features come from images read again, in full, whatever the size of the fit; and runs are
     repeatable."""
     found = triangulate.triangulated(read_dataset(data.path, "train", downscale=2))
     assert found is not None
     np.testing.assert_array_equal(found.position, points.position)
 
 
-def test_a_fit_starts_from_them(
+def test_fit_starts_from_triangulated_points(
     data: Dataset, points: PointCloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They are found once a run, and said; the surfels of the start lie around them."""
@@ -104,7 +104,7 @@ def test_a_fit_starts_from_them(
     assert len(calls) == 2
 
 
-def test_points_are_looked_for_only_where_they_help(
+def test_triangulation_is_skipped_where_useless(
     data: Dataset, points: PointCloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(triangulate, "triangulated", None)
@@ -120,7 +120,7 @@ def test_points_are_looked_for_only_where_they_help(
     assert 'pip install "mi_refgs[capture]"' in said[0]
 
 
-def test_pictures_without_texture_have_none(data: Dataset, tmp_path: Path) -> None:
+def test_images_without_texture_have_no_points(data: Dataset, tmp_path: Path) -> None:
     folder = tmp_path / "flat"
     for i in range(COUNT):
         scene.save(folder / f"{i}.png", np.full((scene.HEIGHT, scene.WIDTH, 3), 90, np.uint8))
@@ -132,7 +132,7 @@ def test_pictures_without_texture_have_none(data: Dataset, tmp_path: Path) -> No
     assert "too little texture" in said[0]
 
 
-def test_pairs_are_near_ones(data: Dataset) -> None:
+def test_near_pairs_are_close_views(data: Dataset) -> None:
     pairs = triangulate.near_pairs(data.views)
     assert {(i, i + 1) for i in range(COUNT - 1)} <= set(pairs)
     assert len(pairs) < COUNT * (COUNT - 1) / 2 and all(i < j for i, j in pairs)

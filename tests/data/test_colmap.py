@@ -1,4 +1,4 @@
-"""COLMAP's layout, text and binary, as this test writes it: cameras, pictures, copies, masks, points."""
+"""COLMAP's layout, text and binary, as this test writes it: cameras, images, copies, masks, points."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ KINDS = ("txt", "bin")
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0"])
-def test_cameras_see_the_points(kind: str, place: str, tmp_path: Path) -> None:
+def test_colmap_cameras_project_points_onto_images(kind: str, place: str, tmp_path: Path) -> None:
     data = write_colmap(tmp_path, kind, place=place)
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
     assert [view.name for view in test.views] == ["a.png", "i.png"]
@@ -65,7 +65,7 @@ LENSES: dict[str, tuple[tuple[float, ...], Lens]] = {
 
 @pytest.mark.parametrize("model", LENSES)
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_lens_is_undone(model: str, kind: str, tmp_path: Path) -> None:
+def test_every_lens_model_is_undistorted(model: str, kind: str, tmp_path: Path) -> None:
     values, lens = LENSES[model]
     focal = (107.0, 107.0) if values[0] == 107.0 else (110.0, 104.0)
     shots = [replace(shot, lens=lens, focal=focal) for shot in SHOTS[:3]]
@@ -75,7 +75,7 @@ def test_every_lens_is_undone(model: str, kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_lenses_that_are_unknown(kind: str, tmp_path: Path) -> None:
+def test_unsupported_lens_models_are_refused(kind: str, tmp_path: Path) -> None:
     data = write_colmap(tmp_path, kind, SHOTS[:2], camera="FOV", values=(*VALUES, 0.01))
     with pytest.raises(InputError, match=rf"cameras\.{kind}: camera 7: the lens model .*undistort"):
         read_dataset(data, "train")
@@ -92,8 +92,8 @@ def copies(folder: Path, factor: int, ending: str = ".png") -> None:
         write_png(folder / f"images_{factor}" / path.with_suffix(ending).name, 0.5 * small)
 
 
-def test_smaller_copies_serve_where_they_divide(tmp_path: Path) -> None:
-    """The copies here are half as bright, so that a picture tells its file."""
+def test_smaller_copies_are_used_where_they_divide_the_downscale(tmp_path: Path) -> None:
+    """The copies here are half as bright, so that a image tells its file."""
     data = write_colmap(tmp_path)
     copies(data, 2)
     copies(data, 4, ".PNG")
@@ -109,7 +109,7 @@ def test_smaller_copies_serve_where_they_divide(tmp_path: Path) -> None:
     assert read_dataset(data, "train", downscale=2).views[0].width == 24
 
 
-def test_a_copy_of_rounded_size(tmp_path: Path) -> None:
+def test_copy_of_rounded_size_scales_intrinsics(tmp_path: Path) -> None:
     """97 × 73 pixels whose copy has 49 × 37: intrinsics follow the file."""
     shots = [replace(shot, width=97, height=73) for shot in SHOTS[:2]]
     data = write_colmap(tmp_path, shots=shots)
@@ -123,7 +123,7 @@ def test_a_copy_of_rounded_size(tmp_path: Path) -> None:
     assert (view.fx, view.cy) == pytest.approx((110 * 49 / 97, 34.6 * 37 / 73))
 
 
-def test_masks_are_alpha(tmp_path: Path) -> None:
+def test_colmap_masks_become_alpha(tmp_path: Path) -> None:
     data = write_colmap(tmp_path)
     copies(data, 2)
     (data / "masks").mkdir()
@@ -140,7 +140,7 @@ def test_masks_are_alpha(tmp_path: Path) -> None:
         read_dataset(data, "train")
 
 
-def test_points_of_wrong_matches_are_left_out(tmp_path: Path) -> None:
+def test_unreliable_points_are_left_out(tmp_path: Path) -> None:
     data = write_colmap(tmp_path, "txt")
     rng = np.random.default_rng(0)
     lines = []
@@ -163,7 +163,7 @@ def notes(data: Path) -> tuple[str, ...]:
     return found.notes
 
 
-def test_cameras_and_pictures_without_each_other(tmp_path: Path) -> None:
+def test_cameras_and_images_without_each_other_are_noted(tmp_path: Path) -> None:
     data = write_colmap(tmp_path)
     SHOTS[0].write(data / "images/more")
     (data / "images/c.png").unlink()
@@ -182,7 +182,7 @@ def test_cameras_and_pictures_without_each_other(tmp_path: Path) -> None:
         read_dataset(data, "train")
 
 
-def test_names_stay_in_the_folder(tmp_path: Path) -> None:
+def test_names_outside_of_the_folder_are_refused(tmp_path: Path) -> None:
     data = write_colmap(tmp_path / "data")
     SHOTS[0].write(tmp_path)
     for name in ("../a.png", str(tmp_path / "a.png"), "."):
@@ -205,7 +205,7 @@ def test_names_stay_in_the_folder(tmp_path: Path) -> None:
         ("", "none of its 0 images"),
     ],
 )
-def test_images_that_make_no_sense(line: str, said: str, tmp_path: Path) -> None:
+def test_broken_images_file_is_refused(line: str, said: str, tmp_path: Path) -> None:
     data = write_colmap(tmp_path, "txt")
     (data / "sparse/0/images.txt").write_text(line)
     with pytest.raises(InputError, match=rf"images\.txt: .*{said}"):
@@ -223,7 +223,7 @@ def test_cameras_that_make_no_sense(line: str, tmp_path: Path) -> None:
         read_dataset(data, "test")
 
 
-def test_both_splits_mean_the_region_of_the_training_cameras(tmp_path: Path) -> None:
+def test_region_of_both_splits_is_that_of_the_training_cameras(tmp_path: Path) -> None:
     """Also a split of one view, whose camera alone looks at no point."""
     data = write_colmap(tmp_path)
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
@@ -234,7 +234,7 @@ def test_both_splits_mean_the_region_of_the_training_cameras(tmp_path: Path) -> 
     assert len(test.views) == 1 and test.region == train.region == region_of(train.views)
 
 
-def test_a_focal_length_that_no_camera_has(tmp_path: Path) -> None:
+def test_impossible_focal_length_is_refused(tmp_path: Path) -> None:
     data = write_colmap(tmp_path, "txt")
     for focal in ("1e-30", "1e-10"):
         (data / "sparse/0/cameras.txt").write_text(f"7 PINHOLE 96 72 {focal} 104 50 34")
@@ -242,7 +242,7 @@ def test_a_focal_length_that_no_camera_has(tmp_path: Path) -> None:
             read_dataset(data, "train")
 
 
-def test_a_picture_of_another_shape_is_refused(tmp_path: Path) -> None:
+def test_image_of_other_aspect_ratio_is_refused(tmp_path: Path) -> None:
     """As turned upright by its EXIF data, after COLMAP saw it."""
     data = write_colmap(tmp_path)
     replace(SHOTS[1], width=72, height=96).write(data / "images")
@@ -250,7 +250,7 @@ def test_a_picture_of_another_shape_is_refused(tmp_path: Path) -> None:
         read_dataset(data, "train")
 
 
-def test_binary_files_that_end_anywhere(tmp_path: Path) -> None:
+def test_truncated_binary_files_are_refused(tmp_path: Path) -> None:
     """Every length of each file but the whole one is one sentence, at once."""
     model = write_colmap(tmp_path, shots=SHOTS[:3]) / "sparse/0"
     for name, read in (("cameras", read_cameras), ("images", read_images), ("points3D", read_points)):
@@ -271,7 +271,7 @@ def test_binary_files_that_end_anywhere(tmp_path: Path) -> None:
         path.write_bytes(whole)
 
 
-def test_what_colmap_writes_itself(tmp_path: Path) -> None:
+def test_files_written_by_colmap_are_read(tmp_path: Path) -> None:
     """Its own library writes our text as binary, and our reader finds the same in both."""
     pycolmap = pytest.importorskip("pycolmap")
     write_text(tmp_path / "a", SHOTS, "OPENCV", LENSES["OPENCV"][0])

@@ -83,7 +83,7 @@ def test_exr_is_linear_and_premultiplied(folder: Path) -> None:
     np.testing.assert_allclose(view.image, pixels[..., :3] + 1 - pixels[..., 3:], atol=1e-6)
 
 
-def test_picture_without_alpha(folder: Path) -> None:
+def test_image_without_alpha(folder: Path) -> None:
     for i in range(8):
         write_png(folder / f"train/r_{i}.png", read_png(folder / f"train/r_{i}.png")[..., :3])
     view = read_loaded(folder, "train").views[0]
@@ -100,8 +100,8 @@ def test_downscale_averages_composited_pixels(folder: Path) -> None:
         assert half.fx == full.fx / 2 and half.cy == full.cy / 2
 
 
-def test_downscale_leaves_out_what_fills_no_block(folder: Path) -> None:
-    """The camera then only divides: the top left corner of the picture stays where it was."""
+def test_downscale_leaves_out_incomplete_blocks(folder: Path) -> None:
+    """The camera then only divides: the top left corner of the image stays where it was."""
     full, third = (read_loaded(folder, "train", downscale=scale).views[1] for scale in (1, 3))
     assert (third.width, third.height) == (WIDTH // 3, HEIGHT // 3) == (2, 1)
     np.testing.assert_allclose(third.image, box_downscale(full.image[:3], 3), atol=1e-6)
@@ -110,7 +110,7 @@ def test_downscale_leaves_out_what_fills_no_block(folder: Path) -> None:
     )
 
 
-def test_the_size_that_a_budget_of_pixels_affords(folder: Path) -> None:
+def test_fitting_downscale_meets_pixel_budget(folder: Path) -> None:
     """Photographs of 1080 × 1920 and their like, read no larger than asked for."""
     Image.new("RGB", (1080, 1920)).save(folder / "large.jpg")
     write_exr(folder / "large.exr", np.zeros((30, 21, 3)))
@@ -125,7 +125,7 @@ def test_the_size_that_a_budget_of_pixels_affords(folder: Path) -> None:
     assert view.cx == pytest.approx(1080 / 2 / 7) and view.cy == pytest.approx(1920 / 2 / 7)
 
 
-def test_camera_frame(folder: Path) -> None:
+def test_camera_frame_is_that_of_mitsuba(folder: Path) -> None:
     """Mitsuba's frame: +z forward, +x left, +y up; what lies right of the axis lands right."""
     view = read_loaded(folder, "train").views[1]
     opengl = pose(0.7)
@@ -148,7 +148,7 @@ def test_camera_frame(folder: Path) -> None:
     np.testing.assert_allclose(step, [0.1 * focal, -0.2 * focal], atol=1e-4)
 
 
-def test_extent(folder: Path) -> None:
+def test_scene_extent_is_that_of_3dgs(folder: Path) -> None:
     data = read_loaded(folder, "train")
     origins = np.array([pose(0.7 * i)[:3, 3] for i in range(8)])
     extent = 1.1 * max(np.linalg.norm(origins - origins.mean(axis=0), axis=1))
@@ -182,11 +182,11 @@ def test_holdout_without_a_test_file(folder: Path) -> None:
     assert [v.name for v in read_loaded(folder, "test").views] == names["test"]
 
 
-def test_names_that_turn_back_inside_the_folder(folder: Path) -> None:
+def test_relative_names_inside_the_folder_are_accepted(folder: Path) -> None:
     content = read(folder)
     content["frames"][0]["file_path"] = "./test/../train/r_1.png"
     write(folder, "train", content)
-    (folder / "links").symlink_to(folder / "train")  # followed: whoever made the folder made it
+    (folder / "links").symlink_to(folder / "train")  # followed: the user made it
     content["frames"][1]["file_path"] = "links/r_1.png"
     write(folder, "train", content)
     views = read_loaded(folder, "train").views
@@ -246,7 +246,7 @@ def diagonal(x: float, y: float, z: float) -> list[list[float]]:
 
 
 def resize(folder: Path) -> None:
-    """One picture more than there may be sizes."""
+    """One image more than there may be sizes."""
     for i in range(1, 6):
         write_png(folder / f"train/r_{i}.png", np.ones((HEIGHT, WIDTH + i, 4)))
 
@@ -332,14 +332,14 @@ def test_missing_folder(tmp_path: Path) -> None:
         read_loaded(tmp_path / "none", "train")
 
 
-def test_lone_picture_leaves_zero_training_views(folder: Path) -> None:
+def test_single_image_leaves_zero_training_views(folder: Path) -> None:
     edit(lambda c: c.update(frames=c["frames"][:1]))(folder)
     (folder / "transforms_test.json").unlink()
     with pytest.raises(InputError, match="zero training views"):
         read_loaded(folder, "train")
 
 
-def test_an_averaged_view_shows_the_same_points(folder: Path) -> None:
+def test_averaged_view_shows_the_same_points(folder: Path) -> None:
     """Pixels are means of blocks, and a point lands in the block of its pixel."""
     view = read_loaded(folder, "train").views[0]
     small = view.averaged(2)

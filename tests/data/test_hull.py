@@ -19,7 +19,7 @@ BLACK = np.zeros(3)
 def sphere_views(
     count: int, size: int, centre: np.ndarray, radius: float, rng: np.random.Generator
 ) -> list[View]:
-    """Exact masks of a sphere from cameras at distance 4 around it; the picture shows the view's number."""
+    """Exact masks of a sphere from cameras at distance 4 around it; the image shows the view's number."""
     views = []
     focal = 1.6 * size
     for number in range(count):
@@ -52,7 +52,7 @@ def sphere_views(
     return views
 
 
-def test_visual_hull_of_a_sphere(rng: np.random.Generator) -> None:
+def test_visual_hull_of_sphere_masks_is_the_sphere(rng: np.random.Generator) -> None:
     """Off-centre sphere: points within a voxel of its surface, normals outward within 12° on average."""
     centre = np.array([0.4, -0.3, 0.2])
     views = sphere_views(40, 64, centre, 0.8, rng)
@@ -79,7 +79,7 @@ def test_visual_hull_of_a_sphere(rng: np.random.Generator) -> None:
     assert np.all(facing[~seen] == 0.5) and np.mean(facing[seen] == 0) > 0.8
 
 
-def test_points_inside_the_hull_of_a_sphere(rng: np.random.Generator) -> None:
+def test_inner_points_of_sphere_are_uniform(rng: np.random.Generator) -> None:
     """Uniform in the ball: (distance / radius)³ is uniform, whatever the unit; nothing outside the hull."""
     centre = np.array([0.4, -0.3, 0.2])
     views = sphere_views(40, 64, centre, 0.8, rng)
@@ -97,7 +97,7 @@ def test_points_inside_the_hull_of_a_sphere(rng: np.random.Generator) -> None:
     assert np.all(np.abs(hull.median_colours(points[distance < 0.7], views, BLACK) - 0.5) < 0.06)
 
 
-def test_points_inside_a_hull_are_uniform_across_voxels(rng: np.random.Generator) -> None:
+def test_inner_points_are_uniform_across_voxels(rng: np.random.Generator) -> None:
     """A field that falls by 1/2 over 4.3 voxels in the sum of |x|, |y|, |z| bounds an octahedron exactly."""
     radius, voxel = 4.3, np.array([0.1, 0.2, 0.3])
     grid = np.stack(np.meshgrid(*[np.arange(-6, 7)] * 3, indexing="ij"), axis=-1)
@@ -112,7 +112,7 @@ def test_points_inside_a_hull_are_uniform_across_voxels(rng: np.random.Generator
         assert kstest(cumulative, "uniform").pvalue > 1e-3
 
 
-def test_a_hull_of_hardly_any_volume_ends_the_search(rng: np.random.Generator) -> None:
+def test_hull_of_tiny_volume_returns_fewer_points(rng: np.random.Generator) -> None:
     field = np.zeros((5, 5, 5), dtype=np.float32)
     field[2, 2, 2] = 0.500001
     shape = hull.Hull(field, np.zeros(3), np.ones(3))

@@ -309,7 +309,7 @@ from mi_refgs.fitting.targets import Targets
 from mi_refgs.methods.method import DataOptions
 images.CACHE_BYTES = int(sys.argv[2])
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-data = read_dataset(Path(sys.argv[1]), "train", truth=False)
+data = read_dataset(Path(sys.argv[1]), "train")
 targets = Targets(data, DataOptions(), int(sys.argv[2]))
 for index in range(len(data.views)):
     assert targets[index].camera.width == data.views[0].width

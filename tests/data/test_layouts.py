@@ -24,7 +24,7 @@ from tests.scenes.layouts import SHOTS, change_transforms, write_glossy, write_l
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
-def test_nerfstudio_with_intrinsics_of_every_frame(fisheye: bool, tmp_path: Path) -> None:
+def test_nerfstudio_intrinsics_per_frame(fisheye: bool, tmp_path: Path) -> None:
     lens = Lens(fisheye, (0.05, -0.02, 0.0, 0.0)[: 4 if fisheye else 3])
     shots = [
         replace(shot, lens=lens, focal=(110.0 + shot.index, 104.0), centre=(49.0 + 0.3 * shot.index, 35.0))
@@ -53,7 +53,7 @@ def write_ply(path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
-def test_points_that_a_file_names(kind: str, tmp_path: Path) -> None:
+def test_ply_file_path_gives_points(kind: str, tmp_path: Path) -> None:
     """Poses and points share a frame: `applied_transform` was applied to both."""
     moved = np.eye(4)[[0, 2, 1, 3]][:3].tolist()
     data = write_nerfstudio(tmp_path, ply_file_path="sparse_pc.ply", applied_transform=moved)
@@ -69,12 +69,12 @@ def test_points_that_a_file_names(kind: str, tmp_path: Path) -> None:
     ("name", "said"),
     [("../a.ply", "ply_file_path: .* names no file"), ("no.ply", "missing"), (3, "names no file")],
 )
-def test_points_that_are_not_there(name: Any, said: str, tmp_path: Path) -> None:
+def test_missing_ply_file_is_refused(name: Any, said: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=said):
         read_dataset(write_nerfstudio(tmp_path, ply_file_path=name), "train")
 
 
-def test_a_mask_that_a_frame_names(tmp_path: Path) -> None:
+def test_mask_path_becomes_alpha(tmp_path: Path) -> None:
     data = write_nerfstudio(tmp_path)
     mask = np.zeros((72, 96, 3))
     mask[36:] = 1
@@ -87,7 +87,7 @@ def test_a_mask_that_a_frame_names(tmp_path: Path) -> None:
     assert not view.image[:18].any() and view.image[18:].any()
 
 
-def test_splits_that_a_file_names(tmp_path: Path) -> None:
+def test_filenames_define_splits(tmp_path: Path) -> None:
     data = write_nerfstudio(tmp_path, test_filenames=["images/c.png"], val_filenames=["images/d.png"])
     names = {split: [v.name for v in read_dataset(data, split).views] for split in ("train", "test")}
     assert names["test"] == ["images/c"] and len(names["train"]) == 7
@@ -103,7 +103,7 @@ def test_splits_that_a_file_names(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a.PNG", "a.Png", "a.JPG", "a.jpeg", "a.b.JPEG", "a"])
 @pytest.mark.parametrize("written", [True, False])
-def test_a_file_path_finds_its_file_by_any_ending(name: str, written: bool, tmp_path: Path) -> None:
+def test_file_path_matches_any_ending(name: str, written: bool, tmp_path: Path) -> None:
     """With the file's ending, in other letters or of another kind, or without; a dot may be in the name."""
     data = write_nerfstudio(tmp_path)
     stem = name.rpartition(".")[0] or name
@@ -144,7 +144,7 @@ def shiny(folder: Path, alpha: bool = True) -> Path:
 
 
 @pytest.mark.parametrize("alpha", [True, False])
-def test_shiny_blender_has_normals_and_depths(alpha: bool, tmp_path: Path) -> None:
+def test_shiny_blender_maps_are_read(alpha: bool, tmp_path: Path) -> None:
     data = shiny(tmp_path, alpha)
     view = read_dataset(data, "test").views[0].load()
     assert view.normal is not None and view.depth is not None and view.alpha is not None
@@ -163,7 +163,7 @@ def test_shiny_blender_has_normals_and_depths(alpha: bool, tmp_path: Path) -> No
     assert read_dataset(data, "test", truth=False).views[0].normal is None
 
 
-def test_shiny_disparity_of_16_bits_and_broken(tmp_path: Path) -> None:
+def test_shiny_blender_disparity_formats(tmp_path: Path) -> None:
     data = shiny(tmp_path)
     file = data / "test/r_0_disp.tiff"
     Image.fromarray(np.full((24, 32), 65535 // 4, dtype=np.uint16)).save(file)
@@ -184,10 +184,10 @@ def test_shiny_disparity_of_16_bits_and_broken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("factor", [1, 4])
-def test_llff(factor: int, tmp_path: Path) -> None:
+def test_llff_cameras_project_points_onto_images(factor: int, tmp_path: Path) -> None:
     data = write_llff(
         tmp_path, factor
-    )  # focal lengths are those of the original pictures, however small these are
+    )  # focal lengths are those of the original images, however small these are
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
     assert (len(train.views), [view.name for view in test.views]) == (7, ["a.png", "i.png"])
     for view in train.views:
@@ -201,8 +201,8 @@ def test_llff(factor: int, tmp_path: Path) -> None:
     assert fitting_downscale(data, "png", 2000) == (2, 96, 72)
 
 
-def test_llff_masks(tmp_path: Path) -> None:
-    """Of the whole pictures, so that smaller copies are left alone; all pictures have one, or none."""
+def test_llff_masks_become_alpha(tmp_path: Path) -> None:
+    """Masks have the size of the largest images, so that smaller copies are not used; all images need one."""
     data = write_llff(tmp_path)
     for folder in ("images_2", "masks"):
         (data / folder).mkdir()
@@ -223,7 +223,7 @@ def saved(folder: Path, array: Any) -> None:
     np.save(folder / "poses_bounds.npy", array, allow_pickle=True)
 
 
-def test_llff_that_makes_no_sense(tmp_path: Path) -> None:
+def test_broken_llff_poses_are_refused(tmp_path: Path) -> None:
     data = write_llff(tmp_path)
     good = np.load(data / "poses_bounds.npy")
     path = data / "poses_bounds.npy"
@@ -265,7 +265,7 @@ class Code:
 
 
 @pytest.mark.parametrize("protocol", range(5))
-def test_glossy_synthetic(protocol: int, tmp_path: Path) -> None:
+def test_glossy_synthetic_is_read(protocol: int, tmp_path: Path) -> None:
     data = write_glossy(tmp_path, protocol)
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
     assert ([v.name for v in train.views], [v.name for v in test.views]) == (
@@ -292,7 +292,7 @@ class Global:
 
 
 def shared(depth: int = 60) -> bytes:
-    """Instructions that leave a tuple of 2^depth leaves, each level of which holds the next one twice."""
+    """Instructions that leave a tuple of 2^depth leaves, each level of which contains the next one twice."""
     return b")" + b"2\x86" * depth
 
 
@@ -305,7 +305,7 @@ def array_of(
     return b"\x80\x03]" + made + b"(K\x01" + shape + dtype + b"\x89" + b"C\x18" + bytes(24) + b"tba."
 
 
-def test_pickles_that_are_no_arrays(tmp_path: Path) -> None:
+def test_hostile_pickles_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "0-camera.pkl"
     array = np.eye(3)
     good = pickle.dumps([array, array], 4)
@@ -346,7 +346,7 @@ def test_pickles_that_are_no_arrays(tmp_path: Path) -> None:
             read_arrays(path)
 
 
-def test_a_name_that_a_pickle_asks_for_is_not_looked_up(tmp_path: Path) -> None:
+def test_pickle_cannot_change_numpy(tmp_path: Path) -> None:
     """Whatever it does to NumPy's names stays in records of its own."""
     path = tmp_path / "0-camera.pkl"
     path.write_bytes(b"cnumpy\nndarray\n}(Vshape\nI1\nsb.")  # sets attributes of a class
@@ -377,7 +377,7 @@ def test_cameras_that_make_no_sense(pose: Any, matrix: Any, said: str, tmp_path:
         read_dataset(data, "test")
 
 
-def test_glossy_needs_some_views(tmp_path: Path) -> None:
+def test_glossy_without_training_views_is_refused(tmp_path: Path) -> None:
     data = write_glossy(tmp_path)
     for i in range(1, 9):
         (data / f"{i}-camera.pkl").unlink()

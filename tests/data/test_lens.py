@@ -1,4 +1,4 @@
-"""Lens distortion: pictures of a lens become those of a pinhole, or are refused."""
+"""Lens distortion: images of a lens become those of a pinhole, or are refused."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ def dot(u: float, v: float) -> np.ndarray:
 
 def dataset(folder: Path, lens: dict[str, Any], alpha: bool = False) -> Path:
     """Two views of dots through a lens, linear, with maps."""
-    picture = np.stack([sum(dot(*seen_by(lens, x, y)) for x, y in DOTS)] * 3, axis=-1)
-    covered = (picture[..., 0] > 0.2).astype(float)
+    image = np.stack([sum(dot(*seen_by(lens, x, y)) for x, y in DOTS)] * 3, axis=-1)
+    covered = (image[..., 0] > 0.2).astype(float)
     frames = []
     for name in "ab":
-        write_exr(folder / f"{name}.exr", np.dstack([picture, picture[..., 0]]) if alpha else picture)
-        write_png(folder / f"{name}.png", np.clip(picture, 0, 1))
+        write_exr(folder / f"{name}.exr", np.dstack([image, image[..., 0]]) if alpha else image)
+        write_png(folder / f"{name}.png", np.clip(image, 0, 1))
         frames.append({"file_path": name, "transform_matrix": np.eye(4).tolist()})
     write_exr(folder / "depth.exr", 3 * covered)
     frames[0]["depth_path"] = "depth.exr"
@@ -79,7 +79,7 @@ def centroid(image: np.ndarray, u: float, v: float) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_points_land_where_a_pinhole_sees_them(tmp_path: Path, name: str) -> None:
+def test_undistorted_points_are_those_of_a_pinhole(tmp_path: Path, name: str) -> None:
     """Points of a straight line therefore land on one."""
     data = read_dataset(dataset(tmp_path, LENSES[name]), "train", images="exr")
     view = data.views[0].load()
@@ -100,8 +100,8 @@ def test_points_land_where_a_pinhole_sees_them(tmp_path: Path, name: str) -> Non
         assert 1.02 < view.fx / PINHOLE["fl_x"] < 1.2
 
 
-def test_every_pixel_has_data(tmp_path: Path) -> None:
-    """At the smallest zoom the image of one edge touches the picture's, and none leaves it."""
+def test_undistorted_image_has_no_empty_pixel(tmp_path: Path) -> None:
+    """At the smallest zoom the image of one edge touches the image's, and none leaves it."""
     view = read_dataset(dataset(tmp_path, LENSES["pincushion"]), "train", images="exr").views[0].load()
     x = (np.array([0.5, WIDTH - 0.5]) - view.cx) / view.fx
     y = (np.array([0.5, HEIGHT - 0.5]) - view.cy) / view.fy
@@ -110,7 +110,7 @@ def test_every_pixel_has_data(tmp_path: Path) -> None:
     assert -0.01 < gaps.min() < 0.01
 
 
-def test_alpha_and_maps_follow_the_picture(tmp_path: Path) -> None:
+def test_alpha_and_maps_are_undistorted_like_the_image(tmp_path: Path) -> None:
     view = (
         read_dataset(dataset(tmp_path, LENSES["barrel"], alpha=True), "train", images="exr").views[0].load()
     )
@@ -123,7 +123,7 @@ def test_alpha_and_maps_follow_the_picture(tmp_path: Path) -> None:
     assert set(np.unique(view.depth.round(5))) == {0, 3}
 
 
-def test_a_smaller_picture_has_the_same_camera(tmp_path: Path) -> None:
+def test_downscaled_undistortion_has_the_same_camera(tmp_path: Path) -> None:
     folder = dataset(tmp_path, LENSES["pincushion"])
     full = read_dataset(folder, "train", images="exr").views[0].load()
     half = read_dataset(folder, "train", images="exr", downscale=2).views[0].load()
@@ -135,7 +135,7 @@ def test_a_smaller_picture_has_the_same_camera(tmp_path: Path) -> None:
         assert math.dist(centroid(half.image[..., 0], u, v), (u, v)) < 0.1
 
 
-def test_zero_coefficients_change_no_pixel(tmp_path: Path) -> None:
+def test_zero_distortion_changes_no_pixel(tmp_path: Path) -> None:
     folder = dataset(tmp_path, {})
     plain = read_dataset(folder, "train").views[0].load()
     zeros = dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0) | {"is_fisheye": False}
@@ -163,7 +163,7 @@ def test_zero_coefficients_change_no_pixel(tmp_path: Path) -> None:
         ({"k1": 1e9}, ["frames[0]", "half-way"]),
     ],
 )
-def test_other_lenses_are_refused(tmp_path: Path, lens: dict[str, Any], words: list[str]) -> None:
+def test_unsupported_lenses_are_refused(tmp_path: Path, lens: dict[str, Any], words: list[str]) -> None:
     with pytest.raises(InputError) as caught:
         read_dataset(dataset_of(tmp_path, lens), "train", images="exr")
     for word in (str(tmp_path / "transforms_train.json"), *words):
@@ -171,7 +171,7 @@ def test_other_lenses_are_refused(tmp_path: Path, lens: dict[str, Any], words: l
 
 
 def dataset_of(folder: Path, lens: dict[str, Any]) -> Path:
-    """Pictures without distortion whose file claims a lens."""
+    """Images without distortion whose file claims a lens."""
     dataset(folder, {})
     content = json.loads((folder / "transforms_train.json").read_text()) | lens
     (folder / "transforms_train.json").write_text(json.dumps(content))

@@ -1,6 +1,6 @@
 """CONTRIBUTING's recipe "add a reader", followed: a layout of this test's own, from the folder to a fit.
 
-One class and one `register` are all that is added: cameras in a table of text, pictures without alpha beside
+One class and one `register` are all that is added: cameras in a table of text, images without alpha beside
 it, and points to start from.
 """
 
@@ -33,7 +33,7 @@ from tests.scenes.tiny import RADIUS, train_command, write_data, write_method
 
 
 class TableReader:
-    """`cameras.txt` has a line a picture: file, focal length in pixels, the 12 numbers of a pose."""
+    """`cameras.txt` has a line a image: file, focal length in pixels, the 12 numbers of a pose."""
 
     name = "table of cameras"
     looks_for = "cameras.txt"
@@ -73,7 +73,7 @@ def reader() -> Iterator[None]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The views of the tiny ball in the new layout: 9 training pictures and 2 test pictures, no alpha."""
+    """The views of the tiny ball in the new layout: 9 training images and 2 test images, no alpha."""
     views = read_dataset(write_data(tmp_path / "ball", views=11, truth=False), "train").views
     out = tmp_path / "table"
     out.mkdir()
@@ -87,14 +87,14 @@ def folder(tmp_path: Path) -> Path:
     return out
 
 
-def test_a_new_layout_is_recognised_and_read(folder: Path, reader: None) -> None:
+def test_registered_layout_is_recognised_and_read(folder: Path, reader: None) -> None:
     train, test = read_dataset(folder, "train"), read_dataset(folder, "test", downscale=2)
     assert (len(train.views), len(test.views)) == (9, 2) and test.views[0].width == train.views[0].width // 2
     assert train.points is not None and train.points.position.shape == (300, 3)
     assert fitting_downscale(folder, "png", 100) == (2, 20, 20)
 
 
-def test_a_fit_starts_from_its_points(folder: Path, tmp_path: Path, reader: None) -> None:
+def test_fit_starts_from_points_of_the_reader(folder: Path, tmp_path: Path, reader: None) -> None:
     run = tmp_path / "run"
     assert main(train_command(folder, run, write_method(tmp_path))) == 0
     position = read_ply(run / "surfels.ply").to_numpy()["position"]
@@ -102,12 +102,12 @@ def test_a_fit_starts_from_its_points(folder: Path, tmp_path: Path, reader: None
     assert main(["eval", str(run)]) == 0
 
 
-def test_a_folder_that_no_reader_knows_is_named(folder: Path) -> None:
+def test_unrecognised_folder_is_refused(folder: Path) -> None:
     with pytest.raises(InputError, match=r"table: data set: no layout is recognised.*transforms_train\.json"):
         read_dataset(folder, "train")
 
 
-def test_a_reader_of_ones_own_is_asked_first() -> None:
+def test_registered_reader_comes_first() -> None:
     """Also where it is registered before any data set was read."""
     code = (
         "import mi_refgs\nclass Own:\n    name = looks_for = 'own'\n"

@@ -25,7 +25,7 @@ def view_from(origin: np.ndarray, focal: float = 100.0) -> View:
     return View("v", 100, 100, focal, focal, 50, 50, to_world, image, None, None, None, False)
 
 
-def test_pixels_of_the_region_are_those_whose_rays_meet_it() -> None:
+def test_region_pixels_are_those_whose_rays_hit_it() -> None:
     """Against points along the rays of the view's own camera, for a sphere off the axis, and from within."""
     region = Region((0.3, -0.2, 0.1), 0.4)
     for origin in (np.array([2.0, 1.0, 0.5]), np.array([0.4, -0.1, 0.2]), np.array([-0.5, 0.6, -1.5])):
@@ -42,7 +42,7 @@ def test_pixels_of_the_region_are_those_whose_rays_meet_it() -> None:
     assert not region_pixels(view_from(np.array([2.0, 1.0, 0.5])), behind).any()
 
 
-def test_contraction_is_the_identity_inside_and_ends_at_two() -> None:
+def test_contraction_is_identity_inside_and_bounded_by_two() -> None:
     region = Region((1.0, 2.0, 3.0), 0.5)
     inside = np.array([[1.1, 2.2, 2.9], [1.0, 2.0, 3.5]])
     np.testing.assert_allclose(region.contract(inside), (inside - [1, 2, 3]) / 0.5)
@@ -52,29 +52,29 @@ def test_contraction_is_the_identity_inside_and_ends_at_two() -> None:
     assert 1.999 < np.linalg.norm(far) < 2
 
 
-def test_expansion_undoes_contraction() -> None:
+def test_expansion_inverts_contraction() -> None:
     region = Region((-1.0, 0.5, 2.0), 3.0)
     points = np.random.default_rng(0).normal(size=(200, 3)) * 20
     np.testing.assert_allclose(region.expand(region.contract(points)), points, rtol=1e-9, atol=1e-9)
 
 
-def test_cameras_suggest_the_sphere_that_they_show_whole() -> None:
+def test_region_of_cameras_is_what_they_show_entirely() -> None:
     origins = np.array([[4, 0, 1], [0, 4, 1], [-4, 0, 1], [0, -4, 1.0]])
     region = region_of([view_from(origin) for origin in origins])
     np.testing.assert_allclose(region.centre, 0, atol=1e-9)
     # sin atan ½ = 1/√5 of the distance √17.
     assert region.radius == pytest.approx(0.8 * np.sqrt(17 / 5))
     wide = region_of([view_from(origin, focal=10.0) for origin in origins])
-    # Of sin atan 5 = 0.98 the cameras themselves leave 0.8 of their distance.
+    # sin atan 5 = 5/√26 of the distance.
     assert wide.radius == pytest.approx(0.8 * 5 / np.sqrt(26) * np.sqrt(17))
 
 
-def test_one_view_has_no_region() -> None:
+def test_single_view_has_no_region() -> None:
     with pytest.raises(InputError, match="do not look at one point"):
         region_of([view_from(np.array([4.0, 0, 0]))])
 
 
-def test_cameras_that_look_outward_or_stand_in_one_place_have_no_region() -> None:
+def test_outward_or_coincident_cameras_have_no_region() -> None:
     origins = np.array([[4, 0, 1], [0, 4, 1], [-4, 0, 1], [0, -4, 1.0]])
     turn = np.diag([-1.0, 1, -1, 1])
     outward = [replace(v, to_world=v.to_world @ turn) for v in map(view_from, origins)]
@@ -92,7 +92,7 @@ def test_cameras_that_look_outward_or_stand_in_one_place_have_no_region() -> Non
             region_of(panorama)
 
 
-def test_a_region_file_is_read(tmp_path: Path) -> None:
+def test_region_file_is_read(tmp_path: Path) -> None:
     assert read_region(tmp_path) is None
     (tmp_path / REGION_FILE).write_text('{"centre": [1, 2, 3], "radius": 0.5}')
     assert read_region(tmp_path) == Region((1.0, 2.0, 3.0), 0.5)
@@ -106,7 +106,7 @@ def test_a_region_file_is_read(tmp_path: Path) -> None:
      '{"centre": [1, 2, 3], "radius": true}', '{"centre": [1, 2, 3], "radius": 1e10}',
      '{"centre": [1, 2, 3], "radius": 1e-300}', '{"centre": "123", "radius": 1}'],
 )  # fmt: skip
-def test_a_region_file_that_cannot_be_used_is_named(tmp_path: Path, text: str) -> None:
+def test_broken_region_file_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / REGION_FILE).write_text(text)
     with pytest.raises(InputError, match=REGION_FILE):
         read_region(tmp_path)

@@ -1,4 +1,4 @@
-"""`refgs doctor FOLDER`, and data sets that are unusual: one place, one view, pictures of several sizes."""
+"""`refgs doctor FOLDER`, and data sets that are unusual: one place, one view, images of several sizes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return capsys.readouterr().out
 
 
-def test_a_data_set_with_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_survey_of_complete_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = write_data(tmp_path / "ball", views=5)
     found = survey(data)
     assert (found.layout, found.views) == ("Blender / NeRF", {"train": 5, "test": 2})
@@ -40,7 +40,7 @@ def test_a_data_set_with_everything(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert {*printed} == {field.name for field in dataclasses.fields(Survey)}
 
 
-def test_a_reconstruction_with_gaps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_survey_reports_missing_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = write_colmap(tmp_path)
     (data / "images/c.png").unlink()
     found = survey(data)
@@ -50,7 +50,7 @@ def test_a_reconstruction_with_gaps(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "1 of 9 cameras have no image" in text and "NOTE: no alpha" in text and "COLMAP" in text
 
 
-def test_folders_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_survey_refuses_other_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for folder, words in ((tmp_path / "no", "no such folder"), (tmp_path, "no layout is recognised")):
         assert main(["doctor", str(folder)]) == 2
         assert words in capsys.readouterr().err
@@ -59,7 +59,7 @@ def test_folders_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("count", "words"), [(1, "a single training view shows no shape"), (3, "in one place show no shape")]
 )
-def test_cameras_in_one_place(
+def test_cameras_in_one_place_are_refused(
     count: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Named before anything is computed, with the exit code of bad input."""
@@ -74,7 +74,7 @@ def test_cameras_in_one_place(
     assert f"{data}: cameras: " in error and words in error and not (tmp_path / "run").exists()
 
 
-def test_pictures_of_two_sizes_are_fitted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_of_two_sizes_are_fitted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = write_data(tmp_path / "ball", views=6)
     for split, count in (("train", 6), ("test", 2)):
         content = json.loads((data / f"transforms_{split}.json").read_text())
@@ -95,11 +95,11 @@ def test_pictures_of_two_sizes_are_fitted(tmp_path: Path, capsys: pytest.Capture
     assert main(["eval", str(run)]) == 0
 
 
-def test_pictures_of_many_sizes_are_refused(tmp_path: Path) -> None:
+def test_images_of_many_sizes_are_refused(tmp_path: Path) -> None:
     data = write_colmap(tmp_path, shots=[dataclasses.replace(shot, height=72) for shot in SHOTS])
     for i in range(MAX_SIZES + 1):
         shot: Shot = SHOTS[1 + i]
-        picture = box_downscale(read_png(data / "images" / shot.name), i + 1)
-        write_png(data / "images" / shot.name, picture)
+        image = box_downscale(read_png(data / "images" / shot.name), i + 1)
+        write_png(data / "images" / shot.name, image)
     with pytest.raises(InputError, match=r"images: 5 different sizes, such as .*bring all images to one"):
         read_dataset(data, "train")

@@ -80,7 +80,7 @@ def rendered(scale: float, shading: Shading) -> tuple[Surfels, Frame, Any, Any]:
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("scale", SCALES)
-def test_a_scaled_scene_has_the_same_picture_normals_and_gradients(scale: float, order: str) -> None:
+def test_scaled_scene_renders_equal_images_and_gradients(scale: float, order: str) -> None:
     def values(scale: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         surfels, frame, normal, valid = rendered(scale, ORDERS[order])
         flat = [frame.alpha, frame.depth / scale, *frame.normal, *frame.radiance, *normal]
@@ -100,7 +100,7 @@ def test_a_scaled_scene_has_the_same_picture_normals_and_gradients(scale: float,
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_a_scaled_scene_is_the_same_through_the_plugin(scale: float, tmp_path: Path) -> None:
+def test_scaled_scene_renders_equal_images_through_the_plugin(scale: float, tmp_path: Path) -> None:
     def picture(scale: float) -> np.ndarray:
         write_mesh(tmp_path / f"{scale}.ply", wall(scale))
         at = mi.ScalarTransform4f().look_at([float(scale * x) for x in EYE], [0, 0, 0], [0, 0, 1])
@@ -112,7 +112,7 @@ def test_a_scaled_scene_is_the_same_through_the_plugin(scale: float, tmp_path: P
 
 
 @pytest.mark.parametrize("scale", [SCALES[0], SCALES[-1]])
-def test_initial_surfels_of_a_scaled_data_set_are_the_same(scale: float, tmp_path: Path) -> None:
+def test_initial_surfels_scale_with_the_data_set(scale: float, tmp_path: Path) -> None:
     scale = 2.0 ** round(np.log2(scale))  # exact, so that no point changes its place in the table
     write_data(tmp_path, views=4)
     small = read_dataset(tmp_path, "train")
@@ -138,7 +138,7 @@ def test_initial_surfels_of_a_scaled_data_set_are_the_same(scale: float, tmp_pat
         np.testing.assert_allclose(got[name] / unit, values / unit, atol=2e-5, err_msg=name)
 
 
-def test_lengths_without_a_neighbour_follow_the_extent() -> None:
+def test_neighbour_scale_without_neighbours_follows_the_extent() -> None:
     points = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [2.0, 0, 0]])
     for scale in (1, *SCALES):
         np.testing.assert_allclose(neighbour_scale(scale * points), scale * neighbour_scale(points))
@@ -150,7 +150,7 @@ def test_lengths_without_a_neighbour_follow_the_extent() -> None:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_a_step_moves_positions_by_the_same_part_of_the_scene(scale: float) -> None:
+def test_optimiser_step_scales_with_the_scene(scale: float) -> None:
     """Gradients of a length have the inverse unit, Adam's ε too."""
 
     def step(scale: float) -> np.ndarray:
@@ -167,8 +167,8 @@ def test_a_step_moves_positions_by_the_same_part_of_the_scene(scale: float) -> N
 
 
 @pytest.mark.parametrize("shift", [1e3, 1e5])
-def test_far_from_the_origin_the_camera_is_as_exact_as_the_surfels(shift: float) -> None:
-    """Error against the oracle for positions that float32 holds exactly, and a camera that it does not."""
+def test_camera_far_from_origin_is_accurate(shift: float) -> None:
+    """Error against the float64 reference for positions exact in float32, and a camera that is not."""
     rng = np.random.default_rng(2)
     away = shift * np.array([1, -0.7, 0.4])
     raw = {
@@ -207,7 +207,7 @@ def put(data: Path, scale: float, offset: np.ndarray) -> Path:
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_a_data_set_in_any_place_and_unit_is_the_same(place: str, tmp_path: Path) -> None:
+def test_data_set_is_independent_of_unit_and_origin(place: str, tmp_path: Path) -> None:
     """Read, surveyed, and begun to be fitted; both splits are relative to one point."""
     scale, offset = PLACES[place]
     plain = write_data(tmp_path / "plain", truth=False)
@@ -248,7 +248,7 @@ def test_cameras_in_one_place_are_refused_in_any_unit(
         require_several_sides(read_dataset(data, "train"))
 
 
-def test_a_far_reconstruction_keeps_its_points(tmp_path: Path) -> None:
+def test_points_of_far_reconstruction_are_shifted_with_cameras(tmp_path: Path) -> None:
     """They move with the cameras, before anything is float32."""
     shots = layouts.SHOTS
     near = read_dataset(layouts.write_colmap(tmp_path / "near", "txt"), "train")

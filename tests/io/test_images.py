@@ -45,7 +45,7 @@ def test_unwritable_output(tmp_path: Path) -> None:
 
 
 def test_colours_in_other_primaries_are_refused(tmp_path: Path) -> None:
-    """Mitsuba would convert them; taken as they are, they would be wrong without a word."""
+    """Mitsuba would convert them; read unconverted, they would be silently wrong."""
     planes = {name: np.ones((2, 4), np.float32) for name in "RGB"}
     for name, chromaticities in (
         ("srgb", (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)),
@@ -58,7 +58,7 @@ def test_colours_in_other_primaries_are_refused(tmp_path: Path) -> None:
         read_exr_image(tmp_path / "ap1.exr")
 
 
-def test_files_are_replaced_whole_or_left_alone(tmp_path: Path) -> None:
+def test_files_are_written_atomically(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     write_bytes(path, b"old")
 
@@ -101,7 +101,7 @@ assert EnvironmentLight.from_file(folder / "mitsuba.hdr").height == 8
 """
 
 
-def test_no_file_waits_for_a_second_thread(tmp_path: Path) -> None:
+def test_exr_files_work_with_one_thread(tmp_path: Path) -> None:
     """Mitsuba's own EXR files never finish on one thread; a process of its own can be stopped."""
     scene = (
         '<scene version="3.0.0"><emitter type="envmap"><string name="filename" value="light.exr"/></emitter>'

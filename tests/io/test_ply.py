@@ -62,7 +62,7 @@ def test_round_trip_is_bit_exact(count: int, degree: int, tmp_path: Path, rng: n
 
 
 def test_layout_is_that_of_2dgs(tmp_path: Path, rng: np.random.Generator) -> None:
-    """Names, order, w-first quaternion and channel-major harmonics, read by another library."""
+    """Names, order, w-first quaternion and channel-major spherical harmonics, read by another library."""
     surfels = table(3, rng)
     write_ply(tmp_path / "a.ply", surfels)
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
@@ -101,7 +101,9 @@ def test_layout_is_that_of_2dgs(tmp_path: Path, rng: np.random.Generator) -> Non
         ("ascii", "f4"),
     ],
 )
-def test_files_of_other_programs(kind: str, dtype: str, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_ply_of_other_programs_is_read(
+    kind: str, dtype: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
     """Other formats, other order, unknown properties; absent groups give absent channels."""
     columns = {"confidence": np.ones(4), **dict(reversed(geometry(rng).items()))}
     surfels = read_ply(write_file(tmp_path / "a.ply", columns, kind, dtype))
@@ -110,7 +112,7 @@ def test_files_of_other_programs(kind: str, dtype: str, tmp_path: Path, rng: np.
     np.testing.assert_array_equal(surfels.to_numpy()["rotation"][:, 3], columns["rot_0"])
 
 
-def test_a_file_of_3dgs_is_read_and_written_as_it_was(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_3dgs_file_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
     """Its properties, in its order; a third scale is what tells it from surfels."""
     rest = [f"f_rest_{i}" for i in range(45)]
     order = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity"]
@@ -153,7 +155,7 @@ def test_partial_groups_are_refused(
         read_ply(write_file(tmp_path / "a.ply", columns))
 
 
-def test_values_that_are_not_finite_are_counted(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_non_finite_values_are_counted(tmp_path: Path, rng: np.random.Generator) -> None:
     columns = geometry(rng)
     columns["opacity"][1:3] = np.nan, np.inf
     with pytest.raises(InputError, match=r"a\.ply: opacity: 2 values are NaN or infinite; remove"):

@@ -59,7 +59,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_depth_and_normals_lie_on_the_sphere(made: Path) -> None:
+def test_depth_and_normals_are_those_of_the_sphere(made: Path) -> None:
     """Through the reader's camera, so that file convention, pixel centres and maps are tested as one."""
     for split in ("train", "test"):
         for view in read_loaded(made, split).views:
@@ -75,7 +75,7 @@ def test_depth_and_normals_lie_on_the_sphere(made: Path) -> None:
             np.testing.assert_array_equal(view.alpha.ravel()[hit] > 0, True)
 
 
-def test_png_is_the_exr_as_displayed(made: Path, train: Dataset) -> None:
+def test_png_is_the_encoded_exr(made: Path, train: Dataset) -> None:
     radiance = read_loaded(made, "train", images="exr", background="black")
     for shown, linear in zip(train.views, radiance.views, strict=True):
         assert shown.alpha is not None and linear.alpha is not None
@@ -86,7 +86,7 @@ def test_png_is_the_exr_as_displayed(made: Path, train: Dataset) -> None:
         assert shown.alpha[0, 0] == 0 and shown.alpha[SIZE // 2, SIZE // 2] == 1
 
 
-def test_brightness_is_the_lit_sphere(train: Dataset) -> None:
+def test_radiance_is_that_of_the_lit_sphere(train: Dataset) -> None:
     """Radiance of the whole set against an independent estimate, albedo × irradiance / π."""
     data = read_loaded(train.path, "train", images="exr", background="black")
     check_brightness(data, data, pathtrace.environment_image(mi.load_string(SCENE), 16))
@@ -125,14 +125,14 @@ def test_environment_in_mitsuba_orientation(made: Path, train: Dataset) -> None:
     np.testing.assert_allclose(seen.mean(axis=0), truth.mean(axis=0), rtol=0.03)
 
 
-def test_an_environment_of_that_size_comes_back_unchanged(rng: np.random.Generator) -> None:
+def test_environment_of_equal_size_is_unchanged(rng: np.random.Generator) -> None:
     image = rng.uniform(0, 5, (16, 32, 3)).astype(np.float32)
     light = {"type": "envmap", "bitmap": mi.Bitmap(image), "scale": 2.0}
     scene = mi.load_dict({"type": "scene", "e": light})
     np.testing.assert_allclose(pathtrace.environment_image(scene, 16), 2 * image, rtol=1e-6)
 
 
-def test_a_turned_environment_is_shown_where_it_is(rng: np.random.Generator) -> None:
+def test_rotated_environment_is_resampled(rng: np.random.Generator) -> None:
     """A smooth light, turned to an oblique axis: the export as an `envmap` of its own, poles included."""
     light = {"type": "envmap", "bitmap": mi.Bitmap(sky(64)), "to_world": turn(50)}
     scene = mi.load_dict({"type": "scene", "e": light})
@@ -158,7 +158,7 @@ def test_constant_environment() -> None:
     np.testing.assert_allclose(image, np.broadcast_to([1, 2, 3], image.shape), rtol=1e-5)
 
 
-def test_cameras_are_seeded_and_spread() -> None:
+def test_camera_poses_are_seeded_and_evenly_spread() -> None:
     def poses(seed: int) -> np.ndarray:
         return pathtrace.camera_poses(60, CENTRE, (4.0, 4.0), (-30, 80), np.random.default_rng(seed))
 
@@ -178,7 +178,7 @@ def test_cameras_are_seeded_and_spread() -> None:
 
 @pytest.fixture
 def traced(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Seeds of the pictures that are path-traced from now on."""
+    """Seeds of the images that are path-traced from now on."""
     seeds: list[int] = []
     image = pathtrace.Tracer.image
 
@@ -201,9 +201,7 @@ def test_unfinished_folder_is_continued(made: Path, traced: list[int]) -> None:
     assert len(traced) == 1 and files(made) == before  # a map takes no path
 
 
-def test_a_folder_of_the_version_before_gets_what_it_lacks(
-    made: Path, tmp_path: Path, traced: list[int]
-) -> None:
+def test_folder_of_earlier_version_is_completed(made: Path, tmp_path: Path, traced: list[int]) -> None:
     """Without materials, surface, and the settings that came later: nothing is traced again."""
     before, old = files(made), tmp_path / "old"
     shutil.copytree(made, old)
@@ -237,7 +235,7 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
         make_dataset(scene, out, **tiny)
 
 
-def test_passes_average(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_render_passes_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = mi.load_string(SCENE)
     pose = pathtrace.camera_poses(1, CENTRE, (3.0, 3.0), (0, 30), np.random.default_rng(0))[0]
     options: dict[str, Any] = {"size": (8, 8), "fov": 30, "spp": 64, "max_depth": 3, "near": 0.1, "far": 50}
@@ -344,7 +342,7 @@ def relit(made: Path) -> Path:
     return make_dataset(folder / "ball.xml", out, **OPTIONS, relight=lights)
 
 
-def test_lights_are_added_without_tracing_the_rest(relit: Path, made: Path, traced: list[int]) -> None:
+def test_adding_lights_traces_no_other_views(relit: Path, made: Path, traced: list[int]) -> None:
     folder, before = made.parent, files(relit)
     inherited = {k: v for k, v in files(made).items() if k not in ("dataset.json", RECORD)}
     assert before.items() >= inherited.items()
@@ -355,7 +353,7 @@ def test_lights_are_added_without_tracing_the_rest(relit: Path, made: Path, trac
     assert set(json.loads(before["dataset.json"])["relight"]) == {"warm", "cold_sky"}
 
 
-def test_relit_views_have_the_cameras_and_shape_of_the_test_views(relit: Path) -> None:
+def test_relit_views_have_cameras_and_alpha_of_the_test_views(relit: Path) -> None:
     own = read_loaded(relit, "test", images="exr", background="black")
     other = read_loaded(relit / "relight" / "warm", "test", images="exr", background="black")
     for a, b in zip(own.views, other.views, strict=True):
@@ -365,8 +363,8 @@ def test_relit_views_have_the_cameras_and_shape_of_the_test_views(relit: Path) -
         assert np.abs(a.image - b.image).max() > 0.1
 
 
-def test_relit_brightness_is_that_of_the_light_beside_it(relit: Path) -> None:
-    """environment.exr of each light, in Mitsuba's orientation, accounts for the pictures under it."""
+def test_relit_radiance_is_that_of_its_environment(relit: Path) -> None:
+    """environment.exr of each light, in Mitsuba's orientation, accounts for the images under it."""
     for name in ("warm", "cold_sky"):
         data = read_loaded(relit / "relight" / name, "test", images="exr", background="black")
         assert data.environment is not None
@@ -374,8 +372,8 @@ def test_relit_brightness_is_that_of_the_light_beside_it(relit: Path) -> None:
         check_brightness(data, read_loaded(relit, "test"), pathtrace.environment_image(lit, 16))
 
 
-def test_a_light_is_turned_as_the_scenes_own(made: Path, tmp_path: Path) -> None:
-    """The scene's own map, given as `--light`: the same pictures; and a scene without a map is z up."""
+def test_replacement_light_is_rotated_like_the_scenes_own(made: Path, tmp_path: Path) -> None:
+    """The scene's own map, given as `--light`: the same images; and a scene without a map is z up."""
     options = {**OPTIONS, "views": 1, "test_views": 1}
     scene = made.parent / "ball.xml"
     same = make_dataset(scene, tmp_path / "same", **options, light=SCENES / "lights" / "studio.exr")
@@ -398,7 +396,7 @@ def test_a_light_is_turned_as_the_scenes_own(made: Path, tmp_path: Path) -> None
     assert len(changed.emitters()) == 2  # the lamp stays
 
 
-def test_lights_that_cannot_be_used(relit: Path, made: Path, tmp_path: Path) -> None:
+def test_unusable_lights_are_refused(relit: Path, made: Path, tmp_path: Path) -> None:
     scene = made.parent / "ball.xml"
     (tmp_path / "warm.exr").write_bytes((made.parent / "cold sky.exr").read_bytes())
     with pytest.raises(InputError, match=r"dataset.json: --relight warm: .*overwrite"):

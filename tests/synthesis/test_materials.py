@@ -73,13 +73,13 @@ def check(found: Any, expected: Expected) -> None:
 @pytest.mark.parametrize(
     ("bsdf", "expected"), CASES, ids=lambda case: case["type"] if isinstance(case, dict) else ""
 )
-def test_what_a_bsdf_declares(bsdf: dict[str, Any], expected: Expected) -> None:
+def test_materials_of_bsdfs(bsdf: dict[str, Any], expected: Expected) -> None:
     other = {"type": "sphere", "center": [0, 0, -9], "bsdf": {"type": "conductor"}}
     check(seen_from((0, 0, -1), {"type": "sphere", "bsdf": bsdf}, other), expected)
 
 
 @pytest.mark.parametrize("name", ["conductor", "roughconductor"])
-def test_a_metals_albedo_is_what_it_reflects(name: str) -> None:
+def test_albedo_of_metal_is_its_reflectance(name: str) -> None:
     """At normal incidence under a constant light, by the samples of Mitsuba's own BSDF."""
     metal = {"type": name, "material": "Au"} | ({"alpha": 0.001} if name == "roughconductor" else {})
     reflected = weight_of_samples(metal).mean(axis=1)
@@ -90,7 +90,7 @@ def test_a_metals_albedo_is_what_it_reflects(name: str) -> None:
 
 @pytest.mark.parametrize("nonlinear", [False, True])
 @pytest.mark.parametrize("name", ["plastic", "roughplastic"])
-def test_a_plastics_albedo_is_what_the_base_reflects(name: str, nonlinear: bool) -> None:
+def test_albedo_of_plastic_is_that_of_its_base(name: str, nonlinear: bool) -> None:
     """All that leaves at normal incidence is F + (1 - F) albedo, F being Fresnel's; less if rough."""
     plastic = {"type": name, "diffuse_reflectance": RGB, "nonlinear": nonlinear}
     fresnel = ((1.49 - 1.000277) / (1.49 + 1.000277)) ** 2
@@ -110,13 +110,13 @@ def weight_of_samples(bsdf: dict[str, Any], count: int = 200_000) -> np.ndarray:
     return np.broadcast_to(np.array(weight), (3, count))
 
 
-def test_each_side_of_a_sheet_has_its_own() -> None:
+def test_two_sided_sheet_has_two_materials() -> None:
     sheet = {"type": "rectangle", "bsdf": {"type": "twosided", "front": DIFFUSE, "back": PRINCIPLED}}
     check(seen_from((0, 0, -1), sheet), (BASE, None, 0))
     check(seen_from((0, 0, 1), sheet), (BASE, 0.3, 0.7))
 
 
-def test_a_texture_that_is_no_colour_is_unknown() -> None:
+def test_unusable_texture_is_undefined() -> None:
     """Also where a value would not be finite, and where nothing is hit."""
     broken = mi.Bitmap(np.full((2, 2, 1), np.inf, np.float32))
     rough = PRINCIPLED | {"roughness": {"type": "bitmap", "bitmap": broken, "raw": True}}
@@ -156,7 +156,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_dataset(folder / "three.xml", folder / "out", **options, progress=False)
 
 
-def test_maps_are_those_of_the_scene(made: Path) -> None:
+def test_material_maps_are_those_of_the_scene(made: Path) -> None:
     """Pixel by pixel, by the position that depth gives; the reader's camera, files and scene agree."""
     seen = {"metal": 0, "clay": 0, "glass": 0}
     for view in read_loaded(made, "train").views:
@@ -184,7 +184,7 @@ def test_maps_are_those_of_the_scene(made: Path) -> None:
     assert min(seen.values()) > 50
 
 
-def test_a_block_is_the_mean_of_what_is_known(made: Path) -> None:
+def test_downscaled_maps_are_means_of_defined_pixels(made: Path) -> None:
     whole, half = (read_loaded(made, "train", downscale=d).views[0] for d in (1, 2))
     for name, values in whole.materials.items():
         blocks = values.reshape(16, 2, 16, 2, -1)
@@ -193,11 +193,11 @@ def test_a_block_is_the_mean_of_what_is_known(made: Path) -> None:
         np.testing.assert_allclose(half.materials[name], np.concatenate([mean, share], -1), atol=1e-6)
 
 
-def test_training_reads_no_materials(made: Path) -> None:
+def test_materials_are_not_read_without_truth(made: Path) -> None:
     assert read_loaded(made, "train", truth=False).views[0].materials == {}
 
 
-def test_a_map_of_another_size_is_refused(made: Path, tmp_path: Path) -> None:
+def test_map_of_other_size_is_refused(made: Path, tmp_path: Path) -> None:
     path = made / "test" / "r_000_albedo.exr"
     assert read_exr_image(path).shape == (32, 32, 4)
     content = path.read_bytes()
@@ -209,7 +209,7 @@ def test_a_map_of_another_size_is_refused(made: Path, tmp_path: Path) -> None:
         path.write_bytes(content)
 
 
-def test_the_surface_is_that_of_the_shapes(made: Path) -> None:
+def test_surface_mesh_is_that_of_the_shapes(made: Path) -> None:
     """Every point that a view sees lies on it, and its corners lie on the shapes."""
     mesh = read_mesh(made / "surface.ply")
     scene = mi.load_dict(
@@ -233,7 +233,7 @@ def test_the_surface_is_that_of_the_shapes(made: Path) -> None:
     assert (tube | ball | clay).all() and tube.any() and ball.any() and clay.any()
 
 
-def test_a_shape_without_triangles_is_named(tmp_path: Path) -> None:
+def test_unsupported_shape_is_named(tmp_path: Path) -> None:
     """Before anything is written."""
     curve = "0 0 0 0.1\n0.3 0 0 0.1\n0.6 0.1 0 0.1\n0.8 0.1 0.2 0.1\n"
     (tmp_path / "curve.txt").write_text(curve)

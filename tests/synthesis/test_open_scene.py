@@ -1,4 +1,4 @@
-"""Path-traced data sets of an object in a room: pictures of all, truth of the object, COLMAP's files."""
+"""Path-traced data sets of an object in a room: images of all, maps of the object, COLMAP's files."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_dataset(folder / "room.xml", folder / "out", colmap=folder / "colmap", **OPTIONS)
 
 
-def test_pictures_show_all_and_maps_the_object(made: Path) -> None:
+def test_open_scene_images_show_all_and_maps_the_object(made: Path) -> None:
     for view in read_loaded(made, "train").views:
         assert (view.width, view.height) == (WIDTH, HEIGHT)
         assert view.alpha is None and view.image.min() > 0
@@ -89,7 +89,7 @@ def test_pictures_show_all_and_maps_the_object(made: Path) -> None:
             np.testing.assert_array_equal(planes[:, -1], hit)
 
 
-def test_what_is_known_is_of_the_object(made: Path) -> None:
+def test_open_scene_surface_and_region_are_those_of_the_object(made: Path) -> None:
     region = read_region(made)
     assert region is not None
     np.testing.assert_allclose(region.centre, CENTRE, atol=1e-6)
@@ -99,7 +99,7 @@ def test_what_is_known_is_of_the_object(made: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(vertices - CENTRE, axis=1), RADIUS, rtol=1e-4)
 
 
-def test_a_lamp_is_in_the_picture(made: Path, tmp_path: Path) -> None:
+def test_emitter_is_visible_in_open_scene(made: Path, tmp_path: Path) -> None:
     """Seen from below: emitters are not hidden, and the background is the constant light."""
     (tmp_path / "room.xml").write_text(ROOM)
     low = {**OPTIONS, "views": 1, "test_views": 1, "elevation": (-60.0, -50.0), "distance": (0.7, 0.7)}
@@ -113,8 +113,8 @@ def test_a_lamp_is_in_the_picture(made: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.median(view.image[:, 0], axis=0), 0.4, atol=1e-5)
 
 
-def test_colmap_says_the_same(made: Path) -> None:
-    """Cameras, pictures and points of the text files, read by their definition."""
+def test_colmap_files_have_the_cameras_and_points(made: Path) -> None:
+    """Cameras, images and points of the text files, read by their definition."""
     colmap = made.parent / "colmap"
     sparse = colmap / "sparse" / "0"
     rows = {
@@ -163,8 +163,8 @@ def test_colmap_says_the_same(made: Path) -> None:
     assert json.loads((colmap / "region.json").read_text()) == json.loads((made / "region.json").read_text())
 
 
-def test_the_reader_of_colmap_finds_the_same_views(made: Path) -> None:
-    """Pictures, cameras, region and split; two of eight are more than every eighth."""
+def test_colmap_reader_reads_the_same_views(made: Path) -> None:
+    """Images, cameras, region and split; two of eight are more than every eighth."""
     colmap = made.parent / "colmap"
     for split in ("train", "test"):
         original, copy = read_loaded(made, split), read_loaded(colmap, split)
@@ -177,7 +177,7 @@ def test_the_reader_of_colmap_finds_the_same_views(made: Path) -> None:
             assert (same[0].fx, same[0].cy) == pytest.approx((view.fx, view.cy))
 
 
-def test_every_eighth_picture_is_a_test_view(made: Path, tmp_path: Path) -> None:
+def test_every_eighth_image_is_a_test_view(made: Path, tmp_path: Path) -> None:
     """As readers of COLMAP hold them out, where the numbers are those of such a split."""
     tiny = {**OPTIONS, "views": 8, "test_views": 2, "size": 8, "spp": 1}
     make_dataset(made.parent / "room.xml", tmp_path / "out", colmap=tmp_path / "colmap", **tiny)
@@ -204,7 +204,7 @@ def test_refusals(made: Path, tmp_path: Path, options: dict, words: str) -> None
     assert not (tmp_path / "out").exists()
 
 
-def test_sizes_on_the_command_line(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_size_option(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = str(made.parent / "room.xml")
     command = [
         "dataset",
