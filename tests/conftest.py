@@ -21,6 +21,7 @@ from hypothesis import HealthCheck, Phase, settings
 from mi_refgs.cli import main
 from mi_refgs.fitting.cost_model import FOLDER_VARIABLE
 from mi_refgs.io.exr import MITSUBA_EXR_THREADS
+from tests.scenes.known import write_known_data, write_known_run
 from tests.scenes.tiny import train_command, write_data, write_method
 
 # The same examples in every run. Kernels are compiled in the first, so there is no deadline; failures are not
@@ -75,6 +76,15 @@ def pytest_collection_finish() -> None:
     """Modules and tests stay until the end: the collection after each test need not look at them again."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session")
+def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """day.exr, dusk.exr, the data set `data` of two balls under them, and a perfect reconstruction `run`."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("known")
+    write_known_run(write_known_data(folder), folder / "run")
+    return folder
 
 
 @pytest.fixture(autouse=True)

@@ -51,8 +51,8 @@ PIXELS = 400**2
 STEPS = 3
 """Conjugate-gradient steps after the first; two improve a chair by 2.8 dB."""
 DAMPING = 0.1
-"""λ, over the 1/4π that Y² is on average. Of a smooth ball in 20 views, the inside of other views is 33.7 dB
-from the surfels' without the factor l², 36.8 with it; of a smooth metal ball 31.2 and 33.1."""
+"""λ, over the 1/4π that Y² is on average. A smooth ball fitted to 20 views is, inside its outline in other
+views, 33.7 dB from the surfels without the factor l², 36.8 with it; a smooth metal ball 31.2 and 33.1."""
 
 
 @remember_last

@@ -1,1 +1,1 @@
-"""A trained scene under another light: pictures, a scene file, and the score where the truth is known."""
+"""Relight a trained scene: images, a scene file, and a score where there is ground truth."""

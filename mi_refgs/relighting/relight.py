@@ -45,7 +45,7 @@ SHEET_VIEWS = 4
 SHEET_COLUMNS = 6
 """Frames of a turntable per row of its sheet."""
 PREFIX = {"test": "r", "turntable": "t"}
-"""Of image names, by their folder; test views have the names of a data set."""
+"""First letter of image names by folder; test views have the names of a data set."""
 NO_TRUTH = "the data set has no test views under this light; make them with `refgs dataset --relight`"
 NO_DATA = "there is no data set, so cameras are around the object; name its folder with --data"
 

@@ -30,9 +30,9 @@ def displayed_over(rgba: np.ndarray, background: np.ndarray, scale: np.ndarray |
 
 
 def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.ndarray:
-    """Fit the scale of radiance per channel (3,) that brings displayed images nearest to the ground truth.
+    """Fit the scale of radiance per channel (3,) that minimises the error of displayed images.
 
-    One for all images: it minimises the sum of squared differences of displayed colours inside the object.
+    One for all images, by least squares of displayed colours inside the object.
     (Least squares of radiance would fit lamps alone.) 1 for a channel that is black in either.
     """
     a, b = (np.concatenate([p.reshape(-1, 4) for p in images]).astype(np.float64) for images in (ours, truth))

@@ -97,7 +97,7 @@ def maps_of(view: View, factor: Any = 1.0) -> dict[str, np.ndarray]:
     return found
 
 
-def test_a_perfect_decomposition_has_no_error() -> None:
+def test_perfect_decomposition_has_no_error() -> None:
     """Whatever the scale of albedo in each channel, which is reported; what is unknown does not count."""
     factor = np.array([2.0, 0.5, 1.25])
     errors = Decomposition()
@@ -114,7 +114,7 @@ def test_a_perfect_decomposition_has_no_error() -> None:
     assert not any(found[f"{name}_reason"] for name in ("albedo", "roughness", "metallic", "concave"))
 
 
-def test_errors_are_those_of_the_pixels_that_count() -> None:
+def test_errors_equal_plain_formulas() -> None:
     """Against the plain formulas over all foreground pixels of all views, and over the concave ones."""
     errors, ours, true, apart, rough = Decomposition(), [], [], [], []
     rng = np.random.default_rng(9)
@@ -141,7 +141,7 @@ def test_errors_are_those_of_the_pixels_that_count() -> None:
     np.testing.assert_allclose(found["albedo_scale"], scale, rtol=1e-6)
 
 
-def test_what_was_not_compared_is_null_and_says_why() -> None:
+def test_missing_materials_are_null_with_a_reason() -> None:
     shot, view, _ = random_view(0)
     errors = Decomposition()
     maps = maps_of(view)
@@ -186,7 +186,7 @@ def ball(radius: float, centre: tuple[float, ...] = (0, 0, 0)) -> Any:
     return shape.apply_translation(centre)
 
 
-def test_distance_to_itself_is_none() -> None:
+def test_distance_to_itself_is_zero() -> None:
     truth = truth_of(ball(1))
     found = surface.surface_distance(truth.mesh, truth, around())
     assert found["surface_distance"] < 1e-3 and "surface_distance_concave" not in found
@@ -199,7 +199,7 @@ def test_distance_of_spheres() -> None:
         assert found[key] == pytest.approx(5, abs=0.05)
 
 
-def test_what_is_missing_counts_from_the_truth_and_what_is_hidden_does_not() -> None:
+def test_distance_counts_missing_but_not_hidden_surface() -> None:
     """A second ball beside the first is missed; one inside it is seen by no camera, on either side."""
     both = truth_of(ball(1), ball(0.5, (1.7, 0, 0)))
     found = surface.surface_distance(mesh_of(ball(1)), both, around())
@@ -210,7 +210,7 @@ def test_what_is_missing_counts_from_the_truth_and_what_is_hidden_does_not() -> 
         assert found["surface_distance"] < 1e-3
 
 
-def test_a_lid_over_a_hollow_counts_where_it_is_concave() -> None:
+def test_closed_cavity_counts_as_concave_error() -> None:
     """A box with a pit, and the same box without: all distance is in the pit."""
     box = trimesh.creation.box((2, 2, 1)).subdivide().subdivide()
     above = [
@@ -249,7 +249,7 @@ def test_ambient_visibility_inside_a_cap() -> None:
         np.testing.assert_array_equal(outside.numpy(), 1)
 
 
-def test_concave_pixels_are_where_the_balls_are_close(data: Path) -> None:
+def test_concave_pixels_are_between_the_balls(data: Path) -> None:
     truth = surface.TrueSurface.read(data)
     assert truth is not None
     for view in (view.load() for view in read_dataset(data, "test").views):
@@ -267,7 +267,7 @@ def test_concave_pixels_are_where_the_balls_are_close(data: Path) -> None:
 # ---------------- a run that has found everything ----------------
 
 
-def test_a_perfect_run_scores(data: Path, tmp_path: Path) -> None:
+def test_evaluate_scores_a_perfect_run(data: Path, tmp_path: Path) -> None:
     run = write_known_run(data, tmp_path / "run")
     result = evaluate(run)
     assert result["albedo_psnr"] > 28 and result["roughness_mae"] < 0.005 and result["metallic_mae"] < 0.02
@@ -282,7 +282,7 @@ def test_a_perfect_run_scores(data: Path, tmp_path: Path) -> None:
     assert sheet.shape[1] > 10 * SIZE and sheet.std() > 0.1
 
 
-def test_a_wrong_run_does_not(data: Path, tmp_path: Path) -> None:
+def test_evaluate_scores_a_wrong_run(data: Path, tmp_path: Path) -> None:
     """Materials of the other ball, and a surface that is 2 % too small."""
     run = write_known_run(data, tmp_path / "run")
     fitted = TrainedScene.read(run.path)
@@ -297,7 +297,7 @@ def test_a_wrong_run_does_not(data: Path, tmp_path: Path) -> None:
     assert 0.3 < result["surface_distance"] < 2
 
 
-def test_data_without_truth_says_so(data: Path, tmp_path: Path) -> None:
+def test_evaluate_without_ground_truth_gives_reasons(data: Path, tmp_path: Path) -> None:
     """Every key stays; here the maps and the surface of the data set are gone."""
     run = write_known_run(data, tmp_path / "run", occlusion=False)
     bare = tmp_path / "bare"
@@ -325,7 +325,7 @@ def test_data_without_truth_says_so(data: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("with_mesh", [False, True])
-def test_albedo_comes_out_of_the_fitted_radiance(data: Path, with_mesh: bool) -> None:
+def test_relightable_recovers_albedo_from_fitted_radiance(data: Path, with_mesh: bool) -> None:
     """A radiance that changes with direction, (1 - S) albedo × irradiance on average over the hemisphere."""
     mesh = known_mesh()
     surfels = known_surfels()
@@ -358,7 +358,7 @@ def test_albedo_comes_out_of_the_fitted_radiance(data: Path, with_mesh: bool) ->
     np.testing.assert_allclose(albedo[~clay], 0.5, atol=0.01)  # a metal's is the channel
 
 
-def test_a_run_without_materials_or_light_cannot_be_relit() -> None:
+def test_relightable_requires_materials_and_light() -> None:
     surfels = known_surfels()
     raw = {name: x for name, x in surfels.raw.items() if name != "metallic"}
     light = EnvironmentLight.constant(0.5, 8)
@@ -370,7 +370,7 @@ def test_a_run_without_materials_or_light_cannot_be_relit() -> None:
             relightable(scene)
 
 
-def test_materials_that_are_there_stay(data: Path) -> None:
+def test_relightable_keeps_fitted_materials(data: Path) -> None:
     mesh = known_mesh()
     surfels = known_surfels()
     light = EnvironmentLight.constant(0.5, 8)

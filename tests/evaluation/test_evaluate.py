@@ -60,7 +60,7 @@ def run(folder: Path, tmp_path: Path) -> Run:
     return Run(shutil.copytree(folder / "run", tmp_path / "run"))
 
 
-def test_every_key_is_there_and_json_can_hold_it(run: Run) -> None:
+def test_metrics_json_has_every_key(run: Run) -> None:
     result = evaluate(run)
     assert result.keys() >= set(KEYS)
     assert json.loads((run.path / "metrics.json").read_text()) == json.loads(
@@ -75,7 +75,7 @@ def test_every_key_is_there_and_json_can_hold_it(run: Run) -> None:
         assert missing == bool(result[f"{key}_reason"]), key
 
 
-def test_the_numbers_are_those_of_the_trainer(run: Run, folder: Path) -> None:
+def test_metrics_equal_those_of_the_trainer(run: Run, folder: Path) -> None:
     """Exported, read back and measured: the state of the trainer, view by view."""
     result = evaluate(run)
     trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
@@ -89,7 +89,7 @@ def test_the_numbers_are_those_of_the_trainer(run: Run, folder: Path) -> None:
     assert [view["psnr"] for view in result["views"]] == pytest.approx(scores, abs=1e-4)
 
 
-def test_mitsuba_renders_the_exported_scene_as_the_trainer_does(run: Run, folder: Path) -> None:
+def test_mitsuba_renders_the_exported_scene_like_the_trainer(run: Run, folder: Path) -> None:
     evaluate(run)
     scene = mi.load_file(str(run.path / "scene.xml"))
     image = np.array(mi.render(scene))
@@ -102,7 +102,7 @@ def test_mitsuba_renders_the_exported_scene_as_the_trainer_does(run: Run, folder
     np.testing.assert_allclose(image, expected, atol=1e-5)
 
 
-def test_what_does_not_apply_is_null_with_a_reason(run: Run, tmp_path: Path) -> None:
+def test_missing_ground_truth_is_null_with_a_reason(run: Run, tmp_path: Path) -> None:
     plain = write_data(tmp_path / "plain", truth=False)
     result = evaluate(run, plain)
     assert result["dataset"] == str(plain)
@@ -112,7 +112,7 @@ def test_what_does_not_apply_is_null_with_a_reason(run: Run, tmp_path: Path) -> 
     assert "environment.exr" in result["env_reason"]
 
 
-def test_the_artefacts_are_what_is_measured(run: Run) -> None:
+def test_evaluate_measures_the_scene_files(run: Run) -> None:
     """An edited PLY counts; a checkpoint that is newer than the artefacts replaces them."""
     before = evaluate(run)
     fitted = TrainedScene.read(run.path)
@@ -125,7 +125,7 @@ def test_the_artefacts_are_what_is_measured(run: Run) -> None:
     assert evaluate(run)["psnr"] == pytest.approx(before["psnr"], abs=1e-6)
 
 
-def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_timed_frames_have_no_aovs(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Test views are rendered with materials and normals, also for the albedo; the timed frames without."""
     asked: list[bool] = []
 
@@ -138,7 +138,7 @@ def test_the_frames_that_are_timed_are_those_a_user_gets(run: Run, monkeypatch: 
     assert asked == [True] * 4 + [False] * (metrics.WARM_UP_FRAMES + metrics.TIMED_FRAMES)
 
 
-def test_an_export_without_light_or_mesh_leaves_no_stale_one(run: Run, folder: Path) -> None:
+def test_export_removes_stale_mesh(run: Run, folder: Path) -> None:
     evaluate(run)
     camera = dataset.read_dataset(folder / "ball", "test").views[0].camera()
     state = run.load_checkpoint()
@@ -149,14 +149,14 @@ def test_an_export_without_light_or_mesh_leaves_no_stale_one(run: Run, folder: P
     assert not TrainedScene.read(run.path).shading.occlusion
 
 
-def test_pictures_of_the_run(run: Run) -> None:
+def test_evaluate_writes_sheet_and_renders(run: Run) -> None:
     evaluate(run)
     sheet = read_png(run.path / "contact_sheet.png")
     assert sheet.shape[0] > 2 * images.CELL_MIN and sheet.shape[1] > 6 * images.CELL_MIN
     assert sorted(path.name for path in (run.path / "eval").iterdir()) == ["test_r_0.png", "test_r_1.png"]
 
 
-def test_panels_show_what_there_is(run: Run, folder: Path) -> None:
+def test_panels_show_every_map(run: Run, folder: Path) -> None:
     trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
     views = dataset.read_dataset(folder / "ball", "test")
     view = views.views[0].load()
@@ -171,7 +171,7 @@ def test_panels_show_what_there_is(run: Run, folder: Path) -> None:
     assert np.all(panels["true normals"][0, 0] == 1)  # the corner shows no ball, hence white
 
 
-def test_lights_are_shown_at_one_exposure(rng: np.random.Generator) -> None:
+def test_light_panels_have_one_exposure(rng: np.random.Generator) -> None:
     truth = rng.uniform(0.1, 5, (8, 16, 3))
     shown = images.light_panels(truth * [0.5, 2, 1], truth)
     np.testing.assert_allclose(shown["recovered light"], shown["true light"], atol=1e-6)
@@ -179,14 +179,14 @@ def test_lights_are_shown_at_one_exposure(rng: np.random.Generator) -> None:
     assert np.all(dark["recovered light"] == 0)
 
 
-def test_a_sheet_holds_rows_of_different_length() -> None:
+def test_contact_sheet_accepts_rows_of_different_length() -> None:
     black, white = np.zeros((10, 30, 3)), np.ones((10, 30, 3))
     sheet = images.contact_sheet([{"a": black, "b": white}, {"a": black}], {"light": np.zeros((8, 16, 3))})
     assert sheet.ndim == 3 and sheet.shape[2] == 3
     assert (sheet[:, :, 0] == 0).sum() >= 2 * (13 * 10) * (13 * 30)
 
 
-def test_views_of_any_name_have_an_image_each() -> None:
+def test_render_names_are_unique() -> None:
     """Also where file systems ignore case or compose accents; plain names stay as they are."""
     names = [
         "test/r_0",
@@ -212,7 +212,7 @@ def test_views_of_any_name_have_an_image_each() -> None:
     assert again == found[5:]
 
 
-def test_comparisons_read_the_image_of_each_view(
+def test_comparison_reads_the_image_of_each_view(
     run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of views whose names have no ASCII letter."""

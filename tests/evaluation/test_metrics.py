@@ -18,7 +18,7 @@ from mi_refgs.reference import losses as reference
 from mi_refgs.shade.light.envmap import EnvironmentLight
 
 
-def test_scores_of_some_pixels() -> None:
+def test_scores_of_selected_pixels() -> None:
     """Those pixels alone count; where they are all, nothing changes; SSIM's windows reach beyond them."""
     rng = np.random.default_rng(5)
     truth = rng.random((24, 20, 3))
@@ -46,7 +46,7 @@ def test_psnr(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("size", [(16, 21), (7, 30), (1, 1)])
-def test_ssim_is_what_training_optimises(size: tuple[int, int], rng: np.random.Generator) -> None:
+def test_ssim_equals_reference_and_loss(size: tuple[int, int], rng: np.random.Generator) -> None:
     """By scikit-image with padding, by the brute-force definition and by the Dr.Jit loss; smaller than the
     window too."""
     height, width = size
@@ -92,7 +92,7 @@ def test_environment_up_to_a_scale_per_channel(rng: np.random.Generator) -> None
     assert all(np.isfinite(list(metrics.environment(0 * truth, truth).values())[1:]))
 
 
-def test_a_perfect_light_scores_1(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_perfect_environment_has_correlation_1(tmp_path: Path, rng: np.random.Generator) -> None:
     """The true map itself, and read as a light of fewer rows, as a fit would have it."""
     truth = (rng.random((64, 128, 3)) ** 4 + 0.01).astype(np.float32)
     write_exr(tmp_path / "truth.exr", truth)

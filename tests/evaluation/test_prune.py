@@ -99,7 +99,9 @@ def walls(*heights: float, size: float = 20.0) -> Mesh:
 # ---------- What goes ----------
 
 
-def test_exactly_what_was_planted_goes(train: Dataset, folder: Path, rng: np.random.Generator) -> None:
+def test_prune_removes_exactly_the_useless_surfels(
+    train: Dataset, folder: Path, rng: np.random.Generator
+) -> None:
     raw = needed(train, rng)
     whole = scene(with_useless(raw, rng), RADIANCE)
     pruned, report = prune(whole, train, read_dataset(folder, "test"))
@@ -119,7 +121,7 @@ def test_exactly_what_was_planted_goes(train: Dataset, folder: Path, rng: np.ran
     assert json.loads(json.dumps(report, allow_nan=False)) == report
 
 
-def test_harmonics_keep_the_degree_that_shows(train: Dataset, rng: np.random.Generator) -> None:
+def test_prune_keeps_the_visible_sh_degree(train: Dataset, rng: np.random.Generator) -> None:
     raw = needed(train, rng)
     raw["radiance_sh"][:, 3:12] = rng.normal(size=(len(raw["position"]), 9))
     pruned, _ = prune(scene(Surfels.from_numpy(raw), RADIANCE), train)
@@ -127,7 +129,7 @@ def test_harmonics_keep_the_degree_that_shows(train: Dataset, rng: np.random.Gen
 
 
 @pytest.mark.parametrize("met", [False, True])
-def test_tracing_stays_where_it_shows(met: bool, train: Dataset, rng: np.random.Generator) -> None:
+def test_prune_keeps_visible_tracing(met: bool, train: Dataset, rng: np.random.Generator) -> None:
     """Mirror rays from the floor meet the ceiling; a mesh that no ray meets goes, with what is seen of it."""
     raw = needed(train, rng)
     raw["indirect_sh"][:, :3] = 5.0
@@ -140,7 +142,7 @@ def test_tracing_stays_where_it_shows(met: bool, train: Dataset, rng: np.random.
     assert pruned.light is not None and pruned.surfels.has("metallic")
 
 
-def test_a_limit_that_nothing_meets_drops_nothing(train: Dataset, rng: np.random.Generator) -> None:
+def test_prune_keeps_everything_at_a_strict_limit(train: Dataset, rng: np.random.Generator) -> None:
     raw = needed(train, rng)
     raw["radiance_sh"][:, 12:] = rng.normal(size=(len(raw["position"]), 15))
     for name in ("albedo", "metallic", "roughness", "indirect_sh"):
@@ -153,7 +155,7 @@ def test_a_limit_that_nothing_meets_drops_nothing(train: Dataset, rng: np.random
     assert report["train"]["worst"] == 100.0
 
 
-def test_alpha_counts_where_the_background_hides_it(train: Dataset, rng: np.random.Generator) -> None:
+def test_prune_keeps_alpha_that_the_background_hides(train: Dataset, rng: np.random.Generator) -> None:
     """White surfels before a white background: dropped, other backgrounds would show."""
     raw = needed(train, rng)
     raw["radiance_sh"][:] = 0
@@ -162,7 +164,7 @@ def test_alpha_counts_where_the_background_hides_it(train: Dataset, rng: np.rand
     assert pruned.surfels.count == len(raw["position"])
 
 
-def test_an_empty_table_and_one_that_shows_nothing(train: Dataset, rng: np.random.Generator) -> None:
+def test_prune_accepts_empty_and_invisible_scenes(train: Dataset, rng: np.random.Generator) -> None:
     raw = needed(train, rng)
     for count in (0, 4):
         rows = {name: values[:count] for name, values in raw.items()}
@@ -172,12 +174,12 @@ def test_an_empty_table_and_one_that_shows_nothing(train: Dataset, rng: np.rando
 
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, 101.0, float("nan"), float("inf")])
-def test_a_limit_out_of_range_is_refused(limit: float, train: Dataset, rng: np.random.Generator) -> None:
+def test_prune_limit_out_of_range_is_refused(limit: float, train: Dataset, rng: np.random.Generator) -> None:
     with pytest.raises(InputError, match=r"--limit: .* dB is out of range; give"):
         prune(scene(Surfels.from_numpy(needed(train, rng)), RADIANCE), train, limit=limit)
 
 
-def test_contributions_are_the_blended_weights(train: Dataset, rng: np.random.Generator) -> None:
+def test_contributions_equal_blended_weights(train: Dataset, rng: np.random.Generator) -> None:
     """Against the forward blend of a feature that is 1 for one row alone; all together they are alpha."""
     surfels = with_useless(needed(train, rng), rng)
     cameras = [view.camera() for view in train.views]
@@ -196,7 +198,7 @@ def test_contributions_are_the_blended_weights(train: Dataset, rng: np.random.Ge
 # ---------- The command ----------
 
 
-def test_a_pruned_run_shows_what_is_left_and_can_be_brought_back(
+def test_pruned_run_reports_and_is_restored(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Path(shutil.copytree(finished, tmp_path / "run"))
@@ -232,7 +234,7 @@ def test_a_pruned_run_shows_what_is_left_and_can_be_brought_back(
 
 
 @pytest.mark.parametrize("note", [7, {}, {"surfels": 5, "limit": 50, "psnr": float("nan")}])
-def test_a_note_that_cannot_be_read(note: object, finished: Path, tmp_path: Path) -> None:
+def test_unreadable_prune_note_is_refused(note: object, finished: Path, tmp_path: Path) -> None:
     run = Path(shutil.copytree(finished, tmp_path / "run"))
     content = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(content | {"pruned": note}))
@@ -242,7 +244,7 @@ def test_a_note_that_cannot_be_read(note: object, finished: Path, tmp_path: Path
         TrainedScene.read(run)
 
 
-def test_nothing_is_pruned_for_good(
+def test_prune_without_checkpoints_is_refused_in_place(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without checkpoints the artefacts are all there is: the pruned scene then goes to another folder."""

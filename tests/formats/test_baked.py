@@ -120,7 +120,7 @@ def check_materials(
 # ---------------- the surface and its textures ----------------
 
 
-def test_charts_fill_a_texture_without_overlap(exported: Exported) -> None:
+def test_charts_do_not_overlap(exported: Exported) -> None:
     """Areas add up to that of the covered texels: what overlaps would be counted twice."""
     mesh = simplified(exported.trained.mesh or Mesh.empty(), FACES)
     assert FACES / 2 < len(mesh.faces) <= FACES
@@ -148,14 +148,14 @@ def test_textures_have_the_known_materials(exported: Exported) -> None:
         assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
 
 
-def test_every_texel_of_a_seam_has_a_material(exported: Exported) -> None:
+def test_texels_beside_charts_have_materials(exported: Exported) -> None:
     """Lookups beside a chart find the nearest texel of one, not a background."""
     albedo = exported.baked.albedo.reshape(-1, 3)
     distance = np.min([np.abs(albedo - material["albedo"]).max(axis=1) for material in MATERIALS], axis=0)
     assert np.quantile(distance, 0.99) < 0.03
 
 
-def test_normals_and_places_are_those_of_the_balls(exported: Exported) -> None:
+def test_vertices_and_normals_match_the_balls(exported: Exported) -> None:
     made = exported.baked
     ball = ball_of(made.vertices)
     outward = made.vertices - MIDDLES[ball]
@@ -167,7 +167,7 @@ def test_normals_and_places_are_those_of_the_balls(exported: Exported) -> None:
     assert ((crossed * made.normals[made.faces[:, 0]]).sum(axis=1) > 0.8).all()
 
 
-def test_a_mesh_below_the_surface_moves_out(exported: Exported) -> None:
+def test_mesh_below_the_surface_moves_outwards(exported: Exported) -> None:
     """The balls' mesh 1.5 voxels too small becomes as large as their outlines."""
     trained = exported.trained
     assert trained.mesh is not None
@@ -182,7 +182,7 @@ def test_a_mesh_below_the_surface_moves_out(exported: Exported) -> None:
 # ---------------- formats ----------------
 
 
-def test_gltf_has_y_up_and_the_textures(exported: Exported) -> None:
+def test_gltf_mesh_has_y_up_and_known_materials(exported: Exported) -> None:
     scene: Any = trimesh.load(exported.folder / "gltf-mesh.glb", process=False)
     mesh = scene.geometry["object"]
     ours = np.stack([mesh.vertices[:, 0], -mesh.vertices[:, 2], mesh.vertices[:, 1]], axis=1)
@@ -215,7 +215,9 @@ assert "mi_refgs" not in sys.modules
 
 
 @pytest.mark.parametrize(("variant", "spp"), [("llvm_ad_rgb", 64), ("scalar_rgb", 16)])
-def test_plain_mitsuba_shows_what_we_show(exported: Exported, tmp_path: Path, variant: str, spp: int) -> None:
+def test_plain_mitsuba_renders_the_same_image(
+    exported: Exported, tmp_path: Path, variant: str, spp: int
+) -> None:
     """Without this package: a mirror under a light of six colours, and clay, direction by direction."""
     run_python(STOCK, exported.folder / "mitsuba", tmp_path / "p.npy", variant, spp, folder=tmp_path)
     theirs = np.load(tmp_path / "p.npy")
@@ -233,7 +235,7 @@ def test_plain_mitsuba_shows_what_we_show(exported: Exported, tmp_path: Path, va
             assert np.abs(turned - picture)[mirror][:, :3].mean() > 3 * error[mirror].mean()
 
 
-def test_plain_mitsuba_reads_textures_as_they_are_meant(exported: Exported) -> None:
+def test_plain_mitsuba_reads_texture_encodings(exported: Exported) -> None:
     folder = exported.folder / "mitsuba"
     base = base_colour(exported.baked)
     np.testing.assert_allclose(linear_from_srgb(read_png(folder / "albedo.png")), base, atol=0.01)
@@ -251,7 +253,7 @@ def test_plain_mitsuba_reads_textures_as_they_are_meant(exported: Exported) -> N
 
 
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 0.9])
-def test_principled_reflects_as_much_as_our_model(roughness: float) -> None:
+def test_principled_albedo_equals_ours(roughness: float) -> None:
     """Of constant light, over all directions of view: sampled weights against the split-sum table."""
     import drjit as dr
 
@@ -281,7 +283,7 @@ def dr_interaction(made: TexturedMesh) -> Any:
     return si
 
 
-def test_usd_says_what_the_mesh_and_its_light_are(exported: Exported, tmp_path: Path) -> None:
+def test_usd_has_mesh_materials_and_dome_light(exported: Exported, tmp_path: Path) -> None:
     usd = pytest.importorskip("pxr.Usd")
     from pxr import Gf, UsdGeom, UsdLux, UsdShade, UsdUtils
 
@@ -332,7 +334,7 @@ def off_centre() -> Camera:
     return Camera.from_pose(64, 48, -70.0, -55.0, 40.5, 17.0, pose)
 
 
-def test_a_usd_camera_keeps_the_principal_point() -> None:
+def test_usd_camera_keeps_the_principal_point() -> None:
     """Points land where our camera sees them, by USD's own frustum."""
     usd = pytest.importorskip("pxr.Usd")
     from pxr import Gf, UsdGeom
@@ -352,7 +354,7 @@ def test_a_usd_camera_keeps_the_principal_point() -> None:
         np.testing.assert_allclose((64 * x, 48 * (1 - y)), ours, atol=1e-3)
 
 
-def test_a_gltf_camera_that_loses_its_principal_point_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_gltf_camera_warns_of_off_centre_principal_point(capsys: pytest.CaptureFixture[str]) -> None:
     for camera, said in ((off_centre(), True), (shots_around(trained_scene().surfels)[0].camera, False)):
         gltf._add_camera({"nodes": [], "scenes": [{"nodes": []}]}, camera)
         text = "8.5 pixels to the right and -7.0 below" in capsys.readouterr().err
@@ -375,7 +377,7 @@ def test_usd_passes_its_own_validators(exported: Exported) -> None:
 
 
 @pytest.mark.parametrize("package", ["xatlas", "fast_simplification"])
-def test_a_missing_package_is_named(
+def test_missing_package_is_refused(
     exported: Exported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
@@ -398,7 +400,7 @@ def test_a_missing_usd_is_named(exported: Exported, tmp_path: Path, monkeypatch:
         ({"mesh": Mesh.empty()}, "mesh: the run has none that textures could be baked to"),
     ],
 )
-def test_a_run_without_light_or_mesh_is_refused(
+def test_run_without_light_or_mesh_is_refused(
     exported: Exported, tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
     shading = Shading(diffuse="irradiance", occlusion=False)
@@ -408,7 +410,7 @@ def test_a_run_without_light_or_mesh_is_refused(
     assert str(caught.value).startswith(message)
 
 
-def test_a_method_without_materials_is_refused(exported: Exported, tmp_path: Path) -> None:
+def test_run_without_materials_is_refused(exported: Exported, tmp_path: Path) -> None:
     raw = {k: v for k, v in exported.trained.surfels.raw.items() if k not in ("albedo", "metallic")}
     scene = replace(exported.trained, surfels=Surfels(raw))
     with pytest.raises(InputError, match="albedo, metallic: the run has none; fit one with materials"):
@@ -416,7 +418,7 @@ def test_a_method_without_materials_is_refused(exported: Exported, tmp_path: Pat
 
 
 @pytest.mark.parametrize("option", ["--faces=3", "--texture=7", "--texture=100000"])
-def test_numbers_out_of_range_get_one_sentence(
+def test_bake_options_out_of_range_are_refused(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
 ) -> None:
     assert main(["export", str(finished), "--to", "usd", option, "-o", str(tmp_path / "a.usdz")]) == 2

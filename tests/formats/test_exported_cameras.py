@@ -107,7 +107,7 @@ def test_every_reader_has_a_layout() -> None:
 
 
 @pytest.mark.parametrize(("reader", "kind"), CASES)
-def test_exported_cameras_are_those_of_the_files(reader: str, kind: str, tmp_path: Path) -> None:
+def test_exported_cameras_match_the_image_files(reader: str, kind: str, tmp_path: Path) -> None:
     """Beside the files of the data set, whatever size the fit read them at: the same pictures and cameras."""
     data = LAYOUTS[reader][kind](tmp_path / "data" if kind not in ("blender", "exr") else tmp_path)
     assert reader_of(data).name == reader
@@ -141,7 +141,7 @@ def test_exported_cameras_are_those_of_the_files(reader: str, kind: str, tmp_pat
                 assert (other.alpha is None) == (view.alpha is None) or kind in ("depths", "masked")
 
 
-def test_cameras_of_no_file_have_names(tmp_path: Path) -> None:
+def test_cameras_without_image_files_are_named(tmp_path: Path) -> None:
     """Such as those of a reader that gives arrays, and those around a run without data."""
     camera = read_loaded(write_data(tmp_path / "ball", views=1, truth=False), "train").views[0].camera()
     shots = [Shot("a.jpg", "test", camera), Shot("train/r_0", "train", camera)]

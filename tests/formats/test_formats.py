@@ -43,7 +43,7 @@ def plain() -> Iterator[list[Any]]:
 # ---------------- the registry ----------------
 
 
-def test_declarations_import_nothing_that_computes(tmp_path: Path) -> None:
+def test_format_declarations_import_no_numpy_or_mitsuba(tmp_path: Path) -> None:
     found = run_python(
         "import sys, mi_refgs.formats; print([n for n in ('numpy', 'mitsuba') if n in sys.modules])",
         folder=tmp_path,
@@ -54,7 +54,7 @@ def test_declarations_import_nothing_that_computes(tmp_path: Path) -> None:
     assert found == base
 
 
-def test_a_registered_format_is_a_choice_of_the_command(
+def test_registered_format_is_a_choice_of_the_command(
     plain: list[Any], finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = tmp_path / "number.txt"
@@ -86,7 +86,7 @@ def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: P
         (["--to", "plain", "-o", "OUT.ply"], "suffix: plain writes .txt"),
     ],
 )
-def test_bad_arguments_get_one_sentence(
+def test_bad_export_arguments_are_refused(
     plain: list[Any],
     finished: Path,
     tmp_path: Path,
@@ -100,7 +100,7 @@ def test_bad_arguments_get_one_sentence(
     assert message in said and said.count("\n") == 1 and "Traceback" not in said
 
 
-def test_an_option_is_the_same_in_all_formats(plain: list[Any]) -> None:
+def test_registry_refuses_conflicting_options_and_names(plain: list[Any]) -> None:
     def write(trained: TrainedScene, target: Path, shots: Any) -> list[Path]:
         return []
 
@@ -140,7 +140,7 @@ def test_exported_cameras_are_those_of_the_data_set(
 
 
 @pytest.mark.parametrize("record", [None, "{}", '{"path": "gone"}'])
-def test_a_run_without_data_has_cameras_around_its_surfels(
+def test_run_without_data_has_cameras_around_its_surfels(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], record: str | None
 ) -> None:
     run = tmp_path / "run"
@@ -167,7 +167,7 @@ def test_a_run_without_data_has_cameras_around_its_surfels(
 
 
 @pytest.mark.parametrize("mesh", [False, True])
-def test_a_stray_does_not_move_a_turntable(finished: Path, mesh: bool) -> None:
+def test_turntable_ignores_outliers(finished: Path, mesh: bool) -> None:
     """One surfel, or one vertex, far out: the cameras look at what they looked at without it."""
     import mitsuba as mi
 
@@ -188,7 +188,7 @@ def test_a_stray_does_not_move_a_turntable(finished: Path, mesh: bool) -> None:
         np.testing.assert_allclose(other.pose()[:3, 3], camera.pose()[:3, 3], atol=0.1)
 
 
-def test_nothing_to_look_at_is_said(finished: Path) -> None:
+def test_cameras_around_no_surfels_are_refused(finished: Path) -> None:
     trained = TrainedScene.read(finished)
     import mitsuba as mi
 
@@ -196,7 +196,7 @@ def test_nothing_to_look_at_is_said(finished: Path) -> None:
         shots_around(trained.surfels.gather(mi.UInt32()))
 
 
-def test_python_writes_formats_too(plain: list[Any], finished: Path, tmp_path: Path) -> None:
+def test_write_function_writes_formats(plain: list[Any], finished: Path, tmp_path: Path) -> None:
     trained = TrainedScene.read(finished)
     shots = shots_around(trained.surfels)
     found = write(trained, ["plain"], tmp_path / "n.txt", shots, {"level": 5})

@@ -101,7 +101,7 @@ def theirs(request: pytest.FixtureRequest, tmp_path: Path, rng: np.random.Genera
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_file_is_shown_by_its_own_formula(name: str, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_splat_file_matches_float64_reference(name: str, tmp_path: Path, rng: np.random.Generator) -> None:
     raw = raw_of(*LAYOUTS[name], rng)
     path = tmp_path / "theirs.ply"
     path.write_bytes(their_bytes(raw))
@@ -119,7 +119,7 @@ def test_a_file_is_shown_by_its_own_formula(name: str, tmp_path: Path, rng: np.r
     assert GAUSSIAN_LOW_PASS == 0.3  # theirs
 
 
-def test_the_command_makes_a_run_that_is_shown_the_same(
+def test_import_command_makes_a_run_that_renders_the_same(
     theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Rendered of scene.xml, and of what TrainedScene.read gives; edited; exported."""
@@ -144,7 +144,7 @@ def test_the_command_makes_a_run_that_is_shown_the_same(
     assert "holds a run already" in capsys.readouterr().err
 
 
-def test_one_gaussian_is_said_in_the_singular(
+def test_import_reports_one_gaussian_in_the_singular(
     tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole, run = their_bytes(raw_of(3, 0, rng)), tmp_path / "run"
@@ -156,7 +156,7 @@ def test_one_gaussian_is_said_in_the_singular(
 
 
 @pytest.mark.parametrize("form", ["gltf-mesh", "mitsuba"])
-def test_what_a_run_lacks_is_said_of_its_folder(
+def test_mesh_formats_of_an_imported_run_are_refused(
     theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str
 ) -> None:
     run = tmp_path / "run"
@@ -166,7 +166,7 @@ def test_what_a_run_lacks_is_said_of_its_folder(
 
 
 @pytest.mark.parametrize("linear", [False, True])
-def test_python_imports_what_the_command_does(theirs: Path, tmp_path: Path, linear: bool) -> None:
+def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path, linear: bool) -> None:
     """In memory, saved, and by the command: the same picture bit for bit; colours differ by what they are."""
     import mi_refgs
 
@@ -184,7 +184,7 @@ def test_python_imports_what_the_command_does(theirs: Path, tmp_path: Path, line
         mi_refgs.import_splats(tmp_path / "no.ply")
 
 
-def test_what_was_imported_is_exported_as_it_was(theirs: Path, tmp_path: Path) -> None:
+def test_imported_gaussians_are_exported_unchanged(theirs: Path, tmp_path: Path) -> None:
     """Encoded colours are not fitted anew; Gaussians come back bit for bit."""
     run, again = tmp_path / "run", tmp_path / "again.ply"
     assert main(["import", str(theirs), "-o", str(run)]) == 0
@@ -197,7 +197,7 @@ def test_what_was_imported_is_exported_as_it_was(theirs: Path, tmp_path: Path) -
         np.testing.assert_array_equal(after["position"], before["position"])
 
 
-def test_linear_colours_come_back_to_the_same_picture(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_linear_colours_survive_import(tmp_path: Path, rng: np.random.Generator) -> None:
     """surfels.ply of a run that has colours alone → a run: the same picture."""
     path, run = tmp_path / "theirs.ply", tmp_path / "run"
     path.write_bytes(their_bytes(raw_of(2, 2, rng)))
@@ -210,7 +210,7 @@ def test_linear_colours_come_back_to_the_same_picture(tmp_path: Path, rng: np.ra
         assert np.abs(a.numpy() - b.numpy()).max() <= 1e-6 < a.numpy().max()
 
 
-def test_the_model_is_the_inverse_of_the_encoding() -> None:
+def test_displayed_model_inverts_the_srgb_encoding() -> None:
     """Values below and above the straight part, and the derivative, against differences of the formula."""
     import drjit as dr
 
@@ -274,7 +274,7 @@ def broken(kind: str, whole: bytes) -> bytes:
         ("text", "not a PLY file; give the PLY file of 3DGS or 2DGS"),
     ],
 )
-def test_other_files_get_one_sentence(
+def test_other_ply_files_are_refused(
     kind: str, message: str, tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "file.ply"
@@ -285,7 +285,7 @@ def test_other_files_get_one_sentence(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_missing_file_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_ply_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["import", str(tmp_path / "no.ply"), "-o", str(tmp_path / "run")]) == 2
     assert "cannot be read" in capsys.readouterr().err
 
@@ -298,7 +298,7 @@ def transforms() -> dict[str, object]:
     return {"w": 64, "h": 48, "camera_angle_x": 0.8, "frames": [frame, {**frame, "w": 32, "fl_x": 40.0}]}
 
 
-def test_cameras_of_a_transforms_file_are_those_of_the_run(theirs: Path, tmp_path: Path) -> None:
+def test_transforms_file_defines_the_cameras_of_an_import(theirs: Path, tmp_path: Path) -> None:
     file, run = tmp_path / "transforms.json", tmp_path / "run"
     file.write_text(json.dumps(transforms()))
     assert main(["import", str(theirs), "-o", str(run), "--camera", str(file)]) == 0
@@ -321,7 +321,7 @@ def test_cameras_of_a_transforms_file_are_those_of_the_run(theirs: Path, tmp_pat
         ({"frames": [{"transform_matrix": (2 * np.eye(4)).tolist()}]}, "not a rotation and a translation"),
     ],
 )
-def test_bad_cameras_are_named(change: dict[str, object], message: str, tmp_path: Path) -> None:
+def test_bad_transforms_file_is_refused(change: dict[str, object], message: str, tmp_path: Path) -> None:
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps({**transforms(), **change}))
     with pytest.raises(InputError) as caught:
@@ -329,7 +329,7 @@ def test_bad_cameras_are_named(change: dict[str, object], message: str, tmp_path
     assert message in str(caught.value) and str(file) in str(caught.value)
 
 
-def test_a_run_is_rendered_from_the_cameras_of_a_file(
+def test_render_uses_cameras_of_a_file(
     theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The picture of that frame's camera, which is no sensor of the run; wrong frames are one sentence."""
@@ -351,7 +351,7 @@ def test_a_run_is_rendered_from_the_cameras_of_a_file(
     assert capsys.readouterr().err == (f"refgs: {file}: --sensor: 2: the file has 2 frames; give 0 to 1\n")
 
 
-def test_a_scene_without_sensors_needs_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scene_without_sensors_requires_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The scene is any of Mitsuba's: a white sphere in uniform light."""
     scene, file, out = tmp_path / "scene.xml", tmp_path / "camera.json", tmp_path / "out.png"
     scene.write_text(
@@ -367,7 +367,7 @@ def test_a_scene_without_sensors_needs_cameras(tmp_path: Path, capsys: pytest.Ca
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e5])
-def test_cameras_of_a_file_see_scenes_of_every_size(scale: float, tmp_path: Path) -> None:
+def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(scale: float, tmp_path: Path) -> None:
     """A black ball in white light, whose camera has no near plane: it is not cut off."""
     scene, file, out = tmp_path / "scene.xml", tmp_path / "camera.json", tmp_path / "out.exr"
     scene.write_text(

@@ -98,7 +98,7 @@ def db(a: np.ndarray, b: np.ndarray) -> float:
 # ---------------- Gaussians ----------------
 
 
-def test_gaussians_show_what_the_scene_shows(scene: TrainedScene, shots: list[Shot]) -> None:
+def test_gaussians_render_the_same_image(scene: TrainedScene, shots: list[Shot]) -> None:
     """At cameras between those that colours were fitted to, colour and outline, on both grounds."""
     table = gaussians(scene, shots, 3, False)
     assert table.primitive.name == "gaussian" and table.sh_degree() == 3
@@ -111,7 +111,7 @@ def test_gaussians_show_what_the_scene_shows(scene: TrainedScene, shots: list[Sh
         assert db(theirs[..., 3], ours[..., 3]) > 19  # its outline is long for so few pixels
 
 
-def test_more_harmonics_show_more(scene: TrainedScene, shots: list[Shot]) -> None:
+def test_higher_sh_degree_fits_better(scene: TrainedScene, shots: list[Shot]) -> None:
     """Of a smooth metal, whose colour turns with the camera."""
     raw = scene.surfels.to_numpy()
     raw |= {"metallic": np.full((COUNT, 1), 6.0), "roughness": np.full((COUNT, 1), -1.0)}
@@ -126,7 +126,7 @@ def test_more_harmonics_show_more(scene: TrainedScene, shots: list[Shot]) -> Non
     assert found[0] + 4 < found[1] < found[2], found
 
 
-def test_the_third_axis_is_the_thin_normal(scene: TrainedScene, shots: list[Shot]) -> None:
+def test_gaussians_are_thin_along_the_normal_and_inset(scene: TrainedScene, shots: list[Shot]) -> None:
     """Sizes and opacities stay; surfels move inwards by less than a pixel, whichever way normals point."""
     before = scene.surfels.to_numpy()
     after = gaussians(scene, shots, 0, False).to_numpy()
@@ -141,7 +141,7 @@ def test_the_third_axis_is_the_thin_normal(scene: TrainedScene, shots: list[Shot
     assert (radius[seen] < 1 - 0.3 * pixel).mean() > 0.95 and radius.min() > 1 - pixel
 
 
-def test_what_no_camera_sees_has_the_colour_of_its_neighbours(scene: TrainedScene, shots: list[Shot]) -> None:
+def test_unseen_gaussians_get_the_colour_of_neighbours(scene: TrainedScene, shots: list[Shot]) -> None:
     """Not the grey of coefficients that are zero."""
     camera = replace(shots[0].camera, width=SIZE // 2)
     table = gaussians(scene, [Shot("only", "train", camera)], 0, False).to_numpy()
@@ -151,7 +151,7 @@ def test_what_no_camera_sees_has_the_colour_of_its_neighbours(scene: TrainedScen
     assert beside.sum() > 50 and np.abs(table["radiance_sh"][beside]).max(axis=1).min() > 1e-3
 
 
-def test_views_that_see_nothing_change_nothing(scene: TrainedScene, shots: list[Shot]) -> None:
+def test_empty_views_do_not_change_colours(scene: TrainedScene, shots: list[Shot]) -> None:
     """A camera that looks away is as good as none; where all do, there are colours all the same."""
     away = [replace(shot, camera=shot.camera.moved(shot.camera.pose() @ BACKWARDS)) for shot in shots]
     train = [shot for shot in shots if shot.split == "train"]
@@ -161,7 +161,7 @@ def test_views_that_see_nothing_change_nothing(scene: TrainedScene, shots: list[
     assert all(np.isfinite(table).all() for table in none.values())
 
 
-def test_surroundings_come_along_unless_the_object_is_asked_for(
+def test_background_gaussians_are_exported_unless_object_only(
     scene: TrainedScene, shots: list[Shot], rng: np.random.Generator
 ) -> None:
     around = {
@@ -180,7 +180,7 @@ def test_surroundings_come_along_unless_the_object_is_asked_for(
     assert db(their_picture(alone, camera)[..., :3], encoded(both, camera, alone=True)[..., :3]) > 28
 
 
-def test_nothing_and_degrees_out_of_range_are_refused(scene: TrainedScene, shots: list[Shot]) -> None:
+def test_gaussians_refuse_empty_scene_and_bad_degree(scene: TrainedScene, shots: list[Shot]) -> None:
     with pytest.raises(InputError, match="--degree: 4 is out of range"):
         gaussians(scene, shots, 4, False)
     with pytest.raises(InputError, match="there are none"):
@@ -190,7 +190,7 @@ def test_nothing_and_degrees_out_of_range_are_refused(scene: TrainedScene, shots
 # ---------------- files ----------------
 
 
-def test_the_ply_file_has_the_order_of_properties_that_others_expect(
+def test_ply_properties_have_the_order_of_3dgs(
     scene: TrainedScene, shots: list[Shot], tmp_path: Path
 ) -> None:
     (file,) = write(scene, ["3dgs-ply"], tmp_path / "a.ply", shots, {"degree": 1})["3dgs-ply"]
@@ -231,9 +231,7 @@ def columns_of(file: Path) -> tuple[dict[str, Any], Callable[[str], np.ndarray]]
     return content, column
 
 
-def test_the_gltf_file_holds_the_same_gaussians_activated(
-    scene: TrainedScene, shots: list[Shot], tmp_path: Path
-) -> None:
+def test_gltf_has_activated_gaussians(scene: TrainedScene, shots: list[Shot], tmp_path: Path) -> None:
     files = write(scene, ["3dgs-ply", "gltf-splats"], tmp_path, shots, {"degree": 2})
     table = read_ply(files["3dgs-ply"][0])
     content, column = columns_of(files["gltf-splats"][0])
@@ -265,7 +263,7 @@ def test_the_gltf_file_holds_the_same_gaussians_activated(
     )
 
 
-def test_the_exr_file_has_every_layer(scene: TrainedScene, shots: list[Shot], tmp_path: Path) -> None:
+def test_exr_has_every_layer(scene: TrainedScene, shots: list[Shot], tmp_path: Path) -> None:
     (file,) = write(scene, ["exr"], tmp_path / "view.exr", shots, {"view": 1, "samples": 1})["exr"]
     layers = read_exr(file)
     frame = scene.renderer()(shots[1].camera)
@@ -284,7 +282,7 @@ def test_the_exr_file_has_every_layer(scene: TrainedScene, shots: list[Shot], tm
     assert {"metallic.V", "visibility.V"} <= {*layers} and solid.mean() > 0.2
 
 
-def test_views_of_an_exr_file_are_counted(
+def test_exr_view_out_of_range_is_refused(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", str(finished), "--to", "exr", "-o", str(tmp_path / "a.exr"), "--view", "9"]) == 2

@@ -47,7 +47,7 @@ def psnr(ours: np.ndarray, truth: np.ndarray) -> float:
 # ---------------- pictures ----------------
 
 
-def test_the_picture_is_the_path_tracers(folder: Path, balls: Reconstruction) -> None:
+def test_render_matches_path_tracing(folder: Path, balls: Reconstruction) -> None:
     """Of the first test view: right place, orientation, premultiplication and encoding."""
     truth = read_exr_image(folder / "data/test/r_000.exr")
     ours = balls.render(0, samples=4)
@@ -55,7 +55,7 @@ def test_the_picture_is_the_path_tracers(folder: Path, balls: Reconstruction) ->
     assert psnr(ours, truth) > 23 > psnr(ours[:, ::-1], truth) + 5
 
 
-def test_whatever_stands_for_a_camera_gives_one_picture(balls: Reconstruction) -> None:
+def test_render_accepts_every_kind_of_camera(balls: Reconstruction) -> None:
     """An index, a view and a camera alike; a Mitsuba sensor and `look_at` of the same numbers alike."""
     first = balls.render()
     np.testing.assert_array_equal(balls.render(balls.views().views[0]), first)
@@ -74,7 +74,7 @@ def test_whatever_stands_for_a_camera_gives_one_picture(balls: Reconstruction) -
     np.testing.assert_allclose(balls.render(sensor), balls.render(camera), atol=2e-3)
 
 
-def test_other_pixels_show_the_same_view(balls: Reconstruction) -> None:
+def test_render_size_keeps_the_view(balls: Reconstruction) -> None:
     """Twice as many, averaged, are 2 × 2 samples; and one number is the longer side."""
     fine = balls.render(0, size=2 * SIZE)
     mean = fine.reshape(SIZE, 2, SIZE, 2, 4).mean(axis=(1, 3))
@@ -98,7 +98,7 @@ def test_aovs_are_the_known_materials(balls: Reconstruction) -> None:
     np.testing.assert_allclose(summed, balls.render(0)[..., :3], atol=1e-5)
 
 
-def test_surroundings_make_a_picture_opaque(folder: Path, balls: Reconstruction) -> None:
+def test_background_makes_the_image_opaque(folder: Path, balls: Reconstruction) -> None:
     """What is behind the object shows through, and `object_only` leaves it out."""
     from dataclasses import replace
 
@@ -113,7 +113,7 @@ def test_surroundings_make_a_picture_opaque(folder: Path, balls: Reconstruction)
     assert (whole[..., 3] == 1).all()
 
 
-def test_cameras_without_the_data_set(balls: Reconstruction, tmp_path: Path) -> None:
+def test_cameras_without_data_set_surround_the_object(balls: Reconstruction, tmp_path: Path) -> None:
     """All around the object, which they show whole; a turntable goes round at one height."""
     shutil.copytree(balls.folder or Path(), tmp_path / "run")
     Run(tmp_path / "run").write_dataset(str(tmp_path / "gone"), None)
@@ -130,7 +130,7 @@ def test_cameras_without_the_data_set(balls: Reconstruction, tmp_path: Path) -> 
 # ---------------- Mitsuba ----------------
 
 
-def test_the_scene_renders_alike_and_differentiates(balls: Reconstruction) -> None:
+def test_mitsuba_scene_renders_the_same_and_differentiates(balls: Reconstruction) -> None:
     """Each sensor shows its camera; roughness and light have gradients."""
     scene = balls.scene([0, 1], aovs=["normal"])
     for i in range(2):
@@ -148,7 +148,7 @@ def test_the_scene_renders_alike_and_differentiates(balls: Reconstruction) -> No
 # ---------------- run folders ----------------
 
 
-def test_what_is_saved_renders_the_same_bits(balls: Reconstruction, tmp_path: Path) -> None:
+def test_saved_run_renders_bit_identically(balls: Reconstruction, tmp_path: Path) -> None:
     """Of a run; and of what was changed in memory."""
     saved = balls.save(tmp_path / "new")
     assert saved.folder == tmp_path / "new" and not (tmp_path / "new/checkpoints").exists()
@@ -163,7 +163,7 @@ def test_what_is_saved_renders_the_same_bits(balls: Reconstruction, tmp_path: Pa
     assert again.provenance == balls.provenance
 
 
-def test_commands_take_what_is_saved(
+def test_commands_accept_a_saved_run(
     balls: Reconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A folder without checkpoints is a run."""
@@ -182,7 +182,7 @@ def test_commands_take_what_is_saved(
 
 
 @pytest.mark.parametrize("form", ["path", "array", "light", "new light"])
-def test_a_light_in_any_form_gives_one_picture(folder: Path, balls: Reconstruction, form: str) -> None:
+def test_relight_accepts_every_kind_of_light(folder: Path, balls: Reconstruction, form: str) -> None:
     """That of the path tracer under it: the data set has the views."""
     file = folder / "dusk.exr"
     given: dict[str, Any] = {
@@ -197,7 +197,7 @@ def test_a_light_in_any_form_gives_one_picture(folder: Path, balls: Reconstructi
     assert relit.folder is None
 
 
-def test_an_edit_changes_what_it_selects(balls: Reconstruction) -> None:
+def test_edit_changes_selected_surfels(balls: Reconstruction) -> None:
     before = balls.aovs(0, ["roughness", "metallic"])
     changed = balls.edit(where="metallic > 0.5", set={"roughness": 0.8})
     after = changed.aovs(0, ["roughness", "metallic"])
@@ -210,7 +210,7 @@ def test_an_edit_changes_what_it_selects(balls: Reconstruction) -> None:
     assert two.trained.surfels.count == 2 * balls.trained.surfels.count
 
 
-def test_another_format_is_written(balls: Reconstruction, tmp_path: Path) -> None:
+def test_export_writes_a_format(balls: Reconstruction, tmp_path: Path) -> None:
     files = balls.export("cameras", tmp_path / "cameras")
     assert (tmp_path / "cameras/transforms.json") in files
 
@@ -218,7 +218,7 @@ def test_another_format_is_written(balls: Reconstruction, tmp_path: Path) -> Non
 # ---------------- fitting ----------------
 
 
-def test_a_fit_is_what_the_command_makes(data: Path, method: Path, finished: Path, tmp_path: Path) -> None:
+def test_fit_equals_the_command(data: Path, method: Path, finished: Path, tmp_path: Path) -> None:
     """The same folder, with previews; settings as a mapping are those of `--set`."""
     settings = {key: int(value) for key, value in (text.split("=") for text in SETTINGS)}
     with pytest.warns(UserWarning, match="only 3 training views"):
@@ -232,7 +232,7 @@ def test_a_fit_is_what_the_command_makes(data: Path, method: Path, finished: Pat
     np.testing.assert_array_equal(found.render(), mi_refgs.load(tmp_path / "run").render())
 
 
-def test_a_temporary_folder_goes_with_its_last_user(data: Path, method: Path) -> None:
+def test_temporary_folder_is_removed_with_its_last_user(data: Path, method: Path) -> None:
     class Heard(mi_refgs.Progress):
         """Counts steps."""
 
@@ -257,7 +257,7 @@ def test_a_temporary_folder_goes_with_its_last_user(data: Path, method: Path) ->
     assert not folder.exists()
 
 
-def test_settings_are_text_of_toml() -> None:
+def test_settings_become_toml_assignments() -> None:
     found = assignments({"a": 1, "b.c": 0.5, "d": True, "e": "x", "f": [1, 2]})
     assert found == ["a=1", "b.c=0.5", "d=true", 'e="x"', "f=[\n    1,\n    2,\n]"]
     assert assignments(["a=1"]) == ["a=1"]
@@ -291,13 +291,13 @@ def test_settings_are_text_of_toml() -> None:
         (lambda r: mi_refgs.fit("x", settings={"a": None}), "settings: .*; give numbers"),
     ],
 )
-def test_bad_input_is_one_sentence(balls: Reconstruction, call: Any, message: str) -> None:
+def test_reconstruction_refuses_bad_input(balls: Reconstruction, call: Any, message: str) -> None:
     with pytest.raises(InputError, match=message) as refused:
         call(balls)
     assert "\n" not in str(refused.value)
 
 
-def test_a_variant_must_be_set(balls: Reconstruction) -> None:
+def test_load_requires_a_supported_variant(balls: Reconstruction) -> None:
     mi.set_variant("scalar_rgb")
     with pytest.raises(InputError, match=r"mi_refgs.load: variant: .* call mi.set_variant\('llvm_ad_rgb'\)"):
         mi_refgs.load(balls.folder or "")
