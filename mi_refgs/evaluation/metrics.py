@@ -119,7 +119,7 @@ def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> dict[str, float]:
     """Compute the mean angle in degrees between normal maps, over the foreground and over the whole image.
 
-    normal: recovered, of any length; truth: (H, W, 3), zero where nothing is hit; alpha: true alpha (H, W).
+    `normal` is recovered, of any length; `truth` (H, W, 3) is 0 where nothing is hit; `alpha` (H, W) is true.
     Foreground is alpha > 0.5 with a true normal; a missing recovered normal counts 90° there.
     `normal_mae_deg` is the mean over the foreground; `normal_mae_deg_full` divides the same sum by all
     pixels, so the background counts as 0°, as in most papers. Both are 0 for an image without foreground.
@@ -157,10 +157,10 @@ def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     sRGB encoding and clamping to [0, 1]) and `env_correlation` (Pearson, of the same encoded values).
     """
     light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
-    for name, array in (("light", light), ("truth", truth)):
+    for name, array in (("recovered", light), ("true", truth)):
         if array.ndim != 3 or array.shape[2] != 3 or array.shape[0] < 2 or not np.all(np.isfinite(array)):
             raise InputError(
-                f"metrics: environment {name}: need finite (h, w, 3) values, h ≥ 2; write the map again"
+                f"metrics: {name} environment: need finite (h, w, 3) values, h ≥ 2; write the map again"
             )
     rows = lobe_matrices.row_resampling(len(truth), len(light))
     columns = lobe_matrices.column_resampling(truth.shape[1], light.shape[1])

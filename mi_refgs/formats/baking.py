@@ -310,8 +310,8 @@ def _sample_view(
 def _padded(covered: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return textures (N, N, C) of values (T, C) of the texels that are `covered` (N, N).
 
-    Other texels get the value of the nearest covered one, so that lookups at the edge of a chart, or in a mip level, do
-    not meet a texel outside the surface.
+    Other texels get the value of the nearest covered one, so that no lookup at the edge of a chart, or in a
+    mip level, reads a texel outside the surface.
     """
     from scipy import ndimage
 

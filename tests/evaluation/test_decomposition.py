@@ -1,4 +1,4 @@
-"""The decomposition beside the truth: errors of materials and surface, where it is concave, and apart."""
+"""Errors of materials and surface against ground truth, over all pixels and over concave ones."""
 
 from __future__ import annotations
 
@@ -40,25 +40,23 @@ from tests.scenes.known import (
     SIZE,
     known_mesh,
     known_surfels,
-    write_known_data,
     write_known_run,
 )
 
 H = W = 8
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def data(known: Path) -> Path:
     """The data set of the two known balls."""
-    mi.set_variant("llvm_ad_rgb")
-    return write_known_data(tmp_path_factory.mktemp("known"))
+    return known / "data"
 
 
 # ---------------- materials ----------------
 
 
 def random_view(seed: int) -> tuple[RenderedView, View, np.ndarray]:
-    """A view of noise: what is rendered, the truth with materials known in part, and concave pixels."""
+    """A view of noise: its render, its ground truth with partly known materials, and concave pixels."""
     rng = np.random.default_rng(seed)
     colour, normal = rng.random((H, W, 3)).astype(np.float32), rng.normal(size=(H, W, 3)).astype(np.float32)
     alpha = (rng.random((H, W)) > 0.3).astype(np.float32)
@@ -87,7 +85,7 @@ def random_view(seed: int) -> tuple[RenderedView, View, np.ndarray]:
 
 
 def maps_of(view: View, factor: Any = 1.0) -> dict[str, np.ndarray]:
-    """The true materials as ours, albedo times a factor; rubbish where they are unknown."""
+    """The true materials as ours, albedo times a factor; 7 where they are unknown."""
     found = {}
     for name, values in view.materials.items():
         ours = values[..., :-1] * (factor if name == "albedo" else 1)
@@ -98,7 +96,7 @@ def maps_of(view: View, factor: Any = 1.0) -> dict[str, np.ndarray]:
 
 
 def test_perfect_decomposition_has_no_error() -> None:
-    """Whatever the scale of albedo in each channel, which is reported; what is unknown does not count."""
+    """The scale of albedo per channel is reported and does not count; unknown materials do not either."""
     factor = np.array([2.0, 0.5, 1.25])
     errors = Decomposition()
     for seed in range(3):
@@ -168,7 +166,7 @@ def truth_of(*shapes: Any) -> surface.TrueSurface:
 
 
 def around(count: int = 8) -> list[View]:
-    """Cameras on a circle and above, that look at the origin."""
+    """Cameras on a circle and above that look at the origin."""
     blank = np.zeros((16, 16, 3), np.float32)
     views = []
     for i in range(count):
@@ -200,7 +198,7 @@ def test_distance_of_spheres() -> None:
 
 
 def test_distance_counts_missing_but_not_hidden_surface() -> None:
-    """A second ball beside the first is missed; one inside it is seen by no camera, on either side."""
+    """A second ball beside the first is missing; one inside it is hidden, on either side."""
     both = truth_of(ball(1), ball(0.5, (1.7, 0, 0)))
     found = surface.surface_distance(mesh_of(ball(1)), both, around())
     assert found["surface_accuracy"] < 0.02 and found["surface_completeness"] > 2
@@ -211,7 +209,7 @@ def test_distance_counts_missing_but_not_hidden_surface() -> None:
 
 
 def test_closed_cavity_counts_as_concave_error() -> None:
-    """A box with a pit, and the same box without: all distance is in the pit."""
+    """A box with a pit against the same box without: all distance is in the pit."""
     box = trimesh.creation.box((2, 2, 1)).subdivide().subdivide()
     above = [
         replace(v, to_world=look_at(np.array([0.1 * i, 0.3, 6]), np.zeros(3)))
@@ -264,7 +262,7 @@ def test_concave_pixels_are_between_the_balls(data: Path) -> None:
         assert truth.concave(replace(view, depth=None)) is None
 
 
-# ---------------- a run that has found everything ----------------
+# ---------------- runs ----------------
 
 
 def test_evaluate_scores_a_perfect_run(data: Path, tmp_path: Path) -> None:
@@ -298,7 +296,7 @@ def test_evaluate_scores_a_wrong_run(data: Path, tmp_path: Path) -> None:
 
 
 def test_evaluate_without_ground_truth_gives_reasons(data: Path, tmp_path: Path) -> None:
-    """Every key stays; here the maps and the surface of the data set are gone."""
+    """Every key stays; the maps and the surface of the data set are gone here."""
     run = write_known_run(data, tmp_path / "run", occlusion=False)
     bare = tmp_path / "bare"
     (bare / "test").mkdir(parents=True)

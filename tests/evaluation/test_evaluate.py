@@ -1,4 +1,4 @@
-"""Evaluation: the numbers are those of the exported scene, and say why one of them is missing; pictures."""
+"""Evaluation: numbers of the exported scene, reasons of missing ones, contact sheets, names of images."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ def test_render_names_are_unique() -> None:
 def test_comparison_reads_the_image_of_each_view(
     run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of views whose names have no ASCII letter."""
+    """Names of views have no ASCII letter."""
     data = shutil.copytree(folder / "ball", tmp_path / "ball")
     record = json.loads((data / "transforms_test.json").read_text())
     for frame, name in zip(record["frames"], ("左", "右"), strict=True):

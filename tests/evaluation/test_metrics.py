@@ -111,7 +111,7 @@ def test_environment_weighs_by_solid_angle() -> None:
     pole, equator = truth.copy(), truth.copy()
     pole[0], equator[8] = 0, 0
     assert metrics.environment(pole, truth)["env_mae"] < 0.15 * metrics.environment(equator, truth)["env_mae"]
-    with pytest.raises(InputError, match="environment truth: need finite"):
+    with pytest.raises(InputError, match="true environment: need finite"):
         metrics.environment(truth, truth * np.nan)
 
 

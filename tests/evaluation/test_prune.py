@@ -1,4 +1,4 @@
-"""Pruning a fit: what its pictures do not need goes, nothing else does, and nothing is lost."""
+"""Pruning removes what images do not need and nothing else, and the run can be restored."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ import pytest
 from mi_refgs.cli import main
 from mi_refgs.constants import PRUNE_LIMIT
 from mi_refgs.data.dataset import Dataset, read_dataset
-from mi_refgs.errors import InputError
 from mi_refgs.evaluation.prune import contributions, prune
 from mi_refgs.io.ownership import RECORD
 from mi_refgs.occlusion.mesh import Mesh
@@ -26,13 +25,14 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import splat
 from mi_refgs.surfels.attributes import sh_columns
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import refused
 from tests.scenes.tiny import write_data
 
 RADIANCE = Shading("surfel", "radiance", "sh")
 MIRROR = Shading("pixel", "split_sum", "irradiance", occlusion=True)
 DEGREE = 2
 HIDDEN, CLEAR, BEHIND = 5, 4, 3
-"""Rows planted inside the opaque ones, with an opacity below 1/255, and behind every camera."""
+"""Useless surfels: inside the opaque ones, with an opacity below 1/255, and behind every camera."""
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def train(folder: Path) -> Dataset:
 
 
 def needed(data: Dataset, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Raw channels of opaque surfels in a grid of 3 × 3 before each camera, all of which count."""
+    """Raw attributes of visible opaque surfels, 3 × 3 of them in front of each camera."""
     grid = [(x, y) for x in (-0.2, 0, 0.2) for y in (-0.2, 0, 0.2)]
     position, rotation = [], []
     for view in data.views:
@@ -72,7 +72,7 @@ def needed(data: Dataset, rng: np.random.Generator) -> dict[str, np.ndarray]:
 
 
 def with_useless(raw: dict[str, np.ndarray], rng: np.random.Generator) -> Surfels:
-    """The same rows with useless ones before, between and after them."""
+    """The same surfels with useless ones before, between and after them."""
     extra = HIDDEN + CLEAR + BEHIND
     rows = {name: np.repeat(values[:1], extra, axis=0) for name, values in raw.items()}
     rows["position"] = rng.uniform(-0.02, 0.02, (extra, 3))
@@ -96,7 +96,7 @@ def walls(*heights: float, size: float = 20.0) -> Mesh:
     return Mesh(np.array(corners, np.float32), faces, 0.01)
 
 
-# ---------- What goes ----------
+# ---------------- what is removed ----------------
 
 
 def test_prune_removes_exactly_the_useless_surfels(
@@ -130,7 +130,7 @@ def test_prune_keeps_the_visible_sh_degree(train: Dataset, rng: np.random.Genera
 
 @pytest.mark.parametrize("met", [False, True])
 def test_prune_keeps_visible_tracing(met: bool, train: Dataset, rng: np.random.Generator) -> None:
-    """Mirror rays from the floor meet the ceiling; a mesh that no ray meets goes, with what is seen of it."""
+    """Mirror rays from the floor hit the ceiling; a mesh that no ray hits is removed, with its attributes."""
     raw = needed(train, rng)
     raw["indirect_sh"][:, :3] = 5.0
     shading = replace(MIRROR, visibility_rays=2)
@@ -156,7 +156,7 @@ def test_prune_keeps_everything_at_a_strict_limit(train: Dataset, rng: np.random
 
 
 def test_prune_keeps_alpha_that_the_background_hides(train: Dataset, rng: np.random.Generator) -> None:
-    """White surfels before a white background: dropped, other backgrounds would show."""
+    """White surfels in front of a white background stay: other backgrounds would show their absence."""
     raw = needed(train, rng)
     raw["radiance_sh"][:] = 0
     raw["radiance_sh"][:, :3] = 0.5 / 0.28209479
@@ -175,12 +175,12 @@ def test_prune_accepts_empty_and_invisible_scenes(train: Dataset, rng: np.random
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, 101.0, float("nan"), float("inf")])
 def test_prune_limit_out_of_range_is_refused(limit: float, train: Dataset, rng: np.random.Generator) -> None:
-    with pytest.raises(InputError, match=r"--limit: .* dB is out of range; give"):
-        prune(scene(Surfels.from_numpy(needed(train, rng)), RADIANCE), train, limit=limit)
+    whole = scene(Surfels.from_numpy(needed(train, rng)), RADIANCE)
+    refused(lambda: prune(whole, train, limit=limit), "--limit: ", " dB is out of range; give")
 
 
 def test_contributions_equal_blended_weights(train: Dataset, rng: np.random.Generator) -> None:
-    """Against the forward blend of a feature that is 1 for one row alone; all together they are alpha."""
+    """They equal the forward blend of a feature that is 1 for one surfel, and sum to alpha."""
     surfels = with_useless(needed(train, rng), rng)
     cameras = [view.camera() for view in train.views]
     weight = contributions(surfels, cameras)
@@ -195,7 +195,7 @@ def test_contributions_equal_blended_weights(train: Dataset, rng: np.random.Gene
     assert np.count_nonzero(weight == 0) >= CLEAR + BEHIND
 
 
-# ---------- The command ----------
+# ---------------- the command ----------------
 
 
 def test_pruned_run_reports_and_is_restored(
@@ -238,16 +238,13 @@ def test_unreadable_prune_note_is_refused(note: object, finished: Path, tmp_path
     run = Path(shutil.copytree(finished, tmp_path / "run"))
     content = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(content | {"pruned": note}))
-    with pytest.raises(
-        InputError, match=r"model\.json: cannot be read .*; write it again with `refgs export"
-    ):
-        TrainedScene.read(run)
+    refused(lambda: TrainedScene.read(run), "model.json: cannot be read", "write it again with `refgs export")
 
 
 def test_prune_without_checkpoints_is_refused_in_place(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without checkpoints the artefacts are all there is: the pruned scene then goes to another folder."""
+    """Without checkpoints the scene files cannot be restored: a pruned scene must go to another folder."""
     run = Path(shutil.copytree(finished, tmp_path / "run"))
     shutil.rmtree(run / "checkpoints")
     before = (run / "surfels.ply").read_bytes()

@@ -43,7 +43,7 @@ def nerfstudio(folder: Path, lens: Lens = BENT) -> Path:
 
 
 def masked(folder: Path) -> Path:
-    """Masks that frames name."""
+    """Frames that name masks."""
     data = nerfstudio(folder)
     write_png(data / "mask.png", np.indices((72, 96)).sum(axis=0)[..., None].repeat(3, -1) % 2)
     layouts.change_transforms(
@@ -57,7 +57,7 @@ def colmap(folder: Path, camera: str, values: tuple[float, ...]) -> Path:
 
 
 def llff(folder: Path, masks: bool = False) -> Path:
-    """With smaller copies of another ending."""
+    """LLFF with smaller copies of another ending."""
     data = layouts.write_llff(folder)
     (data / "images_2").mkdir()
     for path in (data / "images").iterdir():
@@ -108,7 +108,7 @@ def test_every_reader_has_a_layout() -> None:
 
 @pytest.mark.parametrize(("reader", "kind"), CASES)
 def test_exported_cameras_match_the_image_files(reader: str, kind: str, tmp_path: Path) -> None:
-    """Beside the files of the data set, whatever size the fit read them at: the same pictures and cameras."""
+    """Read back beside the image files: the same images and cameras, whatever size the fit read them at."""
     data = LAYOUTS[reader][kind](tmp_path / "data" if kind not in ("blender", "exr") else tmp_path)
     assert reader_of(data).name == reader
     images = "exr" if kind == "exr" else "png"

@@ -1,4 +1,4 @@
-"""PLY files of other programs: read, drawn by their own formulas, refused in one sentence, taken on."""
+"""PLY files of other programs: read, rendered by their own formulas, refused, imported and exported."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import pytest
 from mi_refgs.cli import main
 from mi_refgs.constants import GAUSSIAN_LOW_PASS
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
-from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats.cameras import read_cameras
 from mi_refgs.formats.gaussian_ply import read_splats
@@ -27,15 +26,16 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera
+from tests.helpers import refused
 
 SIZE, FOCAL, COUNT = 48, 60.0, 40
 BACKGROUND = np.array([0.2, 0.5, 0.9])
 LAYOUTS = {"3DGS of degree 0": (3, 0), "3DGS of degree 3": (3, 3), "2DGS": (2, 2)}
-"""Sizes of a splat, and the degree of its colour."""
+"""Number of scales of a splat, and the SH degree of its colour."""
 
 
 def raw_of(sizes: int, degree: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Raw values as the files hold them, quaternions w first; colours go beyond black and white."""
+    """Raw values as in the files, quaternions w first; colours go beyond black and white."""
     terms = (degree + 1) ** 2
     position = rng.uniform(-0.5, 0.5, (COUNT, 3))
     position[:, 2] = np.linspace(-0.6, 0.6, COUNT)  # far enough apart for every rule of sorting
@@ -67,13 +67,13 @@ def their_bytes(raw: dict[str, np.ndarray]) -> bytes:
 
 
 def pinhole() -> PinholeCamera:
-    """A camera 3 units below the splats, which looks up at them."""
+    """A camera 3 units below the splats that looks up at them."""
     pose = np.eye(4)
     pose[:3, 3] = [0.1, -0.05, -3]
     return PinholeCamera(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose, 0.01)
 
 
-def their_picture(raw: dict[str, np.ndarray], camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
+def their_image(raw: dict[str, np.ndarray], camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
     """Encoded colours, composited as they are, in float64; and where a cut may fall either way."""
     table = {
         "position": raw["position"].astype(np.float64),
@@ -97,7 +97,7 @@ def theirs(request: pytest.FixtureRequest, tmp_path: Path, rng: np.random.Genera
     return path
 
 
-# ---------------- pictures ----------------
+# ---------------- images ----------------
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -106,7 +106,7 @@ def test_splat_file_matches_float64_reference(name: str, tmp_path: Path, rng: np
     path = tmp_path / "theirs.ply"
     path.write_bytes(their_bytes(raw))
     camera = pinhole()
-    goal, band = their_picture(raw, camera)
+    goal, band = their_image(raw, camera)
     scene = read_splats(path)
     assert scene.surfels.sh_degree() == LAYOUTS[name][1]
     seen = Camera.from_pose(
@@ -122,7 +122,7 @@ def test_splat_file_matches_float64_reference(name: str, tmp_path: Path, rng: np
 def test_import_command_makes_a_run_that_renders_the_same(
     theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Rendered of scene.xml, and of what TrainedScene.read gives; edited; exported."""
+    """Rendered from scene.xml and by TrainedScene.read; exported."""
     run = tmp_path / "run"
     assert main(["import", str(theirs), "-o", str(run), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -140,8 +140,7 @@ def test_import_command_makes_a_run_that_renders_the_same(
     goal = np.minimum(encoded, image_array(frame.alpha, *size)[..., None])  # 8 bits end at white
     assert np.abs(picture[..., :3] * picture[..., 3:] - goal).max() < 3 / 255
     assert main(["export", str(run)]) == 0
-    assert main(["import", str(theirs), "-o", str(run)]) == 2
-    assert "holds a run already" in capsys.readouterr().err
+    refused(["import", theirs, "-o", run], "a run already")
 
 
 def test_import_reports_one_gaussian_in_the_singular(
@@ -156,18 +155,16 @@ def test_import_reports_one_gaussian_in_the_singular(
 
 
 @pytest.mark.parametrize("form", ["gltf-mesh", "mitsuba"])
-def test_mesh_formats_of_an_imported_run_are_refused(
-    theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str
-) -> None:
+def test_mesh_formats_of_an_imported_run_are_refused(theirs: Path, tmp_path: Path, form: str) -> None:
     run = tmp_path / "run"
     assert main(["import", str(theirs), "-o", str(run)]) == 0
-    assert main(["export", str(run), "--to", form, "-o", str(tmp_path / "out")]) == 2
-    assert f"{run}: albedo, metallic, roughness: the run has none; fit one" in capsys.readouterr().err
+    command = ["export", run, "--to", form, "-o", tmp_path / "out"]
+    refused(command, f"{run}: albedo, metallic, roughness: the run has none; fit one")
 
 
 @pytest.mark.parametrize("linear", [False, True])
 def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path, linear: bool) -> None:
-    """In memory, saved, and by the command: the same picture bit for bit; colours differ by what they are."""
+    """In memory, saved, and by the command: the same image bit for bit; linear colours render differently."""
     import mi_refgs
 
     made = mi_refgs.import_splats(str(theirs), linear=linear)
@@ -180,8 +177,7 @@ def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path, linear: 
     np.testing.assert_array_equal(mi_refgs.load(run).render(1, size=32), picture)
     other = mi_refgs.import_splats(theirs, linear=not linear).render(1, size=32)
     assert np.abs(other - picture).max() > 0.05
-    with pytest.raises(InputError, match="cannot be read"):
-        mi_refgs.import_splats(tmp_path / "no.ply")
+    refused(lambda: mi_refgs.import_splats(tmp_path / "no.ply"), "cannot be read")
 
 
 def test_imported_gaussians_are_exported_unchanged(theirs: Path, tmp_path: Path) -> None:
@@ -198,7 +194,7 @@ def test_imported_gaussians_are_exported_unchanged(theirs: Path, tmp_path: Path)
 
 
 def test_linear_colours_survive_import(tmp_path: Path, rng: np.random.Generator) -> None:
-    """surfels.ply of a run that has colours alone → a run: the same picture."""
+    """surfels.ply of a run that has only colours → a run: the same image."""
     path, run = tmp_path / "theirs.ply", tmp_path / "run"
     path.write_bytes(their_bytes(raw_of(2, 2, rng)))
     scene = read_splats(path, linear=True)
@@ -227,7 +223,7 @@ def test_displayed_model_inverts_the_srgb_encoding() -> None:
     np.testing.assert_allclose(np.array(dr.grad(out.x)), slope, rtol=1e-4)
 
 
-# ---------------- what is no such file ----------------
+# ---------------- other files ----------------
 
 
 def broken(kind: str, whole: bytes) -> bytes:
@@ -275,19 +271,16 @@ def broken(kind: str, whole: bytes) -> bytes:
     ],
 )
 def test_other_ply_files_are_refused(
-    kind: str, message: str, tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
+    kind: str, message: str, tmp_path: Path, rng: np.random.Generator
 ) -> None:
     path = tmp_path / "file.ply"
     path.write_bytes(broken(kind, their_bytes(raw_of(3, 3, rng))))
-    assert main(["import", str(path), "-o", str(tmp_path / "run")]) == 2
-    said = capsys.readouterr().err
-    assert str(path) in said and message in said and said.count("\n") == 1
+    refused(["import", path, "-o", tmp_path / "run"], path, message)
     assert not (tmp_path / "run").exists()
 
 
-def test_missing_ply_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["import", str(tmp_path / "no.ply"), "-o", str(tmp_path / "run")]) == 2
-    assert "cannot be read" in capsys.readouterr().err
+def test_missing_ply_file_is_refused(tmp_path: Path) -> None:
+    refused(["import", tmp_path / "no.ply", "-o", tmp_path / "run"], "cannot be read")
 
 
 # ---------------- cameras ----------------
@@ -324,15 +317,11 @@ def test_transforms_file_defines_the_cameras_of_an_import(theirs: Path, tmp_path
 def test_bad_transforms_file_is_refused(change: dict[str, object], message: str, tmp_path: Path) -> None:
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps({**transforms(), **change}))
-    with pytest.raises(InputError) as caught:
-        read_cameras(file)
-    assert message in str(caught.value) and str(file) in str(caught.value)
+    refused(lambda: read_cameras(file), file, message)
 
 
-def test_render_uses_cameras_of_a_file(
-    theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The picture of that frame's camera, which is no sensor of the run; wrong frames are one sentence."""
+def test_render_uses_cameras_of_a_file(theirs: Path, tmp_path: Path) -> None:
+    """The image of a camera that is no sensor of the run; wrong frames are refused."""
     import mi_refgs
 
     file, run, out = tmp_path / "camera.json", tmp_path / "run", tmp_path / "out.exr"
@@ -346,12 +335,10 @@ def test_render_uses_cameras_of_a_file(
     picture = np.stack([channels[name] for name in "RGBA"], axis=-1)
     assert picture.shape == goal.shape == (camera.height, camera.width, 4) and goal[..., 3].max() > 0.5
     np.testing.assert_allclose(picture, goal, atol=2e-3)
-    capsys.readouterr()
-    assert main([*command, "2"]) == 2
-    assert capsys.readouterr().err == (f"refgs: {file}: --sensor: 2: the file has 2 frames; give 0 to 1\n")
+    refused([*command, "2"], f"{file}: --sensor: 2: the file has 2 frames; give 0 to 1")
 
 
-def test_scene_without_sensors_requires_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scene_without_sensors_requires_cameras(tmp_path: Path) -> None:
     """The scene is any of Mitsuba's: a white sphere in uniform light."""
     scene, file, out = tmp_path / "scene.xml", tmp_path / "camera.json", tmp_path / "out.png"
     scene.write_text(
@@ -360,8 +347,7 @@ def test_scene_without_sensors_requires_cameras(tmp_path: Path, capsys: pytest.C
     )
     file.write_text(json.dumps(transforms()))
     command = ["render", str(scene), "-o", str(out)]
-    assert main(command) == 2
-    assert "sensor: the scene has none; add one, or give a file with --camera" in capsys.readouterr().err
+    refused(command, "sensor: the scene has none; add one, or give a file with --camera")
     assert main([*command, "--camera", str(file)]) == 0
     assert read_png(out).shape[:2] == (48, 64)
 

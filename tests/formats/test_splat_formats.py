@@ -1,4 +1,4 @@
-"""3D Gaussians of a scene for other viewers, as PLY and as glTF; and a view with its layers as EXR."""
+"""3D Gaussians of a scene in PLY and glTF files for other viewers, and a view with its layers as EXR."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from mi_refgs.cli import main
-from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats import Shot, write
 from mi_refgs.formats.gaussians import THIN, gaussians
@@ -32,6 +31,7 @@ from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import SH_DC, logit
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import refused
 
 COUNT, SIZE = 1500, 64
 BACKWARDS = np.diag([-1.0, 1.0, -1.0, 1.0])  # half a turn about the camera's y axis
@@ -72,7 +72,7 @@ def scene(rng: np.random.Generator) -> TrainedScene:
 
 @pytest.fixture
 def shots(scene: TrainedScene) -> list[Shot]:
-    """Few small cameras around it."""
+    """A few small cameras around it."""
     found = shots_around(scene.surfels)[::3]
     return [replace(shot, camera=shot.camera.resized(SIZE)) for shot in found]
 
@@ -85,8 +85,8 @@ def encoded(scene: TrainedScene, camera: Camera, alone: bool = False) -> np.ndar
     return image_array([*shown, frame.alpha], camera.height, camera.width)
 
 
-def their_picture(table: Surfels, camera: Camera) -> np.ndarray:
-    """The formula of 3DGS (H, W, 4): colours blended as they are."""
+def their_image(table: Surfels, camera: Camera) -> np.ndarray:
+    """The formula of 3DGS (H, W, 4): encoded colours are blended."""
     frame = render(SurfelScene(table, Shading("surfel", "radiance")), camera)
     return image_array([*frame.radiance, frame.alpha], camera.height, camera.width)
 
@@ -99,11 +99,11 @@ def db(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_gaussians_render_the_same_image(scene: TrainedScene, shots: list[Shot]) -> None:
-    """At cameras between those that colours were fitted to, colour and outline, on both grounds."""
+    """Colour and outline agree at cameras between those that colours were fitted to."""
     table = gaussians(scene, shots, 3, False)
     assert table.primitive.name == "gaussian" and table.sh_degree() == 3
     for shot in [shot for shot in shots if shot.split == "test"]:
-        ours, theirs = encoded(scene, shot.camera), their_picture(table, shot.camera)
+        ours, theirs = encoded(scene, shot.camera), their_image(table, shot.camera)
         inside = ours[..., 3] > 0.99
         assert inside.mean() > 0.3
         assert db(theirs[inside, :3], ours[inside, :3]) > 34
@@ -112,7 +112,7 @@ def test_gaussians_render_the_same_image(scene: TrainedScene, shots: list[Shot])
 
 
 def test_higher_sh_degree_fits_better(scene: TrainedScene, shots: list[Shot]) -> None:
-    """Of a smooth metal, whose colour turns with the camera."""
+    """The colour of a smooth metal changes with the view direction."""
     raw = scene.surfels.to_numpy()
     raw |= {"metallic": np.full((COUNT, 1), 6.0), "roughness": np.full((COUNT, 1), -1.0)}
     scene = replace(scene, surfels=Surfels.from_numpy(raw))
@@ -121,13 +121,13 @@ def test_higher_sh_degree_fits_better(scene: TrainedScene, shots: list[Shot]) ->
     inside = ours[..., 3] > 0.99
     found = []
     for degree in (0, 1, 3):
-        theirs = their_picture(gaussians(scene, shots, degree, False), camera)
+        theirs = their_image(gaussians(scene, shots, degree, False), camera)
         found.append(db(theirs[inside, :3], ours[inside, :3]))
     assert found[0] + 4 < found[1] < found[2], found
 
 
 def test_gaussians_are_thin_along_the_normal_and_inset(scene: TrainedScene, shots: list[Shot]) -> None:
-    """Sizes and opacities stay; surfels move inwards by less than a pixel, whichever way normals point."""
+    """Scales and opacities stay; surfels move inwards by less than a pixel, whichever way normals point."""
     before = scene.surfels.to_numpy()
     after = gaussians(scene, shots, 0, False).to_numpy()
     np.testing.assert_array_equal(after["scale"][:, :2], before["scale"])
@@ -137,12 +137,12 @@ def test_gaussians_are_thin_along_the_normal_and_inset(scene: TrainedScene, shot
     radius = np.linalg.norm(after["position"], axis=1)
     camera = shots[0].camera
     pixel = np.linalg.norm(camera.pose()[:3, 3]) / camera.focal
-    seen = before["position"][:, 2] > -0.3  # the cameras stand above
+    seen = before["position"][:, 2] > -0.3  # the cameras are above
     assert (radius[seen] < 1 - 0.3 * pixel).mean() > 0.95 and radius.min() > 1 - pixel
 
 
 def test_unseen_gaussians_get_the_colour_of_neighbours(scene: TrainedScene, shots: list[Shot]) -> None:
-    """Not the grey of coefficients that are zero."""
+    """Their colour is not the grey of zero coefficients."""
     camera = replace(shots[0].camera, width=SIZE // 2)
     table = gaussians(scene, [Shot("only", "train", camera)], 0, False).to_numpy()
     place = camera.to_camera(scene.surfels.position())
@@ -152,7 +152,7 @@ def test_unseen_gaussians_get_the_colour_of_neighbours(scene: TrainedScene, shot
 
 
 def test_empty_views_do_not_change_colours(scene: TrainedScene, shots: list[Shot]) -> None:
-    """A camera that looks away is as good as none; where all do, there are colours all the same."""
+    """A camera that looks away has no effect; if all do, colours are still finite."""
     away = [replace(shot, camera=shot.camera.moved(shot.camera.pose() @ BACKWARDS)) for shot in shots]
     train = [shot for shot in shots if shot.split == "train"]
     few, more = (gaussians(scene, given, 1, False).to_numpy() for given in (train, [*train, away[0]]))
@@ -176,15 +176,14 @@ def test_background_gaussians_are_exported_unless_object_only(
     camera = shots[0].camera
     whole, alone = (gaussians(both, shots, 2, object) for object in (False, True))
     assert whole.count == COUNT + 400 and alone.count == COUNT
-    assert db(their_picture(whole, camera)[..., :3], encoded(both, camera)[..., :3]) > 26
-    assert db(their_picture(alone, camera)[..., :3], encoded(both, camera, alone=True)[..., :3]) > 28
+    assert db(their_image(whole, camera)[..., :3], encoded(both, camera)[..., :3]) > 26
+    assert db(their_image(alone, camera)[..., :3], encoded(both, camera, alone=True)[..., :3]) > 28
 
 
 def test_gaussians_refuse_empty_scene_and_bad_degree(scene: TrainedScene, shots: list[Shot]) -> None:
-    with pytest.raises(InputError, match="--degree: 4 is out of range"):
-        gaussians(scene, shots, 4, False)
-    with pytest.raises(InputError, match="there are none"):
-        gaussians(replace(scene, surfels=scene.surfels.gather(mi.UInt32())), shots, 1, False)
+    refused(lambda: gaussians(scene, shots, 4, False), "--degree: 4 is out of range")
+    empty = replace(scene, surfels=scene.surfels.gather(mi.UInt32()))
+    refused(lambda: gaussians(empty, shots, 1, False), "there are none")
 
 
 # ---------------- files ----------------
@@ -247,7 +246,7 @@ def test_gltf_has_activated_gaussians(scene: TrainedScene, shots: list[Shot], tm
     np.testing.assert_allclose(np.linalg.norm(rotation, axis=1), 1, atol=1e-6)
     q = table.rotation()
     np.testing.assert_allclose(rotation, np.stack([q.x, q.y, q.z, q.w], axis=1), atol=1e-6)
-    # Harmonics by degree and order give the colour of the table in any direction.
+    # SH coefficients by degree and order give the colour of the table in any direction.
     toward = mi.Vector3f(0.48, -0.6, 0.64)
     basis = [float(f[0]) for f in sh_basis(toward, 2)]
     names = [f"{prefix}:SH_DEGREE_{k}_COEF_{n}" for k in range(3) for n in range(2 * k + 1)]
@@ -282,18 +281,13 @@ def test_exr_has_every_layer(scene: TrainedScene, shots: list[Shot], tmp_path: P
     assert {"metallic.V", "visibility.V"} <= {*layers} and solid.mean() > 0.2
 
 
-def test_exr_view_out_of_range_is_refused(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["export", str(finished), "--to", "exr", "-o", str(tmp_path / "a.exr"), "--view", "9"]) == 2
-    assert "--view: 9 is out of range; there are 5, give 0 to 4" in capsys.readouterr().err
-    assert (
-        main(["export", str(finished), "--to", "exr, 3dgs-ply, gltf-splats,", "-o", str(tmp_path / "all")])
-        == 0
-    )
-    assert {path.name for path in (tmp_path / "all").iterdir()} == {
-        RECORD,
-        "exr.exr",
-        "3dgs-ply.ply",
-        "gltf-splats.glb",
-    }
+def test_exr_view_out_of_range_is_refused(finished: Path, tmp_path: Path) -> None:
+    command = ["export", finished, "--to", "exr", "-o", tmp_path / "a.exr", "--view", "9"]
+    refused(command, "--view: 9 is out of range; there are 5, give 0 to 4")
+
+
+def test_formats_are_separated_by_commas_and_blanks(finished: Path, tmp_path: Path) -> None:
+    command = ["export", str(finished), "--to", "exr, 3dgs-ply, gltf-splats,", "-o", str(tmp_path / "all")]
+    assert main(command) == 0
+    names = {path.name for path in (tmp_path / "all").iterdir()}
+    assert names == {RECORD, "exr.exr", "3dgs-ply.ply", "gltf-splats.glb"}
