@@ -156,13 +156,14 @@ def _current(name: str, options: Sequence[str]) -> Iterator[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
-    from mi_refgs.cli.command import UnusableError, finite
-    from mi_refgs.runs.interrupt import TerminatedError
-
     argv = sys.argv[1:] if argv is None else list(argv)
     if not argv or argv[0] in ("-h", "--help", "--version"):
         print(f"mi_refgs {__version__}" if "--version" in argv else overview())
         return 0
+
+    from mi_refgs.cli.command import UnusableError, finite
+    from mi_refgs.runs.interrupt import TerminatedError
+
     try:
         command = parse(argv)
         with _standard_output_to_error():

@@ -18,7 +18,6 @@ from mi_refgs.cli.command import (
     Rendering,
     Result,
     Settings,
-    Words,
     joined,
     separated,
 )
@@ -49,15 +48,14 @@ class Compare:
         tuple[str, ...],
         arg(metavar="NAME|FILE.toml …", help=f"methods: {METHODS}, or files", help_behavior_hint=""),
     ] = ()
-    seeds: Words = ()
+    seeds: Annotated[tuple[str, ...], arg(metavar="K …", help_behavior_hint="")] = ()
     """seeds of the fits (default: 0)"""
     preset: Preset = None
     set: Settings = ()
     workers: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 1)")] = None
     """simultaneous jobs, which share the cores"""
     cluster: Annotated[str | None, arg(metavar="local|ADDRESS", help_behavior_hint="")] = None
-    """run the jobs by dask.distributed: on --workers processes of this machine, or on the scheduler at
-    ADDRESS, whose workers must see the same folders"""
+    """run the jobs by dask.distributed, here or on a scheduler whose workers must see the same folders"""
     common: Rendering = Rendering()
 
     def run(self) -> Result:

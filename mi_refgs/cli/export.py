@@ -150,7 +150,7 @@ def _output(run: Run, target: Path, overwrite: bool) -> OutputFolder:
     if target.resolve() == run.path.resolve():
         return run.output
     if Run(target).exists():
-        raise InputError(f"{target}: output: holds a run, which is never overwritten; choose another -o")
+        raise InputError(f"{target}: output: contains a run, which is never overwritten; choose another -o")
     remedy = "choose another -o, or replace it with --overwrite"
     return OutputFolder(target, f"export of {run.path.resolve()}", remedy=remedy, overwrite=overwrite)
 

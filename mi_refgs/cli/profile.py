@@ -24,7 +24,7 @@ MEBIBYTE = 2**20
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileCommand:
-    """Of a run: its newest checkpoint in its stage, and its frames. Of a data set: every stage of a new fit.
+    """A run is measured at its newest checkpoint, with its frames; a data set in every stage of a new fit.
 
     Nothing is written.
 

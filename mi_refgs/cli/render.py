@@ -8,8 +8,10 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from mi_refgs.cli.command import Cameras, Flag, Output, Rendering, Result, Words, separated
+from mi_refgs.cli.command import Cameras, Flag, Output, Rendering, Result, separated
 from mi_refgs.errors import InputError, counted
+
+AOVS = "albedo, metallic, roughness, normal, depth, alpha, visibility, diffuse, specular, indirect"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,9 +34,10 @@ class Render:
     """render the object without its background, on transparency"""
     samples: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """samples per pixel (default: those of the scene's sampler)"""
-    aov: Words = ()
-    """additional channels of the EXR: albedo, metallic, roughness, normal, depth, alpha, visibility, diffuse,
-    specular, indirect"""
+    aov: Annotated[
+        tuple[str, ...],
+        arg(metavar="NAME …", help=f"more channels of the EXR: {AOVS}", help_behavior_hint=""),
+    ] = ()
     common: Rendering = Rendering()
 
     def run(self) -> Result:

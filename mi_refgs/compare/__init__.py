@@ -1,1 +1,1 @@
-"""Methods side by side: many fits, each a run of its own, and the tables, plots and page made of them."""
+"""Comparison of methods: many fits, each a run, and tables, plots and a page."""

@@ -33,11 +33,10 @@ CONNECT = "20s"
 
 
 def execute(job: Job, stop: threading.Event | None = None) -> str | None:
-    """Do a job; returns None if it is done, else why not, which failed.json says too.
+    """Run a job; returns None if it is done, else the reason, which is also written to failed.json.
 
-    A process that a signal ended, as a crash does, starts again from its checkpoint, RETRIES times at most.
-    With `stop` set, the process is asked to save its state and to end; that counts as done here.
-
+    A process that a signal ended (a crash) is restarted from its checkpoint at most RETRIES times. When
+    `stop` is set, the process saves its state and ends; the result is then None.
     Raises InputError if the run folder cannot be written.
     """
     if stop is not None and stop.is_set():
@@ -61,7 +60,7 @@ def execute(job: Job, stop: threading.Event | None = None) -> str | None:
 
 
 def execute_all(jobs: Sequence[Job], workers: int, report: Report) -> None:
-    """Do jobs, `workers` at once; `report(job, reason)` is called for each that ended.
+    """Run jobs, `workers` at once.
 
     Raises KeyboardInterrupt or TerminatedError after a signal, when all processes have saved their state.
     """
@@ -80,7 +79,7 @@ def execute_all(jobs: Sequence[Job], workers: int, report: Report) -> None:
 
 
 def _process(job: Job, stop: threading.Event | None) -> int:
-    """The exit code of one process that works on a job."""
+    """Run one process of a job; returns its exit code."""
     package = str(Path(__file__).resolve().parents[2])
     paths = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
     try:
@@ -112,9 +111,9 @@ def _process(job: Job, stop: threading.Event | None) -> int:
 
 
 def threads_each(workers: int, threads: int | None) -> int | None:
-    """Threads of each of `workers` processes: those asked for, or an equal share of the cores.
+    """Return the threads per process: `threads`, or an equal share of the cores.
 
-    Raises InputError if there are fewer than one worker.
+    Raises InputError for fewer than one worker, or too many.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if not 1 <= workers <= 4 * cores:
@@ -128,15 +127,20 @@ def threads_each(workers: int, threads: int | None) -> int | None:
 
 
 def run_on_cluster(jobs: Sequence[Job], address: str | None, workers: int, report: Report) -> None:
-    """Do jobs on the workers of the scheduler at `address`, or on `workers` of this machine without one.
+    """Run jobs on the scheduler at `address`, or, if None, on `workers` processes of this machine.
 
-    `report(job, reason)` is called for each that ended. A job whose worker died starts again from its
-    checkpoint on another, RETRIES times at most; then its row says why.
+    Workers must see the data sets and the comparison's folder under the same paths. A job whose worker died
+    is restarted from its checkpoint on another one, at most RETRIES times.
 
     Raises InputError without dask.distributed and for a scheduler that does not answer; KeyboardInterrupt or
-    TerminatedError after a signal, when the jobs have been called off.
+    TerminatedError after a signal, when the jobs are cancelled.
     """
-    distributed = _distributed()
+    try:
+        import distributed
+    except ImportError as error:
+        raise InputError(
+            "--cluster: dask.distributed is not installed; pip install 'mi_refgs[cluster]'"
+        ) from error
     with held_interrupts() as release, _client(distributed, address, workers) as client:
         pending = {client.submit(execute, job, key=job.folder, pure=False): job for job in jobs}
         try:
@@ -153,7 +157,7 @@ def run_on_cluster(jobs: Sequence[Job], address: str | None, workers: int, repor
 
 @contextlib.contextmanager
 def _client(distributed: Any, address: str | None, workers: int) -> Iterator[Any]:
-    """A client of the scheduler, or of a cluster of this machine that ends with it."""
+    """Yield a client of the scheduler, or of a local cluster that ends with it."""
     import dask
 
     limits = {"distributed.scheduler.allowed-failures": RETRIES, "distributed.comm.timeouts.connect": CONNECT}
@@ -173,7 +177,7 @@ def _client(distributed: Any, address: str | None, workers: int) -> Iterator[Any
 
 
 def _reason(job: Job, future: Any) -> str | None:
-    """None if a job is done, else why not, written into its run folder too."""
+    """Return None if a job is done, else the reason, which is also written into its run folder."""
     error = future.exception()
     if error is None:
         reason: str | None = future.result()
@@ -181,13 +185,3 @@ def _reason(job: Job, future: Any) -> str | None:
     reason = f"the cluster gave it up: {type(error).__name__}: {str(error).splitlines()[0]}"
     job.run.write_json(FAILED, {"reason": reason})
     return reason
-
-
-def _distributed() -> Any:
-    try:
-        import distributed
-    except ImportError as error:
-        raise InputError(
-            "--cluster: dask.distributed is not installed; pip install 'mi_refgs[cluster]'"
-        ) from error
-    return distributed

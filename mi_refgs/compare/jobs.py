@@ -1,4 +1,4 @@
-"""What a comparison has to do: one job, with a run folder of its own, for each data set, method and seed."""
+"""The jobs of a comparison: one per data set, method and seed, each with its own run folder."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from mi_refgs.methods.read import differences, load
 from mi_refgs.runs.run import Run
 
 RUNS = "runs"
-"""Folder of a comparison with its runs: runs/<data>/<variant>/seed<k>."""
+"""Folder of the runs: runs/<data>/<method>/seed<k>."""
 SETTINGS, JOB, FAILED = "compare.json", "job.json", "failed.json"
-"""Files: what all jobs of a comparison share; in a run folder, its job, and why it failed."""
+"""Files: settings of the comparison; in a run folder, its job, and why it failed."""
 MAX_SEED = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class Job:
-    """One fit and its evaluation; plain values only, so that it can travel to another process."""
+    """One fit and its evaluation, in values that can be sent to another process."""
 
     folder: str  # of the run, absolute
     data: str  # folder of the data set, absolute
@@ -46,21 +46,21 @@ class Job:
 
     @property
     def title(self) -> str:
-        """Data set, variant and seed, for people."""
+        """Data set, method and seed as text."""
         return f"{Path(self.data).name} × {Path(self.variant).stem} × seed {self.seed}"
 
     def method(self, terms: Sequence[str] = ()) -> Method:
-        """The method to run, with these of its terms; raises InputError as `load` and `sized` do."""
+        """Load the method with these optional components; raises InputError as `load` and `sized` do."""
         method = load(self.variant, self.preset, [*self.settings, f"seed={self.seed}"], terms)
         return sized(method, Path(self.data))
 
     def write(self) -> None:
-        """Write the job into its run folder; raises InputError if that is impossible."""
+        """Write the job into its run folder; raises InputError where that is impossible."""
         self.run.write_json(JOB, dataclasses.asdict(self))
 
     @staticmethod
     def read(folder: Path) -> Job:
-        """The job of a run folder; raises InputError if it is none."""
+        """Read the job of a run folder; raises InputError for another file."""
         content = read_json(folder / JOB)
         try:
             content["settings"] = tuple(content["settings"])
@@ -82,10 +82,10 @@ class Shared:
 def plan(
     folder: Path, data: Sequence[Path], methods: Sequence[str], seeds: Sequence[int], shared: Shared
 ) -> list[Job]:
-    """The jobs of a comparison in `folder`, checked: every data set has test views, every method loads.
+    """Plan and check the jobs of a comparison; seeds vary slowest, so that each method is fitted once early.
 
-    Seeds vary slowest, so that a comparison that is cut short has each method once. Raises InputError for a
-    data set or a method that cannot be used, two of one name, and runs that were made with other settings.
+    Raises InputError for a data set without test views, a method that does not load, two data sets or methods
+    of one name, and existing runs with other settings.
     """
     _unique((absolute(path).name for path in data), "DATA", "give the folders different names")
     _unique((Path(method).stem for method in methods), "--methods", "name each once")
@@ -115,8 +115,7 @@ def plan(
 
 
 def _require_test_views(folder: Path, jobs: Iterable[Job]) -> None:
-    """Raise InputError for test views that cannot be read as the jobs will read them, or that these and the
-    runs in the folder read in different sizes."""
+    """Raise InputError for test views that cannot be read, or that jobs and runs read in different sizes."""
     read: dict[tuple[str, DataOptions], list[int]] = {}
     sizes: dict[str, dict[str, list[int]]] = {}
     for job in jobs_in(folder):
@@ -134,10 +133,7 @@ def _require_test_views(folder: Path, jobs: Iterable[Job]) -> None:
 
 
 def require_one_size(where: str, sizes: Mapping[str, list[int]], remedy: str) -> None:
-    """Raise InputError if runs, by their names, were or will be measured on images of different sizes.
-
-    Their scores do not compare: the PSNR of one fit differs by decibels between sizes.
-    """
+    """Raise InputError for runs of different image sizes: the PSNR of one fit differs by decibels."""
     named: dict[tuple[int, ...], str] = {}
     for name, size in sizes.items():
         named.setdefault(tuple(size), name)
@@ -147,7 +143,7 @@ def require_one_size(where: str, sizes: Mapping[str, list[int]], remedy: str) ->
 
 
 def require_settings(folder: Path, shared: Shared) -> None:
-    """Raise InputError if `folder` holds a comparison with another preset or other settings."""
+    """Raise InputError if `folder` has a comparison with another preset or other settings."""
     if not (folder / SETTINGS).is_file():
         return
     before = read_json(folder / SETTINGS)
@@ -160,13 +156,13 @@ def require_settings(folder: Path, shared: Shared) -> None:
 
 
 def require_same(job: Job) -> None:
-    """Raise InputError if the job's folder holds a run of another method or other data, or foreign files."""
+    """Raise InputError if the job's folder has a run of another method or other data, or foreign files."""
     if not job.run.exists():
         job.method()
         job.run.output.require_free()
         return
     made = job.run.method()
-    # The terms are what the run has chosen.
+    # Optional components are those that the run has chosen.
     for key, (before, now) in differences(made, job.method(made.components)).items():
         raise InputError(
             f"{job.folder}/config.toml: {key}: the run was made with {before}, and now --methods, "
@@ -193,7 +189,7 @@ def require_same(job: Job) -> None:
 
 
 def finished(job: Job) -> bool:
-    """Whether the run was trained to its end, and has metrics of its last checkpoint on the job's data."""
+    """Return whether the run is trained to its end and its last checkpoint is evaluated on the job's data."""
     run = job.run
     if not run.exists() or not (saved := run.checkpoints()):
         return False
@@ -207,12 +203,12 @@ def finished(job: Job) -> bool:
 
 
 def jobs_in(folder: Path) -> list[Job]:
-    """The jobs of all runs in a comparison's folder."""
+    """Return the jobs of all runs in the folder of a comparison."""
     return [Job.read(path.parent) for path in (folder / RUNS).glob(f"*/*/*/{JOB}")]
 
 
 def absolute(path: Path) -> Path:
-    """The path from the root, without dots; a link keeps its own name, which is the scene's."""
+    """Return an absolute path without dots; a link keeps its own name."""
     return Path(os.path.abspath(path))
 
 
@@ -220,7 +216,7 @@ def _unique(names: Iterable[str], option: str, remedy: str) -> None:
     seen: set[str] = set()
     for name in names:
         if name in seen:
-            raise InputError(f"{option}: '{name}' stands there twice; {remedy}")
+            raise InputError(f"{option}: '{name}' is given twice; {remedy}")
         seen.add(name)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from io import BytesIO
@@ -41,157 +41,121 @@ code, pre { background: var(--soft); border-radius: 3px; padding: .1em .3em; }
 pre { padding: .6rem; overflow-x: auto; }
 """
 AXES = (("seconds", "training (s)"), ("iteration", "iterations"))
-"""Key of a line of a curve, and the axis' title."""
+"""Key of a line of a curve, and the title of the axis."""
 STYLES, DPI = ("-", "--", ":"), 140
-"""Line styles, the next one for every ten methods; pixels per inch, twice those of a common screen."""
+"""Line styles, one per ten methods; pixels per inch, twice those of a common screen."""
 CROP_VIEWS = 16
-"""Test views that are searched for the crop, evenly spread."""
+"""Test views, evenly spaced, that are searched for the crop."""
 CROP_SHARE, CROP_MIN = 3, 24
-"""A crop is so small a part of the picture's shorter side, but no fewer pixels."""
+"""The side of a crop is this fraction of the image's shorter side, at least so many pixels."""
 ROW = 6
-"""Crops side by side."""
+"""Crops per row."""
 
 
 def write_page(output: OutputFolder, table: Table) -> None:
-    """Write index.html and its pictures; raises InputError if a file cannot be written."""
-    names = _names(scene.name for scene in table.scenes)
-    parts = [_scene(output, scene, name) for scene, name in zip(table.scenes, names, strict=True)]
-    title = f"Comparison: {', '.join(scene.name for scene in table.scenes)}"
+    """Write index.html and its images; raises InputError if a file cannot be written."""
+    names: list[str] = []  # of scenes in addresses, each once
+    for scene in table.scenes:
+        name = re.sub(r"[^0-9A-Za-z]+", "_", scene.name).strip("_") or "scene"
+        names.append(name if name not in names else f"{name}_{len(names)}")
+    title = escape(f"Comparison: {', '.join(scene.name for scene in table.scenes)}")
+    about, workers = table.about, int(table.about.get("workers", 1))
+    timed = "with the machine to themselves" if workers == 1 else f"while {workers} jobs shared the machine"
+    notes = "\n".join(f'<li id="note{n}">{escape(text)}</li>' for n, text in enumerate(table.footnotes, 1))
+    machines = (", ".join(f"{key} {value}" for key, value in machine.items()) for machine in table.machines)
+    settings = f", with {' '.join(about['set'])}" if about.get("set") else ""
+    made_with = f"mi_refgs {about.get('version', '')}, preset {about.get('preset', '')}{settings}"
     content = f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
+<title>{title}</title>
 <style>{STYLE}</style>
 </head>
 <body>
-<h1>{escape(title)}</h1>
-<p>Means ± sample standard deviation over seeds; the best mean of each column in bold. Frames and training
-were timed {_crowd(table)}.</p>
-{"".join(parts)}
-{_footnotes(table)}
-{_made_with(table)}
+<h1>{title}</h1>
+<p>Means ± sample standard deviation over seeds; the best mean per column in bold. Frames and
+training were timed {timed}.</p>
+{"".join(_section(output, scene, name) for scene, name in zip(table.scenes, names, strict=True))}
+{f"<h2>Deviations from the originals</h2>{chr(10)}<ol>{chr(10)}{notes}{chr(10)}</ol>" if notes else ""}
+<h2>How it was made</h2>
+<p>{escape(made_with)}</p>
+<pre>{escape(str(about.get("command", "")))}</pre>
+<ul>
+{"".join(f"<li>{escape(machine)}</li>" for machine in machines)}</ul>
+<p>The same numbers: <a href="table.json">table.json</a>, <a href="table.md">table.md</a>.</p>
 </body>
 </html>
 """
     write_bytes(output.own(PAGE), content.encode())
 
 
-def _scene(output: OutputFolder, scene: Scene, name: str) -> str:
+def _section(output: OutputFolder, scene: Scene, name: str) -> str:
+    """Write the plot and the crops of a scene; returns its section of the page."""
     curves, crops = f"{PICTURES}/{name}_psnr.png", f"{PICTURES}/{name}_crops.png"
     figures, folder = "", output.path
     output.claim(curves, crops)
     if write_curves(folder, scene, folder / curves):
-        figures += _figure(
-            curves,
-            f"PSNR on a few test views of {scene.name} over training time and over iterations, a line a seed",
-        )
+        figures += _figure(curves, f"PSNR on a few test views of {scene.name}, one line per seed")
     try:
         region = write_crops(folder, scene, folder / crops)
     except InputError as error:
         figures += f'<p class="remark">No crops: {escape(str(error))}.</p>\n'
     else:
-        figures += _figure(crops, _crop_caption(region)) if region else ""
-    said = "".join(f'<p class="remark">{escape(remark)}</p>\n' for remark in remarks(scene))
+        if region:
+            figures += _figure(
+                crops,
+                f"{region.side}² pixels at row {region.row}, column {region.column} of view {region.view}, "
+                "where the errors of the methods differ most (first seed of each)",
+            )
+    notes = "".join(f'<p class="remark">{escape(remark)}</p>\n' for remark in remarks(scene))
     return f"""<section id="{name}">
 <h2>{escape(heading(scene))}</h2>
 <div class="wide">
 {_table(scene)}
 </div>
-{said}{figures}</section>
+{notes}{figures}</section>
 """
 
 
-def _crop_caption(region: Region) -> str:
-    return (
-        f"The square of {region.side}² pixels at row {region.row}, column {region.column} of test view "
-        f"{region.view}, where the errors of the methods differ most (first seed of each)"
-    )
-
-
 def _table(scene: Scene) -> str:
+    """Return the table of a scene; the best mean of each column is marked where there are several."""
     columns = columns_of(scene)
-    heads = ["method", *map(header, columns)]
-    lines = ["<tr>" + "".join(f'<th scope="col">{escape(head)}</th>' for head in heads) + "</tr>"]
-    best = {c.key: _best(scene, c.key, c.higher) for c in columns if c.higher is not None}
+    best: dict[str, float] = {}
+    for column in columns:
+        means = [number.mean for row in scene.rows if (number := row.numbers.get(column.key)) is not None]
+        if column.higher is not None and len(means) > 1:
+            best[column.key] = max(means) if column.higher else min(means)
+    heads = "".join(f'<th scope="col">{escape(head)}</th>' for head in ["method", *map(header, columns)])
+    lines = [f"<tr>{heads}</tr>"]
     for row in scene.rows:
-        cells = [f"<td>{_label(row)}</td>"]
+        notes = ", ".join(f'<a href="#note{n}">{n}</a>' for n in row.footnotes)
+        seeds = f' <span class="sd">({len(row.seeds)} seeds)</span>' if len(row.seeds) > 1 else ""
+        cells = f"<td>{escape(row.variant)}{f'<sup>{notes}</sup>' if notes else ''}{seeds}</td>"
         for column in columns:
             number = row.numbers.get(column.key)
             mark = ' class="best"' if number and number.mean == best.get(column.key) else ""
-            cells.append(f"<td{mark}>{escape(cell(column, number))}</td>")
-        mark = ' class="failed"' if row.failed else ""
-        lines.append(f"<tr{mark}>{''.join(cells)}</tr>")
+            cells += f"<td{mark}>{escape(cell(column, number))}</td>"
+        failed = ' class="failed"' if row.failed else ""
+        lines.append(f"<tr{failed}>{cells}</tr>")
     return "<table>\n" + "\n".join(lines) + "\n</table>"
 
 
-def _best(scene: Scene, key: str, higher: bool) -> float | None:
-    means = [number.mean for row in scene.rows if (number := row.numbers.get(key)) is not None]
-    if len(means) < 2:
-        return None
-    return max(means) if higher else min(means)
-
-
-def _label(row: Row) -> str:
-    """The row's name with links to its footnotes, and its seeds."""
-    notes = ", ".join(f'<a href="#note{n}">{n}</a>' for n in row.footnotes)
-    seeds = f' <span class="sd">({len(row.seeds)} seeds)</span>' if len(row.seeds) > 1 else ""
-    return f"{escape(row.variant)}{f'<sup>{notes}</sup>' if notes else ''}{seeds}"
-
-
-def _footnotes(table: Table) -> str:
-    if not table.footnotes:
-        return ""
-    items = "\n".join(f'<li id="note{n}">{escape(text)}</li>' for n, text in enumerate(table.footnotes, 1))
-    return f"<h2>Deviations from the originals</h2>\n<ol>\n{items}\n</ol>"
-
-
-def _made_with(table: Table) -> str:
-    """Machine, command line and versions."""
-    about = table.about
-    machines = "".join(
-        "<li>" + escape(", ".join(f"{key} {value}" for key, value in machine.items())) + "</li>\n"
-        for machine in table.machines
-    )
-    return f"""<h2>How it was made</h2>
-<p>mi_refgs {escape(str(about.get("version", "")))}, preset {escape(str(about.get("preset", "")))}{
-        escape(", with " + " ".join(about["set"])) if about.get("set") else ""
-    }</p>
-<pre>{escape(str(about.get("command", "")))}</pre>
-<ul>
-{machines}</ul>
-<p>The same numbers: <a href="table.json">table.json</a>, <a href="table.md">table.md</a>.</p>"""
-
-
-def _crowd(table: Table) -> str:
-    workers = int(table.about.get("workers", 1))
-    return "with the machine to themselves" if workers == 1 else f"while {workers} jobs shared the machine"
-
-
 def _figure(source: str, caption: str) -> str:
+    caption = escape(caption)
     return (
-        f'<figure><img src="{escape(source)}" alt="{escape(caption)}"><figcaption>{escape(caption)}.'
-        "</figcaption></figure>\n"
+        f'<figure><img src="{escape(source)}" alt="{caption}"><figcaption>{caption}.</figcaption></figure>\n'
     )
 
 
-def _names(scenes: Iterable[str]) -> list[str]:
-    """File names of scenes, each once: letters that may not stand in an address are replaced."""
-    names: list[str] = []
-    for scene in scenes:
-        name = re.sub(r"[^0-9A-Za-z]+", "_", scene).strip("_") or "scene"
-        names.append(name if name not in names else f"{name}_{len(names)}")
-    return names
-
-
-# ---------- curves ----------
+# ---------- Curves ----------
 
 
 def write_curves(folder: Path, scene: Scene, path: Path) -> bool:
-    """Plot PSNR on test views over seconds and over iterations as PNG; False if no run has a curve.
+    """Plot PSNR on test views over seconds and iterations: one colour per method, one line per seed.
 
-    One colour a method, one line a seed. Raises InputError if the file cannot be written.
+    Returns False if no run has a curve; raises InputError if the file cannot be written.
     """
     lines = [(row, read_curve(folder / run)) for row in scene.rows for run in row.runs]
     lines = [(row, curve) for row, curve in lines if curve]
@@ -222,7 +186,7 @@ def write_curves(folder: Path, scene: Scene, path: Path) -> bool:
 
 
 def read_curve(run: Path) -> list[dict[str, Any]]:
-    """The points of a run's curve, without half a line that a killed process may leave."""
+    """Return the points of a run's curve, without an incomplete line of a killed process."""
     try:
         lines = (run / CURVE).read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -237,7 +201,7 @@ def read_curve(run: Path) -> list[dict[str, Any]]:
     return points
 
 
-# ---------- crops ----------
+# ---------- Crops ----------
 
 
 @dataclass(frozen=True)
@@ -251,9 +215,9 @@ class Region:
 
 
 def write_crops(folder: Path, scene: Scene, path: Path) -> Region | None:
-    """Write the truth and each method's render (first seed) of the region where they differ most.
+    """Write crops of ground truth and each method (first seed) where the methods differ most.
 
-    Returns the region; None if there is nothing to show. Raises InputError if the data is gone.
+    Returns the region, or None without images; raises InputError if the data set is gone.
     """
     rows = [row for row in scene.rows if row.runs]
     if not rows:
@@ -265,44 +229,44 @@ def write_crops(folder: Path, scene: Scene, path: Path) -> Region | None:
     side = max(min(views[0].width, views[0].height) // CROP_SHARE, CROP_MIN)
     side = min(side, views[0].width, views[0].height)
     for index in chosen:
-        truth = views[index].load().displayed
-        pictures = _renders(folder, rows, names[index])
-        if pictures is None or any(picture.shape != truth.shape for picture in pictures):
+        reference = views[index].load().displayed
+        images = _renders(folder, rows, names[index])
+        if images is None or any(image.shape != reference.shape for image in images):
             continue
-        score, y, x = most_different(truth, pictures, side)
+        score, y, x = most_different(reference, images, side)
         if best is None or score > best[0]:
-            best = score, int(index), y, x, [truth, *pictures]
+            best = score, int(index), y, x, [reference, *images]
     if best is None:
         return None
-    _, index, y, x, pictures = best
+    _, index, y, x, images = best
     cells = [
-        (title, picture[y : y + side, x : x + side])
-        for title, picture in zip(["ground truth", *(row.variant for row in rows)], pictures, strict=True)
+        (title, image[y : y + side, x : x + side])
+        for title, image in zip(["ground truth", *(row.variant for row in rows)], images, strict=True)
     ]
     write_png(path, contact_sheet([dict(cells[i : i + ROW]) for i in range(0, len(cells), ROW)]))
     return Region(views[index].name, y, x, side)
 
 
-def most_different(truth: np.ndarray, pictures: Sequence[np.ndarray], side: int) -> tuple[float, int, int]:
-    """(score, row, column) of the square where the mean squared errors of pictures (H, W, 3) spread most.
+def most_different(reference: np.ndarray, images: Sequence[np.ndarray], side: int) -> tuple[float, int, int]:
+    """Return (score, row, column) of the square where mean squared errors of images (H, W, 3) differ most.
 
-    The score is the largest error minus the smallest; of a lone picture, its error.
+    The score is the largest error minus the smallest, or the error of a single image.
     """
-    errors = np.stack([box_mean(np.mean((picture - truth) ** 2, axis=-1), side) for picture in pictures])
-    spread = errors.max(axis=0) - (errors.min(axis=0) if len(pictures) > 1 else 0)
+    errors = np.stack([box_mean(np.mean((image - reference) ** 2, axis=-1), side) for image in images])
+    spread = errors.max(axis=0) - (errors.min(axis=0) if len(images) > 1 else 0)
     row, column = np.unravel_index(int(np.argmax(spread)), spread.shape)
     return float(spread[row, column]), int(row), int(column)
 
 
 def box_mean(values: np.ndarray, side: int) -> np.ndarray:
-    """Means (H − side + 1, W − side + 1) over all squares of values (H, W), by the upper left pixel."""
+    """Return means (H − side + 1, W − side + 1) over all squares of `values` (H, W)."""
     sums = np.pad(values, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
     total = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
     return total / side**2
 
 
 def _renders(folder: Path, rows: Sequence[Row], name: str) -> list[np.ndarray] | None:
-    """Each row's picture of a view, (H, W, 3); None if one is missing."""
+    """Return the image (H, W, 3) of a view per row; None if one is missing."""
     try:
         return [read_png(folder / row.runs[0] / name)[..., :3] for row in rows]
     except InputError:

@@ -1,4 +1,4 @@
-"""The files of a comparison: compare.json, and, made of the runs, table.json and table.md."""
+"""The files of a comparison: compare.json (settings); table.json, table.md and page, made from the runs."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ TABLE, TABLE_TEXT = "table.json", "table.md"
 
 
 def output(folder: Path) -> OutputFolder:
-    """The files of a comparison beside its runs."""
+    """Return the folder of a comparison with its files beside the runs."""
     files = (SETTINGS, TABLE, TABLE_TEXT, PAGE, f"{PICTURES}/*_psnr.png", f"{PICTURES}/*_crops.png")
     return OutputFolder(folder, "compare", files, marker=SETTINGS)
 
 
 def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequence[str]) -> None:
-    """Write what the jobs share, and each job into its run folder; raises InputError if that is impossible.
+    """Write the settings of the comparison and the jobs, which are rows of the table from now on.
 
-    The table has a row for each of them from now on.
+    Raises InputError where that is impossible.
     """
     output(folder).require_free()
     for job in planned:
@@ -49,7 +49,7 @@ def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequenc
 
 
 def table(folder: Path) -> Table:
-    """The table of all jobs in the folder."""
+    """Return the table of all jobs in the folder."""
     about = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
     data, variants = about.get("data", []), about.get("variants", [])
 
@@ -62,9 +62,9 @@ def table(folder: Path) -> Table:
 
 
 def write(folder: Path) -> Table:
-    """Make the table of all jobs in the folder, as table.json and table.md.
+    """Write the table of all jobs in the folder as table.json, table.md and a page.
 
-    Raises InputError if there are none, and if a file cannot be written.
+    Raises InputError if there are none, or a file cannot be written.
     """
     found, files = table(folder), output(folder)
     if not found.scenes:
@@ -78,5 +78,5 @@ def write(folder: Path) -> Table:
 
 
 def text(folder: Path, found: Table) -> str:
-    """The table for the terminal, and where its files are."""
+    """Return the table and the paths of its files."""
     return f"{markdown(found)}\n{folder / PAGE}, {folder / TABLE_TEXT}, {folder / TABLE}"

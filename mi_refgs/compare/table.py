@@ -1,4 +1,4 @@
-"""The table of a comparison, from its run folders: mean ± s.d. over seeds for each scene and method."""
+"""The table of a comparison: mean ± standard deviation over seeds per scene and method; as Markdown."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from mi_refgs.io.files import read_json
 
 @dataclass(frozen=True)
 class Column:
-    """A number of metrics.json as the table shows it."""
+    """A number of metrics.json and its format."""
 
     key: str
     title: str
     unit: str
-    form: str  # of the mean; the s.d. is written likewise
-    higher: bool | None  # whether more is better; None: neither
-    reason: str = ""  # key of metrics.json that says why the number is missing
+    form: str  # of mean and standard deviation
+    higher: bool | None  # whether higher is better; None: neither
+    reason: str = ""  # key of metrics.json with the reason for a missing number
 
     def text(self, value: float) -> str:
-        """A value as the table shows it."""
+        """Format a value."""
         return format(value, self.form)
 
 
@@ -48,7 +48,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Statistic:
-    """A number over seeds; `sd` is the sample's standard deviation, None for a single seed."""
+    """A number over seeds; `sd` is the sample standard deviation, None for one seed."""
 
     mean: float
     sd: float | None
@@ -56,17 +56,17 @@ class Statistic:
 
     @staticmethod
     def of(values: Sequence[float]) -> Statistic:
-        """The statistic of at least one value."""
+        """Return the statistic of at least one value."""
         sd = statistics.stdev(values) if len(values) > 1 else None
         return Statistic(statistics.fmean(values), sd, tuple(values))
 
 
 @dataclass
 class Row:
-    """A method on a scene."""
+    """Results of a method on a scene."""
 
     variant: str
-    name: str  # what the method calls itself
+    name: str  # title of the method
     seeds: list[int] = field(default_factory=list)  # of finished runs
     runs: list[str] = field(default_factory=list)  # their folders, below the comparison's
     numbers: dict[str, Statistic | None] = field(default_factory=dict)  # by a column's key
@@ -79,7 +79,7 @@ class Row:
 
 @dataclass
 class Scene:
-    """A data set with its rows."""
+    """Rows of a data set."""
 
     name: str
     path: str
@@ -91,7 +91,7 @@ class Scene:
 
 @dataclass
 class Table:
-    """All scenes of a comparison, and what their numbers rely on."""
+    """All scenes of a comparison, and how they were made."""
 
     scenes: list[Scene] = field(default_factory=list)
     footnotes: list[str] = field(default_factory=list)
@@ -100,13 +100,13 @@ class Table:
 
     @property
     def complete(self) -> bool:
-        """Whether every job of the table is done."""
+        """Whether every job is done."""
         rows = [row for scene in self.scenes for row in scene.rows]
         return not any(row.failed or row.unfinished for row in rows)
 
 
 def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
-    """The table of the jobs of a comparison in `folder`; a run that cannot be read is a failed one.
+    """Tabulate the jobs of a comparison in `folder`; a run that cannot be read counts as failed.
 
     Raises InputError for runs on one data set that were measured on images of different sizes.
     """
@@ -116,12 +116,15 @@ def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
     metrics: dict[tuple[str, str], list[dict[str, Any]]] = {}
     sizes: dict[str, dict[str, list[int]]] = {}
     for job in jobs:
+        # Find or add the row.
         key = job.data, Path(job.variant).stem
         scene = scenes.setdefault(job.data, Scene(Path(job.data).name, job.data))
         if key not in rows:
             rows[key], metrics[key] = Row(key[1], key[1]), []
             scene.rows.append(rows[key])
         row = rows[key]
+
+        # Sort the job into finished, failed and unfinished.
         try:
             if job.run.exists():
                 _describe(row, job, table)
@@ -129,31 +132,34 @@ def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
         except InputError as error:  # a config.toml of another version
             row.failed[job.seed] = str(error)
             continue
-        if done:
-            found = read_metrics(job.run)
-            assert found is not None
-            metrics[key].append(found)
-            row.seeds.append(job.seed)
-            row.runs.append(str(Path(job.folder).relative_to(folder.resolve())))
-            scene.image_size, scene.test_views = found["image_size"], found["test_views"]
-            scene.downscale = found.get("downscale")
-            sizes.setdefault(job.data, {})[row.runs[-1]] = scene.image_size
-            if found["machine"] not in table.machines:
-                table.machines.append(found["machine"])
-        elif (failure := Path(job.folder) / FAILED).is_file():
-            row.failed[job.seed] = str(read_json(failure).get("reason"))
-        else:
-            row.unfinished.append(job.seed)
+        if not done:
+            if (failure := Path(job.folder) / FAILED).is_file():
+                row.failed[job.seed] = str(read_json(failure).get("reason"))
+            else:
+                row.unfinished.append(job.seed)
+            continue
+
+        # Collect its metrics.
+        found = read_metrics(job.run)
+        assert found is not None
+        metrics[key].append(found)
+        row.seeds.append(job.seed)
+        row.runs.append(str(Path(job.folder).relative_to(folder.resolve())))
+        scene.image_size, scene.test_views = found["image_size"], found["test_views"]
+        scene.downscale = found.get("downscale")
+        sizes.setdefault(job.data, {})[row.runs[-1]] = scene.image_size
+        if found["machine"] not in table.machines:
+            table.machines.append(found["machine"])
     for found in sizes.values():
         require_one_size(str(folder), found, "remove the runs of one size, and fit them again in the other")
-    for (path, _), row in rows.items():
-        _fill(row, metrics[path, row.variant])
+    for key, row in rows.items():
+        _fill(row, metrics[key])
     table.scenes = list(scenes.values())
     return table
 
 
 def _describe(row: Row, job: Job, table: Table) -> None:
-    """What the method says of itself, its deviations as footnotes that rows share."""
+    """Fill in the method's title and its deviations, as footnotes that rows share."""
     about = job.run.method().about
     row.name, row.paper_row = about.name or row.variant, about.paper_row
     for text in about.deviations:
@@ -178,10 +184,13 @@ def _fill(row: Row, found: list[dict[str, Any]]) -> None:
 
 
 def markdown(table: Table) -> str:
-    """One table a scene, the deviations of its methods as numbered footnotes, and what failed."""
+    """Return one table per scene, failures, and deviations of methods as numbered footnotes."""
     lines: list[str] = []
     for scene in table.scenes:
-        lines += [f"### {heading(scene)}", "", *_table(scene), ""]
+        columns = columns_of(scene)
+        titles = ["method", *map(header, columns)]
+        body = [[label(row), *(cell(c, row.numbers.get(c.key)) for c in columns)] for row in scene.rows]
+        lines += [f"### {heading(scene)}", "", *aligned(titles, body), ""]
         lines += [f"{remark}\n" for remark in remarks(scene)]
     if table.footnotes:
         lines += ["Deviations from the originals:", ""]
@@ -190,7 +199,7 @@ def markdown(table: Table) -> str:
 
 
 def heading(scene: Scene) -> str:
-    """The scene's name with the pictures that its numbers are means over."""
+    """Return the name of the scene with the images over which its numbers are means."""
     if not scene.image_size:
         return scene.name
     width, height = scene.image_size
@@ -199,7 +208,7 @@ def heading(scene: Scene) -> str:
 
 
 def remarks(scene: Scene) -> list[str]:
-    """What a reader of a scene's numbers has to be told: failures, numbers that are missing, the paper."""
+    """Return failures, and reasons of missing numbers, of a scene."""
     said = []
     for row in scene.rows:
         said += [f"{row.variant}, seed {seed}: failed: {why}." for seed, why in row.failed.items()]
@@ -212,17 +221,17 @@ def remarks(scene: Scene) -> list[str]:
 
 
 def columns_of(scene: Scene) -> list[Column]:
-    """The columns that at least one row has a number in."""
+    """Return the columns in which at least one row has a number."""
     return [column for column in COLUMNS if any(row.numbers.get(column.key) for row in scene.rows)]
 
 
 def header(column: Column) -> str:
-    """A column's title with its unit."""
+    """Return the title of a column with its unit."""
     return f"{column.title} ({column.unit})" if column.unit else column.title
 
 
 def cell(column: Column, number: Statistic | None) -> str:
-    """Mean ± s.d."""
+    """Format a mean ± standard deviation."""
     if number is None:
         return NOTHING
     mean = column.text(number.mean)
@@ -230,22 +239,14 @@ def cell(column: Column, number: Statistic | None) -> str:
 
 
 def label(row: Row) -> str:
-    """The row's name with the numbers of its footnotes."""
+    """Return the name of a row with its footnotes and number of seeds."""
     marks = f" [{','.join(map(str, row.footnotes))}]" if row.footnotes else ""
     seeds = f" ({len(row.seeds)} seeds)" if len(row.seeds) > 1 else ""
     return f"{row.variant}{marks}{seeds}"
 
 
-def _table(scene: Scene) -> list[str]:
-    columns = columns_of(scene)
-    body = [
-        [label(row), *(cell(column, row.numbers.get(column.key)) for column in columns)] for row in scene.rows
-    ]
-    return aligned(["method", *map(header, columns)], body)
-
-
 def aligned(titles: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table whose columns stand below each other: the first left, the others right."""
+    """Return lines of a Markdown table: the first column left-aligned, the others right-aligned."""
     widths = [max(len(line[i]) for line in [titles, *body]) for i in range(len(titles))]
     rule = [f":{'-' * (w - 1)}" if i == 0 else f"{'-' * (w - 1)}:" for i, w in enumerate(widths)]
 

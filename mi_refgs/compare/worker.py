@@ -1,9 +1,7 @@
-"""One job in a process of its own: `python -m mi_refgs.compare.worker RUN_FOLDER`.
+"""One job in a separate process, whose crash is a row: `python -m mi_refgs.compare.worker RUN`.
 
-A crash of the process is no crash of the comparison. The process ends, its state saved, when its standard
-input closes: whoever started it is gone.
-
-Exit codes: 0 done, 2 failed (failed.json says why), 143 told to stop.
+The process saves its state and ends when its standard input closes, which means that its parent is gone.
+Exit codes: 0 done, 2 failed (failed.json has the reason), 143 stopped.
 """
 
 from __future__ import annotations
@@ -27,15 +25,15 @@ DONE, FAILURE, STOPPED = 0, 2, 143
 """Exit codes."""
 CURVE = "curve.jsonl"
 CURVE_POINTS, CURVE_VIEWS = 20, 8
-"""Measurements during a fit, evenly spread over it, and the test views of each, spread over the split."""
+"""Measurements during a fit, evenly spaced, and test views per measurement, evenly spaced."""
 PATIENCE = 60.0
-"""Seconds to wait for the process that worked in the folder before to save its state."""
+"""Seconds to wait for an earlier process to leave the folder."""
 GRACE = 30.0
-"""Seconds between asking this process to end and ending it."""
+"""Seconds between SIGTERM and the end of this process by force."""
 
 
 def main(folder: Path) -> int:
-    """Do the job of a run folder and return the exit code."""
+    """Run the job of a run folder; returns the exit code."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         with Run(folder).alone(PATIENCE):
@@ -53,7 +51,7 @@ def main(folder: Path) -> int:
 
 
 def fit_and_measure(job: Job) -> None:
-    """Train from the newest checkpoint, if there is one, to the end; then write artefacts and metrics.
+    """Train from the newest checkpoint, if any, to the end; then write artefacts and metrics.
 
     Raises InputError as training and evaluation do, and KeyboardInterrupt for Ctrl-C and SIGTERM.
     """
@@ -82,7 +80,7 @@ def fit_and_measure(job: Job) -> None:
 
 
 class Curve:
-    """PSNR on a few test views in the course of a fit, measured between its steps, off its clock."""
+    """Measures PSNR on a few test views between steps of a fit; its clock does not count."""
 
     def __init__(self, job: Job, method: Method, begin: int) -> None:
         from mi_refgs.fitting.targets import read_views
@@ -114,7 +112,7 @@ class Curve:
 
 
 def _end_with_parent() -> None:
-    """End this process when its standard input closes: between two steps, the state saved, if it trains."""
+    """Send SIGTERM to this process when its standard input closes, and end it by force after GRACE."""
     while os.read(0, 1):  # not sys.stdin: its lock would be held when the interpreter ends
         pass
     os.kill(os.getpid(), signal.SIGTERM)

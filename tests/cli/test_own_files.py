@@ -274,7 +274,7 @@ def test_a_run_is_never_overwritten(sources: Path, tmp_path: Path) -> None:
     before = contents(Place(bare))
     for more in ([], ["--overwrite"]):
         command = ["export", str(tmp_path / "run"), "-o", str(bare), *more]
-        refused(command, "holds a run, which is never overwritten")
+        refused(command, "contains a run, which is never overwritten")
         (bare / "config.toml").rename(tmp_path / "config.toml")
         refused(command, "belongs to a run, which is never overwritten")
         (tmp_path / "config.toml").rename(bare / "config.toml")
