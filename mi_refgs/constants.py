@@ -22,7 +22,7 @@ has more, and its square fits float32."""
 # ---------------- cameras ----------------
 
 RIGID_TOLERANCE = 1e-3
-"""Largest deviation of RᵀR from the identity in a camera: float32 in text files carries about 1e-6."""
+"""Largest deviation of RᵀR from the identity in a camera: float32 in text files is exact to 1e-6."""
 
 # ---------------- footprint and compositing ----------------
 
@@ -63,7 +63,7 @@ GAUSSIAN_LOW_PASS = 0.3
 fitted with it. [3DGS, released code]"""
 
 GAUSSIAN_SLOPE_MARGIN = 0.15
-"""Share of the picture's width and height beyond its border from which on the projection of a 3D Gaussian is
+"""Share of the image's width and height beyond its border from which on the projection of a 3D Gaussian is
 linearised there, and not at its centre: the affine approximation of what lies far beside the view would cover
 all of it. [3DGS, released code: 1.3 tan(fov/2)]"""
 
@@ -73,7 +73,7 @@ an 8-bit image. The default of `refgs export --limit`."""
 
 TILE_SIZES = ((512.0, (4, 4)), (1024.0, (8, 4)), (math.inf, (8, 8)))
 """Focal lengths in pixels, and width and height in pixels of the tiles of cameras below them. The pixels of a
-tile share a list of surfels and its order: large tiles give one order to more of the picture, and evaluate
+tile share a list of surfels and its order: large tiles give one order to more of the image, and evaluate
 more surfels that miss a pixel; small ones need more lists. [measured, docs/decisions.md]"""
 
 PACKET_EDGE = 8
@@ -83,7 +83,7 @@ and hold the same surfels."""
 
 LANE_PIXELS_PER_AXIS = 2
 """Blocks of a tile along each axis. A lane does the pixel at its place in every block: what it reads of a
-surfel then serves them all, and what it adds to the surfel's gradient is their sum."""
+surfel is then used for all, and what it adds to the surfel's gradient is their sum."""
 
 
 FOCAL_TOLERANCE = 1e-5
@@ -104,7 +104,7 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 # ---------------- surfels ----------------
 
 RAW_LIMIT = 1e18
-"""Bound of |raw value| where an activation has none, in positions (scene units), harmonics and the light: its
+"""Bound of |raw value| where an activation has none, in positions (scene units), SH and the light: its
 square still fits float32. A surfel with a value beyond it, an infinite one or a NaN in any channel covers no
 pixel and gets zero gradient; such a texel of the light is black."""
 

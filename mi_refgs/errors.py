@@ -1,4 +1,4 @@
-"""The exceptions for input a person can mend, and values in their messages."""
+"""Exceptions for input that a user can fix, and values in their messages."""
 
 
 class InputError(ValueError):
@@ -9,7 +9,7 @@ class InputError(ValueError):
 
 
 class SceneError(InputError):
-    """A scene lacks what is asked of it: where a run is read, its folder is put in front of the message."""
+    """A scene lacks what a request needs. Where a run is read, its folder precedes the message."""
 
 
 def counted(count: int, noun: str) -> str:
@@ -18,7 +18,7 @@ def counted(count: int, noun: str) -> str:
 
 
 def abbreviated(value: object, limit: int = 80) -> str:
-    """A value as it may stand in a message: at most `limit` characters, whatever a file holds."""
+    """Format a value for a message: at most `limit` characters, whatever a file contains."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of more than 4,300 digits; lists in lists

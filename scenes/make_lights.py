@@ -17,7 +17,7 @@ from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import box_downscale
 
 HEIGHT = 128  # rows; twice as many columns
-OVERSAMPLING = 4  # samples a texel and axis
+OVERSAMPLING = 4  # samples per texel and axis
 EDGE = np.radians(2.0)  # width of a blurred edge
 
 Vector = tuple[float, float, float]

@@ -82,7 +82,7 @@ def surface(distance: Distance, half: float, cells: int) -> trimesh.Trimesh:
 
 
 def union(a: np.ndarray, b: np.ndarray, blend: float) -> np.ndarray:
-    """Distance of a union whose seam is rounded over about `blend`."""
+    """Distance of a union whose edge is rounded over about `blend`."""
     share = np.clip(0.5 + 0.5 * (b - a) / blend, 0, 1)
     return b + (a - b) * share - blend * share * (1 - share)
 
@@ -105,7 +105,7 @@ def hollow_block(p: np.ndarray) -> np.ndarray:
 
 
 def shell(p: np.ndarray) -> np.ndarray:
-    """A hollow ball with six round windows and rounded rims."""
+    """A spherical shell with six round windows and rounded rims."""
     radius = np.linalg.norm(p, axis=-1)
     wall = np.abs(radius - 0.84) - 0.07
     windows = np.min(
@@ -158,7 +158,7 @@ def lathe(profile: np.ndarray, sections: int = 96, rows: int = 64) -> trimesh.Tr
 
 
 def jug() -> trimesh.Trimesh:
-    """The body of a jug with a closed lid, from z = -0.6 to 0.5."""
+    """The body of a jug with a closed top, from z = -0.6 to 0.5."""
     profile = [
         (0, -0.6), (0.3, -0.6), (0.36, -0.58), (0.47, -0.42), (0.5, -0.22), (0.44, 0.02), (0.31, 0.2),
         (0.27, 0.3), (0.3, 0.38), (0.29, 0.42), (0.2, 0.47), (0, 0.5),
@@ -167,7 +167,7 @@ def jug() -> trimesh.Trimesh:
 
 
 def brick(columns: int, rows: int) -> trimesh.Trimesh:
-    """A building brick, open below: walls, a lid with studs, tubes between the studs. A stud a unit, z up."""
+    """A building brick, open below: walls, a top with studs, tubes between the studs. A stud a unit, z up."""
     wall, height, stud = 0.16, 1.2, (0.3, 0.22)
     w, d = columns / 2 - 0.01, rows / 2 - 0.01
 

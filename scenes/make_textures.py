@@ -2,7 +2,7 @@
 
 Run from the repository root: python scenes/make_textures.py
 
-Every texture is drawn from a seed. None repeats itself, so that pictures of the room can be matched by what
+Every texture is drawn from a seed. None repeats itself, so that images of the room can be matched by what
 they show.
 """
 

@@ -84,7 +84,7 @@ def test_images_are_refused_and_rendered_again_where_they_fit(monkeypatch: pytes
 def test_the_least_of_machine_and_control_groups_is_available(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of the group and of those around it; page cache can be had back; both versions; nothing is no limit."""
+    """Limits of the group and of its parents; page cache is available; both versions; nothing is no limit."""
     proc, groups = tmp_path / "proc", tmp_path / "cgroup"
     monkeypatch.setattr(memory, "PROC", proc)
     monkeypatch.setattr(memory, "CGROUPS", groups)

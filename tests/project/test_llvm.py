@@ -172,7 +172,7 @@ def test_a_missing_choice_of_the_user_is_refused() -> None:
 
 @pytest.mark.parametrize("old", OLD[:2], ids=lambda path: path.name)
 def test_an_old_library_that_is_already_loaded_is_refused(old: Path) -> None:
-    """Mitsuba came first and took an old library: nothing can be mended any more, but it can be said."""
+    """Mitsuba came first and took an old library: it is too late to choose another, but not to say so."""
     if not old.exists():
         pytest.skip(f"{old.name} is not installed")
     first = f"import os\nos.environ['DRJIT_LIBLLVM_PATH'] = '{old}'\nimport mitsuba\n"
