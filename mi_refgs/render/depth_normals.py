@@ -15,10 +15,9 @@ from mi_refgs.constants import ALPHA_MIN, NORM_FLOOR
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.splat.camera import Camera
 
-# Cosine to the viewing ray below which a depth difference is read as a step between two surfaces, not as a
-# slope: the normal of such a step would pull at the rims of both. At 160² and 40° it is a step of a twentieth
-# of the depth.
 DEPTH_EDGE_COSINE = 0.2
+"""Cosine to the viewing ray below which a depth difference is a step between two surfaces, not a slope: its
+normal would bend the rims of both. At 160² and 40° it is a step of 1/20 of the depth."""
 
 
 def normals_from_depth(depth: Any, alpha: Any, camera: Camera) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""What a camera shows of linear radiance: the one place where the sRGB curve and the background come in.
+"""Display of linear radiance: the one place where the sRGB curve and the background are applied.
 
 Images are planes: lists of mi.Float of width H·W in raster order (or a mi.Color3f).
 """
@@ -14,9 +14,10 @@ import numpy as np
 
 from mi_refgs.io.images import SRGB_LINEAR_LIMIT
 from mi_refgs.render.pipeline import Frame
+from mi_refgs.types import Color3f, Float
 
-# Alpha below which a pixel is empty: radiance / A has no meaning and the background alone is seen.
 ALPHA_EMPTY = 1e-6
+"""Alpha below which a pixel is empty: radiance / A has no meaning, and only the background is seen."""
 
 
 def srgb_from_linear(linear: Any) -> Any:
@@ -30,10 +31,10 @@ def srgb_from_linear(linear: Any) -> Any:
 
 
 def display_image(radiance: Iterable[Any], alpha: Any, background: Iterable[Any]) -> list[Any]:
-    """What an 8-bit RGBA picture shows: A srgb(L / A) + (1 - A) background, per plane.
+    """Composite as 8-bit RGBA images do: A srgb(L / A) + (1 - A) background, per plane.
 
     radiance: linear, premultiplied (L); background: display-encoded floats or planes. Pixels with A < 1e-6
-    show the background and give radiance no gradient.
+    show the background, and their radiance has no gradient.
     """
     seen = alpha >= ALPHA_EMPTY
     inverse = dr.select(seen, dr.rcp(dr.select(seen, alpha, 1.0)), 0.0)
@@ -43,8 +44,8 @@ def display_image(radiance: Iterable[Any], alpha: Any, background: Iterable[Any]
     ]
 
 
-def composited(frame: Frame) -> tuple[Any, Any]:
-    """Radiance (mi.Color3f) over the background of a frame and alpha, 1 over one: the pixels of an image."""
+def composited(frame: Frame) -> tuple[Color3f, Float]:
+    """Radiance over the frame's background, and alpha: 1 where there is a background."""
     if frame.background is None:
         return frame.radiance, frame.alpha
     return frame.radiance + (1 - frame.alpha) * frame.background, mi.Float(1)
@@ -53,11 +54,11 @@ def composited(frame: Frame) -> tuple[Any, Any]:
 def displayed(
     frame: Frame, background: np.ndarray, linear: bool, gain: Sequence[Any] | None = None
 ) -> list[Any]:
-    """What the camera shows of a frame, display-encoded planes.
+    """Display-encoded planes of a frame.
 
-    Pictures with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it,
-    and what the frame itself has behind it, in place of `background`. `gain` is a factor a channel of the
-    radiance, ahead of both, and of what the frame has behind it.
+    Images with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it. The
+    frame's own background replaces `background`, and is linear. `gain` is a factor per channel of radiance
+    and of the frame's own background, applied first.
     """
     radiance = list(frame.radiance)
     behind = [float(x) for x in background] if frame.background is None else list(frame.background)

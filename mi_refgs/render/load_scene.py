@@ -12,12 +12,12 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.exr import mitsuba_exr
 
 
-def load_scene(path: Path, aovs: Sequence[str] = (), alone: bool = False) -> Any:
+def load_scene(path: Path, aovs: Sequence[str] = (), object_only: bool = False) -> Any:
     """Load a scene, its `refgs` integrator with these AOVs after its own: types, or `name:type`.
 
-    A pair that the integrator has already is not repeated. `alone`: without the surroundings and the
+    A pair that the integrator has already is not repeated. `object_only`: without the surroundings and the
     background of that. Raises InputError for what Mitsuba cannot load, for a name of two types, and for AOVs
-    or `alone` without a `refgs` integrator.
+    or `object_only` without a `refgs` integrator.
     """
     before = mi.file_resolver()
     beside = mi.FileResolver(before)
@@ -27,7 +27,7 @@ def load_scene(path: Path, aovs: Sequence[str] = (), alone: bool = False) -> Any
         config = mi.parser.ParserConfig(mi.variant())
         state = mi.parser.parse_file(config, str(path))
         mi.parser.transform_all(config, state)
-        if aovs or alone:
+        if aovs or object_only:
             integrators = [node.props for node in state.nodes if node.props.plugin_name() == "refgs"]
             if not integrators:
                 option = "--aov" if aovs else "--object"
@@ -35,7 +35,7 @@ def load_scene(path: Path, aovs: Sequence[str] = (), alone: bool = False) -> Any
             if aovs:
                 own = str(integrators[0].get("aovs", "")).split(",")
                 integrators[0]["aovs"] = ",".join(_pairs([*filter(str.strip, own), *aovs]))
-            for name in ("surroundings", "background") if alone else ():
+            for name in ("surroundings", "background") if object_only else ():
                 if name in integrators[0]:
                     del integrators[0][name]
         with mitsuba_exr():
@@ -48,7 +48,7 @@ def load_scene(path: Path, aovs: Sequence[str] = (), alone: bool = False) -> Any
 
 
 def _pairs(aovs: Sequence[str]) -> list[str]:
-    """`name:type` pairs in order, each once; a type alone is its own name."""
+    """`name:type` pairs in order, each once; a bare type is its own name."""
     parts = [[part.strip() for part in aov.split(":")] for aov in aovs]
     return list(dict.fromkeys(":".join(part * 2 if len(part) == 1 else part) for part in parts))
 

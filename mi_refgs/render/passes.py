@@ -1,7 +1,7 @@
-"""Images rendered in passes, bands of rows one after the other, so that memory does not grow with samples.
+"""Rendering in passes, band of rows by band of rows, so that memory does not grow with the sample count.
 
-A band keeps its place in the tiles of the whole image: its tiles have the same lists, and its pixels the same
-values. Bands are equally high, and their places are opaque, so that one set of kernels serves all of them.
+The tiles of a band are tiles of the whole image, with the same lists: its pixels have the same values.
+Bands are equally high and their offsets opaque, so that one set of kernels serves all of them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Band:
         return self.size[1]
 
     def kept(self, value: Any) -> Any:
-        """Values of the band's own pixels, of an array of values of all pixels of `camera`, or of one."""
+        """The band's own pixels of an array of values per pixel of `camera`; one of width 1 stays."""
         if dr.width(value) == 1 or self.size == (self.camera.width, self.camera.height):
             return value
         index, columns = dr.arange(mi.UInt32, self.size[0] * self.size[1]), self.size[0]
@@ -45,11 +45,10 @@ class Band:
 
 
 def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = None) -> list[Band]:
-    """The bands of a camera's image for passes of at most so many samples, factor² per pixel.
+    """Divide an image into bands of at most `most` samples (default: PASS_SAMPLES), factor² per pixel.
 
-    `margin`: pixels of neighbours that the values of a pixel depend on. Without one, the last band may reach
-    below the image, as high as the others. `most` is PASS_SAMPLES by default; a band has PACKET_EDGE rows of
-    samples at least.
+    `margin`: pixels of neighbours on which a pixel depends. Without one, the last band may reach below the
+    image, as high as the others. A band has PACKET_EDGE rows of samples at least.
     """
     most = PASS_SAMPLES if most is None else most
     width, height = camera.width, camera.height
@@ -73,16 +72,16 @@ def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = N
 
 
 MAPS = 24
-"""Channels of a frame with all its maps, about."""
+"""Planes of a frame with all its maps, about."""
 
 
 def in_passes(
     draw: Callable[[Camera], Result], camera: Camera, factor: int = 1, margin: int = 0, surfels: int = 0
 ) -> Result:
-    """What `draw` gives for a camera, drawn in the `bands` of its image; without derivatives.
+    """Call `draw` for each band of a camera's image and join the results; without derivatives.
 
-    `draw` returns arrays of one value per pixel or one in all, in lists, dictionaries and dataclasses. It
-    takes factor² samples per pixel. Raises InputError where an image of `surfels` does not fit into memory.
+    `draw` renders factor² samples per pixel and returns lists, dictionaries and dataclasses of arrays of one
+    value per pixel or one in all. Raises InputError if an image of so many surfels does not fit into memory.
     """
     require_image((camera.width, camera.height), factor**2, surfels, MAPS)
     found = bands(camera, factor, margin)
@@ -97,7 +96,7 @@ def in_passes(
             return arrays[-1]
 
         parts.append(_mapped(kept, draw(band.camera)))
-        dr.eval(arrays)  # or memory would hold the samples of all bands
+        dr.eval(arrays)  # or the samples of all bands would stay in memory
 
     def stacked(*values: Any) -> Any:
         if all(dr.width(value) == 1 for value in values):
@@ -109,7 +108,7 @@ def in_passes(
 
 
 def _mapped(function: Callable[..., Any], *trees: Any) -> Any:
-    """Trees of arrays (None and flags stay) as one of what a function makes of each of their leaves."""
+    """Apply a function to corresponding arrays of trees; None and flags stay."""
     first = trees[0]
     if first is None or isinstance(first, bool):
         return first

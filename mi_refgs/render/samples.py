@@ -1,4 +1,4 @@
-"""Several samples a pixel: a view is rendered larger, and its pixels are averaged."""
+"""Several samples per pixel: a view is rendered larger, and its pixels are averaged."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from mi_refgs.render.gbuffer import inverse_alpha
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.points import RadianceTerms
 from mi_refgs.splat.camera import Camera
+from mi_refgs.types import Color3f, Float
 
 
 def samples_per_axis(samples: int) -> int:
-    """k of the k × k regular samples that a number of samples stands for: ⌈√samples⌉.
+    """k of the k × k regular samples for a sample count: ⌈√samples⌉.
 
     Raises InputError for less than 1.
     """
@@ -31,13 +32,13 @@ def samples_per_axis(samples: int) -> int:
 def supersampled(
     view: Callable[[Camera], Frame], camera: Camera, samples: int, details: bool = True
 ) -> Frame:
-    """The frame of `view` with k × k samples a pixel (`samples_per_axis`), box filtered; under AD.
+    """Render a frame with k × k samples per pixel (`samples_per_axis`), box filtered; under AD.
 
-    Linear radiance, its terms, normals and alpha are premultiplied: they are averaged as they are. Depth is
-    weighted by alpha, maps by the opacity of the object, and the background by 1 - alpha, so that compositing
-    the mean frame equals the mean of composited samples. The sRGB encoding comes after, as for a path-traced
-    image with a box filter. Without `details`, there are neither terms nor maps: each mean is a kernel of its
-    own, used or not.
+    Linear radiance, its terms, normals and alpha are premultiplied: their means are plain. Depth is weighted
+    by alpha, maps by the opacity of the object, and the background by 1 - alpha, so that compositing the mean
+    frame equals the mean of composited samples. The sRGB encoding comes after, as for a path-traced image
+    with a box filter. Without `details`, there are neither terms nor maps: each mean is a kernel of its own,
+    used or not.
     """
     factor = samples_per_axis(samples)
     fine_camera = camera.supersampled(factor)
@@ -48,34 +49,33 @@ def supersampled(
         fine = replace(fine, terms=None, maps={})
 
     def mean(value: Any) -> Any:
+        if value is None:
+            return None
         if dr.depth_v(value) > 1:
             return type(value)(*(box_mean(part, camera, factor) for part in value))
         return box_mean(value, camera, factor)
 
-    def maybe(value: Any) -> Any:
-        return None if value is None else mean(value)
-
-    alphas: dict[int, Any] = {}  # two or all of the three may be one array
+    # Two of the three opacities, or all, may be one array.
+    alphas: dict[int, Any] = {}
     for value in (fine.alpha, fine.object_alpha, fine.normal_alpha):
         if id(value) not in alphas:
-            alphas[id(value)] = maybe(value)
+            alphas[id(value)] = mean(value)
     alpha, object_alpha = alphas[id(fine.alpha)], alphas[id(fine.object_alpha)]
     inverse = inverse_alpha(alpha)
 
-    def by_alpha(value: Any) -> Any:
+    def by_alpha(value: Float) -> Float:
         return mean(value * fine.alpha) * inverse
 
-    distance = None
+    distance = terms = None
     if details and fine.depth is not None:
         distance = by_alpha(ray_distance(fine.depth, fine_camera))
-    terms = None
     if fine.terms is not None:
         terms = RadianceTerms(**{name: mean(term) for name, term in fine.terms.known().items()})
     return replace(
         fine,
         alpha=alpha,
         depth=None if fine.depth is None else by_alpha(fine.depth),
-        normal=maybe(fine.normal),
+        normal=mean(fine.normal),
         radiance=mean(fine.radiance),
         terms=terms,
         maps={
@@ -89,51 +89,51 @@ def supersampled(
     )
 
 
-def mean_behind(mean: Callable[[Any], Any], background: Any, alpha: Any) -> Any:
-    """Mean background (mi.Color3f) weighted by 1 - alpha; the plain mean where alpha is 1."""
+def mean_behind(mean: Callable[[Any], Any], background: Color3f, alpha: Float) -> Color3f:
+    """Mean background weighted by 1 - alpha; the plain mean where alpha is 1."""
     through = 1 - mean(alpha)
     hidden = through <= COVERAGE_FLOOR
     weighted = mean(background * (1 - alpha)) * inverse_alpha(through)
     return dr.select(hidden, mean(background), weighted)
 
 
-def ray_distance(depth: Any, camera: Camera) -> Any:
-    """Distance along the rays of a camera from its near plane to camera-z depths of its pixels."""
+def ray_distance(depth: Float, camera: Camera) -> Float:
+    """Distance along the rays from the near plane to a camera-z depth per pixel."""
     return (depth - camera.near) * dr.norm(camera.rays())
 
 
-def box_mean(channel: Any, camera: Camera, factor: int) -> Any:
-    """Mean of each factor × factor block of a supersampled raster; a channel of width 1 is constant."""
-    if factor == 1 or dr.width(channel) == 1:
-        return channel
-    return dr.custom(_BoxMean, channel, camera.width, camera.height, factor)
+def box_mean(plane: Float, camera: Camera, factor: int) -> Float:
+    """Mean of each factor × factor block of a supersampled plane; one of width 1 is constant."""
+    if factor == 1 or dr.width(plane) == 1:
+        return plane
+    return dr.custom(_BoxMean, plane, camera.width, camera.height, factor)
 
 
 class _BoxMean(dr.CustomOp):
-    """Mean of blocks of pixels; its adjoint gathers, and so adds to what else is read of the channel."""
+    """Mean of blocks of pixels, with an adjoint that gathers."""
 
-    def eval(self, channel: Any, width: int, height: int, factor: int) -> Any:
+    def eval(self, plane: Any, width: int, height: int, factor: int) -> Any:
         self.size = width, height, factor
-        return self._mean(channel)
+        return self._mean(plane)
 
-    def _mean(self, channel: Any) -> Any:
+    def _mean(self, plane: Any) -> Any:
         width, height, factor = self.size
         sample = dr.arange(mi.UInt32, width * height * factor * factor)
         pixel, part = sample // (factor * factor), sample % (factor * factor)
         x = (pixel % width) * factor + part % factor
         y = (pixel // width) * factor + part // factor
-        ordered = dr.gather(mi.Float, channel, y * (width * factor) + x)
+        ordered = dr.gather(mi.Float, plane, y * (width * factor) + x)
         return dr.block_sum(ordered, factor * factor) / (factor * factor)
 
     def forward(self) -> None:
-        self.set_grad_out(self._mean(self.grad_in("channel")))
+        self.set_grad_out(self._mean(self.grad_in("plane")))
 
     def backward(self) -> None:
         width, height, factor = self.size
         sample = dr.arange(mi.UInt32, width * height * factor * factor)
         x, y = sample % (width * factor), sample // (width * factor)
         δ = dr.gather(mi.Float, self.grad_out(), (y // factor) * width + x // factor)
-        self.set_grad_in("channel", δ / (factor * factor))
+        self.set_grad_in("plane", δ / (factor * factor))
 
     def name(self) -> str:
         return "box mean"

@@ -184,7 +184,7 @@ def by_scene_file(case: Case) -> Maps:
     """The image of `mi.load_file` without AOVs; and those."""
     path = case.folder / SCENE
     maps = of_mitsuba(load_scene(path, case.names, case.alone), 0, case)
-    scene = load_scene(path, alone=True) if case.alone else mi.load_file(str(path))
+    scene = load_scene(path, object_only=True) if case.alone else mi.load_file(str(path))
     return maps | {IMAGE: mi.render(scene, spp=case.samples).numpy()}
 
 
