@@ -77,7 +77,7 @@ class Straight:
         except InputError as error:
             raise InputError(
                 f"photographs: the lens found cannot be undone ({error}); choose another lens model, such as "
-                "--camera RADIAL"
+                "--camera-model RADIAL"
             ) from None
         zoom = 1.0 if undo is None else undo.zoom
         return cls(size, (zoom * fx, zoom * fy), (cx, cy), undo)

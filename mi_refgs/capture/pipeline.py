@@ -21,7 +21,6 @@ import numpy as np
 from mi_refgs.capture import colmap, output
 from mi_refgs.capture.colmap import Solved
 from mi_refgs.capture.frame import moved, upright_unit
-from mi_refgs.capture.output import Straight
 from mi_refgs.capture.photographs import Photograph, cameras_of, find_masks, find_photographs, write_copies
 from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.region import Region, write_region
@@ -96,12 +95,15 @@ def capture(
 
     Raises InputError for unusable input, with the remedy, and without pycolmap.
     """
+    # Photographs and options.
     colmap.load()
     if camera not in (None, *MODELS):
-        raise InputError(f"--camera: {camera}: unknown lens model; give one of {', '.join(MODELS)}")
+        raise InputError(f"--camera-model: {camera}: unknown lens model; give one of {', '.join(MODELS)}")
     photographs = find_photographs(source)
     job = CaptureJob(photographs, find_masks(masks, photographs), source, folder, camera)
     output.prepare(folder, [source] if masks is None else [source, masks])
+
+    # Cameras of the largest group, transformed to an upright world.
     began = time.perf_counter()
     result = _solve(job, tell)
     model, groups = colmap.load().Reconstruction(result), read_json(result / "groups.json")["groups"]
@@ -111,6 +113,8 @@ def capture(
     similarity = upright_unit(solved, np.array([job.copies[name].up for name in solved.names]))
     world = moved(solved, similarity)
     found = region or Region((0.0, 0.0, 0.0), 1.0)
+
+    # Undistorted images and COLMAP's files, unless the last capture wrote the same.
     lenses = [(name, repr(straight[name])) for name in solved.names]
     key = job.key(lenses, _digests(sorted(result.glob("*.bin"))), _digests(job.masks.values()))
     if not output.is_complete(folder, key):
@@ -124,10 +128,38 @@ def capture(
         output.replace_output(folder, made, key)
         shutil.rmtree(made)
     write_region(folder, found)
-    report = Report.of(job, model, world, groups, straight, found, key, time.perf_counter() - began)
     draw(folder / PLOT, world, found)
-    write_json(folder / REPORT, report.content)
-    return report
+
+    # The report.
+    registered = {job.copies[name].name for name in world.names}
+    cameras, pinholes = model.cameras.values(), {(s.size, s.focal): s for s in straight.values()}
+    report = {
+        "key": key,
+        "photographs": len(photographs),
+        "placed": len(registered),
+        "not_placed": [p.name for p in photographs if p.name not in registered],
+        "other_groups": [[job.copies[name].name for name in group] for group in groups[1:]],
+        "points": len(world.points),
+        "observations": int(world.length.sum()),
+        "mean_track_length": float(world.length.mean()) if len(world.length) else 0.0,
+        "mean_reprojection_error": float(model.compute_mean_reprojection_error()),
+        "lens": {
+            "model": next(iter(cameras)).model_name,
+            "cameras": [
+                {"width": c.width, "height": c.height, "parameters": [float(x) for x in c.params]}
+                for c in cameras
+            ],
+        },
+        "pinholes": [
+            {"size": s.size, "focal": [*map(float, s.focal)], "centre": [*map(float, s.centre)]}
+            for s in pinholes.values()
+        ],
+        "region": {"centre": found.centre, "radius": found.radius},
+        "masks": bool(job.masks),
+        "seconds": round(time.perf_counter() - began, 1),
+    }
+    write_json(folder / REPORT, report)
+    return Report(report)
 
 
 def _digests(files: Iterable[Path]) -> list[str]:
@@ -149,17 +181,20 @@ def _solve(job: CaptureJob, tell: Callable[[str], None]) -> Path:
         for path in job.work.iterdir():  # of other images or options
             if path != images and not path.name.startswith(database.stem):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
+        # Features.
         write_copies(job.photographs, images, size, colmap.progress("images"))
         if not database.is_file():
             colmap.begin(database, images, _groups(job, images))
         colmap.extract(database, images, names)
         found = colmap.features(database)
         require_features(job.source, [len(found[name]) for name in names], _contrast(images, names))
+        # Matches.
         pairs = colmap.pairs_to_match(found)
         tell(
             f"{len(names)} photographs, {sum(map(len, found.values()))} features, {len(pairs)} pairs to match"
         )
         colmap.match(database, pairs)
+        # Cameras and lens.
         raw = job.work / "unfinished"
         shutil.rmtree(raw, ignore_errors=True)
         models = colmap.reconstruct(database, images, raw, len(names))
@@ -218,49 +253,6 @@ class Report:
 
     content: dict[str, Any]
 
-    @classmethod
-    def of(
-        cls,
-        job: CaptureJob,
-        model: Any,
-        world: Solved,
-        groups: Sequence[Sequence[str]],
-        straight: dict[str, Straight],
-        region: Region,
-        key: str,
-        seconds: float,
-    ) -> Report:
-        """Report on a reconstruction and its data set."""
-        placed = {job.copies[name].name for name in world.names}
-        cameras = {(s.size, s.focal): s for s in straight.values()}
-        return cls(
-            {
-                "key": key,
-                "photographs": len(job.photographs),
-                "placed": len(placed),
-                "not_placed": [p.name for p in job.photographs if p.name not in placed],
-                "other_groups": [[job.copies[name].name for name in group] for group in groups[1:]],
-                "points": len(world.points),
-                "observations": int(world.length.sum()),
-                "mean_track_length": float(world.length.mean()) if len(world.length) else 0.0,
-                "mean_reprojection_error": float(model.compute_mean_reprojection_error()),
-                "lens": {
-                    "model": next(iter(model.cameras.values())).model_name,
-                    "cameras": [
-                        {"width": c.width, "height": c.height, "parameters": [float(x) for x in c.params]}
-                        for c in model.cameras.values()
-                    ],
-                },
-                "pinholes": [
-                    {"size": s.size, "focal": [*map(float, s.focal)], "centre": [*map(float, s.centre)]}
-                    for s in cameras.values()
-                ],
-                "region": {"centre": region.centre, "radius": region.radius},
-                "masks": bool(job.masks),
-                "seconds": round(seconds, 1),
-            }
-        )
-
     def text(self, folder: Path) -> str:
         """The report as text."""
         c = self.content
@@ -274,7 +266,7 @@ class Report:
                 f"not placed: {abbreviated_names(c['not_placed'])}; take more between them and the others"
             )
         if c["mean_reprojection_error"] > GOOD_ERROR:
-            lines.append("the error is high: something moved, or the lens needs another --camera")
+            lines.append("the error is high: something moved, or the lens needs another --camera-model")
         lines.append(f"look at {folder / 'capture.png'}; next: refgs train {folder} -o runs/{folder.name}")
         return "\n".join(lines)
 

@@ -56,6 +56,7 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
     Raises InputError, naming `path`, for a file without PLY header (the message says to give `wanted`) and
     for a header that promises more rows than the file contains.
     """
+    # Lines up to end_header.
     if file.readline(MAX_LINE).strip() != b"ply":
         raise InputError(f"{path}: header: not a PLY file; give {wanted}")
     order, comments = "", []
@@ -86,6 +87,7 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
     elements = tuple(Element(name, count, (*fields,), (*lists,)) for name, count, fields, lists in found)
     if not order or not elements:
         raise InputError(f"{path}: header: no format or no element; export it again")
+    # Properties, and the number of rows against the size of the file.
     left = os.fstat(file.fileno()).st_size - file.tell()
     for element in elements:
         names = [name for name, _ in (*element.fields, *element.lists)]

@@ -109,6 +109,7 @@ def make_dataset(
     out of range, a camera does not see the object, the folder cannot be written, or it contains a data set of
     other settings or foreign files and `overwrite` is false.
     """
+    # Settings.
     scene, out = Path(scene), Path(out)
     width, height = (size, 0) if isinstance(size, int) else size
     main = None if light is None else LightFile.of(Path(light))
@@ -135,6 +136,8 @@ def make_dataset(
     settings.require_valid()
     if objects and others:
         raise InputError(f"{scene}: --relight: an open scene keeps its emitters; leave it out, or --shapes")
+
+    # The scene under each light, and its surface; all input is read before anything is written.
     loaded = load_scene(scene, whole=bool(objects))
     about = named_shapes(loaded, objects, scene) if objects else []
     shapes = about or loaded.shapes()
@@ -143,7 +146,9 @@ def make_dataset(
         vertices, faces = surface_mesh(shapes)
     except InputError as error:
         raise InputError(f"{scene}: {error}") from error
-    relit = [under_light(loaded, other.path) for other in others]  # read before anything is written
+    relit = [under_light(loaded, other.path) for other in others]
+
+    # Cameras.
     centre, radius = bounding_sphere(shapes)
     cameras = Cameras(settings, centre, radius, reach(loaded.shapes(), centre) if about else radius, about)
     x, y, z = (float(c) for c in centre)
@@ -151,6 +156,8 @@ def make_dataset(
     if about:
         poses = np.stack([pose for split in ("train", "test") for pose, _ in cameras.of(split)])
         require_clear_view(loaded, about, region, poses, scene)
+
+    # Output.
     points = None if colmap is None else colmap_output(Path(colmap), out, cameras)
     output = prepare_folder(out, settings, overwrite, others)
     if about:

@@ -176,8 +176,8 @@ def prepare_folder(
     Raises InputError for a folder with a data set of other settings or with foreign files; `overwrite`
     removes the former.
     """
+    # Recorded settings; those that an older version lacked have their defaults.
     record = out / RECORD
-    # Settings that an older version lacked have their defaults.
     known = _as_json({f.name: f.default for f in fields(Settings) if f.default is not MISSING})
     wanted = _as_json(asdict(settings))
     found: Any = None
@@ -186,6 +186,8 @@ def prepare_folder(
             content = read_json(record)
             found = known | content if "scene_sha256" in content else None  # runs also have a dataset.json
     output = OutputFolder(out, "dataset", (RECORD, *VIEW_FILES), RECORD if found else "", overwrite=overwrite)
+
+    # Files that do not match the settings or a light, and the options that say so.
     lights = _lights(found)
     same = found is not None and {name: found.get(name) for name in wanted} == wanted
     stale = [] if same else [f for pattern in VIEW_FILES for f in sorted(out.glob(pattern))]
@@ -203,6 +205,8 @@ def prepare_folder(
             f"{record if found else out}: {', '.join(changed) or 'output'}: the folder contains another "
             "data set; give another folder, the same settings, or --overwrite"
         )
+
+    # Remove them, make the folders, and record the settings.
     lights = (lights if same else {}) | {light.name: light.sha256 for light in relight}
     if not same:
         output.require_free()
