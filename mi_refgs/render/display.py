@@ -57,7 +57,7 @@ def displayed(
     """Display-encoded planes of a frame.
 
     Images with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it.
-    The frame's own background replaces `background`, and is linear. `gain` is a factor per channel of radiance
+    The frame's own background replaces `background`, linear. `gain` is a factor per channel of radiance
     and of the frame's own background, applied first.
     """
     radiance = list(frame.radiance)
