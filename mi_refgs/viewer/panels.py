@@ -22,7 +22,6 @@ from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import Change as SceneChange
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import FINEST, SIDES
-from mi_refgs.viewer.tonemap import BACKGROUND
 
 STOPS = 6.0
 """Largest exposure either way."""
@@ -66,25 +65,12 @@ def add_display(page: Page) -> None:
     page.status = lambda text: setattr(status, "content", text)
     sizes = {f"{side}²": side for side in SIDES}
     with gui.add_folder("View"):
-        what = gui.add_dropdown(
-            "Show",
-            page.scene.variables,
-            hint="The image, or an AOV: materials, geometry, terms of the radiance.",
-        )
+        what = gui.add_dropdown("Show", page.scene.variables, hint="The image, or one of its AOVs.")
         exposure = gui.add_slider("Exposure", -STOPS, STOPS, 0.25, 0.0, hint="Stops.")
-        backdrop = gui.add_dropdown(
-            "Backdrop",
-            page.scene.backdrops,
-            hint=f"What is behind the object; the object only is displayed except with its {BACKGROUND}.",
-        )
-        moving = gui.add_dropdown(
-            "Moving",
-            (AUTOMATIC, *sizes),
-            hint="Pixels during motion: as many as can be drawn 20 times per second, or these.",
-        )
-        still = gui.add_dropdown(
-            "Still", tuple(sizes), initial_value=f"{FINEST}²", hint="Most pixels at rest."
-        )
+        backdrop = gui.add_dropdown("Backdrop", page.scene.backdrops, hint="What is behind the object.")
+        hint = "Pixels during motion; automatic: as many as can be drawn 20 times per second."
+        moving = gui.add_dropdown("Moving", (AUTOMATIC, *sizes), hint=hint)
+        still = gui.add_dropdown("Still", [*sizes], initial_value=f"{FINEST}²", hint="Most pixels at rest.")
     what.on_update(lambda _: page.set(what=what.value))
     backdrop.on_update(lambda _: page.set(backdrop=backdrop.value))
     exposure.on_update(lambda _: page.set(exposure=float(exposure.value)))
@@ -107,22 +93,14 @@ def add_light(page: Page, scene: ReconstructionView | MitsubaScene) -> None:
     if not isinstance(scene, ReconstructionView):
         return
     with folder:
-        upload = gui.add_upload_button(
-            "Upload or drop an HDRI",
-            mime_type=IMAGES,
-            hint="A lat-long image (EXR, HDR) whose first row is straight up.",
-        )
-        world = gui.add_checkbox(
-            "Map has world directions", False, hint="Like environment.exr and envmap.exr."
-        )
+        hint = "A lat-long image (EXR, HDR) whose first row is straight up."
+        upload = gui.add_upload_button("Upload or drop an HDRI", mime_type=IMAGES, hint=hint)
+        hint = "Like environment.exr and envmap.exr."
+        world = gui.add_checkbox("Map has world directions", False, hint=hint)
         own = gui.add_button("Estimated environment map")
         if scene.can_relight:
-            relit = gui.add_checkbox(
-                "Light changes colours",
-                False,
-                hint="Replaces fitted colours by materials, so that all of them follow a new light, with "
-                "traced shadows, as `refgs relight` does.",
-            )
+            hint = "Replaces fitted colours by materials and traces shadows, as `refgs relight` does."
+            relit = gui.add_checkbox("Light changes colours", False, hint=hint)
             relit.on_update(lambda _: submit("relit", lambda: scene.set_relit(relit.value)))
         gui.add_html(DROP)
 
@@ -161,9 +139,7 @@ class MaterialsPanel:
     """A selection and sliders for its materials; what was set on earlier selections stays."""
 
     def __init__(self, page: Page, scene: ReconstructionView) -> None:
-        """Add the controls; none for a scene without materials."""
-        if not scene.materials:
-            return
+        """Add the controls."""
         self.scene = scene
         self.done: list[SceneChange] = []  # of earlier selections
         self.values: dict[str, float] = {}  # set on the present one
@@ -171,11 +147,8 @@ class MaterialsPanel:
         self.quiet = False  # sliders are being set to the selection's values
         gui, submit = page.server.gui, page.loop.submit
         with gui.add_folder("Materials"):
-            self.where = gui.add_text(
-                "Where",
-                "",
-                hint="An expression such as `metallic > 0.5 and z < 0`; empty: all surfels.",
-            )
+            hint = "An expression such as `metallic > 0.5 and z < 0`; empty: all surfels."
+            self.where = gui.add_text("Where", "", hint=hint)
             self.count = gui.add_markdown(self._counted())
             self.sliders = {
                 name: gui.add_slider(name.capitalize(), 0.0, 1.0, STEP, self._mean(name))

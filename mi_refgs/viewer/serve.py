@@ -71,7 +71,7 @@ def add_panels(
     """Add all panels that a scene has something for, and accept pages."""
     add_display(page)
     add_light(page, scene)
-    if isinstance(scene, ReconstructionView):
+    if isinstance(scene, ReconstructionView) and scene.materials:
         MaterialsPanel(page, scene)
     add_overlays(page, trained)
     add_comparison(page)

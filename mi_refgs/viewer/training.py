@@ -72,7 +72,7 @@ class TrainingViewer(ProgressBar):
         super().begin(trainer)
         if trainer.run is not None:
             self.page = TrainingPage(trainer, trainer.run, self.address)
-            self.say(f"open {self.page.page.url} in a browser to watch")
+            self.say(f"open {self.page.url} in a browser to watch")
 
     def step(self, trainer: Trainer) -> None:
         super().step(trainer)
@@ -82,10 +82,10 @@ class TrainingViewer(ProgressBar):
     def end(self) -> None:
         super().end()
         if self.page is not None:
-            self.page.page.close()
+            self.page.close()
 
 
-class TrainingPage:
+class TrainingPage(Page):
     """The page of a running fit; `step` is called after each of its steps."""
 
     def __init__(
@@ -97,55 +97,50 @@ class TrainingPage:
     ) -> None:
         """Serve the page; raises InputError if the port is taken, and without viser."""
         scene, views = Training(trainer), Views(train=trainer.data)
-        self.page = Page(scene, views, run.path.resolve().name, address, run.path / "views")
-        self.page.set(largest=LARGEST)
-        self.page.loop.smooth, self.page.loop.clock = False, clock
+        super().__init__(scene, views, run.path.resolve().name, address, run.path / "views")
+        self.set(largest=LARGEST)
+        self.loop.smooth, self.loop.clock = False, clock
         self.log, self.clock = run.path / LOG, clock
         self.since, self.spent, self.refreshed = clock(), 0.0, -REFRESH
-        add_display(self.page)
+        add_display(self)
         self.curves = self._add_curves()
-        add_overlays(self.page, None)
-        self.page.listen()
+        add_overlays(self, None)
+        self.listen()
 
     def step(self) -> None:
         """Draw what open pages wait for, within the share of time."""
-        loop, now = self.page.loop, self.clock()
-        if not loop.clients:
+        now = self.clock()
+        if not self.loop.clients:
             self.since, self.spent = now, 0.0
             return
         if now - self.refreshed > REFRESH:
             self.refreshed = now
             self._update_curves()
-            loop.change()
+            self.loop.change()
         if self.spent <= SHARE * (now - self.since):
-            loop.step()
+            self.loop.step()
             self.spent += self.clock() - now
 
     def _add_curves(self) -> dict[str, Any]:
         from viser import uplot
 
-        gui, empty = self.page.server.gui, np.zeros(1)
+        gui, empty, iteration = self.server.gui, np.zeros(1), uplot.Series(label="iteration")
+        scales = {"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)}
+        curves = {}
         with gui.add_folder("Training"):
-            return {
-                name: gui.add_uplot(
-                    data=(empty, empty),
-                    series=(
-                        uplot.Series(label="iteration"),
-                        uplot.Series(label=name, stroke=colour, width=2),
-                    ),
-                    scales={"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)},
-                    title=name,
-                    aspect=2.0,
-                )
-                for name, colour in CURVES.items()
-            }
+            for name, colour in CURVES.items():
+                series = (iteration, uplot.Series(label=name, stroke=colour, width=2))
+                curves[name] = gui.add_uplot((empty, empty), series, scales=scales, title=name, aspect=2.0)
+        return curves
 
     def _update_curves(self) -> None:
         rows = read_log(self.log)
-        iteration = np.array([row["iteration"] for row in rows], np.float64)
-        for name, plot in self.curves.items():
-            if len(rows) > 1:
-                plot.data = (iteration, np.array([row[name] for row in rows], np.float64))
+        iteration, *values = (
+            np.array([row[name] for row in rows], np.float64) for name in ("iteration", *CURVES)
+        )
+        if len(rows) > 1:
+            for plot, value in zip(self.curves.values(), values, strict=True):
+                plot.data = (iteration, value)
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:

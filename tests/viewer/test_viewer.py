@@ -659,7 +659,7 @@ def test_a_fit_draws_only_for_open_pages_and_a_share_of_its_time(
     trainer = Trainer(load(str(method), "quick", SETTINGS), views)
     page = TrainingPage(trainer, Run(tmp_path), ("127.0.0.1", 0), clock)
     drawn: list[SampleRequest] = []
-    draw, loop = page.page.scene.draw, page.page.loop
+    draw, loop = page.scene.draw, page.loop
 
     def slow(sample: SampleRequest) -> SampleResult:
         drawn.append(sample)
@@ -672,7 +672,7 @@ def test_a_fit_draws_only_for_open_pages_and_a_share_of_its_time(
             page.step()
 
     try:
-        page.page.scene.draw = slow  # type: ignore[method-assign]
+        page.scene.draw = slow  # type: ignore[method-assign]
         steps(20)
         assert drawn == []
         seen: list[DeliveredImage] = []
@@ -683,7 +683,7 @@ def test_a_fit_draws_only_for_open_pages_and_a_share_of_its_time(
         assert 0.2 * taken < 0.5 * len(drawn) < 0.25 * taken + 0.6
         assert seen[0].image.std() > 1
     finally:
-        page.page.close()
+        page.close()
 
 
 def test_the_curves_have_the_complete_lines_of_the_log(tmp_path: Path) -> None:
