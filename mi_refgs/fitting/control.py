@@ -27,20 +27,20 @@ from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Vector2f
 
 MARGIN = 0.02
-"""Radii of the region by which a surfel has to cross its border: what lies on it stays."""
+"""Distance beyond the border of the region, in radii, from which a surfel changes tables."""
 
 Raw = dict[str, np.ndarray]
 
 
 def depth_outside(raw: Raw, region: Region) -> np.ndarray:
-    """Distance (N,) of positions from the region's sphere in its radii, negative inside."""
+    """Signed distance (N,) from the region's sphere in its radii, negative inside."""
     offset = np.linalg.norm(raw["position"] - np.array(region.centre), axis=1)
     found: np.ndarray = offset / region.radius - 1
     return found
 
 
 def distances(surfels: Surfels, region: Region) -> np.ndarray:
-    """Distance (N,) of surfels from the region's centre, at least its radius: with it sizes outside grow."""
+    """Distance (N,) of surfels from the region's centre, at least its radius, with which sizes may grow."""
     outside = depth_outside({"position": surfels.raw["position"].numpy()}, region)
     found: np.ndarray = region.radius * (1 + np.maximum(outside, 0))
     return found
@@ -49,12 +49,12 @@ def distances(surfels: Surfels, region: Region) -> np.ndarray:
 def exchanged(
     inner: Surfels, outer: Surfels, method: Method, region: Region, rng: np.random.Generator
 ) -> list[TableEdit]:
-    """Both tables after the exchange."""
+    """Both tables after surfels beyond the border have changed tables."""
     options = method.surroundings
     assert options is not None
     tables = [inner.to_numpy(), outer.to_numpy()]
     leaves = [depth_outside(tables[0], region) > MARGIN, depth_outside(tables[1], region) < -MARGIN]
-    for i, limit in enumerate((options.max_count, method.surfels.max_count)):  # of where they go
+    for i, limit in enumerate((options.max_count, method.surfels.max_count)):  # of the destination
         room = limit - len(leaves[1 - i])
         leaves[i] &= np.cumsum(leaves[i]) <= min(max(room, 0), len(leaves[i]) - 1)
     edits = []
@@ -68,7 +68,7 @@ def exchanged(
 
 
 def _converted(rows: Raw, like: Raw, method: Method, rng: np.random.Generator) -> Raw:
-    """Rows of the other table with the channels of a table `like` that."""
+    """Convert rows of the other table to the attributes of `like`."""
     made = {}
     for name, values in like.items():
         count, width = len(rows["position"]), values.shape[1]

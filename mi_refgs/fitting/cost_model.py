@@ -1,8 +1,8 @@
-"""How fast the steps of methods are on this machine, as it was measured once and is kept.
+"""Cache of the speed of methods on this machine.
 
-One JSON file per kind of method, in the user's cache folder. A file of another machine, another number of
-threads or another version is of another name; one that cannot be read counts as none. A fit's size follows
-from what is kept and from nothing else, so it does not depend on what the machine does meanwhile.
+One JSON file per kind of method, in the user's cache folder; its name depends on the machine, the number of
+threads and the version. A file that cannot be read is ignored. The image size of a fit follows from these
+files only, so it does not depend on the present load of the machine.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import locked, read_json, write_json
 
 SIZES = 96, 224
-"""Pixels along a side of the images that speeds are measured on: a step at the second takes twice as long."""
+"""Sides in pixels of the images that speeds are measured on: a step on the second takes twice as long."""
 FOLDER_VARIABLE = "MI_REFGS_CACHE"
-"""Environment variable that moves the folder of these files."""
+"""Environment variable with the folder of these files."""
 PATIENCE = 120.0
 """Seconds to wait for another process that measures the same."""
 
@@ -38,7 +38,8 @@ class Speed:
     mesh_view: float  # of each view
 
     def step(self, stage: str, pixels: int) -> float:
-        """Seconds of a step with an image of so many pixels: linear, and never next to nothing."""
+        """Seconds of a step with an image of so many pixels: linear, at least half of the smaller
+        measurement."""
         small, large = self.stages[stage]
         low, high = (side * side for side in SIZES)
         slope = max(large - small, 0) / (high - low)
@@ -46,17 +47,14 @@ class Speed:
 
 
 def folder() -> Path:
-    """Where speeds are kept: $MI_REFGS_CACHE, or mi_refgs in $XDG_CACHE_HOME or ~/.cache."""
+    """The folder: $MI_REFGS_CACHE, or mi_refgs in $XDG_CACHE_HOME or ~/.cache."""
     if named := os.environ.get(FOLDER_VARIABLE):
         return Path(named)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mi_refgs"
 
 
 def kept(subject: dict[str, Any], measure: Callable[[], Speed]) -> Speed:
-    """The speed of `subject`, a machine and what runs on it; measured if no file has it, and then kept.
-
-    Where nothing can be kept it is measured each time.
-    """
+    """The speed of `subject`, a machine and a method on it, from its file; otherwise measured, and written."""
     key = hashlib.sha256(json.dumps(subject, sort_keys=True).encode()).hexdigest()[:24]
     path = folder() / f"speed-{key}.json"
     if (speed := _read(path, subject)) is not None:
@@ -65,7 +63,7 @@ def kept(subject: dict[str, Any], measure: Callable[[], Speed]) -> Speed:
         with contextlib.suppress(InputError):
             busy = f"{path}: another process measures it; wait until it ends"
             stack.enter_context(locked(path.with_suffix(".lock"), busy, PATIENCE))
-        if (speed := _read(path, subject)) is not None:  # by whom we waited for
+        if (speed := _read(path, subject)) is not None:  # by the process that had the lock
             return speed
         speed = measure()
         with contextlib.suppress(InputError):
@@ -74,7 +72,7 @@ def kept(subject: dict[str, Any], measure: Callable[[], Speed]) -> Speed:
 
 
 def _read(path: Path, subject: dict[str, Any]) -> Speed | None:
-    """The speed in a file; None if it is missing, damaged, or of something else."""
+    """The speed in a file; None if it is missing, damaged, or of another subject."""
     try:
         content = read_json(path)
         if content["subject"] != subject:
@@ -88,7 +86,7 @@ def _read(path: Path, subject: dict[str, Any]) -> Speed | None:
 
 
 def summary() -> list[str]:
-    """What is kept, for people: a sentence for each number of threads, and how to measure anew."""
+    """Sentences about the cached speeds: one per number of threads, and how to measure them again."""
     threads: Counter[Any] = Counter()
     for path in sorted(folder().glob("speed-*.json")):
         with contextlib.suppress(InputError, KeyError, TypeError):

@@ -1,11 +1,11 @@
-"""Gains of the training views: exposure and white balance that differ from picture to picture.
+"""Per-image exposure compensation: exposure and white balance that differ between training images.
 
-View v shows encode(g_v L) of linear radiance L, g_v a factor a channel. The parameter is log g (V, 3); what a
-step uses has the mean over views subtracted, so the scene keeps its scale.
+View v shows encode(g_v L) of linear radiance L, with a gain g_v per channel. The parameter is log g (V, 3); a
+step subtracts its mean over the views, so the scene keeps its scale.
 
-Whether a data set needs gains is decided once, on training views: gains that are fitted to half of the pixels
-of a view are judged on the other half, which they have not seen. Three numbers fit no noise of 10⁴ pixels, so
-the verdict needs no views of its own, and where gains do not pay the fit stays what it was, bit for bit.
+Whether a data set requires gains is decided once, on training views: gains that are fitted to half of the
+pixels of a view are judged on the other half. Three numbers do not overfit 10⁴ pixels, so the decision
+requires no validation views. If gains do not improve the other half, the fit stays bit for bit what it was.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS
 from mi_refgs.types import Float, TensorXf
 
 JUDGES = 32
-"""Views that judge, spread evenly: the mean over them has an error of a tenth of a dB."""
+"""Views that the decision is based on, spread evenly: the mean over them has an error of a tenth of a dB."""
 BLOCK = 16
-"""Pixels along a side of the squares of the checkerboard that parts a picture: larger than what its pixels
-share, such as JPEG's 8."""
+"""Pixels along a side of the squares of the checkerboard that halves an image: larger than the blocks of
+JPEG, 8 pixels."""
 EXIF_SPREAD = 0.02
-"""Standard deviation of log exposures below which EXIF tells no difference."""
+"""Standard deviation of log exposures below which EXIF exposures count as equal."""
 EXPOSURE_FILE = "exposure.json"
-"""File of a run with the decision and the gains."""
+"""File of a run that contains the decision and the gains."""
 
 
 def initial_gains(setup: FitSetup) -> dict[str, TensorXf]:
@@ -135,9 +135,9 @@ def record(setup: FitSetup, state: FitState) -> dict[str, Any] | None:
 
 
 def exif_gains(data: Dataset) -> np.ndarray | None:
-    """Log gains (V, 3) by EXIF data, 0 for the median, within the limits of `fitted_gain`.
+    """Log gains (V, 3) from EXIF data, 0 for the median, within the limits of `fitted_gain`.
 
-    None where a view has no such data or all have the same.
+    None if a view has no such data, or all have the same.
     """
     log = [view.exposure for view in data.views]
     if any(value is None for value in log):
@@ -153,9 +153,9 @@ def exif_gains(data: Dataset) -> np.ndarray | None:
 def with_gain(
     frame: Frame, view: View, data: Dataset, where: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The `fitted_gain` (3,) of a rendered view, and the picture (H, W, 3) that it shows with it."""
+    """The `fitted_gain` (3,) of a rendered view, and its image (H, W, 3) with that gain."""
     planes, alpha = list(frame.radiance), image_of([frame.alpha], view)[..., 0]
-    if frame.background is not None:  # all that is seen, nothing is cut out
+    if frame.background is not None:  # the image is opaque
         planes = [a + (1 - frame.alpha) * b for a, b in zip(planes, frame.background, strict=True)]
         alpha = np.ones_like(alpha)
     radiance = image_of(planes, view)
@@ -164,26 +164,26 @@ def with_gain(
 
 
 def displayed_of(frame: Frame, data: Dataset, gain: np.ndarray | None = None) -> list[Any]:
-    """`displayed` with a gain that is no part of the kernel."""
+    """`displayed` with an opaque gain, which is not compiled into the kernel."""
     factors = None if gain is None else [dr.opaque(mi.Float, float(g)) for g in gain]
     return displayed(frame, data.background, data.is_linear_radiance, factors)
 
 
 def psnr(image: np.ndarray, view: View, where: np.ndarray | None = None) -> float:
-    """PSNR (dB) of a display-encoded picture (H, W, 3) of a view, over the pixels in `where` (H, W)."""
+    """PSNR (dB) of a display-encoded image (H, W, 3) of a view, over the pixels in `where` (H, W)."""
     square = np.square(np.clip(image, 0, 1) - np.clip(view.load().displayed, 0, 1))
     return psnr_of(float(square.mean() if where is None else square[where].mean() if where.any() else 0))
 
 
 def sentence(decision: dict[str, Any]) -> str:
     """A decision as one sentence."""
-    verdict = "a gain a channel of every view stays" if decision["gains"] else "no gains"
+    verdict = "per-image gains stay" if decision["gains"] else "no gains"
     change = decision["psnr_gain"] - decision["psnr"]
-    return f"exposure: {verdict}: {change:+.2f} dB on pixels that they were not fitted to"
+    return f"exposure: {verdict}: {change:+.2f} dB on pixels to which they were not fitted"
 
 
 def image_of(planes: list[Any], view: View) -> np.ndarray:
-    """Planes of a frame as (H, W, C)."""
+    """Convert planes of a frame to (H, W, C)."""
     size = view.height, view.width
     values = [np.broadcast_to(np.array(plane), view.height * view.width).reshape(size) for plane in planes]
     return np.stack(values, axis=-1)

@@ -19,9 +19,10 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.table import Surfels
 
 CULL_SHARE = 0.1
-"""Share of the surfels from which on a fault is not theirs: a pixel has tens of them, a table thousands."""
+"""Fraction of the surfels from which on they are not the cause: a pixel has tens of surfels, a scene
+thousands."""
 PATIENCE = 3
-"""Intervals of the log in which every step fails before a fit gives up. Removing surfels may help first."""
+"""Log intervals in which every step fails before the fit ends: removing surfels may help first."""
 NAMED = 5
 """Surfels that a message names."""
 
@@ -69,10 +70,8 @@ class Health:
 
 
 def culprits(surfels: Surfels, skipped: Skipped, prefix: str = "") -> dict[str, np.ndarray]:
-    """Rows that spoil steps, by channel: those with values that are not usable, else those whose gradient is
-    not finite.
-
-    Empty if the fault is none of the surfels'. `prefix` begins the names of the table's parameters.
+    """Rows that cause failed steps, by attribute: those with unusable values, else with a gradient that is
+    not finite. Empty if the surfels are not the cause. `prefix` is that of the table's parameters.
     """
     if unusable := surfels.unusable():
         return unusable
@@ -81,12 +80,12 @@ def culprits(surfels: Surfels, skipped: Skipped, prefix: str = "") -> dict[str, 
 
 
 def together(rows: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The rows of all channels, each once, in order."""
+    """The rows of all attributes, each once, sorted."""
     return np.unique(np.concatenate([*rows.values(), np.zeros(0, np.int64)])).astype(np.int64)
 
 
 def sentence(rows: Mapping[str, np.ndarray], skipped: Skipped, view: str) -> str:
-    """What happened, for people: iteration, view, channels and surfels."""
+    """The notice: iteration, view, attributes and surfels."""
     channels = ", ".join(rows or skipped.rows) or "the loss"
     where = f"iteration {skipped.iteration + 1}, view {view}: " if skipped.count else ""
     indices = together(rows)
@@ -97,7 +96,7 @@ def sentence(rows: Mapping[str, np.ndarray], skipped: Skipped, view: str) -> str
 
 
 def require_finite_light(light: EnvironmentLight | None, name: str = LIGHT) -> None:
-    """Raise InputError if the environment has a texel that renders black and learns no more."""
+    """Raise InputError if a map has a texel that renders black and no longer learns."""
     if light is not None and light.unusable():
         rate = "rates.light" if name == LIGHT else "surroundings.rate"
         raise InputError(

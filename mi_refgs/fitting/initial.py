@@ -1,4 +1,7 @@
-"""What a fit starts from: on and inside the visual hull where pictures have alpha, else at sparse points."""
+"""Initial parameters: on and in the visual hull for images with alpha, otherwise at sparse or random points.
+
+Positions are world positions in scene units; colours are linear radiance.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +21,19 @@ from mi_refgs.surfels.init import morton_order
 from mi_refgs.surfels.table import Surfels
 
 FARTHEST = 1.95
-"""Contracted distance of the farthest random points, 20 radii of the region: beyond it the background is as
-good."""
+"""Contracted distance of the farthest random points, 20 radii of the region: beyond it the background map is
+as good."""
 SEEN_SHARE = 0.1
-"""Share of the views that must see a random point: what fewer see, they cannot place."""
+"""Fraction of the views that must see a random point: fewer views cannot determine its position."""
 DRAWS = 64
-"""Rounds of rejection; cameras on one side of a scene keep about a tenth of a round."""
+"""Rounds of rejection sampling; cameras on one side of a scene accept about a tenth per round."""
 
 
 def inside_points(
     count: int, random: float, data: Dataset, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (count, 3) of the object and their colours: a share `random` uniform in the region, the others
-    at sparse points in there, if there are any."""
+    """Points (count, 3) of the object and their colours: a fraction `random` uniform in the region, the
+    others at sparse points inside it, if there are any."""
     region = data.region
     assert region is not None
     sparse = _part(data.points, region, inside=True)
@@ -43,8 +46,8 @@ def inside_points(
 def outside_points(
     count: int, random: float, data: Dataset, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (count, 3) of the surroundings and their colours: a share `random` uniform in contracted space
-    where views see it, the others at sparse points outside of the region, if there are any."""
+    """Points (count, 3) of the background and their colours: a fraction `random` uniform in contracted space
+    where views see it, the others at sparse points outside the region, if there are any."""
     region = data.region
     assert region is not None
     sparse = _part(data.points, region, inside=False)
@@ -55,9 +58,9 @@ def outside_points(
 def at_points(
     cloud: PointCloud, count: int, data: Dataset, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (count, 3) at those of a cloud, with their colours or those of the pictures.
+    """Points (count, 3) at those of a cloud, with their colours or those of the images.
 
-    Copies of a point lie around it, as far off as its neighbours do: their distance is a surfel's size.
+    Copies of a point lie around it, as far away as its neighbours, whose distance is a surfel's size.
     """
     known = cloud.position
     row = rng.permutation(np.arange(count) % len(known))
@@ -71,7 +74,7 @@ def at_points(
 def _both(
     sparse: PointCloud | None, count: int, drawn: np.ndarray, data: Dataset, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """So many points of a cloud, and those that were drawn."""
+    """Join `count` points of a cloud and those that were drawn, with their colours."""
     colours = hull.median_colours(drawn, data.views, data.background)
     if sparse is None or not count:
         return drawn, colours
@@ -80,7 +83,7 @@ def _both(
 
 
 def _part(cloud: PointCloud | None, region: Region, inside: bool) -> PointCloud | None:
-    """The points of a cloud on one side of the region's border; None without one."""
+    """The points of a cloud inside or outside the region; None if there are none."""
     if cloud is None:
         return None
     rows = region.contains(cloud.position) == inside
@@ -90,8 +93,8 @@ def _part(cloud: PointCloud | None, region: Region, inside: bool) -> PointCloud 
 
 
 def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator) -> np.ndarray:
-    """Points (count, 3) uniform in the contracted shell around the region, as far as enough views see them;
-    wherever they are if hardly any are seen."""
+    """Points (count, 3) uniform in the contracted shell around the region, where enough views see them;
+    anywhere if too few are seen."""
     found = np.empty((0, 3))
     for _ in range(DRAWS):
         missing = count - len(found)
@@ -108,23 +111,20 @@ def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator)
 
 
 ALBEDO_RANGE = (0.02, 0.9)
-"""Where an albedo from pictures starts: away from the ends, where the sigmoid has no slope."""
+"""Range of an initial albedo from images: near 0 and 1 the sigmoid has no slope."""
 FAR = 1e4
-"""Scene extents at which a direction is looked up in the pictures."""
+"""Distance, in scene extents, at which a direction is looked up in the images."""
 
 
 def is_open(method: Method, data: Dataset) -> bool:
-    """Whether pictures show surroundings that the method keeps apart from the object."""
+    """Whether the images show a background that the method models apart from the object."""
     return method.surroundings is not None and data.region is not None and not data.has_alpha
 
 
 def initial_parameters(
     method: Method, data: Dataset, rng: np.random.Generator, open_scene: bool
 ) -> dict[str, Any]:
-    """The tensors of a fit by name; with surroundings if the scene is open.
-
-    Raises InputError as `initial_surfels` does.
-    """
+    """The parameters by name, with those of the background for an open scene; raises InputError."""
     params = initial_surfels(method, data, rng, open_scene).raw
     if open_scene:
         params |= initial_surroundings(method, data, rng)
@@ -135,14 +135,14 @@ def initial_parameters(
 
 
 def first_light(options: LightOptions) -> EnvironmentLight:
-    """The environment that a fit starts with: one radiance everywhere."""
+    """The initial environment: constant radiance."""
     return EnvironmentLight.constant(options.radiance, options.height)
 
 
 def seen_around(data: Dataset, height: int) -> EnvironmentLight:
-    """What pictures show around the region, as a map: colours as far off as sparse points are, else far away.
+    """The background of the images as a map: colours at the distance of sparse points, else far away.
 
-    The object reflects that, so it is a better start of the light than one radiance everywhere.
+    The object reflects it, so it is a better initial light than constant radiance.
     """
     assert data.region is not None
     directions, centre = map_directions(height), np.array(data.region.centre)
@@ -157,7 +157,7 @@ def seen_around(data: Dataset, height: int) -> EnvironmentLight:
 
 
 def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator) -> dict[str, Any]:
-    """The tensors of the surroundings by name: a table, and the background in the median of its colours."""
+    """The parameters of the background by name: surfels, and a map of the median of their colours."""
     options, region = method.surroundings, data.region
     assert options is not None and region is not None
     points, colours = outside_points(options.count, options.scattered, data, rng)
@@ -174,7 +174,7 @@ def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator
         largest=options.size * distance,
         opacity=options.opacity,
     )
-    # One colour everywhere: a picture of what is there would leave the surfels nothing to explain.
+    # One colour: a map of the images would leave the surfels nothing to explain.
     shape = (options.height, 2 * options.height, 3)
     background = EnvironmentLight.from_radiance(np.broadcast_to(np.median(colours, axis=0), shape))
     return {AROUND + name: tensor for name, tensor in table.raw.items()} | {BACKGROUND: background.raw}
@@ -183,14 +183,14 @@ def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator
 def initial_surfels(
     method: Method, data: Dataset, rng: np.random.Generator, open_scene: bool = False
 ) -> Surfels:
-    """A table of `method.surfels.count` surfels with the method's channels.
+    """`method.surfels.count` surfels with the method's attributes.
 
-    With alpha, a share `inside` of them is uniform in the hull's volume with normals at random, and the
-    others are uniform on its surface with its normals: the surface of what is concave lies inside the hull.
-    Colours are the median over the views that see the point. Without alpha they start at sparse points and
-    at random; those of an `open_scene` in the region, where `inside` is the share of the random ones.
+    With alpha, a fraction `inside` of them is uniform in the visual hull's volume with random normals, and
+    the others are uniform on its surface with its normals: concave surfaces lie inside the hull. Colours are
+    the median over the views that see the point. Without alpha, they start at sparse and random points; in an
+    `open_scene` inside the region, where `inside` is the fraction of random ones.
 
-    Raises InputError where the masks have no point in common, and for a share that is none.
+    Raises InputError if the masks have no point in common, and for a fraction beyond 0 … 1.
     """
     options = method.surfels
     if not 0 <= options.inside <= 1:
@@ -203,7 +203,7 @@ def initial_surfels(
         outer, facing = shape.surface_points(options.count - len(inner), rng)
         points = np.concatenate([outer, inner])
         normals = np.concatenate([facing, init.random_normals(len(inner), rng)])
-        # What lies inside has no side to be seen from: every view of it votes.
+        # Points inside face no view in particular: every view counts.
         colours = np.concatenate(
             [hull.median_colours(outer, views, behind, facing), hull.median_colours(inner, views, behind)]
         )
@@ -221,7 +221,7 @@ def initial_surfels(
         colours = hull.median_colours(points, views, behind)
     order = morton_order(points)
     if "albedo" in options.from_pictures and method.light is not None:
-        # The hue alone: how bright a place is, is left to the light until it has been found.
+        # The hue only: brightness is left to the light until it has been estimated.
         brightest = colours[order].max(axis=1, keepdims=True)
         hue = np.where(brightest > 0, colours[order] / np.maximum(brightest, 1e-9), 1)
         start["albedo"] = np.clip(hue * options.start("albedo"), *ALBEDO_RANGE)

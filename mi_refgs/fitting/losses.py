@@ -1,14 +1,13 @@
-"""Losses on images given as planes: lists of mi.Float of width H·W in raster order (or a mi.Color3f).
+"""Losses on images given as planes: lists of mi.Float (H*W,) in raster order, or a mi.Color3f.
 
 Letters: I rendered image, T target, A accumulated alpha, L linear radiance, N blended normal Σ w n (not
-unit). Every loss is a mi.Float of width 1, zero for a perfect image, and has finite gradients for finite
+unit). Every loss is a mi.Float of width 1, is zero for a perfect image, and has finite gradients for finite
 input. Targets, weights and masks have no derivative. SSIM is in `fitting.ssim`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,20 +16,21 @@ from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.fitting.ssim import ssim
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.shade.light.light import Light
+from mi_refgs.types import Bool, Float, Vector3f
 
-# An 8-bit target value of 255 stands for everything from here up: the sensor clipped.
+# From here up, 8-bit target values are clipped: 255 means "at least this bright".
 SATURATED = 254.5 / 255.0
 DIRECTIONS = 256
-"""Directions that tell the colour of an irradiance: 13° from one to the next."""
+"""Directions in which irradiance is sampled, 13° apart."""
 
 
 def saturated(
-    target: Iterable[Any], alpha: Any | None = None, background: Iterable[float] = (0, 0, 0)
-) -> list[Any]:
-    """Masks (mi.Bool planes) where the object's own colour is clipped in a display-encoded target.
+    target: Iterable[Float], alpha: Float | None = None, background: Iterable[float] = (0, 0, 0)
+) -> list[Bool]:
+    """Masks (mi.Bool planes) of where the object's own colour is clipped in a display-encoded target.
 
-    That is (target - (1 - A) background) / A ≥ 254.5/255, and A > 0: a white background is no highlight. With
-    `alpha` None, every pixel is the object's.
+    That is (target - (1 - A) background) / A ≥ 254.5/255, and A > 0: a white background is no highlight.
+    Without `alpha`, every pixel is the object's.
     """
     if alpha is None:
         return [plane >= SATURATED for plane in target]
@@ -40,8 +40,8 @@ def saturated(
     ]
 
 
-def clip_highlights(render: Iterable[Any], target: Iterable[Any], clipped: Iterable[Any]) -> list[Any]:
-    """The render with every value above a clipped target value replaced by it: no gradient there."""
+def clip_highlights(render: Iterable[Float], target: Iterable[Float], clipped: Iterable[Bool]) -> list[Float]:
+    """Replace rendered values above a clipped target value by the latter, which has no gradient."""
     return [
         dr.select(mask & (plane > goal), dr.detach(goal), plane)
         for plane, goal, mask in zip(render, target, clipped, strict=True)
@@ -51,18 +51,18 @@ def clip_highlights(render: Iterable[Any], target: Iterable[Any], clipped: Itera
 # ---------------- image losses ----------------
 
 
-def l1(render: Iterable[Any], target: Iterable[Any]) -> Any:
+def l1(render: Iterable[Float], target: Iterable[Float]) -> Float:
     """Mean absolute difference over pixels and planes; the slope at equality is 0."""
     render, target = list(render), [dr.detach(plane) for plane in target]
     return _mean(sum((_abs(a - b) for a, b in zip(render, target, strict=True)), mi.Float(0))) / len(render)
 
 
-def d_ssim(render: Iterable[Any], target: Iterable[Any], width: int, height: int) -> Any:
+def d_ssim(render: Iterable[Float], target: Iterable[Float], width: int, height: int) -> Float:
     """1 - SSIM (not halved), as 3DGS weighs it against `l1`."""
     return 1 - ssim(list(render), list(target), width, height)
 
 
-def alpha_loss(alpha: Any, target: Any) -> Any:
+def alpha_loss(alpha: Float, target: Float) -> Float:
     """Mean absolute difference of accumulated alpha and a mask in [0, 1]."""
     return _mean(_abs(alpha - dr.detach(target)))
 
@@ -70,7 +70,7 @@ def alpha_loss(alpha: Any, target: Any) -> Any:
 # ---------------- geometry losses ----------------
 
 
-def normal_consistency(normal: Any, depth_normal: Any, valid: Any, alpha: Any) -> Any:
+def normal_consistency(normal: Vector3f, depth_normal: Vector3f, valid: Bool, alpha: Float) -> Float:
     """Mean over all pixels of A (A - N · n_d), with A detached and only where n_d is valid.
 
     This is Σ wᵢ (1 - nᵢ · n_d) of 2DGS (eq. 13), weighted by A: its gradient is that of 1 - N · (n_d
@@ -82,8 +82,8 @@ def normal_consistency(normal: Any, depth_normal: Any, valid: Any, alpha: Any) -
 
 
 def smoothness(
-    planes: Iterable[Any], image: Iterable[Any], width: int, height: int, edge: float = 1.0
-) -> Any:
+    planes: Iterable[Float], image: Iterable[Float], width: int, height: int, edge: float = 1.0
+) -> Float:
     """Edge-aware smoothness ‖∇M‖ exp(-edge ‖∇I‖) of the maps M (`planes`): pixel mean, sum over axes.
 
     With the normals' planes and edge = 1 this is the smoothness of Ref-Gaussian (§3.3). ∇ is Sobel / 8 with
@@ -99,7 +99,7 @@ def smoothness(
     return _mean(total)
 
 
-def sobel(plane: Any, width: int, height: int) -> tuple[Any, Any]:
+def sobel(plane: Float, width: int, height: int) -> tuple[Float, Float]:
     """Sobel derivatives (∂x, ∂y) of a plane, divided by 8 (per pixel), the border repeated."""
     steps = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]
     at = dict(zip(steps, neighbours(plane, width, height, steps), strict=True))
@@ -111,21 +111,21 @@ def sobel(plane: Any, width: int, height: int) -> tuple[Any, Any]:
 # ---------------- priors ----------------
 
 
-def half_metal(metallic: Any, alpha: Any) -> Any:
-    """Mean over all pixels of A m (1 - m), with A detached: 0 where every surface is a metal or none.
+def half_metal(metallic: Float, alpha: Float) -> Float:
+    """Mean over all pixels of A m (1 - m), with A detached: 0 if every surface is either metal or dielectric.
 
-    Surfaces are one or the other; what is between them fits pictures with a light of any colour.
+    Values in between explain the images under lights of any colour.
     """
     return _mean(dr.detach(alpha) * metallic * (1 - metallic))
 
 
-def light_colour(light: Light) -> Any:
-    """How coloured the light is that a matt surface gets: mean of |E - grey E| over that of E.
+def light_colour(light: Light) -> Float:
+    """Colour of the irradiance: mean of |E - grey E| over the mean of E.
 
-    E is the irradiance in DIRECTIONS all around. Pictures fix albedo times light only: whatever factor one
-    gains a channel, the other may lose, and no picture tells. This prior gives the colour to the albedo; what
-    mirrors and highlights show of the light, lamp by lamp, is finer than E. Highlights of a dielectric fix
-    the scale of the light; for other surfaces no picture tells it, and it stays near that of the start.
+    E is the irradiance in DIRECTIONS all around. Light and albedo share an unknown per-channel scale: images
+    determine their product only. This prior makes the irradiance grey, and leaves the colour to the albedo;
+    what reflections show of single lamps is finer than E. Highlights of a dielectric determine the scale of
+    the light; otherwise it stays near that of the start.
     """
     index = dr.arange(mi.Float, DIRECTIONS)
     height = 1 - (index + 0.5) * (2 / DIRECTIONS)
@@ -137,10 +137,10 @@ def light_colour(light: Light) -> Any:
     return dr.sum(off) / dr.detach(dr.sum(grey))
 
 
-def _abs(difference: Any) -> Any:
+def _abs(difference: Float) -> Float:
     """|x| with slope 0 at 0: equal values must not push."""
     return dr.select(difference == 0, 0.0, dr.abs(difference))
 
 
-def _mean(plane: Any) -> Any:
+def _mean(plane: Float) -> Float:
     return dr.sum(plane) / dr.width(plane)

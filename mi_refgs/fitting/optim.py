@@ -1,16 +1,16 @@
-"""Adam over named tensors: rates per group and column, moments that follow the parent index, exact resume.
+"""Adam over named tensors: rates per tensor and column, moments that follow the rows, exact resume.
 
 Letters: θ parameter, g gradient, m v first and second moment, t step count of a tensor, η learning rate.
     m ← β₁ m + (1 - β₁) g,   v ← β₂ v + (1 - β₂) g²,   θ ← θ - η √(1 - β₂ᵗ) / (1 - β₁ᵗ) · m / (√v + ε)
 [Kingma and Ba 2015, §2, the efficient order].
 
-Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing (`Skips`). And |g|
-is cut to OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor, whichever is
-more, and to RAW_LIMIT, whose square float32 holds. A step is at most (1 - β₁) / √(1 - β₂) = 3.2
-η long however large g is, so the cut shortens the one in hand by less than 5 %. What it bounds is the memory
-of v: after one gradient of 10¹⁰, an entry of usual gradients 10⁻⁷ would not move for 2 ln(10¹⁷ √(1 - β₂)) /
-(1 - β₂) = 71,000 steps; cut, it moves 3.3 times slower, or ten times if it happens in the first hundred
-steps.
+Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing: the device decides, and
+the host asks later (`Adam.report`) how many there were and which rows had such gradients. And |g| is cut to
+OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor, whichever is more, and
+to RAW_LIMIT, whose square float32 can represent. A step is at most (1 - β₁) / √(1 - β₂) = 3.2 η long however
+large g is, so the cut shortens the present step by less than 5 %. It bounds the memory of v: after one
+gradient of 10¹⁰, an entry of usual gradients 10⁻⁷ would not move for 2 ln(10¹⁷ √(1 - β₂)) / (1 - β₂) = 71,000
+steps; cut, it moves 3.3 times slower, or ten times if it happens in the first hundred steps.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import operator
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -31,23 +30,35 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.timing import phase
 from mi_refgs.surfels.table import gather_rows
+from mi_refgs.types import Bool, Float, TensorXf, UInt32
+
+# Adam's decay rates and the ε that 3DGS uses: tiny, as per-surfel gradients of a pixel mean are about 1e-7.
+BETA_1 = 0.9
+BETA_2 = 0.999
+EPSILON = 1e-15
+OUTLIER = 100.0
+"""Gradients beyond this many times the usual are cut; see above."""
+SAMPLES = 10_000
+"""Entries that a median is computed from."""
+WIDE_ROW = 64
+"""Columns beyond which rows are not distinguished: SH have 48, a row of the light hundreds."""
+WORD = 32
+"""Tensors whose bits fit one integer of the marks."""
+MEMORY = 4096
+"""Steps that `report` may come late."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Learning rate of one tensor: from `rate` log-linearly to `final` in `steps` iterations, then constant.
-
-    The first `head` columns learn at the rate, the others at rate · tail (spherical harmonics: head 3, tail
-    1/20).
-    """
+    """Learning rate of one tensor: from `rate` log-linearly to `final` in `steps` iterations, then constant."""
 
     rate: float  # per step, units of the raw tensor
     final: float | None = None  # None: constant
     steps: int = 1  # iterations
-    head: int = 0  # columns; 0: every column
-    tail: float = 1.0  # factor
-    relative: bool = False  # what is above 1 learns at the rate times itself: a lamp grows by shares
-    unit: float = 1.0  # of the raw tensor, to which the moments refer: ε, and what float32 squares, have none
+    head: int = 0  # columns that learn at the rate; 0: all
+    tail: float = 1.0  # factor of the rate of the other columns: SH beyond degree 0
+    relative: bool = False  # values above 1 learn at the rate times themselves: lamps grow exponentially
+    unit: float = 1.0  # of the raw tensor; moments are without unit, as ε is
 
     def at(self, iteration: int) -> float:
         """Learning rate at this iteration (0-based)."""
@@ -55,16 +66,6 @@ class Group:
             return self.rate
         progress = min(max(iteration / max(self.steps, 1), 0.0), 1.0)
         return math.exp((1 - progress) * math.log(self.rate) + progress * math.log(self.final))
-
-
-WIDE_ROW = 64
-"""Columns beyond which rows are not told apart: harmonics have 48, a row of the light hundreds."""
-
-WORD = 32
-"""Tensors whose bits fit one integer of the marks."""
-
-MEMORY = 4096
-"""Steps that `report` may come late."""
 
 
 @dataclass(frozen=True)
@@ -77,22 +78,24 @@ class Skipped:
 
 
 class Skips:
-    """Looks at the gradients of each step, and remembers the steps that must change nothing.
+    """Finds the steps that must change nothing; `params` and `groups` are those of the optimiser."""
 
-    `params` and `groups` are those of the optimiser: tensors and learning rates by name.
-    """
-
-    def __init__(self, params: Mapping[str, Any], groups: Mapping[str, Group]) -> None:
+    def __init__(self, params: Mapping[str, TensorXf], groups: Mapping[str, Group]) -> None:
         self._params, self._groups = params, groups
         # By number of rows and word w, (rows,): bit b where a gradient of group WORD w + b was not finite.
-        self._marks: dict[tuple[int, int], Any] = {}
+        self._marks: dict[tuple[int, int], UInt32] = {}
         self._calls, self._iteration = 0, 0  # number and iteration of the last step
         self._reported = 0  # number of the last step that was reported
         # At the number of a step modulo MEMORY: that number, if the step was skipped.
         self._skipped = dr.opaque(mi.UInt32, 0, MEMORY)
 
-    def good(self, gradients: Mapping[str, Any], iteration: int, loss: Any = None) -> Any:
-        """Whether the step may be taken (mi.Bool of width 1), by its `loss` (mi.Float) and gradients."""
+    def good(
+        self,
+        gradients: Mapping[str, Float],  # (N * D,) each
+        iteration: int,
+        loss: Float = None,  # width 1
+    ) -> Bool:  # width 1
+        """Whether the step may be applied."""
         self._calls, self._iteration = self._calls + 1, iteration
         number, place = dr.opaque(mi.UInt32, self._calls), dr.opaque(mi.UInt32, self._calls % MEMORY)
         for skip in self._not_finite(gradients):
@@ -104,7 +107,7 @@ class Skips:
         return dr.gather(mi.UInt32, self._skipped, place) != number
 
     def report(self) -> Skipped:
-        """The steps that were skipped since the last call; waits for the device, so not for every step."""
+        """The steps that were skipped since the last call; waits for the device."""
         skipped = self._skipped.numpy()
         skipped = skipped[skipped > self._reported]
         rows = {}
@@ -119,22 +122,22 @@ class Skips:
         return Skipped(len(skipped), last, {name: at for name, at in rows.items() if len(at)})
 
     def forget_rows(self) -> None:
-        """Forget which rows had such gradients: rows have moved."""
+        """Clear the marks: rows have moved."""
         self._marks.clear()
 
     def _marked(self, name: str) -> int:
-        """Rows of the marks that a tensor shares with others; 1 for one of wide rows, not told apart."""
+        """Rows of the marks that a tensor shares with others; 1 if its rows are wide, and not distinguished."""
         rows, width = int(self._params[name].shape[0]), math.prod(self._params[name].shape[1:])
         return rows if width <= WIDE_ROW else 1
 
-    def _not_finite(self, gradients: Mapping[str, Any]) -> list[Any]:
-        """Where something is not finite (mi.Bool), by rows or by entries; rows get the bit of each group.
+    def _not_finite(self, gradients: Mapping[str, Float]) -> list[Bool]:
+        """Masks of what is not finite, by rows or by entries; rows are marked with the bit of each group.
 
-        One look at a row serves all of its tensors. Only head columns are looked at: the others are of
-        spherical harmonics, whose gradient is that of a head column times a bounded function.
+        Tensors of equal length share one scan. Only head columns are tested: the gradient of the other SH
+        columns is that of a head column times a bounded function.
         """
-        by_entry: list[Any] = []
-        by_row: dict[tuple[int, int], Any] = {}
+        by_entry: list[Bool] = []
+        by_row: dict[tuple[int, int], UInt32] = {}
         for i, name in enumerate(self._groups):
             if name not in gradients:
                 continue
@@ -156,28 +159,16 @@ class Skips:
         return by_entry + [found != 0 for found in by_row.values()]
 
 
-# Adam's decay rates and the ε that 3DGS uses: tiny, as per-surfel gradients of a pixel mean are about 1e-7.
-BETA_1 = 0.9
-BETA_2 = 0.999
-EPSILON = 1e-15
-OUTLIER = 100.0
-"""Gradients beyond this many times the usual are cut; see above."""
-
-SAMPLES = 10_000
-"""Entries that a median is taken of."""
-
-
 class Adam:
-    """Adam over `params`, a mutable mapping of name to tensor that it updates in place (new entries).
+    """Adam over the tensors in `params` that have a group; others are left alone.
 
-    Each step reads `dr.grad` of the tensors, replaces them by fresh leaves, and leaves names without a group
-    alone. Everything that changes from step to step is opaque, so a second step of the same kind compiles
-    nothing; one kernel is launched per distinct tensor size.
+    Each step reads `dr.grad` of the tensors and replaces them by new leaves. Everything that changes from
+    step to step is opaque, so a second step of the same kind compiles nothing; one kernel is launched per
+    distinct tensor size.
     """
 
-    def __init__(self, params: MutableMapping[str, Any], groups: Mapping[str, Group]) -> None:
-        """Own the moments of params[name] for every name in groups; raises InputError for a group without
-        one."""
+    def __init__(self, params: MutableMapping[str, TensorXf], groups: Mapping[str, Group]) -> None:
+        """Create moments for every name in groups; raises InputError for a group without a parameter."""
         for name in groups:
             if name not in params:
                 raise InputError(
@@ -187,11 +178,11 @@ class Adam:
         self.groups = dict(groups)
         self.factors: dict[str, float] = {}
         self.stage: Mapping[str, float] = {}  # factors of the present stage of a fit
-        self._first: dict[str, Any] = {}
-        self._second: dict[str, Any] = {}
+        self._first: dict[str, Float] = {}
+        self._second: dict[str, Float] = {}
         self._steps: dict[str, int] = {}
         self._usual: dict[str, float] = {}  # median √(v / (1 - β₂ᵗ)); 0: not known yet
-        self._least: dict[str, Any] = {}  # the same on the device; infinity: not known yet
+        self._least: dict[str, Float] = {}  # the same on the device; infinity: not known yet
         self._skips = Skips(params, self.groups)
         for name in groups:
             self._clear(name)
@@ -200,7 +191,7 @@ class Adam:
             self._make_leaf(name)
 
     def set_factor(self, name: str, factor: float) -> None:
-        """Scale the learning rate of one tensor until further notice; 0 freezes it."""
+        """Set the factor of one tensor's learning rate; 0 freezes it."""
         self.factors[name] = factor
 
     def rate(self, name: str, iteration: int) -> float:
@@ -212,12 +203,13 @@ class Adam:
         return self._skips.report()
 
     @phase("optimiser")
-    def step(self, iteration: int, loss: Any = None) -> None:
+    def step(self, iteration: int, loss: Float = None) -> None:
         """Apply one update with the learning rates of this iteration (0-based), then clear the gradients.
 
-        Nothing changes if `loss` (a mi.Float) or a gradient is not finite. Tensors that the loss does not
-        depend on are skipped, as in PyTorch: their moments and step count stay.
+        Nothing changes if `loss` (width 1) or a gradient is not finite. Tensors that the loss does not depend
+        on are skipped, as in PyTorch: their moments and step count stay.
         """
+        # Gradients, and whether all are finite.
         gradients = {}
         for name in self.groups:
             g = dr.grad(self.params[name]).array
@@ -225,8 +217,10 @@ class Adam:
                 gradients[name] = g
         good = self._skips.good(gradients, iteration, loss)
 
-        updated: dict[str, tuple[Any, Any]] = {}
-        inverse: dict[int, Any] = {}  # by step count, which tensors share: each number costs time to send
+        # One update per tensor; those of equal step count share a bias correction, since each upload takes
+        # time.
+        updated: dict[str, tuple[Float, tuple[int, ...]]] = {}
+        inverse: dict[int, Float] = {}
         for name, g in gradients.items():
             shape, group = tuple(int(size) for size in self.params[name].shape), self.groups[name]
             t = self._steps[name] + 1
@@ -247,16 +241,21 @@ class Adam:
             self._first[name] = dr.select(good, m, self._first[name])
             self._second[name] = dr.select(good, v, self._second[name])
             self._steps[name] = t
+
+        # Evaluate all at once, then make new leaves.
         dr.eval(self._first, self._second, [θ for θ, _ in updated.values()])
         for name, (θ, shape) in updated.items():
             self.params[name] = mi.TensorXf(θ, shape=shape)
             self._make_leaf(name)
 
-    def _cut(self, name: str, g: Any, t: int, inverse: Any) -> Any:
-        """The gradient of step t, without unit, cut where it is far beyond the usual, 0 where not finite.
-
-        `inverse` is 1 / (1 - β₂ᵗ⁻¹), of the steps so far.
-        """
+    def _cut(
+        self,
+        name: str,
+        g: Float,  # (N * D,)
+        t: int,
+        inverse: Float,  # 1 / (1 - β₂ᵗ⁻¹), width 1
+    ) -> Float:
+        """The gradient of step t, without unit, cut where it is far beyond the usual, 0 where not finite."""
         if self.groups[name].unit != 1:
             g = g * dr.opaque(mi.Float, self.groups[name].unit)
         if t & (t - 1) == 0:  # at steps 1, 2, 4, …, since it waits for the device
@@ -270,12 +269,15 @@ class Adam:
         self._usual[name] = usual
         self._least[name] = dr.opaque(mi.Float, usual or math.inf)
 
-    def gather(self, parent: Any, names: list[str], fresh: Any | None = None) -> None:
-        """Let the moments of (N, D) tensors follow their rows: row i takes those of row parent[i].
+    def gather(
+        self,
+        parent: UInt32,  # (M,) rows of the present tensors
+        names: list[str],
+        fresh: Bool | None = None,  # (M,) rows that start with zero moments: clones and children
+    ) -> None:
+        """Let the moments of (N, D) tensors follow their rows. Step counts stay.
 
-        parent is an mi.UInt32. Call it together with replacing params[name] by the gathered tensor
-        (`Surfels.gather`). Rows where `fresh` (mi.Bool) holds start with zero moments: clones and children
-        have no history. Step counts stay.
+        Call it after replacing params[name] by the gathered tensor (`Surfels.gather`).
         """
         for name in names:
             if name not in self.groups:
@@ -293,10 +295,9 @@ class Adam:
         self._skips.forget_rows()
 
     def reset(self, name: str) -> None:
-        """Zero the moments of one tensor; its step count stays.
+        """Zero the moments of one tensor, after params[name] was replaced.
 
-        Keeping the count is what 3DGS does: the next update is up to about 3 η long, not η. Call it after
-        replacing params[name].
+        Its step count stays, as in 3DGS: the next update is up to about 3 η long, not η.
         """
         self._clear(name)
         self._make_leaf(name)
@@ -314,7 +315,7 @@ class Adam:
 
     @staticmethod
     def fresh_state(name: str, size: int) -> dict[str, np.ndarray]:
-        """What `state_dict` has of a tensor of so many numbers before its first step."""
+        """Entries of `state_dict` for a tensor of so many numbers before its first step."""
         zeros = np.zeros(size, np.float32)
         parts = {"first": zeros, "second": zeros, "steps": 0, "factor": 1.0, "usual": 0.0}
         return {f"{name}/{part}": np.array(value) for part, value in parts.items()}
@@ -350,7 +351,7 @@ class Adam:
         self.params[name] = tensor
 
 
-def _median(values: Any) -> float:
+def _median(values: Float) -> float:
     """Median |x| of the finite entries that are not 0, of at most SAMPLES; 0 if there are none."""
     x = np.abs(values.numpy()[:: max(dr.width(values) // SAMPLES, 1)])
     x = x[(x > 0) & np.isfinite(x)]

@@ -1,4 +1,12 @@
-"""How long a fit takes and how much memory it needs, before its first step; what size of pictures fits."""
+"""Time and memory of a fit, estimated before its first step, and the image size that fits the time.
+
+The time of a step is measured once per machine (`cost_model` caches it): steps of the method itself on a
+stand-in for the data set, at two sizes, in each stage and with its mesh. It is linear in the number of
+pixels.
+
+The clock is the CPU time of the main thread. On an idle machine it is the wall time, since this thread takes
+part in every kernel of Dr.Jit; beside other processes it stays, while the wall time doubles.
+"""
 
 from __future__ import annotations
 
@@ -30,20 +38,35 @@ from mi_refgs.methods.read import PRESETS
 
 VIEWS = 6
 COVERED = 0.35
-"""Share of a picture with alpha that the stand-in's object covers; published data sets have 0.1 to 0.5."""
+"""Fraction of the stand-in's images that the object covers; published data sets have 0.1 to 0.5."""
 WARM, TIMED, REPEATS = 4, 4, 3
-"""Steps before the clock runs, which compile kernels; steps that are timed at once; how often they are, of
-which the fastest counts."""
+"""Steps before the timed ones, which compile kernels; steps timed together; repetitions, of which the fastest
+counts."""
+WHOLE = 256 * 256
+"""Pixels of an image up to which it is not downscaled, unless the method says so."""
+LEAST = 96
+"""Pixels of the shorter side below which no image is downscaled: smaller images show no surface."""
+SAFETY = 0.8
+"""Fraction of the time limit that the estimate may reach: data sets differ by as much."""
+GROWTH, OPEN_GROWTH = 1.0, 0.6
+"""Mean time of a step relative to the stand-in, with alpha and without: the number of surfels grows, but
+opaque ones hide others, and without alpha surfels start far larger than they end."""
+START = 10.0
+"""Seconds for the visual hull, previews, checkpoints and artefacts."""
+DECODING = 1.5e-8
+"""Seconds per pixel of a file, once per image: JPEG 8e-9, PNG 2e-8."""
+WORTH = 1e7
+"""Iterations × pixels from which a fit takes minutes, and an estimate is worth its time."""
 
 
 def speed_of(method: Method, has_alpha: bool) -> Speed:
-    """How fast steps of a method are here, on pictures with alpha or without: as kept, or measured."""
+    """Speed of a method on this machine, on images with alpha or without: cached, or measured."""
     subject = machine() | {"simd_width": simd_width(), "mi_refgs": __version__, "cut_out": has_alpha}
     return cost_model.kept(subject | _cost(method), lambda: measured(method, has_alpha))
 
 
 def _cost(method: Method) -> dict[str, Any]:
-    """What the time of a step depends on: two methods that differ in rates or weights alone are one."""
+    """What the time of a step depends on: methods that differ in learning rates or weights only are equal."""
     weights = {name: bool(value) for name, value in asdict(method.loss).items()}
     parts = {name: getattr(method, name) for name in ("surfels", "light", "surroundings", "mesh", "stage")}
     return {
@@ -59,7 +82,7 @@ def measured(method: Method, has_alpha: bool) -> Speed:
 
 
 def _measured(method: Method, has_alpha: bool, size: int) -> tuple[dict[str, float], tuple[float, float]]:
-    """Seconds of a step by stage, and of a mesh without views and of each of its views."""
+    """Seconds per step by stage; per mesh, and per view of a mesh."""
     data_options = replace(method.data, coarse=())
     still = replace(method, refine=Refine(), exposure=None, select=None, data=data_options)
     trainer = Trainer(still, stand_in(has_alpha, size))
@@ -84,7 +107,7 @@ def _measured(method: Method, has_alpha: bool, size: int) -> tuple[dict[str, flo
 
 
 def _mesh(trainer: Trainer) -> tuple[float, float]:
-    """Seconds of a mesh without views, and of each view: from one of all views, and one of four times all."""
+    """Seconds per mesh, and per view of a mesh: from a mesh of all views, and one of four times all."""
     cameras = [view.camera() for view in trainer.data.views]
     trainer.extract_mesh(cameras)
     few, many = (
@@ -104,7 +127,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def stand_in(has_alpha: bool, size: int) -> Dataset:
-    """Pictures of noise, of a ball that is cut out or of what is all around, from a ring of cameras."""
+    """Images of noise from a ring of cameras: of a ball with alpha, or of an open scene."""
     rng = np.random.default_rng(0)
     y, x = (np.mgrid[0:size, 0:size] + 0.5) / size - 0.5
     alpha = (np.hypot(x, y) < np.sqrt(COVERED / np.pi)).astype(np.float32)
@@ -125,27 +148,10 @@ def stand_in(has_alpha: bool, size: int) -> Dataset:
     return Dataset(Path("stand-in"), "train", tuple(views), np.ones(3, np.float32), False, None, None, region)
 
 
-WHOLE = 256 * 256
-"""Pixels of an image up to which it is read whole, unless the method says otherwise."""
-LEAST = 96
-"""Pixels of the shorter side that no data set is read smaller than: what is left shows no surface."""
-SAFETY = 0.8
-"""Share of the promised time that the estimate may take: data sets differ by as much."""
-GROWTH, OPEN_GROWTH = 1.0, 0.6
-"""Mean time of a step over that of the stand-in, with alpha and without: tables grow, but what is opaque
-hides what lies behind it, and without alpha surfels start far larger than they end."""
-START = 10.0
-"""Seconds for the visual hull, previews, checkpoints and artefacts."""
-DECODING = 1.5e-8
-"""Seconds for a pixel of a file, once for each picture: JPEG 8e-9, PNG 2e-8."""
-WORTH = 1e7
-"""Iterations × pixels from which a fit takes minutes, and an estimate is worth its own seconds."""
-
-
 def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> Method:
-    """The method with the size of pictures decided: where it says none, what its preset can afford.
+    """The method with the size of images decided: by default, that of its preset.
 
-    `tell` is called when pictures are read smaller than they are. Raises InputError as `read_dataset` does.
+    `tell` is called if images are downscaled. Raises InputError as `read_dataset` does.
     """
     if method.data.downscale is not None:
         return method
@@ -153,16 +159,15 @@ def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: No
     factor, width, height = fitting_downscale(path, method.data.images, budget)
     if factor > 1:
         tell(
-            f"{path}: pictures of {width} × {height} pixels are read as {width // factor} × "
-            f"{height // factor}, so that preset {method.preset} takes its time and not more; "
-            "--set data.downscale=1 reads them whole"
+            f"{path}: images of {width} × {height} pixels are read as {width // factor} × "
+            f"{height // factor} to fit the time of preset {method.preset}; --set data.downscale=1 avoids it"
         )
     return replace(method, data=replace(method.data, downscale=factor))
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a fit will need."""
+    """Time and memory of a fit."""
 
     seconds: float
     bytes: float
@@ -170,7 +175,7 @@ class Estimate:
     height: int
 
     def sentence(self, iterations: int) -> str:
-        """For people."""
+        """The estimate as one sentence."""
         return (
             f"estimate: {minutes(self.seconds)} and {self.bytes / 1e9:.1f} GB for {iterations} iterations on "
             f"{self.width} × {self.height} pixels with {dr.thread_count()} threads"
@@ -178,19 +183,19 @@ class Estimate:
 
 
 def minutes(seconds: float) -> str:
-    """A time for people, not more exact than it is."""
+    """Format a time, not more precisely than it is known."""
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} min"
 
 
 def planned(
     method: Method, path: Path, limit: float | None = None, tell: Callable[[str], None] = lambda _: None
 ) -> tuple[Method, Estimate | None]:
-    """The method with the size of images decided, and what its fit will need; None if that is next to none.
+    """The method with the size of images decided, and an estimate of its fit, or None if it takes seconds.
 
-    The largest images whose fit takes at most `limit` seconds, or what the preset promises. Images of at most
-    WHOLE pixels are not downscaled, nor is a size changed that the method gives. On a busy machine the same
-    is decided: a step takes as long as `cost_model` has it. `tell` is called with what was chosen. Raises
-    InputError as `read_dataset` does.
+    Chooses the largest images whose fit takes at most `limit` seconds, by default the time of the preset.
+    Images of at most WHOLE pixels are not downscaled, nor is a size changed that the method gives. The load
+    of the machine has no influence. `tell` is called with the choice. Raises InputError as `read_dataset`
+    does.
     """
     promise = PRESETS[method.preset].minutes if method.preset in PRESETS else None
     limit = 60 * promise if limit is None and promise is not None else limit
@@ -237,15 +242,13 @@ def planned(
 def estimate(
     method: Method, speed: Speed, views: int, size: tuple[int, int], factor: int, has_alpha: bool = True
 ) -> Estimate:
-    """What a fit to so many pictures of `size` (width, height), read `factor` times smaller, will need.
-
-    `has_alpha`: whether they have alpha.
-    """
+    """Estimate a fit to so many images of `size` (width, height), with or without alpha, downscaled by
+    `factor`."""
     width, height = size[0] // factor, size[1] // factor
     pixels, begin, steps = width * height, 0, 0.0
     for name, stage in method.stages():
-        for block, share in _blocks(method, begin, min(stage.until, method.iterations)):
-            steps += share * speed.step(name, pixels // block**2)
+        for block, count in _blocks(method, begin, min(stage.until, method.iterations)):
+            steps += count * speed.step(name, pixels // block**2)
         begin = stage.until
     meshes = 0 if method.mesh is None else method.mesh.extract.count(method.iterations)
     files = views * size[0] * size[1] * DECODING
@@ -255,7 +258,7 @@ def estimate(
 
 
 def _blocks(method: Method, begin: int, end: int) -> list[tuple[int, int]]:
-    """Sides of what counts as a pixel in the iterations after `begin` to `end`, and how many have each."""
+    """Sides of the pixel blocks of coarse images in the iterations after `begin` to `end`, and their numbers."""
     ends = sorted({end, *(coarse.until for coarse in method.data.coarse if begin < coarse.until < end)})
     return [
         (method.data.block_at(last), last - first)

@@ -1,4 +1,4 @@
-"""What a fit tells while it runs, to whoever listens."""
+"""Interface of listeners to a fit: progress bar, previews, live viewer."""
 
 from __future__ import annotations
 
@@ -10,26 +10,23 @@ if TYPE_CHECKING:
 
 
 class Progress:
-    """A listener that shows nothing; subclasses override what they show.
+    """A listener that displays nothing; subclasses override methods."""
 
-    `trainer` and `expected` stay afterwards: the state at the end, and the estimate of a new fit.
-    """
-
-    trainer: Trainer | None = None
-    expected: Estimate | None = None
+    trainer: Trainer | None = None  # of the fit, also after its end
+    expected: Estimate | None = None  # of a new fit
 
     def say(self, message: str) -> None:
-        """What is going on, and what was decided."""
+        """Is called with messages about the fit and its decisions."""
 
     def warn(self, message: str) -> None:
-        """Something unusual about the data or the fit."""
+        """Is called with warnings about the data or the fit."""
 
     def begin(self, trainer: Trainer) -> None:
-        """Ahead of the first step; also of a run that is finished already. Overrides call this one."""
+        """Is called before the first step, also of a finished run. Overrides call this one."""
         self.trainer = trainer
 
     def step(self, trainer: Trainer) -> None:
-        """After each step: `trainer.iteration`, `.statistics()` (waits for the device), `.view(camera)`."""
+        """Is called after each step. `trainer.statistics()` waits for the device, `.view(camera)` renders."""
 
     def end(self) -> None:
-        """After the last step, and when the fit is interrupted or fails."""
+        """Is called after the last step, and when the fit is interrupted or fails."""

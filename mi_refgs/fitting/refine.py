@@ -1,7 +1,9 @@
-"""Adaptive control of the surfel table: every edit is a new table and the parent of each row.
+"""Edits of a set of surfels: densification, pruning, resets, normal propagation, relocation.
 
-Runs a few hundred times a fit, never in the step, so it is plain NumPy on the raw channels.
-Letters: s scale, o opacity, extent the size of the camera rig [3DGS §5.2].
+Each is a function from surfels to new surfels, with the parent of each row if rows move. They run a few
+hundred times per fit, not in every step, so they are plain NumPy on the raw attributes (but for `wander`).
+Letters: s scale, o opacity, extent the size of the camera rig [3DGS §5.2], N surfels at one place, η learning
+rate of positions, Σ covariance.
 """
 
 from __future__ import annotations
@@ -9,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,22 +23,23 @@ from mi_refgs.surfels.attributes import attribute, logit, sigmoid
 from mi_refgs.surfels.init import morton_order
 from mi_refgs.surfels.primitives import Primitive, primitive_of
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import TensorXf
 
 SPLIT_SHRINK = 1.6
 """A split surfel's two children have its scale divided by this. [3DGS §5.2: φ = 1.6, found by experiment]"""
 
 
 PRUNE_PATIENCE = 4.5
-"""Times the fewest steps in which an opacity can grow back after a reset: 150 iterations as shipped. Twice
-the fewest (67 iterations) were too few on a diffuse scene, which lost every surfel."""
+"""Factor of the fewest steps in which an opacity can grow back after a reset: 150 iterations as shipped.
+Factor 2 (67 iterations) was too small on a diffuse scene, which lost every surfel."""
 
 
 def prune_wait(options: Refine, rate: float) -> float:
-    """Iterations that opacities get to grow back after a reset, from the learning rate of their logits.
+    """Iterations without pruning after a reset, in which opacities grow back, from their learning rate.
 
-    Adam lifts a logit by about its rate a step, so reset_opacity to prune_opacity takes at least logit
-    (prune_opacity) - logit(reset_opacity) over the rate: 33 steps of 0.05 from 0.01 to 0.05. These are steps
-    of the optimiser: a preset, which does not scale the rate, does not scale them either.
+    Adam raises a logit by about its rate per step, so from reset_opacity to prune_opacity it takes at least
+    logit(prune_opacity) - logit(reset_opacity) over the rate: 33 steps of 0.05 from 0.01 to 0.05. Presets do
+    not scale the rate, and so do not scale these iterations.
     """
     lift = max(logit(options.prune_opacity) - logit(options.reset_opacity), 0.0)
     return PRUNE_PATIENCE * lift / rate if rate > 0 else math.inf
@@ -45,37 +47,34 @@ def prune_wait(options: Refine, rate: float) -> float:
 
 @dataclass(frozen=True)
 class TableEdit:
-    """A new table; row i descends from row parent[i] of the old one, and is `fresh` if it is a copy of it."""
+    """New surfels; row i descends from row parent[i] of the old ones, and is `fresh` if it has no history."""
 
     surfels: Surfels
     parent: np.ndarray  # (M,) uint32
     fresh: np.ndarray  # (M,) bool
 
     def ordered(self) -> TableEdit:
-        """The same rows, those of neighbours next to each other; densifying leaves new ones at the end."""
+        """Sort the rows in Morton order; densifying appends new ones."""
         order = morton_order(self.surfels.raw["position"].numpy())
         return TableEdit(self.surfels.gather(upload(order, mi.UInt32)), self.parent[order], self.fresh[order])
 
 
 def densify_and_prune(
     surfels: Surfels,
-    gradient: np.ndarray,
-    extent: float | np.ndarray,
+    gradient: np.ndarray,  # (N,) mean length of the screen-space gradient over the views with one, NDC
+    extent: float | np.ndarray,  # scene units; sizes are compared with it; or (N,)
     options: Refine,
     max_count: int,
     rng: np.random.Generator,
     prune_transparent: bool = True,
-    largest: np.ndarray | None = None,
+    largest: np.ndarray | None = None,  # (N,) scene units
 ) -> TableEdit:
-    """Clone small and split large surfels with a high screen gradient; drop transparent and oversized ones.
+    """Clone small and split large surfels with a high screen gradient; prune transparent and oversized ones.
 
-    `gradient` (N,) is the mean length of the screen-translation gradient in NDC units over the views that saw
-    a surfel. At most max_count surfels result: those with the highest gradient grow first. Transparent ones
-    stay unless `prune_transparent`: wait `prune_wait` iterations after an opacity reset. Sizes are compared
-    with `extent`, one for all or (N,). `largest` (N,) replaces the size from which surfels go; the most
-    opaque one then stays in any case.
-
-    Raises InputError if no surfel would be left.
+    At most max_count surfels result: those with the highest gradient are cloned or split first. Transparent
+    ones stay unless `prune_transparent`: wait `prune_wait` iterations after an opacity reset. `largest`
+    replaces the size limit of pruning; the most opaque surfel then stays in any case. Raises InputError if no
+    surfel would be left.
     """
     raw = surfels.to_numpy()
     count = len(gradient)
@@ -90,7 +89,7 @@ def densify_and_prune(
     if not keep.any():
         raise InputError(
             "refine.prune_opacity: no surfel is opaque and small enough to stay; lower it, raise "
-            "refine.prune_extent, or check that the pictures and their cameras belong together"
+            "refine.prune_extent, or check that the images and their cameras belong together"
         )
 
     hot = np.flatnonzero(keep & (gradient >= options.gradient))
@@ -114,16 +113,16 @@ def densify_and_prune(
 def _offsets(
     primitive: Primitive, table: dict[str, np.ndarray], rows: slice, rng: np.random.Generator
 ) -> np.ndarray:
-    """Normal deviates of the primitives' own Gaussians (M, 3)."""
+    """Normal deviates (M, 3) of the primitives' own Gaussians."""
     axes, deviations = primitive.extent({name: values[rows] for name, values in table.items()})
     local = rng.normal(size=deviations.shape) * deviations
     return sum(local[:, i : i + 1] * axes[:, i] for i in range(local.shape[1])).astype(np.float32)
 
 
 def reset_opacity(surfels: Surfels, options: Refine, floors: Mapping[str, float]) -> Surfels:
-    """Lower every opacity to at most reset_opacity, and lift the channels of `floors` to at least that value.
+    """Lower opacities to at most reset_opacity, and raise the attributes in `floors` to at least their value.
 
-    What the pictures need grows back; what they do not is pruned. [3DGS §5.2; 3DGS-DR for the metallic]
+    Surfels that the images require grow back; others are pruned. [3DGS §5.2; 3DGS-DR for the metallic]
     """
     raw = surfels.to_numpy()
     raw["opacity"] = np.minimum(raw["opacity"], np.float32(logit(options.reset_opacity)))
@@ -133,12 +132,11 @@ def reset_opacity(surfels: Surfels, options: Refine, floors: Mapping[str, float]
 
 
 def propagate_normals(surfels: Surfels, options: Propagation, rng: np.random.Generator) -> Surfels:
-    """Make all surfels opaque, and enlarge the reflective. [3DGS-DR §3.3; Ref-Gaussian §3.4]
+    """Make all surfels opaque, and enlarge the reflective ones. [3DGS-DR §3.3; Ref-Gaussian §3.4]
 
     Enlarged opaque surfels cover their neighbours, whose reflections then follow the normals that already
-    explain them. Reflective means metallic, and smooth where there is a roughness and a limit of it: a rough
-    metal has no sharp reflection to propagate. Noise on the colour of what reflects nothing keeps it from
-    explaining reflections.
+    explain them. Reflective means metallic, and not rough, if there is a limit: a rough metal has no sharp
+    reflection. Noise on the colour of the others keeps it from explaining reflections.
     """
     raw = surfels.to_numpy()
     raw["opacity"] = np.maximum(raw["opacity"], np.float32(logit(options.opacity)))
@@ -155,8 +153,7 @@ def propagate_normals(surfels: Surfels, options: Propagation, rng: np.random.Gen
 
 
 def restart(surfels: Surfels, starts: Mapping[str, float], rng: np.random.Generator) -> Surfels:
-    """The channels of `starts` back to these initial values, activated. [Ref-Gaussian, implementation
-    details]"""
+    """Reset attributes to the initial values `starts`. [Ref-Gaussian, implementation details]"""
     raw = surfels.to_numpy()
     for name, value in starts.items():
         count, width = raw[name].shape
@@ -165,19 +162,18 @@ def restart(surfels: Surfels, starts: Mapping[str, float], rng: np.random.Genera
 
 
 MOST_COPIES = 51
-"""Surfels at one place that the correction tells apart, at most; their opacities hardly change beyond. [code
-of 3DGS-MCMC]"""
+"""Most surfels at one place that the correction distinguishes. [code of 3DGS-MCMC]"""
 SHARPNESS = 100.0
-"""Slope of the noise over opacity: what is a few hundredths more opaque than the idle hardly moves. [§4.2]"""
+"""Slope of the noise over opacity: surfels a few hundredths more opaque than idle ones hardly move. [§4.2]"""
 OPACITY_RANGE = (0.005, 1 - 1e-4)
-"""Opacities after a correction: none is idle at once, and logits stay moderate."""
+"""Range of corrected opacities: none is idle, and logits stay moderate."""
 
 
 def shared(opacity: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What `number` surfels at one place have each, to look like the one of this opacity (N,).
+    """Opacity and scale factor with which `number` surfels at one place look like one of this opacity (N,).
 
-    Returns their opacity, 1 - (1 - o)^(1/N), and the factor of their scales, with which the integral along a
-    line through the centre stays [eq. 9]:
+    The opacity is 1 - (1 - o)^(1/N); the factor preserves the integral along a line through the centre [eq.
+    9]:
         o / Σ_{k<N} (-1)^k C(N, k+1) o'^{k+1} / √(k+1),  the sum over i of eq. 9 done.
     """
     number = np.clip(number, 1, MOST_COPIES)
@@ -190,10 +186,11 @@ def shared(opacity: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def relocate(surfels: Surfels, options: Relocation, max_count: int, rng: np.random.Generator) -> TableEdit:
-    """Put each idle surfel onto a seen one, drawn by opacity, and add copies up to `grow` and `max_count`.
+    """Move each idle surfel onto a visible one, drawn by opacity, and add copies up to `grow` and
+    `max_count`.
 
-    All that then share a place are corrected so that the picture hardly changes. Moved and added rows, and
-    those onto which they moved, are `fresh`: their history is of another surfel.
+    Surfels that then share a place are corrected so that the image hardly changes. They are all `fresh`.
+    [3DGS-MCMC, Kheradmand et al., NeurIPS 2024]
     """
     raw = surfels.to_numpy()
     opacity = sigmoid(raw["opacity"][:, 0].astype(np.float64))
@@ -220,8 +217,8 @@ def relocate(surfels: Surfels, options: Relocation, max_count: int, rng: np.rand
 
 def wander(
     surfels: Surfels, rate: float, extent: float, options: Relocation, iteration: int, seed: int
-) -> Any:
-    """Positions (mi.TensorXf) after a random step of η λ Σ ε / (1 + exp(SHARPNESS (o - opacity))). [eq. 7, 8]
+) -> TensorXf:
+    """Positions (N, 3) after a random step of η λ Σ ε / (1 + exp(SHARPNESS (o - opacity))). [eq. 7, 8]
 
     ε are normal deviates that follow from seed and iteration. `rate` is η, and 1/λ has the unit of Σ; lengths
     in both are in extents. A second call compiles nothing.

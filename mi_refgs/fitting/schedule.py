@@ -1,10 +1,10 @@
-"""What a step takes from its iteration number alone, so that a resumed fit goes on as a straight one."""
+"""Everything in a step that depends on the iteration number alone: random draws, learning rates, shared
+lights."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -16,30 +16,31 @@ from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import attribute
+from mi_refgs.types import Float
 
 POSITION_STEPS = 0.6
-"""Share of the iterations after which positions learn at their final rate: 30,000 of 50,000 in the released
-Ref-Gaussian code."""
+"""Fraction of the iterations after which positions learn at their final rate: 30,000 of 50,000 in the
+released Ref-Gaussian code."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """The draws and rates of a fit to `views` pictures, by (1-based) iteration."""
+    """Random draws and learning rates of a fit to `views` images, by (1-based) iteration."""
 
     method: Method
     views: int
 
     def rng(self, iteration: int, operation: str) -> np.random.Generator:
-        """Random numbers of one operation of an iteration, such as "densify"; 0 is the initialisation."""
+        """Generator for one operation, such as "densify", of an iteration; 0 is the initialisation."""
         return np.random.default_rng([self.method.seed, iteration, *operation.encode()])
 
     def view(self, iteration: int) -> int:
-        """Index of the picture: sampling without replacement, a fresh permutation every epoch."""
+        """Index of the training view: sampling without replacement, a new permutation every epoch."""
         epoch, place = divmod(iteration - 1, self.views)
         return int(np.random.default_rng([self.method.seed, epoch, 1]).permutation(self.views)[place])
 
     def sh_degree(self, iteration: int) -> int:
-        """Degree of the radiance channel that is in use."""
+        """SH degree of the radiance that is in use."""
         return min(
             self.method.surfels.sh_raise.count(iteration), self.method.surfels.degree_of("radiance_sh")
         )
@@ -51,10 +52,7 @@ class Schedule:
         return light is not None and (iteration % light.every == 0 or iteration in ends)
 
     def groups(self, extent: float, open_scene: bool = False) -> dict[str, Group]:
-        """Learning rates of every parameter of the method; `extent` in scene units.
-
-        `open_scene`: with those of the surroundings, whose positions have an extent of their own.
-        """
+        """Learning rates by parameter; `extent` in scene units; `open_scene`: with those of the background."""
         rates, iterations = self.method.rates, self.method.iterations
         groups = self._of_table(self.method.surfels.names, extent)
         around = self.method.surroundings
@@ -68,7 +66,7 @@ class Schedule:
         return groups
 
     def _of_table(self, names: tuple[str, ...], extent: float) -> dict[str, Group]:
-        """Learning rates of the channels of one table."""
+        """Learning rates of the attributes of one set of surfels."""
         rates, iterations = self.method.rates, self.method.iterations
         groups = {}
         for name in names:
@@ -86,14 +84,19 @@ GATHERED = "light_gradient"
 
 
 class SharedPrefilter:
-    """Steps that share the levels of one filtered light; `close` ends them, and passes on their gradient."""
+    """The light of a fit, filtered once for several steps, whose gradients it learns from together.
+
+    Filtering a light and its adjoint cost the same for one view as for a hundred: with 128 rows a quarter of
+    a step of 200² pixels on one core. `close` ends the steps that share a light, and passes on their
+    gradient.
+    """
 
     def __init__(self) -> None:
-        self._light: PrefilteredLight | None = None  # under AD, as the environment's levels
-        self._leaf: Any = None  # its levels, where the steps leave their gradients
+        self._light: PrefilteredLight | None = None  # attached to the environment
+        self._leaf: Float = None  # its levels, which accumulate the gradients of the steps
 
     def light(self, environment: EnvironmentLight | None, shading: Shading) -> Light | None:
-        """The light of a step, under AD; one that is not filtered stays attached to its environment."""
+        """The light of a step, under AD; a light that is not filtered stays attached to its environment."""
         if self._light is not None and self._light.operator.roughness == shading.levels.roughness:
             return replace(self._light, levels=self._leaf)
         light = shading.light_of(environment)
@@ -104,7 +107,7 @@ class SharedPrefilter:
         return replace(light, levels=self._leaf)
 
     def close(self) -> None:
-        """Add what the steps have gathered to the gradient of the environment that they began with."""
+        """Add the accumulated gradient to that of the environment."""
         if self._light is not None:
             dr.set_grad(self._light.levels, dr.grad(self._leaf))
             dr.enqueue(dr.ADMode.Backward, self._light.levels)
@@ -112,17 +115,17 @@ class SharedPrefilter:
         self.clear()
 
     def clear(self) -> None:
-        """Forget what was gathered."""
+        """Discard the accumulated gradient."""
         self._light = self._leaf = None
 
     def state(self) -> dict[str, np.ndarray]:
-        """The gradient of the levels so far, for a checkpoint; empty if no step has left one."""
+        """The accumulated gradient for a checkpoint; empty if there is none."""
         return {} if self._leaf is None else {GATHERED: np.array(dr.grad(self._leaf), dtype=np.float32)}
 
     def restore(
         self, environment: EnvironmentLight | None, shading: Shading, state: Mapping[str, np.ndarray]
     ) -> None:
-        """Go on where `state` was taken; a gradient of other levels, as in a trial, is left out."""
+        """Continue from a checkpoint; a gradient of other levels, as in a trial, is left out."""
         self.clear()
         gathered = state.get(GATHERED)
         if gathered is None or environment is None:

@@ -1,8 +1,8 @@
-"""Model only what a scene needs: terms of a method are tried while it is fitted, and stay if they earn it.
+"""Component selection: optional components of a method are tried during a fit, and kept if they improve it.
 
-A term is tried where the fit has come to: both go on from there for a while, with it and without it, and the
-views held out for the purpose judge. The one that wins is the fit that goes on, so a trial costs what its
-loser took. A term that is not in use is absent from the table, the G-buffer, the kernels and the optimiser.
+At a trial, the fit continues for a while both with and without the component; validation views decide. The
+better one is continued, so a trial costs what the other one took. A component that is not in use is absent
+from the attributes, the G-buffer, the kernels and the optimiser.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from mi_refgs.surfels.attributes import attribute
 
 
 def branched(trainer: Trainer, method: Method) -> Trainer:
-    """A trainer of `method`, at the same iteration of the same data; `trainer` stays as it is.
+    """Copy a fit to a trainer of another method, at the same iteration, without a run folder.
 
-    Harmonics of another degree are cut or filled with zeros, a light of another size is resampled, and both
-    keep their history as far as they keep their entries. It has no run folder.
+    Parameters of both methods are kept, others start as `method` says. SH of another degree are cut or filled
+    with zeros, a light of another size is resampled; entries that are kept have their history.
     """
     state = trainer.state()
     old, count = part(state, PARAMS), trainer.surfels.count
@@ -67,7 +67,7 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
 
 
 def _columns(table: np.ndarray, width: int) -> np.ndarray:
-    """The first `width` columns, zeros beyond those that are there."""
+    """The first `width` columns, filled with zeros."""
     kept = table[:, :width]
     return np.pad(kept, ((0, 0), (0, width - kept.shape[1])))
 
@@ -75,7 +75,7 @@ def _columns(table: np.ndarray, width: int) -> np.ndarray:
 def _history(
     state: dict[str, np.ndarray], old: dict[str, np.ndarray], name: str, values: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Adam's moments of one tensor, by the names of `Adam.state_dict`."""
+    """Adam's moments of one tensor, with the names of `Adam.state_dict`."""
     found: dict[str, np.ndarray] = {}
     for key in ("first", "second"):
         moments = state.get(f"{OPTIMISER}{name}/{key}")
@@ -94,24 +94,24 @@ MOMENTS = 3
 """Arrays of float32 that a parameter needs: itself, and Adam's first and second moment."""
 
 TIME_NOISE = 0.05
-"""Part of a step by which its time may differ by chance."""
+"""Relative difference of two measurements of a step's time by chance."""
 
 DECISIONS = "decisions.json"
-"""File of a run with the decisions."""
+"""File of a run that contains the decisions."""
 
 
 @dataclass(frozen=True)
 class ComponentTrial:
-    """How a method did in a trial."""
+    """Result of a method in a trial."""
 
-    psnr: float  # dB, mean over the views held out
-    ms: float  # processor time of a step, median: that of the wall depends on what else the machine does
+    psnr: float  # dB, mean over the validation views
+    ms: float  # CPU time per step, median: wall time depends on the load of the machine
     mb: float  # parameters and their moments
 
 
 @dataclass(frozen=True)
 class Decision:
-    """One term, tried or not."""
+    """Decision about one component, tried or not."""
 
     term: str
     iteration: int
@@ -122,7 +122,7 @@ class Decision:
 
     @property
     def gain(self) -> float | None:
-        """dB that the term brings."""
+        """PSNR improvement by the component, dB."""
         return None if self.without is None or self.with_it is None else self.with_it.psnr - self.without.psnr
 
 
@@ -190,7 +190,7 @@ def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Dec
 
 
 def required_gain(without: ComponentTrial, with_it: ComponentTrial, select: Selection) -> float:
-    """PSNR (dB) that a term has to bring for what it costs; what it may lose, where it saves."""
+    """PSNR gain (dB) that a component has to reach for its cost; negative if it saves cost."""
     time_price = select.gain_per_ms * (with_it.ms - without.ms)
     price = time_price + select.gain_per_mb * (with_it.mb - without.mb)
     costs = with_it.mb > without.mb or with_it.ms > (1 + TIME_NOISE) * without.ms
@@ -198,7 +198,7 @@ def required_gain(without: ComponentTrial, with_it: ComponentTrial, select: Sele
 
 
 def _run(trainer: Trainer, steps: int, judges: Dataset, release: Callable[[], None]) -> ComponentTrial:
-    """Go on for some steps, and what came of it; `release` lets an interrupt through between two of them."""
+    """Run some steps and measure the result; `release` raises a pending interrupt between two of them."""
     seconds = []
     for _ in range(steps):
         begin = time.process_time()
@@ -216,13 +216,13 @@ def _run(trainer: Trainer, steps: int, judges: Dataset, release: Callable[[], No
 
 
 def validation_psnr(trainer: Trainer, judges: Dataset) -> float:
-    """Mean PSNR (dB) of the present state on views that it was not fitted to; waits for the device."""
+    """Mean PSNR (dB) of the present state on validation views; waits for the device."""
     shown = [(trainer.view(view.camera(), aovs=False), view) for view in judges.views]
     return float(np.mean([psnr(image_of(displayed_of(frame, judges), view), view) for frame, view in shown]))
 
 
 def sentence(decision: Decision) -> str:
-    """A decision as one sentence."""
+    """The decision as one sentence."""
     verdict = "stays" if decision.stays else "is left out"
     if decision.without is None or decision.with_it is None:
         return f"{decision.term} {verdict}: {decision.reason}"
@@ -231,7 +231,7 @@ def sentence(decision: Decision) -> str:
 
 
 def table(decisions: list[dict[str, Any]]) -> str:
-    """The decisions of a fit as lines of text."""
+    """Format the decisions of a fit as a text table."""
     rows = [("term", "iteration", "gain", "time", "memory", "verdict")]
     for row in decisions:
         cells = ["", "", ""]
@@ -252,7 +252,7 @@ def table(decisions: list[dict[str, Any]]) -> str:
 
 
 def with_components(method: Method, decisions: list[dict[str, Any]]) -> Method:
-    """The method with the terms that decisions have left in it."""
+    """The method with the components that the decisions kept."""
     names = tuple(row["term"] for row in decisions if row["stays"])
     if method.select is None or names == method.components:
         return method

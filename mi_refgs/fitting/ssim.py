@@ -11,13 +11,13 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.kernels.device import replayed
 from mi_refgs.kernels.timing import phase
+from mi_refgs.types import Float
 
 # Half width of the 11-pixel window, in pixels. [Wang et al. 2004, §III.B]
 WINDOW_RADIUS = 5
@@ -42,7 +42,7 @@ def window() -> list[float]:
 
 
 @phase("ssim forward")
-def ssim(x: Sequence[Any], y: Sequence[Any], width: int, height: int) -> Any:
+def ssim(x: Sequence[Float], y: Sequence[Float], width: int, height: int) -> Float:
     """Mean SSIM (mi.Float, width 1) of two images given as planes (mi.Float, raster order) in [0, 1].
 
     Window 11×11, σ = 1.5, zero padding, mean over pixels and planes: the definition that 3DGS trains with.
@@ -52,13 +52,13 @@ def ssim(x: Sequence[Any], y: Sequence[Any], width: int, height: int) -> Any:
 
 
 def _blur(
-    sources: Sequence[Any],
+    sources: Sequence[Float],
     width: int,
     height: int,
     axis: int,
-    derive: Callable[[list[Any]], list[Any]] = list,
-    finish: Callable[[list[Any], Any, Any], list[Any]] = lambda totals, pixel, inside: totals,
-) -> list[Any]:
+    derive: Callable[[list[Float]], list[Float]] = list,
+    finish: Callable[[list[Float], Float, Float], list[Float]] = lambda totals, pixel, inside: totals,
+) -> list[Float]:
     """Blur planes along x (axis 0) or y (axis 1), evaluated.
 
     `derive` makes the values to blur of what is read at a pixel; `finish` makes the planes to return of the
@@ -71,7 +71,7 @@ def _blur(
     first = run * RUN
     pixel = line * width + first if axis == 0 else first * width + line
     weights = window()
-    totals: list[list[Any]] = [[] for _ in range(RUN)]
+    totals: list[list[Float]] = [[] for _ in range(RUN)]
     for k in range(-WINDOW_RADIUS, RUN + WINDOW_RADIUS):
         # A place left of the image wraps to a huge unsigned number, so one comparison guards both ends.
         inside = first + mi.UInt32(k % 2**32) < size
@@ -81,7 +81,7 @@ def _blur(
             weight = weights[k - r + WINDOW_RADIUS]
             before = totals[r] or [mi.Float(0)] * len(values)
             totals[r] = [dr.fma(value, weight, total) for value, total in zip(values, before, strict=True)]
-    planes: list[Any] = []
+    planes: list[Float] = []
     for r in range(RUN):
         here, inside = pixel + r * stride, first + r < size
         results = finish(totals[r], here, inside)
@@ -92,14 +92,14 @@ def _blur(
     return planes
 
 
-def _moments(values: list[Any]) -> list[Any]:
+def _moments(values: list[Float]) -> list[Float]:
     """(x₁…, y₁…) → (x₁…, y₁…, x₁² + y₁²…, x₁ y₁…)."""
     x, y = values[: len(values) // 2], values[len(values) // 2 :]
     squares = [a * a + b * b for a, b in zip(x, y, strict=True)]
     return [*x, *y, *squares, *(a * b for a, b in zip(x, y, strict=True))]
 
 
-def _similarity(blurred: list[Any], pixel: Any, inside: Any) -> list[Any]:
+def _similarity(blurred: list[Float], pixel: Float, inside: Float) -> list[Float]:
     """S summed over planes, then ∂S/∂μx, ∂S/∂q and ∂S/∂p of each, from what `_moments` gives."""
     planes = len(blurred) // 4
     μx, μy, q, p = (blurred[i * planes : (i + 1) * planes] for i in range(4))
@@ -117,18 +117,18 @@ def _similarity(blurred: list[Any], pixel: Any, inside: Any) -> list[Any]:
 
 
 @_replayed
-def _forward(x: list[Any], y: list[Any], width: int, height: int) -> list[Any]:
+def _forward(x: list[Float], y: list[Float], width: int, height: int) -> list[Float]:
     """What `_similarity` gives at every pixel."""
     rows = _blur([*x, *y], width, height, 0, derive=_moments)
     return _blur(rows, width, height, 1, finish=_similarity)
 
 
 @_replayed
-def _gradient(x: list[Any], y: list[Any], slopes: list[Any], width: int, height: int) -> list[Any]:
+def _gradient(x: list[Float], y: list[Float], slopes: list[Float], width: int, height: int) -> list[Float]:
     """∂(mean S)/∂x per plane, from the slopes of `_similarity`."""
     planes = len(x)
 
-    def combine(blurred: list[Any], pixel: Any, inside: Any) -> list[Any]:
+    def combine(blurred: list[Float], pixel: Float, inside: Float) -> list[Float]:
         by_mean, by_square, by_product = (blurred[i * planes : (i + 1) * planes] for i in range(3))
         a, b = ([dr.gather(mi.Float, plane, pixel, inside) for plane in image] for image in (x, y))
         return [
@@ -141,13 +141,13 @@ def _gradient(x: list[Any], y: list[Any], slopes: list[Any], width: int, height:
 
 
 class _Ssim(dr.CustomOp):
-    def eval(self, x: list[Any], y: list[Any], width: int, height: int) -> Any:
+    def eval(self, x: list[Float], y: list[Float], width: int, height: int) -> Float:
         dr.make_opaque(x, y)  # a literal would be another recording
         self.x, self.y, self.size = x, y, (width, height)
         value, *self.slopes = _forward(x, y, width, height)
         return dr.sum(value) / (len(x) * width * height)
 
-    def gradient(self) -> list[Any]:
+    def gradient(self) -> list[Float]:
         """∂(mean S)/∂x per plane."""
         return _gradient(self.x, self.y, self.slopes, *self.size)
 

@@ -1,4 +1,4 @@
-"""The surface of surfels, as a mesh of the depth that training views show, and what a fit looks up on it."""
+"""Mesh of the surfels' surface, fused from rendered depth, and the occluder's caches."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def surface_of(
     around: Surfels | None = None,
     region: Region | None = None,
 ) -> Mesh:
-    """The mesh of the depth rendered in all cameras, fused in `resolution` voxels along the longest side.
+    """Fuse the depth rendered in all cameras, with `resolution` voxels along the longest side, into a mesh.
 
-    With a region of both surfels and those `around` them, in all of space by the region's contraction, so
-    many voxels along its diameter.
+    With a `region` and background surfels `around`, in all of space by the region's contraction, with
+    `resolution` voxels along its diameter.
     """
     points = surfels.to_numpy()["position"]
     if around is None or region is None:
@@ -55,8 +55,8 @@ def surface_of(
 def update_missing_caches(
     occluder: Occluder, surfels: Surfels, environment: EnvironmentLight | None, shading: Shading
 ) -> None:
-    """Give an occluder what the shading asks for and what it lacks: all of it for a new mesh, the surfels of
-    its vertices also after an edit of the table. It stays as it is until the next of these.
+    """Compute the caches that the shading requires and the occluder lacks: all for a new mesh, the surfels at
+    its vertices also after surfels were added or removed.
     """
     if shading.ambient_rays and occluder.ambient is None:
         update_occluder_caches(occluder, surfels, shading.light_of(environment), shading)

@@ -21,13 +21,13 @@ from mi_refgs.splat import Camera
 from mi_refgs.types import Bool, Float
 
 BUDGET = 2**30
-"""Bytes of targets that stay on the device: a thousand pictures of 200², or ten of 2000²."""
+"""Bytes of targets that stay on the device: a thousand images of 200², or ten of 2000²."""
 PIXEL_BYTES = 4 * 4 + 3
-"""Bytes of a pixel of a target: three colours and alpha as float32, and where each colour is clipped."""
+"""Bytes per pixel of a target: three colours and alpha as float32, and a mask per colour."""
 
 
 def bytes_of(method: Method, views: int, pixels: int) -> float:
-    """Memory of a fit to so many images of so many pixels each."""
+    """Memory, in bytes, of a fit to so many images of so many pixels each."""
     surfels = method.surfels.max_count
     surfels += method.surroundings.max_count if method.surroundings is not None else 0
     images = min(views * pixels * 12, CACHE_BYTES) + min(views * pixels * PIXEL_BYTES, BUDGET)
@@ -35,7 +35,7 @@ def bytes_of(method: Method, views: int, pixels: int) -> float:
 
 
 def require_memory(method: Method, data: Dataset) -> None:
-    """Raise InputError if the fit would not fit into memory."""
+    """Raise InputError if the fit requires more memory than there is."""
     pixels = max((view.width * view.height for view in data.views), default=0)
     what = f"fit: images of {pixels:,} pixels, {method.surfels.max_count:,} surfels at most"
     remedy = "read them smaller with --set data.downscale=N, or lower surfels.max_count"
@@ -43,10 +43,8 @@ def require_memory(method: Method, data: Dataset) -> None:
 
 
 def read_views(method: Method, path: Path, split: str, truth: bool = True, decode: bool = True) -> Dataset:
-    """A split of the data set at `path` as the method asks for its pictures; the others as in `read_dataset`.
-
-    Raises InputError as `read_dataset` does.
-    """
+    """Read a split of a data set with the image options of a method; raises InputError as `read_dataset`
+    does."""
     options = method.data
     return read_dataset(
         path,
@@ -83,7 +81,7 @@ class Target:
 
 
 class Targets:
-    """Targets by the index of their view; those that were used last stay on the device."""
+    """Targets by the index of their view; the most recently used ones stay on the device."""
 
     def __init__(self, data: Dataset, options: DataOptions, budget: int = BUDGET) -> None:
         self.data, self.options, self.budget = data, options, budget
@@ -103,7 +101,7 @@ class Targets:
         return self._target(index, 1)
 
     def at(self, iteration: int, index: int) -> Target:
-        """What a (1-based) iteration is fitted to: the picture of a view, of the size that is due."""
+        """The target of a view in a (1-based) iteration, whose images may be coarse."""
         return self._target(index, self.options.block_at(iteration))
 
     def _target(self, index: int, block: int) -> Target:

@@ -1,4 +1,4 @@
-"""What a profile suggests: each sentence follows from a number that was measured, and names it."""
+"""Advice from a profile: sentences that follow from a measurement, and state it."""
 
 from __future__ import annotations
 
@@ -8,25 +8,26 @@ from mi_refgs.methods.method import Method
 from mi_refgs.profiling.profile import FAINT, Profile, StageProfile
 
 LOW_SHARE = 0.25
-"""Contributing share of the evaluations below which it is worth asking why."""
+"""Fraction of contributing evaluations below which there is advice."""
 THIN = 5.0
+"""Length over width of a thin surfel."""
 MANY = 0.3
-"""A share of surfels that is more than a few."""
+"""Fraction of the surfels from which there is advice."""
 HEAVY = 0.25
-"""A share of a step that is more than a detail."""
+"""Fraction of a step from which there is advice."""
 CROWDED = 0.5
-"""Share of the machine's memory above which it becomes tight."""
+"""Fraction of the machine's memory above which there is advice."""
 SMALLEST_LIGHT = 32
-"""Rows of the light below which its filter no longer matters."""
+"""Rows of the light up to which its filter is cheap."""
 
 
 def advice(found: Profile, method: Method) -> list[str]:
-    """Sentences, the same one only once; empty where nothing stands out."""
+    """Sentences without repetitions."""
     lines = [*_of_work(found), *(line for stage in found.stages for line in _of_stage(stage, found, method))]
     if found.allocated > CROWDED * found.physical:
         lines.append(
             f"A step held {found.allocated / 2**30:.1f} of the machine's {found.physical / 2**30:.1f} GiB: "
-            "use smaller pictures (--set data.downscale=2) or fewer surfels (surfels.max_count)."
+            "use smaller images (--set data.downscale=2) or fewer surfels (surfels.max_count)."
         )
     return list(dict.fromkeys(lines))
 
@@ -42,14 +43,14 @@ def _of_work(found: Profile) -> Iterator[str]:
     if work.single_share > MANY:
         yield (
             f"{work.single_share:.0%} of the surfels that are seen never cover more than one pixel: they are "
-            "smaller than the pictures can show; train with fewer (--set surfels.max_count)."
+            "smaller than the images can resolve; train with fewer (--set surfels.max_count)."
         )
     if work.share >= LOW_SHARE:
         return
     low = f"Only {work.share:.0%} of the evaluated surfel-pixel pairs contribute"
     if work.faint_share > MANY:
         yield (
-            f"{low}, and {work.faint_share:.0%} of the surfels are of an opacity below {FAINT:g}: prune them "
+            f"{low}, and {work.faint_share:.0%} of the surfels have an opacity below {FAINT:g}: prune them "
             "earlier (--set refine.prune_opacity=0.1)."
         )
     if work.aspect > THIN:
@@ -81,8 +82,8 @@ def _of_stage(stage: StageProfile, found: Profile, method: Method) -> Iterator[s
     lists = of("tile lists", "sort")
     if lists > splat:
         yield (
-            f"Stage {stage.name}: listing and sorting takes {lists:.1f} ms, more than splatting "
-            f"({splat:.1f} ms), for {found.work.pairs / max(found.work.surfels, 1):.0f} tiles a surfel: "
+            f"Stage {stage.name}: listing and sorting take {lists:.1f} ms, more than splatting "
+            f"({splat:.1f} ms), for {found.work.pairs / max(found.work.surfels, 1):.0f} tiles per surfel: "
             "large, faint surfels do that (--set refine.prune_opacity, refine.prune_extent)."
         )
     if of("ssim forward", "loss backward") > HEAVY * whole and method.loss.ssim:

@@ -1,7 +1,7 @@
-"""Where the time of a training step goes: wall time by phase, between barriers.
+"""Wall time of a training step by phase, between barriers.
 
 The clock listens to the hooks of `mi_refgs.kernels.timing`. The backward pass is one call of Dr.Jit:
-identities at the boundaries between phases tell the clock which one the pass has come to.
+identities at the boundaries between phases notify the clock of the phase that the pass has reached.
 """
 
 from __future__ import annotations
@@ -33,15 +33,16 @@ PHASES = (
     "optimiser",
     "rest",
 )
-"""Every phase, in the order of a step. `shade forward` and `shade backward` are those of shading at pixels;
-shading at surfels goes back in `surfels backward`, with the projection. `rest`: whatever no other covers."""
+"""Every phase, in the order of a step. `shade forward` and `shade backward` are those of deferred shading;
+the adjoint of forward shading is in `surfels backward`, with the projection. `rest`: all that no other
+covers."""
 
 WARM_UP = 4
-"""Steps with barriers before the first that counts: a kernel that ends at a barrier is compiled anew."""
+"""Steps with barriers before the first measured one: a kernel that ends at a barrier is compiled anew."""
 
 
 class PhaseClock:
-    """Books wall time under the innermost phase; a `timing.Listener`."""
+    """Sums wall time by innermost phase; a `timing.Listener`."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
@@ -49,7 +50,7 @@ class PhaseClock:
         self._since = 0.0
 
     def call(self, phase: str, function: Callable[[], Any], arguments: Any = ()) -> Any:
-        """Evaluate the arguments, which are not the phase's own time; run, evaluate, wait, book."""
+        """Evaluate the arguments, whose time is not the phase's; run the function, wait, and add the time."""
         dr.eval(arguments)
         outer = self._phase
         self._enter(phase)
@@ -61,7 +62,7 @@ class PhaseClock:
         return result
 
     def boundary(self, value: Any, phase: str) -> Any:
-        """The value, with identities on all that carries derivatives."""
+        """The value, with identities on everything under AD."""
         leaves: list[Any] = []
 
         def collect(leaf: Any) -> Any:
@@ -85,7 +86,7 @@ class PhaseClock:
 
 
 class _Boundary(dr.CustomOp):
-    """Identity that tells when derivatives pass it on their way back."""
+    """Identity that calls a function when the backward pass reaches it."""
 
     def eval(self, values: list[Any], reached: Callable[[], None]) -> list[Any]:
         self.reached = reached
@@ -102,7 +103,7 @@ class _Boundary(dr.CustomOp):
 
 
 def _map(value: Any, change: Callable[[Any], Any]) -> Any:
-    """The value with every Dr.Jit array in it changed."""
+    """Apply a function to every Dr.Jit array in a value."""
     if dr.is_array_v(value):
         return change(value)
     if isinstance(value, list | tuple):
@@ -118,9 +119,9 @@ def _map(value: Any, change: Callable[[Any], Any]) -> Any:
 def phase_times(
     step: Callable[[], Any], steps: int, before: Callable[[], None] = lambda: None
 ) -> dict[str, float]:
-    """Median milliseconds of a step by phase, in the order of PHASES; `before` is called ahead of every one.
+    """Median milliseconds of a step by phase, in the order of PHASES; `before` is called before each step.
 
-    There are barriers between phases. The sum is more than a step takes, where kernels fuse across phases.
+    The sum exceeds the time of a step if kernels fuse across phases, since there are barriers in between.
     """
     rows = []
     for _ in range(WARM_UP + steps):

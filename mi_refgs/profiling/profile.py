@@ -1,4 +1,4 @@
-"""What a training step costs on a scene of the user's, and what would make it cheaper."""
+"""Cost of training steps and images on a scene: times, kernel launches, and the work of splatting."""
 
 from __future__ import annotations
 
@@ -20,30 +20,26 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera, Footprints, TileLists, list_by_tile, project
 from mi_refgs.splat.lanes import advance
 from mi_refgs.surfels.attributes import sigmoid
+from mi_refgs.types import UInt32
 
 
 @dataclass(frozen=True)
 class Counts:
-    """What the splatter has to do for one view, in numbers of things."""
+    """Splatting work of one view."""
 
     surfels: int
     pixels: int
-    tile_pixels: int  # of a tile
+    tile_pixels: int  # per tile
     pairs: int  # surfel-tile pairs listed
-    visited: int  # of these, those that a tile came to before all of its pixels had ended
+    visited: int  # pairs that a tile reached before all of its pixels had ended
     contributing: int  # surfel-pixel pairs with α ≥ ALPHA_MIN, before the pixel's end
     covered: int  # pixels with a contribution
-    pixels_of_surfel: Any  # mi.UInt32 (N,): at how many pixels a surfel contributes
+    pixels_of_surfel: UInt32  # (N,) pixels to which a surfel contributes
 
     @property
     def evaluated(self) -> int:
         """Surfel-pixel evaluations: a visited pair is evaluated at every pixel of its tile at once."""
         return self.visited * self.tile_pixels
-
-    @property
-    def share(self) -> float:
-        """Share of the evaluated pairs that contribute."""
-        return self.contributing / max(self.evaluated, 1)
 
 
 def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
@@ -80,7 +76,7 @@ def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
     state = (begin, inside, mi.Float(1), mi.UInt32(0), mi.UInt32(0))
     _, _, _, steps, hits = dr.while_loop(state, condition, body, label="count")
     dr.eval(steps, hits, pixels_of_surfel)
-    # A tile goes on until the last of its pixels has ended.
+    # A tile continues until the last of its pixels has ended.
     visited = dr.sum(dr.block_reduce(dr.ReduceOp.Max, steps, width * height))
     return Counts(
         surfels=surfels,
@@ -95,12 +91,11 @@ def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
 
 
 SIZES = (200, 400, 800)
-"""Pixels along the longer side of a picture."""
+"""Pixels along the longer side of an image."""
 ROUNDS = 9
-"""Pictures of each kind that are timed, one after the other in turns: what else the machine does then slows
-all kinds alike."""
+"""Timed images of each kind, in turns, so that other load of the machine slows all kinds equally."""
 FRAME_WARM_UP = 2
-"""Rounds before the first that counts: they compile kernels."""
+"""Rounds before the first measured one: they compile kernels."""
 
 Draw = Callable[[Camera, Collection[str]], Frame]
 """Renders a view with the AOVs of these names."""
@@ -108,23 +103,23 @@ Draw = Callable[[Camera, Collection[str]], Frame]
 
 @dataclass(frozen=True)
 class FrameProfile:
-    """Pictures of one size."""
+    """Time of images of one size."""
 
     width: int
     height: int
-    frame_ms: float  # radiance and alpha alone, median
-    aovs_ms: dict[str, float]  # what each AOV alone adds, median of the differences in a round
+    frame_ms: float  # radiance and alpha only, median
+    aovs_ms: dict[str, float]  # added by each AOV, median of the differences in a round
 
 
 def aovs_of(frame: Frame) -> list[str]:
-    """The AOVs that a frame with all of them has, apart from alpha, which every frame has."""
-    # A term that the model does not have is a single zero.
+    """The AOVs of a frame that has all, without alpha, which every frame has."""
+    # Terms that the model lacks are a single zero.
     terms = {} if frame.terms is None else frame.terms.known()
     return [*frame.maps, "normal", "depth", *(name for name, term in terms.items() if dr.width(term) > 1)]
 
 
 def profile_frame(draw: Draw, names: Collection[str], camera: Camera, rounds: int = ROUNDS) -> FrameProfile:
-    """Time the picture of a camera alone and with each of the named AOVs, in turns."""
+    """Time the image of a camera without AOVs and with each of the named ones, in turns."""
     plain: list[float] = []
     more: dict[str, list[float]] = {name: [] for name in names}
     for _ in range(FRAME_WARM_UP + rounds):
@@ -149,32 +144,32 @@ def _seconds(draw: Draw, camera: Camera, names: Collection[str]) -> float:
 
 
 WARM_UP = 4
-"""Steps before the first that counts: they compile kernels."""
+"""Steps before the first measured one: they compile kernels."""
 VIEWS = 8
-"""Training views whose work is counted, at most."""
+"""Most training views whose work is counted."""
 FAINT = 0.1
-"""Opacity below which a surfel counts as faint: more than twenty such are needed to hide what is behind."""
+"""Opacity below which a surfel counts as faint: more than twenty such are required for an opaque pixel."""
 
 
 @dataclass(frozen=True)
 class StageProfile:
-    """A step of one stage of the schedule."""
+    """Cost of a step in one stage of the schedule."""
 
     name: str
     step_ms: float  # median of undisturbed steps
-    launches: int  # kernels a step
+    launches: int  # kernels per step
     misses: int  # kernels compiled in all warm steps together
     phases_ms: dict[str, float]  # by `profiling.phases`, between barriers
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a view costs, as the mean over training views; shares are between 0 and 1."""
+    """Splatting work per view, mean over training views; shares are between 0 and 1."""
 
     views: int
     surfels: int
     pixels: float
-    tile_pixels: float  # of a tile
+    tile_pixels: float  # per tile
     covered: float  # pixels with a contribution
     pairs: float  # surfel-tile pairs listed
     evaluated: float  # surfel-pixel evaluations
@@ -193,19 +188,19 @@ class Work:
 
 @dataclass(frozen=True)
 class Profile:
-    """All that was measured."""
+    """Result of `profile`."""
 
     stages: tuple[StageProfile, ...]
     work: Work
-    allocated: int  # bytes: the most that Dr.Jit held
-    physical: int  # bytes: what the machine has
+    allocated: int  # bytes, peak of Dr.Jit
+    physical: int  # bytes of the machine
 
 
 def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
     """Measure `steps` steps of each named stage of the schedule, twice, and count the work of some views.
 
-    The steps are real and change the trainer's state; nothing is refined, extracted or saved meanwhile.
-    Raises InputError if there is no surfel to draw.
+    The steps change the trainer's state; nothing is refined, extracted or saved. Raises InputError without
+    surfels.
     """
     if trainer.surfels.count == 0:
         raise InputError(f"{trainer.data.path}: surfels: none are left; profile an earlier run or a data set")
@@ -224,7 +219,7 @@ def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
 
 
 def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
-    """Times, launches and cache misses of steps in one stage of the schedule."""
+    """Measure times, launches and cache misses of steps in one stage of the schedule."""
     with trainer.held_in_stage(name) as prepare:
         for _ in range(WARM_UP):
             prepare()
@@ -242,17 +237,11 @@ def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
         prepare()
         launches = _launches(trainer.step)
         stages = phase_times(trainer.step, max(steps // 3, 5), prepare)
-    return StageProfile(
-        name=name,
-        step_ms=1e3 * float(np.median(times)),
-        launches=launches,
-        misses=misses,
-        phases_ms=stages,
-    )
+    return StageProfile(name, 1e3 * float(np.median(times)), launches, misses, stages)
 
 
 def _launches(call: Callable[[], None]) -> int:
-    """Kernels that a call launches, replayed ones too (Dr.Jit's own count leaves those out)."""
+    """Kernels that a call launches, including replayed ones, which Dr.Jit's own count leaves out."""
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         call()
@@ -261,7 +250,7 @@ def _launches(call: Callable[[], None]) -> int:
 
 
 def count_work(trainer: Trainer) -> Work:
-    """Mean work of up to VIEWS training views."""
+    """Count the mean work of up to VIEWS training views."""
     surfels = trainer.surfels.detach()
     chosen = np.linspace(0, len(trainer.targets) - 1, min(VIEWS, len(trainer.targets))).astype(int)
     counts: list[Counts] = []
@@ -284,15 +273,11 @@ def count_work(trainer: Trainer) -> Work:
     def of_seen(values: np.ndarray, summary: Callable[[np.ndarray], Any] = np.mean) -> float:
         return float(summary(values[seen])) if seen.any() else 0.0
 
+    means = ("pixels", "tile_pixels", "covered", "pairs", "evaluated", "contributing")
     return Work(
         views=len(chosen),
         surfels=surfels.count,
-        pixels=mean("pixels"),
-        tile_pixels=mean("tile_pixels"),
-        covered=mean("covered"),
-        pairs=mean("pairs"),
-        evaluated=mean("evaluated"),
-        contributing=mean("contributing"),
+        **{name: mean(name) for name in means},
         unseen_share=float(1 - seen.mean()),
         single_share=of_seen(largest == 1),
         faint_share=of_seen(sigmoid(opacity[:, 0]) < FAINT),

@@ -1,1 +1,1 @@
-"""The run folder: its files, checkpoints, interruption, and what is exported from it."""
+"""The run folder: its files, checkpoints and artefacts."""

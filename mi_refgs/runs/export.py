@@ -1,14 +1,14 @@
-"""The artefacts of a run, which need nothing of ours to be read.
+"""The artefacts of a run, which other programs can read.
 
-    surfels.ply   raw channels, with 2DGS's property names: the object
-    envmap.exr    lat-long radiance, Mitsuba's orientation
-    mesh.ply      the occluder
-    surroundings.ply  what is around the object, likewise, with radiance_sh alone
-    background.exr    what is behind everything, lat-long radiance
-    scene.xml     what `mi.load_file` renders
-    model.json    the iteration and the seconds that they stand for, and how they are shaded
+    surfels.ply       the object: raw attributes, with 2DGS's property names
+    envmap.exr        the environment map: lat-long radiance, Mitsuba's orientation
+    mesh.ply          the occluder
+    surroundings.ply  the background Gaussians, like surfels.ply, with radiance_sh only
+    background.exr    the background map, lat-long radiance
+    scene.xml         the scene for `mi.load_file`
+    model.json        iteration and training seconds of these files, and the shading options
 
-What a method does not have (a light, a mesh), and surroundings of pictures with alpha, have no file.
+Files of what a method does not model are absent.
 """
 
 from __future__ import annotations
@@ -50,19 +50,19 @@ def export(
     more: Sequence[Camera] = (),
     output: OutputFolder | None = None,
 ) -> list[Path]:
-    """Write the artefacts into `folder`, each whole or not at all; returns their paths.
+    """Write the artefacts into `folder`, each atomically; returns their paths.
 
-    `camera` becomes the sensor of scene.xml, and `more` the next ones. `output` says whose artefacts they
-    are, by default those of a run in `folder`. Raises BusyError for a run that another process trains;
-    InputError, with nothing changed, where a file of another owner has the name of an artefact; and if a
-    file cannot be written or a value is not finite.
+    `camera` and `more` become the sensors of scene.xml. `output` says whose artefacts they are, by default
+    those of a run in `folder`. Raises BusyError for a run that another process trains; InputError, with
+    nothing changed, where a file of another owner has the name of an artefact; and if a file cannot be
+    written or a value is not finite.
     """
     with Run(folder).alone():
-        return _export(fitted, folder, camera, more, output or Run(folder).output)
+        return _export(fitted, folder, [camera, *more], output or Run(folder).output)
 
 
 def _export(
-    fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Camera], output: OutputFolder
+    fitted: TrainedScene, folder: Path, cameras: Sequence[Camera], output: OutputFolder
 ) -> list[Path]:
     light = LIGHT_MAP if fitted.light is not None else None
     mesh = MESH if fitted.mesh is not None else None
@@ -81,8 +81,8 @@ def _export(
         write_ply(folder / AROUND_FILE, fitted.surroundings.surfels)
         if fitted.surroundings.background is not None:
             fitted.surroundings.background.write(folder / BACKGROUND_MAP)
-    # Transparent without surroundings: pictures with alpha are composited after the sRGB encoding, which no
-    # scene can say. Behind surroundings without a map it is black, as `render` has it.
+    # Transparent without a background: images with alpha are composited after the sRGB encoding, which a
+    # scene file cannot express. Without a background map it is black, as in `render`.
     black = (0.0, 0.0, 0.0) if around is not None and behind is None else None
     write_scene_xml(
         folder / SCENE,
@@ -90,18 +90,15 @@ def _export(
         envmap=light,
         mesh=mesh,
         shading=fitted.shading,
-        camera=camera,
-        more=more,
+        camera=cameras[0],
+        more=cameras[1:],
         surroundings=around,
         background=behind or black,
         remark="" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels",
     )
-    # Written last: where it is, the other files are complete.
-    note: dict[str, Any] = {
-        "iteration": fitted.iteration,
-        "seconds": fitted.seconds,
-        "surfels": fitted.surfels.count,
-    }
+    # Written last: if it is there, the other files are complete.
+    note: dict[str, Any] = {"iteration": fitted.iteration, "seconds": fitted.seconds}
+    note["surfels"] = fitted.surfels.count
     if fitted.pruned is not None:
         note["pruned"] = dataclasses.asdict(fitted.pruned)
     write_json(folder / MODEL, note | {"shading": dataclasses.asdict(fitted.shading)}, indent=2)
@@ -109,7 +106,7 @@ def _export(
 
 
 def load_if_newer(run: Run, method: Method) -> TrainedScene | None:
-    """What the newest checkpoint holds, if there is one that the artefacts do not already show."""
+    """The scene of the newest checkpoint, if it is newer than the artefacts."""
     shown = -1
     if (run.path / SURFELS).is_file():
         with contextlib.suppress(ValueError, KeyError, TypeError, OverflowError):
@@ -123,9 +120,9 @@ def load_if_newer(run: Run, method: Method) -> TrainedScene | None:
 
 
 def newest(run: Run, method: Method) -> TrainedScene:
-    """What a run holds, of its newest checkpoint where the artefacts are older; writes nothing.
+    """The scene of the newest checkpoint or of newer artefacts; writes nothing.
 
-    A mesh that only other programs use is there, too. Raises InputError as `TrainedScene.read` does.
+    It has the mesh even if shading does not use it. Raises InputError as `TrainedScene.read` does.
     """
     fresh = load_if_newer(run, method)
     if fresh is not None:
@@ -143,10 +140,10 @@ def _no_artefacts(run: Run) -> InputError:
 
 
 def up_to_date(run: Run, method: Method, camera: Camera | Callable[[TrainedScene], Camera]) -> TrainedScene:
-    """The artefacts of a run, written first if there are none or the newest checkpoint is newer.
+    """Read the artefacts of a run, after writing them if there are none or the newest checkpoint is newer.
 
-    Of a run that another process trains, the newest checkpoint, and nothing is written. `camera` is that of
-    scene.xml, or chooses one for what is written. Raises InputError if there is nothing to write them from.
+    If another process trains the run, returns the newest checkpoint and writes nothing. `camera` is that of
+    scene.xml, or chooses one for a scene. Raises InputError if there is neither artefact nor checkpoint.
     """
     fresh = load_if_newer(run, method)
     if fresh is not None:
@@ -170,12 +167,13 @@ def save(
     region: Region | None = None,
     records: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Write a scene as a run folder, which every command that takes a run reads; returns its artefacts.
+    """Write a scene that was not fitted here (edited, imported, relit, copied) as a run folder.
 
-    `camera` and `more` become the sensors of scene.xml; `data` is the data set of its test views, and
-    `region` that of interest; `records` are JSON files by name. config.toml is written last: where it is, the
-    folder is complete. Raises InputError for a folder that holds a run, has a foreign file in the way or
-    cannot be written, and for a value that is not finite.
+    It has no checkpoints, logs and previews. Returns its artefacts. `camera` and `more` become the sensors of
+    scene.xml; `data` is the data set of its test views, `region` the region of interest; `records` are JSON
+    files by name. config.toml is written last: if it is there, the folder is complete. Raises InputError for
+    a folder that contains a run, has a foreign file in the way or cannot be written, and for a value that is
+    not finite.
     """
     run = Run(folder)
     if run.exists():

@@ -17,10 +17,10 @@ class TerminatedError(KeyboardInterrupt):
 def held_interrupts() -> Iterator[Callable[[], None]]:
     """Delay the first Ctrl-C or SIGTERM, and yield a function that raises it; a second one is not delayed.
 
-    Raised are KeyboardInterrupt and TerminatedError. A state that is saved in the middle of a step
-    (parameters moved, refinement or the mesh still due) could not be resumed to the same result. Outside the
-    main thread, where Python delivers no signals, nothing is delayed; nor is a signal that the process was
-    started to ignore, or that code outside Python handles.
+    It raises KeyboardInterrupt or TerminatedError. A state that is saved in the middle of a step (parameters
+    moved, refinement or the mesh still due) could not be resumed to the same result. Nothing is delayed
+    outside the main thread, where Python delivers no signals; nor is a signal that the process ignores, or
+    that code outside Python handles.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None

@@ -1,4 +1,4 @@
-"""A trained scene as materials alone, which any light may shine on."""
+"""Conversion of a fitted scene to materials that any light can illuminate."""
 
 from __future__ import annotations
 
@@ -29,34 +29,33 @@ from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
 
 COSINE_LOBE = (1.0, 2 / 3, 1 / 4, 0.0)
-"""Factors by degree that turn harmonics into their cosine-weighted mean over a hemisphere. [Ramamoorthi and
-Hanrahan 2001, eq. 8, over π]"""
+"""Factors by SH degree for the cosine-weighted mean over a hemisphere. [Ramamoorthi and Hanrahan 2001, eq. 8,
+over π]"""
 IRRADIANCE_FLOOR = 1e-4
-"""Share of the light's brightest irradiance: below, a surfel is dark whatever its albedo."""
+"""Fraction of the brightest irradiance below which a surfel is dark whatever its albedo."""
 RELIGHT_RAYS = 16
-"""Rays of the lobe of each pixel. Two balls of known materials, relit at 128² and 2 × 2 samples, are 33.6 dB
-from the path tracer's with one, 34.2 with 4, 34.4 with 16 and 34.5 with 64 rays."""
+"""Specular-lobe samples per pixel. PSNR of two balls of known materials, relit at 128² with 2 × 2 samples,
+against the path tracer: 33.6 dB with one, 34.2 with 4, 34.4 with 16 and 34.5 with 64."""
 RELIGHT_BOUNCES = 2
-"""Times that what these rays hit is shaded. Of the self-reflecting instances of `benchmarks.visibility`, two
-bounces leave 9 % of the light in a bowl unaccounted for, one 27 %, four 3 %."""
+"""Traced bounces. In a self-reflecting bowl of `benchmarks.visibility`, one bounce misses 27 % of the light,
+two 9 %, four 3 %."""
 AMBIENT_RAYS = 128
-"""Rays of each vertex of the mesh."""
+"""Rays per vertex of the mesh."""
 
 
 def lacking(scene: TrainedScene) -> str:
-    """What a scene lacks to be `relightable`: some materials or a light, by name; nothing if it is."""
+    """Names of the materials, or "light", that a scene lacks to be `relightable`; empty if it is."""
     missing = [name for name in MATERIALS if not scene.surfels.has(name)]
     return ", ".join(missing) or ("light" if scene.light is None else "")
 
 
 def relightable(scene: TrainedScene) -> TrainedScene:
-    """The scene with albedo, metallic and roughness alone, shaded by whatever light it is given.
+    """Reduce a scene to albedo, metallic and roughness, so that any light can replace its own.
 
-    A diffuse part that was fitted as a colour of its own ("sh") becomes an albedo (`albedo_from_radiance`).
-    What is fitted to the light, the radiance and indirect channels, goes; light that other parts of the
-    object send is traced instead, where the scene has a mesh. The light stays, and so do other options of
-    accuracy. Surroundings go: they are as bright as they were photographed. A scene that has only materials
-    keeps them as they are.
+    A diffuse part that was fitted as an SH colour becomes an albedo (`albedo_from_radiance`). Attributes that
+    are fitted to the light (radiance, indirect) are removed; interreflection is traced instead, if the scene
+    has a mesh. The light stays, and so do other shading options. The background is removed: its brightness is
+    that of the photographs. A scene that has only materials keeps them as they are.
 
     Raises InputError for a scene without light or one of the materials.
     """
@@ -86,19 +85,19 @@ def relightable(scene: TrainedScene) -> TrainedScene:
 
 
 def _near(mesh: Mesh, surfels: Surfels) -> Mesh:
-    """The triangles in the box of the surfels: what is around them stands in no other light's way."""
+    """The triangles in the box of the surfels: the background must not shadow another light."""
     low, high = bounds_from_points(surfels.to_numpy()["position"])
     return mesh.of_vertices(np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1))
 
 
 def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> Surfels:
-    """The table with the diffuse radiance of each surfel as an albedo, under the light that it was fitted to.
+    """Convert the diffuse radiance of each surfel to an albedo, under the light that it was fitted to.
 
-    With R, the cosine-weighted mean of the radiance over the directions in front of a surfel, E, the light's
-    irradiance there, times what the mesh leaves of it (`shade.ambient`), and S, a dielectric's reflectance at
-    normal incidence, the diffuse albedo is R / ((1 - S) E), in 0 … 1; the table's albedo becomes
-    metallic albedo + (1 - metallic) that. Front is the mesh's outside, without a mesh that away from the
-    surfels' middle. Raises InputError without the channels radiance_sh, albedo, metallic and roughness.
+    R is the cosine-weighted mean of the radiance over the directions in front of a surfel, E the irradiance
+    there times the ambient visibility of the mesh (`shade.ambient`), S a dielectric's reflectance at normal
+    incidence. The diffuse albedo is R / ((1 - S) E), clipped to 0 … 1; the albedo becomes
+    metallic albedo + (1 - metallic) that. The front is the mesh's outside, or without a mesh the side away
+    from the centre of the surfels. Raises InputError without radiance_sh, albedo, metallic and roughness.
     """
     with dr.suspend_grad():
         surfels = surfels.cleaned()
@@ -124,7 +123,7 @@ def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> S
         found = with_shadows(1.0)
         if mesh is None or vertex is None:
             return found
-        # Light from other parts of the object has their albedo: that without shadows is near enough for it.
+        # Interreflection depends on the albedo of other parts: that without shadows is close enough.
         occluder = Occluder(mesh)
         occluder.set_materials(found)
         ratios = ambient(occluder, found, light, ShadingOptions(ambient_rays=AMBIENT_RAYS)).numpy()
@@ -137,7 +136,7 @@ def _rows(value: Any) -> np.ndarray:
 
 
 def outward(surfels: Surfels, mesh: Mesh | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Unit normals (N, 3) float32 of the surfels, turned outwards, and the nearest vertex (N) of the mesh."""
+    """Outward unit normals (N, 3) float32 of the surfels, and their nearest vertices (N) of the mesh."""
     normal = surfels.primitive.normal(surfels).numpy().T
     position = surfels.position().numpy().T
     vertex = None

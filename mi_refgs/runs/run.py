@@ -1,6 +1,6 @@
-"""The run folder: readable without this package, written atomically, resumable.
+"""The run folder: readable by other programs, written atomically, resumable.
 
-config.toml  dataset.json  metrics.jsonl  checkpoints/  previews/      written while it is fitted
+config.toml  dataset.json  metrics.jsonl  checkpoints/  previews/      written during the fit
 surfels.ply  envmap.exr  mesh.ply  scene.xml  model.json               by `runs.export`
 metrics.json  contact_sheet.png  eval/                                 by `evaluation`
 """
@@ -27,30 +27,23 @@ from mi_refgs.methods.read import dump, load_resolved
 from mi_refgs.runs import checkpoint
 
 DATASET = "dataset.json"
-"""What the run is fitted to: the data set's folder and its region of interest."""
+"""The folder of the data set, and its region of interest."""
 LOCK = ".refgs.lock"
-"""A file that is there, and locked, while a process changes the run."""
+"""A file that exists, and is locked, while a process changes the run."""
 LOG = "metrics.jsonl"
-"""The log of training; another log of a run is another .jsonl."""
+"""The training log; other logs of a run are other .jsonl files."""
 CONFIG = "config.toml"
 RUN_FILES = (
     *(CONFIG, DATASET, LOG, "curve.jsonl", "checkpoints/*.npz", "previews/*.png", "points.npz"),
-    *(
-        "surfels.ply",
-        "envmap.exr",
-        "mesh.ply",
-        "surroundings.ply",
-        "background.exr",
-        "scene.xml",
-        "model.json",
-    ),
+    *("surfels.ply", "envmap.exr", "mesh.ply", "surroundings.ply", "background.exr"),
+    *("scene.xml", "model.json"),
     *("exposure.json", "decisions.json", "edit.json", "preview.png"),
     *("metrics.json", "contact_sheet.png", "decomposition.png", "eval/*.png"),
     *("job.json", "failed.json", "job.log"),
 )
 """Patterns of all files that commands write into a run folder, relative to it."""
 CHECKPOINTS_KEPT = 2
-"""One could be enough, since a checkpoint appears only when complete; two survive a disk that lies."""
+"""One could be enough, since checkpoints are written atomically; two survive a disk that loses writes."""
 
 
 class Run:
@@ -61,11 +54,11 @@ class Run:
         self.output = OutputFolder(self.path, RUN, RUN_FILES, marker=CONFIG)
 
     def exists(self) -> bool:
-        """Whether the folder holds a run."""
+        """Whether the folder contains a run."""
         return (self.path / "config.toml").is_file()
 
     def require_none(self) -> None:
-        """Raise InputError if the folder holds a run already, or a foreign file where a run has its own."""
+        """Raise InputError if the folder contains a run, or a foreign file with the name of one of a run's."""
         if (self.path / CONFIG).exists():
             raise InputError(
                 f"{self.path}: holds a run already; add --resume to go on with it, or choose another -o"
@@ -73,9 +66,9 @@ class Run:
         self.output.require_free()
 
     def alone(self, wait: float = 0.0) -> AbstractContextManager[None]:
-        """Hold the run for changes; within it, raises BusyError if another process does for `wait` seconds.
+        """Lock the run for changes; raises BusyError if another process keeps it locked for `wait` seconds.
 
-        Whoever trains holds it, and whoever writes artefacts; a killed process holds nothing.
+        Training and writing artefacts lock it; the lock of a killed process is released.
         """
         return locked(
             self.path / LOCK,
@@ -87,7 +80,7 @@ class Run:
     def create(self, method: Method, dataset: str, region: Region | None = None) -> None:
         """Start a run on the data set in folder `dataset`, with this region of interest if there is one.
 
-        Raises InputError if the folder holds one already, has a foreign file in the way or cannot be written.
+        Raises InputError as `require_none` does, and if the folder cannot be written.
         """
         self.require_none()
         self._make_folders()
@@ -95,14 +88,14 @@ class Run:
         self.write_method(method)
 
     def write_dataset(self, dataset: str, region: Region | None) -> None:
-        """Write what the run is of: the folder of a data set, and its region of interest if there is one."""
+        """Write the folder of the data set, and its region of interest if there is one."""
         record: dict[str, Any] = {"path": dataset}
         if region is not None:
             record["region"] = asdict(region)
         write_bytes(self.output.own(DATASET), json.dumps(record).encode())
 
     def write_method(self, method: Method) -> None:
-        """Write the resolved method."""
+        """Write the resolved method to config.toml."""
         write_bytes(self.output.own(CONFIG), dump(method).encode())
 
     def method(self) -> Method:
@@ -118,10 +111,7 @@ class Run:
         return Path(read_json(self.path / DATASET)["path"])
 
     def region(self) -> Region | None:
-        """The region of interest that the run was started with; None where it records none.
-
-        Raises InputError for one that cannot be used.
-        """
+        """The region of interest that the run was started with; raises InputError if it cannot be used."""
         record = self.path / DATASET
         found = read_json(record).get("region") if record.is_file() else None
         return None if found is None else Region.of(found, record)
@@ -134,17 +124,16 @@ class Run:
         return sorted(path for path in found if path.stem.isdecimal())
 
     def save_checkpoint(self, iteration: int, state: dict[str, np.ndarray]) -> None:
-        """Save a state, then drop all but the newest CHECKPOINTS_KEPT; raises InputError if it cannot be
-        written."""
+        """Save a state, then remove all but the newest CHECKPOINTS_KEPT; raises InputError on failure."""
         write_bytes(self.output.own(f"checkpoints/{iteration:07d}.npz"), checkpoint.encode(state))
         own = self.output.owned("checkpoints/*.npz")
         for old in [path for path in self.checkpoints() if path in own][:-CHECKPOINTS_KEPT]:
             old.unlink(missing_ok=True)
 
     def load_checkpoint(self) -> dict[str, np.ndarray] | None:
-        """The newest checkpoint that is whole, or None if there is none yet; names damaged ones on stderr.
+        """The newest undamaged checkpoint, or None if there is none yet; names damaged ones on stderr.
 
-        Raises InputError if there are checkpoints and all are damaged: a fit is never begun anew unasked.
+        Raises InputError if all are damaged: a fit is never restarted unasked.
         """
         damaged = []
         for path in reversed(self.checkpoints()):
@@ -161,11 +150,10 @@ class Run:
         return None
 
     def rewind(self, iteration: int) -> None:
-        """Make the folder ready to go on after `iteration`: drops later checkpoints (`load_checkpoint` found
-        them damaged), later lines of the logs (*.jsonl), which a resumed run writes again, and what killed
-        processes left behind.
+        """Prepare the folder for continuing after `iteration`; raises InputError if it cannot be written.
 
-        Raises InputError if the folder cannot be written.
+        Removes later checkpoints (which are damaged), later lines of the logs (*.jsonl), which a resumed run
+        writes again, and temporary files of killed processes.
         """
         self._make_folders()
         for folder in (self.path, self.path / "checkpoints", self.path / "previews"):
@@ -182,7 +170,7 @@ class Run:
     # ---------------- logs ----------------
 
     def log(self, line: dict[str, Any], name: str = LOG) -> None:
-        """Append one JSON line with an `iteration` to a log, with null for a number that is not finite.
+        """Append a JSON line with an `iteration` to a log, with null for numbers that are not finite.
 
         Raises InputError if it cannot be written.
         """
@@ -212,7 +200,7 @@ class Run:
 
 
 def _logged(line: str) -> float:
-    """The iteration of a line of the log; infinity for half a line, which a killed process may leave."""
+    """The iteration of a line of the log; infinity for an incomplete line, which a killed process may leave."""
     try:
         return float(json.loads(line)["iteration"])
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError):

@@ -1,4 +1,4 @@
-"""A fitted scene, and the names of the files that contain it."""
+"""A fitted scene, and the names of its files."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ ARTEFACTS = (SURFELS, LIGHT_MAP, MESH, AROUND_FILE, BACKGROUND_MAP, SCENE, MODEL
 
 @dataclass(frozen=True)
 class Pruned:
-    """That a scene is not the whole fit, and how near its pictures are to the whole one's."""
+    """Record of a pruned scene: how close its images are to those of the whole fit."""
 
-    surfels: int  # of the whole
-    limit: float  # dB that the pictures of all training views had to keep
-    psnr: float  # dB, of the worst of them
+    surfels: int  # of the whole fit
+    limit: float  # PSNR, dB, that every training view had to reach
+    psnr: float  # dB, of the worst training view
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.limit) and math.isfinite(self.psnr)):
@@ -49,7 +49,7 @@ class Pruned:
 
 @dataclass(frozen=True, eq=False)
 class TrainedScene:
-    """What a fit has found: enough to render, and nothing that only training needs."""
+    """A fitted scene: all that rendering requires, and nothing that only training requires."""
 
     surfels: Surfels
     light: EnvironmentLight | None
@@ -57,12 +57,12 @@ class TrainedScene:
     shading: Shading
     iteration: int
     seconds: float  # spent training
-    pruned: Pruned | None = None  # absent: all that the fit has found
-    surroundings: Surroundings | None = None  # of pictures without alpha
+    pruned: Pruned | None = None  # absent: the whole fit
+    surroundings: Surroundings | None = None  # background Gaussians and map, of images without alpha
 
     @staticmethod
     def from_state(method: Method, state: Mapping[str, np.ndarray]) -> TrainedScene:
-        """Take the state of a `Trainer`, as a checkpoint holds it."""
+        """Convert the content of a checkpoint."""
         params = tensors(state, PARAMS)
         mesh = None
         if len(state.get("mesh/faces", ())):
@@ -81,7 +81,7 @@ class TrainedScene:
 
     @property
     def count(self) -> int:
-        """Surfels of the object and of what is around it."""
+        """Number of surfels of the object and the background."""
         return self.surfels.count + (0 if self.surroundings is None else self.surroundings.surfels.count)
 
     @staticmethod
@@ -126,15 +126,15 @@ class TrainedScene:
         return fitted
 
     def renderer(self, aovs: bool | Collection[str] = True, samples: int = 1) -> Callable[[Camera], Frame]:
-        """A function that renders views without derivatives, with these AOVs, all or by name.
+        """A function that renders views without derivatives, with these AOVs (all, or by name).
 
-        `samples` a pixel as in `render.samples`. Light and mesh are prepared once.
+        `samples` per pixel, as in `render.samples`. Light and mesh are prepared once.
         """
         draw = self.drawn()
         return lambda camera: draw(camera, aovs, samples)
 
     def drawn(self) -> Callable[..., Frame]:
-        """`renderer`, but what it is called with is a camera, the `aovs` and, if not 1, the `samples`."""
+        """Like `renderer`, for calls with a camera, `aovs` and, by default 1, `samples`."""
         require_supported_variant("TrainedScene.renderer")
         with dr.suspend_grad():
             light = self.shading.light_of(self.light)
