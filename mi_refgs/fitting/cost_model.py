@@ -54,7 +54,7 @@ def folder() -> Path:
 
 
 def kept(subject: dict[str, Any], measure: Callable[[], Speed]) -> Speed:
-    """The speed of `subject`, a machine and a method on it, from its file; otherwise measured, and written."""
+    """Read the speed of `subject`, a machine and a method, from its file; otherwise measure and write it."""
     key = hashlib.sha256(json.dumps(subject, sort_keys=True).encode()).hexdigest()[:24]
     path = folder() / f"speed-{key}.json"
     if (speed := _read(path, subject)) is not None:

@@ -50,7 +50,7 @@ MEMORY = 4096
 
 @dataclass(frozen=True)
 class Group:
-    """Learning rate of one tensor: from `rate` log-linearly to `final` in `steps` iterations, then constant."""
+    """Learning rate of one tensor: log-linear from `rate` to `final` in `steps` iterations, then constant."""
 
     rate: float  # per step, units of the raw tensor
     final: float | None = None  # None: constant
@@ -126,7 +126,7 @@ class Skips:
         self._marks.clear()
 
     def _marked(self, name: str) -> int:
-        """Rows of the marks that a tensor shares with others; 1 if its rows are wide, and not distinguished."""
+        """Rows of the marks that a tensor shares with others; 1 if its rows are wide."""
         rows, width = int(self._params[name].shape[0]), math.prod(self._params[name].shape[1:])
         return rows if width <= WIDE_ROW else 1
 

@@ -258,7 +258,7 @@ def estimate(
 
 
 def _blocks(method: Method, begin: int, end: int) -> list[tuple[int, int]]:
-    """Sides of the pixel blocks of coarse images in the iterations after `begin` to `end`, and their numbers."""
+    """Block sides of coarse images in the iterations after `begin` to `end`, and how many have each."""
     ends = sorted({end, *(coarse.until for coarse in method.data.coarse if begin < coarse.until < end)})
     return [
         (method.data.block_at(last), last - first)

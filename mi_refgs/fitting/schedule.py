@@ -52,7 +52,7 @@ class Schedule:
         return light is not None and (iteration % light.every == 0 or iteration in ends)
 
     def groups(self, extent: float, open_scene: bool = False) -> dict[str, Group]:
-        """Learning rates by parameter; `extent` in scene units; `open_scene`: with those of the background."""
+        """Learning rates by parameter; `extent` in scene units; `open_scene`: also of the background."""
         rates, iterations = self.method.rates, self.method.iterations
         groups = self._of_table(self.method.surfels.names, extent)
         around = self.method.surroundings

@@ -58,7 +58,7 @@ class Run:
         return (self.path / "config.toml").is_file()
 
     def require_none(self) -> None:
-        """Raise InputError if the folder contains a run, or a foreign file with the name of one of a run's."""
+        """Raise InputError if the folder contains a run, or a foreign file of the same name as one of its."""
         if (self.path / CONFIG).exists():
             raise InputError(
                 f"{self.path}: holds a run already; add --resume to go on with it, or choose another -o"
@@ -200,7 +200,7 @@ class Run:
 
 
 def _logged(line: str) -> float:
-    """The iteration of a line of the log; infinity for an incomplete line, which a killed process may leave."""
+    """The iteration of a line of the log; infinity for an incomplete line of a killed process."""
     try:
         return float(json.loads(line)["iteration"])
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
