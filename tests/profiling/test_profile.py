@@ -373,7 +373,7 @@ def cases() -> Iterator[tuple[dict[str, Any], dict[str, Any], str]]:
     yield {"contributing": 8e4, "aspect": 9.0}, {}, "9 times as long as wide"
     yield {"contributing": 8e4, "footprint": 5.0}, {}, "5.0 pixels on average"
     yield {}, {"prefilter forward": 5.0}, "light.height=32"
-    yield {}, {"sort": 3.0}, "50 tiles a surfel"
+    yield {}, {"sort": 3.0}, "50 tiles per surfel"
     yield {}, {"ssim forward": 5.0}, "loss.ssim=0"
     yield {}, {"optimiser": 9.0}, "the optimiser takes"
 
