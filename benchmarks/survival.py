@@ -30,6 +30,7 @@ import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
 from benchmarks.common.report import plain_parser
+from benchmarks.common.timing import process_bytes
 
 ROOT = Path(__file__).parents[1]
 SIZE, VIEWS = 32, 5
@@ -219,7 +220,7 @@ def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
         records.append(
             {
                 "step": state.iteration,
-                "rss_mb": round(_resident() / 2**20, 3),
+                "rss_mb": round(process_bytes() / 2**20, 3),
                 "wall_ms": round(1e3 * float(np.median(np.diff(wall))), 3),
                 "cpu_ms": round(1e3 * float(np.median(np.diff(cpu))), 3),
                 "surfels": state.surfels.count,
@@ -259,11 +260,6 @@ def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
     if output is not None:
         output.write_text(json.dumps({"result": result, "records": records}, indent=1) + "\n")
     return result
-
-
-def _resident() -> int:
-    """Bytes of this process in memory."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def main(arguments: list[str] | None = None) -> int:

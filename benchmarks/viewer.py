@@ -28,6 +28,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common.timing import process_bytes
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -46,12 +48,6 @@ def cpu_seconds(pid: int) -> float:
     """User and system time of a process and all its threads."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
-
-
-def resident_mb(pid: int) -> float:
-    """Resident memory of a process."""
-    found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())
-    return int(found[1]) / 1024 if found else 0.0
 
 
 def children_cpu() -> float:
@@ -151,10 +147,10 @@ def click_about(page: Any, viewer: Viewer, seconds: float, seed: int) -> dict[st
     rng, pid = random.Random(seed), viewer.process.pid
     box = page.locator("canvas").first.bounding_box()
     begin, clicks = time.monotonic(), 0
-    memory = {"start": resident_mb(pid)}
+    memory = {"start": process_bytes(pid=pid) / 2**20}
     while (passed := time.monotonic() - begin) < seconds:
         if "tenth" not in memory and passed > seconds / 10:
-            memory["tenth"] = resident_mb(pid)
+            memory["tenth"] = process_bytes(pid=pid) / 2**20
         clicks += 1
         kind = rng.random()
         x, y = box["x"] + rng.random() * box["width"], box["y"] + rng.random() * box["height"]
@@ -186,7 +182,7 @@ def click_about(page: Any, viewer: Viewer, seconds: float, seed: int) -> dict[st
                     raise
         page.wait_for_timeout(rng.choice((20, 100, 700)))
     page.wait_for_timeout(2000)
-    memory["end"] = resident_mb(pid)
+    memory["end"] = process_bytes(pid=pid) / 2**20
     return {
         "seconds": round(time.monotonic() - begin, 1),
         "clicks": clicks,

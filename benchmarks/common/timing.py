@@ -1,9 +1,11 @@
-"""Times of warm runs, taken in turns."""
+"""Times of warm runs, taken in turns, and memory of a process."""
 
 from __future__ import annotations
 
+import resource
 import time
 from collections.abc import Callable, Hashable, Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 import drjit as dr
@@ -49,3 +51,12 @@ def once(call: Callable[[], Any]) -> float:
     dr.eval(call())
     dr.sync_thread()
     return time.perf_counter() - begin
+
+
+def process_bytes(field: str = "VmRSS", pid: int | str = "self") -> int:
+    """VmRSS (now), VmHWM (peak) or VmSize (mapped) of a process; this one's peak where there is no /proc."""
+    status = Path(f"/proc/{pid}/status")
+    if not status.exists():
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    line = next((line for line in status.read_text().splitlines() if line.startswith(field)), f"{field} 0")
+    return 1024 * int(line.split()[1])

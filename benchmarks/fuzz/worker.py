@@ -17,6 +17,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common.timing import process_bytes
 from benchmarks.fuzz import MEBIBYTES, SECONDS
 from benchmarks.fuzz.mutate import mutate
 from benchmarks.fuzz.readers import READERS, Reader
@@ -43,7 +44,7 @@ def mutated(reader: Reader, samples: list[bytes], seed: int, index: int) -> byte
 
 def outcome(reader: Reader, folder: Path, data: bytes) -> dict[str, Any]:
     """Read one file; `result` is "right", "refused" or what went wrong."""
-    began, before = time.perf_counter(), _memory("VmRSS")
+    began, before = time.perf_counter(), process_bytes("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # VmHWM begins anew
     Watch.folder, Watch.seen = (folder if reader.inside else None), []
     before_alarm = signal.signal(signal.SIGALRM, _ring)
@@ -65,7 +66,7 @@ def outcome(reader: Reader, folder: Path, data: bytes) -> dict[str, Any]:
         signal.signal(signal.SIGALRM, before_alarm)
         Watch.folder = None
     found["seconds"] = round(time.perf_counter() - began, 4)
-    found["mebibytes"] = round((_memory("VmHWM") - before) / 1024, 1)
+    found["mebibytes"] = round((process_bytes("VmHWM") - before) / 2**20, 1)
     if Watch.seen:
         found |= {"result": "escape", "what": Watch.seen[0]}
     elif found["mebibytes"] > MEBIBYTES:
@@ -95,12 +96,6 @@ class Watch:
 
 def _ring(*_: object) -> None:
     raise HangError
-
-
-def _memory(name: str) -> int:
-    """Kibibytes, from the kernel's table of this process."""
-    found = re.search(rf"{name}:\s+(\d+)", Path("/proc/self/status").read_text())
-    return int(found.group(1)) if found else 0
 
 
 def _kind(message: str) -> str:
@@ -133,7 +128,7 @@ def main() -> None:
         samples = reader.samples(folder)
         for sample in samples:  # compiles and imports what reading needs
             outcome(reader, folder, reader.finish(sample))
-        limit = (_memory("VmSize") >> 10) + ADDRESS_SPACE
+        limit = (process_bytes("VmSize") >> 20) + ADDRESS_SPACE
         resource.setrlimit(resource.RLIMIT_AS, (limit << 20, limit << 20))
         sys.addaudithook(Watch.hook)
         for index in range(options.first, options.last):

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -20,6 +19,7 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
+from benchmarks.common.timing import process_bytes
 from benchmarks.common.view import ROOT
 
 SPREAD = 1.5
@@ -95,7 +95,7 @@ def _step(count: int, size: int) -> dict[str, Any]:
         trainer.step()
         dr.sync_thread()
         times.append(1e3 * (time.perf_counter() - begin))
-    whole = _resident("VmHWM")
+    whole = process_bytes("VmHWM")
     found = {"surfels": trainer.surfels.count, "size": size, "ms": float(np.median(times[1:]))}
     return found | _peaks(before) | {"whole_process": whole}
 
@@ -124,22 +124,13 @@ def _start() -> int:
     reset = Path("/proc/self/clear_refs")
     if reset.exists():
         reset.write_text("5")
-    return _resident("VmRSS")
+    return process_bytes("VmRSS")
 
 
 def _peaks(before: int) -> dict[str, int]:
     """Bytes since `_start`: what the process grew by at most, and what Dr.Jit's allocator held at most."""
     backend = dr.JitBackend.LLVM
-    return {"peak": _resident("VmHWM") - before, "allocated": int(dr.detail.malloc_watermark(backend))}
-
-
-def _resident(field: str) -> int:
-    """VmRSS (now) or VmHWM (peak) in bytes; the peak where the system has no /proc."""
-    status = Path("/proc/self/status")
-    if not status.exists():
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    line = next(line for line in status.read_text().splitlines() if line.startswith(field))
-    return 1024 * int(line.split()[1])
+    return {"peak": process_bytes("VmHWM") - before, "allocated": int(dr.detail.malloc_watermark(backend))}
 
 
 if __name__ == "__main__":
