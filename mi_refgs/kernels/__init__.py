@@ -1,1 +1,1 @@
-"""What kernels share: table rows, device arrays, timing, memory."""
+"""Shared by kernels: packed rows, device arrays, timing, memory."""

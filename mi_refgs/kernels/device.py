@@ -1,4 +1,4 @@
-"""The machine, the variant that kernels need, NumPy arrays on the device, functions that are traced once."""
+"""The machine, supported variants, NumPy arrays on the device, functions that are traced once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 
 LOOK_AHEAD = 64
-"""Elements by which kernels read beyond the last one of an array, at most: a packet of the widest machine."""
+"""Largest number of elements that kernels read beyond the end of an array: a packet of the widest machine."""
 ALIGNMENT = 64
 """Bytes of the widest packet."""
 DTYPES = {"Float": np.float32, "UInt32": np.uint32, "Int32": np.int32, "Bool": np.bool_}
@@ -26,7 +26,7 @@ DTYPES = {"Float": np.float32, "UInt32": np.uint32, "Int32": np.int32, "Bool": n
 
 
 def machine() -> dict[str, Any]:
-    """What times are measured on: processor, threads and versions."""
+    """Processor, threads and versions, for reports of times."""
     try:
         found = re.search(
             r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE
@@ -45,7 +45,7 @@ def machine() -> dict[str, Any]:
 
 
 def simd_width() -> int:
-    """Floats of a vector of the kernels, read off one, since Dr.Jit does not tell it; 1 for other devices."""
+    """Floats per SIMD vector, read from a kernel's code, since Dr.Jit has no query; 1 for other devices."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.eval(dr.minimum(dr.arange(mi.Float, LOOK_AHEAD), dr.opaque(mi.Float, 2)))
         code = "".join(kernel["ir"].getvalue() for kernel in dr.kernel_history() if "ir" in kernel)
@@ -53,12 +53,12 @@ def simd_width() -> int:
 
 
 def is_supported(variant: str | None) -> bool:
-    """Whether the renderer can run under this variant: it needs arrays with derivatives and RGB colour."""
+    """Whether the renderer supports a variant: it requires arrays with derivatives and RGB colour."""
     return variant is not None and variant.endswith("_ad_rgb")
 
 
 def require_supported_variant(what: str) -> None:
-    """Raise InputError, naming `what` and the remedy, under a variant that the renderer cannot use."""
+    """Raise InputError that starts with `what` under a variant that is not supported."""
     variant = mi.variant()
     if not is_supported(variant):
         raise InputError(
@@ -70,8 +70,8 @@ def require_supported_variant(what: str) -> None:
 def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
     """A flat copy in memory aligned to packets, LOOK_AHEAD zeros after its end.
 
-    Dr.Jit compiles one kernel for aligned and another for unaligned memory. NumPy's is either by chance, so
-    that kernels on disk would serve only some of the later processes.
+    Dr.Jit compiles one kernel for aligned and another for unaligned memory. NumPy's memory is either by
+    chance, and cached kernels would fit only some of the later processes.
     """
     size, count = np.dtype(dtype).itemsize, np.size(values)
     whole: np.ndarray = np.zeros((count + LOOK_AHEAD) * size + ALIGNMENT, np.uint8)
@@ -84,11 +84,11 @@ def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
 def upload(values: np.ndarray, kind: Any = None) -> Any:
     """A flat mi.Float (or another `kind` of DTYPES) with the values, in memory that Dr.Jit has allocated.
 
-    `mi.Float(values)` wraps NumPy's memory on the CPU. A kernel reads whole packets of it, and so beyond its
-    end: the process ends where the next page of memory is nobody's. Also, that memory may be aligned to
-    packets or not: each array has two kernels, and which one a training step needs, and compiles, changes
-    from view to view. Dr.Jit copies arrays of vectors, such as `mi.Point3f(table.T)`, by elements: they need
-    none of this. Raises InputError under a variant that the renderer cannot use.
+    `mi.Float(values)` wraps NumPy's memory on the CPU. A kernel reads whole packets, and so beyond its end:
+    the process crashes if the next page is not mapped. That memory may also be aligned to packets or not:
+    each array has two kernels, and which one a training step compiles changes from view to view. Dr.Jit
+    copies arrays of vectors, such as `mi.Point3f(points.T)`, element by element: they need none of this.
+    Raises InputError under a variant that is not supported.
     """
     require_supported_variant("mi_refgs")
     kind = mi.Float if kind is None else kind
@@ -112,10 +112,10 @@ def upload_tensor(values: np.ndarray, kind: Any = None) -> Any:
 
 
 def replayed(function: Callable[..., Any], limit: int | None = None) -> Callable[..., Any]:
-    """The function, traced by `dr.freeze` for each new kind of arguments (at most `limit` kept) and replayed.
+    """Trace a function by `dr.freeze` per kind of arguments (at most `limit` are kept) and replay it.
 
-    Python's garbage collector waits meanwhile: it could meet a scene of the user's, whose release Dr.Jit
-    cannot record, and the process would be aborted.
+    Python's garbage collector is off meanwhile: it could free a scene of the user, which Dr.Jit cannot
+    record, and the process would abort.
     """
     frozen = dr.freeze(function, limit=limit, warn_after=10**9)
 

@@ -1,4 +1,4 @@
-"""Memory: what a computation will need, what there is, and the refusal of what would not fit.
+"""Memory that a computation needs, memory that is available, and the refusal of what would not fit.
 
 Numbers are upper bounds of the resident memory of the process, measured by `python -m benchmarks.memory`.
 """
@@ -14,15 +14,15 @@ from mi_refgs.errors import InputError
 BASE = 0.4e9
 """Bytes of a process with its kernels."""
 PASS_SAMPLES = 1 << 22
-"""Samples of a pass: pixels times samples per pixel. Smaller passes project the surfels more often."""
+"""Samples per pass: pixels times samples per pixel. Smaller passes project the surfels more often."""
 DERIVATIVE_SAMPLES = 1 << 21
-"""Samples of a pass with derivatives, which needs more memory for each."""
+"""Samples per pass with derivatives, which need more memory each."""
 PER_SAMPLE, PER_DERIVATIVE_SAMPLE, PER_CHANNEL = 60, 260, 5
 """Bytes per sample of a pass, and of each of its channels."""
 PER_VALUE, PER_STACKED_VALUE = 10, 28
 """Bytes per pixel and channel of a finished image, of one pass and of several that are stacked."""
 PER_SHOWN_SURFEL, PER_DERIVATIVE_SURFEL = 700, 1000
-"""Bytes per surfel of an image: raw channels, projected rows, tile lists with their sort, and gradients."""
+"""Bytes per surfel of an image: raw attributes, projected rows, sorted tile lists, and gradients."""
 PER_PIXEL, PER_SURFEL = 3e3, 2.5e3
 """Bytes per pixel of a training step; per surfel with moments and gradients."""
 PER_TEXEL = 400
@@ -30,7 +30,7 @@ PER_TEXEL = 400
 PER_PATH = 100
 """Bytes per path of Mitsuba's path tracer."""
 PER_PLY_BYTE = 4
-"""Bytes per byte of the vertices of a PLY file, as they are read, checked and made arrays."""
+"""Bytes per byte of the vertices of a PLY file: read, checked, and as arrays."""
 
 CGROUPS = Path("/sys/fs/cgroup")
 PROC = Path("/proc")
@@ -59,16 +59,16 @@ def require_image(
     )
 
 
-def of_fit(pixels: int, surfels: int, pictures: float) -> float:
-    """Bytes of a fit: per pixel of a step, per surfel at most, and of the images that are kept."""
-    return BASE + pictures + PER_PIXEL * pixels + PER_SURFEL * surfels
+def of_fit(pixels: int, surfels: int, images: float) -> float:
+    """Bytes of a fit with so many pixels per step, surfels at most, and bytes of images in memory."""
+    return BASE + images + PER_PIXEL * pixels + PER_SURFEL * surfels
 
 
 def require(needed: float, what: str, remedy: str) -> None:
     """Raise InputError if a process that needs so many bytes in all would not fit into memory.
 
-    `what` names the computation and its size, `remedy` what to do; the sentence is made of both. Memory that
-    the process has already counts as there to use.
+    `what` names the computation and its size, `remedy` what to do. Memory that the process already has counts
+    as available.
     """
     there = available() + resident()
     if needed > there:
@@ -78,12 +78,12 @@ def require(needed: float, what: str, remedy: str) -> None:
 
 
 def available() -> float:
-    """Bytes that this process may still take: what the machine and its control groups have left."""
+    """Bytes that this process may still allocate, by the machine and its control groups."""
     return min(_machine(), *_groups(), math.inf)
 
 
 def resident() -> float:
-    """Bytes that this process has; 0 where the system does not say."""
+    """Bytes that this process has allocated; 0 if the system does not report them."""
     try:
         pages = int((PROC / "self/statm").read_text().split()[1])
     except (OSError, ValueError, IndexError):
@@ -98,14 +98,14 @@ def _machine() -> float:
                 return 1024 * float(line.split()[1])
     except (OSError, ValueError, IndexError):
         pass
-    try:  # of other systems all that is built in
+    try:  # other systems: all installed memory
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
         return math.inf
 
 
 def _groups() -> list[float]:
-    """What the control groups (version 2, else 1) around this process leave, page cache not counted."""
+    """Bytes that the control groups (version 2, else 1) of this process leave, without page cache."""
     found = []
     try:
         lines = (PROC / "self/cgroup").read_text().splitlines()

@@ -1,4 +1,4 @@
-"""Tables by rows, read and written in packets: a row is then a few wide memory accesses, not one a column."""
+"""Arrays of rows that are read and written in packets: a few wide accesses per row, not one per column."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.types import Float
+
 PACKET = 8
-"""Floats that one access moves: Dr.Jit's LLVM code for wider packets is made of these."""
+"""Floats per access: Dr.Jit's LLVM code splits wider packets into these."""
 
 COPIES_BYTES = 1 << 30
-"""Most memory of the copies that `PackedRows.add` makes, one a thread; above it adds atomically. A gradient
-of a million surfels with 14 features, 24 floats a row, has 96 MB a copy: up to 11 threads have one each."""
+"""Largest memory of the copies per thread that `PackedRows.add` makes; above it, additions are atomic. The
+gradient of a million surfels with 14 features, 24 floats per row, has 96 MB per copy: 11 threads fit."""
 
 
 @dataclass(frozen=True)
 class PackedRows:
     """N rows of `width` floats, each padded with zeros to whole packets; no derivative."""
 
-    data: Any  # mi.Float (N · packets · PACKET,)
+    data: Float  # (N · packets · PACKET,)
     count: int
     width: int
 
@@ -32,12 +34,12 @@ class PackedRows:
 
     @staticmethod
     def zeros(count: int, width: int) -> PackedRows:
-        """PackedRows of zeros."""
+        """Rows of zeros."""
         return PackedRows(dr.zeros(mi.Float, count * _padded(width)), count, width)
 
     @staticmethod
     def pack(columns: list[Any]) -> PackedRows:
-        """PackedRows of columns (mi.Float, width N)."""
+        """Pack columns (N,)."""
         count, width = dr.width(columns[0]), len(columns)
         rows = PackedRows(dr.empty(mi.Float, count * _padded(width)), count, width)
         values = [dr.detach(column) for column in columns]
@@ -47,28 +49,28 @@ class PackedRows:
         return rows
 
     def columns(self) -> list[Any]:
-        """Columns (mi.Float, width N)."""
+        """Columns (N,)."""
         return self.fetch(dr.arange(mi.UInt32, self.count))[: self.width]
 
     def unpadded(self) -> Any:
-        """The rows without their padding, mi.Float (N · width,)."""
+        """The rows without their padding, (N · width,)."""
         entry = dr.arange(mi.UInt32, self.count * self.width)
         row = entry // self.width
         return dr.gather(mi.Float, self.data, row * (self.packets * PACKET) + (entry - row * self.width))
 
     def fetch(self, row: Any, active: Any = True) -> list[Any]:
-        """Values of rows (mi.UInt32, any width): a mi.Float for each column, then for the padding."""
+        """Values of rows, one array per column, then per column of the padding."""
         shape = (PACKET, dr.width(row))
         places = [row * self.packets + i for i in range(self.packets)]
         packets = [dr.gather(mi.ArrayXf, self.data, place, active, shape=shape) for place in places]
         return [value for packet in packets for value in packet]
 
     def add(self, row: Any, values: list[Any], active: Any) -> None:
-        """Add values, one for each column, to rows.
+        """Add values, one array per column, to rows.
 
-        On the CPU each thread has a copy of the rows until they are read, of COPIES_BYTES in all at most.
+        On the CPU each thread has a copy until the rows are read, if all copies fit into COPIES_BYTES.
         """
-        # Dr.Jit's own choice for a table of more than a million entries is atomic, whatever the threads.
+        # Dr.Jit itself always adds atomically to more than a million entries.
         copies = 4 * dr.width(self.data) * dr.thread_count()
         mode = dr.ReduceMode.Expand if copies <= COPIES_BYTES else dr.ReduceMode.Local
         for place, packet in self._packets(row, values):
@@ -86,11 +88,11 @@ def _padded(width: int) -> int:
 
 
 def columns_of(array: Any, width: int) -> list[Any]:
-    """Columns (mi.Float, width N) of N · width floats without padding, under AD.
+    """Columns (N,) of N · width floats without padding, under AD.
 
-    The adjoint is made in memory of its own and then added to that of `array`. The adjoint of a gather would
-    write into the gradient of `array` itself, where other terms of a loss write too, in another mode: what
-    one of them has written is then lost.
+    The adjoint is computed in memory of its own and then added to that of `array`. The adjoint of a gather
+    would write into the gradient of `array` itself, where other terms of a loss write in another mode: one of
+    the two would be lost.
     """
     return list(dr.custom(_Columns, array, width))
 
@@ -113,7 +115,7 @@ class _Columns(dr.CustomOp):
 
     @property
     def packet(self) -> int:
-        """Floats that one access moves: the widest packet that divides a row."""
+        """Floats per access: the widest packet that divides a row."""
         return math.gcd(self.width, PACKET)
 
     def _split(self, array: Any) -> list[Any]:
@@ -142,15 +144,15 @@ class _Columns(dr.CustomOp):
 
 
 def joined(first: list[Any], second: list[Any]) -> list[Any]:
-    """Each mi.Float of `first` with that of `second` after it, under AD; both lists are of one length.
+    """Concatenate the arrays of two lists pair by pair, under AD.
 
-    The adjoints go to arrays of their own, so that nothing else that reads an input writes there too.
+    The adjoints are arrays of their own, into which no other reader of the inputs writes.
     """
     return list(dr.custom(_Joined, first, second))
 
 
 class _Joined(dr.CustomOp):
-    """Two lists of arrays → a list of longer ones; one kernel for each distinct width that is read."""
+    """Two lists of arrays → a list of concatenated ones; one kernel per distinct width that is read."""
 
     def eval(self, first: list[Any], second: list[Any]) -> list[Any]:
         self.widths = [[dr.width(array) for array in part] for part in (first, second)]

@@ -1,8 +1,8 @@
 """Named phases of a step, for a listener that times them.
 
-`phase` marks a function as a phase, `boundary` a value at which the backward pass enters another one. While
-nobody listens both do nothing: no kernel, no launch, no node of the derivative graph. Names of phases are
-those of `profiling.phases`.
+`phase` marks a function as a phase, `boundary` a value at which the backward pass enters another phase.
+Without a listener both do nothing: no kernel, no launch, no node of the AD graph. Names of phases are those
+of `profiling.phases`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class Listener(Protocol):
-    """What is told of phases."""
+    """Receives the phases."""
 
     def call(self, phase: str, function: Callable[[], Any], arguments: Any) -> Any:
-        """Call the function, which holds its `arguments`, and return its result."""
+        """Call the function, bound to its `arguments`, and return its result."""
 
     def boundary(self, value: Any, phase: str) -> Any:
-        """Return the value, changed only in what happens when derivatives pass it."""
+        """Return the value, with a node of the AD graph that notices derivatives."""
 
 
 _listener: Listener | None = None
@@ -30,7 +30,7 @@ _listener: Listener | None = None
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Tell `listener` of every phase in the block, and nobody else."""
+    """Report every phase in the block to `listener` only."""
     global _listener
     before, _listener = _listener, listener
     try:

@@ -1,4 +1,4 @@
-"""A pinhole camera as the splatter needs it: a rigid map into its frame, focal lengths in signed pixels."""
+"""Pinhole camera: a rigid map from the world, and focal lengths in signed pixels."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from mi_refgs.constants import RIGID_TOLERANCE, tile_size
 from mi_refgs.errors import InputError
+from mi_refgs.types import Float, Point2f, Point3f, UInt32, Vector3f
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Camera:
     """A pinhole camera: the point p of its frame lands on the pixel (fx·p.x/p.z + cx, fy·p.y/p.z + cy).
 
     In Mitsuba's camera frame (+x left, +y up) both focal lengths are negative. All numbers but the image size
-    are opaque Dr.Jit values, so that one compiled kernel serves every view of a data set. Cameras carry no
+    are opaque Dr.Jit values, so that one compiled kernel serves every view of a data set. Cameras have no
     derivatives.
     """
 
@@ -32,11 +33,11 @@ class Camera:
     cy: mi.Float  # pixels
     rotation: mi.Matrix3f  # camera from world
     origin: mi.Point3f  # world, rounded to float32
-    origin_rest: mi.Vector3f  # what rounding took off it: far from the world's origin more than a surfel
+    origin_rest: mi.Vector3f  # exact origin - `origin`: larger than a surfel far from the world's origin
     near: mi.Float  # scene units along the camera's z axis
-    focal: float  # |fx| as a host number, which chooses the size of tiles
-    offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film, whose tiles it keeps
-    film: tuple[int, int] | None = None  # pixels, size of the film of a window; None: this is all of it
+    focal: float  # |fx| on the host, decides the size of tiles
+    offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film; tiles are those of the film
+    film: tuple[int, int] | None = None  # pixels, size of the film; None: the camera has all of it
 
     @property
     def tile(self) -> tuple[int, int]:
@@ -44,8 +45,8 @@ class Camera:
         return tile_size(self.focal)
 
     @property
-    def centre(self) -> tuple[Any, Any]:
-        """The principal point on the film (mi.Float each), pixels."""
+    def centre(self) -> tuple[Float, Float]:
+        """The principal point on the film, pixels."""
         if self.film is None:
             return self.cx, self.cy
         x, y = (dr.opaque(mi.Float, offset) for offset in self.offset)
@@ -53,7 +54,7 @@ class Camera:
 
     @property
     def tile_offset(self) -> tuple[int, int]:
-        """Place of the first pixel in its tile."""
+        """Column and row of the first pixel in its tile."""
         return self.offset[0] % self.tile[0], self.offset[1] % self.tile[1]
 
     @staticmethod
@@ -110,11 +111,11 @@ class Camera:
         size: int | tuple[int, int] = 256,
         near: float | None = None,
     ) -> Camera:
-        """Camera at `origin` (world) that looks at `target`, with `up` upwards in the picture.
+        """Camera at `origin` that looks at `target`, both in the world, with `up` upwards in the image.
 
-        fov: degrees across the picture's width, as of Mitsuba's `perspective`. size: width and height, or
-        both as one number, pixels. near: depth of the near plane, scene units; a thousandth of the distance
-        to the target by default. Raises InputError where these give no view.
+        fov: degrees across the width of the image, as in Mitsuba's `perspective`. size: width and height, or
+        both as one number, pixels. near: depth of the near plane, scene units; 1/1000 of the distance to the
+        target by default. Raises InputError for values that define no view.
         """
         width, height = (size, size) if isinstance(size, int) else size
         eye, forward, top = (np.asarray(x, dtype=np.float64) for x in (origin, target, up))
@@ -149,7 +150,7 @@ class Camera:
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
         # A uniform scale in to_world moves no ray of a pinhole; take it out before the rigidity check.
         matrix[:3, :3] /= np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
-        # The sensor's own corner rays hold field of view, crop window and principal point.
+        # Field of view, crop window and principal point follow from the sensor's own corner rays.
         corners = mi.Point2f(mi.Float([0, 1, 0]), mi.Float([0, 0, 1]))
         ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), corners, mi.Point2f(0.5))
         local = np.array(ray.d, dtype=np.float64).reshape(3, 3).T @ matrix[:3, :3]
@@ -170,20 +171,20 @@ class Camera:
         size = int(film.size()[0]), int(film.size()[1])
         return replace(camera, offset=(x, y), film=None if size == (width, height) else size)
 
-    def towards(self, point: Any) -> Any:
-        """Vector (mi.Vector3f, world) from the camera to a world point, to float32 of the vector itself."""
+    def towards(self, point: Point3f) -> Vector3f:
+        """Vector in the world from the camera to a point, with the precision of float32 of the vector."""
         return (mi.Vector3f(point) - mi.Vector3f(self.origin)) - self.origin_rest
 
-    def to_camera(self, point: Any) -> Any:
+    def to_camera(self, point: Point3f) -> Vector3f:
         """World point to camera frame."""
         return self.rotation @ self.towards(point)
 
-    def pixel_centres(self, raster: Any = None) -> Any:
-        """Centres (i + ½, j + ½) of pixels by their index in the image (mi.UInt32); of all without one."""
+    def pixel_centres(self, raster: UInt32 | None = None) -> Point2f:
+        """Centres (i + ½, j + ½) of pixels, by their index in the image; of all pixels by default."""
         index = dr.arange(mi.UInt32, self.width * self.height) if raster is None else raster
         return mi.Point2f(index % self.width + 0.5, index // self.width + 0.5)
 
-    def rays(self, raster: Any = None) -> Any:
+    def rays(self, raster: UInt32 | None = None) -> Vector3f:
         """World directions through `pixel_centres`: 1 along the viewing axis, not unit."""
         pixel = self.pixel_centres(raster)
         local = mi.Vector3f((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1)
@@ -202,7 +203,7 @@ class Camera:
         return Camera.from_pose(self.width, self.height, fx, fy, cx, cy, to_world, near)
 
     def resized(self, size: int | tuple[int, int]) -> Camera:
-        """The same view with other pixels: so many in width and height, or along the longer side alone.
+        """The same view with another resolution: width and height, or the longer side, pixels.
 
         Raises InputError for a size without pixels.
         """
@@ -221,7 +222,7 @@ class Camera:
         )
 
     def window(self, x: int, y: int, width: int, height: int) -> Camera:
-        """The same view of so many pixels from pixel (x, y), which may lie outside the image.
+        """The part of the view from pixel (x, y), which may lie outside the image.
 
         Tiles, random numbers and borders are those of the whole image. Kernels do not depend on x and y, if
         these are multiples of PACKET_EDGE.
@@ -231,8 +232,8 @@ class Camera:
         film = self.film or (self.width, self.height)
         return replace(self, width=width, height=height, cx=cx, cy=cy, offset=offset, film=film)
 
-    def image_index(self, raster: Any = None) -> Any:
-        """Index on the film of pixels (None: of all) by that in a window; the same without a window."""
+    def image_index(self, raster: UInt32 | None = None) -> UInt32:
+        """Index on the film of pixels of a window (default: all); `raster` itself without a window."""
         if self.film is None:
             return raster
         index = dr.arange(mi.UInt32, self.width * self.height) if raster is None else raster

@@ -1,4 +1,4 @@
-"""Which surfels each tile has to look at, nearest first."""
+"""Lists of the surfels that each tile may show, nearest first."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from mi_refgs.kernels.rows import PackedRows
 from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.primitives import Footprints
+from mi_refgs.types import Float, UInt32
 
 MAX_PAIR_BITS = 27
-"""Log₂ of the most pairs that are sorted: they take 40 bytes each, 5 GB in all."""
+"""Log₂ of the largest number of surfel-tile pairs: 40 bytes each, 5 GB in all."""
 
 CHUNK = 1 << 25
-"""Candidates, the tiles in the rectangles of footprints, that are looked at together: 20 bytes each, 0.7 GB.
+"""Candidate pairs, the tiles in footprints' rectangles, that are tested together: 20 bytes each, 0.7 GB.
 A view of 50,000 surfels at 1024² has a million."""
 
 
@@ -29,9 +30,9 @@ A view of 50,000 surfels at 1024² has a million."""
 class TileLists:
     """M surfel-tile pairs, sorted by tile, then by the surfel's depth there; no derivative."""
 
-    surfel_from_pair: Any  # mi.UInt32 (M,)
-    pair_begin: Any  # mi.UInt32 (tiles,): first pair of a tile
-    pair_end: Any  # mi.UInt32 (tiles,): one past its last pair
+    surfel_from_pair: UInt32  # (M,)
+    pair_begin: UInt32  # (tiles,): first pair of a tile
+    pair_end: UInt32  # (tiles,): one past its last pair
     tiles_x: int
     tiles_y: int
 
@@ -45,8 +46,8 @@ class TileLists:
 def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     """List every surfel in each tile that its footprint may touch.
 
-    Both sorts are stable, so surfels of equal depth keep the order of the table. Raises InputError where more
-    than 2^MAX_PAIR_BITS pairs are left.
+    Both sorts are stable, so surfels of equal depth keep their order in memory. Raises InputError for more
+    than 2^MAX_PAIR_BITS pairs.
     """
     offset_x, offset_y = camera.tile_offset
     tiles_x = -(-(camera.width + offset_x) // camera.tile[0])
@@ -85,7 +86,7 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
 
 @phase("sort")
 def _sorted(pairs: Any, depth: Any, tiles: int) -> tuple[Any, Any]:
-    """Tile and surfel of the pairs (tile, surfel), by tile, then by depth."""
+    """Tiles and surfels of pairs (tile, surfel), sorted by tile, then by depth."""
     nearest_first = _nearest_first(depth)
     pairs = _sorted_by(dr.gather(mi.UInt64, pairs, nearest_first), 0, (tiles - 1).bit_length())
     tile, surfel = _upper(pairs), _lower(pairs)
@@ -93,11 +94,11 @@ def _sorted(pairs: Any, depth: Any, tiles: int) -> tuple[Any, Any]:
     return tile, surfel
 
 
-def _nearest_first(depth: Any) -> Any:
-    """Places in `depth` (mi.UInt32), the least depth first: 24 bits of a radix sort, `dr.argsort` does 32.
+def _nearest_first(depth: Float) -> UInt32:
+    """Indices that sort `depth`: a radix sort of 24 bits, where `dr.argsort` sorts 32.
 
-    The bits of positive floats are in the order of the floats. What the largest is above the smallest fits
-    into 24 of them where it is up to four times as far; beyond, the last digits go.
+    The bits of positive floats are in the order of the floats. The differences to the smallest fit into 24
+    bits if the largest is up to four times as far; beyond, the last digits are dropped.
     """
     key = dr.reinterpret_array(mi.UInt32, depth)
     dr.eval(key)
@@ -110,7 +111,7 @@ def _nearest_first(depth: Any) -> Any:
 
 
 def _join(upper: Any, lower: Any) -> Any:
-    """Two mi.UInt32 in one mi.UInt64: half the random reads of two arrays."""
+    """Join two mi.UInt32 to one mi.UInt64, for half the random reads of two arrays."""
     return mi.UInt64(upper) << 32 | mi.UInt64(lower)
 
 
@@ -123,21 +124,21 @@ def _lower(joined: Any) -> Any:
 
 
 def _sorted_by(joined: Any, shift: int, bits: int) -> Any:
-    """Sort by some bits of the upper half, stably: one pass of a counting sort."""
+    """Sort by some bits of the upper half: one pass of a stable counting sort."""
     digit = (_upper(joined) >> shift) & ((1 << bits) - 1)
     dr.eval(joined, digit)
     return dr.gather(mi.UInt64, joined, dr.detail.block_mkperm(digit, dr.width(digit), 1 << bits))
 
 
 def _runs(tile: Any, tiles: int) -> tuple[Any, Any]:
-    """Where the run of each tile begins and ends (mi.UInt32 (tiles,)) among sorted tiles (mi.UInt32 (M,))."""
+    """First pair (tiles,), and one past the last pair (tiles,), of each tile among sorted tiles (M,)."""
     pairs, wanted = dr.opaque(mi.UInt32, dr.width(tile)), dr.arange(mi.UInt32, tiles + 1)
 
     def before(place: Any) -> Any:
         inside = place < pairs
         return inside & (dr.gather(mi.UInt32, tile, place, inside) < wanted)
 
-    # Always as many steps, so that another number of pairs is not another kernel.
+    # The same number of steps for every number of pairs, or each would compile a kernel.
     edges = mi.UInt32(dr.binary_search(0, 1 << MAX_PAIR_BITS, before))
     dr.eval(edges)
     first = dr.arange(mi.UInt32, tiles)
@@ -150,10 +151,7 @@ def _empty(tiles_x: int, tiles_y: int) -> TileLists:
 
 
 def _candidates(footprints: Footprints, camera: Camera) -> Iterator[tuple[Any, Any, Any]]:
-    """Surfel, tile column and tile row of every tile in the rectangles of footprints, surfel by surfel.
-
-    They come in parts of about CHUNK.
-    """
+    """Yield surfel, tile column and tile row of every tile in footprints' rectangles, CHUNK by CHUNK."""
     first, last = (
         [
             mi.Int32((x + at) // size)
@@ -180,9 +178,9 @@ def _candidates(footprints: Footprints, camera: Camera) -> Iterator[tuple[Any, A
 
 
 def _part(first: list[Any], span: Any, count: Any, end: Any, begin: int, stop: int) -> tuple[Any, Any, Any]:
-    """Candidates number `begin` to `stop`, of whole surfels, which have `count` each and `end` in all."""
+    """Candidates `begin` to `stop`, of whole surfels; each has `count`, and `end` with all before it."""
     pairs, offset = stop - begin, dr.opaque(mi.UInt64, begin)
-    start = end - count - offset  # wraps round before the part, to numbers that are no place in it either
+    start = end - count - offset  # before the part it wraps round, to numbers outside the part too
     inside = (count > 0) & (start < dr.opaque(mi.UInt64, pairs))
     start = mi.UInt32(start)
     # The index of a surfel at its first pair, and up to the next one's by a running maximum: `dr.repeat`
