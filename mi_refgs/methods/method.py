@@ -177,7 +177,9 @@ class Rates:
     """Adam learning rates, raw units per step; those of positions in scene extents."""
 
     channel: dict[str, float] = field(default_factory=dict)  # by attribute; else its own default
-    rest: dict[str, float] = field(default_factory=dict)  # factor for SH degrees of 1 and above; likewise
+    rest: dict[str, float] = field(
+        default_factory=dict
+    )  # factor for SH degrees of 1 and above; else its own default
     light: float = 0.01  # texels of the environment map
     light_relative: bool = False  # texels brighter than 1: times their radiance, so that lamps can form
     position_final: float = 1.6e-6  # of positions, at 0.6 of the iterations

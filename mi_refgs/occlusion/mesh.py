@@ -27,27 +27,23 @@ the surface makes triangles without area."""
 
 FOREIGN_RESOLUTION = 256
 """Voxels along the bounding box's diagonal that a mesh made elsewhere counts as: about those of a fit, whose
-grid has 128 along the longest side. Its triangles say nothing: two of them make an exact wall. Rays then
-start 0.8 % of the diagonal off the surface, and walls closer to each other than that do not occlude."""
+grid has 128 along the longest side. The number of triangles is no measure: two of them make an exact wall.
+Rays then start 0.8 % of the diagonal off the surface, and walls closer to each other do not occlude."""
 
 FORMATS = ("ply", "obj", "stl", "off")
-"""Endings of the files that `read_mesh` takes."""
-
-NO_HEADER = Header("", (), ())
-"""What stands for the header of formats without one."""
+"""File endings that `read_mesh` accepts."""
 
 VOXEL_COMMENT = "voxel_size"
-"""Key of the PLY comment that holds the voxel the mesh was extracted with."""
+"""Key of the PLY comment with the voxel size of the extraction."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles whose (v1 - v0) × (v2 - v0) points outward; without faces it is valid and occludes
-    nothing."""
+    """Triangles whose (v1 - v0) × (v2 - v0) points outward; a mesh without faces occludes nothing."""
 
     vertices: np.ndarray  # (V, 3) float32, world
     faces: np.ndarray  # (F, 3) uint32
-    voxel: float  # resolution of the surface, scene units: visibility offsets scale with it
+    voxel: float  # resolution of the surface, scene units; offsets of visibility rays scale with it
 
     @staticmethod
     def empty(voxel: float = 1.0) -> Mesh:
@@ -67,10 +63,9 @@ class Mesh:
 def extract_mesh(tsdf: TSDF) -> Mesh:
     """Zero level set of the field by marching cubes (Lewiner et al. 2003), without floaters.
 
-    The surface has no degenerate triangles and is closed: what touches the border of the volume gets a lid
-    there, but not where all of space ends. Components of less than COMPONENT_KEEP of the largest one's area
-    are dropped; of all of space, where areas are those in contracted space, unless they have as large a part
-    of what lies in the region. No derivative."""
+    The surface has no degenerate triangles and is closed by a cap at the border of the volume, but not where
+    contracted space ends. Components of less than COMPONENT_KEEP of the largest one's area are dropped; in
+    contracted space, unless their part in the region is as large. No derivative."""
     # One layer of free space all around closes surfaces that the box cuts.
     volume = np.pad(np.asarray(tsdf.volume, dtype=np.float32), 1, constant_values=1.0)
     volume = np.where(np.abs(volume) < ZERO_NUDGE, np.copysign(np.float32(ZERO_NUDGE), volume), volume)
@@ -89,9 +84,9 @@ def extract_mesh(tsdf: TSDF) -> Mesh:
 
 
 def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float, open_: bool = False) -> Mesh:
-    """Mesh of the large closed components, without triangles of no area and vertices that nothing refers to.
+    """Keep the large closed components, without degenerate triangles and unused vertices.
 
-    Walls of inner cavities go too: no ray that starts on the outside meets them. `open_`: vertices are in
+    Walls of inner cavities are removed: no ray that starts outside meets them. `open_`: vertices are in
     contracted space, where a room is a cavity; cavities stay, and what is large in the region.
     """
     mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -123,10 +118,10 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
 
 
 def read_mesh(path: Path | str) -> Mesh:
-    """Read a triangle mesh: PLY, OBJ, STL or OFF. No file but this one is read.
+    """Read a triangle mesh (PLY, OBJ, STL or OFF), and no other file that it refers to.
 
     The voxel size comes from the comment of `write_mesh`; for other files see FOREIGN_RESOLUTION. Raises
-    InputError if the file is missing or holds no mesh.
+    InputError if the file is missing or contains no mesh.
     """
     path = Path(path)
     if not is_file(path):
@@ -136,7 +131,7 @@ def read_mesh(path: Path | str) -> Mesh:
         raise InputError(f"{path}: mesh: not one of {', '.join(FORMATS)}; write it again as PLY or OBJ")
     try:
         with path.open("rb") as file:
-            header = read_header(path, file) if kind == "ply" else NO_HEADER
+            header = read_header(path, file) if kind == "ply" else Header("", (), ())
             file.seek(0)
             data = file.read()
         voxel = _voxel(header)
@@ -161,7 +156,7 @@ def read_mesh(path: Path | str) -> Mesh:
 
 
 def _voxel(header: Header) -> float | None:
-    """The voxel that a comment notes, None without one; raises ValueError for one without size."""
+    """The voxel size in a comment, None without one; raises ValueError unless it is positive."""
     noted = [words[1:2] for words in map(str.split, header.comments) if words[:1] == [VOXEL_COMMENT]]
     if not noted:
         return None
@@ -172,7 +167,7 @@ def _voxel(header: Header) -> float | None:
 
 
 def _load(path: Path, kind: str, data: bytes) -> Any:
-    """What trimesh makes of a file's bytes, with the indices checked that it trusts.
+    """The trimesh of a file's bytes, with its indices checked.
 
     From memory, trimesh resolves no other names: textures, materials, archives.
     """

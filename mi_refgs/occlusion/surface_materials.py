@@ -1,14 +1,13 @@
 """Materials on the extracted mesh, taken from the surfels around each vertex, under AD.
 
-Who a vertex's neighbours are, their weights and the vertex's normal are found once per mesh, in NumPy; the
-materials are gathered anew for every render, so that the surfels' own parameters receive the gradient.
+Each vertex's neighbours, their weights and the vertex normal are computed once per mesh, in NumPy; the
+materials are gathered for every render, so that the surfels' own parameters receive the gradient.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,10 +19,10 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Bool, Float, Point2f, UInt32
+from mi_refgs.types import Bool, Color3f, Float, Point2f, UInt32, Vector3f
 
 NEIGHBOURS = 4
-"""Surfels that a vertex mixes: those that overlap at a point of a fitted surface with visible weight."""
+"""Surfels per vertex: those that overlap at a point of a fitted surface with visible weight."""
 
 WEIGHT_FLOOR = 1e-6
 """Sum of weights below which no surfel reaches a vertex, which then takes the nearest one only."""
@@ -32,39 +31,39 @@ NORMAL_AGREEMENT = 0.5
 """Cosine between the neighbours' mean normal and the mesh's from which the former, which a fit has smoothed,
 is used: at a rim the neighbours belong to another face."""
 
-CHANNELS = ("albedo", "metallic", "roughness")
-"""What a surface that is hit is shaded with."""
+MATERIALS = ("albedo", "metallic", "roughness")
+"""Attributes that hits are shaded with."""
 
 
 @dataclass(frozen=True)
 class SurfaceSample:
-    """What the surface is like where rays meet it; the normal is detached."""
+    """The surface where N rays meet it; the normal is detached."""
 
-    albedo: Any  # mi.Color3f
-    metallic: Any
-    roughness: Any
-    normal: Any  # mi.Vector3f, interpolated, outward, not unit
-    surfel: Any  # mi.UInt32: the surfel nearest to the nearest vertex
+    albedo: Color3f
+    metallic: Float
+    roughness: Float
+    normal: Vector3f  # interpolated, outward, not unit
+    surfel: UInt32  # the surfel nearest to the nearest vertex
 
 
 @dataclass(frozen=True)
 class VertexSurfels:
-    """The surfels around every vertex of a mesh. V vertices, K neighbours, F faces."""
+    """The surfels around every vertex of a mesh: V vertices, K neighbours, F faces."""
 
     count: int  # surfels
-    faces: Any  # mi.UInt32 (3 F)
-    surfel: list[Any]  # K × mi.UInt32 (V), the nearest first
-    weight: list[Any]  # K × mi.Float (V), their sum is 1
-    normal: Any  # mi.Vector3f (V)
+    faces: UInt32  # (3 F,)
+    surfel: list[UInt32]  # K × (V,), the nearest first
+    weight: list[Float]  # K × (V,), their sum is 1
+    normal: Vector3f  # (V,)
 
     @staticmethod
     def of(mesh: Mesh, surfels: Surfels) -> VertexSurfels:
-        """The NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint.
+        """Find the NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint.
 
         The footprint is the surfel's own Gaussian, wider by a voxel along its normal. Detached. Raises
-        InputError if there are no surfels, or a channel of their materials is missing.
+        InputError if there are no surfels, or an attribute of MATERIALS is missing.
         """
-        for name in CHANNELS:
+        for name in MATERIALS:
             if not surfels.has(name):
                 raise InputError(
                     f"occluder: {name}: the surfels have no such channel; add it, or trace nothing"
@@ -72,14 +71,18 @@ class VertexSurfels:
         if not surfels.count:
             raise InputError("occluder: surfels: there are none to take materials from")
         surfels = surfels.detach().cleaned()
+        usable = np.flatnonzero(surfels.usable().numpy())
+        if not len(usable):
+            raise InputError("occluder: surfels: none has finite values; correct them, or trace nothing")
+
+        # Ellipsoids of the surfels: axes and standard deviations, along the normal at least a voxel.
         position, opacity = surfels.position().numpy().T, surfels.opacity().numpy()
         axes, spread = surfels.primitive.extent(surfels.to_numpy())
         normal = surfels.primitive.normal(surfels).numpy().T
         across = np.abs(np.sum(axes * normal[:, None], axis=2)) > 0.5
         spread = np.where(across, np.hypot(spread, mesh.voxel), spread)
-        usable = np.flatnonzero(surfels.usable().numpy())
-        if not len(usable):
-            raise InputError("occluder: surfels: none has finite values; mend them, or trace nothing")
+
+        # Nearest surfels of each vertex, and their Gaussians there.
         count = min(NEIGHBOURS, len(usable))
         _, found = cKDTree(position[usable]).query(mesh.vertices, k=np.arange(1, count + 1))
         found = usable[found]
@@ -89,20 +92,20 @@ class VertexSurfels:
         reach = np.square(along / spread[found]).sum(-1) + np.square(beside / mesh.voxel).sum(-1)
         weight = opacity[found] * np.exp(-0.5 * reach)
         total = weight.sum(1, keepdims=True)
-        alone = np.arange(count) == 0
-        weight = np.where(total > WEIGHT_FLOOR, weight / np.maximum(total, WEIGHT_FLOOR), alone)
+        nearest = np.arange(count) == 0
+        weight = np.where(total > WEIGHT_FLOOR, weight / np.maximum(total, WEIGHT_FLOOR), nearest)
         normal = _normals(mesh, normal[found], weight)
         arrays = {"surfels": found.T, "weights": weight.T, "normals": normal.T}
         return VertexSurfels.restored(mesh, surfels.count, arrays)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What `of` has found, for checkpoints: "surfels" and "weights" (K, V), "normals" (3, V)."""
+        """Values for checkpoints: "surfels" and "weights" (K, V), "normals" (3, V)."""
         surfel, weight = (np.array([np.array(x) for x in columns]) for columns in (self.surfel, self.weight))
         return {"surfels": surfel, "weights": weight, "normals": np.array(self.normal)}
 
     @staticmethod
     def restored(mesh: Mesh, count: int, arrays: Mapping[str, np.ndarray]) -> VertexSurfels:
-        """That of a mesh and `count` surfels whose `arrays` were kept."""
+        """The neighbours among `count` surfels from their `arrays`."""
         return VertexSurfels(
             count,
             upload(mesh.faces.ravel(), mi.UInt32),
@@ -114,7 +117,7 @@ class VertexSurfels:
     def surface(self, surfels: Surfels) -> Surface:
         """The mesh with the present materials of the surfels, under AD.
 
-        Raises InputError unless it is the table, or one with as many rows, that `of` saw.
+        Raises InputError for another number of surfels than `of` has seen.
         """
         if surfels.count != self.count:
             raise InputError(
@@ -134,10 +137,10 @@ class Surface:
     """A mesh with materials, to look up at hits."""
 
     vertex_surfels: VertexSurfels
-    rows: Any  # mi.Float (8 V): albedo, metallic, roughness, normal
+    rows: Float  # (8 V,): albedo, metallic | roughness, normal
 
-    def at(self, triangle: mi.UInt32, barycentric: mi.Point2f, active: mi.Bool) -> SurfaceSample:
-        """Attributes at the barycentric coordinates `barycentric` (of the second and third corner)."""
+    def at(self, triangle: UInt32, barycentric: Point2f, active: Bool) -> SurfaceSample:
+        """Attributes at barycentric coordinates of the second and third corner."""
         near, far = mi.Vector4f(0), mi.Vector4f(0)
         closest, largest = mi.UInt32(0), mi.Float(-1)
         for vertex, share in _corners(self.vertex_surfels.faces, triangle, barycentric, active):
@@ -150,10 +153,34 @@ class Surface:
         return SurfaceSample(mi.Color3f(near.x, near.y, near.z), near.w, far.x, normal, surfel)
 
 
+@dataclass(frozen=True)
+class VertexColours:
+    """One colour per vertex, linear over each face; detached."""
+
+    faces: UInt32  # (3 F,)
+    rows: Float  # (3 V,)
+
+    @staticmethod
+    def of(mesh: Mesh, colours: np.ndarray) -> VertexColours:
+        """Colours (V, 3) of the vertices of a mesh."""
+        return VertexColours(upload(mesh.faces.ravel(), mi.UInt32), upload(np.asarray(colours).ravel()))
+
+    def at(self, triangle: UInt32, barycentric: Point2f, active: Bool) -> Color3f:
+        """Colour at barycentric coordinates of the second and third corner; 0 where not `active`."""
+        colour = mi.Color3f(0)
+        for vertex, share in _corners(self.faces, triangle, barycentric, active):
+            colour += share * dr.gather(mi.Color3f, self.rows, vertex, active)
+        return colour
+
+    def numpy(self) -> np.ndarray:
+        """The colours (V, 3)."""
+        return np.array(self.rows).reshape(-1, 3)
+
+
 def _corners(
     faces: UInt32, triangle: UInt32, barycentric: Point2f, active: Bool
 ) -> list[tuple[UInt32, Float]]:
-    """Vertex and barycentric weight of the three corners of triangles (N,)."""
+    """Vertex and barycentric weight of each of the three corners of triangles (N,)."""
     shares = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)
     return [
         (dr.gather(mi.UInt32, faces, 3 * triangle + corner, active), share)
@@ -171,27 +198,3 @@ def _normals(mesh: Mesh, neighbours: np.ndarray, weight: np.ndarray) -> np.ndarr
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     agrees = (mean * own).sum(1, keepdims=True) > NORMAL_AGREEMENT
     return np.where(agrees, mean, own)
-
-
-@dataclass(frozen=True)
-class VertexColours:
-    """One colour a vertex, linear over each face; detached."""
-
-    faces: Any  # mi.UInt32 (3 F)
-    rows: Any  # mi.Float (3 V)
-
-    @staticmethod
-    def of(mesh: Mesh, colours: np.ndarray) -> VertexColours:
-        """Colours (V, 3) of the vertices of a mesh."""
-        return VertexColours(upload(mesh.faces.ravel(), mi.UInt32), upload(np.asarray(colours).ravel()))
-
-    def at(self, triangle: Any, barycentric: Any, active: Any) -> Any:
-        """mi.Color3f at the barycentric coordinates of the second and third corner; 0 where not `active`."""
-        colour = mi.Color3f(0)
-        for vertex, share in _corners(self.faces, triangle, barycentric, active):
-            colour += share * dr.gather(mi.Color3f, self.rows, vertex, active)
-        return colour
-
-    def numpy(self) -> np.ndarray:
-        """The colours (V, 3)."""
-        return np.array(self.rows).reshape(-1, 3)

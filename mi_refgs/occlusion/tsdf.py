@@ -1,6 +1,6 @@
-"""Depth maps of many views, fused into one truncated signed distance field over a box, or over all of space.
+"""Fuse depth maps of many views into one truncated signed distance field, over a box or contracted space.
 
-The sign is positive in free space. A voxel's state follows from what the views say about it:
+The sign is positive in free space. The state of a voxel follows from the views:
 
 =======================================  ===================================================================
 in front of, or just behind, a surface   running mean of (depth - z), truncated
@@ -9,10 +9,10 @@ only further behind surfaces             -1: the inside that no view reaches; no
 in no view's image                       +1: nothing is known to be there
 =======================================  ===================================================================
 
-All of space is the ball of radius 2 into which a region's contraction maps it: grid, truncation and
-distances are of contracted space there. The distance of a voxel to a surface along the view's ray is that of
-both in contracted space, by the cosine between ray and viewing axis: inside of the region it is
-(depth - z) / radius, as without contraction.
+Contracted space is the ball of radius 2 that a region's contraction maps all of space to; grid, truncation
+and distances are in that space. The distance between a voxel and a surface along the view's ray is theirs in
+contracted space times the cosine between ray and viewing axis: (depth - z) / radius inside the region, as
+without contraction.
 """
 
 from __future__ import annotations
@@ -30,32 +30,30 @@ from mi_refgs.errors import InputError
 from mi_refgs.splat.camera import Camera
 
 ALPHA_SOLID = 0.5
-"""Opacity from which a pixel has a surface: half coverage puts a box filter's silhouette where it is."""
+"""Opacity from which a pixel has a surface: half coverage, where a box filter has its silhouette."""
 
 TRUNCATION_VOXELS = 5.0
 """Truncation of the signed distance, in voxels. [Ref-Gaussian's released extraction; 2DGS, §6]"""
 
 UNSEEN_VOTE = 0.1
-"""A voxel counts as inside while it has at most this many sightings for each view that has a surface before
-it, so that pixels which leak through thin places drill no tunnels; a cavity must be seen by 9 % of the views
-to stay open. Measured on splats with thin places: part of the surface that is false, 12 % at 0.03, 0.5 % at
-0.15."""
+"""A voxel is inside while it has at most this many sightings per view with a surface before it, so that
+pixels which leak through thin places drill no tunnels; a cavity must be seen by 9 % of the views to stay
+open. Measured on splats with thin places: 12 % of the surface is false at 0.03, 0.5 % at 0.15."""
 
 RESOLUTION_MAX = 1023
-"""Voxels along one axis: three coordinates share one 32-bit word."""
+"""Most voxels along one axis: three coordinates share one 32-bit word."""
 
 BOX_QUANTILE = 0.02
-"""Part of the points on each side, per axis, that may be floaters when the fusion box is found."""
+"""Fraction of the points per side and axis that may be floaters when the fusion box is computed."""
 
 BOX_REACH = 0.25
-"""The box may grow beyond those quantiles by this part of their distance: thin ends hold few points."""
+"""The box may grow beyond those quantiles by this part of their distance: thin ends have few points."""
 
 BOX_FLOOR = 1e-6
 """Least margin, as part of the points' distance from the origin: some units in the last place of float32."""
 
 BOX_MARGIN = 0.05
 """Free space around the points, as part of the longest side: room for the truncation from 128 voxels up."""
-
 
 END_VOXELS = 2.0
 """Contracted voxels from the border of contracted space, where the world is infinite, to the last values."""
@@ -68,16 +66,16 @@ class TSDF:
     volume: np.ndarray  # (nx, ny, nz) float32 in [-1, 1]
     origin: np.ndarray  # (3,) float64, world position of volume[0, 0, 0]
     voxel: float  # grid spacing, scene units
-    region: Region | None = None  # whose contracted space `origin` and `voxel` are of; None: the world's
+    region: Region | None = None  # `origin` and `voxel` are in its contracted space; None: in the world
 
     @property
     def end(self) -> float:
-        """Largest distance from the middle of contracted space at which there are values."""
+        """Largest distance from the centre of contracted space with values."""
         return 2 - END_VOXELS * self.voxel
 
 
 def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Box (lo, hi) with a margin around the (N, 3) world points but for a few per cent of floaters.
+    """Box (lo, hi) with a margin around (N, 3) world points, without a few per cent of floaters.
 
     Points that are not finite are ignored. Raises InputError if none is left.
     """
@@ -107,12 +105,12 @@ def fuse(
 ) -> TSDF:
     """Fuse depth maps into a signed distance field over `bounds`.
 
-    `resolution` is the number of voxels along the longest side. Each depth (expected camera z, scene units;
-    not premultiplied) and alpha is a `mi.Float` or `mi.TensorXf` of height·width values in raster order. The
-    three iterables are read once, in step: pass generators and only one view is in memory. Depth where alpha
-    < ALPHA_SOLID is ignored. `carve`: such pixels show free space (set it where the data's alpha means
-    something). Detached; every view runs the same compiled kernel. With a `region`, `bounds` are in its
-    contracted space, and `resolution` voxels are as long as the region is wide.
+    `resolution` is the number of voxels along the longest side. Depths (expected camera z, scene units; not
+    premultiplied) and alphas are `mi.Float` or `mi.TensorXf` of height·width values in raster order. The
+    iterables are read once, in step: with generators only one view is in memory. Depth where alpha <
+    ALPHA_SOLID is ignored; `carve`: such pixels are free space (for data with meaningful alpha). Detached;
+    every view runs the same compiled kernel. With a `region`, `bounds` are in its contracted space, and
+    `resolution` voxels are as long as the region is wide.
 
     Curless and Levoy 1996 (weighted running mean); weight falling behind the surface as in Bylow et al. 2013,
     so that the far side of thin parts is pushed away less. Raises InputError for an empty box or a resolution
@@ -143,18 +141,15 @@ def _flat(image: Any, camera: Camera) -> Any:
 
 
 class _Grid:
-    """The accumulators of one fusion."""
+    """Accumulators of one fusion."""
 
     def __init__(self, shape: np.ndarray, of: TSDF) -> None:
         count = self.count = int(np.prod(shape))
         flat = dr.arange(mi.UInt32, count)
-        yz = flat % dr.opaque(mi.UInt32, int(shape[1] * shape[2]))
-        x, y = (
-            flat // dr.opaque(mi.UInt32, int(shape[1] * shape[2])),
-            yz // dr.opaque(mi.UInt32, int(shape[2])),
-        )
+        nz, nyz = dr.opaque(mi.UInt32, int(shape[2])), dr.opaque(mi.UInt32, int(shape[1] * shape[2]))
+        yz = flat % nyz
         # Integer division is slow and would run for every view: keep the three coordinates, 10 bits each.
-        self.corner = x | (y << 10) | ((yz % dr.opaque(mi.UInt32, int(shape[2]))) << 20)
+        self.corner = (flat // nyz) | ((yz // nz) << 10) | ((yz % nz) << 20)
         self.lo = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in of.origin))
         self.voxel = dr.opaque(mi.Float, of.voxel)
         self.space: _Contracted | None = None
@@ -164,10 +159,7 @@ class _Grid:
             length = dr.norm(mi.Vector3f(self._place()))
             self.index = dr.compress(length <= dr.opaque(mi.Float, of.end))  # space has no corners
             self.corner, count = dr.gather(mi.UInt32, self.corner, self.index), dr.width(self.index)
-        self.total = dr.zeros(mi.Float, count)
-        self.weight = dr.zeros(mi.Float, count)
-        self.seen = dr.zeros(mi.Float, count)
-        self.behind = dr.zeros(mi.Float, count)
+        self.total, self.weight, self.seen, self.behind = (dr.zeros(mi.Float, count) for _ in range(4))
         dr.eval(self.corner, self.total, self.weight, self.seen, self.behind)
 
     def integrate(self, depth: Any, alpha: Any, camera: Camera, carve: bool) -> None:

@@ -1,18 +1,17 @@
-"""How much of a diffuse surface's light the object itself takes away, and what it sends back instead.
+"""Ambient visibility: how much of the diffuse light the object itself blocks, and what it reflects instead.
 
-`light.irradiance` is that of a surface that sees all of its hemisphere. `options.ambient_rays` rays from
-every vertex of the occluding mesh, cosine-weighted, say what it sees instead:
+`light.irradiance` assumes that the whole hemisphere is visible. `options.ambient_rays` cosine-weighted rays
+per vertex of the occluding mesh give the ratio to it per colour,
 
-    ratio = Σ (free ? L(ω) : B(ω)) / Σ L(ω)
+    ratio = Σ (free ? L(ω) : B(ω)) / Σ L(ω),
 
-in each colour, L being the light and B the radiance that leaves what stands in the way. So a ratio has the
-shadows of the present light, not only how open a place is, and the diffuse term is albedo × irradiance of
-the pixel's normal × ratio. Where nothing is in the way it is 1, whatever the rays.
+L being the light and B the radiance of the mesh where it blocks the ray. Ratios therefore contain the shadows
+of the present light; where nothing is blocked they are 1, whatever the rays. The diffuse term is albedo ×
+irradiance of the pixel's normal × ratio.
 
-L is looked up in the lobe that is as wide as the part of the hemisphere a ray stands for, so that no lamp
-falls between them. B is shaded by the split sum as traced light is (`shade.reflection`), with the ratios
-of the round before at what is hit, 1 in the first: each of BOUNCES rounds adds a bounce. Ratios are detached,
-and stay until they are found again.
+L is looked up in a lobe as wide as the part of the hemisphere per ray, so that no lamp falls between rays. B
+is shaded as traced light is (`shade.reflection`), with the ratios of the previous round at the hits, 1 in the
+first: each of BOUNCES rounds adds a bounce. Ratios are detached and kept until they are computed again.
 """
 
 from __future__ import annotations
@@ -30,23 +29,23 @@ from mi_refgs.shade.ggx_sampling import lobe_point, lobe_turn
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import safe_normalize
-from mi_refgs.shade.reflection import MeshRadiance
+from mi_refgs.shade.reflection import MeshRadiance, TraceContext
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Color3f, UInt32, Vector3f
 
 BOUNCES = 2
-"""Times that light bounces from what stands in the way before it is taken as unblocked."""
+"""Rounds: bounces of light between surfaces before it is taken as unblocked."""
 
 BRIGHTEST = 4.0
-"""Largest ratio: a mirror that sends a lamp to one of a few rays makes a vertex shine otherwise."""
+"""Largest ratio: otherwise a mirror that reflects a lamp into one of a few rays makes a vertex shine."""
 
 
 def update_occluder_caches(
     occluder: Occluder, surfels: Surfels, light: Light | None, options: ShadingOptions
 ) -> None:
-    """Give a mesh what `options` asks for: materials if its hits are shaded, and ambient ratios.
+    """Give a mesh what `options` require: materials if its hits are shaded, and ambient ratios.
 
-    To be called again when mesh, surfels or light have changed; nothing is done where nothing is asked for.
-    Raises InputError as `Occluder.set_materials` does.
+    Call it again when mesh, surfels or light have changed. Raises InputError as `Occluder.set_materials`.
     """
     if occluder.empty:
         return
@@ -58,18 +57,31 @@ def update_occluder_caches(
 
 
 def ambient(occluder: Occluder, surfels: Surfels, light: Light, options: ShadingOptions) -> VertexColours:
-    """The ratios of all vertices of a mesh whose materials are set; see the head of this file. Detached."""
+    """Ratios of all vertices of a mesh whose materials are set, detached; see the head of this file."""
     mesh = occluder.mesh()
     assert mesh is not None
     place = mi.Point3f(mesh.vertices.T)
     normal = safe_normalize(occluder.surface(surfels).vertex_surfels.normal)
-    occluder.ambient = None  # all light arrives, in the first round
+    frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
+    rays = dr.opaque(mi.UInt32, options.ambient_rays)
+    blur = dr.opaque(mi.Float, ray_roughness(options.ambient_rays))
+    occluder.ambient = None  # the first round is unoccluded
     for _ in range(BOUNCES):
         scene = MeshRadiance.of(
             occluder, surfels, light, replace(options, traced_bounces=1, diffuse="irradiance")
         )
-        ratio = _round(scene, place, normal, options.ambient_rays)
-        occluder.ambient = found = VertexColours.of(mesh, ratio.numpy().T)
+
+        def body(index: Any, arrives: Any, every: Any, scene: MeshRadiance = scene) -> tuple[Any, ...]:
+            direction = ambient_direction(frame, turn, index, rays)
+            radiance = scene.light.specular(direction, blur)
+            hit = scene.trace(place, direction, normal, True, 1)
+            arrives = arrives + dr.select(hit.valid, scene.radiance(hit, direction), radiance)
+            return index + 1, arrives, every + radiance
+
+        start = (dr.zeros(mi.UInt32, dr.width(normal)), mi.Color3f(0), mi.Color3f(0))
+        _, arrives, every = dr.while_loop(start, lambda index, *_: index < rays, body, label="ambient")
+        ratio = dr.select(every > 0, arrives * dr.rcp(dr.select(every > 0, every, 1)), 1)
+        occluder.ambient = found = VertexColours.of(mesh, dr.clip(ratio, 0, BRIGHTEST).numpy().T)
     return found
 
 
@@ -78,7 +90,7 @@ def ray_roughness(count: int) -> float:
     return float((4 * count) ** -0.25)
 
 
-def ambient_direction(frame: Any, turn: Any, ray: Any, count: Any) -> Any:
+def ambient_direction(frame: Any, turn: UInt32, ray: UInt32, count: UInt32) -> Vector3f:
     """Unit direction `ray` of `count` around the z axis of frames, with density cosθ / π."""
     along, around = lobe_point(turn, ray, count)
     sin, cos = dr.sincos(dr.two_pi * around)
@@ -86,29 +98,12 @@ def ambient_direction(frame: Any, turn: Any, ray: Any, count: Any) -> Any:
     return frame.to_world(mi.Vector3f(across * cos, across * sin, dr.sqrt(1 - along)))
 
 
-def _round(scene: MeshRadiance, place: Any, normal: Any, rays: int) -> Any:
-    """Ratios (mi.Color3f) at vertices, with the present ones at what stands in the way."""
-    frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
-    count, blur = dr.opaque(mi.UInt32, rays), dr.opaque(mi.Float, ray_roughness(rays))
-
-    def body(index: Any, arrives: Any, every: Any) -> tuple[Any, ...]:
-        direction = ambient_direction(frame, turn, index, count)
-        radiance = scene.light.specular(direction, blur)
-        hit = scene.trace(place, direction, normal, True, 1)
-        arrives = arrives + dr.select(hit.valid, scene.radiance(hit, direction), radiance)
-        return index + 1, arrives, every + radiance
-
-    start = (dr.zeros(mi.UInt32, dr.width(normal)), mi.Color3f(0), mi.Color3f(0))
-    _, arrives, every = dr.while_loop(start, lambda index, *_: index < count, body, label="ambient")
-    ratio = dr.select(every > 0, arrives * dr.rcp(dr.select(every > 0, every, 1)), 1)
-    return dr.clip(ratio, 0, BRIGHTEST)
-
-
-def ambient_of_pixels(occluder: Occluder, origin: Any, ray: Any, covered: Any) -> Any:
-    """Ratio (mi.Color3f, detached) where the pixels' rays meet the mesh, and 1 where they miss it.
+def ambient_of_pixels(context: TraceContext) -> Color3f:
+    """Ratio where the pixels' rays meet the mesh, and 1 where they miss it; detached.
 
     Raises InputError if the mesh has no ratios.
     """
+    occluder = context.occluder
     if occluder.empty:
         return mi.Color3f(1)
     if occluder.ambient is None:
@@ -116,7 +111,7 @@ def ambient_of_pixels(occluder: Occluder, origin: Any, ray: Any, covered: Any) -
             "occluder: ambient: none for this mesh; call shade.ambient.update_occluder_caches after update"
         )
     with dr.suspend_grad():
-        hit = occluder.closest(origin, ray, None, covered)
+        hit = occluder.closest(context.origin, context.ray, None, context.covered)
         ratio = dr.select(hit.valid, occluder.ambient.at(hit.triangle, hit.barycentric, hit.valid), 1)
         # Now, once: every kernel of the adjoint that reads it would trace the rays again.
         dr.eval(ratio)

@@ -1,4 +1,4 @@
-"""The split-sum table: what a GGX surface reflects of a constant light, F0·A + B, over (N·V, roughness).
+"""The split-sum table: reflectance F0·A + B of a GGX surface under constant light, over (N·V, roughness).
 
 α = roughness², height-correlated Smith shadowing, Schlick's Fresnel. [Karis 2013, "Real Shading in Unreal
 Engine 4"; Heitz 2014, "Understanding the Masking-Shadowing Function", eq. 99]
@@ -77,7 +77,7 @@ def cache_dir() -> Path:
 def table() -> np.ndarray:
     """The table of `compute_table`, kept in the user's cache folder once it is computed.
 
-    A cache that cannot be read or written, or that holds something else, is passed over without a word.
+    A cache that cannot be read or written, or that contains something else, is silently ignored.
     """
     path = None
     with suppress(OSError, ValueError, RuntimeError, EOFError):

@@ -1,4 +1,4 @@
-"""What reflectance models take and give: points to shade, and named terms of outgoing radiance."""
+"""Input and output of reflectance models: points to shade, and named terms of outgoing radiance."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from mi_refgs.errors import InputError
 
 @dataclass(init=False, eq=False)
 class ShadingPoints:
-    """N points to shade: normal and view, and whatever else a model names, all arrays of width N.
+    """N points to shade: normal, view and the attributes that a model names, all arrays of width N.
 
     `normal` and `view` (mi.Vector3f) are in the world frame and of any length; `view` leads towards the
-    camera. Further attributes are read as `points.roughness`, or by `get` where they may be absent. An
-    attribute that a scene does not use is absent and costs nothing. Two names have one meaning for every
-    model: `visibility` (mi.Float, 0 … 1: does light arrive along the reflected direction?) and `indirect`
-    (mi.Color3f: radiance from there when it does not).
+    camera. Further attributes are read as `points.roughness`, or by `get` where they may be absent. Two
+    names have one meaning for every model: `visibility` of the light in the reflected direction (mi.Float,
+    0 … 1) and `indirect` (mi.Color3f: radiance from there where it is blocked).
     """
 
     normal: Any
@@ -31,7 +30,7 @@ class ShadingPoints:
     def __init__(
         self, normal: Any, view: Any, attributes: Mapping[str, Any] | None = None, **named: Any
     ) -> None:
-        """Points with `attributes` and those that are `named`; None says that there is none."""
+        """Points with `attributes` and those that are `named`; None: absent."""
         self.normal, self.view = normal, view
         given = {**(attributes or {}), **named}
         self.attributes = {name: value for name, value in given.items() if value is not None}
@@ -55,14 +54,14 @@ class ShadingPoints:
 
 @dataclass(frozen=True)
 class RadianceTerms:
-    """Outgoing radiance (mi.Color3f) by cause, None where there is no such term; the picture is their sum."""
+    """Outgoing radiance (mi.Color3f) as terms, None for those that do not exist; the image is their sum."""
 
     diffuse: Any
     specular: Any = None
     indirect: Any = None
 
     def known(self) -> dict[str, Any]:
-        """The terms that there are, by name."""
+        """The terms that exist, by name."""
         return {name: getattr(self, name) for name in TERMS if getattr(self, name) is not None}
 
     def total(self) -> Any:
@@ -70,7 +69,7 @@ class RadianceTerms:
         return sum(self.known().values(), mi.Color3f(0))
 
     def filled(self) -> RadianceTerms:
-        """The same, with zeros for the terms that there are not."""
+        """The same, with zeros for terms that do not exist."""
         return RadianceTerms(**{name: dr.zeros(mi.Color3f, 1) for name in TERMS} | self.known())
 
 

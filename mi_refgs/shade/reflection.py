@@ -1,8 +1,8 @@
-"""What pixels see in their mirrors: is the light free there, and what stands in its way?
+"""Traced mirror rays: visibility of the light, and radiance of the mesh where it blocks it.
 
 The paper traces one mirror ray for the whole lobe and leaves what it hits to the indirect attribute. The
-option `visibility_rays` averages over samples of the lobe instead, and `traced_bounces` shades what blocked
-rays hit.
+option `visibility_rays` averages over samples of the lobe instead; `traced_bounces` shades what blocked rays
+hit.
 """
 
 from __future__ import annotations
@@ -23,7 +23,12 @@ from mi_refgs.shade.points import ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.shade.split_sum import base_reflectance, lookup_direction, shade
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Bool, Point3f, UInt32, Vector3f
+from mi_refgs.types import Bool, Color3f, Float, Point2f, Point3f, UInt32, Vector3f
+
+CLAMP_MAX_ALPHA = 1 / 3
+"""α of a lobe from which single bright rays are not clamped. In the concave scenes of
+`benchmarks.visibility`, 4 rays and 6 bounces, the clamp takes 17 to 42 % off relMSE at α = 0.01, 0 to 33 % at
+0.09, and adds up to 15 % at 0.36."""
 
 
 @dataclass(frozen=True)
@@ -38,65 +43,58 @@ class TraceContext:
     covered: Bool = True  # (N,) or a literal; nothing is traced for the other points
     pixel: UInt32 = None  # (N,) image index that seeds the random numbers; None: 0 … N - 1
 
+    def start(self, normal: Vector3f) -> tuple[Point3f, Vector3f, Bool]:
+        """Where the primary rays meet the mesh, the unit normals there, and whether they do; detached.
 
-def mirror_visibility(
-    occluder: Occluder, origin: Any, ray: Any, normal: Any, view: Any, covered: Any = True
-) -> Any:
-    """Is the mirror direction free, seen from where the pixel's ray meets the mesh itself?
+        Not the blended depth: at a silhouette, and between two layers, that lies inside the object and every
+        ray from there is blocked, which draws a dark outline.
+        """
+        distance, hit = self.occluder.first_hit(self.origin, self.ray, self.covered)
+        return mi.Point3f(mi.Vector3f(self.origin) + distance * self.ray), safe_normalize(normal), hit
 
-    Not from the blended depth: at a silhouette, and between two layers, that lies inside the object and every
-    ray from there is blocked, which draws a dark outline. A ray that misses the mesh sees the light, and so
-    do pixels that are not `covered`, for which nothing is traced.
-    """
+
+def mirror_visibility(context: TraceContext, normal: Vector3f, view: Vector3f) -> Float:
+    """Whether the light is visible in the mirror direction (0 or 1), detached; 1 where nothing is traced."""
     with dr.suspend_grad():
-        point, facing, hit = start_on_mesh(occluder, origin, ray, normal, covered)
-        visibility = occluder.visible(point, reflect(view=view, normal=facing), facing, hit)
+        point, facing, hit = context.start(normal)
+        visibility = context.occluder.visible(point, reflect(view=view, normal=facing), facing, hit)
         # Now, once: every kernel of the adjoint that reads it would trace the rays again.
         dr.eval(visibility)
         return visibility
 
 
-def start_on_mesh(
-    occluder: Occluder, origin: Any, ray: Any, normal: Any, covered: Any
-) -> tuple[Any, Any, Any]:
-    """Where the pixels' rays meet the mesh, the unit normals there, and whether they do."""
-    distance, hit = occluder.first_hit(origin, ray, covered)
-    return mi.Point3f(mi.Vector3f(origin) + distance * ray), safe_normalize(normal), hit
-
-
 @dataclass(frozen=True)
 class MeshHit:
-    """A hit of the mesh, and whether light arrives there along the mirror direction (0 or 1); detached."""
+    """Hits of N rays, and whether light is visible there in the mirror direction; detached."""
 
-    valid: Any
-    triangle: Any
-    barycentric: Any
-    visibility: Any
-    next: MeshHit | None = None  # where it does not: what stands in its way, if that is shaded too
+    valid: Bool
+    triangle: UInt32
+    barycentric: Point2f
+    visibility: Float  # 0 or 1
+    next: MeshHit | None = None  # what blocks it, if that is shaded too
 
 
 @dataclass(frozen=True)
 class MeshRadiance:
-    """The mesh as the second surface that light meets: shaded by `shade` with the materials of the surfels.
+    """Radiance of the mesh, shaded by `split_sum.shade` with the materials of the surfels.
 
-    Its specular light must arrive along its own mirror direction, which is traced once more: without that, a
-    hit deep in a bowl shines as if it lay in the open, and the picture is worse than with no indirect light
-    at all (relMSE 4.7 against 1.0, at roughness 0.3; with it 0.2 at 0.4). What blocks it is another hit,
-    shaded likewise, `options.traced_bounces` times in all; what is blocked at the last is dark. (No closing
-    term was better in every concave scene: with 64 rays, 2 bounces and roughness 0.1, relMSE in a bowl is
-    0.10 with none, 0.98 with the unblocked light and 3.8 with the irradiance.) The recursion is unrolled:
-    every number of bounces is a kernel of its own, and its length grows with them.
+    The specular light of a hit requires visibility in its own mirror direction, which is traced once more.
+    Without that, a hit deep in a bowl shines as if it were in the open, and the image is worse than without
+    indirect light (relMSE 4.7 against 1.0, at roughness 0.3; with it 0.2 at 0.4). What blocks it is another
+    hit, shaded in the same way, `traced_bounces` times in all; what is blocked at the last is dark. (No
+    closing term was better in every concave scene: with 64 rays, 2 bounces and roughness 0.1, relMSE in a
+    bowl is 0.10 with none, 0.98 with the unblocked light and 3.8 with the irradiance.) The recursion is
+    unrolled: every number of bounces is a kernel of its own, and its length grows with them.
 
     With diffuse="sh" the diffuse part is the SH radiance of the surfel nearest to the hit, along the ray: the
-    same quantity that pixels blend, and like it tied to the light it was fitted under; a picture to be relit
-    asks for "irradiance" in either place.
+    quantity that pixels blend, tied to the light it was fitted under. Relighting requires "irradiance".
     """
 
     occluder: Occluder
     surface: Surface
     light: Light
     options: ShadingOptions
-    harmonics: Any  # mi.Float (3 C N): the radiance channel by rows; empty unless diffuse="sh"
+    harmonics: Float  # (3 C N,) radiance_sh by rows; empty unless diffuse="sh"
     count: int  # C
 
     @staticmethod
@@ -111,11 +109,9 @@ class MeshRadiance:
         dr.eval(surface.rows, harmonics)
         return MeshRadiance(occluder, surface, light, options, harmonics, len(coefficients))
 
-    def light_from(self, normal: Any, view: Any, roughness: Any) -> Any:
-        """Radiance (mi.Color3f) of the light as `shade` looks it up at points of unit normals and views."""
-        return self.light.specular(lookup_direction(normal, view, roughness, self.options), roughness)
-
-    def trace(self, point: Any, direction: Any, normal: Any, active: Any, bounces: int) -> MeshHit:
+    def trace(
+        self, point: Point3f, direction: Vector3f, normal: Vector3f, active: Bool, bounces: int
+    ) -> MeshHit:
         """What rays of `Occluder.visible` hit first, and what their mirror rays hit, `bounces` ≥ 1 times."""
         with dr.suspend_grad():
             hit = self.occluder.closest(point, direction, normal, active)
@@ -128,21 +124,19 @@ class MeshRadiance:
             free = dr.select(further.valid, mi.Float(0), mi.Float(1))
             return MeshHit(hit.valid, hit.triangle, hit.barycentric, free, further)
 
-    def radiance(self, hit: MeshHit, direction: Any) -> Any:
-        """Radiance (mi.Color3f) that leaves the hits against the rays, under AD."""
+    def radiance(self, hit: MeshHit, direction: Vector3f) -> Color3f:
+        """Radiance that leaves the hits against the rays, under AD."""
         sample = self.surface.at(hit.triangle, hit.barycentric, hit.valid)
         normal = self._facing(sample, direction)
-        own = None
+        own = ambient = indirect = None
         if self.count:
             row = sample.surfel * self.count
             coefficients = [
                 dr.gather(mi.Color3f, self.harmonics, row + i, hit.valid) for i in range(self.count)
             ]
             own = clamp_positive(eval_sh(coefficients, direction) + 0.5)
-        ambient = None
         if self.options.ambient_rays and self.occluder.ambient is not None:
             ambient = self.occluder.ambient.at(hit.triangle, hit.barycentric, hit.valid)
-        indirect = None
         if hit.next is not None:
             indirect = self.radiance(hit.next, reflect(view=-direction, normal=normal))
         points = ShadingPoints(
@@ -158,47 +152,35 @@ class MeshRadiance:
         )
         return shade(points, self.light, self.options).total()
 
-    def _facing(self, sample: SurfaceSample, direction: Any) -> Any:
-        """Unit normal on the ray's side, but for one that only leans away (see `FACING_TOLERANCE`)."""
+    def _facing(self, sample: SurfaceSample, direction: Vector3f) -> Vector3f:
+        """Unit normal on the ray's side, unless it only leans away (see `FACING_TOLERANCE`)."""
         normal = dr.detach(safe_normalize(sample.normal))
         return dr.select(dr.dot(normal, direction) > FACING_TOLERANCE, -normal, normal)
 
 
-CLAMP_MAX_ALPHA = 1 / 3
-"""α of a lobe from which single bright rays are not clamped. In the concave scenes of
-`benchmarks.visibility`, 4 rays and 6 bounces, the clamp takes 17 to 42 % off relMSE at α = 0.01, 0 to 33 % at
-0.09, and adds up to 15 % at 0.36."""
-
-
 def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
-    """`points` with the visibility (mi.Float, 0 … 1, detached) and indirect light that `options` asks for.
+    """The points with visibility (mi.Float, 0 … 1, detached) and indirect light, as `options` require.
 
-    `points.indirect` (of the indirect channel) stays unless `options.traced_bounces` replaces it by the mean
-    radiance of what blocked rays hit (`MeshRadiance`), single bright ones clamped (`_firefly_clamp`). Its
-    gradient goes to the light and to the materials of the surfels around all hits, in both modes; rays, hits
-    and the clamp are detached, and so is what the pixel's own roughness does to the rays.
+    `points.indirect` (from the indirect attribute) stays unless `options.traced_bounces` replaces it by the
+    mean radiance of what blocked rays hit (`MeshRadiance`), single bright ones clamped (`_firefly_clamp`).
+    Its gradient goes to the light and to the materials of the surfels around all hits, in both modes; rays,
+    hits, the clamp and the effect of the pixel's own roughness on the rays are detached.
     """
-    occluder, origin, ray, covered = context.occluder, context.origin, context.ray, context.covered
-    normal = dr.detach(points.normal)
+    occluder, normal = context.occluder, dr.detach(points.normal)
     if options.visibility_rays == 1 and not options.traced_bounces:
-        visibility = mirror_visibility(occluder, origin, ray, normal, points.view, covered)
-        return points.replaced(visibility=visibility)
+        return points.replaced(visibility=mirror_visibility(context, normal, points.view))
     if occluder.empty:
-        return points.replaced(visibility=dr.full(mi.Float, 1, dr.width(ray)), indirect=None)
+        return points.replaced(visibility=dr.full(mi.Float, 1, dr.width(context.ray)), indirect=None)
     scene = None
     if options.traced_bounces:
         scene = MeshRadiance.of(occluder, context.surfels, context.light, options)
     with dr.suspend_grad():
-        point, facing, seen = start_on_mesh(occluder, origin, ray, normal, covered)
+        start = context.start(normal)
     if options.visibility_rays > 1:
-        with dr.suspend_grad():
-            lobe = Lobe.of(facing, points.view, points.roughness, base_reflectance(points), context.pixel)
-            open_ = None if scene is None else scene.light_from(facing, points.view, points.roughness)
-        visibility, indirect = _average(
-            occluder, scene, lobe, options.visibility_rays, point, facing, seen, open_
-        )
+        visibility, indirect = _average(points, context, scene, start, options.visibility_rays)
     else:
         assert scene is not None
+        point, facing, seen = start
         mirror = dr.detach(reflect(view=points.view, normal=facing))
         hit = scene.trace(point, mirror, facing, seen, options.traced_bounces)
         dr.eval(hit)  # now, once, as for the visibility alone
@@ -210,27 +192,28 @@ def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOpt
 
 
 def _average(
-    occluder: Occluder,
+    points: ShadingPoints,
+    context: TraceContext,
     scene: MeshRadiance | None,
-    lobe: Lobe,
+    start: tuple[Point3f, Vector3f, Bool],
     rays: int,
-    point: Any,
-    facing: Any,
-    seen: Any,
-    open_: Any,
-) -> tuple[Any, Any]:
-    """Mean visibility over rays of the lobe, weighted as the specular integrand weights them, and the mean
-    radiance of the blocked ones (None without a `scene` to see there), in one loop.
-
-    `open_` (mi.Color3f, detached): the mean radiance of the others.
-    """
+) -> tuple[Float, Color3f | None]:
+    """Mean visibility over samples of the lobe, weighted by the specular integrand, and the mean radiance of
+    the blocked ones (None without a `scene`), in one loop."""
+    point, facing, seen = start
     count = dr.opaque(mi.UInt32, rays)
+    with dr.suspend_grad():
+        lobe = Lobe.of(facing, points.view, points.roughness, base_reflectance(points), context.pixel)
+        unblocked = None  # mean radiance of the others
+        if scene is not None:
+            towards = lookup_direction(facing, points.view, points.roughness, scene.options)
+            unblocked = scene.light.specular(towards, points.roughness)
 
     def body(index: Any, free: Any, blocked: Any, total: Any, largest: Any) -> tuple[Any, ...]:
         with dr.suspend_grad():
             direction, weight = lobe.sample(index, count)
             if scene is None:
-                stopped = occluder.visible(point, direction, facing, weight > 0) == 0
+                stopped = context.occluder.visible(point, direction, facing, weight > 0) == 0
             else:
                 hit = scene.trace(point, direction, facing, weight > 0, scene.options.traced_bounces)
                 stopped = hit.valid
@@ -242,28 +225,28 @@ def _average(
         return index + 1, free, blocked, total, largest
 
     # A sum over rays, whose derivative keeps no state of an iteration: Dr.Jit's max_iterations = -1.
-    start = (mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Color3f(0), mi.Color3f(0))
+    state = (mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Color3f(0), mi.Color3f(0))
     _, free, blocked, total, largest = dr.while_loop(
-        start, lambda index, *_: seen & (index < count), body, max_iterations=-1, label="lobe"
+        state, lambda index, *_: seen & (index < count), body, max_iterations=-1, label="lobe"
     )
     every = free + blocked
     visibility = dr.select(every > 0, free / dr.select(every > 0, every, 1), 1)
     if scene is None:
         dr.eval(visibility)
         return dr.detach(visibility), None
-    total = total * _firefly_clamp(dr.detach(total), largest, free * open_, mi.Float(count), lobe.α)
+    total = total * _firefly_clamp(dr.detach(total), largest, free * unblocked, mi.Float(count), lobe.α)
     indirect = total * dr.select(blocked > 0, dr.rcp(dr.select(blocked > 0, blocked, 1)), 0)
     dr.eval(visibility, indirect)
     return dr.detach(visibility), indirect
 
 
-def _firefly_clamp(total: Any, largest: Any, free: Any, count: Any, α: Any) -> Any:
-    """What share (0 … 1, detached) of the sum over blocked rays counts, in each colour.
+def _firefly_clamp(total: Color3f, largest: Color3f, free: Color3f, count: Float, α: Float) -> Color3f:
+    """Factor (0 … 1, detached) of the sum over blocked rays, per colour.
 
     The `largest` of `count` rays counts for no more than all rays would at the mean of the others, `free`
-    ones included: one of a few rays of a narrow lobe that finds a lamp in a reflection speckles the picture.
-    In a wide lobe rays differ anyway, so this fades out with its α (see CLAMP_MAX_ALPHA). The more rays, the
-    less is clamped: the limit is the true mean.
+    ones included: one of a few rays of a narrow lobe that finds a lamp in a reflection makes a speckle. Rays
+    of a wide lobe differ anyway, so this fades out with its α (see CLAMP_MAX_ALPHA). The more rays, the less
+    is clamped: the limit is the true mean.
     """
     others = dr.maximum(total - largest, 0)
     excess = dr.maximum(largest - (others + free) * count / (count - 1), 0) * dr.maximum(

@@ -56,7 +56,7 @@ class Shading(ShadingOptions):
 
     @staticmethod
     def resolve(options: ShadingOptions, mesh: bool) -> Shading:
-        """Resolve what a stage asks for: it is occluded if there is a `mesh` and the model can trace it in
+        """Resolve the options of a stage: it is occluded if there is a `mesh` and the model can trace it in
         this order; TRACED options count only then.
         """
         given = {option.name: getattr(options, option.name) for option in fields(ShadingOptions)}
@@ -67,7 +67,7 @@ class Shading(ShadingOptions):
     def from_json(note: Mapping[str, Any]) -> Shading:
         """Read what `dataclasses.asdict` has written; raises InputError, or TypeError for an unknown key.
 
-        Files of version 0.1 have a table `accuracy` of the options that now stand beside it.
+        Files of version 0.1 have a table `accuracy` of the options that are now beside it.
         """
         options = dict(note)
         return Shading(**options.pop("accuracy", {}), **options)

@@ -20,7 +20,7 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.options import QUALITY, ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
-from mi_refgs.shade.reflection import mirror_visibility
+from mi_refgs.shade.reflection import TraceContext, mirror_visibility
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
@@ -176,7 +176,9 @@ def test_mirror_rays_start_at_hits_only(tmp_path: Path) -> None:
     _, hit = occluder.first_hit(camera.origin, ray)
     towards = -dr.normalize(ray)
     covered = dr.arange(mi.UInt32, WIDTH * HEIGHT) % 2 == 0
-    answer = mirror_visibility(occluder, camera.origin, ray, towards, towards, covered)
+    nothing: Any = None
+    context = TraceContext(occluder, nothing, None, camera.origin, ray, covered)
+    answer = mirror_visibility(context, towards, towards)
     assert 0 < int(dr.count(hit)[0]) < WIDTH * HEIGHT
     assert asked == [int(dr.count(hit & covered)[0])]
     assert dr.all((answer == 1) | (hit & covered))

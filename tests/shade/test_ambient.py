@@ -22,6 +22,7 @@ from mi_refgs.shade.ggx_sampling import lobe_turn
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 from mi_refgs.shade.options import ShadingOptions
+from mi_refgs.shade.reflection import TraceContext
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
@@ -148,7 +149,7 @@ def test_what_is_convex_gets_all_light() -> None:
     assert occluder.ambient is not None
     np.testing.assert_allclose(occluder.ambient.numpy(), 1, atol=1e-6)
     origin, ray = mi.Point3f(0, 0, 3), mi.Vector3f([0.0, 0.4, 0.1], [0.0, 0.4, 0], [-1.0, -1, -2])
-    ratio = ambient.ambient_of_pixels(occluder, origin, ray, True)
+    ratio = ambient.ambient_of_pixels(TraceContext(occluder, surfels, None, origin, ray))
     np.testing.assert_allclose(ratio.numpy(), np.ones((3, 3)), atol=1e-6)
 
 
@@ -156,14 +157,18 @@ def test_pixels_read_what_the_mesh_holds() -> None:
     """Linear over a face, in the order of its corners; 1 where nothing is hit or covered."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     mesh = Mesh(vertices, np.array([[0, 1, 2]], np.uint32), 1e-3)
-    occluder = Occluder(mesh)
+    occluder, surfels = Occluder(mesh), Surfels.from_numpy(raw_channels())
     with pytest.raises(InputError, match="update_occluder_caches"):
-        ambient.ambient_of_pixels(occluder, mi.Point3f(0, 0, 1), mi.Vector3f(0, 0, -1), True)
+        ambient.ambient_of_pixels(
+            TraceContext(occluder, surfels, None, mi.Point3f(0, 0, 1), mi.Vector3f(0, 0, -1))
+        )
     colours = np.array([[0.1, 0.2, 0.3], [0.9, 0.4, 0.5], [0.6, 0.7, 0.8]])
     occluder.ambient = ambient.VertexColours.of(mesh, colours)
     at = np.array([[0.2, 0.3], [0.6, 0.1], [0.1, 0.1], [2, 2]])
     ray = mi.Vector3f(at[:, 0], at[:, 1], -np.ones(4)) - mi.Vector3f(0, 0, 0)
-    ratio = ambient.ambient_of_pixels(occluder, mi.Point3f(0, 0, 1), ray, mi.Bool([True, True, False, True]))
+    ratio = ambient.ambient_of_pixels(
+        TraceContext(occluder, surfels, None, mi.Point3f(0, 0, 1), ray, mi.Bool([True, True, False, True]))
+    )
     shares = np.column_stack([1 - at.sum(1), at])
     expected = np.where([[True], [True], [False], [False]], shares @ colours, 1)
     np.testing.assert_allclose(ratio.numpy().T, expected, atol=1e-5)

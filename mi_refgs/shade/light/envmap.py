@@ -1,4 +1,4 @@
-"""The environment light: learnable lat-long radiance, its prefiltered levels, and lookups for shading.
+"""The environment map: learnable lat-long radiance, its prefiltered levels, and lookups for shading.
 
 Directions follow Mitsuba's `envmap`: up is +y, φ = atan2(x, -z) runs along a row, θ from +y down the rows;
 column centres at half-integers, the first and the last row at the poles (`lobe_matrices`). Images go in and
@@ -62,7 +62,7 @@ def nearest_raw(radiance: np.ndarray) -> np.ndarray:
     """Raw float32 values whose softplus, as the device rounds it, is nearest to the radiance.
 
     A light that was read, written and read again is the same, bit for bit; by `inverse_softplus` alone 2 %
-    of the texels are not, and pictures differ by 1e-6.
+    of the texels are not, and images differ by 1e-6.
     """
     wanted, exact = radiance.astype(np.float32), inverse_softplus(radiance)
     step = np.maximum(np.spacing(np.abs(exact).astype(np.float32)), np.spacing(wanted) / -np.expm1(-radiance))
@@ -80,17 +80,17 @@ MIN_HEIGHT = 8
 """Fewest rows for which the prefilter's symmetries hold."""
 
 FINEST = 1024
-"""Most rows of a light that is read from a file without saying how many: 0.2° per texel."""
+"""Default for most rows of a light that is read from a file: 0.2° per texel."""
 
 RADIANCE_FLOOR = 1e-4
-"""Darkest radiance that an import keeps: softplus has no finite raw value for 0."""
+"""Least radiance after an import: softplus has no finite raw value for 0."""
 
 POLE_SINE = 1e-4
 """Within 0.006° of a pole the azimuth is fixed, so that its derivative stays below 1e4."""
 
 
 def is_height(rows: int) -> bool:
-    """Whether a learnable light may have so many rows."""
+    """Whether a learnable light may have this number of rows."""
     return rows % 4 == 0 and rows >= MIN_HEIGHT
 
 
@@ -138,7 +138,7 @@ class PrefilteredLight:
 
 @dataclass(frozen=True)
 class UnfilteredLight:
-    """The map alone (`EnvironmentLight.unfiltered`), for models that look up nothing but radiance."""
+    """The map without levels (`EnvironmentLight.unfiltered`), for models that look up `radiance` only."""
 
     height: int
     texels: Any  # flat RGB texels, under AD
@@ -153,11 +153,9 @@ class UnfilteredLight:
         return _interpolated(texel, *_azimuth_polar(direction), h, 2 * h)
 
     def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
-        """Raises InputError: that needs a filter."""
         raise InputError("light: irradiance: the light is not filtered; use EnvironmentLight.prefilter()")
 
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
-        """Raises InputError: that needs a filter."""
         raise InputError("light: specular: the light is not filtered; use EnvironmentLight.prefilter()")
 
 
@@ -185,7 +183,7 @@ def _azimuth_polar(direction: Any) -> tuple[Any, Any]:
     φ = dr.atan2(dr.select(off_pole, x, 0), -dr.select(off_pole, z, 1))
     u = φ * (0.5 / dr.pi)
     u = dr.select(u < 0, u + 1, u)
-    # At the pole itself sqrt has no derivative, and the sign of y alone tells the two poles apart.
+    # At the pole itself sqrt has no derivative, and only the sign of y distinguishes the two poles.
     sin = dr.select(off_pole, dr.sqrt(dr.select(off_pole, sin2, 1)), 0)
     return u, dr.atan2(sin, dr.select(off_pole, y, dr.select(y < 0, -1, 1))) * (1 / dr.pi)
 
@@ -233,7 +231,7 @@ class EnvironmentLight:
         """
         radiance = np.asarray(radiance, np.float64)
         if not np.isfinite(radiance).all():
-            raise InputError("EnvironmentLight: radiance: holds NaN or infinity; replace those texels")
+            raise InputError("EnvironmentLight: radiance: NaN or infinite values; replace those texels")
         return cls(upload_tensor(nearest_raw(np.maximum(radiance, RADIANCE_FLOOR))))
 
     @classmethod
@@ -257,7 +255,7 @@ class EnvironmentLight:
         return mi.TensorXf(bounded(softplus(self.raw.array), self.raw.array), shape=tuple(self.raw.shape))
 
     def unusable(self) -> int:
-        """How many raw values are not < RAW_LIMIT, and black; waits for the device."""
+        """Number of raw values that are not < RAW_LIMIT, which are black; waits for the device."""
         return int(dr.count(~(dr.abs(dr.detach(self.raw.array)) < RAW_LIMIT))[0])
 
     def prefilter(self, levels: Levels = LEVELS) -> PrefilteredLight:
@@ -269,13 +267,13 @@ class EnvironmentLight:
         return PrefilteredLight(*prefilter(self.radiance(), levels))
 
     def unfiltered(self) -> UnfilteredLight:
-        """The map of this light, under AD, for models that look up nothing but radiance."""
+        """The map of this light, under AD, for models that look up `radiance` only."""
         return UnfilteredLight(self.height, self.radiance().array)
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the radiance as a float32 EXR that Mitsuba's `envmap` shows in the same directions; atomic.
+        """Write the radiance as a float32 EXR, in the orientation of Mitsuba's `envmap`; atomic.
 
-        Raises InputError when the place cannot be written.
+        Raises InputError when the path cannot be written.
         """
         path = Path(path)
         with suppress(OSError):  # a folder that cannot be made cannot be written to either

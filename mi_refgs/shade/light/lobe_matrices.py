@@ -2,10 +2,10 @@
 
 With N = V = R the lobe depends only on the angle between R and L, so on a lat-long grid the filter commutes
 with every rotation about the pole: it acts on each azimuthal frequency m separately, as a small matrix from
-input rows to output rows. Those matrices, built once a resolution, *are* the prefilter, the whole lobe
-included and nothing cut: where a lobe is wide, all but the lowest frequencies vanish and cost nothing.
+input rows to output rows. Those matrices, built once per resolution, are the prefilter of the whole lobe:
+where a lobe is wide, all but the lowest frequencies vanish and cost nothing.
 
-Grid    Rows stand at θ = πi/(h-1) from +y (first and last row are the poles), columns at φ = 2π(j+½)/w with
+Grid    Rows are at θ = πi/(h-1) from +y (first and last row are the poles), columns at φ = 2π(j+½)/w with
         φ = atan2(x, -z). That is where Mitsuba's `envmap` puts the texels of an image, measured by
         tests/shade/test_envmap.py.
 Radiance between texels is bilinear, as Mitsuba looks it up: the operator integrates the lobe against that
@@ -37,7 +37,7 @@ class Levels:
 
     @staticmethod
     def some(count: int) -> Levels:
-        """So many of all levels, evenly chosen: the sharpest, the roughest, and those between."""
+        """`count` of all levels, evenly chosen: the sharpest, the roughest, and those between."""
         chosen = np.unique(np.linspace(0, len(LEVEL_ROUGHNESS) - 1, count).round().astype(int))
         roughness = tuple(LEVEL_ROUGHNESS[i] for i in chosen)
         return Levels(roughness, tuple(LEVEL_MAX_HEIGHT[i] for i in chosen))
@@ -54,7 +54,7 @@ HORIZON_CUTS = 0.5
 """Roughness from which a lobe ends at the horizon rather than before it."""
 
 MIN_SUBSAMPLES = 2
-"""Quadrature points a texel side where the lobe is wider than a texel."""
+"""Quadrature points per texel side where the lobe is wider than a texel."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def hat_rows(count: int, fewer: int, periodic: bool = False) -> Any:
     """`row_resampling(count, fewer)`, or of columns if `periodic`, sparse (fewer, count) float32."""
     from scipy.sparse import csr_matrix
 
-    last = 0 if periodic else 1  # rows stand on both ends of their interval, columns do not
+    last = 0 if periodic else 1  # rows are on both ends of their interval, columns are not
     ratio = (count - last) / (fewer - last)
     offset = 0.5 * (ratio - 1) if periodic else 0.0
     centre = ratio * np.arange(fewer) + offset  # in steps of the finer grid
@@ -199,7 +199,7 @@ def build_levels(h: int, levels: Levels = LEVELS) -> list[Level]:
             transfer = (first[:, None] * np.cos(m * offset[:, None])).sum(0) * (h_in / h)
             weights = np.einsum("ikm,kn,m->inm", weights, row_resampling(h, h_in), transfer, optimize=True)
         rows = weights.shape[0]
-        weights = weights[:, :, : rows + 1]  # a level of w columns holds frequencies up to w/2
+        weights = weights[:, :, : rows + 1]  # a level of w columns has frequencies up to w/2
         if rows < h_in and roughness > HORIZON_CUTS:
             # The edge at the horizon has a long series. Cut short, it rings: light would turn negative
             # opposite a sun. Lanczos' factors fade it out.

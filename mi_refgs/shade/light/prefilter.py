@@ -26,16 +26,16 @@ from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels
 
 BLOCK = 4
-"""Rows that need as many frequencies as each other: `mixing` computes them in one lane."""
+"""Consecutive rows with the same number of frequencies, which `mix_rows` computes in one lane."""
 
 COEFFICIENT = 8
-"""Floats a coefficient, and TEXEL floats a texel: powers of two, as packets are."""
+"""Floats per coefficient; TEXEL floats per texel. Powers of two, as packets are."""
 TEXEL = 4
 
 
 @dataclass(frozen=True)
 class RowLayout:
-    """Where the rows of some lat-long grids lie in a texel buffer and in a Fourier buffer.
+    """Places of the rows of several lat-long grids in a texel buffer and in a Fourier buffer.
 
     Analysis has one lane per four columns, to fold them, then one per four frequencies; synthesis has one per
     sixteen columns, two times eight that share their cosines.
@@ -47,9 +47,8 @@ class RowLayout:
     analysis: tuple[Any, Any, Any, Any]  # per lane: texel of the row's start, w, m, offset of the twiddles
     slots: tuple[Any, ...]  # where m, w/2-m, w/4-m and w/4+m go ...
     exists: tuple[Any, ...]  # ... and whether they do
-    synthesis: tuple[
-        Any, Any, Any, Any, Any, Any
-    ]  # row's start, w, column, offset of the twiddles, first slot, M
+    # Per lane: texel of the row's start, w, column, offset of the twiddles, first slot, M.
+    synthesis: tuple[Any, Any, Any, Any, Any, Any]
     twiddles: Any  # pairs of cos and sin of multiples of π/w
 
 
@@ -58,13 +57,13 @@ def to_device(*columns: np.ndarray) -> tuple[Any, ...]:
 
 
 def row_limits(weights: list[np.ndarray]) -> np.ndarray:
-    """Frequencies (rows,) that each row needs in any of `weights` (rows, ·, M), equal within a block."""
+    """Frequencies (rows,) per row that any of `weights` (rows, ·, M) uses, equal within a block."""
     need = [np.where(w.any(1), np.arange(1, w.shape[2] + 1), 0).max(1) for w in weights]
     return np.repeat(np.max(need, 0).reshape(-1, BLOCK).max(1), BLOCK)
 
 
 def row_slots(limits: list[np.ndarray]) -> list[np.ndarray]:
-    """First coefficient of each row, for grids that follow each other in the buffer."""
+    """First coefficient of each row, for consecutive grids in the buffer."""
     ends = np.cumsum(np.concatenate(limits))
     return np.split(ends - np.concatenate(limits), np.cumsum([len(m) for m in limits])[:-1])
 
@@ -101,7 +100,7 @@ def make_rows(firsts: list[int], limits: list[np.ndarray]) -> RowLayout:
 
 
 def write(target: Any, values: list[Any], place: Any, active: Any = True) -> None:
-    """Scatter packets to distinct places, padded with zeros to TEXEL or COEFFICIENT floats."""
+    """Scatter packets to distinct indices, padded with zeros to TEXEL or COEFFICIENT floats."""
     padded = values + [mi.Float(0)] * ((TEXEL if len(values) <= TEXEL else COEFFICIENT) - len(values))
     # Without the promise of no conflicts Dr.Jit runs one kernel, loop and all, per scatter.
     dr.scatter(target, mi.ArrayXf(padded), place, active, mode=dr.ReduceMode.NoConflicts)
@@ -120,8 +119,8 @@ def _turn(turn: Any, step: Any, w: Any) -> Any:
 def _four_turns(rows: RowLayout, at: Any, turn: Any, step: Any, w: Any) -> tuple[list[tuple[Any, Any]], Any]:
     """(cos, sin) at `turn` and after one, two and three steps, and the turn after four.
 
-    One is looked up and three are rotated from it: lookups are what the loops here spend their time on, and a
-    longer chain of rotations would lose digits.
+    One is looked up and three are rotated from it: lookups dominate the time of these loops, and a longer
+    chain of rotations would lose digits.
     """
     cos, sin = read(2, rows.twiddles, at + turn)
     c, s = read(2, rows.twiddles, at + step)  # the same in every turn of a loop: read once
@@ -133,10 +132,10 @@ def _four_turns(rows: RowLayout, at: Any, turn: Any, step: Any, w: Any) -> tuple
 
 
 def _fold(rows: RowLayout, texels: Any) -> Any:
-    """Four columns with the same cosines and sines, up to signs, as one.
+    """Sum four columns with the same cosines and sines, up to signs.
 
-    At 2 (row's start/4 + j) for even frequencies, and at the next place for odd ones: the sums that go with
-    the cosine at column j, then those that go with the sine.
+    Index 2 (row's start/4 + j) has the sums for even frequencies, the next one those for odd ones: first the
+    factors of the cosine at column j, then those of the sine.
     """
     start, w, j = rows.folding
     half = w // 2
@@ -195,7 +194,7 @@ def analyse(rows: RowLayout, texels: Any) -> Any:
 def synthesise(rows: RowLayout, coefficients: Any, texels: Any) -> None:
     """Write Σ_m (a_m cos mφ_j + b_m sin mφ_j) of every row and column into the RGBA buffer `texels`."""
     start, w, q, at, slot, limit = rows.synthesis
-    columns = (q, q + (w // 8 + 1) // 2)  # one read of a coefficient serves both
+    columns = (q, q + (w // 8 + 1) // 2)  # one read of a coefficient is used for both
 
     def body(m: Any, turns: Any, sums: Any) -> tuple[Any, ...]:
         sums = [list(of_column) for of_column in sums]
@@ -219,7 +218,7 @@ def synthesise(rows: RowLayout, coefficients: Any, texels: Any) -> None:
 
 
 def _add_frequency(sums: list[Any], r: int, x: list[Any], cos: Any, sin: Any) -> None:
-    """Add the coefficients x of a frequency m ≡ r (mod 4) to the 24 sums of a column (see `_unfold`)."""
+    """Add the coefficients x of a frequency m ≡ r (mod 4) to the 24 sums of a column, see `_unfold`."""
 
     def add(n: int, a: Any, b: Any) -> None:
         sums[n] = dr.fma(a, b, sums[n])
@@ -258,7 +257,7 @@ def _unfold(texels: Any, start: Any, w: Any, q: Any, sums: list[Any]) -> None:
 
 @dataclass(frozen=True)
 class Mixing:
-    """A block-sparse matrix between Fourier buffers: a lane owns four outputs, entries [begin, end)."""
+    """A block-sparse matrix between Fourier buffers: each lane has four outputs, of entries [begin, end)."""
 
     outputs: int
     begin: Any
@@ -266,14 +265,11 @@ class Mixing:
     slot: Any  # first of the four outputs
     step: Any  # from one output to the next
     source: Any  # input coefficient of each entry
-    weights: Any  # four floats an entry
+    weights: Any  # four floats per entry
 
 
 def make_mixing(blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]], outputs: int) -> Mixing:
-    """The matrix of pieces (rows, columns, M), each with slots of its columns, slots and limits of its rows.
-
-    Pieces that share output rows add up.
-    """
+    """Sum pieces (rows, columns, M), each with slots of its columns, and slots and limits of its rows."""
     slots, steps, sources, weights = [], [], [], []
     for matrix, slot_in, slot_out, limit_out in blocks:
         quads = matrix.reshape(-1, BLOCK, *matrix.shape[1:])
@@ -296,7 +292,7 @@ def make_mixing(blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarra
 
 
 def mix_rows(matrix: Mixing, coefficients: Any) -> Any:
-    """The block-sparse product of a `Mixing` and a Fourier buffer."""
+    """Multiply a Fourier buffer by a block-sparse matrix."""
 
     def body(n: Any, *acc: Any) -> tuple[Any, ...]:
         out = list(acc)
@@ -331,7 +327,7 @@ class Operator:
 
 @functools.lru_cache(maxsize=4)
 def _host_levels(height: int, levels: Levels) -> list[lobe_matrices.Level]:
-    return lobe_matrices.build_levels(height, levels)
+    return lobe_matrices.build_levels(height, levels)  # the same in every variant
 
 
 def _build(height: int, wanted: Levels) -> Operator:
@@ -343,10 +339,7 @@ def _build(height: int, wanted: Levels) -> Operator:
     limit_in = row_limits([np.pad(m, ((0, 0), (0, 0), (0, frequencies - m.shape[2]))) for m in transposed])
     limits_out = [row_limits([matrix]) for matrix in matrices]
     (slot_in,), slots_out = row_slots([limit_in]), row_slots(limits_out)
-    base, levels = (
-        make_rows([0], [limit_in]),
-        make_rows(firsts[1:-1], limits_out),
-    )
+    base, levels = make_rows([0], [limit_in]), make_rows(firsts[1:-1], limits_out)
     out = list(zip(slots_out, limits_out, strict=True))
     return Operator(
         height=height,
@@ -388,10 +381,10 @@ def apply_transposed(op: Operator, δlevels: Any) -> Any:
 
 @dataclass(frozen=True)
 class _Prepared:
-    """An operator, and `apply` and `apply_transposed` of it, which are traced once and then replayed.
+    """An operator with its `apply` and `apply_transposed`, traced once and then replayed.
 
-    Tracing them takes as long as running them. All their sizes are the operator's own, so that a recording
-    holds for every call.
+    Tracing them takes as long as running them. All sizes are the operator's own, so that a recording is valid
+    for every call.
     """
 
     operator: Operator
@@ -402,7 +395,6 @@ class _Prepared:
 @functools.lru_cache(maxsize=4)
 def _prepare(variant: str, height: int, levels: Levels) -> _Prepared:
     op = _build(height, levels)
-
     return _Prepared(
         op,
         replayed(lambda radiance: apply(op, radiance)),
@@ -411,12 +403,12 @@ def _prepare(variant: str, height: int, levels: Levels) -> _Prepared:
 
 
 def operator(height: int, levels: Levels = LEVELS) -> Operator:
-    """The prefilter for maps (height, 2·height), built once a height, levels and variant (64 rows: 1 s)."""
+    """The prefilter for maps (height, 2·height), built once per height, levels and variant (64 rows: 1 s)."""
     return _prepare(mi.variant(), height, levels).operator
 
 
 class _Prefilter(dr.CustomOp):
-    """`apply` under automatic differentiation; linear, so its derivative is itself."""
+    """`apply` under AD; linear, so that its derivative is itself."""
 
     def eval(self, prepared: _Prepared, radiance: Any) -> Any:
         self.prepared = prepared

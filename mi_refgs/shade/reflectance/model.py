@@ -73,10 +73,7 @@ class Reflectance:
     def trace(self, points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
         """The points with what rays find, called if `options.occlusion`: here the visibility of the mirror
         direction."""
-        visibility = mirror_visibility(
-            context.occluder, context.origin, context.ray, points.normal, points.view, context.covered
-        )
-        return points.replaced(visibility=visibility)
+        return points.replaced(visibility=mirror_visibility(context, points.normal, points.view))
 
 
 def require_complete(model: Reflectance) -> None:

@@ -36,7 +36,7 @@ class MonteCarlo(Reflectance):
     f_s is GGX with α = roughness², Smith-Schlick shadowing of k = (roughness + 1)² / 8, and F0 = 0.04.
     b = 0.03 + 0.77 albedo, roughness = 0.09 + 0.9 of the channel. The directions are those of a Fibonacci
     hemisphere about the normal, J = `options.directions`; the normal is detached in all of it. V is 0 where
-    the mesh blocks the ray, which `options.occlusion` asks for. The light of other surfaces, `indirect_sh`,
+    the mesh blocks the ray, if `options.occlusion`. The light of other surfaces, `indirect_sh`,
     counts where the surfels have it.
     """
 

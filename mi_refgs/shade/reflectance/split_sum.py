@@ -53,5 +53,4 @@ class SplitSum(Reflectance):
         points = reflection(points, context, options)
         if not options.ambient_rays:
             return points
-        ratio = ambient_of_pixels(context.occluder, context.origin, context.ray, context.covered)
-        return points.replaced(ambient=ratio)
+        return points.replaced(ambient=ambient_of_pixels(context))
