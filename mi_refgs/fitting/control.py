@@ -81,7 +81,7 @@ def _converted(rows: Raw, like: Raw, method: Method, rng: np.random.Generator) -
 
 
 class AdaptiveControl:
-    """The edits that a method asks for, applied to the state of a fit after its steps."""
+    """Applies the edits of a method to the state of a fit after its steps."""
 
     def __init__(self, setup: FitSetup, state: FitState) -> None:
         self.setup, self.state = setup, state

@@ -5,7 +5,7 @@ Letters: θ parameter, g gradient, m v first and second moment, t step count of 
 [Kingma and Ba 2015, §2, the efficient order].
 
 Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing: the device decides, and
-the host asks later (`Adam.report`) how many there were and which rows had such gradients. And |g| is cut to
+the host reads later (`Adam.report`) how many there were and which rows had such gradients. And |g| is cut to
 OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor, whichever is more, and
 to RAW_LIMIT, whose square float32 can represent. A step is at most (1 - β₁) / √(1 - β₂) = 3.2 η long however
 large g is, so the cut shortens the present step by less than 5 %. It bounds the memory of v: after one

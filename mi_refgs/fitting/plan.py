@@ -1,7 +1,7 @@
 """Time and memory of a fit, estimated before its first step, and the image size that fits the time.
 
 The time of a step is measured once per machine (`cost_model` caches it): steps of the method itself on a
-stand-in for the data set, at two sizes, in each stage and with its mesh. It is linear in the number of
+synthetic data set, at two sizes, in each stage and with its mesh. It is linear in the number of
 pixels.
 
 The clock is the CPU time of the main thread. On an idle machine it is the wall time, since this thread takes
@@ -38,7 +38,7 @@ from mi_refgs.methods.read import PRESETS
 
 VIEWS = 6
 COVERED = 0.35
-"""Fraction of the stand-in's images that the object covers; published data sets have 0.1 to 0.5."""
+"""Fraction of the synthetic images that the object covers; published data sets have 0.1 to 0.5."""
 WARM, TIMED, REPEATS = 4, 4, 3
 """Steps before the timed ones, which compile kernels; steps timed together; repetitions, of which the fastest
 counts."""
@@ -49,8 +49,8 @@ LEAST = 96
 SAFETY = 0.8
 """Fraction of the time limit that the estimate may reach: data sets differ by as much."""
 GROWTH, OPEN_GROWTH = 1.0, 0.6
-"""Mean time of a step relative to the stand-in, with alpha and without: the number of surfels grows, but
-opaque ones hide others, and without alpha surfels start far larger than they end."""
+"""Mean time of a step relative to the synthetic data set, with alpha and without: the number of surfels
+grows, but opaque ones hide others, and without alpha surfels start far larger than they end."""
 START = 10.0
 """Seconds for the visual hull, previews, checkpoints and artefacts."""
 DECODING = 1.5e-8
@@ -85,7 +85,7 @@ def _measured(method: Method, has_alpha: bool, size: int) -> tuple[dict[str, flo
     """Seconds per step by stage; per mesh, and per view of a mesh."""
     data_options = replace(method.data, coarse=())
     still = replace(method, refine=Refine(), exposure=None, select=None, data=data_options)
-    trainer = Trainer(still, stand_in(has_alpha, size))
+    trainer = Trainer(still, synthetic_data(has_alpha, size))
     every = 1 if method.light is None else method.light.every
     timed = max(TIMED // every, 1) * every
     steps, mesh, begin = {}, (0.0, 0.0), 0
@@ -126,7 +126,7 @@ def _seconds(call: Callable[[], Any]) -> float:
     return clock() - begin
 
 
-def stand_in(has_alpha: bool, size: int) -> Dataset:
+def synthetic_data(has_alpha: bool, size: int) -> Dataset:
     """Images of noise from a ring of cameras: of a ball with alpha, or of an open scene."""
     rng = np.random.default_rng(0)
     y, x = (np.mgrid[0:size, 0:size] + 0.5) / size - 0.5
@@ -145,7 +145,8 @@ def stand_in(has_alpha: bool, size: int) -> Dataset:
             View(f"{i}", *place, image, alpha if has_alpha else None, None, None, is_linear_radiance=False)
         )
     region = None if has_alpha else Region((0.0, 0.0, 0.0), 1.0)
-    return Dataset(Path("stand-in"), "train", tuple(views), np.ones(3, np.float32), False, None, None, region)
+    white = np.ones(3, np.float32)
+    return Dataset(Path("synthetic"), "train", tuple(views), white, False, None, None, region)
 
 
 def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> Method:

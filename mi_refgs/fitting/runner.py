@@ -163,7 +163,7 @@ def begin(
 
     A new fit starts from what `find_points` finds, by default the points of the data set. `tell` is called
     with what is found and decided. A resumed run keeps its region of interest. Raises InputError for cameras
-    that all stand in one place, checkpoints that are all damaged, a scene without a checkpoint, and a folder
+    that are all in one place, checkpoints that are all damaged, a scene without a checkpoint, and a folder
     that cannot be written.
     """
     resumed = run.exists()
@@ -274,7 +274,7 @@ def _require_same(
 
 
 def _require(run: Run, option: str, made: Method, now: Method) -> None:
-    """Raise InputError if the method of a run is not the one that an option asks for."""
+    """Raise InputError if the method of a run is not that of an option."""
     if now.data.downscale is None:  # decided when the run was started
         now = replace(now, data=replace(now.data, downscale=made.data.downscale))
     for key, (before, after) in methods.differences(made, now).items():

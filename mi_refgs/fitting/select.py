@@ -227,7 +227,7 @@ def sentence(decision: Decision) -> str:
     if decision.without is None or decision.with_it is None:
         return f"{decision.term} {verdict}: {decision.reason}"
     ms, mb = (getattr(decision.with_it, unit) - getattr(decision.without, unit) for unit in ("ms", "mb"))
-    return f"{decision.term} {verdict}: {decision.reason}, {ms:+.1f} ms a step, {mb:+.1f} MB"
+    return f"{decision.term} {verdict}: {decision.reason}, {ms:+.1f} ms per step, {mb:+.1f} MB"
 
 
 def table(decisions: list[dict[str, Any]]) -> str:

@@ -220,12 +220,12 @@ class FitState:
 
     @property
     def surroundings(self) -> Surroundings | None:
-        """The background in images without alpha, attached likewise."""
+        """The background in images without alpha, also attached."""
         return surroundings_of(self.params)
 
     @property
     def light(self) -> EnvironmentLight | None:
-        """The environment map, attached likewise."""
+        """The environment map, also attached."""
         return light_of(self.params)
 
     def shading(self, method: Method, iteration: int | None = None) -> Shading:

@@ -137,12 +137,12 @@ class Trainer:
 
     @property
     def surroundings(self) -> Surroundings | None:
-        """The background in images without alpha, attached likewise."""
+        """The background in images without alpha, also attached."""
         return self.fit.surroundings
 
     @property
     def light(self) -> EnvironmentLight | None:
-        """The environment map, attached likewise."""
+        """The environment map, also attached."""
         return self.fit.light
 
     def shading(self, iteration: int | None = None) -> Shading:

@@ -178,7 +178,7 @@ def save(
     run = Run(folder)
     if run.exists():
         raise InputError(
-            f"{folder}: holds a run already, which nothing is written into; choose another folder"
+            f"{folder}: contains a run already, which nothing is written into; choose another folder"
         )
     make_folder(folder)
     with run.alone():

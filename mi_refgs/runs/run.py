@@ -61,7 +61,7 @@ class Run:
         """Raise InputError if the folder contains a run, or a foreign file of the same name as one of its."""
         if (self.path / CONFIG).exists():
             raise InputError(
-                f"{self.path}: holds a run already; add --resume to go on with it, or choose another -o"
+                f"{self.path}: contains a run already; add --resume to go on with it, or choose another -o"
             )
         self.output.require_free()
 

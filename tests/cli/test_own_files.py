@@ -278,7 +278,7 @@ def test_a_run_is_never_overwritten(sources: Path, tmp_path: Path) -> None:
         (bare / "config.toml").rename(tmp_path / "config.toml")
         refused(command, "belongs to a run, which is never overwritten")
         (tmp_path / "config.toml").rename(bare / "config.toml")
-    with pytest.raises(InputError, match="holds a run already"):
+    with pytest.raises(InputError, match="contains a run already"):
         mi_refgs.load(tmp_path / "run").save(bare)
     assert contents(Place(bare)) == before
 

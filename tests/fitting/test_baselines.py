@@ -1,4 +1,4 @@
-"""Reflectance models of the baselines: terms and derivatives against float64 oracles, pictures, fits."""
+"""Reflectance models of the baselines: terms and derivatives against the float64 reference, images, fits."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def shaded(name: str, points: ShadingPoints, light: EnvironmentLight) -> list[An
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_terms_against_the_oracle(name: str, rng: np.random.Generator) -> None:
+def test_terms_against_oracle(name: str, rng: np.random.Generator) -> None:
     light, values = EnvironmentLight.from_radiance(MAP), scene(name, rng)
     maps = level_maps(light.prefilter())
     expected = np.array([exact_terms(name, values, maps, k, values["normal"][k]) for k in range(N)])
@@ -112,8 +112,8 @@ def test_terms_against_the_oracle(name: str, rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_derivatives_of_each_attribute(name: str, rng: np.random.Generator) -> None:
-    """With random weights a point, term and colour, against the oracle's slopes; the tangent is the transpose
-    of the adjoint."""
+    """With random weights per point, term and colour, against the slopes of the float64 reference; the
+    tangent is the transpose of the adjoint."""
     light, values = EnvironmentLight.from_radiance(MAP), scene(name, rng)
     maps, points = level_maps(light.prefilter()), points_of(values)
     used = {n: getattr(points, n) for n in values if n != "free"}
@@ -157,7 +157,7 @@ def test_derivatives_of_each_attribute(name: str, rng: np.random.Generator) -> N
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_derivative_of_the_light(name: str, rng: np.random.Generator) -> None:
+def test_derivative_of_light(name: str, rng: np.random.Generator) -> None:
     """Outgoing radiance is linear in that of the light, so that any step will do; in both modes."""
     points, weight = points_of(scene(name, rng)), vector(rng.normal(size=(N, 3)))
     raw, direction = EnvironmentLight.from_radiance(MAP).raw, rng.normal(size=MAP.shape)
@@ -202,7 +202,7 @@ def test_degenerate_points_stay_finite(name: str) -> None:
 # ---------------- lights ----------------
 
 
-def test_lights_give_the_same_to_a_model() -> None:
+def test_lights_give_same_to_model() -> None:
     """A constant light is its own filter, and one look-up of the map needs no filter."""
     d, roughness = mi.Vector3f(0.6, 0, 0.8), mi.Float(0.3)
     colour = mi.Color3f(0.5, 1, 2)
@@ -224,7 +224,7 @@ def test_lights_give_the_same_to_a_model() -> None:
             lookup(d)
 
 
-def test_a_model_of_mirrors_does_not_pay_for_the_filter() -> None:
+def test_model_of_mirrors_does_not_pay_for_filter() -> None:
     """Kernel launches of the light, forward and backward."""
     d = vector(unit(np.random.default_rng(0).normal(size=(100, 3))))
 
@@ -242,7 +242,7 @@ def test_a_model_of_mirrors_does_not_pay_for_the_filter() -> None:
         assert launches("mirror") + 4 <= launches("gaussian_shader")
 
 
-# ---------------- pictures ----------------
+# ---------------- images ----------------
 
 
 def table(*channels: str, count: int = 60) -> Surfels:
@@ -255,7 +255,7 @@ def table(*channels: str, count: int = 60) -> Surfels:
 
 
 @pytest.mark.parametrize("name", ["mirror", "gaussian_shader", "monte_carlo"])
-def test_every_channel_of_a_picture_gets_its_gradient(name: str) -> None:
+def test_every_channel_of_image_gets_its_gradient(name: str) -> None:
     """And the channel that is missing is named."""
     model, light = MODELS[name], EnvironmentLight.from_radiance(MAP)
     dr.enable_grad(light.raw)
@@ -279,7 +279,7 @@ def test_every_channel_of_a_picture_gets_its_gradient(name: str) -> None:
             shading.require_inputs([other for other in surfels.raw if other != missing])
 
 
-def test_the_hemisphere_is_blocked_where_a_mesh_stands() -> None:
+def test_hemisphere_is_blocked_where_mesh_stands() -> None:
     """Points before a large wall get light from the other side alone."""
     n = 5
     wall = np.array([[1, -50, -50], [1, 50, -50], [1, 50, 50], [1, -50, 50]], np.float32)
@@ -297,7 +297,7 @@ def test_the_hemisphere_is_blocked_where_a_mesh_stands() -> None:
         np.testing.assert_array_equal([not free[k] >> j & 1 for j in range(DIRECTIONS)], blocked)
 
 
-def test_what_the_models_refuse() -> None:
+def test_what_models_refuse() -> None:
     with pytest.raises(InputError, match="gaussian_shader needs shade_at = surfel"):
         Shading("pixel", "gaussian_shader")
     with pytest.raises(InputError, match="'lambert' is unknown; use split_sum or"):

@@ -1,4 +1,4 @@
-"""Gains of pictures: what is fitted, its derivative, when they are switched on, what they cost elsewhere."""
+"""Gains of images: what is fitted, its derivative, when they are switched on, what they cost elsewhere."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def shown(radiance: np.ndarray, alpha: np.ndarray, linear: bool, gain: np.ndarray) -> np.ndarray:
-    """The picture of exposed radiance, in float64, as its file has it."""
+    """The image of exposed radiance, in float64, as its file has it."""
     if linear:
         return radiance * gain + (1 - alpha[..., None]) * BACKGROUND
     x, y, z = map(float, BACKGROUND)
@@ -59,10 +59,10 @@ def view_of(image: np.ndarray, alpha: np.ndarray | None, linear: bool) -> View:
 
 @pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("has_alpha", [False, True])
-def test_a_gain_is_found_beside_clipped_pixels(
+def test_gain_is_found_beside_clipped_pixels(
     linear: bool, has_alpha: bool, picture: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    """An 8-bit picture clips what the gain makes brighter than white."""
+    """An 8-bit image clips what the gain makes brighter than white."""
     radiance, alpha = picture
     if not has_alpha:
         radiance, alpha = radiance / np.maximum(alpha, 1e-9)[..., None], np.ones_like(alpha)
@@ -83,7 +83,7 @@ def test_a_gain_is_found_beside_clipped_pixels(
 
 
 @pytest.mark.parametrize("linear", [False, True])
-def test_the_exposure_of_a_step_and_its_derivative(
+def test_exposure_of_step_and_its_derivative(
     linear: bool, picture: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
 ) -> None:
     """Value, both modes, against differences of the float64 definition; the prior is part of it."""
@@ -122,8 +122,8 @@ def test_the_exposure_of_a_step_and_its_derivative(
     assert float(dr.grad(moved)[0]) == pytest.approx(expected @ [0.5, -1.0, 2.0], rel=2e-4)
 
 
-def test_the_gain_of_an_open_scene_counts_what_lies_behind(picture: tuple[np.ndarray, np.ndarray]) -> None:
-    """Pictures without alpha show object, surroundings and background at one exposure."""
+def test_gain_of_open_scene_counts_what_lies_behind(picture: tuple[np.ndarray, np.ndarray]) -> None:
+    """Images without alpha show object, surroundings and background at one exposure."""
     radiance, alpha = picture
     behind = np.array([0.3, 0.2, 0.4])
     seen = radiance + (1 - alpha[..., None]) * behind
@@ -137,7 +137,7 @@ def test_the_gain_of_an_open_scene_counts_what_lies_behind(picture: tuple[np.nda
 
 
 def exposed(data: Dataset, log: np.ndarray) -> Dataset:
-    """The data set with log gains (V, 3) on its 8-bit pictures with a white background."""
+    """The data set with log gains (V, 3) on its 8-bit images with a white background."""
     views = []
     for view, gain in zip(data.views, np.exp(log), strict=True):
         assert view.alpha is not None
@@ -175,7 +175,7 @@ def decide(trainer: Trainer, iteration: int) -> None:
 
 
 def perfect(data: Dataset) -> Any:
-    """In place of `Trainer.view`: frames that show the pictures of a data set as they are."""
+    """In place of `Trainer.view`: frames that show the images of a data set as they are."""
 
     def frame(_: Trainer, camera: Camera, aovs: bool = True) -> Frame:
         [own] = [view for view in data.views if np.array_equal(view.camera().origin, camera.origin)]
@@ -187,10 +187,10 @@ def perfect(data: Dataset) -> Any:
     return frame
 
 
-def test_gains_are_switched_on_where_pictures_have_them(
+def test_gains_are_switched_on_where_images_have_them(
     method: Method, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They begin as those that bring the render to each picture, up to the mean of all views."""
+    """They begin as those that bring the render to each image, up to the mean of all views."""
     log, said = rng.uniform(-0.5, 0.3, (12, 3)), list[str]()
     trainer = Trainer(method, exposed(ball(views=12), log))
     trainer.tell = said.append
@@ -213,10 +213,10 @@ def test_gains_are_switched_on_where_pictures_have_them(
     assert len(said) == 1
 
 
-def test_gains_that_fit_half_of_the_pixels_only_do_not_pay(
+def test_gains_that_fit_half_of_the_pixels_are_rejected(
     method: Method, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every other square of a picture has another exposure: what is fitted to some is wrong for the rest."""
+    """Every other square of an image has another exposure: what is fitted to some is wrong for the rest."""
     data, squares = ball(views=4), []
     for view in data.views:
         row, column = np.indices((view.height, view.width)) // exposure.BLOCK
@@ -233,7 +233,7 @@ def test_gains_that_fit_half_of_the_pixels_only_do_not_pay(
     assert decision is not None and not decision["gains"] and decision["psnr_gain"] < decision["psnr"] - 3
 
 
-def test_where_gains_do_not_pay_the_fit_stays_what_it_was(method: Method, one_thread: None) -> None:
+def test_rejected_gains_leave_fit_unchanged(method: Method, one_thread: None) -> None:
     method = dataclasses.replace(method, iterations=DECIDED + 4)
     trainer, without = fit(method, ball()), fit(dataclasses.replace(method, exposure=None), ball())
     assert trainer.fit.exposure is not None and not trainer.fit.exposure["gains"]
@@ -250,7 +250,7 @@ def test_where_gains_do_not_pay_the_fit_stays_what_it_was(method: Method, one_th
 
 
 @pytest.mark.parametrize("stop", [DECIDED - 1, DECIDED + 3])
-def test_a_fit_with_gains_resumes_bit_for_bit(
+def test_fit_with_gains_resumes_bit_for_bit(
     stop: int, method: Method, rng: np.random.Generator, tmp_path: Path, one_thread: None
 ) -> None:
     """Started by EXIF data; stopped before or after the decision, which is not repeated."""
@@ -279,7 +279,7 @@ def test_a_fit_with_gains_resumes_bit_for_bit(
         Trainer(method, fewer, Run(tmp_path / "run"))
 
 
-def test_a_warm_step_with_gains_compiles_nothing(method: Method) -> None:
+def test_warm_step_with_gains_compiles_nothing(method: Method) -> None:
     """Another view has other gains, and no other kernel; a view's gain moves with its own gradient."""
     trainer = Trainer(dataclasses.replace(method, exposure=ExposureOptions(gains="on", after=2)), ball())
     while trainer.iteration < 16:
@@ -307,7 +307,7 @@ def photograph(path: Path, settings: dict[int, Any] | None) -> Path:
     return path
 
 
-def test_exif_data_tell_the_exposure(tmp_path: Path, method: Method) -> None:
+def test_exif_data_tell_exposure(tmp_path: Path, method: Method) -> None:
     """A stop is a factor of two; what lacks one of the three numbers, or has nonsense, tells nothing."""
     usual: dict[int, Any] = {EXPOSURE_TIME: 0.01, F_NUMBER: 2.0, ISO: 100}
     changes: list[dict[int, Any]] = [{}, {EXPOSURE_TIME: 0.02}, {ISO: 50}, {F_NUMBER: 4.0}]

@@ -1,4 +1,4 @@
-"""Fits to pictures nobody would wish for: they run with finite numbers, or end with one sentence."""
+"""Fits to images nobody would wish for: they run with finite numbers, or end with one sentence."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ CASES: dict[str, Callable[[], Dataset]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_fit_stays_finite(name: str, tmp_path: Path) -> None:
+def test_fit_stays_finite(name: str, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(METHOD)
     method = dataclasses.replace(methods.load_resolved(tmp_path / "small.toml"), iterations=STEPS)
     trainer = Trainer(method, CASES[name]())

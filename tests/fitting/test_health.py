@@ -51,7 +51,7 @@ def spoil_gradient(monkeypatch: pytest.MonkeyPatch, name: str, rows: list[int], 
     monkeypatch.setattr(Adam, "step", step)
 
 
-def test_surfels_with_a_gradient_that_is_not_finite_are_removed_and_named(
+def test_surfels_with_gradient_that_is_not_finite_are_removed_and_named(
     method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Steps on view 2 fail until the next check, every third iteration; then the culprits are gone."""
@@ -79,7 +79,7 @@ def test_surfels_with_a_gradient_that_is_not_finite_are_removed_and_named(
 
 @pytest.mark.parametrize("name", ["position", "roughness", "indirect_sh"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_surfels_that_are_not_finite_are_removed_and_the_fit_goes_on(
+def test_surfels_that_are_not_finite_are_removed_and_fit_goes_on(
     name: str, value: float, method: Method
 ) -> None:
     trainer = Trainer(dataclasses.replace(method, iterations=12), ball())
@@ -104,7 +104,7 @@ def test_values_too_large_to_render_are_named_beside_those_that_are_not_finite(m
     assert {name: at.tolist() for name, at in rows.items()} == {"roughness": [9], "indirect_sh": [4]}
 
 
-def test_a_fit_in_which_every_step_fails_ends_with_one_sentence(
+def test_fit_in_which_every_step_fails_ends_with_one_sentence(
     method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Too many surfels to be the cause: nothing is removed, nothing changes, and the view is named."""
@@ -120,7 +120,7 @@ def test_a_fit_in_which_every_step_fails_ends_with_one_sentence(
         np.testing.assert_array_equal(after[name], before[name])
 
 
-def test_a_light_that_is_not_finite_ends_a_fit_with_one_sentence(method: Method, tmp_path: Path) -> None:
+def test_light_that_is_not_finite_ends_fit_with_one_sentence(method: Method, tmp_path: Path) -> None:
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
     light = np.array(trainer.params["light"].numpy())

@@ -1,4 +1,4 @@
-"""What a fit starts from: surfels on and inside the visual hull, coloured by the pictures."""
+"""What a fit starts from: surfels on and inside the visual hull, coloured by the images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COUNT = 2_000
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A hull of fewer voxels: pictures of 20² show no more."""
+    """A hull of fewer voxels: images of 20² show no more."""
     monkeypatch.setattr(hull, "visual_hull", functools.partial(hull.visual_hull, resolution=32))
 
 
@@ -38,7 +38,7 @@ def start(ball: dataset.Dataset, inside: float, seed: int = 0, *settings: str) -
     return surfels.to_numpy() | {"normal": np.array(surfels.frame()[2]).T}
 
 
-def test_the_share_inside_is_spread_over_the_volume(ball: dataset.Dataset) -> None:
+def test_share_inside_is_spread_over_volume(ball: dataset.Dataset) -> None:
     """Below 0.8 of the radius lies half of the volume of the ball, and nothing of its surface."""
     deep = {}
     for share in (0.0, 0.5, 1.0):
@@ -67,7 +67,7 @@ def init_colour(table: dict[str, np.ndarray]) -> np.ndarray:
     return table["radiance_sh"][:, :3] * 0.28209479
 
 
-def test_albedo_starts_with_the_hue_of_the_pictures(ball: dataset.Dataset) -> None:
+def test_albedo_starts_with_hue_of_images(ball: dataset.Dataset) -> None:
     """As bright everywhere as its initial value; without it, it is grey."""
     table = start(ball, 0.5, 0, "surfels.from_pictures=['albedo']", "surfels.initial.albedo=0.6")
     albedo, colour = 1 / (1 + np.exp(-table["albedo"])), 0.5 + init_colour(table)
@@ -78,20 +78,20 @@ def test_albedo_starts_with_the_hue_of_the_pictures(ball: dataset.Dataset) -> No
     assert np.abs(1 / (1 + np.exp(-start(ball, 0.5)["albedo"])) - 0.5).max() < 0.026
 
 
-def test_the_same_seed_gives_the_same_start(ball: dataset.Dataset) -> None:
+def test_same_seed_gives_same_start(ball: dataset.Dataset) -> None:
     one, two, other = start(ball, 0.5), start(ball, 0.5), start(ball, 0.5, seed=1)
     assert all(np.array_equal(one[name], two[name]) for name in one)
     assert not np.array_equal(one["position"], other["position"])
 
 
-def test_without_alpha_surfels_fill_the_box(ball: dataset.Dataset) -> None:
+def test_without_alpha_surfels_fill_box(ball: dataset.Dataset) -> None:
     bare = dataclasses.replace(ball, views=tuple(view.changed(alpha=None) for view in ball.views))
     table = start(bare, 0.5)
     assert len(table["position"]) == COUNT and np.linalg.norm(table["position"], axis=1).max() > 1.1 * RADIUS
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.5, float("nan")])
-def test_a_share_out_of_range_is_refused(ball: dataset.Dataset, share: float) -> None:
+def test_share_out_of_range_is_refused(ball: dataset.Dataset, share: float) -> None:
     with pytest.raises(InputError, match=r"surfels(\.|: )inside"):
         start(ball, share)
 

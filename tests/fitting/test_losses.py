@@ -59,12 +59,12 @@ def test_l1_of_clipped_highlights(images: tuple[np.ndarray, np.ndarray]) -> None
     )
 
 
-def test_saturated_is_the_last_8_bit_value() -> None:
+def test_saturated_is_last_8_bit_value() -> None:
     (mask,) = losses.saturated([mi.Float(254 / 255, 254.4 / 255, 1.0, 1.7)])
     assert list(np.array(mask)) == [False, False, True, True]
 
 
-def test_only_the_objects_own_colour_is_a_highlight() -> None:
+def test_only_objects_own_colour_is_highlight() -> None:
     """Composites of 8-bit colours: white behind empty pixels and edges is none, a white edge on black is."""
     alpha = np.array([0, 1 / 255, 0.2, 0.5, 1, 0, 1 / 255, 0.2, 0.5, 1], np.float32)
     own = np.array([0.3, 254 / 255, 0.3, 254 / 255, 254 / 255, 1, 1, 1, 1, 1], np.float32)
@@ -75,7 +75,7 @@ def test_only_the_objects_own_colour_is_a_highlight() -> None:
 
 
 @pytest.mark.parametrize("covered", [0.0, 1.0])
-def test_a_floater_brighter_than_a_white_background_costs(covered: float) -> None:
+def test_floater_brighter_than_white_background_costs(covered: float) -> None:
     """Over the background it does, over a highlight of the object it does not."""
     image, alpha = np.ones((4, 4, 3), np.float32), np.full((4, 4), covered, np.float32)
     view = View("a", 4, 4, 4, 4, 2, 2, np.eye(4), image, alpha, None, None, is_linear_radiance=False)
@@ -119,7 +119,7 @@ def test_ssim(images: tuple[np.ndarray, np.ndarray]) -> None:
     )
 
 
-def test_ssim_forward_mode_is_the_transpose(images: tuple[np.ndarray, np.ndarray]) -> None:
+def test_ssim_forward_mode_is_transpose(images: tuple[np.ndarray, np.ndarray]) -> None:
     image, target = images
     leaves = planes(image)
     dr.enable_grad(leaves)
@@ -153,7 +153,7 @@ def test_alpha_loss(rng: np.random.Generator) -> None:
     )
 
 
-def test_srgb_matches_the_file_reader_and_has_a_slope_at_zero() -> None:
+def test_srgb_matches_file_reader_and_has_slope_at_zero() -> None:
     linear = np.array([-0.1, 0, 1e-30, 0.001, 0.0031308, 0.0032, 0.5, 1, 4, 1000], dtype=np.float32)
     x = mi.Float(linear)
     dr.enable_grad(x)
@@ -183,7 +183,7 @@ def test_display_image(rng: np.random.Generator) -> None:
     )
 
 
-def test_display_image_shows_the_background_of_empty_pixels() -> None:
+def test_display_image_shows_background_of_empty_pixels() -> None:
     radiance, alpha = mi.Float(0, 0, 1e-9), mi.Float(0, 1e-7, 1e-8)
     dr.enable_grad(radiance, alpha)
     (image,) = display.display_image([radiance], alpha, (0.25,))
@@ -221,7 +221,7 @@ def test_half_metal(rng: np.random.Generator) -> None:
     assert not dr.grad_enabled(losses.half_metal(mi.Float(0.5, 0.5, 0.5), weight))
 
 
-def test_the_colour_of_a_light(rng: np.random.Generator) -> None:
+def test_colour_of_light(rng: np.random.Generator) -> None:
     """Against the definition, by the light's texels; a grey light, however uneven, costs nothing."""
     texels = rng.uniform(0.1, 2, (8, 16, 3))
 

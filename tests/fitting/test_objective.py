@@ -1,4 +1,4 @@
-"""What a step lowers: zero for the perfect picture, and the sum that the method's weights say."""
+"""What a step lowers: zero for the perfect image, and the sum that the method's weights say."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BACKGROUND = np.array([1.0, 0.5, 0.25], np.float32)
 
 
 def made(linear: bool, radiance: np.ndarray, alpha: np.ndarray) -> tuple[Dataset, Target]:
-    """A data set of one picture of premultiplied linear radiance (H, W, 3), and its target."""
+    """A data set of one image of premultiplied linear radiance (H, W, 3), and its target."""
     if linear:
         image = radiance + (1 - alpha[..., None]) * BACKGROUND
     else:
@@ -58,15 +58,15 @@ def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("linear", [False, True])
-def test_a_perfect_picture_costs_nothing(linear: bool, picture: tuple[np.ndarray, np.ndarray]) -> None:
-    """8-bit pictures are composited as displayed, linear ones before they are encoded; either once."""
+def test_perfect_image_costs_nothing(linear: bool, picture: tuple[np.ndarray, np.ndarray]) -> None:
+    """8-bit images are composited as displayed, linear ones before they are encoded; either once."""
     data, target = made(linear, *picture)
     weights = LossWeights(ssim=0.2, normal=0.0, alpha=0.3)
     loss, error = objective(frame_of(*picture), target, data, weights, 1)
     assert abs(float(loss[0])) < 1e-5 and float(error[0]) < 1e-10
 
 
-def test_terms_are_weighed_as_the_method_says(
+def test_losses_are_weighed_as_method_says(
     picture: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
 ) -> None:
     data, target = made(True, *picture)
@@ -83,7 +83,7 @@ def test_terms_are_weighed_as_the_method_says(
     assert float(error[0]) == pytest.approx(np.mean((shown - goal) ** 2), rel=1e-4)
 
 
-def test_priors_are_weighed_as_the_method_says(
+def test_priors_are_weighed_as_method_says(
     picture: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
 ) -> None:
     data, target = made(True, *picture)
@@ -111,7 +111,7 @@ def test_priors_are_weighed_as_the_method_says(
     assert loss(light_colour=0.4) - rest == pytest.approx(expected, rel=1e-3) and expected > 0.01
 
 
-def test_the_weight_of_normals_rises_linearly(data: Path, method: Path) -> None:
+def test_weight_of_normals_rises_linearly(data: Path, method: Path) -> None:
     views = read_dataset(data, "train", truth=False)
     trainer = Trainer(methods.load(str(method), "quick", ["surfels.count=200", "loss.alpha=0"]), views)
     target = trainer.targets[0]

@@ -1,4 +1,4 @@
-"""The fit of pictures without alpha: what it starts from, its two tables, checkpoints, the default method."""
+"""The fit of images without alpha: what it starts from, its two tables, checkpoints, the default method."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def method(tmp_path_factory: pytest.TempPathFactory) -> Method:
     return methods.load(str(path), "quick", settings)
 
 
-def test_what_an_open_fit_starts_from(data: Dataset, method: Method) -> None:
+def test_initial_parameters_of_open_scene(data: Dataset, method: Method) -> None:
     """Small surfels in the region, others outside with sizes that grow with distance; no material columns."""
     assert is_open(method, data) and not is_open(replace(method, surroundings=None), data)
     params = initial_parameters(method, data, np.random.default_rng(0), True)
@@ -61,7 +61,7 @@ def test_what_an_open_fit_starts_from(data: Dataset, method: Method) -> None:
     names = {name.removeprefix("surroundings/") for name in params if name.startswith("surroundings/")}
     assert names == {"position", "rotation", "scale", "opacity", "radiance_sh"}
     assert method.surroundings is not None
-    for name in ("opacity", "surroundings/opacity"):  # nearly transparent: pictures show through the cloud
+    for name in ("opacity", "surroundings/opacity"):  # nearly transparent: images show through the cloud
         np.testing.assert_allclose(
             1 / (1 + np.exp(-params[name].numpy())), method.surroundings.opacity, atol=1e-6
         )
@@ -84,7 +84,7 @@ def test_what_an_open_fit_starts_from(data: Dataset, method: Method) -> None:
     assert 0.1 < seen.mean() < 0.9 and np.mean(error < 0.05) > 0.2  # the ball hides the rest
 
 
-def test_sparse_points_start_on_their_side_of_the_border(data: Dataset, method: Method) -> None:
+def test_sparse_points_start_on_their_side_of_border(data: Dataset, method: Method) -> None:
     rng = np.random.default_rng(1)
     near, far = rng.normal(size=(2, 30, 3))
     near *= 0.4 / np.linalg.norm(near, axis=1, keepdims=True)
@@ -107,8 +107,8 @@ def test_sparse_points_start_on_their_side_of_the_border(data: Dataset, method: 
     assert np.mean(np.abs(np.linalg.norm(mixed, axis=1) - 0.4) < 1e-5) == pytest.approx(0.5)
 
 
-def test_surfels_that_cross_the_border_change_tables(method: Method) -> None:
-    """Beyond the margin; with their geometry and harmonics, without history, and within the limits."""
+def test_surfels_beyond_border_change_tables(method: Method) -> None:
+    """Beyond the margin; with their geometry and SH, without history, and within the limits."""
     rng = np.random.default_rng(0)
 
     def table(names: tuple[str, ...], distance: list[float], degree: int) -> Surfels:
@@ -142,7 +142,7 @@ def test_surfels_that_cross_the_border_change_tables(method: Method) -> None:
     assert exchanged(gone, outer, method, REGION, rng)[0].surfels.count == 2  # one left, one came
 
 
-def test_resume_repeats_a_straight_run_bit_for_bit(data: Dataset, method: Method, one_thread: None) -> None:
+def test_resume_repeats_straight_run_bit_for_bit(data: Dataset, method: Method, one_thread: None) -> None:
     """Both tables, the background and their history, across edits of the tables."""
     straight = Trainer(method, data)
     for _ in range(5):
@@ -158,9 +158,7 @@ def test_resume_repeats_a_straight_run_bit_for_bit(data: Dataset, method: Method
     assert len(one["params/surroundings/position"]) != 60  # it was edited
 
 
-def test_a_run_keeps_the_region_that_it_was_started_with(
-    data: Dataset, method: Method, tmp_path: Path
-) -> None:
+def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method, tmp_path: Path) -> None:
     """However region.json is edited: a resumed fit says so, and what evaluates the run goes by its own."""
     folder, run, said = shutil.copytree(data.path, tmp_path / "data"), Run(tmp_path / "run"), list[str]()
     begin(method, read_dataset(folder, "train"), run)
@@ -181,7 +179,7 @@ def test_a_run_keeps_the_region_that_it_was_started_with(
         load_split(run, method, "test")
 
 
-def test_a_fit_of_an_open_scene_improves(data: Dataset, method: Method) -> None:
+def test_fit_of_open_scene_improves(data: Dataset, method: Method) -> None:
     """Object, surroundings and background learn; whatever is of alpha has no part in it."""
     trainer = Trainer(replace(method, iterations=100, refine=Refine()), data)
     start = {name: np.array(x) for name, x in trainer.state().items() if name.startswith("params/")}
@@ -196,7 +194,7 @@ def test_a_fit_of_an_open_scene_improves(data: Dataset, method: Method) -> None:
     assert trainer.health.skipped == 0 and all(np.isfinite(x).all() for n, x in end.items() if n in start)
 
 
-def test_a_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> None:
+def test_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> None:
     trainer = Trainer(method, data)
     raw = trainer.fit.tables[1].surfels.to_numpy()
     raw["opacity"][[3, 5]] = np.nan
@@ -208,7 +206,7 @@ def test_a_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) ->
     assert "surroundings/opacity" in trainer.notices[0]
 
 
-def test_the_method_for_photographs_is_the_default_without_alpha(
+def test_method_for_photographs_is_default_without_alpha(
     data: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert default_method(data.path, progress=ProgressBar()) == "photographs"
@@ -217,10 +215,10 @@ def test_the_method_for_photographs_is_the_default_without_alpha(
     assert capsys.readouterr().err == ""
 
 
-def test_the_default_method_is_chosen_without_decoding_pictures(
+def test_default_method_is_chosen_without_decoding_images(
     data: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ImageFile, "decode", lambda _: pytest.fail("a picture was decoded"))
+    monkeypatch.setattr(ImageFile, "decode", lambda _: pytest.fail("an image was decoded"))
     assert default_method(data.path) == "photographs"
 
 

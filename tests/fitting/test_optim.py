@@ -29,7 +29,7 @@ def test_group_rates() -> None:
     assert Group(0.05).at(7) == 0.05 and Group(0.0, final=1.0).at(50) == 0.0
 
 
-def test_equals_the_published_algorithm(rng: np.random.Generator) -> None:
+def test_equals_published_algorithm(rng: np.random.Generator) -> None:
     """Ten steps of two tensors with a schedule and per-column rates; gradients as small as a mean over pixels
     gives."""
     start = {"position": rng.normal(size=(7, 3)), "radiance_sh": rng.normal(size=(7, 12))}
@@ -55,7 +55,7 @@ def test_equals_the_published_algorithm(rng: np.random.Generator) -> None:
         assert moved > 1e-3 and dr.grad_enabled(params[name])
 
 
-def test_equals_drjit_on_a_quadratic(rng: np.random.Generator) -> None:
+def test_equals_drjit_on_quadratic(rng: np.random.Generator) -> None:
     start, goal = rng.normal(size=(50, 2)), tensor(rng.normal(size=(50, 2)))
     params = {"x": tensor(start)}
     ours = Adam(params, {"x": Group(0.02)})
@@ -69,7 +69,7 @@ def test_equals_drjit_on_a_quadratic(rng: np.random.Generator) -> None:
     assert np.abs(params["x"].numpy() - goal.numpy()).mean() < 0.1 < np.abs(start - goal.numpy()).mean()
 
 
-def test_gradients_are_cleared_and_a_tensor_without_one_rests() -> None:
+def test_gradients_are_cleared_and_tensor_without_one_rests() -> None:
     params = {"x": tensor(np.ones((2, 1))), "idle": tensor(np.ones((2, 1)))}
     optimiser = Adam(params, {"x": Group(0.1)})
     optimiser.step(0)
@@ -97,7 +97,7 @@ def values(optimiser: Adam) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("where", ["gradient", "loss"])
-def test_a_step_that_is_not_finite_changes_nothing_and_is_reported(bad: float, where: str) -> None:
+def test_step_that_is_not_finite_changes_nothing_and_is_reported(bad: float, where: str) -> None:
     """No entry of any tensor, its moments included; the next step goes on."""
     params = {"x": tensor(np.zeros((4, 2))), "y": tensor(np.zeros((3, 1))), "sh": tensor(np.zeros((4, 12)))}
     groups = {"x": Group(0.1), "y": Group(0.1), "sh": Group(0.1, head=3, tail=0.05)}
@@ -134,7 +134,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_reported(bad: float, w
     assert optimiser.report().count == 0 and not optimiser.report().rows
 
 
-def test_a_harmonic_that_is_not_finite_alone_does_no_harm() -> None:
+def test_harmonic_that_is_not_finite_alone_does_no_harm() -> None:
     """The columns after the head are not looked at before the step: theirs counts as 0."""
     params = {"sh": tensor(np.zeros((4, 12)))}
     optimiser = Adam(params, {"sh": Group(0.1, head=3, tail=0.05)})
@@ -184,7 +184,7 @@ def test_gradients_whose_square_is_no_float32_leave_finite_moments(before: float
     assert np.all(params["x"].numpy() < 0) and optimiser.report().count == 0
 
 
-def test_an_ordinary_fit_is_not_cut(rng: np.random.Generator) -> None:
+def test_ordinary_fit_is_not_cut(rng: np.random.Generator) -> None:
     """Gradients that vary by a factor of 50 from step to step, rows that are seldom seen, and a reset."""
     shape, spread = (400, 3), np.exp(0.5 * rng.normal(size=(400, 3)))
     params = {"x": tensor(np.zeros(shape))}
@@ -237,7 +237,7 @@ def test_gather_to_nothing_and_back() -> None:
     assert params["x"].shape == (0, 2) and optimiser.state_dict()["x/first"].shape == (0,)
 
 
-def test_reset_clears_the_moments_and_keeps_the_count() -> None:
+def test_reset_clears_moments_and_keeps_count() -> None:
     params = {"x": tensor(np.zeros((3, 2)))}
     optimiser = Adam(params, {"x": Group(0.1)})
     give(optimiser, "x", np.ones((3, 2)))
@@ -247,7 +247,7 @@ def test_reset_clears_the_moments_and_keeps_the_count() -> None:
     assert not state["x/first"].any() and not state["x/second"].any() and state["x/steps"] == 1
 
 
-def test_factor_freezes_a_tensor() -> None:
+def test_factor_freezes_tensor() -> None:
     params = {"x": tensor(np.zeros((2, 1)))}
     optimiser = Adam(params, {"x": Group(0.1)})
     optimiser.set_factor("x", 0.0)
@@ -293,7 +293,7 @@ def test_what_does_not_fit_is_refused() -> None:
         optimiser.load_state_dict({})
 
 
-def test_steps_compile_nothing_after_the_second(rng: np.random.Generator) -> None:
+def test_steps_compile_nothing_after_second(rng: np.random.Generator) -> None:
     """Rates, step counts and factors change every step, the number of rows once."""
     params = {"x": tensor(np.zeros((30, 3))), "sh": tensor(np.zeros((30, 12)))}
     optimiser = Adam(params, {"x": Group(0.1, 0.01, 100), "sh": Group(0.1, head=3, tail=0.05)})
@@ -314,7 +314,7 @@ def test_steps_compile_nothing_after_the_second(rng: np.random.Generator) -> Non
     assert misses[3:] == [0] * 5
 
 
-def test_factors_of_a_stage() -> None:
+def test_factors_of_stage() -> None:
     """They multiply the rate beside those that `set_factor` sets; 0 keeps a tensor still."""
     params = {"x": tensor(np.zeros((2, 1))), "y": tensor(np.zeros((2, 1)))}
     optimiser = Adam(params, {"x": Group(0.1), "y": Group(0.1)})
@@ -327,7 +327,7 @@ def test_factors_of_a_stage() -> None:
     assert np.allclose(params["x"].numpy(), -0.01, rtol=1e-3) and np.all(params["y"].numpy() == 0)
 
 
-def test_lamps_grow_by_shares() -> None:
+def test_relative_rate_scales_lamps() -> None:
     """A relative group: what is above 1 moves by the rate times itself, what is below by the rate."""
     start = np.array([[-3.0], [0.5], [1.0], [4.0], [50.0]])
     params = {"x": tensor(start)}
@@ -339,7 +339,7 @@ def test_lamps_grow_by_shares() -> None:
 
 
 def test_every_tensor_has_its_bit_however_many_there_are() -> None:
-    """The first and the last of 40 tensors are told apart from the others, by row and where rows are wide."""
+    """The first and the last of 40 tensors are distinguished, also where rows are wide."""
     sizes = {f"t{i}": (4, 2) for i in range(38)} | {"wide": (2, 100), "last": (4, 2)}
     params = {name: tensor(np.zeros(size)) for name, size in sizes.items()}
     optimiser = Adam(params, {name: Group(1.0) for name in sizes})

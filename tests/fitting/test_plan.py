@@ -33,7 +33,7 @@ def method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Method:
     return dataclasses.replace(methods.load_resolved(path), data=DataOptions())
 
 
-def test_an_estimate_is_the_sum_of_the_stages(method: Method) -> None:
+def test_estimate_is_sum_of_stages(method: Method) -> None:
     """8 iterations of the first, 22 of the second, three meshes of 7 views, the files; coarse ones apart."""
     at_100 = 8 * 1 + 22 * 2
     others = plan.START + 3 * (3.0 + 7 * 0.5)
@@ -55,10 +55,10 @@ def test_an_estimate_is_the_sum_of_the_stages(method: Method) -> None:
     assert tiny.seconds == pytest.approx(others + 7 * plan.DECODING + 0.5 * at_100)  # never next to nothing
 
 
-def test_the_largest_pictures_that_fit_the_time_are_chosen(
+def test_largest_images_within_time_limit_are_chosen(
     method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of 20 × 20 pixels; a size that the method says stays, and nothing is decoded meanwhile."""
+    """Images have 20 × 20 pixels; a size that the method says stays, and nothing is decoded meanwhile."""
     data = write_data(tmp_path / "data", truth=False)
     for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "LEAST": 5, "WHOLE": 399}.items():
         monkeypatch.setattr(plan, name, value)
@@ -110,7 +110,7 @@ def test_small_images_are_never_downscaled_unasked(
     assert limit is None or plan.planned(method, data, limit)[0].data.downscale == 4
 
 
-def test_small_is_256_pixels_a_side() -> None:
+def test_small_is_256_pixels_side() -> None:
     assert plan.WHOLE == 256**2
 
 
@@ -129,7 +129,7 @@ class Machine:
         self.cpu, self.wall = self.cpu + seconds, self.wall + self.busy * seconds
 
     def step(self, trainer: Trainer) -> None:
-        """Of 1 + P seconds, later 2 + P; each seventh is disturbed."""
+        """Take 1 + P seconds, later 2 + P; each seventh step is disturbed."""
         self.steps += 1
         trainer.iteration += 1
         view = trainer.data.views[0]
@@ -149,7 +149,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_a_speed_is_measured_once_and_stays_on_a_busy_machine(
+def test_speed_is_measured_once_and_stays_on_busy_machine(
     method: Method, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is CPU time, and of one machine and one kind of method; damaged files are measured anew."""
@@ -199,7 +199,7 @@ def test_a_speed_is_measured_once_and_stays_on_a_busy_machine(
     assert measurements() == 1
 
 
-def test_a_cache_that_cannot_be_written_is_no_error(
+def test_cache_that_cannot_be_written_is_no_error(
     method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan, "measured", lambda *_: SPEED)
@@ -209,7 +209,7 @@ def test_a_cache_that_cannot_be_written_is_no_error(
 
 
 def test_real_steps_are_measured(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of every stage, with the surroundings of images without alpha; no more than what measuring took."""
+    """Every stage is measured, with the background of images without alpha."""
     monkeypatch.setattr(cost_model, "SIZES", (16, 32))
     around = SurroundingsOptions(count=60, max_count=60, height=8)
     method = dataclasses.replace(method, surroundings=around)
@@ -223,12 +223,12 @@ def test_real_steps_are_measured(method: Method, monkeypatch: pytest.MonkeyPatch
     assert plan.REPEATS * plan.TIMED * sum(each) + meshes < taken
 
 
-def test_tests_keep_away_from_the_users_cache() -> None:
+def test_tests_keep_away_from_users_cache() -> None:
     """In this process and in those that it starts."""
     assert Path.home() / ".cache" not in [cost_model.folder(), *cost_model.folder().parents]
 
 
-def test_the_cache_is_where_the_user_keeps_caches(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_is_where_user_keeps_caches(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(cost_model.FOLDER_VARIABLE)
     monkeypatch.setenv("XDG_CACHE_HOME", "/caches")
     assert cost_model.folder() == Path("/caches/mi_refgs")

@@ -83,7 +83,7 @@ def test_transparent_and_oversized_surfels_go_even_when_hot() -> None:
     assert sorted(set(edited.parent.tolist())) == [2, 3, 4, 5]
 
 
-def test_sizes_are_shares_of_the_scene() -> None:
+def test_sizes_are_shares_of_scene() -> None:
     """In any unit the same surfels are cloned, split and dropped."""
     gradient, sizes = np.array([1e-3, 1e-3, 1e-3, 0, 0, 0]), np.array([0.005, 0.05, 0.5, 0.005, 0.05, 0.5])
     parents = []
@@ -94,7 +94,7 @@ def test_sizes_are_shares_of_the_scene() -> None:
     assert parents == [[0, 3, 4, 0, 1, 1]] * 3
 
 
-def test_opacities_get_time_to_grow_back_after_a_reset() -> None:
+def test_opacities_get_time_to_grow_back_after_reset() -> None:
     surfels = table(opacity=0.02)
     limits = (np.zeros(6), 1.0, OPTIONS, 100, np.random.default_rng(1))
     assert len(refine.densify_and_prune(surfels, *limits, prune_transparent=False).parent) == 6
@@ -102,7 +102,7 @@ def test_opacities_get_time_to_grow_back_after_a_reset() -> None:
         refine.densify_and_prune(surfels, *limits)
 
 
-def test_the_wait_follows_the_rate_that_lifts_opacities() -> None:
+def test_wait_follows_rate_that_lifts_opacities() -> None:
     """As many steps as Adam needs under a constant gradient, times the patience; 150 as shipped."""
     options, rate = Refine(), 0.05
     params = {"opacity": mi.TensorXf(np.full((1, 1), logit(options.reset_opacity), np.float32))}
@@ -120,7 +120,7 @@ def test_the_wait_follows_the_rate_that_lifts_opacities() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.005, 0.05])
-def test_growth_stops_at_the_limit_and_takes_the_hottest(scale: float) -> None:
+def test_growth_stops_at_limit_and_takes_hottest(scale: float) -> None:
     edited = densify(table(scale=scale), np.array([3, 9, 4, 8, 5, 7]) * 1e-3, max_count=8)
     assert len(edited.parent) == 8
     assert np.flatnonzero(np.bincount(edited.parent) == 2).tolist() == [1, 3]
@@ -149,7 +149,7 @@ def test_propagation_is_material_aware(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(sigmoid(edited["opacity"])[:, 0], [0.9, 0.9, 0.95, 0.9, 0.9, 0.9], rtol=1e-5)
 
 
-def test_propagation_without_a_limit_of_roughness_grows_every_metal(rng: np.random.Generator) -> None:
+def test_propagation_without_limit_of_roughness_grows_every_metal(rng: np.random.Generator) -> None:
     """3DGS-DR's rule: whatever the roughness; and noise on the colour of what is no metal alone."""
     raw = table().to_numpy() | {"radiance_sh": np.zeros((6, 12), np.float32)}
     raw["metallic"][:2] = logit(0.01)
@@ -163,7 +163,7 @@ def test_propagation_without_a_limit_of_roughness_grows_every_metal(rng: np.rand
     assert np.all(noise[:2, :3] != 0) and np.abs(noise).max() <= 0.4
 
 
-def test_a_restart_of_materials_leaves_geometry() -> None:
+def test_restart_of_materials_leaves_geometry() -> None:
     surfels = table()
     starts = {"albedo": 0.5, "metallic": 0.01, "roughness": 0.1}
     edited = refine.restart(surfels, starts, np.random.default_rng(0)).to_numpy()

@@ -1,4 +1,4 @@
-"""Relocation: the picture hardly changes, idle surfels go where others are seen, and only they wander."""
+"""Relocation: the image hardly changes, idle surfels move onto visible ones and take random steps."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def table(count: int, idle: int, rng: np.random.Generator, scale: float = 0.05) 
 
 @pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9])
 @pytest.mark.parametrize("number", [1, 2, 5, 20])
-def test_the_correction_is_that_of_the_paper(opacity: float, number: int) -> None:
+def test_correction_is_that_of_paper(opacity: float, number: int) -> None:
     new, factor = refine.shared(np.array([0.5, opacity]), np.array([1, number]))
     expected = reference.relocated(opacity, number)
     np.testing.assert_allclose([new[1], factor[1]], expected, rtol=1e-9)
@@ -74,7 +74,7 @@ def test_opaque_surfels_are_drawn_more_often(rng: np.random.Generator) -> None:
     assert np.mean(edit.parent[2:] == 1) == pytest.approx(0.8, abs=0.05)
 
 
-def test_a_relocation_hardly_changes_the_picture(rng: np.random.Generator) -> None:
+def test_relocation_hardly_changes_image(rng: np.random.Generator) -> None:
     """A tenth of what the same copies without a correction change."""
     raw = table(400, 100, rng).to_numpy()
     raw["opacity"][300:] = -20  # idle ones cover nothing
@@ -89,7 +89,7 @@ def test_a_relocation_hardly_changes_the_picture(rng: np.random.Generator) -> No
     assert changed < 0.2 * uncorrected
 
 
-def test_the_table_grows_up_to_the_limit(rng: np.random.Generator) -> None:
+def test_table_grows_up_to_limit(rng: np.random.Generator) -> None:
     surfels = table(40, 0, rng)
     grow = Relocation(WHEN, grow=0.25)
     assert refine.relocate(surfels, grow, 100, rng).surfels.count == 50
@@ -103,7 +103,7 @@ def test_all_idle_stay_where_they_are(rng: np.random.Generator) -> None:
     assert edit.parent.tolist() == [0, 1, 2, 3, 4]
 
 
-def test_only_transparent_surfels_wander_within_their_plane(rng: np.random.Generator) -> None:
+def test_only_transparent_surfels_take_random_steps_in_their_plane(rng: np.random.Generator) -> None:
     """Steps are η λ σ² / (1 + exp(100 (o - threshold))) of normal deviates along each tangent."""
     surfels = table(20_000, 10_000, rng)
     options, rate, extent = Relocation(WHEN, opacity=0.01, noise=100.0), 0.1, 2.0
@@ -121,7 +121,7 @@ def test_only_transparent_surfels_wander_within_their_plane(rng: np.random.Gener
     assert np.abs(moved[opacity > 0.5]).max() < 1e-9 * np.abs(moved).max() + 1e-7
 
 
-def test_steps_follow_from_seed_and_iteration_and_scale_with_the_scene(rng: np.random.Generator) -> None:
+def test_steps_follow_from_seed_and_iteration_and_scale_with_scene(rng: np.random.Generator) -> None:
     small = table(50, 50, rng)
     raw = small.to_numpy()
     large = Surfels.from_numpy(raw | {"position": 8 * raw["position"], "scale": raw["scale"] + np.log(8)})

@@ -109,10 +109,10 @@ def fitted(variant: str, views: Dataset, run: Path) -> Trainer:
     return trainer
 
 
-def test_terms_stay_if_they_earn_their_price(
+def test_components_are_kept_if_gain_exceeds_cost(
     variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Degree 1 brings too little and goes; the two others stay. Held-out views are fitted at the end only."""
+    """Degree 1 gains too little; the two others are kept. Validation views are fitted at the end only."""
     seen = judged(monkeypatch, [20.01, 20.0, 25.0, 20.0, 27.0, 25.0])
     trainer = fitted(variant, views, tmp_path / "run")
     assert [(row["term"], row["iteration"], row["stays"]) for row in trainer.decisions] == [
@@ -126,7 +126,7 @@ def test_terms_stay_if_they_earn_their_price(
     assert trainer.surfels.sh_degree() == 0
 
 
-def test_a_term_without_what_it_needs_is_not_tried(
+def test_component_without_its_requirement_is_not_tried(
     variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     judged(monkeypatch, [21.0, 20.0, 19.0, 20.0])
@@ -138,7 +138,7 @@ def test_a_term_without_what_it_needs_is_not_tried(
     assert "left out (needs specular)" in text and "+1.00 dB" in text and len(text.splitlines()) == 4
 
 
-def test_the_price_is_of_time_and_memory() -> None:
+def test_required_gain_depends_on_time_and_memory() -> None:
     cheap, dear = select.ComponentTrial(20.0, 5.0, 1.0), select.ComponentTrial(20.5, 25.0, 11.0)
     method = methods.load("auto", "quick")
     assert method.select is not None
@@ -156,7 +156,7 @@ def launches() -> Iterator[None]:
     dr.kernel_history_clear()
 
 
-def test_a_term_that_is_off_is_absent(
+def test_component_that_is_off_is_absent(
     variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, launches: None
 ) -> None:
     """Channels, parameters, features of the blend, launches and rays of a step, and the PLY's properties."""
@@ -190,7 +190,7 @@ def test_a_term_that_is_off_is_absent(
     assert counted["off"][2] < counted["on"][2]
 
 
-def test_an_interrupted_selection_resumes_where_it_was(
+def test_interrupted_selection_resumes(
     variant: str, folder: Path, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Killed after the second decision: the same decisions, and tables of the same shapes."""
@@ -223,10 +223,10 @@ def test_an_interrupted_selection_resumes_where_it_was(
         assert tensor.shape == resumed.params[name].shape
 
 
-def test_a_run_keeps_its_decisions(
+def test_run_keeps_its_decisions(
     variant: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """On the command line, with real trials: config.toml, decisions.json and the PLY tell of one method."""
+    """On the command line, with real trials: config.toml, decisions.json and the PLY are of one method."""
     run = tmp_path / "run"
     command = train_command(folder, run, Path(variant))
     assert main([*command[: command.index("--set")], "--json", "--set", *SETTINGS]) == 0
@@ -248,7 +248,7 @@ def other(variant: str, *terms: str) -> Method:
     return methods.load(variant, "quick", SETTINGS, terms)
 
 
-def test_branching_keeps_what_both_methods_have(variant: str, views: Dataset) -> None:
+def test_branching_keeps_common_parameters(variant: str, views: Dataset) -> None:
     trainer = Trainer(other(variant), views)
     for _ in range(3):
         trainer.step()
@@ -271,7 +271,7 @@ def test_branching_keeps_what_both_methods_have(variant: str, views: Dataset) ->
     np.testing.assert_array_equal(trainer.params["position"].numpy(), before["position"])
 
 
-def test_branching_resamples_the_light(variant: str, views: Dataset) -> None:
+def test_branching_resamples_light(variant: str, views: Dataset) -> None:
     trainer = Trainer(other(variant, "specular"), views)
     trainer.params[LIGHT] = mi.TensorXf(np.linspace(-1, 2, 8 * 16 * 3).reshape(8, 16, 3).astype(np.float32))
     method = other(variant, "specular")
@@ -297,7 +297,7 @@ def test_branching_resamples_the_light(variant: str, views: Dataset) -> None:
         ("after = 5\n", 'after = 8\nneeds = ["interreflection"]\n', ["specular", "tried later"]),
     ],
 )
-def test_a_selection_that_cannot_be_made_is_refused_at_once(
+def test_selection_that_cannot_be_made_is_refused_at_once(
     old: str, new: str, words: list[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "own.toml"
@@ -308,7 +308,7 @@ def test_a_selection_that_cannot_be_made_is_refused_at_once(
     assert all(word in str(error.value) for word in words), error.value
 
 
-def test_trials_end_with_the_fit(
+def test_trials_end_with_fit(
     variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A term that has no room left is not tried, and no step is made beyond the last iteration."""
@@ -320,7 +320,7 @@ def test_trials_end_with_the_fit(
     assert Run(tmp_path / "run").method().components == ("degree",)
 
 
-def test_a_rival_that_fails_is_left_out(
+def test_rival_that_fails_is_left_out(
     variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def failing(*_: Any) -> Trainer:
@@ -332,10 +332,10 @@ def test_a_rival_that_fails_is_left_out(
     assert "no surfel is left" in trainer.decisions[0]["reason"]
 
 
-def test_the_time_of_trials_counts(
+def test_seconds_include_trials(
     variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The seconds of a fit hold the steps of both sides of a trial, and the judges' pictures."""
+    """The seconds of a fit hold the steps of both sides of a trial, and the judges' images."""
     begin_ = time.perf_counter()
     trainer = begin(methods.load(variant, "quick", SETTINGS), views, Run(tmp_path / "run"))
     before = time.perf_counter()
@@ -344,10 +344,10 @@ def test_the_time_of_trials_counts(
     assert 0.5 * wall < trainer.seconds <= wall + 0.1 < time.perf_counter() - begin_ + 0.2
 
 
-def test_linear_pictures_are_judged_as_they_are_shown(
+def test_linear_images_are_scored_as_displayed(
     variant: str, views: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The score of a picture in linear radiance is that of the same picture as a PNG."""
+    """The score of an image in linear radiance is that of the same image as a PNG."""
     trainer = Trainer(other(variant), views)
     encoded = select.validation_psnr(trainer, views)
     linear = tuple(

@@ -33,7 +33,7 @@ def method(tmp_path: Path) -> Method:
     return methods.load_resolved(path)
 
 
-def test_the_loss_falls_and_everything_trains(method: Method) -> None:
+def test_loss_falls_and_everything_trains(method: Method) -> None:
     data = ball()
     method = dataclasses.replace(method, refine=methods.Refine(), data=DataOptions(), iterations=60)
     trainer = Trainer(method, data)
@@ -66,7 +66,7 @@ def with_deferred(method: Method, options: dict[str, Any]) -> Method:
         ({"traced_bounces": 2, "samples": 4}, {"mesh/surfels", "mesh/weights", "mesh/normals"}),
     ],
 )
-def test_resume_repeats_a_straight_run_bit_for_bit(
+def test_resume_repeats_straight_run_bit_for_bit(
     options: dict[str, Any], kept: set[str], method: Method, tmp_path: Path, one_thread: None
 ) -> None:
     data, method = ball(), with_deferred(method, options)
@@ -92,7 +92,7 @@ def test_resume_repeats_a_straight_run_bit_for_bit(
     assert "mesh/faces" in expected
 
 
-def test_a_stage_has_its_own_rates(method: Method) -> None:
+def test_stage_has_its_own_rates(method: Method) -> None:
     initial = dataclasses.replace(method.stage["initial"], rates={"metallic": 0.0, "light": 0.1})
     slow = dataclasses.replace(method, stage=method.stage | {"initial": initial}, refine=methods.Refine())
     first = {}
@@ -111,7 +111,7 @@ def test_a_stage_has_its_own_rates(method: Method) -> None:
     assert np.abs(trainer.params["metallic"].numpy() - before_deferred).max() > 0
 
 
-def test_an_edit_clears_the_moments_of_what_it_changed(method: Method) -> None:
+def test_edit_clears_moments_of_what_it_changed(method: Method) -> None:
     """The propagation of iteration 5 changes opacities and scales."""
     trainer = Trainer(method, ball())
     trainer.step()
@@ -125,7 +125,7 @@ def test_an_edit_clears_the_moments_of_what_it_changed(method: Method) -> None:
 
 
 @pytest.mark.parametrize("samples, factor", [(1, 1), (4, 2)])
-def test_the_screen_gradient_is_in_half_pictures(
+def test_screen_gradient_is_in_normalised_device_coordinates(
     samples: int, factor: int, method: Method, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Normalised device coordinates: what densification compares then has no unit."""
@@ -146,7 +146,7 @@ def test_the_screen_gradient_is_in_half_pictures(
     np.testing.assert_allclose(trainer.fit.tables[0].gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
 
 
-def test_a_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: Path) -> None:
+def test_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: Path) -> None:
     """A killed process leaves its last periodic checkpoint, and a torn file is passed over."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
@@ -165,7 +165,7 @@ def test_a_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: 
 
 
 @pytest.mark.parametrize(("number", "raised"), [("SIGINT", KeyboardInterrupt), ("SIGTERM", TerminatedError)])
-def test_a_signal_waits_for_the_step_in_hand(
+def test_signal_waits_for_step_in_hand(
     number: str,
     raised: type[KeyboardInterrupt],
     heard_interrupts: None,
@@ -173,7 +173,7 @@ def test_a_signal_waits_for_the_step_in_hand(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A signal inside iteration 7, before its refinement: the checkpoint holds the whole iteration."""
+    """A signal inside iteration 7, before its refinement: the checkpoint contains the whole iteration."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
     refine = AdaptiveControl.refine
@@ -194,7 +194,7 @@ def test_a_signal_waits_for_the_step_in_hand(
         assert np.array_equal(state[name], value), name
 
 
-def test_a_second_signal_is_not_held(
+def test_second_signal_is_not_held(
     method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, heard_interrupts: None
 ) -> None:
     """Twice within iteration 7, which ends it there; what was saved before is whole."""
@@ -216,7 +216,7 @@ def test_a_second_signal_is_not_held(
     assert not after and state is not None and int(state["iteration"]) == 5
 
 
-def test_a_signal_that_was_ignored_stays_ignored() -> None:
+def test_signal_that_was_ignored_stays_ignored() -> None:
     """As of a job that a script put in the background."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -230,7 +230,7 @@ def test_a_signal_that_was_ignored_stays_ignored() -> None:
 
 
 @pytest.mark.parametrize("limit", ["file size", "disk"])
-def test_a_full_disk_leaves_what_was_saved(
+def test_full_disk_leaves_what_was_saved(
     limit: str, method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The checkpoint of iteration 10 does not fit: one sentence, no half file; that of 5 is still there."""
@@ -261,7 +261,7 @@ def test_a_full_disk_leaves_what_was_saved(
     assert again.iteration == method.iterations
 
 
-def test_a_log_that_cannot_be_written_is_one_sentence(method: Method, tmp_path: Path) -> None:
+def test_log_that_cannot_be_written_is_one_sentence(method: Method, tmp_path: Path) -> None:
     run = run_folder(tmp_path / "run", method)
     run.output.own("metrics.jsonl").mkdir()
     with pytest.raises(InputError, match=r"metrics\.jsonl: output: cannot be written \(.*\); choose"):
@@ -269,7 +269,7 @@ def test_a_log_that_cannot_be_written_is_one_sentence(method: Method, tmp_path: 
 
 
 @pytest.mark.parametrize("resumed", [False, True])
-def test_a_folder_that_cannot_be_written_is_refused_before_the_first_step(
+def test_folder_that_cannot_be_written_is_refused_before_first_step(
     resumed: bool, method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A read-only disk, imitated: file permissions mean nothing to root."""
@@ -284,7 +284,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_first_step(
     assert not (run.path / "metrics.jsonl").exists()
 
 
-def test_a_run_is_not_overwritten(method: Method, tmp_path: Path) -> None:
+def test_run_is_not_overwritten(method: Method, tmp_path: Path) -> None:
     run_folder(tmp_path / "run", method)
     with pytest.raises(InputError, match="--resume"):
         run_folder(tmp_path / "run", method)
@@ -293,7 +293,7 @@ def test_a_run_is_not_overwritten(method: Method, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "options, most", [({}, 80), ({"traced_bounces": 1, "samples": 4, "antialias": True}, 100)]
 )
-def test_a_warm_step_compiles_nothing(options: dict[str, Any], most: int, method: Method) -> None:
+def test_warm_step_compiles_nothing(options: dict[str, Any], most: int, method: Method) -> None:
     method = with_deferred(method, options)
     trainer = Trainer(dataclasses.replace(method, refine=methods.Refine()), ball())
     while trainer.iteration < 22:  # into the deferred stage, with a mesh
@@ -308,8 +308,8 @@ def test_a_warm_step_compiles_nothing(options: dict[str, Any], most: int, method
     assert (after - launches) / 3 < most
 
 
-def test_pictures_begin_coarse(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks of 3² pixels, then of 2², then whole pictures: each is rendered in its own size."""
+def test_images_begin_coarse(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks of 3² pixels, then of 2², then whole images: each is rendered in its own size."""
     trainer, widths, steps = Trainer(method, ball()), [], []
     real = train.render
 
@@ -340,7 +340,7 @@ def test_another_size_compiles_once(method: Method) -> None:
     assert misses[4:] == [0] * 4
 
 
-def test_a_light_that_is_shared_learns_the_sum(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shared_light_learns_sum_of_gradients(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     """The gradient that three steps leave together is the sum of those that each leaves alone."""
     assert method.light is not None
     still = dataclasses.replace(method, rates=Rates(channel=dict.fromkeys(method.surfels.names, 0.0)))

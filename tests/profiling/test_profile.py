@@ -127,7 +127,7 @@ class SleepyClock(phases.PhaseClock):
         *[(name, "in", name, "deferred") for name in ("splat forward", "ssim forward", "optimiser")],
     ],
 )
-def test_time_is_booked_where_it_is_spent(
+def test_time_counts_for_innermost_phase(
     place: str, side: str, phase: str, at: str, used_trainer: Trainer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(phases, "WARM_UP", 1)
@@ -154,7 +154,7 @@ class Notes:
         return value
 
 
-def test_hooks_stand_where_their_names_say(trainer: Trainer) -> None:
+def test_hooks_enclose_the_phases_of_their_names(trainer: Trainer) -> None:
     notes = Notes()
     trainer.iteration = 35
     with timing.listening(notes):
@@ -192,7 +192,7 @@ def test_profiling_leaves_nothing_behind(trainer: Trainer) -> None:
     assert trainer.iteration == 0 and trainer.method is method
 
 
-def test_a_step_with_a_clock_is_the_same_step(
+def test_step_with_clock_is_same_step(
     data: Path, method: Path, one_thread: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Boundaries are identities: the table moves as in plain steps."""
@@ -218,7 +218,7 @@ def files(folder: Path) -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
-def test_of_a_run(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_of_run(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = files(finished)
     capsys.readouterr()
     assert main(["profile", str(finished), "--steps", "2", "--size", "16", "--json"]) == 0
@@ -240,7 +240,7 @@ def test_of_a_run(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert {*frame["aovs_ms"]} == {*materials, *traced, "normal", "depth", "diffuse", "specular", "indirect"}
 
 
-def test_what_a_picture_and_each_aov_take(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_image_and_each_aov_take(monkeypatch: pytest.MonkeyPatch) -> None:
     """In turns; kernels that are compiled count for nothing, and an AOV by its difference in a round."""
     asked: list[tuple[str, ...]] = []
     clock = [0.0]
@@ -259,7 +259,7 @@ def test_what_a_picture_and_each_aov_take(monkeypatch: pytest.MonkeyPatch) -> No
     assert found.aovs_ms == pytest.approx({"albedo": 0, "depth": 40}, abs=1e-6)
 
 
-def test_aovs_of_a_frame_are_those_that_it_has(finished: Path) -> None:
+def test_aovs_of_frame_are_those_that_it_has(finished: Path) -> None:
     scene = TrainedScene.read(finished)
     camera = Camera.from_pose(8, 6, -8.0, -8.0, 4.0, 3.0, np.eye(4))
     plain = replace(scene, shading=Shading(reflectance="radiance"), mesh=None)
@@ -267,7 +267,7 @@ def test_aovs_of_a_frame_are_those_that_it_has(finished: Path) -> None:
     assert aovs_of(frame) == ["albedo", "metallic", "roughness", "normal", "depth", "diffuse"]
 
 
-def test_of_a_data_set(data: Path, method: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_of_data_set(data: Path, method: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--method", str(method), "--preset", "quick", "--steps", "1", "--set", *SETTINGS]
     assert main(["profile", str(data), *options]) == 0
     said = capsys.readouterr().out
@@ -311,7 +311,7 @@ def test_what_is_neither_run_nor_data(
     assert "drop --size" in capsys.readouterr().err
 
 
-def test_a_run_without_checkpoints_has_pictures(
+def test_run_without_checkpoints_has_images(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Path(shutil.copytree(finished, tmp_path / "run"))
@@ -326,7 +326,7 @@ def test_a_run_without_checkpoints_has_pictures(
     assert "checkpoints: none yet" in capsys.readouterr().err
 
 
-def test_the_benchmark_of_a_step_runs_as_a_script(tmp_path: Path) -> None:
+def test_benchmark_of_step_runs_as_script(tmp_path: Path) -> None:
     options = ["--surfels", "300", "--size", "32", "--steps", "1", "--json"]
     script = [sys.executable, str(ROOT / "benchmarks" / "step.py"), *options]
     done = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)

@@ -40,7 +40,7 @@ def test_what_is_written_is_read(state: State) -> None:
         assert set(archive.files) == state.keys()
 
 
-def test_a_cut_anywhere_is_found(state: State) -> None:
+def test_cut_anywhere_is_found(state: State) -> None:
     data = checkpoint.encode(state)
     lengths = {0, 1, 22, len(data) - 1, *np.linspace(0, len(data) - 1, 300).astype(int).tolist()}
     for length in lengths:
@@ -48,7 +48,7 @@ def test_a_cut_anywhere_is_found(state: State) -> None:
             checkpoint.decode(data[:length])
 
 
-def test_a_flipped_bit_anywhere_is_found(state: State, rng: np.random.Generator) -> None:
+def test_flipped_bit_anywhere_is_found(state: State, rng: np.random.Generator) -> None:
     data = bytearray(checkpoint.encode(state))
     ends = [*range(200), *range(len(data) - 200, len(data))]
     for place in (*ends, *rng.integers(len(data), size=300).tolist()):
@@ -119,7 +119,7 @@ def test_wrong_content_is_found_though_its_checksum_is_right(
         checkpoint.decode(data)
 
 
-def test_an_archive_of_something_else_is_found() -> None:
+def test_archive_of_something_else_is_found() -> None:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.writestr("iteration.npy", b"\x93NUMPY\x01\x00 no")
@@ -143,7 +143,7 @@ def damage(path: Path, how: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["empty", "cut", "half", "flipped"])
-def test_resume_goes_on_from_the_checkpoint_before_and_says_so(
+def test_resume_goes_on_from_checkpoint_before_and_says_so(
     how: str, finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Run(copytree(finished, tmp_path / "run"))
@@ -156,7 +156,7 @@ def test_resume_goes_on_from_the_checkpoint_before_and_says_so(
     assert checkpoint.read(newest)["iteration"] == 6 and run.checkpoints() == [before, newest]
 
 
-def test_a_fit_is_not_begun_anew_when_every_checkpoint_is_damaged(
+def test_fit_is_not_begun_anew_when_every_checkpoint_is_damaged(
     finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Run(copytree(finished, tmp_path / "run"))
@@ -171,7 +171,7 @@ def test_a_fit_is_not_begun_anew_when_every_checkpoint_is_damaged(
     assert main(["eval", str(run.path)]) == 0
 
 
-def test_resume_clears_what_a_killed_process_left(finished: Path, data: Path, tmp_path: Path) -> None:
+def test_resume_clears_what_killed_process_left(finished: Path, data: Path, tmp_path: Path) -> None:
     run = Run(copytree(finished, tmp_path / "run"))
     log = run.path / "metrics.jsonl"
     whole = log.read_bytes()
@@ -192,7 +192,7 @@ def test_resume_clears_what_a_killed_process_left(finished: Path, data: Path, tm
     assert lines[:1] == whole.splitlines()[:1] and len(lines) == 3
 
 
-def test_a_method_that_changed_since_is_refused(
+def test_method_that_changed_since_is_refused(
     finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Run(copytree(finished, tmp_path / "run"))

@@ -1,4 +1,4 @@
-"""A run that is written shows the same picture as a Mitsuba scene, and when its files are read again."""
+"""A run that is written shows the same image as a Mitsuba scene, and when its files are read again."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def picture(made: TrainedScene, camera: Camera) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["deferred", "at surfels", "3D Gaussians", "surrounded"])
-def test_the_picture_goes_round(name: str, tmp_path: Path) -> None:
+def test_image_goes_round(name: str, tmp_path: Path) -> None:
     """The camera is that of the scene's sensor, whose numbers are rounded to float32."""
     made = scenes()[name]
     export(made, tmp_path, camera_at(30.0))

@@ -20,7 +20,7 @@ from tests.scenes.tiny import write_data, write_open_data
 
 STORED = Path(__file__).parent / "run_of_0_1"
 TOLERANCE = 2e-5
-"""Of images: other SIMD widths sum in another order."""
+"""Difference of images: other SIMD widths sum in another order."""
 
 
 @pytest.fixture(params=["object", "open"])
