@@ -198,10 +198,7 @@ class Tracer:
                 wanted |= si.shape == mi.ShapePtr(shape)
             hit = plane(wanted).astype(bool) & covered
             depth = ((np.array(si.p).T - pose[:3, 3]) @ pose[:3, 2]).reshape(height, width)
-            found = {
-                "normal": np.array(normal).T.reshape(height, width, 3),
-                "depth": depth[..., None],
-            }
+            found = {"normal": np.array(normal).T.reshape(height, width, 3), "depth": depth[..., None]}
             for name, (value, known) in vars(materials_at(self.scene, si)).items():
                 planes = [plane(x) for x in (value if dr.depth_v(value) > 1 else [value])]
                 found[name] = np.stack([*planes, plane(known)], axis=-1)

@@ -18,14 +18,7 @@ from mi_refgs.data.region import region_of
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, linear_from_srgb, read_png, write_png
 from tests.scenes.dots import COLOURS, POINTS, check
-from tests.scenes.layouts import (
-    SHOTS,
-    VALUES,
-    WRITERS,
-    write_binary,
-    write_colmap,
-    write_text,
-)
+from tests.scenes.layouts import SHOTS, VALUES, WRITERS, write_binary, write_colmap, write_text
 
 KINDS = ("txt", "bin")
 

@@ -177,10 +177,7 @@ def test_broken_files_are_refused(tmp_path: Path, rng: np.random.Generator) -> N
         (b"\x89PNG\r\n", "not a PLY file"),
         (text[:-30], "row 3 is broken|rows are more than"),
         (text.replace(text.split()[-1], b"zero"), "row 3 is broken"),
-        (
-            whole.replace(b"format binary_little_endian", b"format pdp_endian"),
-            "no format or no element",
-        ),
+        (whole.replace(b"format binary_little_endian", b"format pdp_endian"), "no format or no element"),
         (face_first + bytes(8), "face: the vertices must come first"),
         (
             whole.replace(b"property float scale_1", b"property list uchar int scale_1"),
