@@ -74,7 +74,7 @@ class Reconstruction:
         return self.provenance.method
 
     def views(self, split: str = "test") -> Dataset:
-        """Read the "test" or "train" views of the data set: each of `.views` has `.image` (H, W, 3).
+        """Read the "test" or "train" views of the data set; `view.load().image` is (H, W, 3).
 
         Raises InputError for a data set that is unknown, missing or unreadable.
         """

@@ -62,7 +62,7 @@ class Materials:
         import drjit as dr
         import mitsuba as mi
 
-        def clean(value: Any, known: Any) -> tuple[Any, Any]:
+        def clean(value: Any, known: Bool) -> tuple[Any, Bool]:
             finite = known
             for x in value if dr.depth_v(value) > 1 else [value]:
                 finite = finite & (dr.abs(x) < MAX_NUMBER)
@@ -102,7 +102,7 @@ def materials_at(scene: Any, si: Any) -> Materials:
 class _Parameters:
     """The parameters of one BSDF by name, evaluated at surface interactions."""
 
-    def __init__(self, bsdf: Any, si: Any, active: Any) -> None:
+    def __init__(self, bsdf: Any, si: Any, active: Bool) -> None:
         import mitsuba as mi
 
         class Children(mi.TraversalCallback):
@@ -125,7 +125,7 @@ class _Parameters:
     def __contains__(self, name: str) -> bool:
         return name in self.children
 
-    def number(self, name: str, default: float = 0.0) -> Any:
+    def number(self, name: str, default: float = 0.0) -> Float:
         """A parameter as mi.Float; `default` without one."""
         import mitsuba as mi
 
@@ -136,7 +136,7 @@ class _Parameters:
             return mi.Float(texture.eval_1(self.si, self.active))
         return mi.Float(self.values[name])
 
-    def colour(self, name: str, default: float = 1.0) -> Any:
+    def colour(self, name: str, default: float = 1.0) -> Color3f:
         """A parameter as mi.Color3f; `default` without one."""
         import mitsuba as mi
 
@@ -149,7 +149,7 @@ class _Parameters:
         return _of(self.children[name], self.si if si is None else si, self.active)
 
 
-def _of(bsdf: Any, si: Any, active: Any) -> Materials:
+def _of(bsdf: Any, si: Any, active: Bool) -> Materials:
     """Materials of one BSDF, by the first rule whose parameters it has."""
     parameters = _Parameters(bsdf, si, active)
     for needed, rule in RULES:

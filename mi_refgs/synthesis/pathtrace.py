@@ -15,6 +15,7 @@ from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis.ground_truth import materials_at
 from mi_refgs.synthesis.settings import Settings
+from mi_refgs.types import Point2f
 
 SAMPLES_PER_LAUNCH = 1 << 24
 """Largest number of paths per launch; the path tracer keeps about 100 bytes for each."""
@@ -218,8 +219,8 @@ class Tracer:
             seen = np.array(si.is_valid()) & np.ones(len(film), dtype=bool)
             return np.where(seen[:, None], np.array(si.p, dtype=np.float64).T, np.nan)
 
-    def _rays(self, film: Any) -> Any:
-        """Rays through positions (mi.Point2f) on the film."""
+    def _rays(self, film: Point2f) -> Any:
+        """Rays (mi.RayDifferential3f) through film positions, 0 … 1."""
         import mitsuba as mi
 
         return self.sensor.sample_ray(0, 0.5, film, mi.Point2f(0.5))[0]
