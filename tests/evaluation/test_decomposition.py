@@ -7,39 +7,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
-import trimesh
 
 from mi_refgs.cli.evaluate import table
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.view import View
-from mi_refgs.errors import InputError
-from mi_refgs.evaluation import surface
 from mi_refgs.evaluation.decomposition import Decomposition
 from mi_refgs.evaluation.evaluate import DECOMPOSITION, evaluate
 from mi_refgs.evaluation.images import RenderedView
 from mi_refgs.io.images import read_png
-from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.reference.camera import look_at
 from mi_refgs.runs.export import export
-from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.attributes import SH_DC
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.known import (
-    CENTRES,
-    CLAY,
-    METAL,
-    RADII,
     SIZE,
-    known_mesh,
-    known_surfels,
     write_known_run,
 )
 
@@ -153,115 +135,6 @@ def test_missing_materials_are_null_with_a_reason() -> None:
     assert found["albedo_scale"] is None and found["psnr_concave"] is None
 
 
-# ---------------- surface ----------------
-
-
-def mesh_of(shape: Any) -> Mesh:
-    return Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.uint32), 1e-3)
-
-
-def truth_of(*shapes: Any) -> surface.TrueSurface:
-    mesh = mesh_of(trimesh.util.concatenate(shapes))
-    return surface.TrueSurface(mesh, Occluder(mesh))
-
-
-def around(count: int = 8) -> list[View]:
-    """Cameras on a circle and above that look at the origin."""
-    blank = np.zeros((16, 16, 3), np.float32)
-    views = []
-    for i in range(count):
-        angle = 2 * np.pi * i / count
-        origin = 6 * np.array([np.cos(angle), np.sin(angle), np.sin(3 * angle)])
-        pose = look_at(origin, np.zeros(3))
-        views.append(
-            View(f"{i}", 16, 16, 16, 16, 8, 8, pose, blank, None, None, None, is_linear_radiance=False)
-        )
-    return views
-
-
-def ball(radius: float, centre: tuple[float, ...] = (0, 0, 0)) -> Any:
-    shape = trimesh.creation.icosphere(subdivisions=4, radius=radius)
-    return shape.apply_translation(centre)
-
-
-def test_distance_to_itself_is_zero() -> None:
-    truth = truth_of(ball(1))
-    found = surface.surface_distance(truth.mesh, truth, around())
-    assert found["surface_distance"] < 1e-3 and "surface_distance_concave" not in found
-
-
-def test_distance_of_spheres() -> None:
-    """In percent of the true diameter, either way."""
-    found = surface.surface_distance(mesh_of(ball(1.1)), truth_of(ball(1)), around())
-    for key in surface.SURFACE_KEYS:
-        assert found[key] == pytest.approx(5, abs=0.05)
-
-
-def test_distance_counts_missing_but_not_hidden_surface() -> None:
-    """A second ball beside the first is missing; one inside it is hidden, on either side."""
-    both = truth_of(ball(1), ball(0.5, (1.7, 0, 0)))
-    found = surface.surface_distance(mesh_of(ball(1)), both, around())
-    assert found["surface_accuracy"] < 0.02 and found["surface_completeness"] > 2
-    inside = trimesh.util.concatenate([ball(1), ball(0.5)])
-    for ours, true in ((ball(1), inside), (inside, ball(1))):
-        found = surface.surface_distance(mesh_of(ours), truth_of(true), around())
-        assert found["surface_distance"] < 1e-3
-
-
-def test_closed_cavity_counts_as_concave_error() -> None:
-    """A box with a pit against the same box without: all distance is in the pit."""
-    box = trimesh.creation.box((2, 2, 1)).subdivide().subdivide()
-    above = [
-        replace(v, to_world=look_at(np.array([0.1 * i, 0.3, 6]), np.zeros(3)))
-        for i, v in enumerate(around(3))
-    ]
-    found = surface.surface_distance(mesh_of(box), truth_of(pitted_box()), [*around(), *above])
-    assert found["surface_distance_concave"] > 4 * found["surface_distance"] > 0
-    assert found["surface_completeness_concave"] > 3
-
-
-def pitted_box() -> Any:
-    """The box of 2 × 2 × 1 whose top has a square pit, 1 wide and 0.6 deep, as an open surface."""
-    box = trimesh.creation.box((2, 2, 1)).subdivide().subdivide()
-    middle = box.triangles_center
-    lid = (middle[:, 2] > 0.49) & (abs(middle[:, 0]) < 0.5) & (abs(middle[:, 1]) < 0.5)
-    box.update_faces(~lid)
-    pit = trimesh.creation.box((1, 1, 0.6)).subdivide()
-    pit.apply_translation((0, 0, 0.2))
-    pit.update_faces(pit.triangles_center[:, 2] < 0.49)
-    return trimesh.util.concatenate([box, pit])
-
-
-def test_ambient_visibility_inside_a_cap() -> None:
-    """Everywhere inside a cap of a sphere it is 1 - h / 2R; on the outside 1."""
-    sphere = trimesh.creation.icosphere(subdivisions=5)
-    for height in (0.5, 1.0):
-        cap = sphere.copy()
-        cap.update_faces(cap.triangles_center[:, 2] < height - 1)
-        occluder = Occluder(mesh_of(cap))
-        down = np.array([[0, 0, -1], [0.3, 0, -0.95], [0.2, 0.2, -0.96]])
-        point = down / np.linalg.norm(down, axis=1, keepdims=True)
-        inside = surface.ambient_visibility(occluder, mi.Point3f(point.T * 0.999), mi.Vector3f(-point.T))
-        np.testing.assert_allclose(inside.numpy(), 1 - height / 2, atol=0.04)
-        outside = surface.ambient_visibility(occluder, mi.Point3f(point.T * 1.001), mi.Vector3f(point.T))
-        np.testing.assert_array_equal(outside.numpy(), 1)
-
-
-def test_concave_pixels_are_between_the_balls(data: Path) -> None:
-    truth = surface.TrueSurface.read(data)
-    assert truth is not None
-    for view in (view.load() for view in read_dataset(data, "test").views):
-        concave = truth.concave(view)
-        assert concave is not None and view.depth is not None
-        assert not concave[view.depth == 0].any() and 0.02 < concave[view.depth > 0].mean() < 0.4
-        rays = np.array(view.camera().rays()).T.reshape(SIZE, SIZE, 3)
-        point = view.to_world[:3, 3] + rays * view.depth[..., None]
-        gap = np.abs(np.linalg.norm(point[..., None, :] - CENTRES, axis=-1) - RADII).max(axis=-1)
-        hit = view.depth > 0
-        assert gap[concave].mean() < 0.7 * gap[hit & ~concave].mean()
-        assert truth.concave(replace(view, depth=None)) is None
-
-
 # ---------------- runs ----------------
 
 
@@ -317,62 +190,3 @@ def test_evaluate_without_ground_truth_gives_reasons(data: Path, tmp_path: Path)
     ):
         assert result[key] is None and result[f"{name}_reason"]
     assert result["surface_reason"] == "the run has no mesh"
-
-
-# ---------------- from a fitted colour to an albedo ----------------
-
-
-@pytest.mark.parametrize("with_mesh", [False, True])
-def test_relightable_recovers_albedo_from_fitted_radiance(data: Path, with_mesh: bool) -> None:
-    """A radiance that changes with direction, (1 - S) albedo × irradiance on average over the hemisphere."""
-    mesh = known_mesh()
-    surfels = known_surfels()
-    light = EnvironmentLight.from_file(data / "environment.exr")
-    normal = surfels.primitive.normal(surfels)
-    irradiance = light.prefilter().irradiance(normal).numpy().T
-    raw = surfels.to_numpy()
-    clay = raw["metallic"][:, 0] < 0
-    truth = np.where(clay[:, None], CLAY["albedo"], METAL["albedo"])
-    slope = np.random.default_rng(0).normal(0, 0.03, (len(truth), 3, 3))  # of each colour along x, y, z
-    # A linear function has two thirds of its largest value as its cosine-weighted mean.
-    mean = -np.einsum("ncx,nx->nc", slope, normal.numpy().T) * 2 / 3
-    constant = (0.96 * irradiance * truth - mean - 0.5) / SH_DC
-    linear = -slope[:, :, [1, 2, 0]] * [1, -1, 1] / np.sqrt(3 / (4 * np.pi))
-    raw["radiance_sh"] = np.concatenate([constant, linear.transpose(0, 2, 1).reshape(-1, 9)], 1).astype("f4")
-    wrong = raw | {
-        "albedo": np.zeros_like(raw["albedo"]),
-        "indirect_sh": np.zeros((len(truth), 3), np.float32),
-    }
-    scene = TrainedScene(
-        Surfels.from_numpy(wrong), light, mesh if with_mesh else None, Shading(occlusion=with_mesh), 1, 0.0
-    )
-    found = relightable(scene)
-    assert set(found.surfels.raw) == set(raw) - {"radiance_sh"}
-    assert found.shading.diffuse == "irradiance" and found.light is light
-    assert (found.shading.ambient_rays > 0) == with_mesh
-    albedo = np.array(found.surfels.value("albedo")).T
-    far = np.abs(np.array(surfels.position()).T[:, 0]) > 0.45  # from the other ball, which shades and shines
-    np.testing.assert_allclose(albedo[clay & far], truth[clay & far], atol=0.04)
-    np.testing.assert_allclose(albedo[~clay], 0.5, atol=0.01)  # a metal's is the channel
-
-
-def test_relightable_requires_materials_and_light() -> None:
-    surfels = known_surfels()
-    raw = {name: x for name, x in surfels.raw.items() if name != "metallic"}
-    light = EnvironmentLight.constant(0.5, 8)
-    for scene, words in (
-        (TrainedScene(surfels, None, None, Shading("surfel", "radiance"), 1, 0.0), "light: the run has none"),
-        (TrainedScene(Surfels(raw), light, None, Shading("surfel", "radiance"), 1, 0.0), "metallic: the run"),
-    ):
-        with pytest.raises(InputError, match=words):
-            relightable(scene)
-
-
-def test_relightable_keeps_fitted_materials(data: Path) -> None:
-    mesh = known_mesh()
-    surfels = known_surfels()
-    light = EnvironmentLight.constant(0.5, 8)
-    scene = TrainedScene(surfels, light, mesh, Shading(diffuse="irradiance", occlusion=True), 1, 0.0)
-    found = relightable(scene)
-    for name in ("albedo", "metallic", "roughness", "position"):
-        assert dr.all(found.surfels.raw[name].array == surfels.raw[name].array)

@@ -1,0 +1,22 @@
+"""Panels of environment maps, and contact sheets."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mi_refgs.evaluation import images
+
+
+def test_light_panels_have_one_exposure(rng: np.random.Generator) -> None:
+    truth = rng.uniform(0.1, 5, (8, 16, 3))
+    shown = images.light_panels(truth * [0.5, 2, 1], truth)
+    np.testing.assert_allclose(shown["recovered light"], shown["true light"], atol=1e-6)
+    dark = images.light_panels(np.zeros((8, 16, 3)))
+    assert np.all(dark["recovered light"] == 0)
+
+
+def test_contact_sheet_accepts_rows_of_different_length() -> None:
+    black, white = np.zeros((10, 30, 3)), np.ones((10, 30, 3))
+    sheet = images.contact_sheet([{"a": black, "b": white}, {"a": black}], {"light": np.zeros((8, 16, 3))})
+    assert sheet.ndim == 3 and sheet.shape[2] == 3
+    assert (sheet[:, :, 0] == 0).sum() >= 2 * (13 * 10) * (13 * 30)
