@@ -1,12 +1,11 @@
-"""Arbitrary output variables (AOVs): parsing Mitsuba's `name:type` lists, channel names, values.
+"""Arbitrary output variables (AOVs): Mitsuba's `name:type` lists, names of image channels, values.
 
-No Mitsuba class is defined here, so that this module need not be reloaded when the variant changes.
+This module defines no Mitsuba class, so that it need not be reloaded when the variant changes.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +18,7 @@ from mi_refgs.render.samples import ray_distance
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
+from mi_refgs.types import Float
 
 # Suffixes as Mitsuba's own `aov` integrator gives them; `Bitmap.split` makes a greyscale layer of a lone Y.
 _SUFFIXES = {
@@ -31,8 +31,8 @@ _SUFFIXES = {
 
 
 def suffixes() -> dict[str, str]:
-    """Suffixes of the channels of every type: of what surfels may have, of geometry, and of terms."""
-    return {name: channel.aov for name, channel in ATTRIBUTES.items() if channel.aov} | _SUFFIXES
+    """Suffixes of the image channels of every type: attributes of surfels, geometry, and terms."""
+    return {name: declared.aov for name, declared in ATTRIBUTES.items() if declared.aov} | _SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -67,10 +67,10 @@ def parse_aovs(text: str) -> list[AOV]:
     return aovs
 
 
-def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Any]:
-    """The channels (mi.Float) of one type, as wide as the frame or 1.
+def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Float]:
+    """Planes of one type, as wide as the frame or 1.
 
-    Materials, the unit normal and the visibility are those of what is seen, 0 where nothing is. Depth is the
+    Materials, the unit normal and the visibility are means of what is seen, 0 where nothing is. Depth is the
     distance along the ray from the near plane, as Mitsuba's `depth` is. The three terms are premultiplied by
     alpha and sum to the image over black. A supersampled frame was averaged premultiplied
     and divided by its mean alpha; `camera` is that of its pixels, not of the samples.
@@ -78,17 +78,17 @@ def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Any]:
     return _finished(kind, *_weighted(kind, frame, camera))
 
 
-def aov_planes(kind: str, frame: Frame, camera: Camera) -> list[Any]:
-    """Premultiplied channels (mi.Float) of one type and their weight, which are averaged over samples.
+def aov_planes(kind: str, frame: Frame, camera: Camera) -> list[Float]:
+    """Premultiplied planes of one type and their weight, to be averaged over samples.
 
-    `values_of_planes` of the means gives what `aov_values` gives for a supersampled frame.
+    `values_of_planes` of the means equals `aov_values` of a supersampled frame.
     """
     values, weight = _weighted(kind, frame, camera)
     return [*(values if kind in PREMULTIPLIED else (value * weight for value in values)), weight]
 
 
-def values_of_planes(kind: str, planes: list[Any]) -> list[Any]:
-    """The channels (mi.Float) of one type from means of `aov_planes`."""
+def values_of_planes(kind: str, planes: list[Float]) -> list[Float]:
+    """Planes of one type from means of `aov_planes`."""
     *values, weight = planes
     if kind not in PREMULTIPLIED:
         inverse = inverse_alpha(weight)
@@ -97,11 +97,11 @@ def values_of_planes(kind: str, planes: list[Any]) -> list[Any]:
 
 
 PREMULTIPLIED = (*TERMS, "alpha", "normal")
-"""Types that a frame has premultiplied. All others are divided by alpha, or by the opacity of the object."""
+"""Types that are premultiplied in a frame. All others are divided by alpha or the opacity of the object."""
 
 
-def _weighted(kind: str, frame: Frame, camera: Camera) -> tuple[list[Any], Any]:
-    """The channels of one type as the frame has them, and the opacity of what they are of."""
+def _weighted(kind: str, frame: Frame, camera: Camera) -> tuple[list[Float], Float]:
+    """Planes of one type as in the frame, and the opacity of the surfels they belong to."""
     if kind in ATTRIBUTES:
         value = frame.maps[kind]
         return [*value] if len(ATTRIBUTES[kind].aov) > 1 else [value], frame.object_alpha
@@ -116,8 +116,8 @@ def _weighted(kind: str, frame: Frame, camera: Camera) -> tuple[list[Any], Any]:
     return [*getattr(frame.terms, kind)], frame.object_alpha
 
 
-def _finished(kind: str, values: list[Any], weight: Any) -> list[Any]:
-    """The channels as an image has them: unit normals, and 0 where nothing is seen."""
+def _finished(kind: str, values: list[Float], weight: Float) -> list[Float]:
+    """Planes for an image: unit normals, and 0 where nothing is seen."""
     if kind in TERMS or kind == "alpha":
         return values
     valid = weight > COVERAGE_FLOOR

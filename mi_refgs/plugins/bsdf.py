@@ -17,10 +17,11 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.shade.brdf import device_table, split_sum
 from mi_refgs.shade.split_sum import DIELECTRIC_F0
+from mi_refgs.types import Color3f, Float
 
 ROUGHNESS_FLOOR = 0.01
-"""Smaller roughness counts as this one: α = 1e-4 is the smallest that Mitsuba's microfacet distribution
-samples. The split-sum table has no floor; what a surface reflects changes by less than 3e-5 below this one.
+"""Least roughness: α = 1e-4 is the smallest that Mitsuba's microfacet distribution samples. The split-sum
+table has no such floor; below it, reflectance changes by less than 3e-5.
 [measured against quadrature, N·V ≥ 0.02]"""
 
 SPECULAR, DIFFUSE = 0, 1
@@ -34,31 +35,31 @@ FLAGS = (
 
 @dataclass(frozen=True)
 class Material:
-    """The parameters at surface points, all of one width."""
+    """Parameters at surface points, all of one width."""
 
-    f0: Any  # mi.Color3f, reflectance at normal incidence
-    base: Any  # mi.Color3f, (1 - metallic) albedo: what the diffuse base reflects of what reaches it
-    roughness: Any  # mi.Float
+    f0: Color3f  # reflectance at normal incidence
+    base: Color3f  # (1 - metallic) albedo: reflectance of the diffuse base under the specular layer
+    roughness: Float
 
     @property
-    def α(self) -> Any:
-        """mi.Float."""
+    def α(self) -> Float:
+        """GGX's α, the square of the roughness."""
         return dr.square(self.roughness)
 
-    def specular(self, cosine: Any) -> Any:
-        """Reflectance (mi.Color3f) of the specular component under constant light, seen at this cosine."""
+    def specular(self, cosine: Float) -> Color3f:
+        """Reflectance of the specular component under constant light, viewed at this cosine."""
         scale, bias = split_sum(cosine, self.roughness)
         return dr.fma(self.f0, scale, bias)
 
-    def diffuse(self, cosine: Any) -> Any:
-        """Reflectance (mi.Color3f) of the diffuse component, seen at this cosine."""
+    def diffuse(self, cosine: Float) -> Color3f:
+        """Reflectance of the diffuse component, viewed at this cosine."""
         return dr.maximum(1 - self.specular(cosine), 0) * self.base
 
     def distribution(self) -> Any:
         """GGX; Mitsuba's own shadowing, which is separable, is not used."""
         return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self.α, True)
 
-    def slope(self, cosine: Any) -> Any:
+    def slope(self, cosine: Float) -> Float:
         """cosθ (1 + 2 Λ(θ)) of Smith's Λ, finite at cosθ = 0."""
         return dr.sqrt(dr.lerp(dr.square(self.α), 1, dr.square(cosine)))
 
@@ -97,9 +98,9 @@ class RefGSBSDF(mi.BSDF):
         F = F_0 + (1 - F_0) (1 - v \cdot h)^5, \quad F_0 = 0.04 (1 - m) + a\,m
 
     with GGX's D, and the height-correlated G of Smith [Heitz 2014, "Understanding the Masking-Shadowing
-    Function", eqs. 72, 99]. E, for each channel, is what the specular term reflects of a constant light, from
-    the split-sum table: the diffuse base gets what the specular layer over it leaves (the albedo scaling of
-    layered models). No material reflects more than it receives, but for the table's error (1e-3; up to 0.11
+    Function", eqs. 72, 99]. E, per channel, is the specular reflectance under constant light, from the
+    split-sum table: the diffuse base receives what the specular layer transmits (albedo scaling of layered
+    models). No material reflects more than it receives, but for the table's error (1e-3; up to 0.11
     at n · v below 0.005 and roughness below 0.15); rough metals lose light between the microfacets. The
     diffuse term is not reciprocal, as E depends on the view v alone: on wi, or on wo for paths that start at
     a light (``TransportMode.Importance``).
@@ -109,8 +110,8 @@ class RefGSBSDF(mi.BSDF):
     should be loaded with ``raw = true``, as numbers and not as sRGB.
 
     Samples are drawn from the visible normals [Heitz 2018] or from the cosine, chosen in proportion to what
-    the two terms reflect of a constant light at wi. `eval`, and the weight that `sample` returns, carry
-    derivatives with respect to the parameters and the directions; samples and densities carry none.
+    the two terms reflect of a constant light at wi. `eval`, and the weight that `sample` returns, have
+    derivatives with respect to the parameters and the directions; samples and densities have none.
 
     .. tabs::
         .. code-tab:: xml
@@ -230,7 +231,7 @@ def _texture(props: Any, name: str, default: float) -> Any:
 
 
 def _front(direction: Any, active: Any) -> tuple[Any, Any]:
-    """The directions on the side of the normal, the normal itself in place of others; and which they are."""
+    """Directions on the side of the normal, others replaced by the normal; and whether they are."""
     active = mi.Bool(active) & (direction.z > 0)
     return dr.select(active, direction, mi.Vector3f(0, 0, 1)), active
 
@@ -241,7 +242,7 @@ def _schlick(f0: Any, cosine: Any) -> Any:
 
 
 def _enabled(ctx: Any) -> tuple[bool, bool]:
-    """Whether the context asks for the specular and for the diffuse component."""
+    """Whether the context enables the specular and the diffuse component."""
     return (
         ctx.is_enabled(mi.BSDFFlags.GlossyReflection, SPECULAR),
         ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, DIFFUSE),
@@ -272,7 +273,7 @@ def _density(ctx: Any, material: Material, wi: Any, wo: Any) -> Any:
 
 
 def _specular_probability(ctx: Any, material: Material, cosine: Any) -> Any:
-    """Share of the samples that the specular component gets: 0 or 1 if the context asks for one only."""
+    """Probability of sampling the specular component: 0 or 1 if the context enables one only."""
     specular, diffuse = _enabled(ctx)
     if not (specular and diffuse):
         return mi.Float(specular)

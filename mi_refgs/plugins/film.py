@@ -1,6 +1,6 @@
-"""Channels of an image are sampled, filtered and developed by a sensor's film.
+"""Images through a sensor's film, and their derivatives.
 
-No Mitsuba class is defined here, so that this module need not be reloaded when the variant changes.
+This module defines no Mitsuba class, so that it need not be reloaded when the variant changes.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.splat.camera import Camera
 
 Channels = Callable[[Frame, Camera, bool], list[Any]]
-"""Channels of a frame, arrays of one value per pixel or one in all, for its camera and whether the film has
-alpha: R, G, B, (A), the weight and the AOVs, as the film's blocks have them."""
+"""Function of a frame, its camera and whether the film has alpha. Returns R, G, B, (A), the weight and the
+AOVs, in the order of the film's blocks; arrays of one value per pixel or one in all."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class FilmImage:
     def adjoints(self, δ_image: Any) -> Iterator[tuple[Any, Any]]:
         """Values of one pass after the other, attached to the parameters, and their adjoints.
 
-        They add up to the adjoint of the image. Hold no reference to the values when asking for the next.
+        They add up to the adjoint of the image. Delete references to the values before the next ones.
         """
         found = self._bands(DERIVATIVE_SAMPLES)
         if len(found) == 1:
@@ -126,7 +126,7 @@ class FilmImage:
     # ---------------- the film ----------------
 
     def _developed(self, values: Any) -> Any:
-        """What the film makes of the channels of all pixels; under AD."""
+        """The developed image of the channels of all pixels; under AD."""
         height, width = self._size
         tensor = mi.TensorXf(values, (height, width, dr.width(values) // (height * width)))
         self.film.prepare(self.aovs)
@@ -134,8 +134,8 @@ class FilmImage:
         return self.film.develop()
 
     def _through_film(self, derivative: Callable[[Any, Any], Any]) -> Any:
-        """A derivative of the developed image by the channels: the film is linear, so any values will do."""
-        shown = self.film.develop(True)
+        """A derivative of the developed image by the channels; the film is linear, so any values will do."""
+        before = self.film.develop(True)
         height, width = self._size
         alpha = mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha)
         count = (4 if alpha else 3) + 1 + len(self.aovs)
@@ -144,8 +144,8 @@ class FilmImage:
         dr.enable_grad(values)
         found = dr.detach(derivative(self._developed(values), values))
         dr.eval(found)
-        self.film.prepare(self.aovs)  # what it has shown before
-        self.film.put_block(mi.ImageBlock(shown, self.film.crop_offset()))
+        self.film.prepare(self.aovs)  # restore the image before
+        self.film.put_block(mi.ImageBlock(before, self.film.crop_offset()))
         return found
 
 

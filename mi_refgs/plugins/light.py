@@ -1,6 +1,6 @@
 """Mitsuba's environment emitters as the lights of `mi_refgs.shade`.
 
-No Mitsuba class is defined here, so that this module need not be reloaded when the variant changes.
+This module defines no Mitsuba class, so that it need not be reloaded when the variant changes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mi_refgs.shade.light.prefilter import prefilter
 from mi_refgs.shade.shading import Shading
 
 MAX_HEIGHT = 512
-"""Rows above which an emitter's map is averaged down: at 512 filtering costs 45 ms a render on two cores,
+"""Rows above which an emitter's map is downscaled: with 512, filtering takes 45 ms per render on two cores,
 and it grows with the square of the rows. [measured]"""
 
 
@@ -45,7 +45,7 @@ def own_light(emitter: Any) -> tuple[Any, Any]:
 
 
 def emitter_light(emitter: Any, filtered: bool = True, levels: Levels = LEVELS) -> Light:
-    """The light of an emitter of the scene, under AD; not `filtered` to `levels`, it has `radiance` alone.
+    """The light of an emitter of the scene, under AD: `filtered` to `levels`, or with `radiance` only.
 
     Gradients flow to its `scale` and `data`, or `radiance.value`; to `data` only where its size is one that
     lights have. Raises InputError if the texels of another size (see `_map_radiance`) should receive some,
@@ -57,7 +57,7 @@ def emitter_light(emitter: Any, filtered: bool = True, levels: Levels = LEVELS) 
     radiance, resampled = _map_radiance(params, emitter)
     if resampled and dr.grad_enabled(params["data"]):
         raise InputError(
-            f"emitter '{emitter.id()}': data: a map of {resampled} cannot be differentiated; "
+            f"emitter '{emitter.id()}': data: a map of {resampled} has no derivative; "
             f"use one of h x 2h, h a multiple of 4 from {MIN_HEIGHT} to {MAX_HEIGHT}"
         )
     light: Light = UnfilteredLight(radiance.shape[0], radiance.array)
@@ -84,12 +84,12 @@ def light_of(shading: Shading, own: EnvironmentLight | None, rotation: Any, scen
 
 
 def rotated(light: Light, light_from_world: Any) -> Light:
-    """The light through a rotation, as `own_light` gives it; None turns nothing."""
+    """Rotate a light by a matrix of `own_light`; None rotates nothing."""
     return light if light_from_world is None else RotatedLight(light, light_from_world)
 
 
 def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
-    """Radiance (h, 2h, 3) of an `envmap` times its scale; and its own size where that took resampling."""
+    """Radiance (h, 2h, 3) of an `envmap` times its scale, and the size of the map if it was resampled."""
     data = params["data"]
     rows, columns, channels = (int(x) for x in data.shape)
     width = columns - 2  # Mitsuba keeps one more column on each side, for its interpolation
@@ -119,7 +119,7 @@ def _constant_radiance(params: Any, emitter: Any) -> Any:
 def _light_from_world(params: Any) -> Any:
     """Rotation or mirror image from world to light (mi.Matrix3f, detached), None where it is the identity.
 
-    Raises InputError if `to_world` has scale or shear, by which Mitsuba itself shows another picture.
+    Raises InputError if `to_world` has scale or shear, with which Mitsuba itself renders another image.
     """
     matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
     if np.abs(matrix - np.eye(3)).max() < 1e-7:
