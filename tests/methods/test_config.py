@@ -147,7 +147,7 @@ EVENTS = {
     "many": {"degree": 3, "densify": 22, "reset_opacity": 4, "propagate_normals": 4, "mesh": 7}
     | {"restart": 1},
 }
-"""Of methods that no other one's windows make up."""
+"""Numbers of events that differ between methods."""
 
 
 @pytest.mark.parametrize("variant", EVENTS)
@@ -336,3 +336,28 @@ def test_a_prior_needs_what_it_is_about(prior: str) -> None:
     with pytest.raises(InputError, match=rf"loss\.{prior}: .*drop it"):
         methods.load("base_2dgs", "quick", [f"loss.{prior}=0.1"])
     methods.load("ref_gaussian", "quick", [f"loss.{prior}=0.1"])
+
+
+def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
+    """`select.term`, `terms` and `variant` are `select.component`, `components` and `name` now."""
+    now = methods.load("auto", "quick", ["select.component.degree_1.trial=9"], ["levels_3"])
+    old = methods.dump(now).replace("[select.component", "[select.term")
+    old = old.replace("components =", "terms =").replace('\nname = "auto"', '\nvariant = "auto"', 1)
+    assert all(key in old for key in ("[select.term.degree_1]", "terms = [", 'variant = "auto"'))
+    (tmp_path / "config.toml").write_text(old)
+    assert methods.load_resolved(tmp_path / "config.toml") == now
+    changed = methods.load("auto", "quick", ["select.term.degree_1.trial=9"], ["levels_3"])
+    assert dataclasses.replace(changed, assignments=now.assignments) == now
+    (tmp_path / "own.toml").write_text('extends = "auto"\ndrop = ["select.term.lobe_rays"]\n')
+    select = methods.load(str(tmp_path / "own.toml")).select
+    assert select is not None and "lobe_rays" not in select.component
+
+
+def test_a_stage_sets_every_shading_option() -> None:
+    options = ["dominant=true", "multiscatter=true", "light_levels=3", "visibility_rays=4", "antialias=true"]
+    method = methods.load("ref_gaussian", "quick", [f"stage.deferred.{option}" for option in options])
+    shading = method.stage["deferred"].shading
+    assert shading.chosen() == ["dominant", "multiscatter", "visibility_rays", "light_levels", "antialias"]
+    for wrong in ("visibility_rays=0", "occlusion=true", "dominant=1"):
+        with pytest.raises(InputError, match=wrong.partition("=")[0]):
+            methods.load("ref_gaussian", "quick", [f"stage.deferred.{wrong}"])

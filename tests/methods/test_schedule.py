@@ -1,4 +1,4 @@
-"""What a step takes from its iteration number: the view, random numbers, the degree of the harmonics."""
+"""What an iteration number determines: the view, random numbers, the SH degree."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fused distances by the float64 oracle, with the thresholds of the program."""
+"""Fused distances by the float64 reference, with the thresholds of the program."""
 
 from __future__ import annotations
 

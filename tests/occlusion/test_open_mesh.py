@@ -1,4 +1,4 @@
-"""Depth fusion of all of space, by contraction: against the float64 oracle, and shapes near and far."""
+"""Depth fusion of all of space, by contraction: against the float64 reference, and shapes near and far."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_matches_the_float64_specification() -> None:
 
 
 def test_inside_of_the_region_it_is_the_bounded_field() -> None:
-    """The same voxels in the same places have the same values, if all that they are told of lies inside."""
+    """Equal voxels have equal values if everything that the views report is inside."""
     poses = ring_of_views(6)
     depths = [ref.depth_map(ref.sphere(tuple(BALL), BALL_RADIUS), pose, FOCAL, SIZE) for pose in poses]
     opened = fuse(depths, poses, 40, REGION)
@@ -116,7 +116,7 @@ def test_near_and_far_surfaces_are_within_a_voxel(ball_mesh: Mesh) -> None:
     level = vertices.copy()
     level[:, 2] = FLOOR
     on_floor = np.linalg.norm(REGION.contract(level) - place, axis=1) / voxel
-    seen = distance < 12  # farther, no view's picture has a pixel for a voxel
+    seen = distance < 12  # farther, no view's image has a pixel for a voxel
     error = np.minimum(on_ball, on_floor)[seen]
     assert np.quantile(error, 0.99) < 1 and np.sqrt(np.mean(error**2)) < 0.35, (
         np.quantile(error, 0.99),

@@ -92,11 +92,8 @@ NOT_CLEAN_YET = {
     "tests/cli",
     "tests/compare",
     "tests/laws",
-    "tests/methods",
-    "tests/occlusion",
     "tests/plugins",
     "tests/render",
-    "tests/shade",
     "tests/splat",
     "tests/surfels",
 }

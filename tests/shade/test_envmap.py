@@ -316,7 +316,7 @@ def test_lookups_are_continuous_across_the_seam_and_the_poles() -> None:
 
 
 def test_lookup_derivatives(rng: np.random.Generator) -> None:
-    """Direction and roughness against differences of the float64 oracle; the levels by linearity."""
+    """Direction and roughness against differences of the float64 reference; the levels by linearity."""
     n, h = 60, 16
     light = EnvironmentLight.from_radiance(rng.uniform(0.1, 3, (h, 2 * h, 3))).prefilter()
     levels = [level.astype(np.float64) for level in level_maps(light)]

@@ -22,7 +22,7 @@ from tests.helpers import run_python
 
 
 def write_hdr(path: Path, mantissa: np.ndarray) -> None:
-    """A Radiance picture without run lengths of bytes (H, W, 3), all with the exponent of 1/256 per step."""
+    """A Radiance image without run lengths of bytes (H, W, 3), all with the exponent of 1/256 per step."""
     height, width = mantissa.shape[:2]
     pixels = np.concatenate([mantissa, np.full((height, width, 1), 128, np.uint8)], axis=-1)
     path.write_bytes(f"#?RADIANCE\n\n-Y {height} +X {width}\n".encode() + pixels.tobytes())

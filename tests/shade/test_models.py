@@ -1,4 +1,4 @@
-"""Shading: terms and every derivative against the float64 oracle, energy, and degenerate points."""
+"""Shading: terms and every derivative against the float64 reference, energy, and degenerate points."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def test_terms_against_the_oracle(
 def test_derivatives_of_each_parameter(
     diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
-    """Random weights per point, term and colour; differences of the oracle that straddle a texel or a level
-    are left out."""
+    """Random weights per point, term and colour; differences of the reference that straddle a texel or a
+    level are left out."""
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     levels, values = level_maps(light), shading_values(rng, occlusion)
     points = points_of(values)

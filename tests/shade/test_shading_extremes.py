@@ -1,4 +1,4 @@
-"""Shading where its formulas are at their ends: against the float64 oracle, and the energy that leaves."""
+"""Shading at the limits of its formulas: against the float64 reference, and conservation of energy."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def case(name: str, rng: np.random.Generator) -> dict[str, Any]:
         "normals of length 1e15": {"normal": 1e15 * values["normal"]},
         "towards the axes": {"normal": mirrored_to(view, AXES[np.arange(N) % 6])},
         "beside the pole": {"normal": mirrored_to(view, unit(rng.normal(size=(N, 3)) * 0.01 + [0, 1, 0]))},
-        "beside the seam": {"normal": mirrored_to(view, unit(across_the_seam))},
+        "beside the map's seam": {"normal": mirrored_to(view, unit(across_the_seam))},
     }
     return values | {key: np.broadcast_to(x, values[key].shape).copy() for key, x in cases[name].items()}
 
@@ -73,7 +73,7 @@ def case(name: str, rng: np.random.Generator) -> dict[str, Any]:
 NAMES = (
     "roughness 0, roughness 1, roughness 1e-6, metallic 0, metallic 1, black albedo, n·v = 1e-3, n·v = 0, "
     "n·v < 0, n = v, normals of length 1e-9, normals of length 1e15, towards the axes, beside the pole, "
-    "beside the seam"
+    "beside the map's seam"
 ).split(", ")
 LIGHTS = {
     "smooth": lambda rng: rng.uniform(0.1, 3, (16, 32, 3)),
@@ -90,7 +90,7 @@ LIGHTS = {
 def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.random.Generator) -> None:
     """Error ≤ 1e-4 of the brightest term, and gradients of albedo, metallic and radiance to 1 %.
 
-    The terms are at most quadratic in each of them up to S = 1, so that the oracle's central difference is
+    The terms are at most quadratic in each of them up to S = 1, so that the reference's central difference is
     exact.
     """
     radiance = LIGHTS[light](rng)

@@ -1,4 +1,4 @@
-"""What can be shaded how: one sentence from one place, whoever asks."""
+"""Which shading options are allowed together, and the one sentence that refuses others."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ IMPOSSIBLE = {
         f"[surfels]\nchannels = ['albedo', 'metallic', 'roughness']\n{LIGHT}{STAGE}",
         ["stage.only", "radiance_sh", "no such channel"],
     ),
-    "no harmonics for radiance": (
+    "no SH attribute for radiance": (
         f"[surfels]\nchannels = ['albedo']\n{STAGE}reflectance = 'radiance'",
         ["stage.only", "radiance_sh"],
     ),
@@ -72,7 +72,7 @@ def test_impossible_methods_are_refused_when_they_are_read(case: str, tmp_path: 
 
 
 def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
-    """`at` keeps its default, "pixel": blending is linear, so that it is the same picture."""
+    """`at` keeps its default, "pixel": blending is linear, so that the image is the same."""
     path = tmp_path / "own.toml"
     path.write_text(
         f"iterations = 100\n[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'"
@@ -122,7 +122,7 @@ def test_rendering_without_what_it_needs_is_refused() -> None:
 
 
 def test_every_mode_that_is_not_refused_renders() -> None:
-    """Each reflectance, order and diffuse with the channels that `check` asks for, and no other."""
+    """Each reflectance, order and diffuse with the attributes that `require_inputs` requires only."""
     raw = raw_channels()
     for reflectance in ("radiance", "split_sum"):
         for diffuse in ("sh", "irradiance"):

@@ -195,7 +195,7 @@ def test_traced_light_comes_closer_to_the_integral(roughness: float) -> None:
 
 @pytest.mark.parametrize("diffuse", ["irradiance", "sh"])
 def test_a_traced_mirror_ray_is_shaded_as_a_pixel_is(diffuse: Any) -> None:
-    """The hit against the oracle's `shade` there, with the wall's own materials, normal and harmonics."""
+    """The hit against the reference's `shade` there, with the wall's own materials, normal and SH."""
     place, points = floor_points(0.3)
     surfels = wall_surfels()
     harmonics = np.random.default_rng(4).normal(size=12) * 0.2
@@ -229,7 +229,7 @@ def test_a_traced_mirror_ray_is_shaded_as_a_pixel_is(diffuse: Any) -> None:
 
 
 def test_a_hit_in_the_dark_is_dark() -> None:
-    """A lid before the wall: the wall is seen in the floor, but its own mirror ray is blocked."""
+    """A plate before the wall: the wall is seen in the floor, but its own mirror ray is blocked."""
     base = corner()
     lid = np.array([[-1, 3, -9], [9, 3, -9], [9, 3, 9], [-1, 3, 9]], np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32) + len(base.vertices)
@@ -278,7 +278,7 @@ def oracle_of_walls(light: PrefilteredLight, surfels: Surfels, diffuse: str) -> 
 
 
 def harmonic_channel_surfels(albedo: np.ndarray | None = None, uneven: float = 0.0) -> Surfels:
-    """Surfels of a channel with harmonics, those of a wall alike but for `uneven`."""
+    """Surfels of a channel with SH colours, those of a wall alike but for `uneven`."""
     rng, surfels = np.random.default_rng(4), channel_surfels(albedo)
     harmonics = np.repeat(0.2 * rng.normal(size=(2, 12)), 400, 0) + uneven * rng.normal(size=(800, 12))
     return Surfels(surfels.raw | {"radiance_sh": mi.TensorXf(harmonics.astype(np.float32))})
@@ -299,7 +299,7 @@ def lengths(place: np.ndarray, directions: np.ndarray) -> list[int]:
 @pytest.mark.parametrize("diffuse", ["irradiance", "sh"])
 @pytest.mark.parametrize("bounces", [1, 2, 3])
 def test_bounces_of_a_mirror_ray_against_the_oracle(bounces: int, diffuse: Any) -> None:
-    """To and fro between two walls, recursion in float64: rays that end before the last bounce, and after."""
+    """Between two walls, recursion in float64: rays that end before the last bounce, and after."""
     place, points = floor_points(0.3, eye=LOW_EYE)
     surfels = harmonic_channel_surfels()
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()

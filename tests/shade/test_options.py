@@ -1,9 +1,10 @@
-"""Options of accuracy: the float64 oracle, derivatives, and the integrals they approach."""
+"""Shading options: values and derivatives against the float64 reference and exact integrals; the plugin."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -22,6 +23,7 @@ from mi_refgs.shade.points import reflect
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.split_sum import multiple_scattering, shade
 from tests.helpers import check_slopes, level_maps, unit, vector
+from tests.scenes.integrator import check_derivatives, image, integrator, plane_mesh, raw_channels, scene
 from tests.scenes.shading_points import N, points_of, shading_values
 
 DOMINANT = ShadingOptions(diffuse="irradiance", dominant=True)
@@ -109,8 +111,8 @@ def test_terms_against_the_oracle(
 def test_derivatives_of_the_points(
     options: ShadingOptions, diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
-    """Every input of every point against one-sided differences of the oracle, with random weights; where the
-    two sides disagree, a kink of the lookup is near."""
+    """Every input of every point against one-sided differences of the reference, with random weights; where
+    the two sides disagree, a kink of the lookup is near."""
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     levels, values = level_maps(light), shading_values(rng, occlusion)
     points, weight = points_of(values), rng.normal(size=(N, 3, 3))
@@ -277,7 +279,7 @@ def test_multiple_scattering_comes_closer_to_a_walk_in_the_microsurface(
 
 
 def test_the_walks_first_bounce_is_the_brute_force_integral(rng: np.random.Generator) -> None:
-    """Two independent oracles: a black second bounce leaves F0 A + B."""
+    """Two independent references: a black second bounce leaves F0 A + B."""
     n, f0 = np.array([0, 0, 1.0]), np.array([0.3])
     for cosine, roughness in ((0.3, 0.4), (0.8, 0.9)):
         v = np.array([np.sqrt(1 - cosine**2), 0, cosine])
@@ -301,3 +303,61 @@ def test_a_point_seen_from_behind_keeps_its_mirror_direction(radiance: np.ndarra
         shade(points, light, ShadingOptions(dominant=True)).specular.numpy(), mirrored, rtol=2e-4, atol=2e-4
     )
     assert dr.all(dr.isfinite(reflect(points.view, points.normal)), axis=None)
+
+
+def test_properties_of_the_plugin(tmp_path: Path) -> None:
+    mesh = plane_mesh(tmp_path)
+    options: dict[str, Any] = {
+        "dominant": True,
+        "multiscatter": True,
+        "visibility_rays": 4,
+        "traced_bounces": 2,
+    }
+    of = scene(mesh=mesh, **options)
+    assert {name: getattr(of.integrator().shading, name) for name in options} == options
+    assert not scene(mesh=mesh).integrator().shading.chosen()
+    plain = image(scene(mesh=mesh, terms="specular,indirect"))
+    for name, value in options.items():
+        assert (
+            np.abs(image(scene(mesh=mesh, terms="specular,indirect", **{name: value})) - plain).max() > 0.01
+        ), name
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"visibility_rays": 0}, "visibility_rays"),
+        ({"visibility_rays": 1.5}, "visibility_rays"),
+        ({"traced_bounces": -1}, "traced_bounces"),
+        ({"traced_bounces": True}, "traced_bounces"),
+        ({"visibility_rays": 4}, "trace a `mesh`"),
+        ({"traced_bounces": 1}, "trace a `mesh`"),
+        ({"dominant": "yes"}, "dominant"),
+        ({"multiscatter": True, "reflectance": "radiance"}, "split_sum"),
+    ],
+)
+def test_bad_properties_are_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(Exception, match=words):
+        mi.load_dict(integrator(**changes))
+
+
+@pytest.mark.parametrize("rays", [1, 3])
+def test_derivatives_of_mi_render(rays: int, tmp_path: Path) -> None:
+    options: dict[str, Any] = {
+        "dominant": True,
+        "multiscatter": True,
+        "visibility_rays": rays,
+        "traced_bounces": 2,
+    }
+    check_derivatives(scene(mesh=plane_mesh(tmp_path), diffuse="irradiance", **options), "integrator.light")
+
+
+def test_new_surfels_give_new_materials(tmp_path: Path) -> None:
+    """Another number of surfels through the parameters, as a scene that is loaded with them."""
+    mesh = plane_mesh(tmp_path)
+    of, other = scene(mesh=mesh, traced_bounces=1), raw_channels(40, seed=5)
+    params = mi.traverse(of)
+    for name, values in other.items():
+        params[f"integrator.{name}"] = mi.TensorXf(values)
+    params.update()
+    np.testing.assert_array_equal(image(of), image(scene(raw=other, mesh=mesh, traced_bounces=1)))
