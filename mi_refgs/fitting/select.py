@@ -142,20 +142,15 @@ def select_components(trainer: Trainer, tell: Callable[[str], None] = lambda _: 
         trainer.adopt(FitSetup(trainer.method, replace(whole, views=kept)), trainer.state())
 
     def before_step(trainer: Trainer) -> None:
-        while (names := _undecided(trainer, select)) and trainer.iteration >= select.component[
-            names[0]
-        ].after:
-            seconds, begin = trainer.fit.seconds, time.perf_counter()
+        while names := _undecided(trainer, select):
+            if trainer.iteration < select.component[names[0]].after:
+                return
+            seconds, begin = trainer.seconds, time.perf_counter()
             decision = _try(trainer, names[0], select, judges)
-            trainer.fit.decisions.append(asdict(decision))
             tell(sentence(decision))
-            if not _undecided(trainer, select):
-                trainer.adopt(FitSetup(trainer.method, whole), trainer.state())
             # All that a trial took counts: the loser's steps and the validation images.
-            trainer.fit.seconds = seconds + time.perf_counter() - begin
-            trainer.save()
-            if trainer.run is not None:
-                trainer.run.write_method(trainer.method)
+            seconds += time.perf_counter() - begin
+            trainer.end_trial(asdict(decision), seconds, whole if len(names) == 1 else trainer.data)
 
     trainer.before_step = before_step
 
@@ -233,15 +228,12 @@ def sentence(decision: Decision) -> str:
 def table(decisions: list[dict[str, Any]]) -> str:
     """Format the decisions of a fit as a text table."""
     rows = [("term", "iteration", "gain", "time", "memory", "verdict")]
+    units = (("psnr", 2, "dB"), ("ms", 1, "ms"), ("mb", 1, "MB"))
     for row in decisions:
         cells = ["", "", ""]
         if row["with_it"] is not None:
-            of, to = row["without"], row["with_it"]
-            cells = [
-                f"{to['psnr'] - of['psnr']:+.2f} dB",
-                f"{to['ms'] - of['ms']:+.1f} ms",
-                f"{to['mb'] - of['mb']:+.1f} MB",
-            ]
+            change = {key: row["with_it"][key] - row["without"][key] for key, _, _ in units}
+            cells = [f"{change[key]:+.{digits}f} {unit}" for key, digits, unit in units]
         verdict = "stays" if row["stays"] else f"left out ({row['reason']})"
         rows.append((row["term"], str(row["iteration"]), *cells, verdict))
     widths = [max(len(row[i]) for row in rows) for i in range(5)]

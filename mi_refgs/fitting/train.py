@@ -85,6 +85,16 @@ class Trainer:
         self._set_up(setup)
         self.restore(state)
 
+    def end_trial(self, decision: dict[str, Any], seconds: float, data: Dataset) -> None:
+        """Record a decision about a component, after so many seconds of the fit, and continue with `data`."""
+        self.fit.decisions.append(decision)
+        if data is not self.data:
+            self.adopt(FitSetup(self.method, data), self.state())
+        self.fit.seconds = seconds
+        self.save()
+        if self.run is not None:
+            self.run.write_method(self.method)
+
     def state(self) -> dict[str, np.ndarray]:
         """The content of a checkpoint."""
         return self.fit.arrays()
