@@ -30,7 +30,7 @@ LONGEST = 8.0
 
 def add_comparison(page: Page) -> None:
     """Add the controls; none without views."""
-    data = page.views.test or page.views.train
+    data = page.data.get("test") or page.data.get("train")
     if data is not None and data.views:
         ComparisonPanel(page, data)
 
@@ -42,7 +42,7 @@ class ComparisonPanel:
         self.page, self.data = page, data
         self.at: dict[int, tuple[Pose, bool]] = {}  # by client: the view's pose, and whether it was reached
         gui = page.server.gui
-        title = "Test views" if data is page.views.test else "Training views"
+        title = "Test views" if data is page.data.get("test") else "Training views"
         with gui.add_folder(title, expand_by_default=False):
             self.index = gui.add_slider("View", 0, max(len(data.views) - 1, 1), 1, 0)
             step = gui.add_button_group("Step", ("previous", "next", "leave"))

@@ -9,15 +9,14 @@ import math
 import socket
 import time
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.viewer.loop import Client, DeliveredImage, RenderLoop
 from mi_refgs.viewer.pose import Pose, up_of
@@ -35,19 +34,6 @@ START_FOV = math.radians(40)
 """Its vertical field of view."""
 ERROR_SECONDS = 8.0
 """Duration of an error message."""
-
-
-@dataclass(frozen=True)
-class Views:
-    """The photographs that a scene was fitted to, if they are available."""
-
-    train: Dataset | None = None
-    test: Dataset | None = None
-
-    @property
-    def all(self) -> list[View]:
-        """Every view, of the test split first."""
-        return [view for split in (self.test, self.train) if split is not None for view in split.views]
 
 
 def require_viser() -> Any:
@@ -85,7 +71,7 @@ class Page:
     def __init__(
         self,
         scene: ViewerScene,
-        views: Views,
+        data: Mapping[str, Dataset],  # the available splits: "train", "test"
         title: str,
         address: tuple[str, int],  # host and port
         views_folder: Path,
@@ -97,7 +83,9 @@ class Page:
 
         host, port = address
         require_free(host, port)
-        self.scene, self.views, self.views_folder, self.begin = scene, views, views_folder, begin
+        self.scene, self.data, self.views_folder, self.begin = scene, data, views_folder, begin
+        self.views = [view for split in ("test", "train") if split in data for view in data[split].views]
+        self.up = up_of(self.views)
         self.loop = RenderLoop(scene)
         self.loop.report = self.complain
         # What new clients begin with.
@@ -131,15 +119,15 @@ class Page:
         """Return the initial pose: the given one, the first test view, or one a little from above."""
         if self.begin is not None:
             return self.begin
-        if self.views.all:
-            return Pose.of_view(self.views.all[0])
+        if self.views:
+            return Pose.of_view(self.views[0])
         outward = np.array([math.cos(0.6), math.sin(0.6), 0.5])
         outward /= np.linalg.norm(outward)
         distance = START_DISTANCE * self.scene.radius / math.tan(START_FOV / 2) / 2
         return Pose.looking_at(self.scene.centre, self.scene.centre + distance * outward, START_FOV)
 
     def _set_start(self) -> None:
-        pose, camera, up = self.start(), self.server.initial_camera, up_of(self.views.all)
+        pose, camera, up = self.start(), self.server.initial_camera, self.up
         self.server.scene.set_up_direction(tuple(up))
         camera.position = pose.position
         camera.look_at = pose.look_at(self.scene.centre)
@@ -150,7 +138,7 @@ class Page:
     def go(self, client: Any, pose: Pose) -> None:
         """Move the camera of a page, a client of viser."""
         with client.atomic():
-            client.camera.up_direction = up_of(self.views.all)
+            client.camera.up_direction = self.up
             client.camera.position = pose.position
             client.camera.look_at = pose.look_at(self.scene.centre)
             client.camera.fov = pose.fov
@@ -177,7 +165,7 @@ class Page:
 
     def _moved(self, number: int, camera: Any) -> None:
         window = (camera.image_width, camera.image_height)
-        near = self.views.all[0].near if self.views.all else 0.0
+        near = self.views[0].near if self.views else 0.0
         pose = Pose.of_page(camera.wxyz, camera.position, camera.fov, window[0] / window[1], near)
         self.moved(number, pose)
         self.loop.change(number, pose=pose, window=window)

@@ -53,8 +53,8 @@ FRUSTUM = 0.08
 """Size of a camera's frustum, in radii of the object."""
 THICKNESS = 1.5
 """Thickness of its lines, pixels."""
-TRAINING, TEST = (90, 160, 255), (255, 160, 60)
-"""Colours of cameras."""
+COLOURS = {"train": (90, 160, 255), "test": (255, 160, 60)}
+"""Colours of the frusta by split."""
 MESH_COLOUR, MESH_OPACITY = (200, 200, 205), 0.55
 
 
@@ -218,12 +218,12 @@ def add_overlays(page: Page, scene: TrainedScene | None) -> None:
     """Add the mesh of a scene and the cameras of the data set, which the browser draws over the image."""
     gui = page.server.gui
     meshed = scene is not None and scene.mesh is not None and len(scene.mesh.faces) > 0
-    if not meshed and not page.views.all:
+    if not meshed and not page.views:
         return
     with gui.add_folder("Overlays"):
         if scene is not None and meshed:
             add_mesh(page, gui.add_checkbox("Mesh", False, hint="The occluder of reflections."), scene)
-        if page.views.all:
+        if page.views:
             add_cameras(page, gui.add_checkbox("Cameras", False, hint="Blue: training, orange: test."))
 
 
@@ -262,11 +262,8 @@ def add_cameras(page: Page, box: Any) -> None:
     @box.on_update
     def _(_: Any) -> None:
         if box.value and not nodes:
-            for split, data, colour in (
-                ("train", page.views.train, TRAINING),
-                ("test", page.views.test, TEST),
-            ):
-                for index, view in enumerate(data.views if data is not None else ()):
+            for split, data in page.data.items():
+                for index, view in enumerate(data.views):
                     pose = Pose.of_view(view)
                     node = page.server.scene.add_camera_frustum(
                         f"/cameras/{split}/{index}",
@@ -275,7 +272,7 @@ def add_cameras(page: Page, box: Any) -> None:
                         scale=FRUSTUM * page.scene.radius,
                         thickness=THICKNESS,
                         thickness_units="screen",
-                        color=colour,
+                        color=COLOURS[split],
                         wxyz=pose.page_rotation,
                         position=pose.position,
                         cast_shadow=False,

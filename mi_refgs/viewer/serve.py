@@ -20,7 +20,7 @@ from mi_refgs.viewer import resolution
 from mi_refgs.viewer.comparison import add_comparison
 from mi_refgs.viewer.loop import added
 from mi_refgs.viewer.mitsuba_scene import MitsubaScene
-from mi_refgs.viewer.page import Page, Views
+from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.panels import MaterialsPanel, add_display, add_light, add_overlays
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.saving import add_saving
@@ -46,11 +46,11 @@ def serve_run(
     Nothing is written into the run. Raises InputError for a folder that is no run or has no fit, for a port
     that is taken, and without viser.
     """
-    views = views_of(run, data, tell)
-    some = views.test or views.train
+    found = splits_of(run, data, tell)
+    some = found.get("test") or found.get("train")
     trained = newest(run, run.method())
     scene = ReconstructionView(trained, None if some is None else some.region)
-    page = Page(scene, views, run.path.resolve().name, address, output or run.path / "views")
+    page = Page(scene, found, run.path.resolve().name, address, output or run.path / "views")
     warm_up(page, tell)
     add_panels(page, scene, trained)
     return page
@@ -59,7 +59,7 @@ def serve_run(
 def serve_scene(scene: Any, path: Path, address: tuple[str, int], output: Path | None, tell: Tell) -> Page:
     """Return the page of a loaded Mitsuba scene; raises InputError as `serve_run`."""
     shown = MitsubaScene(scene, str(path))
-    page = Page(shown, Views(), path.name, address, output or path.parent / "views", shown.start())
+    page = Page(shown, {}, path.name, address, output or path.parent / "views", shown.start())
     warm_up(page, tell)
     add_panels(page, shown)
     return page
@@ -79,8 +79,8 @@ def add_panels(
     page.listen()
 
 
-def views_of(run: Run, data: Path | None, tell: Tell) -> Views:
-    """Return the views of a run's data set, or of that in `data`; tells which cannot be read."""
+def splits_of(run: Run, data: Path | None, tell: Tell) -> dict[str, Dataset]:
+    """Return the splits of a run's data set, or of that in `data`; tells which cannot be read."""
     method, found = run.method(), dict[str, Dataset]()
     if data is not None or (run.path / DATASET).is_file():
         for split in ("train", "test"):
@@ -90,7 +90,7 @@ def views_of(run: Run, data: Path | None, tell: Tell) -> Views:
                 if data is not None:
                     raise
                 tell(f"{error}; shown without {split} views")
-    return Views(**found)
+    return found
 
 
 def warm_up(page: Page, tell: Tell) -> None:

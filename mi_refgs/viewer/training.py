@@ -17,7 +17,7 @@ import numpy as np
 from mi_refgs.reconstruction.fit import ProgressBar
 from mi_refgs.runs.run import LOG, Run
 from mi_refgs.shade.shading import Shading
-from mi_refgs.viewer.page import Page, Views, require_free, require_viser
+from mi_refgs.viewer.page import Page, require_free, require_viser
 from mi_refgs.viewer.panels import add_display, add_overlays
 from mi_refgs.viewer.reconstruction_view import bounds_of, variables_of
 from mi_refgs.viewer.tonemap import IMAGE, backdrops_of, planes_of
@@ -96,8 +96,8 @@ class TrainingPage(Page):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Serve the page; raises InputError if the port is taken, and without viser."""
-        scene, views = Training(trainer), Views(train=trainer.data)
-        super().__init__(scene, views, run.path.resolve().name, address, run.path / "views")
+        data = {"train": trainer.data}
+        super().__init__(Training(trainer), data, run.path.resolve().name, address, run.path / "views")
         self.set(largest=LARGEST)
         self.loop.smooth, self.loop.clock = False, clock
         self.log, self.clock = run.path / LOG, clock

@@ -28,7 +28,7 @@ from websockets.sync.client import connect
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.viewer import guard as guard_module
 from mi_refgs.viewer.guard import SIDE, TEXT, UPLOAD, VALUES, Guard, guard_controls, guarded
-from mi_refgs.viewer.page import Page, Views
+from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.serve import add_panels
 from tests.helpers import refused
@@ -55,8 +55,8 @@ def pages(
         found = {}
         for host in ("127.0.0.1", "0.0.0.0"):
             folder = tmp_path_factory.mktemp("page")
-            views = Views(test=read_dataset(write_data(folder / "data"), "test"))
-            found[host] = Page(displayed, views, "a page", (host, 0), folder / "views")
+            data = {"test": read_dataset(write_data(folder / "data"), "test")}
+            found[host] = Page(displayed, data, "a page", (host, 0), folder / "views")
             stack.callback(found[host].close)
             add_panels(found[host], displayed, displayed.scene)
         yield found
@@ -393,7 +393,7 @@ def test_a_viser_that_bypasses_the_guard_is_stopped(
 ) -> None:
     monkeypatch.setattr(viser, "ViserServer", Server)
     before, words = Server.stopped, "does not let the page be protected; pip install viser=="
-    refused(lambda: Page(displayed, Views(), "a page", ("127.0.0.1", 0), tmp_path), words)
+    refused(lambda: Page(displayed, {}, "a page", ("127.0.0.1", 0), tmp_path), words)
     assert Server.stopped == before + 1
 
 
