@@ -76,7 +76,7 @@ def tetrahedron() -> mi_refgs.Mesh:
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral"])
 @pytest.mark.parametrize("what", UNUSABLE)
-def test_a_variant_that_cannot_render_is_one_sentence(what: str, variant: str) -> None:
+def test_unsupported_variant_is_refused_in_one_sentence(what: str, variant: str) -> None:
     mi.set_variant(variant)
     with pytest.raises(Exception, match=f"variant: '{variant}' is not supported; call mi.set_variant"):
         UNUSABLE[what]()

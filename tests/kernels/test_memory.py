@@ -115,7 +115,7 @@ def test_the_least_of_machine_and_control_groups_is_available(
     assert memory.available() == 0
 
 
-def test_a_need_counts_what_the_process_has(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_of_the_process_counts_as_available(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "resident", lambda: 2e9)
     monkeypatch.setattr(memory, "available", lambda: 1e9)
     memory.require(3e9, "a", "b")

@@ -14,8 +14,8 @@ ROWS = 37
 
 
 @pytest.mark.parametrize("width", [1, 2, 3, 4, 8, 12, 27, 48])
-def test_columns_of_a_table_and_their_derivatives(width: int) -> None:
-    """Whatever divides the width, columns are those of the table, in value, tangent and adjoint."""
+def test_columns_and_their_derivatives(width: int) -> None:
+    """Whatever divides the width, columns are those of the surfel model, in value, tangent and adjoint."""
     rng = np.random.default_rng(width)
     table, tangent, adjoint = rng.normal(size=(3, ROWS, width)).astype(np.float32)
     array = mi.Float(table.ravel())

@@ -114,7 +114,7 @@ def light() -> Any:
 
 
 def draw(scene: Scene, shading: Shading = SHADINGS[0], by: Any = None) -> dict[str, np.ndarray]:
-    """Every map of the scene's picture, (pixels, channels) each."""
+    """Every map of the scene's image, (pixels, channels) each."""
     drawn = SurfelScene(Surfels.from_numpy(scene.raw), shading, by or light())
     return maps_of(render(drawn, scene.view.camera(), Request(drawn.all_aovs)))
 

@@ -126,7 +126,7 @@ def test_the_world_has_no_preferred_direction(scene: Scene, seed: int) -> None:
 
 @settings(max_examples=15)
 @given(scene=SCENES, quarters=st.integers(1, 3))
-def test_a_light_turned_by_quarters_is_everything_else_turned_back(scene: Scene, quarters: int) -> None:
+def test_rotating_light_equals_rotating_scene_back(scene: Scene, quarters: int) -> None:
     """To turn the light about the pole, to move its columns, and to turn surfels and camera back are one."""
     turn = Rotation.from_rotvec([0, quarters * np.pi / 2, 0])
     turned = picture(scene, envmap(sky(LIGHT_ROWS), turn.as_matrix()), diffuse="irradiance")

@@ -1,4 +1,4 @@
-"""What pictures do not depend on: the table's order, fronts of discs, culled surfels, tiles, units, views."""
+"""What images do not depend on: order in memory, fronts of discs, culled surfels, tiles, units, views."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.laws.law_scenes import (
 )
 
 EXACT = 2e-6
-"""Between pictures of the same float32 arithmetic, but for fused operations and the order of equal sums."""
+"""Between images of the same float32 arithmetic, but for fused operations and the order of equal sums."""
 GRADIENT = 1e-4
 """Relative L2 between gradients: sums by scatter come in any order."""
 SILHOUETTE = 0.251
@@ -47,7 +47,7 @@ def assert_same_rows(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None
 
 @BOTH
 @given(scene=SCENES, seed=SEEDS)
-def test_the_order_of_the_table_does_not_matter(shading: Shading, scene: Scene, seed: int) -> None:
+def test_order_in_memory_does_not_matter(shading: Shading, scene: Scene, seed: int) -> None:
     order = np.random.default_rng(seed).permutation(COUNT)
     permuted = scene.with_rows(order)
     assert differing(draw(permuted, shading), draw(scene, shading), EXACT) == 0
@@ -72,7 +72,7 @@ def culled(scene: Scene, kind: str, seed: int) -> dict[str, np.ndarray]:
         raw["rotation"][:] = Rotation.from_matrix(
             axes / np.linalg.norm(axes, axis=1, keepdims=True)
         ).as_quat()
-    else:  # outside the picture
+    else:  # outside the image
         side = scene.view.to_world[:3, 0] * rng.choice([-1, 1], (COUNT, 1))
         raw["position"] += side * rng.uniform(50, 500, (COUNT, 1))
         raw["scale"][:] = np.log(0.1)
@@ -97,7 +97,7 @@ def test_culled_surfels_change_nothing(shading: Shading, scene: Scene, kind: str
 
 @BOTH
 @given(scene=SCENES, seed=SEEDS)
-def test_opacity_towards_zero_is_removal(shading: Shading, scene: Scene, seed: int) -> None:
+def test_zero_opacity_equals_removal(shading: Shading, scene: Scene, seed: int) -> None:
     """Exactly below α_min; and just above it by less than it shows, 1/255 a surfel."""
     rng = np.random.default_rng(seed)
     gone = rng.random(COUNT) < 0.5
@@ -115,7 +115,7 @@ def test_opacity_towards_zero_is_removal(shading: Shading, scene: Scene, seed: i
 @given(scene=DISCS, seed=SEEDS)
 def test_a_disc_has_no_front_and_no_first_axis(shading: Shading, scene: Scene, seed: int) -> None:
     """Turned over, turned by a half about its normal, axes exchanged, quaternions of the other sign: the same
-    picture. Discs near the silhouette, whose normals stay as they are, are not turned over."""
+    image. Discs near the silhouette, whose normals stay as they are, are not turned over."""
     rng = np.random.default_rng(seed)
     turn, scale = Rotation.from_quat(scene.raw["rotation"]), scene.raw["scale"].copy()
     ray = scene.raw["position"] - scene.view.to_world[:3, 3]
@@ -163,7 +163,7 @@ def test_units_do_not_matter(shading: Shading, scene: Scene, decades: float) -> 
 
 
 @given(scene=SCENES, seed=SEEDS)
-def test_alpha_is_the_channel_that_is_one(scene: Scene, seed: int) -> None:
+def test_alpha_is_the_composited_feature_one(scene: Scene, seed: int) -> None:
     """To the bit; and what is blended is linear in what surfels carry."""
     f, g = np.random.default_rng(seed).normal(size=(2, COUNT)).astype(np.float32)
     surfels, camera = Surfels.from_numpy(scene.raw), scene.view.camera()
@@ -178,8 +178,8 @@ def test_alpha_is_the_channel_that_is_one(scene: Scene, seed: int) -> None:
 @BOTH
 @settings(max_examples=8)
 @given(scene=SCENES, seed=SEEDS)
-def test_a_view_does_not_depend_on_its_company(shading: Shading, scene: Scene, seed: int) -> None:
-    """Gradients of views one by one add up to those of a set, and a picture is the same in any set."""
+def test_view_does_not_depend_on_other_views(shading: Shading, scene: Scene, seed: int) -> None:
+    """Gradients of views one by one add up to those of a set, and an image is the same in any set."""
     views = [scene.view]
     for turn in Rotation.random(2, random_state=seed):
         matrix = np.eye(4)

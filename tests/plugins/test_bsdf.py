@@ -216,7 +216,7 @@ def test_reflects_on_one_side_unless_wrapped() -> None:
 ROUGHNESS = np.array([0.05, 0.2, 0.5, 1.0])
 METALLIC = np.array([0.0, 0.5, 1.0])
 BLOCK = 12
-"""Pixels along each side of the part of the picture that shows one pair of the two."""
+"""Pixels along each side of the part of the image that shows one pair of the two."""
 
 
 def patch(angle: float, spp: int) -> tuple[Any, np.ndarray, np.ndarray]:
@@ -282,7 +282,7 @@ def test_path_tracer_equals_quadrature(degrees: int) -> None:
 
 
 def sphere(integrator: str = "prb") -> Any:
-    """A sphere under a sky; the picture depends on all the parameters."""
+    """A sphere under a sky; the image depends on all the parameters."""
     film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     return mi.load_dict(
         {
@@ -351,8 +351,8 @@ def test_everything_is_finite() -> None:
             assert np.isfinite(np.array(x)).all()
 
 
-def test_derivatives_of_pictures(rng: np.random.Generator) -> None:
-    """prb against differences of pictures with the same random numbers, in the mean over seeds."""
+def test_derivatives_of_images(rng: np.random.Generator) -> None:
+    """prb against differences of images with the same random numbers, in the mean over seeds."""
     scene = sphere()
     params = mi.traverse(scene)
     params.keep(r"sphere\.bsdf\..*")
@@ -377,7 +377,7 @@ def test_derivatives_of_pictures(rng: np.random.Generator) -> None:
                 params.update()
                 ends.append((weight * mi.render(scene, seed=seed).numpy()).sum((0, 1), dtype=np.float64))
             slopes = (ends[0] - ends[1]) / 0.02
-            # The albedo's channels are independent; the others change all channels of the picture.
+            # The albedo's channels are independent; the others change all channels of the image.
             difference.append(slopes if key == keys[0] else [slopes.sum()])
             params[key] = type(start)(start)
         differences.append(np.concatenate(difference))

@@ -213,7 +213,7 @@ def test_bad_properties_are_refused(changes: dict, words: str) -> None:
         mi.load_dict(integrator(**changes))
 
 
-def test_missing_channels_are_refused() -> None:
+def test_missing_attributes_are_refused() -> None:
     raw = raw_channels()
     del raw["roughness"]
     with pytest.raises(Exception, match="roughness: the surfels have no such channel"):

@@ -24,7 +24,7 @@ from tests.scenes.integrator import (
 
 
 @pytest.mark.parametrize("key", [*(name for name in raw_channels() if name != "indirect_sh"), "light"])
-def test_derivatives_of_every_channel(key: str) -> None:
+def test_derivatives_of_every_attribute(key: str) -> None:
     check_derivatives(scene(), f"integrator.{key}")
 
 

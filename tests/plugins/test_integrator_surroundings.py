@@ -45,7 +45,7 @@ def camera() -> Camera:
 
 
 @pytest.mark.parametrize("key", [*(PREFIX + name for name in far_channels()), "background", "albedo"])
-def test_derivatives_of_what_is_around(key: str) -> None:
+def test_derivatives_of_surroundings(key: str) -> None:
     check_derivatives(open_scene(), f"integrator.{key}")
 
 
@@ -54,7 +54,7 @@ def test_derivatives_when_shading_at_surfels(key: str) -> None:
     check_derivatives(open_scene(shade_at="surfel"), f"integrator.{key}", spp=4)
 
 
-def test_the_picture_is_that_of_the_renderer() -> None:
+def test_image_matches_the_renderer() -> None:
     """All over what is behind, opaque; and without both the object alone, transparent."""
     rgba = sensor(film={"pixel_format": "rgba"})
     seen = image(open_scene(rgba))
@@ -69,7 +69,7 @@ def test_the_picture_is_that_of_the_renderer() -> None:
     assert transparent[..., 3].min() < 0.5 and np.abs(transparent[..., :3] - seen[..., :3]).max() > 0.1
 
 
-def test_one_of_the_two_is_enough() -> None:
+def test_surroundings_or_background_only() -> None:
     """A background alone is opaque; surroundings alone stay transparent where nothing is."""
     rgba = sensor(film={"pixel_format": "rgba"})
     plain, before = image(scene(rgba)), image(scene(rgba, background=background_light().raw))
@@ -112,7 +112,7 @@ def fitted() -> TrainedScene:
     return TrainedScene(surfels, light, None, Shading(), 7, 1.5, surroundings=around)
 
 
-def test_a_runs_files_hold_both_and_lose_them(tmp_path: Path) -> None:
+def test_run_folder_contains_surroundings_and_background_until_removed(tmp_path: Path) -> None:
     """Written, read back, rendered alike by the run and by its scene.xml; what is stale goes."""
     made = fitted()
     files = {path.name for path in export(made, tmp_path, camera())}
@@ -130,7 +130,7 @@ def test_a_runs_files_hold_both_and_lose_them(tmp_path: Path) -> None:
     assert TrainedScene.read(tmp_path).surroundings is None
 
 
-def test_the_object_alone_is_rendered_on_transparency(tmp_path: Path, capsys: Any) -> None:
+def test_object_only_is_rendered_on_transparency(tmp_path: Path, capsys: Any) -> None:
     made = fitted()
     export(made, tmp_path, camera())
     for name, more in (("all", []), ("alone", ["--object"])):

@@ -91,7 +91,7 @@ def test_loading_twice_is_harmless(tmp_path: Path) -> None:
     assert run(code, tmp_path) == ["stand-in under llvm_ad_rgb"]
 
 
-def test_beside_mitsubas_own_loading(tmp_path: Path) -> None:
+def test_loads_beside_entry_point_of_mitsuba(tmp_path: Path) -> None:
     """Mitsuba 3.10 imports the entry point under the first variant, even scalar, and then reloads it."""
     code = """
 import importlib

@@ -129,5 +129,5 @@ def test_one_sample_comes_closer_to_many() -> None:
     np.testing.assert_allclose(own, other, atol=1e-5)  # of one order of additions or another
 
 
-def test_it_needs_pixels() -> None:
+def test_antialias_requires_deferred_shading() -> None:
     refused(lambda: Shading("surfel", antialias=True), "antialias: needs shade_at = pixel")

@@ -134,7 +134,7 @@ def test_normal_consistency_through_the_depth(rng: np.random.Generator) -> None:
     assert np.linalg.norm(found[..., 3:4] - wanted) <= 2e-4 * np.linalg.norm(wanted)
 
 
-def test_aligned_and_empty_pixels_cost_nothing() -> None:
+def test_aligned_and_empty_pixels_keep_their_roughness() -> None:
     empty = dr.zeros(mi.Float, 4)
     normal = mi.Vector3f(0, 0, mi.Float(0.5, 1.0, 0, 0))
     alpha = mi.Float(0.5, 1.0, 0, 0)

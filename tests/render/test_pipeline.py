@@ -189,7 +189,7 @@ def test_samples_before_the_near_plane_are_cut() -> None:
 
 
 def test_normals_are_blended_only_where_something_needs_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At surfels a picture needs none: three features fewer, and the same radiance."""
+    """At surfels an image needs none: three features fewer, and the same radiance."""
     from mi_refgs import splat
 
     composite, features = splat.composite, []

@@ -1,4 +1,4 @@
-"""Several samples a pixel: frames and metrics against means made by NumPy."""
+"""Several samples per pixel: frames and metrics against means made by NumPy."""
 
 from __future__ import annotations
 

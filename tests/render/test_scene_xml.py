@@ -59,7 +59,7 @@ def view(ratio: float = 1.0, sign: float = -1.0, cx: float = WIDTH / 2, cy: floa
 
 
 def shown(folder: Path, made: TrainedScene, camera: Camera) -> tuple[mi.Scene, np.ndarray, np.ndarray]:
-    """The exported scene, its picture, and that of the fit."""
+    """The exported scene, its image, and that of the fit."""
     export(made, folder, camera)
     scene = mi.load_file(str(folder / "scene.xml"))
     frame = made.renderer()(camera)
@@ -68,8 +68,8 @@ def shown(folder: Path, made: TrainedScene, camera: Camera) -> tuple[mi.Scene, n
 
 
 @pytest.mark.parametrize("option", QUALITY)
-def test_every_option_of_accuracy_goes_round(option: str, tmp_path: Path) -> None:
-    """Through scene.xml and through model.json; and the pictures are the same."""
+def test_quality_options_round_trip(option: str, tmp_path: Path) -> None:
+    """Through scene.xml and through model.json; and the images are the same."""
     shading = shading_with(option)
     made = fitted(tmp_path, shading)
     scene, seen, expected = shown(tmp_path / "run", made, view())
@@ -82,7 +82,7 @@ def test_every_option_of_accuracy_goes_round(option: str, tmp_path: Path) -> Non
     assert np.abs(plain.radiance.numpy().T.reshape(HEIGHT, WIDTH, 3) - seen[..., :3]).max() > 1e-3
 
 
-def test_all_other_options_of_shading_go_round(tmp_path: Path) -> None:
+def test_other_shading_options_round_trip(tmp_path: Path) -> None:
     for shading in (Shading("surfel"), Shading("surfel", "radiance"), Shading(diffuse="irradiance")):
         scene, seen, expected = shown(tmp_path, fitted(tmp_path, shading), view())
         assert scene.integrator().shading == shading
@@ -92,7 +92,7 @@ def test_all_other_options_of_shading_go_round(tmp_path: Path) -> None:
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize(("cx", "cy"), [(WIDTH / 2, HEIGHT / 2), (3.3, 10.1), (-1.0, 13.5)])
 def test_square_pixels_are_the_view_itself(cx: float, cy: float, sign: float, tmp_path: Path) -> None:
-    """On its head too, and with a principal point outside the picture."""
+    """On its head too, and with a principal point outside the image."""
     _, seen, expected = shown(tmp_path, fitted(tmp_path, Shading("surfel")), view(1, sign, cx, cy))
     np.testing.assert_allclose(seen, expected, atol=1e-5)
     assert expected[..., 3].max() > 0.2

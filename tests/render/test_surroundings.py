@@ -1,4 +1,4 @@
-"""Open scenes: object, surroundings and background in one picture, against float64."""
+"""Open scenes: object, surroundings and background in one image, against float64."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def weights(pair: Pair) -> dict[str, np.ndarray]:
     }
 
 
-def test_the_picture_is_that_of_float64(pair: Pair) -> None:
+def test_image_matches_float64(pair: Pair) -> None:
     """Radiance, alpha and depth of both; share and materials of the object; the background by its rays."""
     maps, band = pair.truth(pair.values)
     planes = pair.planes({name: upload_tensor(x) for name, x in pair.values.items()})
@@ -166,7 +166,7 @@ def weighted(planes: dict[str, list[Any]], weights: dict[str, np.ndarray]) -> An
 
 
 def test_what_lies_behind_is_exposed_as_the_rest_is() -> None:
-    """Composited in linear radiance, whatever the pictures are; a gain is of object and background alike."""
+    """Composited in linear radiance, whatever the images are; a gain is of object and background alike."""
     half = mi.Float([0.5, 0.5])
     frame = Frame(half, half, None, mi.Color3f(0.1), background=mi.Color3f(0.4, 0.2, 0.0))
     gain = [mi.Float(2), mi.Float(1), mi.Float(1)]
@@ -199,7 +199,7 @@ def test_a_pixel_is_the_mean_of_its_samples() -> None:
         np.testing.assert_allclose(np.array((1 - frame.alpha) * plane), seen_behind, rtol=1e-4, atol=1e-3)
 
 
-def test_an_empty_table_shows_nothing_and_a_screened_one_leaves_rows_out() -> None:
+def test_empty_models_render_nothing_and_screened_ones_skip_unusable_surfels() -> None:
     pair = Pair("pixel", "sh")
     params = {name: upload_tensor(x) for name, x in pair.values.items()}
     own = {name: params[name] for name in pair.case.raw}

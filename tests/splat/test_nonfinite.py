@@ -1,4 +1,4 @@
-"""Values that are NaN, infinite or huge: they end no process, spoil no picture, and are named."""
+"""Values that are NaN, infinite or huge: they end no process, spoil no image, and are named."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def options(kind: str, folder: Path) -> dict[str, Any]:
 
 @pytest.mark.filterwarnings("ignore:refgs:RuntimeWarning")
 @pytest.mark.parametrize("kind", ["pixel", "surfel", "mesh", "bounces"])
-def test_a_surfel_with_such_a_value_is_as_good_as_absent(kind: str, tmp_path: Path) -> None:
+def test_surfel_with_unusable_value_is_ignored(kind: str, tmp_path: Path) -> None:
     raw = raw_channels()
     made = scene(**options(kind, tmp_path))
     light = np.array(mi.traverse(made)["integrator.light"].numpy())
@@ -112,7 +112,7 @@ def test_the_materials_of_a_mesh_stay_finite_without_a_new_search_for_neighbours
 
 
 @pytest.mark.filterwarnings("ignore:refgs:RuntimeWarning")
-def test_such_a_texel_of_the_light_is_black() -> None:
+def test_unusable_texel_of_the_light_is_black() -> None:
     made = scene()
     raw = raw_channels()
     light = np.array(mi.traverse(made)["integrator.light"].numpy())
@@ -126,7 +126,7 @@ def test_such_a_texel_of_the_light_is_black() -> None:
         np.testing.assert_allclose(gradient, gradients[name], rtol=1e-3, atol=1e-5, err_msg=name)
 
 
-def test_such_a_texel_of_the_scene_s_light_is_black() -> None:
+def test_unusable_texel_of_the_scene_light_is_black() -> None:
     def made(values: object) -> np.ndarray:
         light = {"type": "envmap", "bitmap": mi.Bitmap(sky())}
         shader = {name: value for name, value in integrator().items() if name != "light"}
@@ -157,7 +157,7 @@ def test_finite_extremes_leave_everything_finite() -> None:
         assert all(np.isfinite(gradient).all() for gradient in gradients.values())
 
 
-def test_the_plugin_names_channel_number_and_first_surfel_once() -> None:
+def test_plugin_warns_once_with_attribute_count_and_first_surfel() -> None:
     made = scene()
     params = mi.traverse(made)
     mi.render(made, spp=1)

@@ -133,7 +133,7 @@ def test_forward_mode_is_the_transpose_of_reverse(seed: int) -> None:
     check_transpose(make_scene(seed), seed)
 
 
-def test_shift_receives_the_screen_translation_gradient() -> None:
+def test_screen_offset_receives_the_gradient_of_a_translation() -> None:
     """The optional shift gets d loss / d centre, as moving the principal point under one surfel shows."""
     scene = make_scene(0)
     weights = loss_weights(scene, 0)
@@ -201,7 +201,7 @@ def test_mutants_of_the_adjoint_are_caught(
     assert max(gradient_errors(fast_gradients(scene, weights), expected).values()) > GRADIENT_TOLERANCE
 
 
-def test_order_of_the_table_is_irrelevant_and_culled_surfels_change_nothing() -> None:
+def test_order_in_memory_and_culled_surfels_do_not_matter() -> None:
     scene = make_scene(12)
     base = fast_maps(scene)
     permutation = np.random.default_rng(0).permutation(len(scene.features))
@@ -328,7 +328,7 @@ def test_tile_lists_are_in_the_oracles_order(seed: int, tile: tuple[int, int]) -
 
 
 def full_screen(count: int, size: int) -> tuple[Surfels, Camera]:
-    """Large discs, parallel to the picture, each on every tile."""
+    """Large discs, parallel to the image, each on every tile."""
     raw = {
         "position": np.stack([0 * np.arange(count), 0 * np.arange(count), np.linspace(2, 3, count)], axis=1),
         "rotation": np.tile([0.0, 0, 0, 1], (count, 1)),
@@ -352,7 +352,7 @@ def test_candidates_in_parts_give_the_same_lists(chunk: int, monkeypatch: pytest
 
 
 def test_more_pairs_than_32_bits_count_are_refused_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    """2¹⁶ surfels on 2¹⁶ tiles: counted in 32 bits there are none, and the picture is blank."""
+    """2¹⁶ surfels on 2¹⁶ tiles: counted in 32 bits there are none, and the image is blank."""
     monkeypatch.setattr(tiles, "CHUNK", 1 << 20)
     monkeypatch.setattr(tiles, "MAX_PAIR_BITS", 22)
     surfels, camera = full_screen(1 << 16, 1024)

@@ -1,4 +1,4 @@
-"""3D Gaussians by EWA against their float64 oracle: pictures, both derivatives, lists, degenerate rows."""
+"""3D Gaussians by EWA against their float64 oracle: images, both derivatives, lists, degenerate rows."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_gradients_match_the_oracle(seed: int) -> None:
 
 
 @pytest.mark.parametrize("tile", [size for _, size in constants.TILE_SIZES], ids=str)
-def test_pictures_and_gradients_with_tiles_of_every_size(
+def test_images_and_gradients_with_every_tile_size(
     tile: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(constants, "TILE_SIZES", ((np.inf, tile),))
@@ -164,7 +164,7 @@ def test_mutants_of_the_adjoint_are_caught(mutate: Mutation, monkeypatch: pytest
     assert max(errors.values()) > GRADIENT_TOLERANCE
 
 
-def test_shift_receives_the_screen_translation_gradient() -> None:
+def test_screen_offset_receives_the_gradient_of_a_translation() -> None:
     """The shift moves the projected centre alone, as the principal point does where nothing is clamped."""
     scene = gaussians(0)
     weights = loss_weights(scene, 0)
@@ -234,7 +234,7 @@ def test_the_unit_does_not_matter(factor: float) -> None:
         assert np.mean(np.abs(a.numpy() - b.numpy()) > 2e-4) <= 0.01
 
 
-def test_a_point_covers_what_the_low_pass_covers() -> None:
+def test_point_covers_the_area_of_the_low_pass() -> None:
     """Far below a pixel only the filter is left: 2π λ pixels, of which the cut takes α_min / o."""
     raw = {
         "position": np.array([[0.0, 0, 1]]),
@@ -253,8 +253,8 @@ def test_a_point_covers_what_the_low_pass_covers() -> None:
 # ---------------- tables ----------------
 
 
-def test_a_3dgs_file_of_ours_is_rendered_as_the_oracle_has_it(tmp_path: Path) -> None:
-    """Points to a file to a picture of its radiance, against the file's numbers in float64."""
+def test_rendered_3dgs_file_matches_the_oracle(tmp_path: Path) -> None:
+    """Points to a file to an image of its radiance, against the file's numbers in float64."""
     rng = np.random.default_rng(1)
     made = from_points(
         rng.normal(size=(60, 3)) * 0.4,

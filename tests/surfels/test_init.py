@@ -75,7 +75,7 @@ def test_random_normals_are_uniform(rng: np.random.Generator) -> None:
     assert all(kstest(axis, "uniform", (-1, 2)).pvalue > 1e-3 for axis in normals.T)  # Archimedes
 
 
-def test_a_channel_starts_at_its_activated_value(rng: np.random.Generator) -> None:
+def test_attribute_starts_at_its_activated_value(rng: np.random.Generator) -> None:
     """Whatever the activation; a size that is none is refused."""
     declared = {
         "exp": Attribute("width", (2,), "exp", 1e-3, ("w_0", "w_1"), initial=0.2),

@@ -154,14 +154,14 @@ def in_numpy(raw: dict[str, np.ndarray], feature: np.ndarray) -> np.ndarray:
     return maps
 
 
-def test_a_table_says_that_it_holds_balls() -> None:
+def test_attributes_decide_the_primitive() -> None:
     assert balls().primitive.name == "ball" and set(balls().raw) == {"position", "radius", "opacity"}
     with pytest.raises(InputError, match="primitive: 'ball': the name is empty or in use"):
         primitives.register(Ball())
 
 
-def test_they_are_splatted_and_differentiated() -> None:
-    """Pictures against NumPy; reverse mode against differences of it, and against forward mode."""
+def test_balls_are_splatted_and_differentiated() -> None:
+    """Images against NumPy; reverse mode against differences of it, and against forward mode."""
     rng, surfels = np.random.default_rng(1), balls()
     feature, weights = rng.uniform(size=30), rng.normal(size=(3, 20, 24))
     raw = {name: values.astype(np.float64) for name, values in surfels.to_numpy().items()}
@@ -190,7 +190,7 @@ def test_they_are_splatted_and_differentiated() -> None:
     assert dr.forward_to(loss())[0] == pytest.approx(expected, rel=1e-3)
 
 
-def test_they_are_cloned_split_and_written(tmp_path: Path) -> None:
+def test_balls_are_cloned_split_and_written(tmp_path: Path) -> None:
     surfels = balls()
     options, rng = Refine(dense_extent=0.3, prune_extent=10.0), np.random.default_rng(0)
     edited = refine.densify_and_prune(surfels, np.ones(30), 1.0, options, 90, rng)
@@ -205,7 +205,7 @@ def test_they_are_cloned_split_and_written(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.to_numpy()["radius"], after["radius"])
 
 
-def test_they_are_fitted(tmp_path: Path) -> None:
+def test_balls_are_fitted(tmp_path: Path) -> None:
     """A method names them; the run's own scene, checkpoint and evaluation have them."""
     path = tmp_path / "balls.toml"
     path.write_text(

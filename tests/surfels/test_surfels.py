@@ -176,7 +176,7 @@ def test_empty_table(rng: np.random.Generator) -> None:
         ({"scale": np.array([[0, 1], [np.nan, 2], [np.inf, 0]])}, "scale: 2 values are NaN"),
     ],
 )
-def test_bad_tables_are_refused(
+def test_bad_surfel_models_are_refused(
     change: dict[str, np.ndarray], message: str, rng: np.random.Generator
 ) -> None:
     with pytest.raises(InputError, match=message):

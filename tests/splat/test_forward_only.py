@@ -1,4 +1,4 @@
-"""Pictures without derivatives: the same ones as with them, and nothing that nobody asks for."""
+"""Images without derivatives: equal to those with derivatives, with requested AOVs only."""
 
 from __future__ import annotations
 
@@ -71,19 +71,19 @@ def assert_same(expected: Frame, found: Frame) -> None:
 @pytest.mark.parametrize(
     "focal, offset", [(30.0, (0, 0)), (30.0, (3, 2)), (600.0, (5, 3)), (1100.0, (13, 6))]
 )
-def test_the_picture_is_the_same_with_tiles_of_every_size(focal: float, offset: tuple[int, int]) -> None:
+def test_forward_only_image_is_the_same_with_every_tile_size(focal: float, offset: tuple[int, int]) -> None:
     shading = Shading("pixel", "split_sum", "sh", occlusion=True)
     assert_same(*both(things(), camera_at(focal, offset), shading))
 
 
 @pytest.mark.parametrize("at", ["surfel", "pixel"])
 @pytest.mark.parametrize("gaussians", [False, True])
-def test_the_picture_is_the_same_in_both_orders(at: Any, gaussians: bool) -> None:
+def test_forward_only_image_is_the_same_in_both_orders(at: Any, gaussians: bool) -> None:
     assert_same(*both(things(gaussians), camera_at(30.0), Shading(at, "split_sum", "irradiance")))
 
 
 @pytest.mark.parametrize("at", ["surfel", "pixel"])
-def test_the_picture_is_the_same_among_surroundings(at: Any) -> None:
+def test_forward_only_image_is_the_same_with_surroundings(at: Any) -> None:
     light = EnvironmentLight.from_radiance(sky())
     near = scattered_discs()
     near["position"] = near["position"] * 3
@@ -92,12 +92,12 @@ def test_the_picture_is_the_same_among_surroundings(at: Any) -> None:
     assert_same(*both(things(), camera_at(30.0), shading, surroundings=others))
 
 
-def test_rays_of_a_lobe_are_those_of_the_pixel() -> None:
+def test_forward_only_lobe_samples_are_those_of_the_pixel() -> None:
     shading = Shading("pixel", "split_sum", "irradiance", occlusion=True, visibility_rays=4)
     assert_same(*both(things(), camera_at(30.0), shading))
 
 
-def test_antialiasing_sees_the_neighbours_in_the_image() -> None:
+def test_forward_only_antialiasing_reads_neighbours_in_the_image() -> None:
     shading = Shading()
     assert_same(*both(things(), camera_at(30.0), replace(shading, antialias=True)))
 
@@ -114,7 +114,7 @@ def test_nothing_in_view_is_black() -> None:
 
 
 @pytest.mark.parametrize("name", ["project", "list_by_tile"])
-def test_nothing_in_view_is_looked_for_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_empty_view_is_projected_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     behind = replace(camera_at(30.0), origin=mi.Point3f(-9, -15, -30))
     made, calls = getattr(splat, name), []
 
@@ -130,7 +130,7 @@ def test_nothing_in_view_is_looked_for_once(name: str, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("at", ["surfel", "pixel"])
 @pytest.mark.parametrize("name", ["", *sorted(ALL)])
-def test_a_frame_has_what_is_asked_for(at: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frame_contains_requested_aovs_only(at: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """And blends no more channels than that takes."""
     composite, blended = splat.composite, []
 
@@ -152,7 +152,7 @@ def test_a_frame_has_what_is_asked_for(at: Any, name: str, monkeypatch: pytest.M
     assert blended == [deferred if at == "pixel" else 3 + (more | {"depth": 1}).get(name, 0)]
 
 
-def test_every_pixel_of_a_chosen_packet_has_one_place() -> None:
+def test_compacted_pixels_contain_each_pixel_of_chosen_packets_once() -> None:
     view = camera_at(30.0, (3, 2))
     footprints = splat.project(things(), view)
     lists = splat.list_by_tile(footprints, view)
@@ -167,7 +167,7 @@ def test_every_pixel_of_a_chosen_packet_has_one_place() -> None:
     assert not alpha[~there].any() and alpha[there].any()
 
 
-def test_another_view_is_no_other_kernel() -> None:
+def test_second_view_reuses_kernels() -> None:
     """The number of packets that hold something changes from view to view."""
     shading = Shading(reflectance="radiance")
 
@@ -184,7 +184,7 @@ def test_another_view_is_no_other_kernel() -> None:
 
 
 def test_the_plugin_filters_a_light_that_changes_again() -> None:
-    """It keeps what it filtered for the next picture, until its parameters change."""
+    """It keeps what it filtered for the next image, until its parameters change."""
     changing = scene()
     before = image(changing)
     params = mi.traverse(changing)
