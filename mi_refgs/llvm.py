@@ -1,13 +1,12 @@
-"""Finds a libLLVM that Dr.Jit can use, before Dr.Jit loads one by itself.
+"""Choice of a libLLVM that Dr.Jit can use, before Dr.Jit loads one by itself.
 
-Dr.Jit opens libLLVM while it is imported: the file named by DRJIT_LIBLLVM_PATH, else whatever `libLLVM.so`
-points to, else the highest version in the system's library folder. It accepts LLVM 15 and 16, but aborts the
-process with "LLVM ERROR" at the first kernel that takes a minimum, because those cannot compile
-`llvm.minimum` on x86-64. So the newest usable library is chosen here and named in DRJIT_LIBLLVM_PATH, and
-what Dr.Jit then loaded is checked again.
+On import, Dr.Jit opens the file named by DRJIT_LIBLLVM_PATH, else `libLLVM.so`, else the highest version in
+the system's library folder. LLVM 15 and 16 load, but abort the process with "LLVM ERROR" at the first kernel
+that takes a minimum, because they cannot compile `llvm.minimum` on x86-64. Therefore `select` names the
+newest usable library in DRJIT_LIBLLVM_PATH, and `problem` checks the library that Dr.Jit loaded.
 
-Only the standard library is imported at the top: `python -P mi_refgs/llvm.py` prints the library that would
-be used, or what is wrong, and exits with 0 or 1; the set-up script calls it before anything is installed.
+Only the standard library is imported at the top: the set-up script runs `python -P mi_refgs/llvm.py`, which
+prints the library or the problem and exits with 0 or 1, before anything is installed.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _INSTALL_ATOMIC = f"{_SUDO}apt-get install libatomic1"
 
 
 def search_folders() -> list[Path]:
-    """Folders that may hold a libLLVM for this machine's architecture, in no order of preference."""
+    """Return folders that may contain a libLLVM for this machine's architecture, in no particular order."""
     patterns = [
         f"/usr/lib/{platform.machine()}-linux-gnu",  # Debian; other *-linux-gnu are foreign architectures
         "/usr/lib64",
@@ -52,10 +51,9 @@ def search_folders() -> list[Path]:
 
 
 def named_version(path: Path) -> tuple[int, ...] | None:
-    """Version that a library's file name states, as (19, 1) for `libLLVM.so.19.1`; None when it states none.
+    """Return the version in a library's file name, such as (19, 1) for `libLLVM.so.19.1`, or None.
 
-    A symbolic link is resolved first, because `libLLVM.so` may point to any version; a Homebrew library has
-    its version only in its folder's name.
+    Symbolic links are resolved first; Homebrew states the version in the name of the folder.
     """
     resolved = Path(os.path.realpath(path))
     for candidate in (resolved, path):
@@ -68,7 +66,7 @@ def named_version(path: Path) -> tuple[int, ...] | None:
 
 
 def loaded_version(path: Path) -> tuple[int, ...] | None:
-    """Version that the library itself reports; None when it cannot be loaded here or is older than 16."""
+    """Return the version that a library reports; None if it cannot be loaded or is older than 16."""
     try:
         get_version = ctypes.CDLL(str(path)).LLVMGetVersion
     except (OSError, AttributeError):
@@ -79,7 +77,7 @@ def loaded_version(path: Path) -> tuple[int, ...] | None:
 
 
 def find_library(folders: Iterable[Path] | None = None) -> Path | None:
-    """Newest loadable libLLVM of at least `MINIMUM_MAJOR` in `folders` (the system's by default), or None."""
+    """Return the newest loadable libLLVM ≥ `MINIMUM_MAJOR` in `folders` (default: the system's), or None."""
     candidates: dict[Path, tuple[int, ...]] = {}
     for folder in search_folders() if folders is None else folders:
         for path in [*folder.glob("libLLVM*.so*"), *folder.glob("libLLVM*.dylib")]:
@@ -94,7 +92,7 @@ def find_library(folders: Iterable[Path] | None = None) -> Path | None:
 
 
 def select() -> None:
-    """Name the library for Dr.Jit to load, unless the user named one or Dr.Jit is already loaded."""
+    """Set DRJIT_LIBLLVM_PATH, unless the user set it or Dr.Jit is already loaded."""
     if "drjit" in sys.modules or os.environ.get(ENVIRONMENT_VARIABLE):
         return
     library = find_library()
@@ -104,7 +102,7 @@ def select() -> None:
 
 @dataclass(frozen=True)
 class Problem:
-    """Why the LLVM of this process cannot be used, and what to do about it."""
+    """Reason why the LLVM of this process cannot be used, and the remedy."""
 
     what: str
     remedy: str
@@ -114,12 +112,9 @@ class Problem:
 
 
 def problem() -> Problem | None:
-    """What is wrong with the LLVM that Dr.Jit loaded; None when it is usable.
+    """Return the problem of the LLVM that Dr.Jit loaded, or None. Imports Dr.Jit, runs no kernel.
 
-    Imports Dr.Jit, which is what loads the library, but runs no kernel.
-
-    Raises:
-        ImportError: when Dr.Jit cannot be loaded at all.
+    Raises ImportError if Dr.Jit cannot be loaded.
     """
     try:
         import drjit as dr
@@ -135,7 +130,7 @@ def problem() -> Problem | None:
 
 
 def diagnose(version: tuple[int, ...] | None, chosen: str | None) -> Problem:
-    """Words for an unusable LLVM of `version` (None: not loaded), in the file that the user chose, if any."""
+    """Describe an unusable LLVM of `version` (None: not loaded) in the file `chosen` by the user, if any."""
     usable = find_library()
     needed = f"LLVM {MINIMUM_MAJOR} or newer is needed"
     if chosen:
@@ -151,17 +146,15 @@ def diagnose(version: tuple[int, ...] | None, chosen: str | None) -> Problem:
             f"{ENVIRONMENT_VARIABLE}={chosen} {what}, but {needed}",
             unset if usable else f"{REMEDY} && {unset}",
         )
-    if version is not None:
-        what = f"Dr.Jit loaded LLVM {version[0]}, but {needed}"
-    else:
-        what = f"Dr.Jit found no usable libLLVM, but {needed}"
+    loaded = "found no usable libLLVM" if version is None else f"loaded LLVM {version[0]}"
+    what = f"Dr.Jit {loaded}, but {needed}"
     if usable is None:
         return Problem(what, REMEDY)
     return Problem(what, f"import mi_refgs before mitsuba and drjit, or set {ENVIRONMENT_VARIABLE}={usable}")
 
 
 def _main() -> int:
-    """Print the library that would be used, or what is wrong; see the module."""
+    """Print the library or the problem; returns the exit code."""
     chosen = os.environ.get(ENVIRONMENT_VARIABLE)
     library = Path(chosen) if chosen else find_library()
     version = loaded_version(library) if library is not None else None

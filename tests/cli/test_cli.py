@@ -64,14 +64,14 @@ def test_old_names_of_options_work_with_a_warning(data: Path, capsys: pytest.Cap
         assert {*renamed.values()} <= options and not {*renamed} & options
 
 
-def test_purposes_and_presets_of_the_help_are_all(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_lists_purposes_and_presets(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "--help"]) == 0
     text = capsys.readouterr().out
     purposes = {load_method(name, None, []).about.purpose for name in names()} - {""}
     assert "{" + ",".join(sorted(purposes)) + "}" in text and "{" + ",".join(PRESETS) + "}" in text
 
 
-def test_json_is_all_that_is_printed(
+def test_json_output_contains_nothing_else(
     run: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither Python's nor C++'s chatter on standard output gets between a pipe and the object."""
@@ -112,7 +112,7 @@ def test_train_writes_a_run_folder(finished: Path) -> None:
     assert left_over == [RECORD]
 
 
-def test_train_tells_what_is_unusual(
+def test_train_warns_about_few_views(
     data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*train_command(data, tmp_path / "run", method), "iterations=1", "--threads", "1"]) == 0
@@ -120,7 +120,7 @@ def test_train_tells_what_is_unusual(
     assert (tmp_path / "run" / "checkpoints" / "0000001.npz").is_file()  # though none was due
 
 
-def test_large_pictures_are_read_smaller_unless_told_otherwise(
+def test_large_images_are_downscaled_unless_set(
     data: Path,
     method: Path,
     tmp_path: Path,
@@ -128,7 +128,7 @@ def test_large_pictures_are_read_smaller_unless_told_otherwise(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The size is chosen once: config.toml records it, and evaluation reads the same."""
-    slow = cost_model.Speed({"initial": [1.0, 4.0], "deferred": [1.0, 4.0]}, 0.0, 0.0)  # 10 ms a pixel
+    slow = cost_model.Speed({"initial": [1.0, 4.0], "deferred": [1.0, 4.0]}, 0.0, 0.0)  # 10 ms per pixel
     for name, value in {"speed_of": lambda *_: slow, "WORTH": 0, "LEAST": 10, "WHOLE": 0}.items():
         monkeypatch.setattr(plan, name, value)
     monkeypatch.setattr(cost_model, "SIZES", (10, 20))
@@ -154,7 +154,7 @@ def test_large_pictures_are_read_smaller_unless_told_otherwise(
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interrupt_says_how_to_resume_and_resuming_changes_nothing(
+def test_interrupted_fit_resumes_bit_for_bit(
     number: int,
     code: int,
     heard_interrupts: None,
@@ -194,7 +194,7 @@ def test_resume_refuses_another_method(run: Path, data: Path, capsys: pytest.Cap
         assert option in capsys.readouterr().err
 
 
-def test_export_writes_what_is_in_the_newest_checkpoint(
+def test_export_writes_newest_checkpoint(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", str(finished), "-o", str(tmp_path / "out"), "--json"]) == 0
@@ -221,7 +221,7 @@ def test_render_writes_exr_with_aovs_and_png(
     assert seen.any() and np.abs(pixels[..., 1] - shown)[seen].max() < 0.51 / 255
 
 
-def test_aovs_come_after_those_of_the_scene(
+def test_aovs_are_appended_to_those_of_the_scene(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What the scene has already is not repeated; a name of two types is refused."""
@@ -241,7 +241,7 @@ def test_aovs_come_after_those_of_the_scene(
     scene.unlink()
 
 
-def test_render_shows_the_newest_checkpoint(finished: Path, run: Path, tmp_path: Path) -> None:
+def test_render_uses_newest_checkpoint(finished: Path, run: Path, tmp_path: Path) -> None:
     """As `load` and `refgs view` do: of artefacts that are older, nothing is shown."""
     note = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(note | {"iteration": 0}))
@@ -266,7 +266,7 @@ def test_dataset_traces_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert (tmp_path / "out" / "transforms_test.json").is_file()
 
 
-def test_demo_goes_from_nothing_to_a_contact_sheet_and_is_not_done_twice(
+def test_demo_writes_contact_sheet_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in (("VIEWS", 3), ("TEST_VIEWS", 1), ("SIZE", 16), ("SAMPLES", 1)):
@@ -286,60 +286,51 @@ def test_demo_goes_from_nothing_to_a_contact_sheet_and_is_not_done_twice(
 # ---------- Bad input: one sentence with file, field and remedy, and exit code 2 ----------
 
 
-@pytest.fixture
-def spoilt(data: Path, tmp_path: Path) -> Path:
-    """A copy of the data set, to be spoilt."""
-    return Path(shutil.copytree(data, tmp_path / "ball"))
-
-
 def edit(path: Path, change: Callable[[dict], object]) -> None:
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
 
 
-def test_missing_picture(spoilt: Path, method: Path, tmp_path: Path) -> None:
-    (spoilt / "train" / "r_1.png").unlink()
-    refused(train_command(spoilt, tmp_path / "run", method), "r_1.png", "missing", "restore it")
-    assert not (tmp_path / "run").exists()  # so that the same command works once the picture is back
-
-
-def test_unreadable_picture(spoilt: Path, method: Path, tmp_path: Path) -> None:
-    (spoilt / "train" / "r_1.png").write_bytes(b"\x89PNG\r\n no")
-    refused(train_command(spoilt, tmp_path / "run", method), "r_1.png", "not a readable image")
-
-
-def test_wrong_json(spoilt: Path, method: Path, tmp_path: Path) -> None:
-    (spoilt / "transforms_train.json").write_text('{"frames": [')
-    refused(train_command(spoilt, tmp_path / "run", method), "transforms_train.json", "JSON")
-
-
-def test_views_of_unequal_size(spoilt: Path, method: Path, tmp_path: Path) -> None:
-    """A few sizes are fitted together; five are one sentence."""
-
-    def sizes(content: dict) -> None:
+def five_sizes(data: Path) -> None:
+    def change(content: dict) -> None:
         content["frames"] = [content["frames"][0] | {"file_path": f"train/r_{i}"} for i in range(5)]
         for key in "wh":
             content.pop(key)
 
-    edit(spoilt / "transforms_train.json", sizes)
+    edit(data / "transforms_train.json", change)
     for i in range(5):
-        write_png(spoilt / "train" / f"r_{i}.png", np.ones((SIZE, SIZE + 2 * i, 4)))
-    refused(train_command(spoilt, tmp_path / "run", method), "transforms_train.json", "5 different sizes")
+        write_png(data / "train" / f"r_{i}.png", np.ones((SIZE, SIZE + 2 * i, 4)))
 
 
-def test_no_training_views(spoilt: Path, method: Path, tmp_path: Path) -> None:
-    edit(spoilt / "transforms_train.json", lambda content: content.update(frames=[]))
-    command = train_command(spoilt, tmp_path / "run", method)
-    refused(command, "transforms_train.json", "zero training views")
-
-
-def test_missing_data(method: Path, tmp_path: Path) -> None:
-    refused(
-        train_command(tmp_path / "none", tmp_path / "run", method),
-        tmp_path / "none",
-        "no such folder",
-    )
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda data: (data / "train/r_1.png").unlink(), ["r_1.png", "missing", "restore it"]),
+        (
+            lambda data: (data / "train/r_1.png").write_bytes(b"\x89PNG\r\n no"),
+            ["r_1.png", "not a readable image"],
+        ),
+        (
+            lambda data: (data / "transforms_train.json").write_text('{"frames": ['),
+            ["transforms_train.json", "JSON"],
+        ),
+        (five_sizes, ["transforms_train.json", "5 different sizes"]),
+        (
+            lambda data: edit(data / "transforms_train.json", lambda content: content.update(frames=[])),
+            ["transforms_train.json", "zero training views"],
+        ),
+        (shutil.rmtree, ["ball", "no such folder"]),
+    ],
+    ids=["missing image", "broken image", "broken JSON", "five sizes", "no views", "no folder"],
+)
+def test_train_refuses_broken_data(
+    spoil: Callable[[Path], object], words: list[str], data: Path, method: Path, tmp_path: Path
+) -> None:
+    ball = Path(shutil.copytree(data, tmp_path / "ball"))
+    spoil(ball)
+    refused(train_command(ball, tmp_path / "run", method), *words)
+    assert not (tmp_path / "run").exists()  # so that the same command works once the data is complete
 
 
 def test_unknown_key_in_a_method(data: Path, method: Path, tmp_path: Path) -> None:
@@ -351,44 +342,48 @@ def test_unknown_key_in_a_method(data: Path, method: Path, tmp_path: Path) -> No
     refused([*command[:-1], "loss.ssim"], "--set", "key=value")
 
 
-def test_a_value_that_is_nan_in_the_ply(run: Path, tmp_path: Path) -> None:
-    ply = run / "surfels.ply"
-    header, end, body = ply.read_bytes().partition(b"end_header\n")
-    ply.write_bytes(header + end + np.float32(np.nan).tobytes() + body[4:])
-    refused(["render", str(run), "-o", str(tmp_path / "x.exr")], "surfels.ply", "x: 1 values are NaN")
-    refused(["eval", str(run)], "surfels.ply", "x: 1 values are NaN")
+def nan_in_ply(run: Path) -> None:
+    header, end, body = (run / "surfels.ply").read_bytes().partition(b"end_header\n")
+    (run / "surfels.ply").write_bytes(header + end + np.float32(np.nan).tobytes() + body[4:])
 
 
-def test_a_property_that_the_ply_lacks(run: Path, tmp_path: Path) -> None:
-    ply = run / "surfels.ply"
-    ply.write_bytes(ply.read_bytes().replace(b"property float opacity", b"property float opaqueness"))
-    refused(["render", str(run), "-o", str(tmp_path / "x.exr")], "surfels.ply", "opacity", "missing")
-    refused(["eval", str(run)], "surfels.ply", "opacity", "missing")
+def missing_property(run: Path) -> None:
+    ply = (run / "surfels.ply").read_bytes()
+    (run / "surfels.ply").write_bytes(ply.replace(b"property float opacity", b"property float opaqueness"))
 
 
-def test_a_run_whose_light_is_gone(run: Path, tmp_path: Path) -> None:
-    (run / "envmap.exr").unlink()
-    for argv in (["eval", str(run)], ["edit", str(run), "-o", str(tmp_path / "new"), "--set", "opacity=1"]):
-        refused(argv, "envmap.exr", "light: missing")
-    refused(["render", str(run), "-o", str(tmp_path / "x.exr")], "envmap.exr", "light: missing")
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (nan_in_ply, ["surfels.ply", "x: 1 values are NaN"]),
+        (missing_property, ["surfels.ply", "opacity", "missing"]),
+        (lambda run: (run / "envmap.exr").unlink(), ["envmap.exr", "light: missing"]),
+    ],
+    ids=["NaN", "property", "light"],
+)
+def test_broken_run_is_refused(
+    spoil: Callable[[Path], object], words: list[str], run: Path, tmp_path: Path
+) -> None:
+    spoil(run)
+    for command in (
+        ["eval", run],
+        ["render", run, "-o", tmp_path / "x.exr"],
+        ["edit", run, "-o", tmp_path / "new", "--set", "opacity=1"],
+    ):
+        refused(command, *words)
 
 
-def test_what_is_no_run(tmp_path: Path) -> None:
+def test_missing_or_existing_run_is_refused(
+    finished: Path, data: Path, method: Path, run: Path, tmp_path: Path
+) -> None:
     for command in ("eval", "export"):
-        refused([command, str(tmp_path)], tmp_path, "config.toml")
-    refused(["render", str(tmp_path), "-o", str(tmp_path / "x.exr")], "scene.xml", "missing")
-    refused(["render", str(tmp_path / "no.xml"), "-o", str(tmp_path / "x.exr")], "no.xml", "no such file")
-
-
-def test_a_run_that_is_there_already(finished: Path, data: Path, method: Path) -> None:
+        refused([command, tmp_path], tmp_path, "config.toml")
+    refused(["render", tmp_path, "-o", tmp_path / "x.exr"], "scene.xml", "missing")
+    refused(["render", tmp_path / "no.xml", "-o", tmp_path / "x.exr"], "no.xml", "no such file")
     refused(train_command(data, finished, method), finished, "--resume")
-
-
-def test_a_run_whose_data_is_gone(run: Path, tmp_path: Path) -> None:
-    (run / "dataset.json").write_text(json.dumps({"path": str(tmp_path / "gone")}))
-    refused(["eval", str(run)], "dataset.json", "gone", "--data")
-    (run / "dataset.json").write_text("{}")
-    refused(["eval", str(run)], "dataset.json", "--data")
+    for record, words in (({"path": str(tmp_path / "gone")}, ["gone", "--data"]), ({}, ["--data"])):
+        (run / "dataset.json").write_text(json.dumps(record))
+        refused(["eval", run], "dataset.json", *words)
 
 
 def test_unwritable_output(finished: Path, data: Path, method: Path, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ def report() -> doctor.Report:
     return doctor.examine()
 
 
-def test_this_machine_is_usable(report: doctor.Report) -> None:
+def test_doctor_finds_this_machine_usable(report: doctor.Report) -> None:
     assert report.problems == ()
     assert report.usable
     assert report.llvm_version is not None and int(report.llvm_version.split(".")[0]) >= llvm.MINIMUM_MAJOR
@@ -30,11 +30,11 @@ def test_this_machine_is_usable(report: doctor.Report) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a process map")
-def test_the_library_is_named(report: doctor.Report) -> None:
+def test_doctor_names_the_llvm_library(report: doctor.Report) -> None:
     assert report.llvm_path is not None and "libLLVM" in report.llvm_path
 
 
-def test_json_is_one_object_with_every_field(report: doctor.Report) -> None:
+def test_doctor_json_has_every_field(report: doctor.Report) -> None:
     loaded = json.loads(json.dumps(report.to_dict()))
     assert loaded["usable"] is True
     assert set(loaded) == {"usable"} | {field.name for field in dataclasses.fields(report)}
@@ -60,20 +60,20 @@ def test_unusable_llvm_is_a_problem_without_cuda(monkeypatch: pytest.MonkeyPatch
     assert report.problems == (() if report.cuda else (trouble,))
 
 
-def test_a_failing_kernel_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_kernel_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_PROBE", "import os; os.abort()")
     report = doctor.examine()
     assert not report.usable
     assert "trial kernel failed" in report.problems[0].what
 
 
-def test_a_hanging_kernel_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hanging_kernel_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_PROBE", "import time; time.sleep(60)")
     monkeypatch.setattr(doctor, "PROBE_TIMEOUT", 0.2)
     assert "took longer" in doctor.examine().problems[0].what
 
 
-def test_the_command_reports_what_keeps_the_package_from_being_imported() -> None:
+def test_doctor_reports_missing_library() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "mi_refgs", "doctor"],
         cwd=Path(__file__).parents[2],
@@ -88,7 +88,7 @@ def test_the_command_reports_what_keeps_the_package_from_being_imported() -> Non
     assert f"unset {llvm.ENVIRONMENT_VARIABLE}" in done.stdout
 
 
-def test_measured_speeds_are_shown_with_how_to_measure_anew(
+def test_doctor_lists_measured_speeds(
     report: doctor.Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(cost_model.FOLDER_VARIABLE, str(tmp_path))

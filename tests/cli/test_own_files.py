@@ -197,7 +197,7 @@ def tried(case: Case, names: tuple[str, ...]) -> list[str]:
 
 
 def run(case: Case, place: Place) -> int:
-    """Run the command; `refgs view` saves a view, which its page otherwise asks for."""
+    """Run the command; `refgs view` saves a view, as its page would."""
     if case.command != "view":
         return main(case.arguments(place))
     planes = [np.full(4, 0.5, np.float32)] * 4
@@ -215,7 +215,7 @@ def test_every_command_has_a_case() -> None:
 
 @pytest.mark.usefixtures("small_demo")
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.command)
-def test_a_command_touches_only_its_own_files(
+def test_command_changes_only_its_own_files(
     case: Case, sources: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A foreign file keeps every byte; a command that refuses says one sentence and changes nothing."""
@@ -250,7 +250,7 @@ def test_a_command_touches_only_its_own_files(
 # ---------------- what is a command's own ----------------
 
 
-def test_an_export_replaces_only_one_of_the_same_run(sources: Path, tmp_path: Path) -> None:
+def test_export_replaces_only_exports_of_the_same_run(sources: Path, tmp_path: Path) -> None:
     first, second = (shutil.copytree(sources / "run", tmp_path / name) for name in ("first", "second"))
     out = tmp_path / "out"
     export = ["export", str(first), "-o", str(out)]
@@ -267,7 +267,7 @@ def test_an_export_replaces_only_one_of_the_same_run(sources: Path, tmp_path: Pa
     refused(export, "surfels.ply: output: exists")
 
 
-def test_a_run_is_never_overwritten(sources: Path, tmp_path: Path) -> None:
+def test_run_is_never_overwritten(sources: Path, tmp_path: Path) -> None:
     """Not even with --overwrite; nor its files one by one, also in a run without checkpoints."""
     shutil.copytree(sources / "run", tmp_path / "run")
     bare = shutil.copytree(sources / "bare", tmp_path / "bare")
@@ -283,7 +283,7 @@ def test_a_run_is_never_overwritten(sources: Path, tmp_path: Path) -> None:
     assert contents(Place(bare)) == before
 
 
-def test_saving_refuses_files_in_the_way(sources: Path, tmp_path: Path) -> None:
+def test_save_refuses_foreign_files(sources: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/mesh.ply").write_bytes(FOREIGN)
     with pytest.raises(InputError, match=r"mesh\.ply: output: exists"):
@@ -291,7 +291,7 @@ def test_saving_refuses_files_in_the_way(sources: Path, tmp_path: Path) -> None:
     assert contents(Place(tmp_path / "out")) == {"mesh.ply": FOREIGN}
 
 
-def test_a_format_replaces_only_its_own_of_the_same_run(sources: Path, tmp_path: Path) -> None:
+def test_format_replaces_only_files_of_the_same_run(sources: Path, tmp_path: Path) -> None:
     found, out = mi_refgs.load(sources / "run"), tmp_path / "out"
     for _ in range(2):
         assert all(path.is_file() for path in found.export("cameras", out))
@@ -304,7 +304,7 @@ def test_a_format_replaces_only_its_own_of_the_same_run(sources: Path, tmp_path:
     assert not [path for path in out.iterdir() if path.is_dir() and path.name.startswith(".")]
 
 
-def test_a_resumed_fit_leaves_other_logs_and_checkpoints(
+def test_resumed_fit_keeps_foreign_logs_and_checkpoints(
     data: Path, method: Path, sources: Path, tmp_path: Path
 ) -> None:
     run = shutil.copytree(sources / "run", tmp_path / "run")
@@ -323,7 +323,7 @@ def test_a_resumed_fit_leaves_other_logs_and_checkpoints(
     }
 
 
-def test_a_folder_of_an_earlier_version_is_its_own(sources: Path, tmp_path: Path) -> None:
+def test_run_of_earlier_version_is_recognised(sources: Path, tmp_path: Path) -> None:
     """A run without a record: its usual files are its own, and recorded with the first that is written."""
     run = shutil.copytree(sources / "run", tmp_path / "run")
     (run / RECORD).unlink()
@@ -342,7 +342,7 @@ def test_every_file_of_a_run_is_listed(sources: Path, tmp_path: Path) -> None:
     assert {path for path in run.rglob("*") if path.is_file() and path.name != RECORD} == listed
 
 
-def test_records_of_two_processes_add_up(tmp_path: Path) -> None:
+def test_records_of_two_processes_are_merged(tmp_path: Path) -> None:
     """Lines are appended; half a line of a process that was killed is skipped."""
     one, two = OutputFolder(tmp_path, "a"), OutputFolder(tmp_path, "b")
     one.claim("x")
@@ -353,7 +353,7 @@ def test_records_of_two_processes_add_up(tmp_path: Path) -> None:
     assert OutputFolder(tmp_path, "a").owners() == {"x": "a", "y": "b", "z": "a"}
 
 
-def test_another_map_of_the_same_name_gets_a_folder_of_its_own(sources: Path, tmp_path: Path) -> None:
+def test_relight_numbers_maps_of_the_same_name(sources: Path, tmp_path: Path) -> None:
     shutil.copytree(sources / "run", tmp_path / "run")
 
     def relit(light: Path, *more: str) -> str:

@@ -63,7 +63,7 @@ HOW = Free("how it is computed, from here on")
 WHERE = Free("which output this is about")
 FORM = Free("how the result is printed")
 HASHED = Free("names the results of the steps that depend on it: see test_capture")
-WHOLE = Free("a file is written whole: see test_a_picture_is_rendered_anew")
+WHOLE = Free("a file is written whole: see test_render_replaces_image")
 COMMON: dict[str, Row] = {"--json": FORM, "--mitsuba-variant": HOW, "--threads": HOW}
 
 
@@ -116,7 +116,7 @@ KEPT: dict[str, dict[str, Row]] = {
         "--set": refused("--set", "loss.ssim=0.4"),
         "--workers": HOW,
         "--cluster": HOW,
-        "--mitsuba-variant": Free("kept: see test_a_comparison_keeps_its_mitsuba_variant"),
+        "--mitsuba-variant": Free("kept: see test_comparison_keeps_its_mitsuba_variant"),
     },
     "capture": {
         **dict.fromkeys(("photographs", "--masks", "--camera-model"), HASHED),
@@ -181,7 +181,7 @@ def places(data: Path, method: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 
 Began = Callable[[str], tuple[list[str], Path]]
-"""Of a command that has run: its arguments, and its output."""
+"""Runs a command; returns its arguments and its output."""
 
 
 @pytest.fixture
@@ -261,7 +261,7 @@ ROWS = [(command, option) for command, rows in KEPT.items() for option in rows]
 @pytest.mark.parametrize(
     ("command", "option"), [row for row in ROWS if isinstance(KEPT[row[0]][row[1]], Refused)]
 )
-def test_what_cannot_be_changed_is_refused_by_name(
+def test_option_that_cannot_change_is_refused(
     command: str, option: str, began: Began, places: dict[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     row = KEPT[command][option]
@@ -279,7 +279,7 @@ def test_what_cannot_be_changed_is_refused_by_name(
 @pytest.mark.parametrize(
     ("command", "option"), [row for row in ROWS if isinstance(KEPT[row[0]][row[1]], Shows)]
 )
-def test_what_can_be_changed_shows(
+def test_option_that_can_change_takes_effect(
     command: str, option: str, began: Began, places: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = KEPT[command][option]
@@ -306,7 +306,7 @@ CHECKS: dict[str, Callable[[Path, dict[str, str]], bool]] = {
 }
 
 
-def test_the_same_command_goes_on(began: Began, capsys: pytest.CaptureFixture[str]) -> None:
+def test_same_command_resumes(began: Began, capsys: pytest.CaptureFixture[str]) -> None:
     """Options that say what a run was started with are no others, in other words too."""
     argv, out = began("train")
     state = tree(out / "checkpoints")
@@ -318,8 +318,8 @@ def test_the_same_command_goes_on(began: Began, capsys: pytest.CaptureFixture[st
     assert "--for" in capsys.readouterr().err
 
 
-def test_a_method_that_differs_is_refused(began: Began, places: dict[str, str]) -> None:
-    """The Python call likewise, and the difference is named."""
+def test_resume_refuses_changed_method(began: Began, places: dict[str, str]) -> None:
+    """In Python, too; the difference is named."""
     _, out = began("train")
     made = Run(out).method()
     data = places["data"]
@@ -329,7 +329,7 @@ def test_a_method_that_differs_is_refused(began: Began, places: dict[str, str]) 
         reconstruct.fit(data, longer, output=out, resume=True, progress=Progress())
 
 
-def test_minutes_and_a_size_are_one_too_many(
+def test_minutes_and_downscale_exclude_each_other(
     places: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -338,7 +338,7 @@ def test_minutes_and_a_size_are_one_too_many(
     assert "--minutes: data.downscale=1" in capsys.readouterr().err and not out.exists()
 
 
-def test_a_comparison_keeps_its_mitsuba_variant(began: Began) -> None:
+def test_comparison_keeps_its_mitsuba_variant(began: Began) -> None:
     _, out = began("compare")
     [job] = jobs.jobs_in(out)
     jobs.require_same(job)
@@ -347,7 +347,7 @@ def test_a_comparison_keeps_its_mitsuba_variant(began: Began) -> None:
 
 
 @pytest.mark.parametrize("option", ["--methods=a", "--seeds=1", "--preset=quick", "--set=a=1", "--workers=1"])
-def test_a_table_that_is_made_again_takes_no_option_of_a_fit(
+def test_table_without_data_refuses_options_of_a_fit(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["compare", "-o", str(tmp_path), option]) == 2
@@ -357,7 +357,7 @@ def test_a_table_that_is_made_again_takes_no_option_of_a_fit(
 # ---------------- commands that do everything again ----------------
 
 
-def test_an_evaluation_is_made_anew(places: dict[str, str], finished: Path, tmp_path: Path) -> None:
+def test_eval_does_not_depend_on_earlier_eval(places: dict[str, str], finished: Path, tmp_path: Path) -> None:
     """After another one it is what it would be without."""
     used, fresh = (Path(shutil.copytree(finished, tmp_path / name)) for name in ("used", "fresh"))
     assert main(["eval", str(used)]) == 0
@@ -376,7 +376,7 @@ def test_an_evaluation_is_made_anew(places: dict[str, str], finished: Path, tmp_
     assert found[0]["samples"] == 4 and found[0]["antialias"] and found[0]["dataset"] == places["moved"]
 
 
-def test_a_picture_is_rendered_anew(finished: Path, tmp_path: Path) -> None:
+def test_render_replaces_image(finished: Path, tmp_path: Path) -> None:
     run = Path(shutil.copytree(finished, tmp_path / "run"))
     assert main(["render", str(run), "-o", str(tmp_path / "used.exr")]) == 0
     first = (tmp_path / "used.exr").read_bytes()
@@ -387,7 +387,7 @@ def test_a_picture_is_rendered_anew(finished: Path, tmp_path: Path) -> None:
     assert (tmp_path / "used.exr").read_bytes() == (tmp_path / "fresh.exr").read_bytes() != first
 
 
-def test_an_output_that_is_there_is_refused(
+def test_existing_output_is_refused(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """By the commands that make a new run."""
@@ -422,7 +422,7 @@ def live(finished: Path, tmp_path: Path) -> Iterator[tuple[Path, subprocess.Pope
         process.kill()
 
 
-def test_a_second_process_is_refused_until_the_first_ends(
+def test_second_process_on_a_run_is_refused(
     live: tuple[Path, subprocess.Popen[str]],
     places: dict[str, str],
     tmp_path: Path,
@@ -452,9 +452,7 @@ def test_a_second_process_is_refused_until_the_first_ends(
     assert main(argv) == 0 and not (run / LOCK).exists()
 
 
-def test_a_folder_that_is_being_trained_in_is_not_saved_to(
-    live: tuple[Path, subprocess.Popen[str]], finished: Path
-) -> None:
+def test_save_refuses_locked_folder(live: tuple[Path, subprocess.Popen[str]], finished: Path) -> None:
     """Not even before it is a run."""
     run, _ = live
     (run / "config.toml").unlink()
@@ -462,7 +460,7 @@ def test_a_folder_that_is_being_trained_in_is_not_saved_to(
         reconstruct.load(finished).save(run)
 
 
-def test_a_fit_holds_its_run(places: dict[str, str], tmp_path: Path) -> None:
+def test_fit_locks_its_run(places: dict[str, str], tmp_path: Path) -> None:
     """From its first step to its artefacts, against other threads too."""
     run, seen = Run(tmp_path / "run"), []
 

@@ -53,6 +53,14 @@ def variants(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return first, second
 
 
+def copied(folder: Path, target: Path) -> Path:
+    """Copy a comparison; its jobs name the new folders."""
+    shutil.copytree(folder, target)
+    for path in target.rglob("job.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"folder": str(path.parent)}))
+    return target
+
+
 @pytest.fixture(scope="module")
 def compared(
     ball: Path, variants: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
@@ -69,7 +77,7 @@ def compared(
 # ---------- The main job ----------
 
 
-def test_a_comparison_has_a_run_for_each_job(compared: tuple[Path, int]) -> None:
+def test_comparison_has_a_run_per_job(compared: tuple[Path, int]) -> None:
     folder, code = compared
     assert code == 3  # one failed
     for variant, seed in (("tiny", 0), ("other", 0), ("other", 1)):
@@ -82,7 +90,7 @@ def test_a_comparison_has_a_run_for_each_job(compared: tuple[Path, int]) -> None
         assert abs(curve[-1]["psnr"] - metrics["psnr"]) < 0.01  # both on the two test views
 
 
-def test_a_failed_job_is_a_row_that_says_why(compared: tuple[Path, int]) -> None:
+def test_failed_job_is_a_row_with_its_reason(compared: tuple[Path, int]) -> None:
     table = json.loads((compared[0] / "table.json").read_text())
     [scene] = table["scenes"]
     tiny, other = scene["rows"]
@@ -109,7 +117,7 @@ def test_numbers_are_means_over_the_runs(compared: tuple[Path, int]) -> None:
     assert (other["numbers"]["lpips"] is None) == unmeasured
 
 
-def test_a_finished_comparison_has_nothing_left_to_do(
+def test_finished_jobs_are_not_repeated(
     compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def nothing(*_: object) -> None:
@@ -119,7 +127,7 @@ def test_a_finished_comparison_has_nothing_left_to_do(
     assert main(command(ball, compared[0], variants[1], more=("--seeds", "0,1"))) == 3
 
 
-def test_an_interrupted_run_goes_on_from_its_checkpoint(
+def test_interrupted_job_resumes_from_checkpoint(
     compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """With one thread the resumed run is the straight one; what came after the checkpoint is done again."""
@@ -139,7 +147,7 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(
     assert [(p["iteration"], p["psnr"]) for p in again] == [(p["iteration"], p["psnr"]) for p in first]
 
 
-def test_metrics_of_an_older_checkpoint_do_not_finish_a_run(
+def test_job_is_finished_with_metrics_of_last_checkpoint(
     compared: tuple[Path, int], ball: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "run"
@@ -161,7 +169,7 @@ def test_metrics_of_an_older_checkpoint_do_not_finish_a_run(
 # ---------- Crashes ----------
 
 
-def test_a_crash_is_retried_and_then_a_row(
+def test_crash_is_retried_and_becomes_a_row(
     ball: Path, variants: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each worker process dies of a segmentation fault before it does anything."""
@@ -178,8 +186,8 @@ def test_a_crash_is_retried_and_then_a_row(
     assert (tmp_path / "began").read_text() == "x" * (1 + execute.RETRIES)
 
 
-def test_a_worker_ends_with_the_process_that_started_it(ball: Path, variants: tuple[Path, Path]) -> None:
-    """Its standard input closes, and it asks itself to end."""
+def test_worker_ends_with_its_parent(ball: Path, variants: tuple[Path, Path]) -> None:
+    """It ends when its standard input closes."""
     import subprocess
     import sys
 
@@ -193,9 +201,7 @@ def test_a_worker_ends_with_the_process_that_started_it(ball: Path, variants: tu
     assert process.wait(30) == -15
 
 
-def test_a_worker_of_the_cluster_is_killed_midway(
-    ball: Path, variants: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_killed_cluster_worker_is_replaced(ball: Path, variants: tuple[Path, Path], tmp_path: Path) -> None:
     """Another worker goes on from the checkpoint; the log has each iteration once."""
     distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
     from mi_refgs.compare.execute import run_on_cluster
@@ -279,9 +285,7 @@ def test_no_test_views_are_refused(
     assert "zero test views" in capsys.readouterr().err
 
 
-def test_pictures_are_looked_for_as_the_methods_read_them(
-    ball: Path, variants: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_plan_reads_images_as_methods_do(ball: Path, variants: tuple[Path, Path], tmp_path: Path) -> None:
     data = shutil.copytree(ball, tmp_path / "ball")
     for picture in data.glob("*/r_*.png"):
         write_exr(picture.with_suffix(".exr"), read_png(picture))
@@ -296,19 +300,17 @@ def test_pictures_are_looked_for_as_the_methods_read_them(
         plan()
 
 
-def test_images_of_different_sizes_are_not_set_side_by_side(
+def test_different_image_sizes_are_refused(
     compared: tuple[Path, int],
     ball: Path,
     variants: tuple[Path, Path],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Before anything is fitted: two methods, or one and what the folder holds; and where runs are there."""
+    """Before anything is fitted: two methods, or one and existing runs; and existing runs."""
     smaller = tmp_path / "smaller.toml"
     smaller.write_text(f'extends = "{variants[0]}"\n[data]\ndownscale = 2\n')
-    copy = Path(shutil.copytree(compared[0], tmp_path / "copy"))
-    for path in copy.rglob("job.json"):
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"folder": str(path.parent)}))
+    copy = copied(compared[0], tmp_path / "copy")
     for folder, chosen in ((tmp_path / "new", (variants[0], smaller)), (copy, (smaller,))):
         assert main(command(ball, folder, *chosen)) == 2
         said = capsys.readouterr().err.strip()
@@ -321,7 +323,7 @@ def test_images_of_different_sizes_are_not_set_side_by_side(
     assert "20 × 20" in said and "10 × 10" in said and "runs/ball/other/seed1" in said
 
 
-def test_the_size_of_images_stands_above_the_scores(compared: tuple[Path, int]) -> None:
+def test_heading_states_image_size(compared: tuple[Path, int]) -> None:
     [scene] = results.table(compared[0]).scenes
     assert scene.downscale == 1 and heading(scene) == "ball (2 test views of 20 × 20 pixels)"
     scene.downscale = 2
@@ -336,9 +338,7 @@ def test_other_settings_are_refused(
     variants: tuple[Path, Path],
     tmp_path: Path,
 ) -> None:
-    folder = Path(shutil.copytree(compared[0], tmp_path / "copy"))
-    for path in folder.rglob("job.json"):
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"folder": str(path.parent)}))
+    folder = copied(compared[0], tmp_path / "copy")
 
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "compare.json", "--set", "loss.ssim=0.1")
     refused([*command(ball, folder, variants[1]), "--preset", "standard"], "--preset", "quick", "standard")
@@ -386,7 +386,7 @@ class Page(HTMLParser):
         self.text += data
 
 
-def test_the_page_is_whole_and_stands_alone(compared: tuple[Path, int]) -> None:
+def test_page_is_valid_and_self_contained(compared: tuple[Path, int]) -> None:
     folder, _ = compared
     page = Page()
     page.feed((folder / "index.html").read_text())
@@ -412,7 +412,7 @@ def test_statistics() -> None:
     assert number.mean == 3.0 and number.sd == pytest.approx(7**0.5)
 
 
-def test_the_crop_is_where_pictures_differ_most(rng: np.random.Generator) -> None:
+def test_crop_is_where_images_differ_most(rng: np.random.Generator) -> None:
     """Against every square, tried one by one."""
     truth, first, second = rng.random((3, 12, 9, 3))
     score, row, column = page.most_different(truth, [first, second], 4)
@@ -428,16 +428,14 @@ def test_the_crop_is_where_pictures_differ_most(rng: np.random.Generator) -> Non
     assert lone == pytest.approx(error(first, *place))
 
 
-def test_an_unreadable_run_is_a_failed_row(compared: tuple[Path, int], tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(compared[0], tmp_path / "copy"))
-    for path in folder.rglob("job.json"):
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"folder": str(path.parent)}))
+def test_unreadable_run_is_a_failed_row(compared: tuple[Path, int], tmp_path: Path) -> None:
+    folder = copied(compared[0], tmp_path / "copy")
     (folder / "runs" / "ball" / "other" / "seed0" / "config.toml").write_text("future = 1")
     row = results.write(folder).scenes[0].rows[1]
     assert row.seeds == [1] and "future" in row.failed[0]
 
 
-def test_a_job_travels_through_its_file(tmp_path: Path) -> None:
+def test_job_is_written_and_read(tmp_path: Path) -> None:
     job = Job(str(tmp_path / "a"), "/data", "v.toml", 3, "quick", ("x=1",), "llvm_ad_rgb", None)
     job.write()
     assert Job.read(tmp_path / "a") == job
@@ -446,7 +444,7 @@ def test_a_job_travels_through_its_file(tmp_path: Path) -> None:
         Job.read(tmp_path / "a")
 
 
-def test_a_run_that_chose_its_terms_is_still_the_same(ball: Path, tmp_path: Path) -> None:
+def test_run_that_selected_components_is_accepted(ball: Path, tmp_path: Path) -> None:
     """A finished fit of a method that selects its terms is not taken for one of other settings."""
     variant = tmp_path / "choosing.toml"
     variant.write_text(

@@ -96,7 +96,7 @@ def test_exhibits_are_scenes_of_the_package() -> None:
 
 
 @pytest.mark.skipif(not COMMITTED.is_dir(), reason="no gallery is kept here")
-def test_gallery_of_the_repository_is_whole_and_small() -> None:
+def test_gallery_of_the_repository_is_complete_and_small() -> None:
     files = [path for path in COMMITTED.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) <= LIMIT
     page = (COMMITTED / "README.md").read_text()

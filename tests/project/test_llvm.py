@@ -142,7 +142,7 @@ def test_import_chooses_a_usable_library(usable: Path) -> None:
     assert int(done.stdout.split()[-1]) >= llvm.MINIMUM_MAJOR
 
 
-def test_a_usable_choice_of_the_user_is_kept(usable: Path, tmp_path: Path) -> None:
+def test_usable_choice_of_user_is_kept(usable: Path, tmp_path: Path) -> None:
     mine = tmp_path / "libmine.so"  # a name without a version: only the library can tell
     mine.symlink_to(usable)
     code = "import os, mi_refgs\nprint(os.environ['DRJIT_LIBLLVM_PATH'])"
@@ -151,7 +151,7 @@ def test_a_usable_choice_of_the_user_is_kept(usable: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("old", OLD, ids=lambda path: path.name)
-def test_an_old_choice_of_the_user_is_refused(old: Path) -> None:
+def test_old_choice_of_user_is_refused(old: Path) -> None:
     if not old.exists():
         pytest.skip(f"{old.name} is not installed")
     done = run("import mi_refgs" + RENDER, DRJIT_LIBLLVM_PATH=str(old))
@@ -163,7 +163,7 @@ def test_an_old_choice_of_the_user_is_refused(old: Path) -> None:
     assert "LLVM ERROR" not in done.stderr
 
 
-def test_a_missing_choice_of_the_user_is_refused() -> None:
+def test_missing_choice_of_user_is_refused() -> None:
     done = run("import mi_refgs" + RENDER, DRJIT_LIBLLVM_PATH="/none/libLLVM.so")
     assert done.returncode == 1
     assert "RuntimeWarning: DRJIT_LIBLLVM_PATH" in done.stderr
@@ -171,8 +171,8 @@ def test_a_missing_choice_of_the_user_is_refused() -> None:
 
 
 @pytest.mark.parametrize("old", OLD[:2], ids=lambda path: path.name)
-def test_an_old_library_that_is_already_loaded_is_refused(old: Path) -> None:
-    """Mitsuba came first and took an old library: it is too late to choose another, but not to say so."""
+def test_loaded_old_library_is_refused(old: Path) -> None:
+    """Mitsuba came first and took an old library: it cannot be corrected, but reported."""
     if not old.exists():
         pytest.skip(f"{old.name} is not installed")
     first = f"import os\nos.environ['DRJIT_LIBLLVM_PATH'] = '{old}'\nimport mitsuba\n"
@@ -212,7 +212,7 @@ except ImportError:
     assert "RuntimeWarning: Dr.Jit found no usable libLLVM" in done.stderr and llvm.REMEDY in done.stderr
 
 
-def test_a_cuda_device_needs_no_library() -> None:
+def test_cuda_requires_no_library() -> None:
     code = (
         NONE_FOUND
         + """
@@ -225,7 +225,7 @@ import mi_refgs
     assert done.returncode == 0 and "Warning" not in done.stderr
 
 
-def test_an_old_library_beside_cuda_is_refused_with_the_variant() -> None:
+def test_old_library_with_cuda_is_refused_with_the_variant() -> None:
     """LLVM 15 would abort at the first kernel: the switch to the variant already raises."""
     old = SYSTEM / "libLLVM-15.so.1"
     if not old.exists():
@@ -258,7 +258,7 @@ def test_script_prints_the_library(usable: Path) -> None:
     assert (done.returncode, done.stdout.strip()) == (0, str(usable))
 
 
-def test_script_says_what_is_wrong() -> None:
+def test_script_prints_the_problem() -> None:
     done = run_script(DRJIT_LIBLLVM_PATH="/none/libLLVM.so")
     assert done.returncode == 1
     assert "does not exist" in done.stdout
