@@ -32,7 +32,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add what is made: pages of the code, pages that stand elsewhere in the repository, notebooks."""
+    """Add generated pages: of the code, of files elsewhere in the repository, of notebooks."""
     made: dict[str, str | bytes] = {name: write() for name, write in PAGES.items()}
     made |= links.pages_from_elsewhere()
     for file in [file for file in files if file.src_uri.endswith(".ipynb")]:
@@ -49,5 +49,5 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
 
 def on_post_build(config: Any) -> None:
-    """List the links that leave the site, for a person or a program to follow."""
+    """List the links that leave the site, for a user or a program to follow."""
     Path(config.site_dir, "external_links.txt").write_text("\n".join(sorted(links.EXTERNAL)) + "\n")

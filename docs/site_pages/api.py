@@ -9,16 +9,16 @@ from mi_refgs.registry import Registry
 from site_pages import ROOT
 
 FIRST = ("reconstruct", "reconstruction")
-"""What most readers look for: it stands first."""
+"""Names that most readers look for: listed first."""
 
 
 def page() -> str:
     """A section for each package with public names; mkdocstrings writes the names themselves."""
     text = [
         "# Python",
-        "`import mi_refgs` registers the [plugins](plugins.md); it should stand before `import mitsuba`, so "
+        "`import mi_refgs` registers the [plugins](plugins.md); it should precede `import mitsuba`, so "
         "that it can choose the LLVM that Dr.Jit loads. These names are imported from `mi_refgs` itself, and "
-        "each is loaded when it is first asked for. Tables have shapes (N, C), pictures (H, W, C); lengths "
+        "each is loaded when it is first asked for. Tables have shapes (N, C), images (H, W, C); lengths "
         "are in the units of the scene.",
     ]
     for package, names in by_package().items():

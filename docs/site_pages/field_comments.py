@@ -1,4 +1,4 @@
-"""Comments beside the fields of dataclasses as their documentation: shapes and units stand there."""
+"""Comments beside the fields of dataclasses as their documentation, with shapes and units."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Markdown of the repository as pages of the site: links, files that stand outside of docs/, lists."""
+"""Markdown of the repository as pages of the site: links, files outside of docs/, lists."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EXTERNAL: set[str] = set()
 
 
 def pages_from_elsewhere() -> dict[str, str | bytes]:
-    """The pages whose text stands outside of docs/."""
+    """The pages whose text is outside of docs/."""
     return {page: (ROOT / name).read_text(encoding="utf-8") for page, name in ELSEWHERE.items()}
 
 

@@ -10,7 +10,7 @@ from mi_refgs.methods.read import PRESETS, load
 from site_pages import ROOT, table
 
 FIRST = "ref_gaussian"
-"""The method that stands first: the others say what differs from it."""
+"""The first method: the others list their differences from it."""
 
 
 def page() -> str:
@@ -31,7 +31,7 @@ def page() -> str:
                 "iterations",
                 "surfels at first",
                 "at most",
-                "pixels of a picture",
+                "pixels of an image",
                 "minutes, two cores",
             ],
             [

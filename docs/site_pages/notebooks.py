@@ -14,7 +14,7 @@ PICTURES = {"image/png": "png", "image/jpeg": "jpg"}
 
 
 def pages(name: str) -> dict[str, str | bytes]:
-    """The page of a notebook below docs/, and its pictures, by their paths in the site."""
+    """The page of a notebook below docs/, and its images, by their paths in the site."""
     notebook = json.loads((ROOT / "docs" / name).read_text(encoding="utf-8"))
     stem = name.removesuffix(".ipynb")
     made: dict[str, str | bytes] = {}
@@ -36,7 +36,7 @@ def pages(name: str) -> dict[str, str | bytes]:
 
 
 def _output(output: dict[str, Any], stem: str, made: dict[str, str | bytes]) -> str:
-    """One output as Markdown; a picture is added to what is made."""
+    """One output as Markdown; an image is added to the generated files."""
     if output["output_type"] == "stream":
         return _verbatim(output["text"]) if output["name"] == "stdout" else ""
     data = output.get("data", {})

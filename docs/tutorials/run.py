@@ -1,7 +1,7 @@
 """Runs the tutorials: `python docs/tutorials/run.py [NAME.ipynb …]` keeps their outputs, `--check` does not.
 
 Each runs in a kernel and an empty folder of its own, with Python's warnings as errors. What is kept is code,
-text and pictures: no metadata, no numbers of runs, nothing of the machine.
+text and images: no metadata, no numbers of runs, nothing of the machine.
 """
 
 from __future__ import annotations
