@@ -98,11 +98,12 @@ class _Source:
         try:
             self.tree = ast.parse(line, mode="eval").body
         except SyntaxError as error:
-            if not error.offset:  # the end of the line
+            place = (error.offset or len(line) + 1) - 1  # no offset: the end of the line
+            if place >= len(line.rstrip()):
                 raise self.error(len(text), "a name or a number is missing; write one") from error
             open_bracket = "never closed" in error.msg
             remedy = "the bracket is not closed; write )" if open_bracket else "not understood; correct it"
-            raise self.error(error.offset - 1 + self.indent, remedy) from error
+            raise self.error(place + self.indent, remedy) from error
         except (RecursionError, MemoryError) as error:
             raise self.error(0, "too many operations within each other; simplify it") from error
 

@@ -1,4 +1,4 @@
-"""Expressions: values as Python's arithmetic has them, and one sentence for everything that is none."""
+"""Expressions: values equal Python's, and anything else is refused in one sentence."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from mi_refgs.editing import assignments
 from mi_refgs.editing.expression import MAX_DEPTH, parse_condition, parse_numbers
 from mi_refgs.errors import InputError
+from tests.helpers import refused
 
 VALUES = {
     "a": np.array([0.0, 1.0, -2.0, 0.5]),
@@ -49,100 +50,63 @@ def by_python(text: str, row: int) -> Any:
         "1 < 2",
     ],
 )
-def test_values_are_those_of_python(text: str) -> None:
+def test_values_equal_python(text: str) -> None:
     found = np.broadcast_to(parse_condition(text).evaluate(VALUES), 4)
     assert found.dtype == bool
     assert found.tolist() == [by_python(text, row) for row in range(4)]
 
 
-def test_numbers_with_commas() -> None:
+def test_numbers_are_separated_by_commas() -> None:
     first, second, third = parse_numbers(" 0.5 , a*b+1,min(a,b) ")
     assert first.evaluate(VALUES) == 0.5 and not first.names and second.names == {"a", "b"}
     np.testing.assert_array_equal(second.evaluate(VALUES), VALUES["a"] * VALUES["b"] + 1)
     np.testing.assert_array_equal(third.evaluate(VALUES), np.minimum(VALUES["a"], VALUES["b"]))
 
 
-def test_what_is_not_defined_compares_as_false() -> None:
+def test_undefined_numbers_compare_as_false() -> None:
     for text in ("a / 0 * 0 > 0", "sqrt(-1) < 1", "(0/0) == (0/0)", "10**10**10 < 1"):
         assert not np.any(parse_condition(text).evaluate(VALUES)), text
     assert np.all(parse_condition("10**10**10 > 1").evaluate(VALUES))
 
 
 HOSTILE = [
-    "",
-    " ",
-    "a",
-    "a >",
-    "> a",
-    "a > 1 b",
-    "a > 1,",
-    "a > 1, b > 1",
-    "a = 1",
-    "a = = 1",
-    "(a > 1",
-    "a > 1)",
-    "()",
-    "a > ()",
-    "and",
-    "a and b",
-    "not a",
-    "a > 1 and b",
-    "(a > 1) + 1 > 0",
-    "-(a > 1)",
-    "abs(a > 1) > 0",
-    "a > (b > 1)",
-    "abs() > 1",
-    "abs(a, b) > 1",
-    "exp(a) > 1",
-    "a(1) > 1",
-    "__import__('os').system('true')",
-    "().__class__.__bases__[0]",
-    "a.__class__ .b > 1 .real",
-    "lambda: 0",
-    "[a for a in b]",
-    "a if b else a",
-    "a := 1",
-    "a in b",
-    "a < b is not c.x",
-    "True > a",
-    "min(*a) > 1",
-    "min(a=1) > 1",
-    "a & b",
-    "a > 1 # b",
-    'a > "1"',
-    "a\x00 > 1",
-    "α > 1",
-    "a \uff1e 1",
-    "a > \u0661",
-    "1e999 > a",
-    "1_000 > a",
-    "0x10 > a",
-    "1j > a",
-    "a > 1; b",
-    "a\\\n > 1",
-    "%s" * 10,
-    "(" * 1000 + "a" + ")" * 1000 + " > 1",
-    "-" * 1500 + "a > 1",
-    "not " * 400 + "a > 1",
-    "2" + "**2" * 600 + " > 1",
-    "abs(" * 200 + "a" + ")" * 200 + "> 1",
-    "a+" * 100_000 + "a > 1",
-    "9" * 1900 + " > a",
+    *("", " ", "a", "a >", "> a", "a > 1 b", "a > 1,", "a > 1, b > 1", "a = 1", "a = = 1", "(a > 1"),
+    *("a > 1)", "()", "a > ()", "and", "a and b", "not a", "a > 1 and b", "(a > 1) + 1 > 0", "-(a > 1)"),
+    *("abs(a > 1) > 0", "a > (b > 1)", "abs() > 1", "abs(a, b) > 1", "exp(a) > 1", "a(1) > 1"),
+    *("__import__('os').system('true')", "().__class__.__bases__[0]", "a.__class__ .b > 1 .real"),
+    *("lambda: 0", "[a for a in b]", "a if b else a", "a := 1", "a in b", "a < b is not c.x"),
+    *("True > a", "min(*a) > 1", "min(a=1) > 1", "a & b", "a > 1 # b", 'a > "1"', "a\x00 > 1", "α > 1"),
+    *("a \uff1e 1", "a > \u0661", "1e999 > a", "1_000 > a", "0x10 > a", "1j > a", "a > 1; b"),
+    *("a\\\n > 1", "%s" * 10, "(" * 1000 + "a" + ")" * 1000 + " > 1", "-" * 1500 + "a > 1"),
+    *("not " * 400 + "a > 1", "2" + "**2" * 600 + " > 1", "abs(" * 200 + "a" + ")" * 200 + "> 1"),
+    *("a+" * 100_000 + "a > 1", "9" * 1900 + " > a"),
 ]
 
 
 @pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
 def test_hostile_expressions_are_one_sentence(text: str) -> None:
-    with pytest.raises(InputError) as caught:
-        parse_condition(text)
-    assert str(caught.value).startswith("--where: ") and "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 300
+    message = refused(lambda: parse_condition(text))
+    assert message.startswith("--where: ") and "\n" not in message and len(message) < 300
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("metallic > ", "character 12: a name or a number is missing"),
+        ("  (a > 1", "character 3: the bracket is not closed"),
+        ("x < {", "character 5: '{' is not allowed"),
+        (" a > exp(b)", "character 6: 'exp' is no function here; use one of abs, sqrt, min, max"),
+        ("abs(" * 31 + "a" + ")" * 31 + " > 1", "more than 30 operations within each other"),
+    ],
+)
+def test_an_error_names_the_character_and_the_remedy(text: str, words: str) -> None:
+    refused(lambda: parse_condition(text), words)
 
 
 def test_long_chains_and_nearly_too_deep_ones_are_computed() -> None:
     assert np.all(parse_condition("+".join(["1"] * 900) + " == 900").evaluate(VALUES))
     inside = MAX_DEPTH - 1
-    assert np.all(parse_condition("(" * inside + "a" + ")" * inside + " == a").evaluate(VALUES))
+    assert np.all(parse_condition("abs(" * inside + "a" + ")" * inside + " >= a").evaluate(VALUES))
     assert np.all(parse_condition(" and ".join(["a == a"] * 150)).evaluate(VALUES))
 
 
