@@ -12,7 +12,7 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import read_exr, read_exr_image, write_exr
 from mi_refgs.io.files import replace_file, write_bytes
-from mi_refgs.io.images import linear_from_srgb, srgb_from_linear, write_png
+from mi_refgs.io.images import image_size, linear_from_srgb, srgb_from_linear, write_png
 from tests.helpers import run_python
 
 
@@ -56,6 +56,19 @@ def test_colours_in_other_primaries_are_refused(tmp_path: Path) -> None:
     assert read_exr_image(tmp_path / "srgb.exr").shape == (2, 4, 3)
     with pytest.raises(InputError, match=r"ap1\.exr: chromaticities: .* convert"):
         read_exr_image(tmp_path / "ap1.exr")
+
+
+def test_exr_of_several_parts_or_deep_pixels_is_refused(tmp_path: Path) -> None:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    planes = {"Y": np.ones((2, 4), np.float32)}
+    parts = [OpenEXR.Part(header | {"name": name}, planes, name) for name in ("left", "right")]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    deep = {"Y": np.array([[np.ones(3, np.float32)] * 4] * 2 + [[None] * 4], dtype=object)[:2]}
+    header |= {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
+    OpenEXR.File(header, deep).write(str(tmp_path / "deep.exr"))
+    for name in ("parts.exr", "deep.exr"):
+        with pytest.raises(InputError, match=rf"{name}: header: .*several parts, or deep pixels"):
+            image_size(tmp_path / name)
 
 
 def test_files_are_written_atomically(tmp_path: Path) -> None:
