@@ -53,7 +53,7 @@ def test_bash_completes_files(
 def test_every_shell_has_a_script(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     text = script(shell, capsys)
     assert "refgs" in text and "relight" in text
-    assert "--turntable" in text or shell == "tcsh"  # whose scripts by shtab complete commands alone
+    assert "--turntable" in text or shell == "tcsh"
 
 
 def test_json_has_the_script(capsys: pytest.CaptureFixture[str]) -> None:
