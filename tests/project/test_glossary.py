@@ -81,7 +81,6 @@ PROPER_USES: dict[str, str] = {
 
 NOT_CLEAN_YET = {
     "docs/decisions.md",
-    "mi_refgs/kernels",
     "mi_refgs/plugins",
     "mi_refgs/render",
     "mi_refgs/splat",
