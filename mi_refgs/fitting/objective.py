@@ -103,7 +103,7 @@ def losses_in_use(weights: LossWeights) -> list[Loss]:
     """The registered losses that a method weighs; raises InputError for a name that is not registered."""
     for name in weights.registered:
         LOSSES.find(name, f"loss.registered.{name}")
-    return [loss for loss in LOSSES.values() if weights.of(loss.name).weight]
+    return [x for x in LOSSES.values() if x.name in weights.registered or getattr(weights, x.name, None)]
 
 
 def objective(
