@@ -87,6 +87,3 @@ QUALITY = tuple(name for name in TYPES if name not in ("at", "reflectance", "dif
 
 TRACED = ("visibility_rays", "traced_bounces", "ambient_rays")
 """Those that have no effect without occlusion."""
-
-DIRECTIONS: int = ShadingOptions.directions
-"""Default number of directions per hemisphere."""

@@ -8,8 +8,6 @@ roughness (mi.Float, 0 … 1, α = roughness²); for diffuse="sh" also radiance 
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
@@ -69,12 +67,8 @@ def multiple_scattering(f0: mi.Color3f, single: mi.Color3f, energy: mi.Float) ->
     return single * again * dr.rcp(1 - again)
 
 
-def shade(
-    points: ShadingPoints,
-    light: Light,
-    options: ShadingOptions,
-) -> RadianceTerms:
-    """Outgoing radiance towards the camera, by cause.
+def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
+    """Outgoing radiance towards the camera, as separate terms.
 
     With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected direction
     r: specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, and diffuse = (1 - metallic) radiance
@@ -93,6 +87,7 @@ def shade(
     Differentiable in everything but the branches of the clamps. Finite for every finite input.
     Raises InputError for "sh" without a radiance.
     """
+    # Directional reflectance, and the light in the specular lobe.
     normal, view = safe_normalize(points.normal), safe_normalize(points.view)
     f0 = base_reflectance(points)
     scale, bias = split_sum(dr.dot(normal, view), points.roughness)
@@ -103,26 +98,25 @@ def shade(
         further = multiple_scattering(f0, reflectance, scale + bias)
         specular += light.irradiance(normal) * further
         reflectance += further
+
+    # Visibility of that light, and what blocks it.
     indirect = None
     visibility, blocking = points.get("visibility"), points.get("indirect")
     if visibility is not None:
         specular *= visibility
         if blocking is not None:
             indirect = (1 - visibility) * blocking * reflectance
-    return RadianceTerms(_diffuse(points, normal, light, options, reflectance), specular, indirect)
 
-
-def _diffuse(
-    points: ShadingPoints, normal: Any, light: Light, options: ShadingOptions, reflectance: Any
-) -> Any:
+    # Diffuse base under the specular layer.
     if options.diffuse == "irradiance":
         # The table, extrapolated, exceeds 1 by up to 1e-4: no negative light from that.
-        left = dr.maximum(1 - reflectance, 0)
-        arriving = light.irradiance(normal)
-        share = points.get("ambient")
-        if share is not None:
-            arriving *= share
-        return left * (1 - points.metallic) * points.albedo * arriving
-    if points.get("radiance") is None:
+        transmitted = dr.maximum(1 - reflectance, 0)
+        incident = light.irradiance(normal)
+        if (ambient := points.get("ambient")) is not None:
+            incident *= ambient
+        diffuse = transmitted * (1 - points.metallic) * points.albedo * incident
+    elif points.get("radiance") is None:
         raise InputError('shade: radiance: missing; diffuse="sh" needs it, diffuse="irradiance" does not')
-    return (1 - points.metallic) * points.radiance
+    else:
+        diffuse = (1 - points.metallic) * points.radiance
+    return RadianceTerms(diffuse, specular, indirect)
