@@ -190,10 +190,7 @@ def text(found: Comparison, figures: Figures) -> str:
         body = [[row.title, *(_number(value, form, row.signed) for value in row.values)] for row in rows]
         lines += ["", *aligned([title, *heads], body)]
     if found.partial:
-        lines += [
-            "",
-            "Averages of ours over a part of the scenes have no difference.",
-        ]
+        lines += ["", "Averages of ours over a part of the scenes have no difference."]
     if not any(row.title.startswith("  ") for rows in found.lines.values() for row in rows):
         lines += ["", "No finished run is of a scene of this table."]
     for name, scenes in found.missing.items():

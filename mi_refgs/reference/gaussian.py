@@ -9,13 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.camera import (
-    PinholeCamera,
-    camera_frame,
-    intrinsics,
-    rotation_matrix,
-    sigmoid,
-)
+from mi_refgs.reference.camera import PinholeCamera, camera_frame, intrinsics, rotation_matrix, sigmoid
 from mi_refgs.reference.footprint import Rules, Sample
 
 Array = np.ndarray
