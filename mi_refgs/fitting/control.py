@@ -9,8 +9,6 @@ and keeps at least one surfel.
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -149,7 +147,7 @@ class AdaptiveControl:
         wait = refine.prune_wait(options, method.rates.of("opacity"))
         for table in state.tables:
             # Surfels of the background may grow with their distance.
-            extent: Any = data.scene_extent
+            extent: float | np.ndarray = data.scene_extent
             largest = None
             if table.prefix:
                 assert data.region is not None and method.surroundings is not None

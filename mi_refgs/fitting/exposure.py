@@ -163,7 +163,7 @@ def with_gain(
     return gain, image_of(displayed_of(frame, data, gain), view)
 
 
-def displayed_of(frame: Frame, data: Dataset, gain: np.ndarray | None = None) -> list[Any]:
+def displayed_of(frame: Frame, data: Dataset, gain: np.ndarray | None = None) -> list[Float]:
     """`displayed` with an opaque gain, which is not compiled into the kernel."""
     factors = None if gain is None else [dr.opaque(mi.Float, float(g)) for g in gain]
     return displayed(frame, data.background, data.is_linear_radiance, factors)
@@ -182,7 +182,7 @@ def sentence(decision: dict[str, Any]) -> str:
     return f"exposure: {verdict}: {change:+.2f} dB on pixels to which they were not fitted"
 
 
-def image_of(planes: list[Any], view: View) -> np.ndarray:
+def image_of(planes: list[Float], view: View) -> np.ndarray:
     """Convert planes of a frame to (H, W, C)."""
     size = view.height, view.width
     values = [np.broadcast_to(np.array(plane), view.height * view.width).reshape(size) for plane in planes]

@@ -19,6 +19,7 @@ from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels import init
 from mi_refgs.surfels.init import morton_order
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import TensorXf
 
 FARTHEST = 1.95
 """Contracted distance of the farthest random points, 20 radii of the region: beyond it the background map is
@@ -123,7 +124,7 @@ def is_open(method: Method, data: Dataset) -> bool:
 
 def initial_parameters(
     method: Method, data: Dataset, rng: np.random.Generator, open_scene: bool
-) -> dict[str, Any]:
+) -> dict[str, TensorXf]:
     """The parameters by name, with those of the background for an open scene; raises InputError."""
     params = initial_surfels(method, data, rng, open_scene).raw
     if open_scene:
@@ -156,7 +157,7 @@ def seen_around(data: Dataset, height: int) -> EnvironmentLight:
     return EnvironmentLight.from_radiance(seen.reshape(directions.shape))
 
 
-def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator) -> dict[str, Any]:
+def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator) -> dict[str, TensorXf]:
     """The parameters of the background by name: surfels, and a map of the median of their colours."""
     options, region = method.surroundings, data.region
     assert options is not None and region is not None
