@@ -9,6 +9,8 @@ and keeps at least one surfel.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -16,7 +18,7 @@ import numpy as np
 from mi_refgs.data.region import Region
 from mi_refgs.fitting import refine
 from mi_refgs.fitting.initial import first_light
-from mi_refgs.fitting.refine import TableEdit
+from mi_refgs.fitting.refine import SizeLimits, TableEdit
 from mi_refgs.fitting.state import FitSetup, FitState
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.splat import Camera
@@ -144,26 +146,16 @@ class AdaptiveControl:
         options, data, method, state = self.options, self.setup.data, self.setup.method, self.state
         draws = self.setup.schedule.rng(iteration, "densify")
         since_reset = options.reset.since(iteration) if options.reset is not None else None
-        wait = refine.prune_wait(options, method.rates.of("opacity"))
+        if since_reset is not None and since_reset < refine.prune_wait(options, method.rates.of("opacity")):
+            options = replace(options, prune_opacity=0.0)
         for table in state.tables:
-            # Surfels of the background may grow with their distance.
-            extent: float | np.ndarray = data.scene_extent
-            largest = None
-            if table.prefix:
+            surfels, limits = table.surfels, SizeLimits.of(options, data.scene_extent)
+            if table.prefix:  # surfels of the background may grow with their distance
                 assert data.region is not None and method.surroundings is not None
-                distance = distances(table.surfels, data.region)
-                largest = method.surroundings.prune_extent * distance
-                extent = np.maximum(distance, data.scene_extent)
-            edit = refine.densify_and_prune(
-                table.surfels,
-                table.gradient,
-                extent,
-                options,
-                table.max_count,
-                draws,
-                prune_transparent=since_reset is None or since_reset >= wait,
-                largest=largest,
-            )
+                distance = distances(surfels, data.region)
+                split = options.dense_extent * np.maximum(distance, data.scene_extent)
+                limits = SizeLimits(split, method.surroundings.prune_extent * distance, keep_one=True)
+            edit = refine.densify_and_prune(surfels, table.gradient, limits, options, table.max_count, draws)
             table.apply(edit)
         if self.setup.open_scene:
             assert data.region is not None

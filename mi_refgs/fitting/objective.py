@@ -39,7 +39,23 @@ class LossInputs:
     frame: Frame  # with derivatives
     image: list[Float]  # three planes (H*W,), display-encoded as the target
     target: Target
-    light: Light | None  # with derivatives
+    light: Light | None  # with derivatives; without it, losses on it are left out
+    log_gain: list[Float] | None = None  # log exposure of the image, three of width 1; by default 0
+
+    @staticmethod
+    def of(
+        frame: Frame,
+        target: Target,
+        data: Dataset,
+        light: Light | None = None,
+        log_gain: list[Float] | None = None,
+    ) -> LossInputs:
+        """Display a frame as its target is, with highlights clipped where those of the target are."""
+        gain = None if log_gain is None else [dr.exp(value) for value in log_gain]
+        image = displayed(frame, data.background, data.is_linear_radiance, gain)
+        if target.clipped is not None:
+            image = losses.clip_highlights(image, target.image, target.clipped)
+        return LossInputs(frame, image, target, light, log_gain)
 
 
 @dataclass(frozen=True)
@@ -106,35 +122,18 @@ def losses_in_use(weights: LossWeights) -> list[Loss]:
     return [x for x in LOSSES.values() if x.name in weights.registered or getattr(weights, x.name, None)]
 
 
-def objective(
-    frame: Frame,
-    target: Target,
-    data: Dataset,
-    weights: LossWeights,
-    iteration: int,
-    light: Light | None = None,
-    log_gain: list[Float] | None = None,  # three of width 1
-) -> tuple[Float, Float]:
-    """Weighted sum of the losses of a frame (width 1), and its mean squared error, detached.
-
-    `light` is the light of the step, under AD; losses on it are left out without it. `log_gain` is the log
-    exposure of the image, by default 0.
-    """
-    # The image as it is displayed, compared with the target.
-    gain = None if log_gain is None else [dr.exp(value) for value in log_gain]
-    image = displayed(frame, data.background, data.is_linear_radiance, gain)
-    if target.clipped is not None:
-        image = losses.clip_highlights(image, target.image, target.clipped)
+def objective(inputs: LossInputs, weights: LossWeights, iteration: int) -> tuple[Float, Float]:
+    """Weighted sum of the losses (width 1), and the mean squared error of the image, detached."""
+    image, target = inputs.image, inputs.target
     loss = (1 - weights.ssim) * losses.l1(image, target.image)
-    if log_gain is not None:
-        loss += GAIN_PRIOR * sum((dr.square(value) for value in log_gain), mi.Float(0))
+    if inputs.log_gain is not None:
+        loss += GAIN_PRIOR * sum((dr.square(value) for value in inputs.log_gain), mi.Float(0))
     if weights.ssim:
         width, height = target.camera.width, target.camera.height
         loss += weights.ssim * losses.d_ssim(image, target.image, width, height)
 
     # Registered losses. A weight that changes from step to step is opaque: a literal would be compiled into
     # each step's kernels.
-    inputs = LossInputs(frame, image, target, light)
     for term in losses_in_use(weights):
         window = weights.of(term.name)
         weight = window.at(iteration)

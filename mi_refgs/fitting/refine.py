@@ -59,32 +59,41 @@ class TableEdit:
         return TableEdit(self.surfels.gather(upload(order, mi.UInt32)), self.parent[order], self.fresh[order])
 
 
+@dataclass(frozen=True)
+class SizeLimits:
+    """Sizes in scene units, one or (N,), above which hot surfels are split, and all are pruned."""
+
+    split: float | np.ndarray
+    prune: float | np.ndarray
+    keep_one: bool = False  # the most opaque surfel stays, however large and transparent all are
+
+    @staticmethod
+    def of(options: Refine, extent: float) -> SizeLimits:
+        """Those of an object in a scene of this extent."""
+        return SizeLimits(options.dense_extent * extent, options.prune_extent * extent)
+
+
 def densify_and_prune(
     surfels: Surfels,
     gradient: np.ndarray,  # (N,) mean length of the screen-space gradient over the views with one, NDC
-    extent: float | np.ndarray,  # scene units; sizes are compared with it; or (N,)
+    limits: SizeLimits,
     options: Refine,
     max_count: int,
     rng: np.random.Generator,
-    prune_transparent: bool = True,
-    largest: np.ndarray | None = None,  # (N,) scene units
 ) -> TableEdit:
     """Clone small and split large surfels with a high screen gradient; prune transparent and oversized ones.
 
-    At most max_count surfels result: those with the highest gradient are cloned or split first. Transparent
-    ones stay unless `prune_transparent`: wait `prune_wait` iterations after an opacity reset. `largest`
-    replaces the size limit of pruning; the most opaque surfel then stays in any case. Raises InputError if no
-    surfel would be left.
+    At most max_count surfels result: those with the highest gradient are cloned or split first. With
+    prune_opacity = 0 transparent ones stay: wait `prune_wait` iterations after an opacity reset. Raises
+    InputError if no surfel would be left.
     """
     raw = surfels.to_numpy()
     count = len(gradient)
     primitive = primitive_of(raw)
     size = primitive.extent(raw)[1].max(axis=1)
-    dense = np.broadcast_to(np.asarray(options.dense_extent * extent, size.dtype), count)
-    keep = size <= (options.prune_extent * extent if largest is None else largest)
-    if prune_transparent:
-        keep &= sigmoid(raw["opacity"][:, 0]) >= options.prune_opacity
-    if largest is not None and not keep.any():
+    dense = np.broadcast_to(np.asarray(limits.split, size.dtype), count)
+    keep = (size <= limits.prune) & (sigmoid(raw["opacity"][:, 0]) >= options.prune_opacity)
+    if limits.keep_one and not keep.any():
         keep[np.argmax(raw["opacity"][:, 0])] = True
     if not keep.any():
         raise InputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,48 +43,56 @@ Settings = Mapping[str, object] | Sequence[str]
 """Changes of a method: {"loss.ssim": 0.1}, or as on the command line, ["loss.ssim=0.1"]."""
 
 
+@dataclass(frozen=True)
+class Choice:
+    """What the user says about the method of a fit."""
+
+    method: str | Method | None = None
+    """A name, the path of a .toml, or None: the full method, or for images without alpha the one that fits
+    their background too. A `Method` is fitted as it is."""
+    preset: str | None = None  # "standard" by default
+    settings: Settings = ()
+    minutes: float | None = None  # time that a new fit may take
+
+    def __post_init__(self) -> None:
+        if isinstance(self.method, Method) and (self.preset or self.settings):
+            raise InputError("method: preset, settings: a Method has its own; change it, or name one")
+        if self.minutes is not None and not 0 < self.minutes < math.inf:
+            raise InputError(f"--minutes: {self.minutes} is no time; give more than 0")
+
+
 def fit(
     data: Path,
     output: Path,
-    method: str | Method | None = None,
+    choice: Choice,
     *,
-    preset: str | None = None,
-    settings: Settings = (),
-    resume: bool = False,
-    minutes: float | None = None,
-    progress: Progress | None = None,
-    find_points: FindPoints | None = None,
+    resume: bool,
+    progress: Progress,
+    find_points: FindPoints,
 ) -> Trainer:
     """Fit, from the start or from the newest checkpoint, and write the artefacts; a finished run is loaded.
 
-    method: a name, the path of a .toml, or None: the full method, or for images without alpha the one that
-    fits their background too. A `Method` is fitted as it is. preset: "standard" by default. minutes: time
-    that a new fit may take. resume: continue if the folder contains a run; its method, preset, settings and
-    size of images stay, and those that are given have to be the same. find_points: as in `begin`.
+    resume: continue if the folder contains a run; its method, preset, settings and size of images stay, and
+    those of the choice have to be the same. find_points: as in `begin`.
 
     Raises InputError for bad input, BusyError for a run that another process trains, and KeyboardInterrupt or
     TerminatedError with a message that says how to continue.
     """
-    progress = progress or Progress()
-    run = Run(output)
+    run, method, minutes = Run(output), choice.method, choice.minutes
     resumed = resume and run.exists()
-    if isinstance(method, Method) and (preset or settings):
-        raise InputError("method: preset, settings: a Method has its own; change it, or name one")
-    if minutes is not None and not 0 < minutes < math.inf:
-        raise InputError(f"--minutes: {minutes} is no time; give more than 0")
 
     # The method, with the size of images decided.
     if resumed:
         chosen = run.method()
-        _require_same(run, chosen, data, method, preset, settings)
+        _require_same(run, chosen, choice)
         if minutes is not None:
             free = replace(chosen, data=replace(chosen.data, downscale=None))
             _require(run, "--minutes", chosen, planned(free, data, 60 * minutes)[0])
     else:
         run.require_none()
         if not isinstance(method, Method):
-            method = method or default_method(data, preset, settings, progress)
-            method = load_method(method, preset, settings)
+            method = method or default_method(data, choice.preset, choice.settings, progress)
+            method = load_method(method, choice.preset, choice.settings)
         if minutes is not None and method.data.downscale is not None:
             raise InputError(
                 f"--minutes: data.downscale={method.data.downscale} decides the size of images; drop either"
@@ -251,11 +259,10 @@ def default_method(
     return method
 
 
-def _require_same(
-    run: Run, made: Method, data: Path, wanted: str | Method | None, preset: str | None, settings: Settings
-) -> None:
+def _require_same(run: Run, made: Method, choice: Choice) -> None:
     """Raise InputError if what is given for a resumed run would have made another method of it."""
-    changes, file = methods.assignments(settings), made.file
+    wanted, preset, file = choice.method, choice.preset, made.file
+    changes = methods.assignments(choice.settings)
     if isinstance(wanted, Method):
         if wanted.select is not None and wanted.components != made.components:
             wanted = methods.load(wanted.file, wanted.preset, wanted.assignments, made.components)

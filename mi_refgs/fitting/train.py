@@ -22,7 +22,7 @@ from mi_refgs.data.view import View
 from mi_refgs.fitting import exposure
 from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.health import Health
-from mi_refgs.fitting.objective import losses_in_use, objective
+from mi_refgs.fitting.objective import LossInputs, losses_in_use, objective
 from mi_refgs.fitting.state import FitSetup, FitState
 from mi_refgs.fitting.surface import surface_of, update_missing_caches
 from mi_refgs.fitting.targets import Targets, require_memory
@@ -320,7 +320,7 @@ class Trainer:
         view = partial(render, scene, request=request)
         frame = supersampled(view, camera, stage.samples, details=any(loss.maps for loss in asked))
         gain = exposure.log_gain(fit.params, index)
-        loss, self.error = objective(frame, target, self.data, weights, iteration, light, gain)
+        loss, self.error = objective(LossInputs.of(frame, target, self.data, light, gain), weights, iteration)
         self.loss = dr.detach(loss)
         phase("loss backward")(dr.backward)(loss)
         if schedule.light_learns(iteration):

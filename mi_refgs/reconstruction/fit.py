@@ -61,16 +61,9 @@ def fit(
         output = temporary.path
         listener.say(f"{output}: the run, removed with its last Reconstruction; `save` keeps one")
     try:
+        choice = runner.Choice(str(method) if isinstance(method, Path) else method, preset, settings, minutes)
         runner.fit(
-            Path(data),
-            Path(output),
-            str(method) if isinstance(method, Path) else method,
-            preset=preset,
-            settings=settings,
-            resume=resume,
-            minutes=minutes,
-            progress=listener,
-            find_points=with_points,
+            Path(data), Path(output), choice, resume=resume, progress=listener, find_points=with_points
         )
     except KeyboardInterrupt:
         if temporary is not None:

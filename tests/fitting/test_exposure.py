@@ -18,7 +18,7 @@ from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, MAX_GAIN, fitte
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import exposure
 from mi_refgs.fitting.exposure import exif_gains
-from mi_refgs.fitting.objective import GAIN_PRIOR, objective
+from mi_refgs.fitting.objective import GAIN_PRIOR, LossInputs, objective
 from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import EXIF_IFD, srgb_from_linear
@@ -107,7 +107,7 @@ def test_exposure_of_step_and_its_derivative(
     dr.enable_grad(leaves)
     frame = Frame(upload(alpha), upload(alpha), mi.Vector3f(0, 0, 1), mi.Color3f(*planes(radiance)))
     weights = LossWeights(ssim=0, normal=0, alpha=0)
-    loss, _ = objective(frame, target, data, weights, 1, log_gain=leaves)
+    loss, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), weights, 1)
     assert float(loss[0]) == pytest.approx(define(log), abs=3e-6)
     expected = np.array(
         [(define(log + STEP * axis) - define(log - STEP * axis)) / (2 * STEP) for axis in np.eye(3)]
@@ -117,7 +117,7 @@ def test_exposure_of_step_and_its_derivative(
     np.testing.assert_allclose(found, expected, rtol=2e-4)
     for leaf, tangent in zip(leaves, (0.5, -1.0, 2.0), strict=True):
         dr.set_grad(leaf, mi.Float(tangent))
-    moved, _ = objective(frame, target, data, weights, 1, log_gain=leaves)
+    moved, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), weights, 1)
     dr.forward_to(moved)
     assert float(dr.grad(moved)[0]) == pytest.approx(expected @ [0.5, -1.0, 2.0], rel=2e-4)
 

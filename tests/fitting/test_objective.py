@@ -13,7 +13,7 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View, read_dataset
 from mi_refgs.fitting import losses
-from mi_refgs.fitting.objective import objective
+from mi_refgs.fitting.objective import LossInputs, objective
 from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
@@ -62,7 +62,7 @@ def test_perfect_image_costs_nothing(linear: bool, picture: tuple[np.ndarray, np
     """8-bit images are composited as displayed, linear ones before they are encoded; either once."""
     data, target = made(linear, *picture)
     weights = LossWeights(ssim=0.2, normal=0.0, alpha=0.3)
-    loss, error = objective(frame_of(*picture), target, data, weights, 1)
+    loss, error = objective(LossInputs.of(frame_of(*picture), target, data), weights, 1)
     assert abs(float(loss[0])) < 1e-5 and float(error[0]) < 1e-10
 
 
@@ -72,7 +72,7 @@ def test_losses_are_weighed_as_method_says(
     data, target = made(True, *picture)
     radiance, alpha = rng.uniform(0, 0.5, (HEIGHT, WIDTH, 3)), rng.uniform(0, 1, (HEIGHT, WIDTH))
     weights = LossWeights(ssim=0.3, normal=0.0, smooth=0.0, alpha=0.4)
-    loss, error = objective(frame_of(radiance, alpha), target, data, weights, 1)
+    loss, error = objective(LossInputs.of(frame_of(radiance, alpha), target, data), weights, 1)
     shown, goal = (
         np.vectorize(reference.srgb)(x + (1 - a[..., None]) * BACKGROUND)
         for x, a in ((radiance, alpha), picture)
@@ -96,7 +96,7 @@ def test_priors_are_weighed_as_method_says(
 
     def loss(iteration: int = 1, **weights: Any) -> float:
         chosen = LossWeights(ssim=0, normal=0, **weights)
-        return float(objective(frame, target, data, chosen, iteration, light)[0][0])
+        return float(objective(LossInputs.of(frame, target, data, light), chosen, iteration)[0][0])
 
     rest, half = loss(), reference.half_metal(maps["metallic"], alpha)
     assert loss(half_metal=0.3) - rest == pytest.approx(0.3 * half, rel=1e-3)
@@ -118,7 +118,8 @@ def test_weight_of_normals_rises_linearly(data: Path, method: Path) -> None:
     frame = trainer.view(target.camera)
 
     def loss(iteration: int, **weights: Any) -> float:
-        return float(objective(frame, target, views, LossWeights(ssim=0, **weights), iteration)[0][0])
+        inputs = LossInputs.of(frame, target, views)
+        return float(objective(inputs, LossWeights(ssim=0, **weights), iteration)[0][0])
 
     rest, full = loss(1, normal=0), loss(1, normal=0.2)
     assert full - rest > 1e-3

@@ -41,7 +41,8 @@ def table(count: int = 6, scale: float = 0.005, opacity: float = 0.8) -> Surfels
 def densify(
     surfels: Surfels, gradient: np.ndarray, max_count: int = 100, extent: float = 1.0
 ) -> refine.TableEdit:
-    return refine.densify_and_prune(surfels, gradient, extent, OPTIONS, max_count, np.random.default_rng(1))
+    limits, rng = refine.SizeLimits.of(OPTIONS, extent), np.random.default_rng(1)
+    return refine.densify_and_prune(surfels, gradient, limits, OPTIONS, max_count, rng)
 
 
 def test_small_hot_surfels_are_cloned_and_cold_ones_left_alone() -> None:
@@ -99,10 +100,11 @@ def test_sizes_are_shares_of_scene() -> None:
 
 def test_opacities_get_time_to_grow_back_after_reset() -> None:
     surfels = table(opacity=0.02)
-    limits = (np.zeros(6), 1.0, OPTIONS, 100, np.random.default_rng(1))
-    assert len(refine.densify_and_prune(surfels, *limits, prune_transparent=False).parent) == 6
+    waiting = dataclasses.replace(OPTIONS, prune_opacity=0.0)
+    limits, rng = refine.SizeLimits.of(OPTIONS, 1.0), np.random.default_rng(1)
+    assert len(refine.densify_and_prune(surfels, np.zeros(6), limits, waiting, 100, rng).parent) == 6
     with pytest.raises(InputError, match=r"refine\.prune_opacity"):
-        refine.densify_and_prune(surfels, *limits)
+        refine.densify_and_prune(surfels, np.zeros(6), limits, OPTIONS, 100, rng)
 
 
 def test_wait_follows_rate_that_lifts_opacities() -> None:

@@ -311,13 +311,14 @@ def test_children_are_samples_of_their_parent() -> None:
     }
     hot = np.full(count, 1.0)
     options, rng = Refine(prune_extent=1.0), np.random.default_rng(0)
-    edited = refine.densify_and_prune(Surfels.from_numpy(raw), hot, 1.0, options, 4 * count, rng)
+    limits = refine.SizeLimits.of(options, 1.0)
+    edited = refine.densify_and_prune(Surfels.from_numpy(raw), hot, limits, options, 4 * count, rng)
     children = edited.surfels.to_numpy()
     assert len(edited.parent) == 2 * count and edited.fresh.all()
     np.testing.assert_allclose(children["position"].std(axis=0), [0.3, 0.1, 0.05], rtol=0.05)
     np.testing.assert_allclose(np.exp(children["scale"][0]), np.array([0.3, 0.1, 0.05]) / 1.6, rtol=1e-5)
     tiny = Surfels.from_numpy(raw | {"scale": raw["scale"] - 5})
-    cloned = refine.densify_and_prune(tiny, hot, 1.0, options, 4 * count, rng).surfels.to_numpy()
+    cloned = refine.densify_and_prune(tiny, hot, limits, options, 4 * count, rng).surfels.to_numpy()
     assert len(cloned["scale"]) == 2 * count and not cloned["position"].any()
 
 

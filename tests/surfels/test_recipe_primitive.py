@@ -193,7 +193,8 @@ def test_balls_are_splatted_and_differentiated() -> None:
 def test_balls_are_cloned_split_and_written(tmp_path: Path) -> None:
     surfels = balls()
     options, rng = Refine(dense_extent=0.3, prune_extent=10.0), np.random.default_rng(0)
-    edited = refine.densify_and_prune(surfels, np.ones(30), 1.0, options, 90, rng)
+    limits = refine.SizeLimits.of(options, 1.0)
+    edited = refine.densify_and_prune(surfels, np.ones(30), limits, options, 90, rng)
     before, after = surfels.to_numpy(), edited.surfels.to_numpy()
     split = np.exp(before["radius"][edited.parent, 0]) > 0.3
     assert 0 < split.sum() < len(split) == 60
