@@ -6,17 +6,18 @@ import shutil
 import struct
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mi_refgs.data.colmap_model import read_cameras, read_images, read_points
-from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
+from mi_refgs.data.dataset import fitting_downscale, read_dataset
 from mi_refgs.data.lens import Lens
 from mi_refgs.data.region import region_of
-from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, linear_from_srgb, read_png, write_png
+from tests.helpers import refused
 from tests.scenes.dots import COLOURS, POINTS, check
 from tests.scenes.layouts import SHOTS, VALUES, WRITERS, write_binary, write_colmap, write_text
 
@@ -70,12 +71,10 @@ def test_every_lens_model_is_undistorted(model: str, kind: str, tmp_path: Path) 
 @pytest.mark.parametrize("kind", KINDS)
 def test_unsupported_lens_models_are_refused(kind: str, tmp_path: Path) -> None:
     data = write_colmap(tmp_path, kind, SHOTS[:2], camera="FOV", values=(*VALUES, 0.01))
-    with pytest.raises(InputError, match=rf"cameras\.{kind}: camera 7: the lens model .*undistort"):
-        read_dataset(data, "train")
+    refused(lambda: read_dataset(data, "train"), f"cameras.{kind}: camera 7: the lens model", "undistort")
     rational = (*VALUES, 0.1, 0, 0, 0, 0, 0.2, 0, 0)
     WRITERS[kind](data / "sparse/0", SHOTS[:2], "FULL_OPENCV", rational)
-    with pytest.raises(InputError, match=r"b\.png: camera 7: k4, k5, k6: .*undistort"):
-        read_dataset(data, "train")
+    refused(lambda: read_dataset(data, "train"), "b.png: camera 7: k4, k5, k6:", "undistort")
 
 
 def copies(folder: Path, factor: int, ending: str = ".png") -> None:
@@ -120,17 +119,15 @@ def test_colmap_masks_become_alpha(tmp_path: Path) -> None:
     data = write_colmap(tmp_path)
     copies(data, 2)
     (data / "masks").mkdir()
+    mask = np.zeros((72, 96, 3))
+    mask[:, 48:] = 1
     for i, shot in enumerate(SHOTS):
-        mask = np.zeros((72, 96, 3))
-        mask[:, 48:] = 1
-        name = (shot.name + ".png", shot.name)[i % 2]
-        write_png(data / "masks" / name, mask)
+        write_png(data / "masks" / (shot.name + ".png", shot.name)[i % 2], mask)
     view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
     assert view.alpha is not None and view.alpha.sum() == 24 * 36
     assert not view.image[:, :24].any() and view.image[:, 24:].max() > 0.9  # not of the copies
     (data / "masks" / "b.png").unlink()
-    with pytest.raises(InputError, match=r"masks/b\.png\.png: mask: missing"):
-        read_dataset(data, "train")
+    refused(lambda: read_dataset(data, "train"), "masks/b.png.png: mask: missing")
 
 
 def test_unreliable_points_are_left_out(tmp_path: Path) -> None:
@@ -151,28 +148,21 @@ def test_unreliable_points_are_left_out(tmp_path: Path) -> None:
     assert read_dataset(data, "train").points is None
 
 
-def notes(data: Path) -> tuple[str, ...]:
-    found: Dataset = read_dataset(data, "train")
-    return found.notes
-
-
 def test_cameras_and_images_without_each_other_are_noted(tmp_path: Path) -> None:
     data = write_colmap(tmp_path)
     SHOTS[0].write(data / "images/more")
     (data / "images/c.png").unlink()
     (data / "sparse/1").mkdir()
-    assert notes(data) == (
+    found = read_dataset(data, "train")
+    assert len(found.views) == 7 and found.notes == (
         "1 of 9 cameras have no image and are left out",
         "1 of 9 images have no camera and are left out",
         "sparse/1 contains another reconstruction, which is left out",
     )
-    assert len(read_dataset(data, "train").views) == 7
     shutil.rmtree(data / "images")
-    with pytest.raises(InputError, match="images: no such folder"):
-        read_dataset(data, "train")
+    refused(lambda: read_dataset(data, "train"), "images: no such folder")
     (data / "images").mkdir()
-    with pytest.raises(InputError, match=r"images\.bin: none of its 9 images is in .*images; put"):
-        read_dataset(data, "train")
+    refused(lambda: read_dataset(data, "train"), "images.bin: none of its 9 images is in", "images; put")
 
 
 def test_names_outside_of_the_folder_are_refused(tmp_path: Path) -> None:
@@ -180,8 +170,7 @@ def test_names_outside_of_the_folder_are_refused(tmp_path: Path) -> None:
     SHOTS[0].write(tmp_path)
     for name in ("../a.png", str(tmp_path / "a.png"), "."):
         write_binary(data / "sparse/0", [replace(SHOTS[0], name=name), *SHOTS[1:]])
-        with pytest.raises(InputError, match="names no file in images"):
-            read_dataset(data, "test")
+        refused(partial(read_dataset, data, "test"), "names no file in images")
 
 
 @pytest.mark.parametrize(
@@ -201,8 +190,7 @@ def test_names_outside_of_the_folder_are_refused(tmp_path: Path) -> None:
 def test_broken_images_file_is_refused(line: str, said: str, tmp_path: Path) -> None:
     data = write_colmap(tmp_path, "txt")
     (data / "sparse/0/images.txt").write_text(line)
-    with pytest.raises(InputError, match=rf"images\.txt: .*{said}"):
-        read_dataset(data, "test")
+    refused(lambda: read_dataset(data, "test"), "images.txt:", said)
 
 
 @pytest.mark.parametrize(
@@ -212,8 +200,7 @@ def test_broken_images_file_is_refused(line: str, said: str, tmp_path: Path) -> 
 def test_cameras_that_make_no_sense(line: str, tmp_path: Path) -> None:
     data = write_colmap(tmp_path, "txt")
     (data / "sparse/0/cameras.txt").write_text(line)
-    with pytest.raises(InputError, match=r"cameras\.txt: "):
-        read_dataset(data, "test")
+    refused(lambda: read_dataset(data, "test"), "cameras.txt:")
 
 
 def test_region_of_both_splits_is_that_of_the_training_cameras(tmp_path: Path) -> None:
@@ -231,16 +218,16 @@ def test_impossible_focal_length_is_refused(tmp_path: Path) -> None:
     data = write_colmap(tmp_path, "txt")
     for focal in ("1e-30", "1e-10"):
         (data / "sparse/0/cameras.txt").write_text(f"7 PINHOLE 96 72 {focal} 104 50 34")
-        with pytest.raises(InputError, match=r"images\.txt: .*camera 7: focal length: .* out of range"):
-            read_dataset(data, "train")
+        refused(
+            partial(read_dataset, data, "train"), "images.txt: ", "camera 7: focal length: ", "out of range"
+        )
 
 
 def test_image_of_other_aspect_ratio_is_refused(tmp_path: Path) -> None:
     """As turned upright by its EXIF data, after COLMAP saw it."""
     data = write_colmap(tmp_path)
     replace(SHOTS[1], width=72, height=96).write(data / "images")
-    with pytest.raises(InputError, match=r"b\.png: size: 72 × 96 pixels are no copy of 96 × 72"):
-        read_dataset(data, "train")
+    refused(lambda: read_dataset(data, "train"), "b.png: size: 72 × 96 pixels are no copy of 96 × 72")
 
 
 def test_truncated_binary_files_are_refused(tmp_path: Path) -> None:
@@ -251,15 +238,12 @@ def test_truncated_binary_files_are_refused(tmp_path: Path) -> None:
         whole = path.read_bytes()
         for length in range(len(whole)):
             path.write_bytes(whole[:length])
-            with pytest.raises(InputError, match=rf"{name}\.bin: COLMAP: broken"):
-                read(path)
+            refused(partial(read, path), f"{name}.bin: COLMAP: broken")
         path.write_bytes(whole + b"\0")
-        with pytest.raises(InputError, match="1 bytes follow the last record"):
-            read(path)
+        refused(partial(read, path), "1 bytes follow the last record")
         path.write_bytes(struct.pack("<Q", 2**63) + whole[8:])
         began = time.process_time()
-        with pytest.raises(InputError, match="are more than the file contains"):
-            read(path)
+        refused(partial(read, path), "are more than the file contains")
         assert time.process_time() - began < 1
         path.write_bytes(whole)
 
@@ -272,9 +256,8 @@ def test_files_written_by_colmap_are_read(tmp_path: Path) -> None:
     images = (tmp_path / "a/images.txt").read_text().replace("1.5 2.5 3 10.0 20.0 -1", "")
     (tmp_path / "a/images.txt").write_text(images)
     points = (tmp_path / "a/points3D.txt").read_text().replace(" 1 0 2 0 3", "")
-    (tmp_path / "a/points3D.txt").write_text(
-        "\n".join(line[: line.find("0.5 ") + 3] for line in points.splitlines())
-    )
+    lines = [line[: line.find("0.5 ") + 3] for line in points.splitlines()]
+    (tmp_path / "a/points3D.txt").write_text("\n".join(lines))
     pycolmap.Reconstruction(str(tmp_path / "a")).write_binary(str(tmp_path / "b"))
     assert read_cameras(tmp_path / "a/cameras.txt") == read_cameras(tmp_path / "b/cameras.bin")
     ours, theirs = read_images(tmp_path / "a/images.txt"), read_images(tmp_path / "b/images.bin")

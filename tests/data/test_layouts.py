@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,8 @@ from PIL import Image
 from mi_refgs.data.array_pickle import read_arrays
 from mi_refgs.data.dataset import fitting_downscale, read_dataset
 from mi_refgs.data.lens import Lens
-from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, linear_from_srgb, read_png, write_png
+from tests.helpers import refused
 from tests.scenes.dots import COLOURS, POINTS, check
 from tests.scenes.layouts import SHOTS, change_transforms, write_glossy, write_llff, write_nerfstudio
 
@@ -41,10 +42,8 @@ def write_ply(path: Path, kind: str) -> None:
     head = "element vertex 9\n" + "".join(f"property double {c}\n" for c in "xyz")
     head += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
     if kind == "ascii":
-        rows = "".join(
-            f"{' '.join(map(repr, p.tolist()))} {' '.join(map(str, c))}\n"
-            for p, c in zip(POINTS, COLOURS, strict=True)
-        ).encode()
+        lines = zip(POINTS.tolist(), COLOURS.tolist(), strict=True)
+        rows = "".join(f"{' '.join(map(str, (*p, *c)))}\n" for p, c in lines).encode()
     else:
         table = np.zeros(9, dtype=[("p", "<f8", 3), ("c", "u1", 3)])
         table["p"], table["c"] = POINTS, COLOURS
@@ -67,11 +66,10 @@ def test_ply_file_path_gives_points(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("../a.ply", "ply_file_path: .* names no file"), ("no.ply", "missing"), (3, "names no file")],
+    [("../a.ply", "ply_file_path: '../a.ply' names no file"), ("no.ply", "missing"), (3, "names no file")],
 )
 def test_missing_ply_file_is_refused(name: Any, said: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=said):
-        read_dataset(write_nerfstudio(tmp_path, ply_file_path=name), "train")
+    refused(lambda: read_dataset(write_nerfstudio(tmp_path, ply_file_path=name), "train"), said)
 
 
 def test_mask_path_becomes_alpha(tmp_path: Path) -> None:
@@ -94,11 +92,9 @@ def test_filenames_define_splits(tmp_path: Path) -> None:
     change_transforms(data, lambda content: content.update(train_filenames=["images/a.png", "images/b.png"]))
     assert [v.name for v in read_dataset(data, "train").views] == ["images/a", "images/b"]
     change_transforms(data, lambda content: content.update(test_filenames=["images/no.png"]))
-    with pytest.raises(InputError, match="zero test views"):
-        read_dataset(data, "test")
+    refused(lambda: read_dataset(data, "test"), "zero test views")
     change_transforms(data, lambda content: content.update(test_filenames=[3]))
-    with pytest.raises(InputError, match="test_filenames: not a list of paths"):
-        read_dataset(data, "test")
+    refused(lambda: read_dataset(data, "test"), "test_filenames: not a list of paths")
 
 
 @pytest.mark.parametrize("name", ["a.PNG", "a.Png", "a.JPG", "a.jpeg", "a.b.JPEG", "a"])
@@ -109,11 +105,9 @@ def test_file_path_matches_any_ending(name: str, written: bool, tmp_path: Path) 
     stem = name.rpartition(".")[0] or name
     (data / "images/b.png").rename(data / "images" / (name if name != stem else f"{stem}.jpg"))
     named = f"images/{stem}.png" if written else f"images/{stem}"
-    change_transforms(data, lambda content: content["frames"][1].update(file_path=named))
     (data / "images/a.png").unlink(missing_ok=True)
-    change_transforms(
-        data, lambda content: content.update(frames=[content["frames"][2], content["frames"][1]])
-    )
+    change_transforms(data, lambda content: content["frames"][1].update(file_path=named))
+    change_transforms(data, lambda content: content.update(frames=content["frames"][2:0:-1]))
     [view] = read_dataset(data, "test" if named < "images/c.png" else "train").views
     check(view, SHOTS[1])
 
@@ -137,9 +131,8 @@ def shiny(folder: Path, alpha: bool = True) -> Path:
         write_png(folder / "test/r_0_alpha.png", np.repeat(inside[..., None], 3, axis=-1))
     frame = {"file_path": "test/r_0", "transform_matrix": SHOTS[0].camera_to_world.tolist()}
     for split in ("train", "test"):
-        (folder / f"transforms_{split}.json").write_text(
-            json.dumps({"camera_angle_x": 0.7, "frames": [frame]})
-        )
+        content = json.dumps({"camera_angle_x": 0.7, "frames": [frame]})
+        (folder / f"transforms_{split}.json").write_text(content)
     return folder
 
 
@@ -170,14 +163,11 @@ def test_shiny_blender_disparity_formats(tmp_path: Path) -> None:
     depth = read_dataset(data, "test").views[0].depth
     assert depth is not None and depth[3, 3] == pytest.approx(3, abs=1e-3)
     Image.fromarray(np.full((20, 32), 65535 // 4, dtype=np.uint16)).save(file)
-    with pytest.raises(InputError, match=r"r_0_disp\.tiff: size: 32 × 20 pixels"):
-        read_dataset(data, "test")
+    refused(lambda: read_dataset(data, "test"), "r_0_disp.tiff: size: 32 × 20 pixels")
     Image.fromarray(np.zeros((24, 32, 3), dtype=np.uint8)).save(file)
-    with pytest.raises(InputError, match=r"r_0_disp\.tiff: pixels: not one channel"):
-        read_dataset(data, "test")
+    refused(lambda: read_dataset(data, "test"), "r_0_disp.tiff: pixels: not one channel")
     file.write_bytes(b"II*\0")
-    with pytest.raises(InputError, match=r"r_0_disp\.tiff: pixels: not a readable image"):
-        read_dataset(data, "test")
+    refused(lambda: read_dataset(data, "test"), "r_0_disp.tiff: pixels: not a readable image")
 
 
 # ---------------- LLFF ----------------
@@ -185,9 +175,7 @@ def test_shiny_blender_disparity_formats(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("factor", [1, 4])
 def test_llff_cameras_project_points_onto_images(factor: int, tmp_path: Path) -> None:
-    data = write_llff(
-        tmp_path, factor
-    )  # focal lengths are those of the original images, however small these are
+    data = write_llff(tmp_path, factor)  # focal lengths are those of the original images, however large
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
     assert (len(train.views), [view.name for view in test.views]) == (7, ["a.png", "i.png"])
     for view in train.views:
@@ -215,43 +203,33 @@ def test_llff_masks_become_alpha(tmp_path: Path) -> None:
     assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
     assert not view.image[:18].any() and view.image[18:].any()
     (data / "masks/c.png").unlink()
-    with pytest.raises(InputError, match=r"masks/c\.png\.png: mask: missing"):
-        read_dataset(data, "train")
-
-
-def saved(folder: Path, array: Any) -> None:
-    np.save(folder / "poses_bounds.npy", array, allow_pickle=True)
+    refused(lambda: read_dataset(data, "train"), "masks/c.png.png: mask: missing")
 
 
 def test_broken_llff_poses_are_refused(tmp_path: Path) -> None:
     data = write_llff(tmp_path)
-    good = np.load(data / "poses_bounds.npy")
     path = data / "poses_bounds.npy"
-    whole = path.read_bytes()
+    good, whole = np.load(path), path.read_bytes()
     for length in range(0, len(whole), 7):
         path.write_bytes(whole[:length])
-        with pytest.raises(InputError, match=r"poses_bounds\.npy: NumPy"):
-            read_dataset(data, "train")
+        refused(partial(read_dataset, data, "train"), "poses_bounds.npy: NumPy")
     path.write_bytes(whole.replace(b"(9, 17)", b"(10000000000, 17)").replace(b" " * 10, b"", 1))
-    with pytest.raises(InputError, match=r"poses_bounds\.npy: NumPy"):
-        read_dataset(data, "train")
+    refused(lambda: read_dataset(data, "train"), "poses_bounds.npy: NumPy")
     infinite, sheared, flat = good.copy(), good.copy(), good.copy()
     infinite[3, 2], sheared[1, 0], flat[1, 14] = np.inf, 7, 0
     for array, said in (
         (np.array([Code()], dtype=object), "NumPy: cannot be read"),
-        (good[:, :15], r"shape \(9, 15\)"),
+        (good[:, :15], "shape (9, 15)"),
         (good[:8], "8 cameras, but images has 9 images"),
         (infinite, "infinite"),
-        (sheared, r"b\.png: not a rotation"),
-        (flat, r"b\.png: height, width and focal length"),
+        (sheared, "b.png: not a rotation"),
+        (flat, "b.png: height, width and focal length"),
     ):
-        saved(data, array)
-        with pytest.raises(InputError, match=said):
-            read_dataset(data, "train")
+        np.save(path, array, allow_pickle=True)
+        refused(partial(read_dataset, data, "train"), said)
     with path.open("wb") as file:
         np.savez(file, good)
-    with pytest.raises(InputError, match=r"poses_bounds\.npy: NumPy: cannot be read"):
-        read_dataset(data, "train")
+    refused(lambda: read_dataset(data, "train"), "poses_bounds.npy: NumPy: cannot be read")
 
 
 class Code:
@@ -268,9 +246,7 @@ class Code:
 def test_glossy_synthetic_is_read(protocol: int, tmp_path: Path) -> None:
     data = write_glossy(tmp_path, protocol)
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
-    assert ([v.name for v in train.views], [v.name for v in test.views]) == (
-        [*"1234567"], ["0", "8"],
-    )  # fmt: skip
+    assert [v.name for v in train.views] == [*"1234567"] and [v.name for v in test.views] == ["0", "8"]
     view = test.views[0].load()
     assert view.alpha is not None and view.depth is not None
     expected = np.repeat([[0.0] * 32 + [1.0] * 32 + [0.0] * 32], 72, axis=0)
@@ -336,14 +312,12 @@ def test_hostile_pickles_are_refused(tmp_path: Path) -> None:
         "empty": b"",
     }
     for name, data in hostile.items():
+        print(name)
         path.write_bytes(data)
-        with pytest.raises(InputError, match=r"0-camera\.pkl: pickle: no list of arrays") as caught:
-            print(name, read_arrays(path))
-        assert not isinstance(caught.value.__cause__, MemoryError)
+        refused(partial(read_arrays, path), "0-camera.pkl: pickle: no list of arrays")
     for length in range(len(good)):
         path.write_bytes(good[:length])
-        with pytest.raises(InputError):
-            read_arrays(path)
+        refused(partial(read_arrays, path))
 
 
 def test_pickle_cannot_change_numpy(tmp_path: Path) -> None:
@@ -351,8 +325,7 @@ def test_pickle_cannot_change_numpy(tmp_path: Path) -> None:
     path = tmp_path / "0-camera.pkl"
     path.write_bytes(b"cnumpy\nndarray\n}(Vshape\nI1\nsb.")  # sets attributes of a class
     shape = np.ndarray.shape
-    with pytest.raises(InputError):
-        read_arrays(path)
+    refused(lambda: read_arrays(path))
     assert np.ndarray.shape is shape
 
 
@@ -370,16 +343,13 @@ def test_pickle_cannot_change_numpy(tmp_path: Path) -> None:
 def test_cameras_that_make_no_sense(pose: Any, matrix: Any, said: str, tmp_path: Path) -> None:
     data = write_glossy(tmp_path)
     (data / "1-camera.pkl").write_bytes(pickle.dumps([pose, matrix]))
-    with pytest.raises(InputError, match=rf"1-camera\.pkl: .*{said}"):
-        read_dataset(data, "train")
+    refused(lambda: read_dataset(data, "train"), "1-camera.pkl:", said)
     (data / "0-depth.png").unlink()
-    with pytest.raises(InputError, match=r"0-depth\.png: file: missing"):
-        read_dataset(data, "test")
+    refused(lambda: read_dataset(data, "test"), "0-depth.png: file: missing")
 
 
 def test_glossy_without_training_views_is_refused(tmp_path: Path) -> None:
     data = write_glossy(tmp_path)
     for i in range(1, 9):
         (data / f"{i}-camera.pkl").unlink()
-    with pytest.raises(InputError, match="zero train views"):
-        read_dataset(data, "train")
+    refused(lambda: read_dataset(data, "train"), "zero train views")

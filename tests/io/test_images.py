@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
 
-from mi_refgs.errors import InputError
 from mi_refgs.io.exr import read_exr, read_exr_image, write_exr
 from mi_refgs.io.files import replace_file, write_bytes
 from mi_refgs.io.images import image_size, linear_from_srgb, srgb_from_linear, write_png
-from tests.helpers import run_python
+from tests.helpers import refused, run_python
 
 
 def test_srgb_curve() -> None:
@@ -28,20 +28,17 @@ def test_exr_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
     image = rng.normal(size=(5, 7, 3)).astype(np.float32)
     write_exr(tmp_path / "a.exr", image, names="XYZ")
     np.testing.assert_array_equal(read_exr_image(tmp_path / "a.exr", vectors=True), image)
-    with pytest.raises(InputError, match=r"a\.exr: channels: found X, Y, Z; export R, G, B"):
-        read_exr_image(tmp_path / "a.exr")
+    refused(lambda: read_exr_image(tmp_path / "a.exr"), "a.exr: channels: found X, Y, Z; export R, G, B")
     write_exr(tmp_path / "a.exr", image[..., 0], half=True)
     np.testing.assert_allclose(read_exr(tmp_path / "a.exr")["Y"], image[..., 0], rtol=1e-3)
     write_exr(tmp_path / "b.exr", image[..., :2], names="UV")
-    with pytest.raises(InputError, match="channels: found U, V"):
-        read_exr_image(tmp_path / "b.exr")
+    refused(lambda: read_exr_image(tmp_path / "b.exr"), "channels: found U, V")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "b.exr"]
 
 
 def test_unwritable_output(tmp_path: Path) -> None:
     for write_file, name in ((write_png, "none/a.png"), (write_exr, "none/a.exr")):
-        with pytest.raises(InputError, match=r"none/a.*writable"):
-            write_file(tmp_path / name, np.zeros((2, 2, 3)))
+        refused(partial(write_file, tmp_path / name, np.zeros((2, 2, 3))), "none/a", "writable")
 
 
 def test_colours_in_other_primaries_are_refused(tmp_path: Path) -> None:
@@ -54,8 +51,7 @@ def test_colours_in_other_primaries_are_refused(tmp_path: Path) -> None:
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         OpenEXR.File(header | {"chromaticities": chromaticities}, planes).write(str(tmp_path / f"{name}.exr"))
     assert read_exr_image(tmp_path / "srgb.exr").shape == (2, 4, 3)
-    with pytest.raises(InputError, match=r"ap1\.exr: chromaticities: .* convert"):
-        read_exr_image(tmp_path / "ap1.exr")
+    refused(lambda: read_exr_image(tmp_path / "ap1.exr"), "ap1.exr: chromaticities:", "convert")
 
 
 def test_exr_of_several_parts_or_deep_pixels_is_refused(tmp_path: Path) -> None:
@@ -67,8 +63,7 @@ def test_exr_of_several_parts_or_deep_pixels_is_refused(tmp_path: Path) -> None:
     header |= {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
     OpenEXR.File(header, deep).write(str(tmp_path / "deep.exr"))
     for name in ("parts.exr", "deep.exr"):
-        with pytest.raises(InputError, match=rf"{name}: header: .*several parts, or deep pixels"):
-            image_size(tmp_path / name)
+        refused(partial(image_size, tmp_path / name), f"{name}: header:", "several parts, or deep pixels")
 
 
 def test_files_are_written_atomically(tmp_path: Path) -> None:
@@ -90,8 +85,7 @@ def test_files_are_written_atomically(tmp_path: Path) -> None:
     assert path.read_bytes() == b"new" and os.listdir(tmp_path) == ["a.txt"]
     # Not even removing the temporary file may hide the reason: neither below a file, nor in a lost folder.
     for place in (path / "b.txt", tmp_path / "none" / "b.txt"):
-        with pytest.raises(InputError, match=r"b\.txt: output: cannot be written \(.*\); choose a writable"):
-            write_bytes(place, b"")
+        refused(partial(write_bytes, place, b""), "b.txt: output: cannot be written (", "; choose a writable")
 
 
 ONE_THREAD = """

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from mi_refgs.errors import InputError
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import refused
 
 GEOMETRY = ["x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
 
@@ -30,9 +31,8 @@ def write_file(
     header = f"ply\nformat {kind} 1.0\ncomment by hand\nelement vertex {count}\n"
     header += "".join(f"property {names[dtype]} {name}\n" for name in columns) + "end_header\n"
     if kind == "ascii":
-        body = "".join(
-            " ".join(repr(float(c[i])) for c in columns.values()) + "\n" for i in range(count)
-        ).encode()
+        lines = zip(*(c.tolist() for c in columns.values()), strict=True)
+        body = "".join(" ".join(map(repr, line)) + "\n" for line in lines).encode()
     else:
         order = "<" if "little" in kind else ">"
         rows = np.zeros(count, dtype=[(name, order + dtype) for name in columns])
@@ -67,19 +67,8 @@ def test_layout_is_that_of_2dgs(tmp_path: Path, rng: np.random.Generator) -> Non
     write_ply(tmp_path / "a.ply", surfels)
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
     names = [line.split()[2] for line in header if line.startswith("property")]
-    start = [
-        "x",
-        "y",
-        "z",
-        "nx",
-        "ny",
-        "nz",
-        "f_dc_0",
-        "f_dc_1",
-        "f_dc_2",
-        *(f"f_rest_{i}" for i in range(45)),
-    ]
-    start += ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
+    start = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    start += [*(f"f_rest_{i}" for i in range(45)), *GEOMETRY[3:]]
     assert names[: len(start)] == start
     assert names[len(start) :][:5] == ["albedo_0", "albedo_1", "albedo_2", "metallic", "roughness"]
     data = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
@@ -92,15 +81,8 @@ def test_layout_is_that_of_2dgs(tmp_path: Path, rng: np.random.Generator) -> Non
     np.testing.assert_array_equal(data["ind_rest_44"].ravel(), raw["indirect_sh"][:, 3 * 15 + 2])
 
 
-@pytest.mark.parametrize(
-    ("kind", "dtype"),
-    [
-        ("binary_little_endian", "f4"),
-        ("binary_little_endian", "f8"),
-        ("binary_big_endian", "f4"),
-        ("ascii", "f4"),
-    ],
-)
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+@pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
 def test_ply_of_other_programs_is_read(
     kind: str, dtype: str, tmp_path: Path, rng: np.random.Generator
 ) -> None:
@@ -127,16 +109,15 @@ def test_3dgs_file_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
     written, read = ((tmp_path / name).read_bytes() for name in ("again.ply", "3dgs.ply"))
     assert written[written.index(b"element") :] == read[read.index(b"element") :]
     del columns["scale_1"]
-    with pytest.raises(InputError, match=r"scale_1: the property is missing"):
-        read_ply(write_file(tmp_path / "a.ply", columns))
+    refused(lambda: read_ply(write_file(tmp_path / "a.ply", columns)), "scale_1: the property is missing")
 
 
 @pytest.mark.parametrize("missing", GEOMETRY)
 def test_missing_property_is_named(missing: str, tmp_path: Path, rng: np.random.Generator) -> None:
     columns = geometry(rng)
     del columns[missing]
-    with pytest.raises(InputError, match=rf"a\.ply: {missing}: the property is missing; export"):
-        read_ply(write_file(tmp_path / "a.ply", columns))
+    path = write_file(tmp_path / "a.ply", columns)
+    refused(lambda: read_ply(path), f"a.ply: {missing}: the property is missing; export")
 
 
 @pytest.mark.parametrize(
@@ -144,25 +125,23 @@ def test_missing_property_is_named(missing: str, tmp_path: Path, rng: np.random.
     [
         ({"albedo_0": 0, "albedo_2": 0}, "albedo_1: the property is missing"),
         ({"f_dc_0": 0, "f_dc_1": 0}, "f_dc_2: the property is missing"),
-        ({"ind_rest_0": 0}, r"ind_rest_\*: 1 properties; use 0, 9, 24 or 45"),
+        ({"ind_rest_0": 0}, "ind_rest_*: 1 properties; use 0, 9, 24 or 45"),
     ],
 )
 def test_partial_groups_are_refused(
     extra: dict[str, int], message: str, tmp_path: Path, rng: np.random.Generator
 ) -> None:
     columns = geometry(rng) | {name: np.zeros(4) for name in extra}
-    with pytest.raises(InputError, match=rf"a\.ply: {message}"):
-        read_ply(write_file(tmp_path / "a.ply", columns))
+    refused(lambda: read_ply(write_file(tmp_path / "a.ply", columns)), f"a.ply: {message}")
 
 
 def test_non_finite_values_are_counted(tmp_path: Path, rng: np.random.Generator) -> None:
     columns = geometry(rng)
     columns["opacity"][1:3] = np.nan, np.inf
-    with pytest.raises(InputError, match=r"a\.ply: opacity: 2 values are NaN or infinite; remove"):
-        read_ply(write_file(tmp_path / "a.ply", columns))
+    path = write_file(tmp_path / "a.ply", columns)
+    refused(lambda: read_ply(path), "a.ply: opacity: 2 values are NaN or infinite; remove")
     columns["opacity"] = np.full(4, 1e300)
-    with pytest.raises(InputError, match="opacity: 4 values"):
-        read_ply(write_file(tmp_path / "a.ply", columns, dtype="f8"))
+    refused(lambda: read_ply(write_file(tmp_path / "a.ply", columns, dtype="f8")), "opacity: 4 values")
 
 
 def test_broken_files_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -175,34 +154,26 @@ def test_broken_files_are_refused(tmp_path: Path, rng: np.random.Generator) -> N
         (whole[:60], "no end_header; the file is truncated"),
         (b"", "not a PLY file"),
         (b"\x89PNG\r\n", "not a PLY file"),
-        (text[:-30], "row 3 is broken|rows are more than"),
+        (text[:-30], "vertex: "),
         (text.replace(text.split()[-1], b"zero"), "row 3 is broken"),
         (whole.replace(b"format binary_little_endian", b"format pdp_endian"), "no format or no element"),
         (face_first + bytes(8), "face: the vertices must come first"),
-        (
-            whole.replace(b"property float scale_1", b"property list uchar int scale_1"),
-            "scale_1: not a number property",
-        ),
+        (whole.replace(b"float scale_1", b"list uchar int scale_1"), "scale_1: not a number property"),
         (whole.replace(b"float scale_1", b"float scale_0"), "a property of vertex occurs twice"),
     ]:
         path.write_bytes(data)
-        with pytest.raises(InputError, match=message):
-            read_ply(path)
-    with pytest.raises(InputError, match=r"gone\.ply: file: cannot be read"):
-        read_ply(tmp_path / "gone.ply")
+        refused(partial(read_ply, path), message)
+    refused(lambda: read_ply(tmp_path / "gone.ply"), "gone.ply: file: cannot be read")
 
 
 def test_unwritable_output_and_bad_values_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
     surfels = table(3, rng)
-    with pytest.raises(InputError, match="output: cannot be written"):
-        write_ply(tmp_path / "missing" / "a.ply", surfels)
+    refused(lambda: write_ply(tmp_path / "missing" / "a.ply", surfels), "output: cannot be written")
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="output: cannot be written"):
-        write_ply(tmp_path / "file" / "a.ply", surfels)
+    refused(lambda: write_ply(tmp_path / "file" / "a.ply", surfels), "output: cannot be written")
     write_ply(tmp_path / "a.ply", surfels)
     before = (tmp_path / "a.ply").read_bytes()
     raw = surfels.to_numpy()
     raw["albedo"] = np.full((3, 3), np.nan)
-    with pytest.raises(InputError, match="albedo: 9 values are NaN"):
-        write_ply(tmp_path / "a.ply", Surfels.from_numpy(raw))
+    refused(lambda: write_ply(tmp_path / "a.ply", Surfels.from_numpy(raw)), "albedo: 9 values are NaN")
     assert (tmp_path / "a.ply").read_bytes() == before
