@@ -75,7 +75,7 @@ class Train:
         data: dict[str, Any] = {
             "run": str(self.output),
             "method": trainer.method.name,
-            "variant": trainer.method.name,
+            "variant": trainer.method.name,  # name of this key in version 0.1
             "preset": trainer.method.preset,
             "iterations": trainer.iteration,
             "seconds": round(trainer.seconds, 3),
@@ -92,6 +92,7 @@ class Train:
             f"{trainer.surfels.count} surfels; next: refgs eval {self.output}"
         )
         if trainer.decisions:
-            data |= {"terms": list(trainer.method.components), "decisions": trainer.decisions}
+            data["terms"] = list(trainer.method.components)  # name of this key in version 0.1
+            data["decisions"] = trainer.decisions
             text = f"{table(trainer.decisions)}\n{text}"
         return Result(data, text)

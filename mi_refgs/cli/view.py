@@ -60,4 +60,5 @@ class View:
         finally:
             page.close()
         shown = page.loop.delivered
-        return Result({"url": page.url, "pictures": shown}, f"{shown} images displayed")
+        data = {"url": page.url, "pictures": shown}  # name of this key in version 0.1
+        return Result(data, f"{shown} images displayed")

@@ -32,7 +32,9 @@ class Job:
 
     folder: str  # of the run, absolute
     data: str  # folder of the data set, absolute
-    variant: str  # a shipped method's name or the absolute path of a .toml
+    variant: (
+        str  # the method, in job.json by this name: a shipped method's name or the absolute path of a .toml
+    )
     seed: int
     preset: str
     settings: tuple[str, ...]  # key=value
@@ -49,9 +51,9 @@ class Job:
         """Data set, method and seed as text."""
         return f"{Path(self.data).name} × {Path(self.variant).stem} × seed {self.seed}"
 
-    def method(self, terms: Sequence[str] = ()) -> Method:
+    def method(self, components: Sequence[str] = ()) -> Method:
         """Load the method with these optional components; raises InputError as `load` and `sized` do."""
-        method = load(self.variant, self.preset, [*self.settings, f"seed={self.seed}"], terms)
+        method = load(self.variant, self.preset, [*self.settings, f"seed={self.seed}"], components)
         return sized(method, Path(self.data))
 
     def write(self) -> None:

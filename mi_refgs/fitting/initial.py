@@ -221,7 +221,7 @@ def initial_surfels(
         normals = init.random_normals(options.count, rng)
         colours = hull.median_colours(points, views, behind)
     order = morton_order(points)
-    if "albedo" in options.from_pictures and method.light is not None:
+    if "albedo" in options.from_images and method.light is not None:
         # The hue only: brightness is left to the light until it has been estimated.
         brightest = colours[order].max(axis=1, keepdims=True)
         hue = np.where(brightest > 0, colours[order] / np.maximum(brightest, 1e-9), 1)

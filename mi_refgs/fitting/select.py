@@ -113,7 +113,7 @@ class ComponentTrial:
 class Decision:
     """Decision about one component, tried or not."""
 
-    term: str
+    term: str  # the component; in checkpoints and decisions.json by this name
     iteration: int
     stays: bool
     reason: str

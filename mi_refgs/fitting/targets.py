@@ -87,7 +87,7 @@ class Targets:
         self.data, self.options, self.budget = data, options, budget
         self._kept: OrderedDict[tuple[int, int], Target] = OrderedDict()
         self._bytes = 0
-        blocks = {1, *(pictures.block for pictures in options.coarse)}
+        blocks = {1, *(images.block for images in options.coarse)}
         pixels = sum(view.width * view.height for view in data.views)
         if sum(PIXEL_BYTES * pixels // block**2 for block in blocks) <= budget:
             for block in blocks:

@@ -52,7 +52,7 @@ class SurfelOptions:
     degree: dict[str, int] = field(default_factory=dict)  # SH degree by attribute; else 3
     sh_raise: Window = AT_ONCE  # one SH degree of radiance_sh more at each event
     initial: dict[str, float] = field(default_factory=dict)  # activated, by attribute; else its own default
-    from_pictures: tuple[Literal["albedo"], ...] = ()  # attributes that start with the hue of the images
+    from_images: tuple[Literal["albedo"], ...] = ()  # attributes that start with the hue of the images
 
     def degree_of(self, name: str) -> int:
         """SH degree of an attribute."""
@@ -251,7 +251,7 @@ class ExposureOptions:
 
 
 @dataclass(frozen=True)
-class CoarsePictures:
+class CoarseImages:
     """Downscaled images for the iterations up to `until`; the table that ends first applies."""
 
     until: int = field(metadata=ITERATIONS)  # iterations
@@ -265,7 +265,7 @@ class DataOptions:
     images: Literal["png", "exr"] = "png"
     background: Literal["white", "black"] = "white"
     downscale: int | None = None  # pixels of a file per pixel, along a side; absent: as the preset allows
-    coarse: tuple[CoarsePictures, ...] = ()
+    coarse: tuple[CoarseImages, ...] = ()
 
     def block_at(self, iteration: int) -> int:
         """Pixels along a side that a (1-based) iteration averages into one; 1: full resolution."""

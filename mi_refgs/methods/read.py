@@ -29,7 +29,12 @@ from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE
 MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
 
-RENAMED = {"select.term": "select.component", "terms": "components", "variant": "name"}
+RENAMED = {
+    "select.term": "select.component",
+    "surfels.from_pictures": "surfels.from_images",
+    "terms": "components",
+    "variant": "name",
+}
 """Keys of version 0.1 → what they are called now; files may have either."""
 
 
@@ -355,7 +360,7 @@ def _require_known_names(method: Method, attributes: set[str], where: str) -> No
         ("surfels.channels", surfels.channels, {name for name, x in ATTRIBUTES.items() if not x.geometry}),
         ("surfels.initial", surfels.initial, attributes),
         ("surfels.degree", surfels.degree, harmonics),
-        ("surfels.from_pictures", surfels.from_pictures, {*surfels.channels}),
+        ("surfels.from_images", surfels.from_images, {*surfels.channels}),
         ("rates.channel", rates.channel, {*ATTRIBUTES}),
         ("rates.rest", rates.rest, harmonics),
         ("refine.reset_raise", method.refine.reset_raise, bounded),

@@ -41,7 +41,7 @@ class NewLight:
     def __post_init__(self) -> None:
         """Raise InputError for a missing file, or a number out of range."""
         require_file(self.path)
-        _require_range(f"{self.path}: --rotate, --exposure", self.rotate, self.exposure)
+        _require_range(f"{self.path}: --", "azimuth", self.rotate, self.exposure)
 
     @property
     def suffix(self) -> str:
@@ -60,10 +60,14 @@ class NewLight:
         return world_light(read_radiance(self.path, READ_ROWS), self.world, self.rotate, self.exposure)
 
 
-def _require_range(name: str, rotate: float, exposure: float) -> None:
-    if not (np.isfinite(rotate) and abs(exposure) <= EXPOSURE_MAX):
-        allowed = f"give degrees, and stops from {-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
-        raise InputError(f"{name}: {rotate}, {exposure} are out of range; {allowed}")
+def _require_range(where: str, angle: str, rotate: float, exposure: float) -> None:
+    """Raise InputError for a number out of range; `angle` is what the user calls the rotation."""
+    if not np.isfinite(rotate):
+        raise InputError(f"{where}{angle}: {rotate} is out of range; give degrees")
+    if not abs(exposure) <= EXPOSURE_MAX:
+        raise InputError(
+            f"{where}exposure: {exposure} is out of range; give stops from {-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
+        )
 
 
 def world_light(
@@ -73,7 +77,7 @@ def world_light(
 
     Raises InputError for an array that is no such map, and for a number out of range.
     """
-    _require_range("light: rotate, exposure", rotate, exposure)
+    _require_range("light: ", "rotate", rotate, exposure)
     radiance = np.ascontiguousarray(radiance, dtype=np.float32)
     if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape) < 2:
         raise InputError(f"light: {radiance.shape} is no lat-long map; give linear radiance (h, w, 3)")

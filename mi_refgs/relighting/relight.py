@@ -139,7 +139,7 @@ def relight(
         "light": str(light.path),
         "rotate": light.rotate,
         "exposure": light.exposure,
-        "pictures": images,
+        "pictures": images,  # name of this key in version 0.1
         "samples": samples_per_axis(samples) ** 2,
         "psnr": None,
         "psnr_scaled": None,

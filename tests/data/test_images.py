@@ -18,7 +18,7 @@ from mi_refgs.data.survey import survey
 from mi_refgs.fitting.targets import PIXEL_BYTES, Target, Targets
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.images import box_downscale, read_bytes, read_grey, read_png, write_png
-from mi_refgs.methods.method import CoarsePictures, DataOptions
+from mi_refgs.methods.method import CoarseImages, DataOptions
 from tests.helpers import ROOT, refused, run_python
 from tests.scenes.highlight import ball
 from tests.scenes.tiny import write_data
@@ -324,7 +324,7 @@ def test_memory_is_bounded(tmp_path: Path, rng: np.random.Generator) -> None:
 def test_targets_are_uploaded_at_once_or_when_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both are equal and of the resolution of the iteration; the most recently used ones are kept."""
     data = ball(24, 5)
-    options = DataOptions(coarse=(CoarsePictures(until=3, block=2),))
+    options = DataOptions(coarse=(CoarseImages(until=3, block=2),))
     whole, one = Targets(data, options), PIXEL_BYTES * 24 * 24
     made: list[int] = []
     real = View.camera

@@ -69,7 +69,7 @@ def init_colour(table: dict[str, np.ndarray]) -> np.ndarray:
 
 def test_albedo_starts_with_hue_of_images(ball: dataset.Dataset) -> None:
     """As bright everywhere as its initial value; without it, it is grey."""
-    table = start(ball, 0.5, 0, "surfels.from_pictures=['albedo']", "surfels.initial.albedo=0.6")
+    table = start(ball, 0.5, 0, "surfels.from_images=['albedo']", "surfels.initial.albedo=0.6")
     albedo, colour = 1 / (1 + np.exp(-table["albedo"])), 0.5 + init_colour(table)
     hue = 0.6 * colour / colour.max(axis=1, keepdims=True)
     # Its own jitter breaks ties, and its ends are cut off.

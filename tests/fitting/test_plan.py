@@ -15,7 +15,7 @@ from mi_refgs.data.images import ImageFile
 from mi_refgs.fitting import cost_model, plan
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels import memory
-from mi_refgs.methods.method import CoarsePictures, DataOptions, Method, Rates, SurroundingsOptions
+from mi_refgs.methods.method import CoarseImages, DataOptions, Method, Rates, SurroundingsOptions
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.splat import Camera
 from tests.scenes.highlight import METHOD
@@ -42,7 +42,7 @@ def test_estimate_is_sum_of_stages(method: Method) -> None:
     at_400 = 8 * 5 + 22 * 10
     whole = plan.estimate(method, SPEED, 7, (20, 20), 1)
     assert whole.seconds == pytest.approx(others + 7 * 400 * plan.DECODING + at_400)
-    coarse = DataOptions(coarse=(CoarsePictures(6, 2), CoarsePictures(12, 2)))
+    coarse = DataOptions(coarse=(CoarseImages(6, 2), CoarseImages(12, 2)))
     partly = plan.estimate(dataclasses.replace(method, data=coarse), SPEED, 7, (20, 20), 1)
     assert partly.seconds == pytest.approx(others + 7 * 400 * plan.DECODING + 8 * 1 + 4 * 2 + 18 * 10)
     assert whole.bytes - found.bytes == pytest.approx(300 * (memory.PER_PIXEL + 7 * (12 + 19)))

@@ -321,7 +321,7 @@ def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
         ("stage.deferred.rates.tint=2.0", "rates: there is no 'tint'"),
         ("stage.deferred.rates.metallic=-1.0", "metallic: -1.0 is out of range"),
         ("stage.deferred.rates.light=nan", "out of range"),
-        ("surfels.from_pictures=['metallic']", "metallic"),
+        ("surfels.from_images=['metallic']", "metallic"),
         ("surfels.channels=['metallic', 'roughness']", "albedo"),
         ("refine.relocate={when={start=0, until=9, every=3}, grow=-0.1}", r"relocate\.grow: -0\.1"),
     ],
@@ -339,7 +339,7 @@ def test_a_prior_needs_what_it_is_about(prior: str) -> None:
 
 
 def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
-    """`select.term`, `terms` and `variant` are `select.component`, `components` and `name` now."""
+    """Each key of `read.RENAMED`: in the config.toml of a run, in `drop`, in assignments and in own files."""
     now = methods.load("auto", "quick", ["select.component.degree_1.trial=9"], ["levels_3"])
     old = methods.dump(now).replace("[select.component", "[select.term")
     old = old.replace("components =", "terms =").replace('\nname = "auto"', '\nvariant = "auto"', 1)
@@ -351,6 +351,8 @@ def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text('extends = "auto"\ndrop = ["select.term.lobe_rays"]\n')
     select = methods.load(str(tmp_path / "own.toml")).select
     assert select is not None and "lobe_rays" not in select.component
+    (tmp_path / "own.toml").write_text('extends = "ref_gaussian"\n[surfels]\nfrom_pictures = ["albedo"]\n')
+    assert methods.load(str(tmp_path / "own.toml")).surfels.from_images == ("albedo",)
 
 
 def test_a_stage_sets_every_shading_option() -> None:

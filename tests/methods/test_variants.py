@@ -127,7 +127,7 @@ DIFFERENCES: dict[str, set[str]] = {
         "stage.initial",
         "surfels.channels",
         "surfels.degree",
-        "surfels.from_pictures",
+        "surfels.from_images",
         "surfels.initial",
     },
 }
