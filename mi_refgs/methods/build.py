@@ -13,8 +13,7 @@ from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.shade.options import NOT_A_SETTING
 
-FLAT = {"flat": True}
-"""Metadata of a field, a dataclass, whose settings are keys of the table that contains it."""
+FLAT = {"flat": True}  # metadata of a dataclass's field that is one too, with keys in the same table
 
 
 def settings(kind: Any) -> dict[str, Any]:
@@ -62,9 +61,8 @@ def build(kind: Any, value: Any, where: str) -> Any:
 
 def _build_dataclass(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
-        raise InputError(
-            f"{where}: expected a table, found {abbreviated(value)}; the files of variants/ show the form"
-        )
+        found = f"expected a table, found {abbreviated(value)}"
+        raise InputError(f"{where}: {found}; the files of variants/ show the form")
     known, hints = settings(kind), typing.get_type_hints(kind)
     for key in value:
         if key not in known:
@@ -72,13 +70,13 @@ def _build_dataclass(kind: Any, value: Any, where: str) -> Any:
     for field in dataclasses.fields(kind):
         if field.default is field.default_factory is MISSING and field.name not in value:
             raise InputError(f"{where}: missing key '{field.name}'; add it")
-    found = {key: build(known[key], inner, f"{where}: {key}") for key, inner in value.items()}
+    built = {key: build(known[key], inner, f"{where}: {key}") for key, inner in value.items()}
     try:
         for field in dataclasses.fields(kind):
             if field.metadata == FLAT:
                 inner = hints[field.name]
-                found[field.name] = inner(**{key: found.pop(key) for key in settings(inner) if key in found})
-        return kind(**found)
+                built[field.name] = inner(**{key: built.pop(key) for key in settings(inner) if key in built})
+        return kind(**built)
     except (InputError, ValueError) as error:
         raise InputError(f"{where}: {error}") from error
 

@@ -15,18 +15,13 @@ from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE, attribute
 from mi_refgs.surfels.primitives import PRIMITIVES
 
-LIGHT = "light"
-"""Name of the environment map among the parameters of a fit, beside the attributes of the surfels."""
-GAIN = "gain"
-"""Name of the log exposure gains of the training views among them."""
-BACKGROUND, AROUND = "background", "surroundings/"
-"""Name of the background environment among them, and the prefix of the background Gaussians' attributes."""
-APART = (LIGHT, GAIN, BACKGROUND)
-"""Parameters that are not attributes of surfels."""
-AT_ONCE = Window(0, 3, 1)
-"""One SH degree more in each of the first three iterations."""
-MESH_WINDOW = Window(20_000, 50_000, 2_000)
-"""When the released Ref-Gaussian code extracts its mesh on synthetic scenes."""
+# Names among the parameters of a fit, beside the attributes of the surfels:
+LIGHT, BACKGROUND = "light", "background"  # the environment maps
+GAIN = "gain"  # log exposure gains of the training views
+AROUND = "surroundings/"  # prefix of the background Gaussians' attributes
+APART = (LIGHT, GAIN, BACKGROUND)  # parameters that are not attributes of surfels
+AT_ONCE = Window(0, 3, 1)  # one SH degree more in each of the first three iterations
+MESH_WINDOW = Window(20_000, 50_000, 2_000)  # that of the released Ref-Gaussian code on synthetic scenes
 
 
 @dataclass(frozen=True)
@@ -112,9 +107,7 @@ class Stage:
     shading: ShadingOptions = field(default_factory=ShadingOptions, metadata=FLAT)
     samples: int = 1  # per pixel, k × k, in the steps of a fit
     restart: tuple[str, ...] = ()  # attributes, and `light`, reset to initial values when the stage begins
-    rates: dict[str, float] = field(
-        default_factory=dict
-    )  # factors of learning rates, by attribute or `light`
+    rates: dict[str, float] = field(default_factory=dict)  # factors of rates, by attribute or `light`
 
 
 @dataclass(frozen=True)
@@ -177,9 +170,7 @@ class Rates:
     """Adam learning rates, raw units per step; those of positions in scene extents."""
 
     channel: dict[str, float] = field(default_factory=dict)  # by attribute; else its own default
-    rest: dict[str, float] = field(
-        default_factory=dict
-    )  # factor for SH degrees of 1 and above; else its own default
+    rest: dict[str, float] = field(default_factory=dict)  # factors for SH degrees above 0; else their own
     light: float = 0.01  # texels of the environment map
     light_relative: bool = False  # texels brighter than 1: times their radiance, so that lamps can form
     position_final: float = 1.6e-6  # of positions, at 0.6 of the iterations
@@ -236,8 +227,8 @@ class LossWeights:
         """Weight and window of a loss by its name."""
         if name in self.registered:
             return self.registered[name]
-        window = {end: getattr(self, f"{name}_{end}", None) for end in ("start", "rise", "until")}
-        return LossWeight(getattr(self, name, 0.0), **{end: x for end, x in window.items() if x is not None})
+        ends = [end for end in ("start", "rise", "until") if hasattr(self, f"{name}_{end}")]
+        return LossWeight(getattr(self, name, 0.0), **{end: getattr(self, f"{name}_{end}") for end in ends})
 
 
 @dataclass(frozen=True)

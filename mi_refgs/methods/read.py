@@ -26,6 +26,7 @@ from mi_refgs.shade.light.envmap import MIN_HEIGHT, is_height
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE
 
+HEIGHT = f"a multiple of 4 from {MIN_HEIGHT}"  # of an environment map
 MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
 
@@ -71,24 +72,19 @@ def load(
     """
     if preset not in PRESETS:
         raise InputError(f"--preset: {preset}: unknown; use one of {', '.join(PRESETS)}")
-    path = _find(name, "--method", Path())
+    path, chosen = _find(name, "--method", Path()), PRESETS[preset]
     table = _extended(path, [])
     for component in components:
         table = _with_component(table, component, path)
-    chosen = PRESETS[preset]
     method = build(Method, table, str(path))
     table = plain(scaled(method, chosen.iterations / method.iterations))
     for part in table.keys() & {"surfels", "surroundings"}:
         table[part] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
     for assignment in assignments or []:
         _assign(table, assignment)
-    table |= {
-        "name": path.stem,
-        "file": str(path.resolve()) if name.endswith(".toml") else name,
-        "preset": preset,
-        "components": [*components],
-        "assignments": [*(assignments or [])],
-    }
+    file = str(path.resolve()) if name.endswith(".toml") else name
+    table |= {"name": path.stem, "file": file, "preset": preset}
+    table |= {"components": [*components], "assignments": [*(assignments or [])]}
     method = build(Method, table, "--set" if assignments else str(path))
     _require_consistent(method, str(path))
     if method.select is not None and not components:
@@ -125,9 +121,8 @@ def differences(before: Method, now: Method) -> dict[str, tuple[Any, Any]]:
 
     The table `about`, the file's place and how changes were written are not compared.
     """
-    first, second = (
-        _flat(plain(replace(method, about=About(), file="", assignments=()))) for method in (before, now)
-    )
+    compared = (replace(method, about=About(), file="", assignments=()) for method in (before, now))
+    first, second = (_flat(plain(method)) for method in compared)
     keys = sorted(first.keys() | second.keys())
     return {key: (first.get(key), second.get(key)) for key in keys if first.get(key) != second.get(key)}
 
@@ -152,9 +147,8 @@ def _find(name: str, where: str, folder: Path) -> Path:
     shipped = resource_dir("scenes" if "/" in name else "variants")
     path = folder / name if name.endswith(".toml") else shipped / f"{name}.toml"
     if not is_file(path):
-        raise InputError(
-            f"{where}: {name}: no such method; use one of {', '.join(names())}, or a path to a .toml"
-        )
+        known = ", ".join(names())
+        raise InputError(f"{where}: {name}: no such method; use one of {known}, or a path to a .toml")
     return path
 
 
@@ -190,9 +184,8 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
     if base is None and not dropped:
         return table
     if not isinstance(base, str):
-        raise InputError(
-            f"{path}: extends: expected a name or a path in quotes, found {abbreviated(base)}; correct it"
-        )
+        found = f"expected a name or a path in quotes, found {abbreviated(base)}"
+        raise InputError(f"{path}: extends: {found}; correct it")
     if not isinstance(dropped, list) or not all(isinstance(key, str) for key in dropped):
         raise InputError(f"{path}: drop: expected a list of keys, such as ['mesh', 'loss.alpha']; correct it")
     parent = _extended(_find(base, f"{path}: extends", path.parent), [*above, path.resolve()])
@@ -291,9 +284,8 @@ def _require_consistent(method: Method, where: str) -> None:
         for name, stage in method.stages()
         for one, factor in stage.rates.items()
     ]
-    ranges += [
-        ("data.coarse.block", images.block, images.block >= 2, "2 or more") for images in method.data.coarse
-    ]
+    blocks = (images.block for images in method.data.coarse)
+    ranges += [("data.coarse.block", block, block >= 2, "2 or more") for block in blocks]
     if light is not None:
         ranges.append(("light.height", light.height, is_height(light.height), HEIGHT))
         ranges.append(("light.every", light.every, light.every >= 1, "1 or more"))
@@ -339,16 +331,12 @@ def _require_consistent(method: Method, where: str) -> None:
     deferred = any(stage.shading.at == "pixel" for _, stage in method.stages())
     for name, needed in (("half_metal", {"metallic"}), ("materials", {"metallic", "roughness"})):
         if getattr(loss, name) and not (deferred and needed <= attributes):
-            raise InputError(
-                f"{where}: loss.{name}: needs {' and '.join(sorted(needed))}, and a stage at = pixel; drop it"
-            )
+            what = " and ".join(sorted(needed))
+            raise InputError(f"{where}: loss.{name}: needs {what}, and a stage at = pixel; drop it")
     if loss.light_colour and light is None:
         raise InputError(f"{where}: loss.light_colour: there is no light; drop it")
     if method.refine.propagate is not None and "metallic" not in attributes:
-        raise InputError(f"{where}: refine.propagate: there is no channel 'metallic'; add it, or drop this")
-
-
-HEIGHT = f"a multiple of 4 from {MIN_HEIGHT}"
+        raise InputError(f"{where}: refine.propagate: there is no attribute 'metallic'; add it, or drop this")
 
 
 def _require_known_names(method: Method, attributes: set[str], where: str) -> None:
@@ -376,9 +364,8 @@ def _require_selectable(method: Method, select: Selection, where: str) -> None:
         raise InputError(f"{where}: select.holdout: {select.holdout} leaves no views to fit; give 2 or more")
     for name, component in select.component.items():
         if unknown := [one for one in (*component.needs, *component.unless) if one not in select.component]:
-            raise InputError(
-                f"{where}: select.component.{name}: needs: there is no '{unknown[0]}'; name a component"
-            )
+            key = f"select.component.{name}: needs"
+            raise InputError(f"{where}: {key}: there is no '{unknown[0]}'; name a component")
         load(method.file, method.preset, method.assignments, [*_needed(select, name), name])
 
 

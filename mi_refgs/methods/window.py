@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-ITERATIONS = {"unit": "iterations"}
-"""Metadata of a dataclass' field that counts iterations, which a preset scales as it does windows."""
-TIE = 1e-6
-"""Intervals by which a scaled window may miss a multiple of its interval for the rounding of floats."""
+ITERATIONS = {"unit": "iterations"}  # metadata of a field that counts iterations, which a preset scales
+TIE = 1e-6  # intervals by which a scaled window may miss a multiple of its interval through rounding
 
 
 @dataclass(frozen=True)
@@ -38,9 +36,8 @@ class Window:
 
     def since(self, iteration: int) -> int | None:
         """Iterations since the last event before this one; None if there was none yet."""
-        if not self.count(iteration - 1):
-            return None
-        return iteration - math.floor(self._newest(iteration - 1) * self.every + 0.5)
+        newest = math.floor(self._newest(iteration - 1) * self.every + 0.5)
+        return iteration - newest if self.count(iteration - 1) else None
 
     def _newest(self, iteration: int) -> int:
         """The largest k ≤ until / every for which k · every rounds to this iteration or one before."""

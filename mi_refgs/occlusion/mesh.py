@@ -30,11 +30,8 @@ FOREIGN_RESOLUTION = 256
 grid has 128 along the longest side. The number of triangles is no measure: two of them make an exact wall.
 Rays then start 0.8 % of the diagonal off the surface, and walls closer to each other do not occlude."""
 
-FORMATS = ("ply", "obj", "stl", "off")
-"""File endings that `read_mesh` accepts."""
-
-VOXEL_COMMENT = "voxel_size"
-"""Key of the PLY comment with the voxel size of the extraction."""
+FORMATS = ("ply", "obj", "stl", "off")  # file endings that `read_mesh` accepts
+VOXEL_COMMENT = "voxel_size"  # key of the PLY comment with the voxel size of the extraction
 
 
 @dataclass(frozen=True)
@@ -136,22 +133,19 @@ def read_mesh(path: Path | str) -> Mesh:
             data = file.read()
         voxel = _voxel(header)
         if any(element.name == "face" and not element.count for element in header.elements):
-            return Mesh.empty() if voxel is None else Mesh.empty(voxel)
+            return Mesh.empty(1.0 if voxel is None else voxel)
         mesh = _load(path, kind, data)
         if voxel is None:
             voxel = float(np.linalg.norm(mesh.extents)) / FOREIGN_RESOLUTION if len(mesh.faces) else 1.0
     except InputError:
         raise
     except Exception as error:  # trimesh raises whatever its parsers meet
-        raise InputError(
-            f"{path}: mesh: not a readable triangle mesh; write it again as PLY or OBJ"
-        ) from error
+        raise InputError(f"{path}: mesh: not a readable triangle mesh; write it as PLY or OBJ") from error
     with np.errstate(over="ignore"):
         vertices = np.asarray(mesh.vertices, np.float32)
     if not (voxel > 0 and np.isfinite(voxel) and np.isfinite(vertices).all()):
-        raise InputError(
-            f"{path}: mesh: vertices or {VOXEL_COMMENT} not finite and positive; extract the mesh again"
-        )
+        wrong = f"vertices not finite, or {VOXEL_COMMENT} not above 0"
+        raise InputError(f"{path}: mesh: {wrong}; extract the mesh again")
     return Mesh(vertices, np.asarray(mesh.faces, np.uint32), voxel)
 
 

@@ -21,8 +21,7 @@ from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Bool, Color3f, Float, Point2f, UInt32, Vector3f
 
-NEIGHBOURS = 4
-"""Surfels per vertex: those that overlap at a point of a fitted surface with visible weight."""
+NEIGHBOURS = 4  # surfels per vertex: those that overlap at a point of a fitted surface with visible weight
 
 WEIGHT_FLOOR = 1e-6
 """Sum of weights below which no surfel reaches a vertex, which then takes the nearest one only."""
@@ -31,8 +30,7 @@ NORMAL_AGREEMENT = 0.5
 """Cosine between the neighbours' mean normal and the mesh's from which the former, which a fit has smoothed,
 is used: at a rim the neighbours belong to another face."""
 
-MATERIALS = ("albedo", "metallic", "roughness")
-"""Attributes that hits are shaded with."""
+MATERIALS = ("albedo", "metallic", "roughness")  # attributes that hits are shaded with
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ class VertexSurfels:
         for name in MATERIALS:
             if not surfels.has(name):
                 raise InputError(
-                    f"occluder: {name}: the surfels have no such channel; add it, or trace nothing"
+                    f"occluder: {name}: the surfels have no such attribute; add it, or trace nothing"
                 )
         if not surfels.count:
             raise InputError("occluder: surfels: there are none to take materials from")
@@ -120,10 +118,8 @@ class VertexSurfels:
         Raises InputError for another number of surfels than `of` has seen.
         """
         if surfels.count != self.count:
-            raise InputError(
-                f"occluder: surfels: there are {surfels.count}, but the mesh was given {self.count}; call "
-                "Occluder.set_materials whenever their number changes"
-            )
+            numbers = f"there are {surfels.count}, but the mesh was given {self.count}"
+            raise InputError(f"occluder: surfels: {numbers}; call Occluder.set_materials after each change")
         columns = [*surfels.value("albedo"), surfels.value("metallic"), surfels.value("roughness")]
         mixed = [mi.Float(0) for _ in columns]
         for surfel, weight in zip(self.surfel, self.weight, strict=True):
@@ -182,10 +178,8 @@ def _corners(
 ) -> list[tuple[UInt32, Float]]:
     """Vertex and barycentric weight of each of the three corners of triangles (N,)."""
     shares = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)
-    return [
-        (dr.gather(mi.UInt32, faces, 3 * triangle + corner, active), share)
-        for corner, share in enumerate(shares)
-    ]
+    index = (3 * triangle + corner for corner in range(3))
+    return [(dr.gather(mi.UInt32, faces, i, active), share) for i, share in zip(index, shares, strict=True)]
 
 
 def _normals(mesh: Mesh, neighbours: np.ndarray, weight: np.ndarray) -> np.ndarray:

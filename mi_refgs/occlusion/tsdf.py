@@ -40,8 +40,7 @@ UNSEEN_VOTE = 0.1
 pixels which leak through thin places drill no tunnels; a cavity must be seen by 9 % of the views to stay
 open. Measured on splats with thin places: 12 % of the surface is false at 0.03, 0.5 % at 0.15."""
 
-RESOLUTION_MAX = 1023
-"""Most voxels along one axis: three coordinates share one 32-bit word."""
+RESOLUTION_MAX = 1023  # most voxels along one axis: three coordinates share one 32-bit word
 
 BOX_QUANTILE = 0.02
 """Fraction of the points per side and axis that may be floaters when the fusion box is computed."""
@@ -82,9 +81,8 @@ def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
-        raise InputError(
-            "surfels: position: no finite point to bound; the fit has diverged or pruned every surfel"
-        )
+        lost = "the fit has diverged or pruned every surfel"
+        raise InputError(f"surfels: position: no finite point to bound; {lost}")
     lo, hi = np.quantile(points, (BOX_QUANTILE, 1 - BOX_QUANTILE), axis=0)
     reach = BOX_REACH * (hi - lo)
     lo, hi = np.maximum(lo - reach, points.min(axis=0)), np.minimum(hi + reach, points.max(axis=0))
@@ -177,13 +175,8 @@ class _Grid:
         # Relative to the centre of pixel (0, 0), where its texel sits.
         px = point.x * inv_z * camera.fx + camera.cx - 0.5
         py = point.y * inv_z * camera.fy + camera.cy - 0.5
-        in_image = (
-            in_front
-            & (px >= -0.5)
-            & (py >= -0.5)
-            & (px < mi.Float(width) - 0.5)
-            & (py < mi.Float(height) - 0.5)
-        )
+        in_image = in_front & (px >= -0.5) & (py >= -0.5)
+        in_image &= (px < mi.Float(width) - 0.5) & (py < mi.Float(height) - 0.5)
         trunc = TRUNCATION_VOXELS * self.voxel
         ray = (world - camera.origin) * inv_z
         apart = trunc if self.space is None else trunc * self.space.stretch(place, ray)
@@ -214,11 +207,11 @@ class _Grid:
         observed = self.weight > 0
         mean = self.total / dr.select(observed, self.weight, 1)
         value = dr.select(inside, -1, dr.select(observed, mean, 1))
-        if self.index is not None:
-            everywhere = dr.full(mi.Float, 1, self.count)
-            dr.scatter(everywhere, value, self.index)
-            value = everywhere
-        return np.array(value, dtype=np.float32)
+        if self.index is None:
+            return np.array(value, dtype=np.float32)
+        everywhere = np.ones(self.count, np.float32)
+        everywhere[self.index.numpy()] = value.numpy()
+        return everywhere
 
     def _place(self) -> Any:
         """Positions of the voxels (mi.Point3f): world, or contracted."""
@@ -228,7 +221,7 @@ class _Grid:
 
 @dataclass(frozen=True)
 class _Contracted:
-    """A region's contraction for Dr.Jit; `contraction.Region` says what it is."""
+    """A region's contraction for Dr.Jit; see `data.region.Region`."""
 
     centre: Any  # mi.Point3f
     radius: Any  # mi.Float

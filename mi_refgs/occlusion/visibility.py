@@ -117,9 +117,8 @@ class Occluder:
             hit = self._scene.ray_intersect_preliminary(ray, coherent=False, active=valid & active)
             stopped = hit.is_valid()
             # Embree leaves the fields of a miss undefined: they may be NaN.
-            distance, triangle, barycentric = (
-                dr.select(stopped, x, 0) for x in (hit.t, hit.prim_index, hit.prim_uv)
-            )
+            found = (dr.select(stopped, x, 0) for x in (hit.t, hit.prim_index, hit.prim_uv))
+            distance, triangle, barycentric = found
             return Hit(stopped, ray(distance), triangle, barycentric)
 
     def first_hit(self, origin: Point3f, direction: Vector3f, active: Bool = True) -> tuple[Float, Bool]:
@@ -137,9 +136,8 @@ class Occluder:
         """The ray that starts off the surface, and whether it can be traced."""
         assert self._mesh is not None
         if self._variant != mi.variant():
-            raise RuntimeError(
-                f"Occluder was made under {self._variant}, not under {mi.variant()}: call update again"
-            )
+            variants = f"under {self._variant}, not under {mi.variant()}"
+            raise RuntimeError(f"Occluder was made {variants}: call update again")
         offset = OFFSET_VOXELS * dr.opaque(mi.Float, self._mesh.voxel)
         d, active = _unit(mi.Vector3f(direction))
         away = d

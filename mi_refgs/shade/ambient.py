@@ -33,8 +33,7 @@ from mi_refgs.shade.reflection import MeshRadiance, TraceContext
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f, UInt32, Vector3f
 
-BOUNCES = 2
-"""Rounds: bounces of light between surfaces before it is taken as unblocked."""
+BOUNCES = 2  # rounds: bounces of light between surfaces before it is taken as unblocked
 
 BRIGHTEST = 4.0
 """Largest ratio: otherwise a mirror that reflects a lamp into one of a few rays makes a vertex shine."""
@@ -43,9 +42,10 @@ BRIGHTEST = 4.0
 def update_occluder_caches(
     occluder: Occluder, surfels: Surfels, light: Light | None, options: ShadingOptions
 ) -> None:
-    """Give a mesh what `options` require: materials if its hits are shaded, and ambient ratios.
+    """Set `occluder.vertex_surfels` if hits are shaded, and `occluder.ambient` if there are `ambient_rays`.
 
-    Call it again when mesh, surfels or light have changed. Raises InputError as `Occluder.set_materials`.
+    An empty mesh has neither, and without a light there are no ratios. Call it again when mesh, surfels or
+    light have changed. Raises InputError as `Occluder.set_materials`.
     """
     if occluder.empty:
         return
@@ -60,29 +60,29 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, options: Shading
     """Ratios of all vertices of a mesh whose materials are set, detached; see the head of this file."""
     mesh = occluder.mesh()
     assert mesh is not None
-    place = mi.Point3f(mesh.vertices.T)
+    position = mi.Point3f(mesh.vertices.T)
     normal = safe_normalize(occluder.surface(surfels).vertex_surfels.normal)
     frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
     rays = dr.opaque(mi.UInt32, options.ambient_rays)
     blur = dr.opaque(mi.Float, ray_roughness(options.ambient_rays))
-    occluder.ambient = None  # the first round is unoccluded
-    for _ in range(BOUNCES):
-        scene = MeshRadiance.of(
-            occluder, surfels, light, replace(options, traced_bounces=1, diffuse="irradiance")
-        )
+    traced = replace(options, traced_bounces=1, diffuse="irradiance")
+    ratios: VertexColours | None = None  # the first round is unoccluded
+    for _bounce in range(BOUNCES):
+        scene = MeshRadiance.of(occluder, surfels, light, traced, ratios)
 
-        def body(index: Any, arrives: Any, every: Any, scene: MeshRadiance = scene) -> tuple[Any, ...]:
+        def body(index: Any, arrives: Any, total: Any, scene: MeshRadiance = scene) -> tuple[Any, ...]:
             direction = ambient_direction(frame, turn, index, rays)
             radiance = scene.light.specular(direction, blur)
-            hit = scene.trace(place, direction, normal, True, 1)
+            hit = scene.trace(position, direction, normal, True, 1)
             arrives = arrives + dr.select(hit.valid, scene.radiance(hit, direction), radiance)
-            return index + 1, arrives, every + radiance
+            return index + 1, arrives, total + radiance
 
         start = (dr.zeros(mi.UInt32, dr.width(normal)), mi.Color3f(0), mi.Color3f(0))
-        _, arrives, every = dr.while_loop(start, lambda index, *_: index < rays, body, label="ambient")
-        ratio = dr.select(every > 0, arrives * dr.rcp(dr.select(every > 0, every, 1)), 1)
-        occluder.ambient = found = VertexColours.of(mesh, dr.clip(ratio, 0, BRIGHTEST).numpy().T)
-    return found
+        _, arrives, total = dr.while_loop(start, lambda index, *_: index < rays, body, label="ambient")
+        ratio = dr.select(total > 0, arrives * dr.rcp(dr.select(total > 0, total, 1)), 1)
+        ratios = VertexColours.of(mesh, dr.clip(ratio, 0, BRIGHTEST).numpy().T)
+    assert ratios is not None
+    return ratios
 
 
 def ray_roughness(count: int) -> float:

@@ -29,11 +29,8 @@ AZIMUTH_NODES = 32
 4e-4 in the column of smallest N·V and 1e-4 elsewhere, 1 s of one core. [measured against 600 × 400 float64
 midpoints]"""
 
-HORIZON = 1e-7
-"""Smallest N·L whose 1/(N·L)² still fits float32; below it shadowing leaves nothing."""
-
-CACHE_NAME = "split_sum_256_v1.npy"
-"""Raise the version when a number of the table changes."""
+HORIZON = 1e-7  # smallest N·L whose 1/(N·L)² still fits float32; below it shadowing leaves nothing
+CACHE_NAME = "split_sum_256_v1.npy"  # raise the version when a number of the table changes
 
 
 def compute_table() -> np.ndarray:
@@ -69,8 +66,7 @@ def compute_table() -> np.ndarray:
 
 def cache_dir() -> Path:
     """User cache folder of mi_refgs: $XDG_CACHE_HOME/mi_refgs, else ~/.cache/mi_refgs."""
-    root = os.environ.get("XDG_CACHE_HOME")
-    return (Path(root) if root else Path.home() / ".cache") / "mi_refgs"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mi_refgs"
 
 
 @functools.lru_cache(maxsize=1)
@@ -83,11 +79,9 @@ def table() -> np.ndarray:
     with suppress(OSError, ValueError, RuntimeError, EOFError):
         path = cache_dir() / CACHE_NAME
         cached = np.load(path, allow_pickle=False)
-        if (
-            cached.shape == (RESOLUTION, RESOLUTION, 2)
-            and cached.dtype == np.float32
-            and np.isfinite(cached).all()
-        ):
+        if (cached.shape, cached.dtype) == ((RESOLUTION, RESOLUTION, 2), np.float32) and np.isfinite(
+            cached
+        ).all():
             return cached
     computed = compute_table()
     with suppress(OSError, InputError):

@@ -13,15 +13,14 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.shade.points import safe_normalize
+from mi_refgs.types import Color3f, Float, UInt32, Vector3f
 
-GOLDEN = 2654435769
-"""2³² / golden ratio: multiples of it, modulo 2³², are the most even sequence on a circle."""
+GOLDEN = 2654435769  # 2³² / golden ratio: multiples of it, modulo 2³², are the most even sequence on a circle
 
 COSINE_FLOOR = 1e-3
 """Smallest n·v of a lobe: a view from behind is taken as a grazing one, as `shade` takes its reflectance."""
 
-HORIZON = 1e-6
-"""Smallest n·l of a ray: what goes below leaves no light, and 1/(n·l)² fits float32."""
+HORIZON = 1e-6  # smallest n·l of a ray: what goes below leaves no light, and 1/(n·l)² fits float32
 
 
 def lobe_turn(index: mi.UInt32) -> mi.UInt32:
@@ -45,19 +44,13 @@ class Lobe:
     """The GGX lobes of N points, ready to be sampled; α = roughness², height-correlated Smith, Schlick."""
 
     frame: Any  # mi.Frame3f around the normals
-    view: Any  # mi.Vector3f, local, unit, above the horizon
-    α: Any
-    f0: Any  # mean of the channels
-    turn: Any  # of the points, see `lobe_turn`
+    view: Vector3f  # local, unit, above the horizon
+    α: Float
+    f0: Float  # mean of the channels
+    turn: UInt32  # of the points, see `lobe_turn`
 
     @staticmethod
-    def of(
-        normal: mi.Vector3f,
-        view: mi.Vector3f,
-        roughness: mi.Float,
-        f0: mi.Color3f,
-        pixel: mi.UInt32 | None = None,
-    ) -> Lobe:
+    def of(normal: Vector3f, view: Vector3f, roughness: Float, f0: Color3f, pixel: UInt32 = None) -> Lobe:
         """Lobes around unit normals, seen from unit directions; lane i has the points of `pixel` i."""
         frame = mi.Frame3f(normal)
         local = frame.to_local(view)

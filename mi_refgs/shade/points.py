@@ -73,8 +73,7 @@ class RadianceTerms:
         return RadianceTerms(**{name: dr.zeros(mi.Color3f, 1) for name in TERMS} | self.known())
 
 
-TERMS = ("diffuse", "specular", "indirect")
-"""Names of the terms."""
+TERMS = ("diffuse", "specular", "indirect")  # names of the terms
 
 
 def safe_normalize(v: mi.Vector3f) -> mi.Vector3f:

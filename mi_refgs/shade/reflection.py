@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import FACING_TOLERANCE
-from mi_refgs.occlusion.surface_materials import Surface, SurfaceSample
+from mi_refgs.occlusion.surface_materials import Surface, SurfaceSample, VertexColours
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.ggx_sampling import Lobe
 from mi_refgs.shade.light.light import Light
@@ -37,7 +37,7 @@ class TraceContext:
 
     occluder: Occluder
     surfels: Surfels
-    light: Any  # a `Light`, or None if the model looks none up
+    light: Light | None  # None if the model looks none up
     origin: Point3f  # (1,) the camera; (N,) surfel positions in forward shading
     ray: Vector3f  # (N,) to the points from `origin`, or from the camera in forward shading; not unit
     covered: Bool = True  # (N,) or a literal; nothing is traced for the other points
@@ -96,9 +96,16 @@ class MeshRadiance:
     options: ShadingOptions
     harmonics: Float  # (3 C N,) radiance_sh by rows; empty unless diffuse="sh"
     count: int  # C
+    ambient: VertexColours | None  # ratios of irradiance that arrive, see `shade.ambient`
 
     @staticmethod
-    def of(occluder: Occluder, surfels: Surfels, light: Light, options: ShadingOptions) -> MeshRadiance:
+    def of(
+        occluder: Occluder,
+        surfels: Surfels,
+        light: Light,
+        options: ShadingOptions,
+        ambient: VertexColours | None,
+    ) -> MeshRadiance:
         """Take the present values of all arguments, and evaluate them."""
         surfels = surfels.cleaned()  # one that became unusable after `set_materials` may still be looked up
         surface = occluder.surface(surfels)
@@ -107,7 +114,7 @@ class MeshRadiance:
         # writes packets, must not be written to in the same kernel.
         harmonics = dr.ravel(mi.ArrayXf([x for c in coefficients for x in c])) if coefficients else mi.Float()
         dr.eval(surface.rows, harmonics)
-        return MeshRadiance(occluder, surface, light, options, harmonics, len(coefficients))
+        return MeshRadiance(occluder, surface, light, options, harmonics, len(coefficients), ambient)
 
     def trace(
         self, point: Point3f, direction: Vector3f, normal: Vector3f, active: Bool, bounces: int
@@ -131,12 +138,11 @@ class MeshRadiance:
         own = ambient = indirect = None
         if self.count:
             row = sample.surfel * self.count
-            coefficients = [
-                dr.gather(mi.Color3f, self.harmonics, row + i, hit.valid) for i in range(self.count)
-            ]
+            rows = (row + i for i in range(self.count))
+            coefficients = [dr.gather(mi.Color3f, self.harmonics, i, hit.valid) for i in rows]
             own = clamp_positive(eval_sh(coefficients, direction) + 0.5)
-        if self.options.ambient_rays and self.occluder.ambient is not None:
-            ambient = self.occluder.ambient.at(hit.triangle, hit.barycentric, hit.valid)
+        if self.options.ambient_rays and self.ambient is not None:
+            ambient = self.ambient.at(hit.triangle, hit.barycentric, hit.valid)
         if hit.next is not None:
             indirect = self.radiance(hit.next, reflect(view=-direction, normal=normal))
         points = ShadingPoints(
@@ -173,7 +179,8 @@ def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOpt
         return points.replaced(visibility=dr.full(mi.Float, 1, dr.width(context.ray)), indirect=None)
     scene = None
     if options.traced_bounces:
-        scene = MeshRadiance.of(occluder, context.surfels, context.light, options)
+        assert context.light is not None  # by `Shading.require_inputs`
+        scene = MeshRadiance.of(occluder, context.surfels, context.light, options, occluder.ambient)
     with dr.suspend_grad():
         start = context.start(normal)
     if options.visibility_rays > 1:
@@ -249,7 +256,6 @@ def _firefly_clamp(total: Color3f, largest: Color3f, free: Color3f, count: Float
     is clamped: the limit is the true mean.
     """
     others = dr.maximum(total - largest, 0)
-    excess = dr.maximum(largest - (others + free) * count / (count - 1), 0) * dr.maximum(
-        1 - α / CLAMP_MAX_ALPHA, 0
-    )
+    narrow = dr.maximum(1 - α / CLAMP_MAX_ALPHA, 0)
+    excess = dr.maximum(largest - (others + free) * count / (count - 1), 0) * narrow
     return dr.select(total > 0, dr.maximum(1 - excess / dr.select(total > 0, total, 1), 0), 1)

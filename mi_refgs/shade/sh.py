@@ -45,11 +45,8 @@ def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
             0.5 * k * (xx - yy),
         ]
     if degree >= 3:
-        k33, k32, k31 = (
-            0.25 * math.sqrt(35 / (2 * math.pi)),
-            0.5 * math.sqrt(105 / math.pi),
-            0.25 * math.sqrt(21 / (2 * math.pi)),
-        )
+        k33, k31 = (0.25 * math.sqrt(n / (2 * math.pi)) for n in (35, 21))
+        k32 = 0.5 * math.sqrt(105 / math.pi)
         basis += [
             -k33 * y * (3 * xx - yy),
             k32 * x * y * z,
@@ -82,20 +79,13 @@ def sh_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
 
 
 def eval_sh(coefs: Sequence[mi.Color3f], direction: mi.Vector3f) -> mi.Color3f:
-    """Σ coefs[i] basis_i(direction), without offset or clamp; their number tells the degree.
+    """Σ coefs[i] basis_i(direction) of 1, 4, 9 or 16 colours at unit directions, without offset or clamp.
 
-    Args:
-        coefs: 1, 4, 9 or 16 colours.
-        direction: unit vectors, world frame.
-
-    Raises:
-        InputError: for another number of coefficients.
+    Raises InputError for another number of coefficients.
     """
     degree = math.isqrt(len(coefs)) - 1
     if (degree + 1) ** 2 != len(coefs) or not 0 <= degree <= MAX_SH_DEGREE:
-        raise InputError(
-            f"eval_sh: coefs: {len(coefs)} colours; a degree of 0 … {MAX_SH_DEGREE} has 1, 4, 9 or 16"
-        )
+        raise InputError(f"eval_sh: coefs: {len(coefs)} colours; give 1, 4, 9 or 16, for degree 0 … 3")
     colour = mi.Color3f(0)
     for coef, basis in zip(coefs, sh_basis(direction, degree), strict=True):
         colour = dr.fma(coef, basis, colour)

@@ -56,9 +56,7 @@ class Shading(ShadingOptions):
 
     @staticmethod
     def resolve(options: ShadingOptions, mesh: bool) -> Shading:
-        """Resolve the options of a stage: it is occluded if there is a `mesh` and the model can trace it in
-        this order; TRACED options count only then.
-        """
+        """The options of a stage: occluded if `traceable` and there is a `mesh`; else without TRACED ones."""
         given = {option.name: getattr(options, option.name) for option in fields(ShadingOptions)}
         untraced = Shading(**given | {name: getattr(ShadingOptions, name) for name in ("occlusion", *TRACED)})
         return Shading(**given | {"occlusion": True}) if mesh and untraced.traceable else untraced
@@ -96,7 +94,7 @@ class Shading(ShadingOptions):
 
     @property
     def order(self) -> Order:
-        """Where it is shaded: `at`, but "surfel", which blends less, where both give the same image."""
+        """Where it is shaded: `at`, but "surfel", which blends less, if the image is the same either way."""
         return "surfel" if self.model.order_independent else self.at
 
     @property
@@ -106,8 +104,8 @@ class Shading(ShadingOptions):
 
     @property
     def traceable(self) -> bool:
-        """Whether the model can trace visibility in this order."""
-        return self.model.visibility == "own" or (self.model.visibility == "mirror" and self.at == "pixel")
+        """Whether the model can trace visibility where it is shaded."""
+        return self.model.visibility == "own" or (self.model.visibility == "mirror" and self.order == "pixel")
 
     @property
     def neighbours(self) -> int:
@@ -118,9 +116,9 @@ class Shading(ShadingOptions):
         """The light as the model looks it up, under AD; None without one, or if the model uses none."""
         if environment is None or self.model.light == "none":
             return None
-        return (
-            environment.prefilter(self.levels) if self.model.light == "filtered" else environment.unfiltered()
-        )
+        if self.model.light == "filtered":
+            return environment.prefilter(self.levels)
+        return environment.unfiltered()
 
     @property
     def levels(self) -> Levels:
@@ -132,14 +130,12 @@ class Shading(ShadingOptions):
         for name in self.channels:
             if name not in attributes:
                 raise InputError(
-                    f"shading: {name}: the surfels have no such channel; add it, or do without it"
+                    f"shading: {name}: the surfels have no such attribute; add it, or do without"
                 )
         if self.model.light != "none" and not light:
-            free = " or ".join(name for name, model in MODELS.items() if model.light == "none")
-            raise InputError(
-                f"shading: light: reflectance = {self.reflectance} needs one; add it, or set reflectance = "
-                f"{free}"
-            )
+            unlit = " or ".join(name for name, model in MODELS.items() if model.light == "none")
+            needs = f"reflectance = {self.reflectance} needs one"
+            raise InputError(f"shading: light: {needs}; add it, or set reflectance = {unlit}")
         if self.occlusion and not mesh:
             raise InputError("shading: occlusion: there is no mesh to trace; give one, or trace nothing")
 

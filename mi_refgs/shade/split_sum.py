@@ -33,25 +33,23 @@ def base_reflectance(points: ShadingPoints) -> mi.Color3f:
     return dr.fma(points.albedo - DIELECTRIC_F0, points.metallic, DIELECTRIC_F0)
 
 
-def dominant_direction(normal: mi.Vector3f, mirror: mi.Vector3f, roughness: mi.Float) -> mi.Vector3f:
-    """Unit direction near the peak of the GGX lobe, cosine and shadowing included; unit vectors in.
+def lookup_direction(
+    normal: mi.Vector3f, view: mi.Vector3f, roughness: mi.Float, options: ShadingOptions
+) -> mi.Vector3f:
+    """Unit direction in which the prefiltered light is looked up: mirrored, or dominant. Unit vectors in.
 
-    With α = roughness² and s = 1 - α it lies s (√s + α) of the way from the normal to the mirror direction.
-    Differentiable, but for the clamp of roughness to [0, 1]. [Lagarde and de Rousiers 2014, "Moving Frostbite
-    to Physically Based Rendering", §4.9.3; of its two fits the one that it recommends with a prefiltered map]
+    The dominant one is near the peak of the GGX lobe, cosine and shadowing included: with α = roughness² and
+    s = 1 - α it lies s (√s + α) of the way from the normal to the mirror direction. Differentiable, but for
+    the clamp of roughness to [0, 1]. [Lagarde and de Rousiers 2014, "Moving Frostbite to Physically Based
+    Rendering", §4.9.3; of its two fits the one that it recommends with a prefiltered map]
     """
+    mirror = reflect(view, normal)
+    if not options.dominant:
+        return mirror
     α = dr.square(dr.clip(roughness, 0, 1))
     smooth = 1 - α
     mirrored = smooth * (dr.sqrt(dr.maximum(smooth, SMOOTHNESS_FLOOR)) + α)
     return safe_normalize(dr.lerp(normal, mirror, mirrored))
-
-
-def lookup_direction(
-    normal: mi.Vector3f, view: mi.Vector3f, roughness: mi.Float, options: ShadingOptions
-) -> mi.Vector3f:
-    """Where the prefiltered light is looked up: mirror direction, or the dominant one. Unit vectors in."""
-    mirror = reflect(view, normal)
-    return dominant_direction(normal, mirror, roughness) if options.dominant else mirror
 
 
 def multiple_scattering(f0: mi.Color3f, single: mi.Color3f, energy: mi.Float) -> mi.Color3f:
@@ -76,7 +74,7 @@ def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> Radia
     the points have none). n·v is clamped to [0, 1]: a point seen from behind keeps its mirror direction, with
     the reflectance at grazing incidence.
 
-    `options.dominant` turns r to `dominant_direction`; with `options.multiscatter` and M of
+    `options.dominant` turns r (`lookup_direction`); with `options.multiscatter` and M of
     `multiple_scattering`, specular = V (L(r, roughness) S + irradiance(n) M),
     indirect = (1 - V) L_indirect (S + M), and diffuse has the factor 1 - S - M.
 

@@ -216,7 +216,7 @@ def test_bad_properties_are_refused(changes: dict, words: str) -> None:
 def test_missing_attributes_are_refused() -> None:
     raw = raw_channels()
     del raw["roughness"]
-    with pytest.raises(Exception, match="roughness: the surfels have no such channel"):
+    with pytest.raises(Exception, match="roughness: the surfels have no such attribute"):
         mi.load_dict(integrator(raw, reflectance="split_sum"))
     with pytest.raises(Exception, match="there are no surfels"):
         mi.load_dict({"type": "refgs"})

@@ -84,8 +84,7 @@ LIGHTS = {
 
 
 @pytest.mark.parametrize(
-    ("light", "diffuse"),
-    [("smooth", "sh"), *((light, "irradiance") for light in LIGHTS)],
+    ("light", "diffuse"), [("smooth", "sh"), *((light, "irradiance") for light in LIGHTS)]
 )
 def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.random.Generator) -> None:
     """Error ≤ 1e-4 of the brightest term, and gradients of albedo, metallic and radiance to 1 %.

@@ -33,11 +33,11 @@ IMPOSSIBLE = {
     ),
     "no roughness": (
         f"[surfels]\nchannels = ['radiance_sh', 'albedo', 'metallic']\n{LIGHT}{STAGE}",
-        ["stage.only", "roughness", "no such channel"],
+        ["stage.only", "roughness", "no such attribute"],
     ),
     "no harmonics": (
         f"[surfels]\nchannels = ['albedo', 'metallic', 'roughness']\n{LIGHT}{STAGE}",
-        ["stage.only", "radiance_sh", "no such channel"],
+        ["stage.only", "radiance_sh", "no such attribute"],
     ),
     "no SH attribute for radiance": (
         f"[surfels]\nchannels = ['albedo']\n{STAGE}reflectance = 'radiance'",
@@ -86,19 +86,10 @@ def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
     [
         ({"at": "surfel", "occlusion": True}, "occlusion: needs shade_at = pixel"),
         ({"reflectance": "radiance", "occlusion": True}, "occlusion: needs shade_at = pixel"),
-        (
-            {"reflectance": "radiance", "dominant": True},
-            "dominant: needs reflectance",
-        ),
-        (
-            {"visibility_rays": 4},
-            "visibility_rays, traced_bounces, ambient_rays: need occlusion",
-        ),
+        ({"reflectance": "radiance", "dominant": True}, "dominant: needs reflectance"),
+        ({"visibility_rays": 4}, "visibility_rays, traced_bounces, ambient_rays: need occlusion"),
         ({"diffuse": "sh", "ambient_rays": 9}, "need diffuse = irradiance"),
-        (
-            {"traced_bounces": 1},
-            "visibility_rays, traced_bounces, ambient_rays: need occlusion",
-        ),
+        ({"traced_bounces": 1}, "visibility_rays, traced_bounces, ambient_rays: need occlusion"),
     ],
 )
 def test_what_is_not_allowed_together_is_refused(options: dict, words: str) -> None:
@@ -117,7 +108,7 @@ def test_rendering_without_what_it_needs_is_refused() -> None:
     with pytest.raises(InputError, match="there is no mesh to trace"):
         render(SurfelScene(surfels, Shading(occlusion=True), light), camera)
     del surfels.raw["metallic"]
-    with pytest.raises(InputError, match="metallic: the surfels have no such channel"):
+    with pytest.raises(InputError, match="metallic: the surfels have no such attribute"):
         render(SurfelScene(surfels, Shading(), light), camera)
 
 

@@ -32,9 +32,8 @@ def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndar
     path = Path(path)
     (height, width), strips = _strips(path)
     if min(height, width) < 2:
-        raise InputError(
-            f"{path}: environment: {width} × {height} pixels are no lat-long image; give 2 × 2 at least"
-        )
+        size = f"{width} × {height} pixels"
+        raise InputError(f"{path}: environment: {size} are no lat-long image; give 2 × 2 at least")
     h, w = min(height, rows), min(width, 2 * rows)
     image = np.zeros((h, w, 3), np.float32)
     down = None if h == height else hat_rows(height, h)
@@ -77,12 +76,7 @@ def _strips(path: Path) -> tuple[tuple[int, int], Iterator[np.ndarray]]:
         return hdr_strips(path)
     if first == EXR_MAGIC:
         return exr_strips(path)
-    pixels = read_bytes(path)[0]
-    return pixels.shape[:2], _encoded(pixels)
-
-
-def _encoded(pixels: np.ndarray) -> Iterator[np.ndarray]:
-    """Strips of an image (H, W, 3 or 4) of 8-bit numbers."""
+    pixels = read_bytes(path)[0][..., :3]
     step = strip_rows(pixels.shape[1])
-    for top in range(0, len(pixels), step):
-        yield linear_from_srgb(pixels[top : top + step, :, :3].astype(np.float32) / np.float32(255))
+    strips = (pixels[top : top + step].astype(np.float32) for top in range(0, len(pixels), step))
+    return pixels.shape[:2], (linear_from_srgb(strip / np.float32(255)) for strip in strips)

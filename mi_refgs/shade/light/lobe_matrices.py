@@ -43,18 +43,14 @@ class Levels:
         return Levels(roughness, tuple(LEVEL_MAX_HEIGHT[i] for i in chosen))
 
 
-LEVELS = Levels()
-"""The levels of a light by default."""
+LEVELS = Levels()  # the levels of a light by default
 
 DROP_BELOW = 1e-5
 """Matrix entries below this fraction of their level's largest are dropped: 0.05 % of a lobe (L1), 1e-4 of its
 peak at the worst."""
 
-HORIZON_CUTS = 0.5
-"""Roughness from which a lobe ends at the horizon rather than before it."""
-
-MIN_SUBSAMPLES = 2
-"""Quadrature points per texel side where the lobe is wider than a texel."""
+HORIZON_CUTS = 0.5  # roughness from which a lobe ends at the horizon rather than before it
+MIN_SUBSAMPLES = 2  # quadrature points per texel side where the lobe is wider than a texel
 
 
 @dataclass(frozen=True)

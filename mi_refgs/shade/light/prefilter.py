@@ -25,8 +25,7 @@ from mi_refgs.kernels.device import replayed, upload
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels
 
-BLOCK = 4
-"""Consecutive rows with the same number of frequencies, which `mix_rows` computes in one lane."""
+BLOCK = 4  # consecutive rows with the same number of frequencies, which `mix_rows` computes in one lane
 
 COEFFICIENT = 8
 """Floats per coefficient; TEXEL floats per texel. Powers of two, as packets are."""
@@ -283,12 +282,11 @@ def make_mixing(blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarra
     slot, step, source, weight = slot[order], step[order], source[order], weight[order]
     begin = np.flatnonzero(np.diff(slot, prepend=-1))
     end = np.append(begin[1:], len(slot))
-    # Equally long lanes side by side: a packet runs until its longest lane ends.
+    # Equally long lanes side by side: a SIMD vector runs until its longest lane ends.
     lanes = np.argsort(begin - end, kind="stable")
     begin, end = begin[lanes], end[lanes]
     first, last, place, stride, origin = to_device(begin, end, slot[begin], step[begin], source)
-    entries = upload(weight)
-    return Mixing(outputs, first, last, place, stride, origin, entries)
+    return Mixing(outputs, first, last, place, stride, origin, upload(weight))
 
 
 def mix_rows(matrix: Mixing, coefficients: Any) -> Any:
@@ -346,12 +344,10 @@ def _build(height: int, wanted: Levels) -> Operator:
         base=base,
         levels=levels,
         forward=make_mixing(
-            [(m, slot_in, s, n) for m, (s, n) in zip(matrices, out, strict=True)],
-            levels.coefficients,
+            [(m, slot_in, s, n) for m, (s, n) in zip(matrices, out, strict=True)], levels.coefficients
         ),
         adjoint=make_mixing(
-            [(m, s, slot_in, limit_in) for m, (s, _) in zip(transposed, out, strict=True)],
-            base.coefficients,
+            [(m, s, slot_in, limit_in) for m, (s, _) in zip(transposed, out, strict=True)], base.coefficients
         ),
         info=upload(np.array([(f, h, 2 * h, 0) for f, h in zip(firsts, heights, strict=False)]), mi.UInt32),
         shapes=tuple(zip(firsts, heights, strict=False)),
@@ -379,46 +375,37 @@ def apply_transposed(op: Operator, δlevels: Any) -> Any:
     return dr.gather(mi.Float, out, texel) + dr.gather(mi.Float, δlevels, texel)
 
 
-@dataclass(frozen=True)
-class _Prepared:
+_Function = Callable[[Any], Any]
+
+
+@functools.lru_cache(maxsize=4)
+def _prepare(variant: str, height: int, levels: Levels) -> tuple[Operator, _Function, _Function]:
     """An operator with its `apply` and `apply_transposed`, traced once and then replayed.
 
     Tracing them takes as long as running them. All sizes are the operator's own, so that a recording is valid
     for every call.
     """
-
-    operator: Operator
-    forward: Callable[[Any], Any]
-    adjoint: Callable[[Any], Any]
-
-
-@functools.lru_cache(maxsize=4)
-def _prepare(variant: str, height: int, levels: Levels) -> _Prepared:
     op = _build(height, levels)
-    return _Prepared(
-        op,
-        replayed(lambda radiance: apply(op, radiance)),
-        replayed(lambda δlevels: apply_transposed(op, δlevels)),
-    )
+    return op, replayed(lambda radiance: apply(op, radiance)), replayed(lambda δ: apply_transposed(op, δ))
 
 
 def operator(height: int, levels: Levels = LEVELS) -> Operator:
     """The prefilter for maps (height, 2·height), built once per height, levels and variant (64 rows: 1 s)."""
-    return _prepare(mi.variant(), height, levels).operator
+    return _prepare(mi.variant(), height, levels)[0]
 
 
 class _Prefilter(dr.CustomOp):
     """`apply` under AD; linear, so that its derivative is itself."""
 
-    def eval(self, prepared: _Prepared, radiance: Any) -> Any:
-        self.prepared = prepared
-        return prepared.forward(_opaque(radiance))
+    def eval(self, functions: tuple[_Function, _Function], radiance: Any) -> Any:
+        self.apply, self.transposed = functions
+        return self.apply(_opaque(radiance))
 
     def forward(self) -> None:
-        self.set_grad_out(self.prepared.forward(_opaque(self.grad_in("radiance"))))
+        self.set_grad_out(self.apply(_opaque(self.grad_in("radiance"))))
 
     def backward(self) -> None:
-        self.set_grad_in("radiance", self.prepared.adjoint(_opaque(self.grad_out())))
+        self.set_grad_in("radiance", self.transposed(_opaque(self.grad_out())))
 
     def name(self) -> str:
         return "prefilter"
@@ -432,5 +419,5 @@ def _opaque(values: Any) -> Any:
 
 def prefilter(radiance: Any, levels: Levels = LEVELS) -> tuple[Operator, Any]:
     """Operator and levels (flat RGBA, under AD) of a radiance tensor (h, 2h, 3), h a multiple of 4."""
-    prepared = _prepare(mi.variant(), radiance.shape[0], levels)
-    return prepared.operator, dr.custom(_Prefilter, prepared, radiance.array)
+    operator, *functions = _prepare(mi.variant(), radiance.shape[0], levels)
+    return operator, dr.custom(_Prefilter, tuple(functions), radiance.array)

@@ -17,24 +17,17 @@ from mi_refgs.shade.reflection import TraceContext
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
 
+DIELECTRIC_F0 = 0.04  # reflectance at normal incidence; the model has no metals
+# As in R3DG's code: directions lie at least 10° above the horizon; (least, what the attribute adds at most).
 LEAST_COSINE = math.sin(math.radians(10))
-"""Directions lie at least 10° above the horizon. [R3DG's code]"""
-
-DIELECTRIC_F0 = 0.04
-"""Reflectance at normal incidence; the model has no metals."""
-
-BASE_RANGE = (0.03, 0.77)
-"""Least base colour, and what the channel adds to it at most. [R3DG's code]"""
-
-ROUGHNESS_RANGE = (0.09, 0.9)
-"""Least roughness, and what the channel adds to it at most. [R3DG's code]"""
+BASE_RANGE, ROUGHNESS_RANGE = (0.03, 0.77), (0.09, 0.9)
 
 
 class MonteCarlo(Reflectance):
     """c = mean over J directions w of (b / π + f_s(w, v)) (V L(w) + max(0, SH(w; indirect))) 2π n·w.
 
     f_s is GGX with α = roughness², Smith-Schlick shadowing of k = (roughness + 1)² / 8, and F0 = 0.04.
-    b = 0.03 + 0.77 albedo, roughness = 0.09 + 0.9 of the channel. The directions are those of a Fibonacci
+    b = 0.03 + 0.77 albedo, roughness = 0.09 + 0.9 of the attribute. The directions are those of a Fibonacci
     hemisphere about the normal, J = `options.directions`; the normal is detached in all of it. V is 0 where
     the mesh blocks the ray, if `options.occlusion`. The light of other surfaces, `indirect_sh`,
     counts where the surfels have it.
@@ -74,8 +67,7 @@ class MonteCarlo(Reflectance):
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
         count = dr.opaque(mi.UInt32, options.directions)
         normal = dr.detach(safe_normalize(points.normal))
-        free = points.get("free")
-        incident = points.get("incident")
+        free, incident = points.get("free"), points.get("incident")
         base = dr.fma(points.albedo, BASE_RANGE[1], BASE_RANGE[0])
         roughness = dr.fma(points.roughness, ROUGHNESS_RANGE[1], ROUGHNESS_RANGE[0])
 

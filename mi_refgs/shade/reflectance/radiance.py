@@ -31,7 +31,7 @@ class Radiance(Reflectance):
         return RadianceTerms(points.radiance)
 
 
-class Displayed(Reflectance):
+class Displayed(Radiance):
     """c = linear(e), with e the mean of max(0, ½ + Σ c Y(d)) over what a pixel sees: sRGB-encoded colours.
 
     3DGS and 2DGS blend encoded colours, A e = Σ w e_i, and show A e + (1 - A) background. Radiance with this
@@ -40,14 +40,8 @@ class Displayed(Reflectance):
 
     name = "displayed"
     orders = ("pixel",)
-    light = "none"
+    order_independent = False
     encoded = True
-
-    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
-        return ("radiance_sh",)
-
-    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
-        return {"radiance": seen.harmonic_colour(surfels.value("radiance_sh"))}
 
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
         encoded = points.radiance

@@ -14,8 +14,7 @@ from mi_refgs.shade.reflection import TraceContext, reflection
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
 
-MATERIALS = ("albedo", "metallic", "roughness")
-"""Channels of the surface under the light."""
+MATERIALS = ("albedo", "metallic", "roughness")  # attributes of the surface under the light
 
 
 class SplitSum(Reflectance):
@@ -23,14 +22,7 @@ class SplitSum(Reflectance):
 
     name = "split_sum"
     visibility = "mirror"
-    options = (
-        "dominant",
-        "multiscatter",
-        "antialias",
-        "visibility_rays",
-        "traced_bounces",
-        "ambient_rays",
-    )
+    options = ("dominant", "multiscatter", "antialias", "visibility_rays", "traced_bounces", "ambient_rays")
 
     def channels(self, options: ShadingOptions) -> tuple[str, ...]:
         return (*MATERIALS, "radiance_sh") if options.diffuse == "sh" else MATERIALS
@@ -51,6 +43,4 @@ class SplitSum(Reflectance):
 
     def trace(self, points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
         points = reflection(points, context, options)
-        if not options.ambient_rays:
-            return points
-        return points.replaced(ambient=ambient_of_pixels(context))
+        return points.replaced(ambient=ambient_of_pixels(context)) if options.ambient_rays else points
