@@ -1,4 +1,4 @@
-"""Hard cases against a float64 reference, compared with textbook formulas in float32.
+"""Hard cases against a float64 reference.
 
     python -m benchmarks.stability                     the page docs/stability.md, in 15 minutes on 2 cores
     python -m benchmarks.stability --quick -o out      without large cases, fits, the method's own error

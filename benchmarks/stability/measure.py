@@ -1,4 +1,4 @@
-"""Render a case by the product, the float64 reference and the textbook: errors, verdict."""
+"""Render a case by the product and the float64 reference: errors, verdict."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.stability import textbook
 from benchmarks.stability.cases import Array, Case
 from benchmarks.stability.exact import (
     fast_camera,
@@ -65,7 +64,6 @@ class Row:
     image_floor: float  # change of the exact answer by one ulp of the inputs
     gradient_floor: dict[str, float]
     negligible: list[str]  # classes of less than NEGLIGIBLE
-    textbook: float  # image error of the textbook formulas; inf where they are not finite
 
     @property
     def verdict(self) -> str:
@@ -158,11 +156,8 @@ def chosen_pixels(case: Case) -> Array:
     return np.sort(np.random.default_rng(5).choice(every, case.pixels, replace=False))
 
 
-def measure(case: Case, floors: bool = True, book: bool = True) -> Row:
-    """All numbers of a case.
-
-    `floors`: the condition of the answer even where nothing exceeds a limit; `book`: the textbook's error.
-    """
+def measure(case: Case, floors: bool = True) -> Row:
+    """All numbers of a case; `floors`: the condition of the answer even where nothing exceeds a limit."""
     case = case.rounded()
     pixels = chosen_pixels(case)
     order = product_order(case, pixels) if len(case.raw["position"]) else np.empty((0, len(pixels)), int)
@@ -188,7 +183,7 @@ def measure(case: Case, floors: bool = True, book: bool = True) -> Row:
     inverted = inversion(case, scene, truth) if len(order) else 0.0
     return Row(
         case.name, image, others, gradients, found.non_finite, kept, inverted, image_floor, gradient_floor,
-        negligible(exact, scene.raw), textbook.image_error(case, scene, band) if book else 0.0,
+        negligible(exact, scene.raw),
     )  # fmt: skip
 
 

@@ -116,7 +116,6 @@ def record(row: Row) -> dict[str, Any]:
         "case": row.name,
         "image": row.image,
         "maps": row.maps,
-        "textbook": row.textbook,
         "ulp_image": row.image_floor,
         "ulp_gradient": max(row.gradient_floor.values(), default=0.0),
         "non_finite": row.non_finite,
@@ -158,14 +157,12 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
     """By name in page.md."""
     rows, limits = result["rows"], (IMAGE_LIMIT, GRADIENT_LIMIT, ORDER_LIMIT, NEGLIGIBLE)
     names = ("image_limit", "gradient_limit", "order_limit", "negligible")
-    keys = ("value", "slope", "textbook_value", "textbook_slope")
     return dict(zip(names, map(_e, limits), strict=True)) | {
         "count": len(rows),
         "hold": sum(row["verdict"] == "within limits" for row in rows),
         "ill": sum(row["verdict"].startswith("ill") for row in rows),
         "failed": len(failures(result)),
         "non_finite": sum(row["non_finite"] for row in [*rows, *result["losses"], *result["fits"]]),
-        "textbook_misses": sum(row["textbook"] is None or row["textbook"] > IMAGE_LIMIT for row in rows),
         "kept": f"{KEPT:.0%}",
         "ill_factor": f"{ILL:g}",
         "cases": table(["case", *COLUMNS], [[row["case"], *_case(row)] for row in rows]),
@@ -174,8 +171,8 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
             [[row["case"], *(_class(row, name) for name in GRADIENTS)] for row in rows],
         ),
         "curve": table(
-            ["sRGB at", "value", "slope", "textbook value", "textbook slope"],
-            [[row["at"], *(_e(row[key]) for key in keys)] for row in result["curve"]],
+            ["sRGB at", "value", "slope"],
+            [[row["at"], _e(row["value"]), _e(row["slope"])] for row in result["curve"]],
         ),
         "losses": table(
             ["image", "loss", "gradient", "not finite"],
@@ -199,17 +196,13 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-COLUMNS = (
-    "image", "maps", "gradient, largest", "not finite", "textbook image", "image, 1 ulp", "gradient, 1 ulp",
-    "verdict",
-)  # fmt: skip
+COLUMNS = ("image", "maps", "gradient, largest", "not finite", "image, 1 ulp", "gradient, 1 ulp", "verdict")
 
 
 def _case(row: dict[str, Any]) -> list[Any]:
     worst = max((row[f"gradient_{n}"] or 0.0 for n in GRADIENTS), default=0.0)
     ulps = [_e(x) if (x := row[key]) else "" for key in ("ulp_image", "ulp_gradient")]  # cheap cases
-    errors = [*map(_e, (row["image"], row["maps"], worst)), row["non_finite"], _e(row["textbook"])]
-    return [*errors, *ulps, row["verdict"]]
+    return [*map(_e, (row["image"], row["maps"], worst)), row["non_finite"], *ulps, row["verdict"]]
 
 
 def _class(row: dict[str, Any], name: str) -> str:

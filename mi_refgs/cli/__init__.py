@@ -57,9 +57,10 @@ EXIT_CODES = {
     2: "bad input",
     3: "jobs of a comparison failed",
     130: "interrupted",
+    141: "the reader of the output closed it (SIGPIPE)",
     143: "terminated (SIGTERM)",
 }
-"""130 and 143 are the codes of shells for a program that a signal ended: 128 + SIGINT, 128 + SIGTERM."""
+"""130, 141 and 143 are the codes of shells for a program that a signal ended: 128 + its number."""
 
 RENAMED: dict[str, dict[str, str]] = {
     "capture": {"--camera": "--camera-model"},
@@ -156,7 +157,16 @@ def _current(name: str, options: Sequence[str]) -> Iterator[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
-    argv = sys.argv[1:] if argv is None else list(argv)
+    try:
+        code = _run(sys.argv[1:] if argv is None else list(argv))
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of the output, such as `head`, has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the flush at exit would fail again
+        return 141
+    return code
+
+
+def _run(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "--version"):
         print(f"mi_refgs {__version__}" if "--version" in argv else overview())
         return 0

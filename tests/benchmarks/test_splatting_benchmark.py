@@ -78,15 +78,11 @@ def test_counts_are_ordered(result: dict[str, Any]) -> None:
     assert 3 < large["contributing"] / small["contributing"] < 5  # four times the pixels
 
 
-def test_every_renderer_and_phase_is_timed(result: dict[str, Any]) -> None:
-    first = where(result["rows"], surfels=200, size=32)[0]
-    for key in ("forward", "both", "colour_both", "volprim_forward", "volprim_both"):
-        assert first[f"{key}_ms"] > 0
+def test_times_exceed_their_bounds(result: dict[str, Any]) -> None:
     for row in result["rows"]:
-        assert min(page._phases(row)) > 0
         assert row["bound_forward_ms"] < row["forward_ms"] and row["bound_both_ms"] < row["both_ms"]
     for stage in result["step"].values():
-        assert stage["splat_ms"] > 0 and set(measure.PHASES) <= set(stage["phases_ms"])
+        assert set(measure.PHASES) <= set(stage["phases_ms"])
 
 
 def test_errors_are_small(result: dict[str, Any]) -> None:

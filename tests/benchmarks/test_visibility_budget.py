@@ -1,4 +1,4 @@
-"""The error budget of visibility: its chains add up, and a part is nothing where its cause is absent."""
+"""The error budget of visibility: the ends of its chains, and parts that vanish with their cause."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.common.errors import Step, decompose
+from benchmarks.common.errors import Step
 from benchmarks.common.view import Look
 from benchmarks.visibility import budget
 from benchmarks.visibility.cases import PAPER, SMALL, Concave, Rule, make_scene
@@ -78,15 +78,6 @@ def random_chains(rng: np.random.Generator) -> list[list[Step]]:
     fitted = budget.FittedHarmonics(image(), image(), (image(), image()))
     traced = budget.Traced(image(), image(), image())
     return [budget.by_harmonics(shipped, exact, fitted), budget.by_tracing(shipped, exact, traced)]
-
-
-def test_chain_adds_up_at_every_pixel(rng: np.random.Generator) -> None:
-    for steps in random_chains(rng):
-        signed = [before.values - after.values for before, after in itertools.pairwise(steps)]
-        np.testing.assert_allclose(sum(signed), steps[0].values - steps[-1].values, atol=1e-15)
-        found = decompose(steps)
-        assert sum(part.share for part in found.parts) == pytest.approx(1, abs=1e-12)
-        assert found.sum + found.interaction == pytest.approx(found.total)
 
 
 def test_both_chains_end_with_the_path_tracer(rng: np.random.Generator) -> None:

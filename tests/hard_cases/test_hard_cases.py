@@ -34,7 +34,7 @@ ILL_CONDITIONED = {
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_case(case: Case) -> None:
-    row = measure(case, floors=False, book=False)
+    row = measure(case, floors=False)
     assert row.verdict == "within limits" or case.name in ILL_CONDITIONED, row
     assert "FAILS" not in row.verdict, row
 
@@ -44,7 +44,7 @@ def test_slope_at_flat_split_sum_table(name: str, monkeypatch: pytest.MonkeyPatc
     """The gradient of a mirror's roughness is tiny, and right: not the rounding of interpolated values."""
     monkeypatch.setattr(module, "NEGLIGIBLE", 0.0)
     case = next(case for case in CASES if case.name == name)
-    assert measure(case, floors=False, book=False).gradients["roughness"] <= 1e-3
+    assert measure(case, floors=False).gradients["roughness"] <= 1e-3
 
 
 @pytest.mark.parametrize("row", response.CURVE, ids=str)
@@ -126,7 +126,7 @@ def test_verdicts() -> None:
         given: dict[str, Any] = {
             "name": "", "image": 1e-5, "maps": 1e-5, "gradients": {"scale": 1e-3}, "non_finite": 0,
             "kept": 1.0, "order": 0.0, "image_floor": 0.0, "gradient_floor": {"scale": 0.0},
-            "negligible": [], "textbook": 0.0,
+            "negligible": [],
         }  # fmt: skip
         return Row(**(given | changes)).verdict
 
