@@ -119,7 +119,7 @@ def compare(workload: Workload, size: int) -> dict[str, float]:
     raw["radiance_sh"] = workload.features[near, :3] - 0.5
     part = crop(workload, size)
     case = Case("part", raw, part.pinhole, sky(), at="surfel", reflectance="radiance")
-    row = measure_case(case, floors=False, book=False)
+    row = measure_case(case, floors=False)
     found = {"order": row.order, "left_out": 1 - row.kept, "image": row.image, "maps": row.maps}
     return found | {f"gradient_{name}": row.gradients[name] for name in CLASSES}
 
