@@ -65,9 +65,8 @@ def _require_range(where: str, angle: str, rotate: float, exposure: float) -> No
     if not np.isfinite(rotate):
         raise InputError(f"{where}{angle}: {rotate} is out of range; give degrees")
     if not abs(exposure) <= EXPOSURE_MAX:
-        raise InputError(
-            f"{where}exposure: {exposure} is out of range; give stops from {-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
-        )
+        allowed = f"give stops from {-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
+        raise InputError(f"{where}exposure: {exposure} is out of range; {allowed}")
 
 
 def world_light(
