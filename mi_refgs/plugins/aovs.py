@@ -43,7 +43,7 @@ class AOV:
     type: str
 
     def channels(self) -> list[str]:
-        """Attribute names, such as `n.X`, `n.Y`, `n.Z`."""
+        """Names of the image channels, such as `n.X`, `n.Y`, `n.Z`."""
         return [f"{self.name}.{suffix}" for suffix in suffixes()[self.type]]
 
 

@@ -55,7 +55,7 @@ class FilmImage:
         parts = []
         for band in self._bands(None):
             parts.append(self._values(band))
-            if band.rows < self._size[0]:
+            if band.size[1] < self._size[0]:
                 dr.eval(parts[-1])
         values = dr.concat(parts) if len(parts) > 1 else parts[0]
         parts.clear()
@@ -73,9 +73,10 @@ class FilmImage:
         δ_values = self._through_film(lambda image, values: _pulled(image, values, δ_image))
         at = 0
         for band in found:
-            δ = self._rows(δ_values, at, band.rows)
-            at += band.rows
-            yield self._values(band), δ
+            entries = band.size[1] * dr.width(δ_values) // self._size[0]
+            index = dr.arange(mi.UInt32, entries) + dr.opaque(mi.UInt32, at)
+            at += entries
+            yield self._values(band), dr.gather(mi.Float, δ_values, index)
 
     def tangent(self) -> Any:
         """Tangent of the image for the tangents of the parameters; zero where none of these changes it."""
@@ -116,12 +117,6 @@ class FilmImage:
         made = self.channels(frame, camera, mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha))
         pixels = dr.zeros(mi.Float, camera.width * camera.height)
         return dr.ravel(mi.ArrayXf([band.kept(channel + pixels) for channel in made]))
-
-    def _rows(self, values: Any, first: int, rows: int) -> Any:
-        """The values of some rows."""
-        length = dr.width(values) // self._size[0]
-        index = dr.arange(mi.UInt32, rows * length) + dr.opaque(mi.UInt32, first * length)
-        return dr.gather(mi.Float, values, index)
 
     # ---------------- the film ----------------
 

@@ -159,9 +159,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     environment, but not to sensors, background or mesh; `mi_refgs.splat.composite` lists the derivatives that
     are absent.
 
-    A surfel with a value that is NaN or infinite in any attribute, or beyond 1e18 in position or spherical
-    harmonics, covers no pixel and gets zero gradient; such a value of the light is black. One warning names
-    the attribute.
+    A surfel with a value that is NaN or infinite in any attribute, or beyond 1e18 in position or SH
+    coefficients, covers no pixel and gets zero gradient; such a value of the light is black. One warning
+    names the attribute.
 
     .. tabs::
         .. code-tab:: xml
@@ -198,7 +198,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.aovs = read_aovs(props)
         self.check()
         self.unusable = UnusableValues()
-        self.unusable.warn(*self._values())
+        self.unusable.warn(self._models, self._maps)
 
     def check(self) -> None:
         """Raise InputError for shapes that do not fit and for attributes that are required but absent."""
@@ -211,24 +211,26 @@ class RefGSIntegrator(mi.SamplingIntegrator):
                     f"refgs: {name}: the surfels have no such attribute; add it, or do without it"
                 )
         self.background.require_fit(self.surfels)
-        for name, found in self._values()[1].items():
-            shape = tuple(found.raw.shape)
-            if len(shape) != 3 or shape[2] != 3 or shape[1] != 2 * shape[0] or shape[0] % 4:
-                raise InputError(f"refgs: {name}: shape {shape}, expected (h, 2h, 3) with h a multiple of 4")
+        for name, found in self._maps.items():
+            try:
+                EnvironmentLight(found.raw)  # checks the shape, which an update may have changed
+            except InputError as error:
+                raise InputError(f"refgs: {name}: {error}") from error
 
-    def _values(self) -> tuple[dict[str, Surfels], dict[str, EnvironmentLight]]:
-        """Surfel models, and lat-long maps, by name."""
+    @property
+    def _models(self) -> dict[str, Surfels]:
         models = {"surfels": self.surfels, "surroundings": self.background.surfels}
+        return {name: model for name, model in models.items() if model is not None}
+
+    @property
+    def _maps(self) -> dict[str, EnvironmentLight]:
         maps = {"light": self.light, "background": self.background.map}
-        return (
-            {name: model for name, model in models.items() if model is not None},
-            {name: found for name, found in maps.items() if found is not None},
-        )
+        return {name: found for name, found in maps.items() if found is not None}
 
     @property
     def surfel_count(self) -> int:
         """Number of surfels of the object and its surroundings."""
-        return sum(model.count for model in self._values()[0].values())
+        return sum(model.count for model in self._models.values())
 
     # ---------------- parameters ----------------
 
@@ -262,7 +264,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         evaluate: bool = True,
     ) -> Any:
         """The image (h, w, c) of a sensor; see the class for its channels."""
-        self.unusable.check(*self._values())
+        self.unusable.check(self._models, self._maps)
         image = self._image(scene, sensor, spp, forward_only=True).image()
         if evaluate:
             dr.eval(image)
@@ -295,9 +297,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         request = Request({aov.type for aov in self.aovs}, forward_only)
         view = partial(self.frame, scene, request, self.background)
-        return FilmImage(
-            sensor, spp, view, self._channels, self.aov_names(), self.shading.neighbours, self.surfel_count
-        )
+        names, neighbours = self.aov_names(), self.shading.neighbours
+        return FilmImage(sensor, spp, view, self._channels, names, neighbours, self.surfel_count)
 
     def _channels(self, frame: Frame, camera: Camera, alpha: bool) -> list[Any]:
         """R, G, B, (A), W and the AOVs, as the film's blocks have them."""

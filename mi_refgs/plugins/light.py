@@ -20,6 +20,7 @@ from mi_refgs.shade.light.envmap import (
     PrefilteredLight,
     UnfilteredLight,
     bounded,
+    is_height,
 )
 from mi_refgs.shade.light.light import ConstantLight, Light, RotatedLight
 from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels, resample
@@ -69,7 +70,7 @@ def emitter_light(emitter: Any, filtered: bool = True, levels: Levels = LEVELS) 
 def light_of(shading: Shading, own: EnvironmentLight | None, rotation: Any, scene: Any) -> Light | None:
     """The integrator's own light and rotation, else the scene's emitter, as the shading's model looks it up.
 
-    None if the model asks for no light. Raises InputError if there is none.
+    None if the model uses no light. Raises InputError if there is none.
     """
     wanted = shading.model.light
     if wanted == "none":
@@ -96,7 +97,7 @@ def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
     texel = dr.arange(mi.UInt32, rows * width * 3)
     source = ((texel // (3 * width)) * columns + (texel // 3) % width + 1) * channels + texel % 3
     texels = dr.gather(mi.Float, data.array, source)
-    resampled = not (width == 2 * rows and rows % 4 == 0 and MIN_HEIGHT <= rows <= MAX_HEIGHT)
+    resampled = not (width == 2 * rows and is_height(rows) and rows <= MAX_HEIGHT)
     shape = (rows, width, 3)
     if resampled:
         height = min(MAX_HEIGHT, max(MIN_HEIGHT, 4 * (width // 8)))

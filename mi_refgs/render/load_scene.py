@@ -1,4 +1,4 @@
-"""A Mitsuba scene file as an object, its `refgs` integrator with what a caller asks for besides."""
+"""Load a Mitsuba scene file, with further AOVs of its `refgs` integrator or the object only."""
 
 from __future__ import annotations
 

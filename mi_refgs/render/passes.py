@@ -1,7 +1,7 @@
 """Rendering in passes, band of rows by band of rows, so that memory does not grow with the sample count.
 
 The tiles of a band are tiles of the whole image, with the same lists: its pixels have the same values.
-Bands are equally high and their offsets opaque, so that one set of kernels serves all of them.
+Bands are equally high and their offsets opaque, so that all of them use one set of kernels.
 """
 
 from __future__ import annotations
@@ -29,11 +29,6 @@ class Band:
     camera: Camera  # of the rows, and of `margin` neighbours on all sides that lie on the film
     first: tuple[int, int]  # column and row of the band's first pixel in what `camera` sees
     size: tuple[int, int]  # columns and rows of the band
-
-    @property
-    def rows(self) -> int:
-        """Rows of the band."""
-        return self.size[1]
 
     def kept(self, value: Any) -> Any:
         """The band's own pixels of an array of values per pixel of `camera`; one of width 1 stays."""
@@ -101,7 +96,7 @@ def in_passes(
     def stacked(*values: Any) -> Any:
         if all(dr.width(value) == 1 for value in values):
             return values[0]
-        wide = [x + dr.zeros(type(x), b.rows * camera.width) for x, b in zip(values, found, strict=True)]
+        wide = [x + dr.zeros(type(x), b.size[0] * b.size[1]) for x, b in zip(values, found, strict=True)]
         return dr.concat(wide)
 
     return _mapped(stacked, *parts)

@@ -1,9 +1,9 @@
 """Render surfels to an image, in the two orders that every method is made of.
 
-    forward shading:   attributes ─ shade ─► radiance ─ blend ─► image      (`Shading.at` is "surfel")
-    deferred shading:  attributes ─ blend ─► G-buffer ─ shade ─► image      (`Shading.at` is "pixel")
+    forward shading:   attributes ─ shade ─► radiance ─ blend ─► image      (`Shading.order` is "surfel")
+    deferred shading:  attributes ─ blend ─► G-buffer ─ shade ─► image      (`Shading.order` is "pixel")
 
-The same splatter and the same `shade` serve both. Everything is traced by Dr.Jit. No derivative: visibility,
+Both use the same splatter and the same `shade`. Everything is traced by Dr.Jit. No derivative: visibility,
 the side to which a normal is turned, the camera, and those that `mi_refgs.splat.composite` lists.
 """
 
@@ -42,7 +42,7 @@ class SurfelScene:
     surfels: Surfels
     shading: Shading
     light: Light | None = None  # as `Shading.light_of` returns it; required unless the model uses none
-    occluder: Occluder | None = None  # `traced_bounces` requires that it knows the surfels' materials
+    occluder: Occluder | None = None  # `traced_bounces` requires that it has the surfels' materials
     surroundings: Surroundings | None = None
 
     @property
@@ -54,7 +54,7 @@ class SurfelScene:
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a render."""
+    """Requested outputs of a render, and how they are computed."""
 
     aovs: Collection[str] = ()  # materials, terms of the radiance, "visibility", "normal", "depth", by name
     forward_only: bool = False  # without derivatives: faster, equal to rounding
@@ -68,22 +68,28 @@ RADIANCE = Request()
 
 @dataclass(frozen=True)
 class Frame:
-    """One rendered view: arrays of H·W values in raster order.
+    """One rendered view: arrays of H·W linear values in raster order.
 
-    Radiance and its terms are linear and premultiplied by alpha; maps are divided by it and 0 where nothing
-    is seen. With `Surroundings`, alpha, depth and radiance are of both, terms and maps of the object. AOVs
-    that were not asked for are None or missing; with derivatives, those are present that the radiance needs.
+        field      of object and surroundings       weight                   where nothing is seen
+        radiance   both                             times alpha              0
+        depth      both                             divided by alpha         0
+        normal     forward: both; deferred: object  times normal_alpha       0
+        terms      object                           times object_alpha       0
+        maps       object                           divided by object_alpha  0
+
+    Without derivatives, AOVs that were not requested are None or absent. With derivatives, those that the
+    radiance was computed from are there as well.
     """
 
     alpha: Float  # accumulated opacity
-    depth: Float  # expected camera-z depth, 0 where nothing is seen
-    normal: Vector3f  # blended world normal towards the camera, premultiplied by `normal_alpha`
+    depth: Float  # expected camera-z depth
+    normal: Vector3f  # blended world normal towards the camera
     radiance: Color3f  # over black
     terms: RadianceTerms | None = None  # diffuse, specular, indirect; they sum to the radiance of the object
     maps: dict[str, Any] = field(default_factory=dict)  # by name: materials such as albedo, visibility
-    background: Color3f = None  # dot2, seen through 1 - alpha; only with surroundings
+    background: Color3f = None  # linear, seen through 1 - alpha; None without surroundings
     object_alpha: Float = None  # opacity of the object, `alpha` itself without surroundings
-    normal_alpha: Float = None  # opacity of the surfels that `normal` is of: `alpha`, `object_alpha`
+    normal_alpha: Float = None  # `alpha` in forward, `object_alpha` in deferred shading
     distance: Float = None  # mean along the ray from the near plane, of several samples per pixel
 
     def only(self, aovs: Collection[str]) -> Frame:
@@ -126,33 +132,22 @@ def render_depth(
 def _in_raster_order(frame: Frame, pixels: CompactedPixels | None) -> Frame:
     if pixels is None:
         return frame
-    alphas = frame.alpha, frame.object_alpha, frame.normal_alpha
-    dr.eval(frame.depth, frame.normal, frame.radiance, frame.terms, frame.maps, *alphas)
+    arrays = {name: getattr(frame, name) for name in ("alpha", "depth", "normal", "radiance")}
+    arrays |= {name: getattr(frame, name) for name in ("object_alpha", "normal_alpha")}
+    dr.eval(arrays, frame.terms, frame.maps)
     raster = pixels.to_raster
-    terms = frame.terms and RadianceTerms(
-        **{name: raster(term) for name, term in frame.terms.known().items()}
-    )
-    return replace(
-        frame,
-        alpha=raster(frame.alpha),
-        depth=raster(frame.depth),
-        normal=raster(frame.normal),
-        radiance=raster(frame.radiance),
-        terms=terms,
-        maps={name: raster(value) for name, value in frame.maps.items()},
-        object_alpha=raster(frame.object_alpha),
-        normal_alpha=raster(frame.normal_alpha),
-    )
+    terms = frame.terms and RadianceTerms(**{name: raster(x) for name, x in frame.terms.known().items()})
+    maps = {name: raster(value) for name, value in frame.maps.items()}
+    return replace(frame, terms=terms, maps=maps, **{name: raster(x) for name, x in arrays.items()})
 
 
 def _without_empty_tables(scene: SurfelScene, request: Request) -> tuple[SurfelScene, Request]:
     """Put one unseen surfel into tables without any, since Dr.Jit refuses empty arrays."""
 
     def unseen(surfels: Surfels) -> Surfels:
-        raw = {name: (-LOGIT_LIMIT if name == "opacity" else 0, x) for name, x in surfels.raw.items()}
-        return Surfels(
-            {n: dr.full(mi.TensorXf, value, (1, int(x.shape[1]))) for n, (value, x) in raw.items()}
-        )
+        values = {name: -LOGIT_LIMIT if name == "opacity" else 0 for name in surfels.raw}
+        shapes = {name: (1, int(tensor.shape[1])) for name, tensor in surfels.raw.items()}
+        return Surfels({name: dr.full(mi.TensorXf, values[name], shapes[name]) for name in values})
 
     surroundings = scene.surroundings
     if scene.surfels.count == 0:
@@ -244,23 +239,24 @@ def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
         points = scene.shading.model.trace(points, context, scene.shading)
     terms = shade(points, scene.light, scene.shading)
 
-    # Blend it with the requested AOVs only: each slot costs time in every surfel-tile pair.
+    # Slots: the radiance and the requested AOVs only, since each costs time in every surfel-tile pair.
+    asked_terms = {name: term for name, term in terms.known().items() if name in asked}
     slots = {"radiance": terms.total()} | ({"normal": points.normal} if "normal" in asked else {})
-    others = {name: value for name, value in view.others.items() if name in slots}
     materials = view.materials()
-    apart = {name: term for name, term in terms.known().items() if name in asked}
-    if asked - {"normal"}:
-        slots |= apart | materials | view.presence()
-    buffer = view.blend(slots, others)
+    slots |= asked_terms | materials
+    if asked - {"normal"}:  # terms and maps are those of the object: they need its opacity
+        slots |= view.presence()
+    buffer = view.blend(slots, {name: value for name, value in view.others.items() if name in slots})
 
+    # Frame.
     blended = buffer.slots
-    known = RadianceTerms(**{"diffuse": None} | {name: blended[name] for name in apart}).filled()
+    blended_terms = {"diffuse": None} | {name: blended[name] for name in asked_terms}
     frame = Frame(
         alpha=buffer.alpha,
         depth=buffer.depth,
         normal=blended.get("normal"),
         radiance=blended["radiance"],
-        terms=known if asked & {*TERMS} else None,
+        terms=RadianceTerms(**blended_terms).filled() if asked & {*TERMS} else None,
         maps={name: buffer.divided(name) for name in materials},
         background=view.background,
         object_alpha=blended.get(OBJECT, None if view.others else buffer.alpha),

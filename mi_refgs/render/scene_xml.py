@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -22,27 +23,24 @@ NEAR_CLIP_MIN = 1e-12
 FAR_CLIP = RAW_LIMIT
 
 
-def write_scene_xml(
-    path: str | Path,
-    *,
-    ply: str,
-    envmap: str | None = None,
-    mesh: str | None = None,
-    shading: Shading,
-    camera: Camera,
-    more: Sequence[Camera] = (),
-    surroundings: str | None = None,
-    background: Sequence[float] | str | None = None,
-    remark: str = "",
-) -> None:
-    """Write a Mitsuba scene with one `refgs` integrator and one perspective sensor, atomically.
+@dataclass(frozen=True)
+class SceneFiles:
+    """Names of a scene's files, relative to the folder of the XML, so that it can be moved."""
 
-    more: cameras of further sensors, which follow that of `camera`.
-    ply, envmap, mesh, surroundings: file names relative to the folder of the XML, so that it can be moved.
-    background: linear radiance (r, g, b) composited under alpha, the name of a lat-long map of it, or None
-    for a transparent image. The scene has a parameter `spp`, as in `mi.load_file(path, spp=4)`, 1 by default:
-    pixel centres, as in training.
-    remark: a comment in the file, if not empty.
+    ply: str
+    envmap: str | None = None
+    mesh: str | None = None
+    surroundings: str | None = None
+    background: Sequence[float] | str | None = None  # a lat-long map, linear radiance, or transparent
+
+
+def write_scene_xml(
+    path: str | Path, files: SceneFiles, shading: Shading, cameras: Sequence[Camera], remark: str = ""
+) -> None:
+    """Write a Mitsuba scene with one `refgs` integrator and a sensor per camera, atomically.
+
+    The scene has a parameter `spp`, as in `mi.load_file(path, spp=4)`, 1 by default: pixel centres, as in
+    training. remark: a comment in the file, if not empty.
 
     Mitsuba's `perspective` sensor has square pixels. Where those of the camera are not (fx ≠ fy), the film
     has more of them along one axis, and a comment says so: the same view, to half a pixel at that border.
@@ -50,7 +48,7 @@ def write_scene_xml(
     Raises InputError if the camera is mirrored, if there is no mesh for the occlusion, or if the path cannot
     be written.
     """
-    if shading.occlusion and mesh is None:
+    if shading.occlusion and files.mesh is None:
         raise InputError(f"{path}: mesh: there is none to trace; give one, or shade without occlusion")
     scene = ElementTree.Element("scene", version="3.0.0")
     scene.append(ElementTree.Comment(" needs `import mi_refgs` before mi.load_file "))
@@ -58,7 +56,7 @@ def write_scene_xml(
         scene.append(ElementTree.Comment(f" {remark} "))
     put(scene, "default", "spp", "1")
     integrator = ElementTree.SubElement(scene, "integrator", type="refgs", id="refgs")
-    put(integrator, "string", "filename", ply)
+    put(integrator, "string", "filename", files.ply)
     put(integrator, "string", "shade_at", shading.at)
     put(integrator, "string", "reflectance", shading.reflectance)
     put(integrator, "string", "diffuse", shading.diffuse)
@@ -66,21 +64,20 @@ def write_scene_xml(
     for name in shading.chosen():
         value = getattr(shading, name)
         put(integrator, "boolean" if isinstance(value, bool) else "integer", name, str(value).lower())
-    if mesh is not None:
-        put(integrator, "string", "mesh", mesh)
-    if surroundings is not None:
+    if files.mesh is not None:
+        put(integrator, "string", "mesh", files.mesh)
+    if files.surroundings is not None:
         integrator.append(ElementTree.Comment(" without these two: the object alone, on transparency "))
-        put(integrator, "string", "surroundings", surroundings)
-    if isinstance(background, str):
-        put(integrator, "string", "background", background)
-    elif background is not None:
-        put(integrator, "rgb", "background", _numbers(background))
-    if envmap is not None:
+        put(integrator, "string", "surroundings", files.surroundings)
+    if isinstance(files.background, str):
+        put(integrator, "string", "background", files.background)
+    elif files.background is not None:
+        put(integrator, "rgb", "background", _numbers(files.background))
+    if files.envmap is not None:
         light = ElementTree.SubElement(integrator, "emitter", type="envmap", name="light")
-        put(light, "string", "filename", envmap)
-    for index, one in enumerate([camera, *more]):
-        add_sensor(scene, one, f"sensor_{index}" if index else "sensor")
-
+        put(light, "string", "filename", files.envmap)
+    for index, camera in enumerate(cameras):
+        add_sensor(scene, camera, f"sensor_{index}" if index else "sensor")
     write_xml(path, scene)
 
 
@@ -112,11 +109,11 @@ def add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
     fx, fy, cx, cy, near = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy, camera.near))
     if not fx * fy > 0:
         raise InputError(
-            f"camera: fx, fy: {fx:g} and {fy:g} pixels mirror the picture, as no Mitsuba sensor does; choose "
+            f"camera: fx, fy: {fx:g} and {fy:g} pixels mirror the image, as no Mitsuba sensor does; choose "
             "another view"
         )
     to_world = camera.pose()
-    if fx > 0:  # both axes point the other way: the camera stands on its head
+    if fx > 0:  # both axes point the other way: the camera is upside down
         to_world[:3, :2] *= -1
     focal = max(abs(fx), abs(fy))
     per_pixel = focal / abs(fx), focal / abs(fy)

@@ -26,7 +26,7 @@ from mi_refgs.io.files import BusyError, make_folder, read_json, write_json
 from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import read_mesh, write_mesh
-from mi_refgs.render.scene_xml import write_scene_xml
+from mi_refgs.render.scene_xml import SceneFiles, write_scene_xml
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import (
     AROUND_FILE,
@@ -84,18 +84,9 @@ def _export(
     # Transparent without a background: images with alpha are composited after the sRGB encoding, which a
     # scene file cannot express. Without a background map it is black, as in `render`.
     black = (0.0, 0.0, 0.0) if around is not None and behind is None else None
-    write_scene_xml(
-        folder / SCENE,
-        ply=SURFELS,
-        envmap=light,
-        mesh=mesh,
-        shading=fitted.shading,
-        camera=cameras[0],
-        more=cameras[1:],
-        surroundings=around,
-        background=behind or black,
-        remark="" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels",
-    )
+    files = SceneFiles(SURFELS, light, mesh, around, behind or black)
+    remark = "" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels"
+    write_scene_xml(folder / SCENE, files, fitted.shading, cameras, remark)
     # Written last: if it is there, the other files are complete.
     note: dict[str, Any] = {"iteration": fitted.iteration, "seconds": fitted.seconds}
     note["surfels"] = fitted.surfels.count

@@ -36,9 +36,12 @@ def splat(
     forward_only: bool = False,
     depth: bool = True,
 ) -> Composited:
-    """Splat features of surfels to maps of H·W pixels; derivatives, `forward_only` as in `composite`."""
+    """Splat features of surfels to maps of H·W pixels.
+
+    Derivatives, `forward_only` and `depth` as in `composite`.
+    """
     if surfels.count == 0:
-        return Composited.nothing(len(features), camera, depth)
+        return Composited.nothing(len(features), camera, depth or not forward_only)
     footprints = project(surfels, camera, screen_offset)
     lists = list_by_tile(footprints, camera)
     if forward_only:

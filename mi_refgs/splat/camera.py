@@ -21,7 +21,7 @@ class Camera:
     """A pinhole camera: the point p of its frame lands on the pixel (fx·p.x/p.z + cx, fy·p.y/p.z + cy).
 
     In Mitsuba's camera frame (+x left, +y up) both focal lengths are negative. All numbers but the image size
-    are opaque Dr.Jit values, so that one compiled kernel serves every view of a data set. Cameras have no
+    are opaque Dr.Jit values, so that every view of a data set uses one compiled kernel. Cameras have no
     derivatives.
     """
 
@@ -74,30 +74,22 @@ class Camera:
         """
         matrix = np.asarray(to_world, dtype=np.float64)
         rotation = matrix[:3, :3]
-        if (
-            not np.all(np.isfinite(matrix))
-            or np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE
-        ):
+        finite = np.isfinite(matrix).all()
+        if not finite or np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE:
             raise InputError("camera: to_world: must be a rotation and a translation; remove scale and shear")
 
-        def opaque(x: float) -> Any:
-            return dr.opaque(mi.Float, float(x))
+        def opaque(*values: float) -> list[Float]:
+            return [dr.opaque(mi.Float, float(x)) for x in values]
 
-        columns = [opaque(x) for x in rotation.T.ravel()]
-        camera_from_world = mi.Matrix3f([columns[0:3], columns[3:6], columns[6:9]])
         origin = matrix[:3, 3].astype(np.float32)
-        rest = matrix[:3, 3] - origin
         return Camera(
             width,
             height,
-            opaque(fx),
-            opaque(fy),
-            opaque(cx),
-            opaque(cy),
-            camera_from_world,
-            mi.Point3f(*(opaque(x) for x in origin)),
-            mi.Vector3f(*(opaque(x) for x in rest)),
-            opaque(near),
+            *opaque(fx, fy, cx, cy),
+            mi.Matrix3f([opaque(*row) for row in rotation.T]),
+            mi.Point3f(*opaque(*origin)),
+            mi.Vector3f(*opaque(*(matrix[:3, 3] - origin))),
+            *opaque(near),
             abs(float(fx)),
         )
 
@@ -157,18 +149,10 @@ class Camera:
         slope = local[:, :2] / local[:, 2:]
         fx = width / (slope[1, 0] - slope[0, 0])
         fy = height / (slope[2, 1] - slope[0, 1])
-        camera = Camera.from_pose(
-            width,
-            height,
-            fx,
-            fy,
-            -fx * slope[0, 0],
-            -fy * slope[0, 1],
-            matrix,
-            near=float(params["near_clip"]),
-        )
-        film, (x, y) = sensor.film(), (int(offset) for offset in sensor.film().crop_offset())
-        size = int(film.size()[0]), int(film.size()[1])
+        cx, cy, near = -fx * slope[0, 0], -fy * slope[0, 1], float(params["near_clip"])
+        camera = Camera.from_pose(width, height, fx, fy, cx, cy, matrix, near)
+        x, y = (int(offset) for offset in sensor.film().crop_offset())
+        size = tuple(int(n) for n in sensor.film().size())
         return replace(camera, offset=(x, y), film=None if size == (width, height) else size)
 
     def towards(self, point: Point3f) -> Vector3f:

@@ -1,1 +1,1 @@
-"""The surfel table: named raw channels, their activations, initial values and the PLY file."""
+"""The surfel table: named raw attributes, their activations, initial values and the PLY file."""

@@ -174,8 +174,8 @@ class Surfels:
     def value(self, name: str) -> Any:
         """Activated values of an attribute.
 
-        mi.Float for one column, mi.Color3f for three, else a list: of mi.Color3f per coefficient of spherical
-        harmonics, of mi.Float for other widths. Geometry has accessors of its own types.
+        mi.Float for one column, mi.Color3f for three, else a list: mi.Color3f per SH coefficient, mi.Float for
+        other widths. Geometry has accessors of its own types.
         """
         columns = self.columns(name)
         activate = {"sigmoid": sigmoid, "exp": _exp}.get(attribute(name).activation)
@@ -211,7 +211,10 @@ class Surfels:
         return kind(*(_exp(column) for column in columns)) if self.count else dr.zeros(kind, 0)
 
     def opacity(self) -> Float:
-        """Opacities in [0, 1]; if `screened`, 0 with gradient 0 where the surfel is not `usable`."""
+        """Opacities in [0, 1]; if `screened`, 0 with gradient 0 where the surfel is not `usable`.
+
+        Schedules the evaluation of `usable` then.
+        """
         opacity = sigmoid(self.columns("opacity")[0])
         if not self.screened or self.count == 0:
             return opacity

@@ -160,7 +160,7 @@ def differing(a: dict[str, np.ndarray], b: dict[str, np.ndarray], tolerance: flo
 
 
 def rotated(scene: Scene, turn: Rotation) -> Scene:
-    """Surfels and camera turned about the origin together; harmonics stay."""
+    """Surfels and camera turned about the origin together; SH coefficients stay."""
     matrix = np.eye(4)
     matrix[:3, :3] = turn.as_matrix()
     position = turn.apply(scene.raw["position"])

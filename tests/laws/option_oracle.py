@@ -145,7 +145,7 @@ class Oracle:
         return maps
 
     def _rendered(self, values: Values) -> dict[str, Array]:
-        """Maps of `render`, of all that it knows."""
+        """Maps of `render`, of all AOVs."""
         case, chosen, camera = self.case, shading(self.case), self.camera
         held = {name: x.astype(np.float32) for name, x in values.items()}
         surfels = surfels_of(held)

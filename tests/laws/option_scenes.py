@@ -36,10 +36,8 @@ Values = dict[str, np.ndarray]
 AROUND = "surroundings_"
 OTHERS = 10
 """Rows of the surroundings."""
-SCALE = 0.8
-"""Of envmap emitters."""
-CONSTANT = (0.5, 1.0, 1.6)
-"""Radiance of constant lights."""
+SCALE = 0.8  # of envmap emitters
+CONSTANT = (0.5, 1.0, 1.6)  # radiance of constant lights
 BACKDROP = (0.3, 0.1, 0.6)
 """Radiance of a constant background."""
 FOV = 45.0

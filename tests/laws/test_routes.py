@@ -56,8 +56,7 @@ from tests.scenes.integrator import (
 WIDTH, HEIGHT, FOV, NEAR = 16, 12, 40.0, 0.05
 CROP = (4, 3, 9, 7)
 """Offset and size of a crop window, pixels."""
-TOLERANCE = 1e-5
-"""Of an image or an AOV, in parts of its largest value, at least 1."""
+TOLERANCE = 1e-5  # of an image or an AOV, in parts of its largest value, at least 1
 
 Maps = dict[str, np.ndarray]
 """The image (H, W, 4) as IMAGE, linear and premultiplied, and AOVs (H, W, C) by type."""
@@ -382,7 +381,7 @@ LOSSLESS = [
     (Shading("surfel", "radiance"), "gaussian"),
     (Shading("surfel", "radiance"), "surfel"),
 ]
-"""What a PLY file of another program holds whole."""
+"""What a PLY file of another program stores completely."""
 
 
 def cases() -> Iterator[Any]:

@@ -164,7 +164,7 @@ def test_units_do_not_matter(shading: Shading, scene: Scene, decades: float) -> 
 
 @given(scene=SCENES, seed=SEEDS)
 def test_alpha_is_the_composited_feature_one(scene: Scene, seed: int) -> None:
-    """To the bit; and what is blended is linear in what surfels carry."""
+    """To the bit; and what is blended is linear in the features."""
     f, g = np.random.default_rng(seed).normal(size=(2, COUNT)).astype(np.float32)
     surfels, camera = Surfels.from_numpy(scene.raw), scene.view.camera()
     columns = [dr.ones(mi.Float, COUNT), upload(f), upload(g), upload(2 * f - 3 * g)]

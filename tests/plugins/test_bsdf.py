@@ -220,7 +220,7 @@ BLOCK = 12
 
 
 def patch(angle: float, spp: int) -> tuple[Any, np.ndarray, np.ndarray]:
-    """A scene of one rectangle under a sky, each of its cells of another material, that fills the picture of
+    """A scene of one rectangle under a sky, each of its cells of another material, that fills the image of
     an orthographic sensor seen at `angle` (radians); with its normal and the direction of view."""
     normal, helper = unit(np.array([0.3, 0.5, 0.81])), np.array([1.0, 0, 0])
     up = unit(np.cross(normal, helper))
@@ -303,7 +303,7 @@ def sphere(integrator: str = "prb") -> Any:
 
 @pytest.mark.parametrize("roughness", [0.2, 0.7, 1.0])
 def test_derivatives_of_sampled_weights(roughness: float) -> None:
-    """Those of the weights give those of the reflectance, as samples, densities and the choice carry none."""
+    """Those of the weights give those of the reflectance, as samples, densities and the choice have none."""
     n_dot_v, metallic, ε = 0.5, 0.3, 1e-3
     of = mi.load_dict(bsdf(roughness, metallic))
     params = mi.traverse(of)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from mi_refgs.constants import TILE_SIZES, tile_size
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import SurfelScene, render
-from mi_refgs.render.scene_xml import write_scene_xml
+from mi_refgs.render.scene_xml import SceneFiles, write_scene_xml
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
@@ -43,15 +43,8 @@ def run_folder(folder: Path, background: tuple[float, float, float] | None = Non
     plane_mesh(folder)
     shifted = sensor(principal_point_offset_x=0.1, principal_point_offset_y=-0.2)
     camera = Camera.from_sensor(mi.load_dict(shifted))
-    write_scene_xml(
-        folder / "scene.xml",
-        ply="surfels.ply",
-        envmap="envmap.exr",
-        mesh="mesh.ply",
-        shading=Shading(occlusion=True),
-        camera=camera,
-        background=background,
-    )
+    files = SceneFiles("surfels.ply", "envmap.exr", "mesh.ply", background=background)
+    write_scene_xml(folder / "scene.xml", files, Shading(occlusion=True), [camera])
     return surfels, camera
 
 
@@ -243,7 +236,7 @@ def test_an_exported_scene_has_the_trainers_tiles(
     focal = limit * factor
     pose = look_at(np.random.default_rng(1).normal(size=3), np.zeros(3))
     camera = Camera.from_pose(width, height, -focal, -focal, width / 2 + 3, height / 2 - 5, pose, 0.01)
-    write_scene_xml(tmp_path / "scene.xml", ply="a.ply", shading=Shading(), camera=camera)
+    write_scene_xml(tmp_path / "scene.xml", SceneFiles("a.ply"), Shading(), [camera])
     root = ElementTree.parse(tmp_path / "scene.xml").getroot()
     root.remove(root.find("integrator"))  # type: ignore[arg-type]
     exported = Camera.from_sensor(mi.load_string(ElementTree.tostring(root, encoding="unicode")).sensors()[0])

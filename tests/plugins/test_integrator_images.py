@@ -45,7 +45,7 @@ def test_aovs_follow_mitsubas_names(tmp_path: Path) -> None:
     assert 0 < aov["v.Y"][seen].mean() < 1 and aov["ind.R"].max() > 0
     assert np.all((aov["r.Y"][seen] > 0) & (aov["r.Y"][seen] < 1))
     assert all(np.all(values[alpha == 0] == 0) for values in aov.values())
-    # The film holds the same image, in layers.
+    # The film contains the same image, in layers.
     layers = dict(of.sensors()[0].film().bitmap().split())
     assert set(layers) == {"<root>", "al", "m", "r", "n", "dd.y", "a", "v", "di", "sp", "ind"}
     assert np.allclose(

@@ -20,7 +20,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         require_supported_variant("refgs")
         super().__init__(props)
     def to_string(self):
-        return f"stand-in under {mi.variant()}"
+        return f"substitute under {mi.variant()}"
 
 mi.register_integrator("refgs", RefGSIntegrator)
 """
@@ -40,7 +40,7 @@ def make():
 
 
 def run(code: str, folder: Path, order: str = "import mi_refgs, mitsuba as mi") -> list[str]:
-    """Lines that `code` prints after the plugin's module was replaced by a stand-in, in a fresh process."""
+    """Lines that `code` prints after the plugin's module was replaced by another one, in a fresh process."""
     (folder / "stand_in.py").write_text(STAND_IN)
     return run_python(PRELUDE.format(order=order) + code, folder=folder).splitlines()
 
@@ -52,7 +52,7 @@ for variant in ["llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral", "llvm_ad_rgb"]:
     print(make())
 """
     first, scalar, spectral, again = run(code, tmp_path)
-    assert first == again == "stand-in under llvm_ad_rgb"
+    assert first == again == "substitute under llvm_ad_rgb"
     assert "'scalar_rgb' is not supported; call mi.set_variant('llvm_ad_rgb')" in scalar
     assert "'llvm_ad_spectral' is not supported" in spectral
 
@@ -67,9 +67,9 @@ for variant in ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"]:
     print(make(), isinstance(mi.load_dict({"type": "refgs"}), mi.SamplingIntegrator))
 """
     assert run(code, tmp_path) == [
-        "stand-in under llvm_ad_rgb True",
-        "stand-in under llvm_ad_mono True",
-        "stand-in under llvm_ad_rgb True",
+        "substitute under llvm_ad_rgb True",
+        "substitute under llvm_ad_mono True",
+        "substitute under llvm_ad_rgb True",
     ]
 
 
@@ -83,12 +83,12 @@ def test_import_after_the_variant_registers_at_once(tmp_path: Path) -> None:
     code = "print(make())\nmi.set_variant('llvm_ad_rgb')\nprint(make())"
     mono, rgb = run(code, tmp_path, order)
     assert "'llvm_ad_mono' is not supported" in mono
-    assert rgb == "stand-in under llvm_ad_rgb"
+    assert rgb == "substitute under llvm_ad_rgb"
 
 
 def test_loading_twice_is_harmless(tmp_path: Path) -> None:
     code = "mi.set_variant('llvm_ad_rgb')\nplugins.load()\nplugins.load()\nprint(make())"
-    assert run(code, tmp_path) == ["stand-in under llvm_ad_rgb"]
+    assert run(code, tmp_path) == ["substitute under llvm_ad_rgb"]
 
 
 def test_loads_beside_entry_point_of_mitsuba(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ for variant in ["scalar_rgb", "llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral", "
     print(make())
 """
     lines = run(code, tmp_path)
-    assert lines[1] == lines[4] == "stand-in under llvm_ad_rgb"
+    assert lines[1] == lines[4] == "substitute under llvm_ad_rgb"
     for line in (lines[0], lines[2], lines[3]):
         assert "is not supported" in line
 

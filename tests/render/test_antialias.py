@@ -1,4 +1,4 @@
-"""Roughness widened within a pixel: the oracle, derivatives, and whether it comes closer to many samples."""
+"""Roughness widened within a pixel: the float64 reference, derivatives, and many samples."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_maps_against_the_oracle(maps: tuple[np.ndarray, np.ndarray, np.ndarray]
 def test_derivative_of_the_roughness(
     mode: str, maps: tuple[np.ndarray, np.ndarray, np.ndarray], rng: np.random.Generator
 ) -> None:
-    """Against differences of the oracle; normals have none."""
+    """Against differences of the float64 reference; normals have none."""
     roughness, normal, alpha = maps
     weight, tangent = rng.normal(size=(2, *roughness.shape))
     step = 1e-6

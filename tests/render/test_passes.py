@@ -198,15 +198,15 @@ def test_passes_share_their_kernels_and_take_few_samples_at_a_time(
 def test_bands_cover_every_row_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Equally high without neighbours; inside the image with them; one if it fits."""
     eye = Camera.look_at((0, 0, 3), up=(0, 1, 0), size=(30, 103))
-    assert [band.rows for band in passes.bands(eye)] == [103]
+    assert [band.size[1] for band in passes.bands(eye)] == [103]
     for factor, margin in ((1, 0), (1, 1), (2, 0), (3, 1), (8, 0)):
         found = passes.bands(eye, factor, margin, 30 * 24 * factor**2)
-        assert sum(band.rows for band in found) == 103 and len(found) > 1
+        assert sum(band.size[1] for band in found) == 103 and len(found) > 1
         top = 0
         for band in found:
             assert band.camera.offset[1] == top - band.first[1] and band.first in ((0, 0), (0, margin))
             assert band.camera.width * (band.camera.height - 2 * margin) * factor**2 <= 30 * 24 * factor**2
-            top += band.rows
+            top += band.size[1]
         heights = {band.camera.height for band in found}
         assert len(heights) == 1 if not margin else max(heights) <= 26
     assert HEIGHT < 103

@@ -1,4 +1,4 @@
-"""Surfels to image: both orders against float64, the side of normals, harmonics, bounds of opacity."""
+"""Surfels to image: both orders against float64, the side of normals, SH, bounds of opacity."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def attributes(raw: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.n
 @pytest.mark.parametrize("diffuse", ["sh", "irradiance"])
 @pytest.mark.parametrize("at", ["pixel", "surfel"])
 def test_pixels_are_shaded_by_the_oracle(at: Any, diffuse: Any) -> None:
-    """Blend then shade, and shade then blend: both written out with the oracles of splatting and shading."""
+    """Blend then shade, and shade then blend: both written out with the float64 references."""
     light = EnvironmentLight.from_radiance(sky(8)).prefilter()
     table, levels = brdf.table().astype(np.float64), level_maps(light)
 
@@ -189,7 +189,7 @@ def test_samples_before_the_near_plane_are_cut() -> None:
 
 
 def test_normals_are_blended_only_where_something_needs_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At surfels an image needs none: three features fewer, and the same radiance."""
+    """Forward shading blends none: three features fewer, and the same radiance."""
     from mi_refgs import splat
 
     composite, features = splat.composite, []

@@ -14,7 +14,7 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.scene_xml import write_scene_xml
+from mi_refgs.render.scene_xml import SceneFiles, write_scene_xml
 from mi_refgs.runs.export import export
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -124,11 +124,11 @@ def pixels(camera: Camera, point: Any) -> np.ndarray:
 def test_what_no_scene_can_say_is_refused(tmp_path: Path) -> None:
     camera = Camera.from_pose(8, 8, 10, -10, 4, 4, np.eye(4))
     with pytest.raises(InputError, match="fx, fy: 10 and -10 pixels mirror"):
-        write_scene_xml(tmp_path / "scene.xml", ply="a.ply", shading=Shading(), camera=camera)
+        write_scene_xml(tmp_path / "scene.xml", SceneFiles("a.ply"), Shading(), [camera])
     with pytest.raises(InputError, match="cannot be written"):
-        write_scene_xml(tmp_path / "no" / "scene.xml", ply="a.ply", shading=Shading(), camera=view())
+        write_scene_xml(tmp_path / "no" / "scene.xml", SceneFiles("a.ply"), Shading(), [view()])
     with pytest.raises(InputError, match="mesh: there is none"):
-        write_scene_xml(tmp_path / "s.xml", ply="a.ply", shading=Shading(occlusion=True), camera=view())
+        write_scene_xml(tmp_path / "s.xml", SceneFiles("a.ply"), Shading(occlusion=True), [view()])
 
 
 # ---------------- rays only where they are needed ----------------
@@ -161,7 +161,7 @@ def test_mirror_rays_start_at_hits_only(tmp_path: Path) -> None:
     test = occluder._scene.ray_test
 
     class Counted:
-        """The occluder's scene, which notes how many rays are asked of it."""
+        """The occluder's scene, which notes how many rays it traces."""
 
         def __getattr__(self, name: str) -> Any:
             return getattr(scene, name)

@@ -43,7 +43,7 @@ MAPS = (
 
 @dataclass(frozen=True)
 class Pair:
-    """The plain case with surroundings: the product and the oracle."""
+    """The plain case with surroundings: the renderer and the float64 reference."""
 
     at: str
     diffuse: str
@@ -127,7 +127,7 @@ def test_image_matches_float64(pair: Pair) -> None:
 
 
 def test_both_derivative_modes_are_those_of_float64(pair: Pair, weights: dict[str, np.ndarray]) -> None:
-    """Each class of parameters along a random direction, against central differences of the oracle."""
+    """Each class of parameters along a random direction, against central differences in float64."""
     params = {name: upload_tensor(x) for name, x in pair.values.items()}
     dr.enable_grad(list(params.values()))
     dr.backward(weighted(pair.planes(params), weights))

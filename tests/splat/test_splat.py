@@ -1,4 +1,4 @@
-"""The splatter against its float64 oracle: images, gradients of every parameter class, laws, and mutants."""
+"""The splatter against its float64 reference: images, gradients of every parameter class, laws, and mutants."""
 
 from __future__ import annotations
 
@@ -81,13 +81,13 @@ def compare_with_oracle(seed: int) -> None:
 
 
 def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
-    """Derivatives of the oracle's loss in float64, themselves tested against its differences."""
+    """Derivatives of the reference's loss in float64, themselves tested against its differences."""
     adjoints = np.moveaxis(weights, 2, 0).reshape(6, -1)
     return differentiate(scene.raw, scene.features, scene.camera, adjoints).gradients
 
 
 def test_exact_gradients_are_slopes_of_the_oracle() -> None:
-    """Of the surfel whose opacity matters most; and the maps are the oracle's."""
+    """The opacity that matters most is changed; and the maps are the reference's."""
     scene = make_scene(1)
     weights = np.moveaxis(loss_weights(scene, 1), 2, 0).reshape(6, -1)
 
@@ -282,7 +282,7 @@ def test_second_view_compiles_nothing() -> None:
 @pytest.mark.parametrize("thinness", [1.0, 1e-5])
 @pytest.mark.parametrize("seed", range(0, 20, 3))
 def test_tile_lists_hold_what_contributes_and_little_else(seed: int, thinness: float) -> None:
-    """Of all surfel-tile pairs, those with a pixel at α ≥ ALPHA_MIN are listed, and few others.
+    """Every surfel-tile pair with a pixel at α ≥ ALPHA_MIN is listed, and few others.
 
     Needles too, whose ellipses have matrices with next to no determinant.
     """
@@ -362,7 +362,7 @@ def test_more_pairs_than_32_bits_count_are_refused_with_a_sentence(monkeypatch: 
 
 @pytest.mark.parametrize(("aspect", "length"), [(1e4, 5.0), (1e4, 500.0), (1e6, 1e4)])
 def test_needles_are_as_exact_as_the_numbers_that_describe_them(aspect: float, length: float) -> None:
-    """Error against the oracle, beside what half a unit in the last place of every raw number does to it.
+    """Error against the float64 reference, beside what half a unit in the last place of every raw number does to it.
 
     Along a needle the distance from its axis is a difference of large terms, in any precision.
     """

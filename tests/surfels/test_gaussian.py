@@ -1,4 +1,4 @@
-"""3D Gaussians by EWA against their float64 oracle: images, both derivatives, lists, degenerate rows."""
+"""3D Gaussians by EWA against their float64 reference: images, both derivatives, lists, degenerate rows."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ GRADIENT_TOLERANCE = 1e-3  # relative L2
 
 def gaussians(seed: int) -> Scene:
     """The surfels of `make_scene` (sub-pixel, clamped, behind the camera, on top of each other) with a third
-    axis, needles and pancakes among them, and some whose centres lie beside the picture."""
+    axis, needles and pancakes among them, and some whose centres lie beside the image."""
     scene = make_scene(seed)
     rng, count = np.random.default_rng(seed + 7), len(scene.features)
     scale = np.concatenate([scene.raw["scale"], np.log(rng.uniform(0.005, 0.4, (count, 1)))], axis=1)
