@@ -21,13 +21,7 @@ from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.types import Float
 
 # Suffixes as Mitsuba's own `aov` integrator gives them; `Bitmap.split` makes a greyscale layer of a lone Y.
-_SUFFIXES = {
-    "normal": "XYZ",
-    "depth": "T",
-    "alpha": "Y",
-    "visibility": "Y",
-    **dict.fromkeys(TERMS, "RGB"),
-}
+_SUFFIXES = {"normal": "XYZ", "depth": "T", "alpha": "Y", "visibility": "Y", **dict.fromkeys(TERMS, "RGB")}
 
 
 def suffixes() -> dict[str, str]:

@@ -167,9 +167,7 @@ class RefGSBSDF(mi.BSDF):
             sampled.eta = 1
             sampled.sampled_component = dr.select(specular, mi.UInt32(SPECULAR), mi.UInt32(DIFFUSE))
             sampled.sampled_type = dr.select(
-                specular,
-                mi.UInt32(mi.BSDFFlags.GlossyReflection),
-                mi.UInt32(mi.BSDFFlags.DiffuseReflection),
+                specular, mi.UInt32(mi.BSDFFlags.GlossyReflection), mi.UInt32(mi.BSDFFlags.DiffuseReflection)
             )
             valid = above & (sampled.pdf > 0)
             inverse = dr.rcp(dr.select(valid, sampled.pdf, 1))

@@ -211,11 +211,12 @@ class RefGSIntegrator(mi.SamplingIntegrator):
                     f"refgs: {name}: the surfels have no such attribute; add it, or do without it"
                 )
         self.background.require_fit(self.surfels)
-        for name, found in self._maps.items():
+        for name, light in self._maps.items():
             try:
-                EnvironmentLight(found.raw)  # checks the shape, which an update may have changed
+                EnvironmentLight(light.raw)  # checks the shape, which an update may have changed
             except InputError as error:
-                raise InputError(f"refgs: {name}: {error}") from error
+                found = str(error).removeprefix("EnvironmentLight: raw: ")
+                raise InputError(f"refgs: {name}: {found}") from error
 
     @property
     def _models(self) -> dict[str, Surfels]:

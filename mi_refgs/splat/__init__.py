@@ -10,16 +10,7 @@ from mi_refgs.surfels.primitives import Footprints
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float, Point2f
 
-__all__ = [
-    "Camera",
-    "Composited",
-    "Footprints",
-    "TileLists",
-    "composite",
-    "list_by_tile",
-    "project",
-    "splat",
-]
+__all__ = ["Camera", "Composited", "Footprints", "TileLists", "composite", "list_by_tile", "project", "splat"]
 
 
 @phase("project")

@@ -78,18 +78,21 @@ class Camera:
         if not finite or np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE:
             raise InputError("camera: to_world: must be a rotation and a translation; remove scale and shear")
 
-        def opaque(*values: float) -> list[Float]:
-            return [dr.opaque(mi.Float, float(x)) for x in values]
+        def opaque(x: float) -> Float:
+            return dr.opaque(mi.Float, float(x))
 
         origin = matrix[:3, 3].astype(np.float32)
         return Camera(
             width,
             height,
-            *opaque(fx, fy, cx, cy),
-            mi.Matrix3f([opaque(*row) for row in rotation.T]),
-            mi.Point3f(*opaque(*origin)),
-            mi.Vector3f(*opaque(*(matrix[:3, 3] - origin))),
-            *opaque(near),
+            opaque(fx),
+            opaque(fy),
+            opaque(cx),
+            opaque(cy),
+            mi.Matrix3f([[opaque(x) for x in row] for row in rotation.T]),
+            mi.Point3f(*(opaque(x) for x in origin)),
+            mi.Vector3f(*(opaque(x) for x in matrix[:3, 3] - origin)),
+            opaque(near),
             abs(float(fx)),
         )
 
@@ -152,7 +155,7 @@ class Camera:
         cx, cy, near = -fx * slope[0, 0], -fy * slope[0, 1], float(params["near_clip"])
         camera = Camera.from_pose(width, height, fx, fy, cx, cy, matrix, near)
         x, y = (int(offset) for offset in sensor.film().crop_offset())
-        size = tuple(int(n) for n in sensor.film().size())
+        size = int(sensor.film().size()[0]), int(sensor.film().size()[1])
         return replace(camera, offset=(x, y), film=None if size == (width, height) else size)
 
     def towards(self, point: Point3f) -> Vector3f:

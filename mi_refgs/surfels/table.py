@@ -174,8 +174,8 @@ class Surfels:
     def value(self, name: str) -> Any:
         """Activated values of an attribute.
 
-        mi.Float for one column, mi.Color3f for three, else a list: mi.Color3f per SH coefficient, mi.Float for
-        other widths. Geometry has accessors of its own types.
+        mi.Float for one column, mi.Color3f for three, else a list: mi.Color3f per SH coefficient, or mi.Float
+        per column. Geometry has accessors of its own types.
         """
         columns = self.columns(name)
         activate = {"sigmoid": sigmoid, "exp": _exp}.get(attribute(name).activation)

@@ -30,7 +30,7 @@ SEED = 3
 IMAGE = 3e-4
 """Largest error of a pixel, relative to its channel's largest value, and 1 at least."""
 DERIVATIVE = 5e-3
-"""Largest error of a derivative, relative to the largest of a channel; of a sum, to the root of its squares."""
+"""Largest error of a derivative, relative to a channel's largest; of a sum, to the root of its squares."""
 ADJOINT = 1e-4
 """|⟨δ, Jv⟩ - ⟨Jᵀδ, v⟩| over |δ Jv|."""
 STEP = 1e-6  # of central differences of the reference, in units of normal numbers

@@ -433,10 +433,7 @@ def test_xml() -> None:
         ({"roughness": 1.5}, "refgs_bsdf: roughness: 1.5 is outside (0, 1]"),
         ({"roughness": float("nan")}, "refgs_bsdf: roughness: nan is outside (0, 1]"),
         ({"metallic": -0.1}, "refgs_bsdf: metallic: -0.1 is outside [0, 1]"),
-        (
-            {"metallic": {"type": "rgb", "value": 1.0}},
-            "refgs_bsdf: metallic: [1, 1, 1] is a colour",
-        ),
+        ({"metallic": {"type": "rgb", "value": 1.0}}, "refgs_bsdf: metallic: [1, 1, 1] is a colour"),
         ({"albedo": 1.2}, "refgs_bsdf: albedo: 1.2 is outside [0, 1]"),
         ({"albedo": {"type": "rgb", "value": [0, 0, 2]}}, "refgs_bsdf: albedo: [0, 0, 2] is outside [0, 1]"),
         ({"albedo": "red"}, "expected texture/float/color"),

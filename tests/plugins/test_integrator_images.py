@@ -10,14 +10,7 @@ import pytest
 
 from mi_refgs.constants import tile_size
 from tests.helpers import refused
-from tests.scenes.integrator import (
-    HEIGHT,
-    WIDTH,
-    image,
-    plane_mesh,
-    scene,
-    sensor,
-)
+from tests.scenes.integrator import HEIGHT, WIDTH, image, plane_mesh, scene, sensor
 
 EVERY_AOV = "al:albedo,m:metallic,r:roughness,n:normal,dd.y:depth,a:alpha,v:visibility"
 EVERY_AOV += ",di:diffuse,sp:specular,ind:indirect"

@@ -77,7 +77,7 @@ def test_depth_normals_of_a_plane_are_exact() -> None:
 
 
 def test_steps_between_surfaces_have_no_normal(rng: np.random.Generator) -> None:
-    """Steps of every size on a wavy surface: the normals of the float64 reference, which has none elsewhere either."""
+    """Steps of every size on a wavy surface: the float64 reference has the same normals, and gaps."""
     depth = (
         3 + 0.1 * rng.random((HEIGHT, WIDTH)) + np.linspace(0, 4, WIDTH) * (np.arange(HEIGHT) > 6)[:, None]
     )

@@ -75,10 +75,8 @@ def test_quality_options_round_trip(option: str, tmp_path: Path) -> None:
     scene, seen, expected = shown(tmp_path / "run", made, view())
     assert scene.integrator().shading == shading and TrainedScene.read(tmp_path / "run").shading == shading
     np.testing.assert_allclose(seen, expected, atol=1e-5)
-    plain = replace(
-        made,
-        shading=replace(shading, **{option: getattr(ShadingOptions, option)}),
-    ).renderer()(view())
+    default = replace(shading, **{option: getattr(ShadingOptions, option)})
+    plain = replace(made, shading=default).renderer()(view())
     assert np.abs(plain.radiance.numpy().T.reshape(HEIGHT, WIDTH, 3) - seen[..., :3]).max() > 1e-3
 
 

@@ -1,4 +1,4 @@
-"""The splatter against its float64 reference: images, gradients of every parameter class, laws, and mutants."""
+"""The splatter against its float64 reference: images, gradients of every parameter, mutants."""
 
 from __future__ import annotations
 
@@ -362,7 +362,7 @@ def test_more_pairs_than_32_bits_count_are_refused_with_a_sentence(monkeypatch: 
 
 @pytest.mark.parametrize(("aspect", "length"), [(1e4, 5.0), (1e4, 500.0), (1e6, 1e4)])
 def test_needles_are_as_exact_as_the_numbers_that_describe_them(aspect: float, length: float) -> None:
-    """Error against the float64 reference, beside what half a unit in the last place of every raw number does to it.
+    """Error, compared with what half a unit in the last place of every raw number does to the image.
 
     Along a needle the distance from its axis is a difference of large terms, in any precision.
     """

@@ -8,9 +8,9 @@ ray through a pixel at offset δ from the projected centre meets its plane at de
 
 With q = p/p_z and the projected tangents X_k = t_k.x - q.x t_k.z, Y_k = t_k.y - q.y t_k.z, a and b are the
 rows of the inverse of their matrix: a = (Y_v, -X_v) p_z/(s_u q·n), b = (-Y_u, X_u) p_z/(s_v q·n), and
-c = n/(q·n), each divided by the focal lengths. Offsets from the centre enter, not pixel coordinates: two large
-terms that cancel in the textbook form are gone. Lengths enter as ratios, so the unit of the scene is free; no
-difference of two products is rounded twice. Opacity is
+c = n/(q·n), each divided by the focal lengths. Offsets from the centre enter, not pixel coordinates: two
+large terms that cancel in the textbook form are gone. Lengths enter as ratios, so the unit of the scene is
+free; no difference of two products is rounded twice. Opacity is
 
     α = min(α_max, o exp(-ρ/2)),   ρ = min(u² + v², 12 |δ|²)                                [2DGS, eq. 11]
 
