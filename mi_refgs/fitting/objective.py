@@ -13,9 +13,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.data.dataset import Dataset
+from mi_refgs.errors import InputError
 from mi_refgs.fitting import losses
 from mi_refgs.fitting.targets import Target
-from mi_refgs.methods.method import LossWeights
+from mi_refgs.methods.method import LossWeights, Method
 from mi_refgs.registry import Registry
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.display import displayed
@@ -66,6 +67,7 @@ class Loss:
     value: Callable[[LossInputs], Float | None]  # width 1; None: not defined for these inputs
     normals: bool = False  # reads blended normals
     maps: bool = False  # reads blended materials, which deferred stages have
+    attributes: tuple[str, ...] = ()  # of surfels, without which a method that weighs the loss is refused
 
 
 LOSSES = Registry[Loss]("loss")
@@ -115,10 +117,19 @@ register(Loss("light_colour", _light_colour))
 register(Loss("alpha", _alpha))
 
 
+def require_losses(method: Method) -> None:
+    """Raise InputError for a loss that is not registered, or needs an attribute that the surfels lack."""
+    for name in method.loss.registered:
+        for attribute in LOSSES.find(name, f"loss.registered.{name}").attributes:
+            if attribute not in method.surfels.names:
+                raise InputError(
+                    f"loss.registered.{name}: there is no attribute '{attribute}'; "
+                    "add it to surfels.channels, or drop the loss"
+                )
+
+
 def losses_in_use(weights: LossWeights) -> list[Loss]:
-    """The registered losses that a method weighs; raises InputError for a name that is not registered."""
-    for name in weights.registered:
-        LOSSES.find(name, f"loss.registered.{name}")
+    """The registered losses that a method weighs."""
     return [x for x in LOSSES.values() if x.name in weights.registered or getattr(weights, x.name, None)]
 
 

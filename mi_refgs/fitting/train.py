@@ -22,7 +22,7 @@ from mi_refgs.data.view import View
 from mi_refgs.fitting import exposure
 from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.health import Health
-from mi_refgs.fitting.objective import LossInputs, losses_in_use, objective
+from mi_refgs.fitting.objective import LossInputs, losses_in_use, objective, require_losses
 from mi_refgs.fitting.state import FitSetup, FitState
 from mi_refgs.fitting.surface import surface_of, update_missing_caches
 from mi_refgs.fitting.targets import Targets, require_memory
@@ -73,7 +73,7 @@ class Trainer:
             self.restore(state)
 
     def _set_up(self, setup: FitSetup) -> None:
-        losses_in_use(setup.method.loss)  # refuses unknown names
+        require_losses(setup.method)
         require_memory(setup.method, setup.data)
         self.setup, self.targets = setup, Targets(setup.data, setup.method.data)
 

@@ -9,7 +9,7 @@ import contextlib
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -328,6 +328,11 @@ def _require_consistent(method: Method, where: str) -> None:
                 raise InputError(f"{where}: stage.{name}: {key}: there is no '{absent[0]}'; remove it")
 
     # Losses and operations that need attributes, a deferred stage or a light.
+    if twice := sorted(loss.registered.keys() & {key.name for key in fields(loss)}):
+        own = f"loss.{twice[0]}"
+        raise InputError(
+            f"{where}: loss.registered.{twice[0]}: this loss has a key of its own; set {own} instead"
+        )
     deferred = any(stage.shading.at == "pixel" for _, stage in method.stages())
     for name, needed in (("half_metal", {"metallic"}), ("materials", {"metallic", "roughness"})):
         if getattr(loss, name) and not (deferred and needed <= attributes):

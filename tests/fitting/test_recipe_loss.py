@@ -30,7 +30,7 @@ def rough(inputs: mi_refgs.LossInputs) -> Float | None:
 
 @pytest.fixture
 def registered() -> Iterator[None]:
-    mi_refgs.register_loss(mi_refgs.Loss("rough", rough, maps=True))
+    mi_refgs.register_loss(mi_refgs.Loss("rough", rough, maps=True, attributes=("roughness",)))
     yield
     LOSSES.unregister("rough")
 
@@ -51,6 +51,12 @@ def test_registered_loss_is_weighed_by_method_file(data: Path, method: Path, reg
     early = roughness_after(data, method, "loss.registered.rough={weight=1.0, until=6}")
     assert weighed > without + 0.02 and late == pytest.approx(without, abs=1e-4)
     assert without < early < weighed
+
+
+def test_loss_of_an_absent_attribute_is_refused(data: Path, registered: None) -> None:
+    colour = methods.load("base_2dgs", "quick", [*SETTINGS[:-1], "loss.registered.rough={weight=1.0}"])
+    with pytest.raises(mi_refgs.InputError, match=r"registered\.rough: there is no attribute 'roughness'"):
+        Trainer(colour, read_dataset(data, "train", truth=False))
 
 
 def test_loss_that_is_not_registered_is_refused(data: Path, method: Path) -> None:

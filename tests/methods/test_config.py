@@ -338,6 +338,12 @@ def test_a_prior_needs_what_it_is_about(prior: str) -> None:
     methods.load("ref_gaussian", "quick", [f"loss.{prior}=0.1"])
 
 
+@pytest.mark.parametrize("name", ["normal", "half_metal", "ssim"])
+def test_a_loss_with_a_key_of_its_own_is_not_registered_too(name: str) -> None:
+    with pytest.raises(InputError, match=rf"loss\.registered\.{name}: .*; set loss\.{name} instead"):
+        methods.load("base_2dgs", "quick", [f"loss.registered.{name}.weight=0.3"])
+
+
 def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
     """Each key of `read.RENAMED`: in the config.toml of a run, in `drop`, in assignments and in own files."""
     now = methods.load("auto", "quick", ["select.component.degree_1.trial=9"], ["levels_3"])
