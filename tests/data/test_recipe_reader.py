@@ -6,8 +6,6 @@ it, and points to start from.
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,7 +26,7 @@ from mi_refgs.data.dataset import (
 from mi_refgs.data.view import View
 from mi_refgs.io.images import box_downscale, image_size, read_png, write_png
 from mi_refgs.surfels.ply import read_ply
-from tests.helpers import refused
+from tests.helpers import refused, run_python
 from tests.scenes.tiny import RADIUS, train_command, write_data, write_method
 
 
@@ -107,7 +105,7 @@ def test_unrecognised_folder_is_refused(folder: Path) -> None:
     refused(lambda: read_dataset(folder, "train"), *words)
 
 
-def test_registered_reader_comes_first() -> None:
+def test_registered_reader_comes_first(tmp_path: Path) -> None:
     """Also where it is registered before any data set was read."""
     code = (
         "import mi_refgs\nclass Own:\n    name = looks_for = 'own'\n"
@@ -115,4 +113,4 @@ def test_registered_reader_comes_first() -> None:
         "own = Own()\nmi_refgs.register_reader(own)\nfrom mi_refgs.data.dataset import READERS\n"
         "assert next(iter(READERS.values())) is own and len(READERS) > 1"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    run_python(code, folder=tmp_path)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,20 +21,15 @@ from mi_refgs.fitting.optim import Adam, Group
 from mi_refgs.fitting.schedule import Schedule
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points
-from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.depth_normals import normals_from_depth
-from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
-from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import splat
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.init import neighbour_scale
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 from tests.scenes import layouts
-from tests.scenes.integrator import COUNT, image, raw_channels, scene, sensor, sky
+from tests.scenes.integrator import image, raw_channels, scene, sensor
 from tests.scenes.tiny import write_data
 
 SCALES = (1e-6, 3e-3, 1e3, 1e6)
@@ -42,10 +37,6 @@ TOLERANCE = 2e-5
 """Largest error of images; float32 rounds a scaled scene anew."""
 SIZE = 40
 EYE = np.array([3.0, 1, 2])
-ORDERS = {
-    "surfel": Shading("surfel", "split_sum", "irradiance"),
-    "pixel": Shading("pixel", "split_sum", "sh", occlusion=True),
-}
 
 
 def scaled(raw: dict[str, np.ndarray], scale: float) -> dict[str, np.ndarray]:
@@ -62,41 +53,18 @@ def wall(scale: float) -> Mesh:
     return Mesh(vertices, box.faces.astype(np.uint32), 0.05 * scale)
 
 
-def camera(scale: float) -> Camera:
-    to_world = look_at(EYE, np.zeros(3))
-    to_world[:3, 3] *= scale
-    return Camera.from_pose(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world, 0.01 * scale)
-
-
-def rendered(scale: float, shading: Shading) -> tuple[Surfels, Frame, Any, Any]:
-    """Surfels with gradients, a view of them, and its depth normals with their mask."""
-    surfels = Surfels.from_numpy(scaled(raw_channels(), scale))
-    surfels.enable_grad()
-    light = EnvironmentLight.from_radiance(sky()).prefilter()
-    scene = SurfelScene(surfels, shading, light, Occluder(wall(scale)))
-    frame = render(scene, camera(scale), Request(("normal",)))
-    return surfels, frame, *normals_from_depth(frame.depth, frame.alpha, camera(scale))
-
-
-@pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("scale", SCALES)
-def test_scaled_scene_renders_equal_images_and_gradients(scale: float, order: str) -> None:
-    def values(scale: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        surfels, frame, normal, valid = rendered(scale, ORDERS[order])
-        flat = [frame.alpha, frame.depth / scale, *frame.normal, *frame.radiance, *normal]
-        flat += [frame.maps["visibility"]] if "visibility" in frame.maps else []
-        weight = np.random.default_rng(0).normal(size=(len(flat), SIZE * SIZE)).astype(np.float32)
-        dr.backward(sum((dr.sum(x * mi.Float(w)) for x, w in zip(flat, weight, strict=True)), mi.Float(0)))
-        gradients = {name: dr.grad(raw).numpy() for name, raw in surfels.raw.items()}
-        gradients["position"] = gradients["position"] * scale
+def test_scaled_scene_has_equal_depth_normals(scale: float) -> None:
+    def normals(scale: float) -> np.ndarray:
+        to_world = look_at(EYE, np.zeros(3))
+        to_world[:3, 3] *= scale
+        camera = Camera.from_pose(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world, 0.01 * scale)
+        maps = splat(Surfels.from_numpy(scaled(raw_channels(), scale)), [], camera)
+        normal, valid = normals_from_depth(maps.depth, maps.alpha, camera)
         assert dr.count(valid)[0] > 300
-        return np.array([np.array(x) for x in flat]), gradients
+        return normal.numpy()
 
-    (expected, slopes), (got, found) = values(1), values(scale)
-    np.testing.assert_allclose(got, expected, atol=TOLERANCE * max(1, np.abs(expected).max()))
-    for name, slope in slopes.items():
-        error = np.linalg.norm(found[name] - slope) / (np.linalg.norm(slope) + 1e-9)
-        assert error < 1e-3, (name, error)
+    np.testing.assert_allclose(normals(scale), normals(1), atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("scale", SCALES)
@@ -116,14 +84,7 @@ def test_initial_surfels_scale_with_the_data_set(scale: float, tmp_path: Path) -
     scale = 2.0 ** round(np.log2(scale))  # exact, so that no point changes its place in the table
     write_data(tmp_path, views=4)
     small = read_dataset(tmp_path, "train")
-    for name in ("train", "test"):
-        file = tmp_path / f"transforms_{name}.json"
-        content = json.loads(file.read_text())
-        for frame in content["frames"]:
-            matrix = np.array(frame["transform_matrix"])
-            matrix[:3, 3] *= scale
-            frame["transform_matrix"] = matrix.tolist()
-        file.write_text(json.dumps(content))
+    move_cameras(tmp_path, lambda position: scale * position)
     large = read_dataset(tmp_path, "train")
     assert large.scene_extent == pytest.approx(scale * small.scene_extent)
     assert large.views[0].camera().near[0] == pytest.approx(scale * small.views[0].camera().near[0])
@@ -166,26 +127,6 @@ def test_optimiser_step_scales_with_the_scene(scale: float) -> None:
     assert Group(1.0).unit == 1
 
 
-@pytest.mark.parametrize("shift", [1e3, 1e5])
-def test_camera_far_from_origin_is_accurate(shift: float) -> None:
-    """Error against the float64 reference for positions exact in float32, and a camera that is not."""
-    rng = np.random.default_rng(2)
-    away = shift * np.array([1, -0.7, 0.4])
-    raw = {
-        name: raw_channels()[name].astype(np.float64) for name in ("position", "rotation", "scale", "opacity")
-    }
-    raw["position"] = (raw["position"] + away).astype(np.float32).astype(np.float64)
-    to_world = look_at(EYE + away + 0.003 * rng.uniform(size=3), away)
-    pinhole = oracle.PinholeCamera(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world)
-    expected = oracle.splat(raw, np.zeros((COUNT, 0)), pinhole)
-    view = Camera.from_pose(SIZE, SIZE, -48, -48, SIZE / 2, SIZE / 2, to_world, 0.01)
-    maps = splat(Surfels.from_numpy(raw), [], view)
-    keep = ~expected.band
-    assert keep.mean() > 0.95 and np.abs(expected.alpha).max() > 0.5
-    assert np.abs(maps.alpha.numpy().reshape(SIZE, SIZE) - expected.alpha)[keep].max() < 2e-5
-    assert np.abs(maps.depth.numpy().reshape(SIZE, SIZE) - expected.depth)[keep].max() < 1e-4
-
-
 # ---------------- data sets ----------------
 
 UTM = np.array([5e5, 4e6 + 4, 120.0])
@@ -193,17 +134,15 @@ PLACES = {"small": (1e-5, 0 * UTM), "large": (1e5, 0 * UTM), "far": (1.0, UTM), 
 """Another unit of length, and what is added to positions."""
 
 
-def put(data: Path, scale: float, offset: np.ndarray) -> Path:
-    """The cameras, and the region, of a data set in another place and unit."""
+def move_cameras(data: Path, move: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Change the positions of the cameras of a data set."""
     for path in data.glob("transforms*.json"):
         content = json.loads(path.read_text())
         for frame in content["frames"]:
             matrix = np.array(frame["transform_matrix"])
-            matrix[:3, 3] = scale * matrix[:3, 3] + offset
+            matrix[:3, 3] = move(matrix[:3, 3])
             frame["transform_matrix"] = matrix.tolist()
         path.write_text(json.dumps(content))
-    write_region(data, Region(tuple(offset.tolist()), 0.5 * scale))
-    return data
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -211,7 +150,9 @@ def test_data_set_is_independent_of_unit_and_origin(place: str, tmp_path: Path) 
     """Read, surveyed, and begun to be fitted; both splits are relative to one point."""
     scale, offset = PLACES[place]
     plain = write_data(tmp_path / "plain", truth=False)
-    data = put(write_data(tmp_path / "data", truth=False), scale, offset)
+    data = write_data(tmp_path / "data", truth=False)
+    move_cameras(data, lambda position: scale * position + offset)
+    write_region(data, Region(tuple(offset.tolist()), 0.5 * scale))
     for folder in (plain, data):  # a lone test view, whose own mean has another round number
         content = json.loads((folder / "transforms_test.json").read_text())
         (folder / "transforms_test.json").write_text(json.dumps(content | {"frames": content["frames"][:1]}))
@@ -238,12 +179,7 @@ def test_cameras_in_one_place_are_refused_in_any_unit(
     scale: float, offset: np.ndarray, tmp_path: Path
 ) -> None:
     data = write_data(tmp_path / "data", truth=False)
-    for path in data.glob("transforms*.json"):
-        content = json.loads(path.read_text())
-        for frame in content["frames"]:
-            frame["transform_matrix"] = content["frames"][0]["transform_matrix"]
-        path.write_text(json.dumps(content))
-    put(data, scale, offset)
+    move_cameras(data, lambda _: scale * EYE + offset)
     refused(lambda: require_several_sides(read_dataset(data, "train")), "in one place show no shape")
 
 
