@@ -7,7 +7,7 @@ Features and matches are in a database, to which a second run adds what is missi
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -18,8 +18,9 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.cluster.vq import kmeans2, vq
 
+from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.errors import InputError
-from mi_refgs.progress import progress_bar, with_bar
+from mi_refgs.progress import progress_bar
 
 SEED = 0
 """Seed of all random numbers; a second run gives the same result."""
@@ -86,12 +87,6 @@ def quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def progress(what: str) -> Callable[[Sequence[Item]], Iterable[Item]]:
-    """A progress bar around the items of a loop."""
-
-    return lambda items: with_bar(items, what)
-
-
 def _run(call: Callable[[Any], Result], poll: Callable[[], None] = lambda: None) -> Result:
     """Run `call(cancellation token)` in a thread, so that Ctrl-C stops it; `poll` is called repeatedly."""
     pycolmap = load()
@@ -144,12 +139,10 @@ def extract(database: Path, folder: Path, names: Sequence[str]) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.sift.max_num_features = MOST_FEATURES
-    mode, reader = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions()
+    settings = (pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions(), options, pycolmap.Device.cpu)
 
     def work(part: Sequence[str], token: Any) -> None:
-        pycolmap.extract_features(
-            database, folder, list(part), mode, reader, options, pycolmap.Device.cpu, cancellation_token=token
-        )
+        pycolmap.extract_features(database, folder, list(part), *settings, cancellation_token=token)
 
     _in_parts(names, IMAGES_AT_ONCE, "features", work)
 
@@ -163,12 +156,11 @@ def match(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
     pairing.match_list_path = listed
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
+    settings = (matching, pairing, verification, pycolmap.Device.cpu)
 
     def work(part: Sequence[tuple[str, str]], token: Any) -> None:
         listed.write_text("".join(f"{first} {second}\n" for first, second in part))
-        pycolmap.match_image_pairs(
-            database, matching, pairing, verification, pycolmap.Device.cpu, cancellation_token=token
-        )
+        pycolmap.match_image_pairs(database, *settings, cancellation_token=token)
 
     _in_parts(pairs, PAIRS_AT_ONCE, "matches", work)
 
@@ -195,11 +187,9 @@ def verified(database: Path) -> list[tuple[str, str, int, bool]]:
         ids, geometries = opened.read_two_view_geometries()
         found = []
         for pair, geometry in zip(ids, geometries, strict=True):
-            if len(geometry.inlier_matches):
-                first, second = pycolmap.pair_id_to_image_pair(pair)
-                found.append(
-                    (names[first], names[second], len(geometry.inlier_matches), geometry.config in flat)
-                )
+            first, second = (names[image] for image in pycolmap.pair_id_to_image_pair(pair))
+            if count := len(geometry.inlier_matches):
+                found.append((first, second, count, geometry.config in flat))
         return found
 
 
@@ -225,16 +215,11 @@ def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[
     def one_more() -> None:
         placed.append(None)
 
+    arguments = (database, folder, output, options_of_mapping())
+    callbacks = {"initial_image_pair_callback": one_more, "next_image_callback": one_more}
+
     def call(token: Any) -> Any:
-        return pycolmap.incremental_mapping(
-            database,
-            folder,
-            output,
-            options_of_mapping(),
-            initial_image_pair_callback=one_more,
-            next_image_callback=one_more,
-            cancellation_token=token,
-        )
+        return pycolmap.incremental_mapping(*arguments, **callbacks, cancellation_token=token)
 
     with progress_bar(count, "cameras") as shown:
 
@@ -256,12 +241,8 @@ def triangulate(database: Path, folder: Path, output: Path, poses: dict[str, np.
         for image in opened.read_all_images():
             known = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
             model.add_image_with_trivial_frame(known, pycolmap.Rigid3d(poses[image.name]))
-    options = options_of_mapping()
-    return _run(
-        lambda token: pycolmap.triangulate_points(
-            model, database, folder, output, True, options, cancellation_token=token
-        )
-    )
+    arguments = (model, database, folder, output, True, options_of_mapping())
+    return _run(lambda token: pycolmap.triangulate_points(*arguments, cancellation_token=token))
 
 
 def pairs_to_match(features: dict[str, np.ndarray]) -> list[tuple[str, str]]:
@@ -342,19 +323,12 @@ def with_lens(model: Any, kind: str) -> tuple[Any, float]:
     pycolmap = load()
     copy = pycolmap.Reconstruction(model)
     for camera in copy.cameras.values():
-        focal, centre = (
-            (camera.focal_length_x, camera.focal_length_y),
-            (camera.principal_point_x, camera.principal_point_y),
-        )
+        focal = camera.focal_length_x, camera.focal_length_y
         radial = camera.params[3] if camera.model_name == "SIMPLE_RADIAL" else 0.0
-        mean = sum(focal) / 2
-        parameters = {
-            "SIMPLE_PINHOLE": [mean, *centre],
-            "SIMPLE_RADIAL": [mean, *centre, radial],
-            "OPENCV": [*focal, *centre, radial, 0.0, 0.0, 0.0],
-        }
+        known = {"f": sum(focal) / 2, "fx": focal[0], "fy": focal[1], "k1": radial}
+        known |= {"cx": camera.principal_point_x, "cy": camera.principal_point_y}
         camera.model = getattr(pycolmap.CameraModelId, kind)
-        camera.params = parameters[kind]
+        camera.params = [known.get(name, 0.0) for name in MODELS[kind][1].split()]
     adjust(copy)
     return copy, float(copy.compute_mean_reprojection_error())
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import os
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -34,6 +34,7 @@ from mi_refgs.io.files import (
     replace_file,
     write_json,
 )
+from mi_refgs.progress import with_bar
 
 QUALITY = 95
 """Quality of JPEG files; lower ones make a fit reproduce their block edges."""
@@ -68,9 +69,8 @@ class Straight:
         """
         values = dict(zip(MODELS[camera.model_name][1].split(), camera.params, strict=True))
         known = Camera(camera.model_name, camera.width, camera.height, values)
-        fx, fy, cx, cy = np.array(known.intrinsics) * np.tile(
-            np.divide(size, (camera.width, camera.height)), 2
-        )
+        scale = np.divide(size, (camera.width, camera.height))
+        fx, fy, cx, cy = np.array(known.intrinsics) * np.tile(scale, 2)
         try:
             lens = known.lens()
             undo = None if lens is None else undistortion(lens, *size, fx, fy, cx, cy)
@@ -96,10 +96,8 @@ class Straight:
 
 def straighten(model: Any, photographs: dict[str, Photograph]) -> dict[str, Straight]:
     """The undistortion of each registered image by the name of its working copy."""
-    sizes: dict[int, tuple[int, int]] = {}
     images = [model.images[i] for i in model.reg_image_ids()]
-    for image in images:
-        sizes[image.camera_id] = photographs[image.name].kept_size
+    sizes = {image.camera_id: photographs[image.name].kept_size for image in images}
     straight = {i: Straight.of(model.cameras[i], size) for i, size in sizes.items()}
     return {image.name: straight[image.camera_id] for image in images}
 
@@ -109,7 +107,6 @@ def write_images(
     straight: Callable[[Photograph], Straight],
     masks: dict[str, Path],
     folder: Path,
-    progress: Callable[[Sequence[Photograph]], Iterable[Photograph]],
 ) -> None:
     """Write missing images/NAME, and masks/NAME.png if there are masks."""
     for part in ("images", *(["masks"] if masks else [])):
@@ -131,7 +128,7 @@ def write_images(
             replace_file(mask, lambda path: pixels.save(path, format="PNG"))
 
     with ThreadPoolExecutor(min(os.cpu_count() or 1, WRITERS)) as pool:
-        for written, _ in zip(pool.map(write, placed), progress(placed), strict=True):
+        for written, _ in zip(pool.map(write, placed), with_bar(placed, "undistorted"), strict=True):
             assert written is None
 
 

@@ -16,21 +16,9 @@ from mi_refgs.data.dataset import MAX_SIZES
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import replace_file
 from mi_refgs.io.images import ENDINGS, exif_tags, open_image, read_mask, to_8_bits
+from mi_refgs.progress import with_bar
 
-OTHER_ENDINGS = (
-    ".heic",
-    ".heif",
-    ".dng",
-    ".cr2",
-    ".cr3",
-    ".nef",
-    ".arw",
-    ".raf",
-    ".tif",
-    ".tiff",
-    ".webp",
-    ".avif",
-)
+OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .webp .avif".split()
 """Formats of cameras that are not read here, for a message that says what to do."""
 FEWEST = 3
 """Smallest number of photographs: a third view checks a triangulated point."""
@@ -38,16 +26,8 @@ DIAGONAL_35MM = 43.2666
 """Diagonal of a frame of 36 mm × 24 mm, mm, to which EXIF's 35 mm equivalent of a focal length relates."""
 ORIENTATION, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x920A, 0xA405
 """EXIF tags."""
-TURNS = {
-    2: "FLIP_LEFT_RIGHT",
-    3: "ROTATE_180",
-    4: "FLIP_TOP_BOTTOM",
-    5: "TRANSPOSE",
-    6: "ROTATE_270",
-    7: "TRANSVERSE",
-    8: "ROTATE_90",
-}
-"""Pillow's names of what displays stored pixels upright, by EXIF's orientation."""
+TURNS = "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSVERSE ROTATE_90".split()
+"""Pillow's names of what displays stored pixels upright, for EXIF's orientations from 2 on."""
 SIDEWAYS = (5, 6, 7, 8)
 """Values of EXIF's orientation that swap width and height."""
 
@@ -63,9 +43,7 @@ class Photograph:
     device: str  # camera and lens: photographs with the same one share intrinsics
     plain: bool = True  # colour or grey without alpha
     orientation: int = 1  # EXIF's: how the stored pixels are turned for display
-    lying: bool = (
-        False  # rotated by 90° anticlockwise in the data set, so that its sensor is as in the others
-    )
+    lying: bool = False  # rotated by 90° anticlockwise in the data set, to have the sensor of the others
     number: int = 0  # index in the order of names
 
     @property
@@ -128,10 +106,10 @@ class Photograph:
         """Rotate a PIL image from the stored orientation to that of the data set."""
         from PIL.Image import Transpose
 
-        upright = (
-            stored.transpose(Transpose[TURNS[self.orientation]]) if self.orientation in TURNS else stored
-        )
-        return upright.transpose(Transpose.ROTATE_90) if self.lying else upright
+        turns = [TURNS[self.orientation - 2]] if self.orientation > 1 else []
+        for turn in (*turns, *(["ROTATE_90"] if self.lying else [])):
+            stored = stored.transpose(Transpose[turn])
+        return stored
 
     def exif(self) -> bytes:
         """The EXIF data for an image in display orientation; empty if the file's are broken."""
@@ -158,18 +136,13 @@ def find_photographs(folder: Path) -> list[Photograph]:
     paths = [path for path in files if path.suffix.lower() in ENDINGS]
     if len(paths) < FEWEST:
         other = Counter(path.suffix for path in files if path.suffix.lower() in OTHER_ENDINGS).most_common(1)
-        remedy = (
-            f"convert its {other[0][0]} files to JPEG"
-            if other
-            else "photograph the object from all sides, 30 to 100 times"
-        )
+        remedy = "photograph the object from all sides, 30 to 100 times"
+        remedy = f"convert its {other[0][0]} files to JPEG" if other else remedy
         found = {0: "no JPEG or PNG file", 1: "one image"}.get(len(paths), f"{len(paths)} images")
         raise InputError(f"{folder}: photographs: {found}; {remedy}")
-    found_all = [_photograph(path) for path in paths]
-    most = Counter(photograph.size for photograph in found_all).most_common(1)[0][0]
-    kept = [
-        replace(p, lying=p.size != most and p.size[::-1] == most, number=i) for i, p in enumerate(found_all)
-    ]
+    kept = [replace(_photograph(path), number=i) for i, path in enumerate(paths)]
+    most = Counter(photograph.size for photograph in kept).most_common(1)[0][0]
+    kept = [replace(p, lying=p.size != most and p.size[::-1] == most) for p in kept]
     sizes = {p.kept_size: p.name for p in kept}
     if len(sizes) > MAX_SIZES:
         some = ", ".join(f"{width} × {height} ({name})" for (width, height), name in [*sizes.items()][:3])
@@ -203,10 +176,10 @@ def _positive(value: Any) -> float | None:
     return number if 0 < number < np.inf else None
 
 
-def write_copies(photographs: Sequence[Photograph], folder: Path, longest: int, progress: Any) -> None:
+def write_copies(photographs: Sequence[Photograph], folder: Path, longest: int) -> None:
     """Write missing working copies of at most `longest` pixels per side."""
     folder.mkdir(parents=True, exist_ok=True)
-    for photograph in progress(photographs):
+    for photograph in with_bar(photographs, "images"):
         file = folder / photograph.copy
         if not file.is_file():
             image = photograph.load(longest)

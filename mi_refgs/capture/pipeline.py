@@ -122,8 +122,7 @@ def capture(
         for stale in {*job.work.glob("output-*")} - {made}:
             shutil.rmtree(stale)
         placed = [job.copies[name] for name in solved.names]
-        write = colmap.progress("undistorted")
-        output.write_images(placed, lambda p: straight[p.copy], job.masks, made, write)
+        output.write_images(placed, lambda p: straight[p.copy], job.masks, made)
         output.write_model(model, job.copies, straight, similarity, made / "sparse" / "0")
         output.replace_output(folder, made, key)
         shutil.rmtree(made)
@@ -145,15 +144,9 @@ def capture(
         "mean_reprojection_error": float(model.compute_mean_reprojection_error()),
         "lens": {
             "model": next(iter(cameras)).model_name,
-            "cameras": [
-                {"width": c.width, "height": c.height, "parameters": [float(x) for x in c.params]}
-                for c in cameras
-            ],
+            "cameras": [{"width": c.width, "height": c.height, "parameters": [*c.params]} for c in cameras],
         },
-        "pinholes": [
-            {"size": s.size, "focal": [*map(float, s.focal)], "centre": [*map(float, s.centre)]}
-            for s in pinholes.values()
-        ],
+        "pinholes": [{"size": s.size, "focal": s.focal, "centre": s.centre} for s in pinholes.values()],
         "region": {"centre": found.centre, "radius": found.radius},
         "masks": bool(job.masks),
         "seconds": round(time.perf_counter() - began, 1),
@@ -172,17 +165,15 @@ def _solve(job: CaptureJob, tell: Callable[[str], None]) -> Path:
     pycolmap = colmap.load()
     size, names = colmap.WORKING_SIZE, sorted(job.copies)
     images = job.work / f"pictures-{job.key(size)}"
-    features = job.key(size, colmap.MOST_FEATURES, pycolmap.__version__, _first_model(job))
-    database, result = (
-        job.work / f"features-{features}.db",
-        job.work / f"model-{job.key(features, job.camera)}",
-    )
+    features = job.key(size, colmap.MOST_FEATURES, pycolmap.__version__, job.camera or FIRST_MODEL)
+    database = job.work / f"features-{features}.db"
+    result = job.work / f"model-{job.key(features, job.camera)}"
     if not result.is_dir():
         for path in job.work.iterdir():  # of other images or options
             if path != images and not path.name.startswith(database.stem):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         # Features.
-        write_copies(job.photographs, images, size, colmap.progress("images"))
+        write_copies(job.photographs, images, size)
         if not database.is_file():
             colmap.begin(database, images, _groups(job, images))
         colmap.extract(database, images, names)
@@ -190,9 +181,8 @@ def _solve(job: CaptureJob, tell: Callable[[str], None]) -> Path:
         require_features(job.source, [len(found[name]) for name in names], _contrast(images, names))
         # Matches.
         pairs = colmap.pairs_to_match(found)
-        tell(
-            f"{len(names)} photographs, {sum(map(len, found.values()))} features, {len(pairs)} pairs to match"
-        )
+        features_found = sum(map(len, found.values()))
+        tell(f"{len(names)} photographs, {features_found} features, {len(pairs)} pairs to match")
         colmap.match(database, pairs)
         # Cameras and lens.
         raw = job.work / "unfinished"
@@ -200,22 +190,15 @@ def _solve(job: CaptureJob, tell: Callable[[str], None]) -> Path:
         models = colmap.reconstruct(database, images, raw, len(names))
         if not models:
             raise no_model(job.source, len(names), colmap.verified(database))
-        groups = [Solved.of(model).names for model in models]
-        best = models[0]
-        if job.camera is None:
-            best = colmap.best_lens(best)
-        else:
+        best = models[0] if job.camera else colmap.best_lens(models[0])
+        if job.camera:
             colmap.adjust(best)
         shutil.rmtree(raw)
         raw.mkdir()
         best.write_binary(raw)
-        write_json(raw / "groups.json", {"groups": groups})
+        write_json(raw / "groups.json", {"groups": [Solved.of(model).names for model in models]})
         raw.rename(result)
     return result
-
-
-def _first_model(job: CaptureJob) -> str:
-    return job.camera or FIRST_MODEL
 
 
 def _groups(job: CaptureJob, images: Path) -> list[tuple[list[str], str, list[float]]]:
@@ -224,7 +207,7 @@ def _groups(job: CaptureJob, images: Path) -> list[tuple[list[str], str, list[fl
     for photographs in cameras_of(job.photographs):
         copies = [photograph.copy for photograph in photographs]
         size = image_size(images / copies[0])
-        focal, model = photographs[0].focal_pixels(size), _first_model(job)
+        focal, model = photographs[0].focal_pixels(size), job.camera or FIRST_MODEL
         parameters: list[float] = []
         if focal is not None:
             known = {"f": focal, "fx": focal, "fy": focal, "cx": size[0] / 2, "cy": size[1] / 2}
@@ -262,9 +245,8 @@ class Report:
             f"{c['mean_reprojection_error']:.2f} pixels; lens {c['lens']['model']}"
         ]
         if c["not_placed"]:
-            lines.append(
-                f"not placed: {abbreviated_names(c['not_placed'])}; take more between them and the others"
-            )
+            names = abbreviated_names(c["not_placed"])
+            lines.append(f"not placed: {names}; take more between them and the others")
         if c["mean_reprojection_error"] > GOOD_ERROR:
             lines.append("the error is high: something moved, or the lens needs another --camera-model")
         lines.append(f"look at {folder / 'capture.png'}; next: refgs train {folder} -o runs/{folder.name}")
@@ -273,37 +255,24 @@ class Report:
 
 def draw(path: Path, world: Solved, region: Region) -> None:
     """Plot cameras, points and region from above and from the side."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.patches import Circle
 
     centre = np.array(region.centre)
     reach = float(np.abs(world.origin - centre).max())
     half = 1.1 * max(reach, min(SHOWN_RADII * region.radius, 2 * reach))
     near = world.points[(np.abs(world.points - centre) < half).all(axis=1)]
-    step = half / 12
+    directions = np.stack([world.origin, world.origin + half / 12 * world.axis])
     figure = Figure(figsize=(12, 6), layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, (across, up), title in zip(
-        figure.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side"), strict=True
-    ):
-        axes.scatter(near[:, across], near[:, up], s=0.5, c="0.5", linewidths=0)
-        ends = world.origin + step * world.axis
-        axes.plot(
-            *np.stack([world.origin, ends], axis=2)[:, [across, up]].transpose(1, 2, 0), color="C0", lw=0.8
-        )
-        axes.scatter(world.origin[:, across], world.origin[:, up], s=8, color="C0")
-        angle = np.linspace(0, 2 * np.pi, 100)
-        axes.plot(
-            centre[across] + region.radius * np.cos(angle),
-            centre[up] + region.radius * np.sin(angle),
-            color="C3",
-        )
-        axes.set(title=title, xlabel="xyz"[across], ylabel="xyz"[up], aspect="equal")
-        axes.set_xlim(centre[across] - half, centre[across] + half)
-        axes.set_ylim(centre[up] - half, centre[up] + half)
-    figure.suptitle(
-        f"{len(world.names)} cameras (blue), {len(world.points)} points, region of interest (red)"
-    )
+    for axes, up, title in zip(figure.subplots(1, 2), (1, 2), ("from above", "from the side"), strict=True):
+        axes.scatter(near[:, 0], near[:, up], s=0.5, c="0.5", linewidths=0)
+        axes.plot(directions[..., 0], directions[..., up], color="C0", lw=0.8)
+        axes.scatter(world.origin[:, 0], world.origin[:, up], s=8, color="C0")
+        axes.add_patch(Circle((centre[0], centre[up]), region.radius, fill=False, color="C3", lw=1.5))
+        axes.set(title=title, xlabel="x", ylabel="xyz"[up], aspect="equal")
+        axes.set(xlim=centre[0] + half * np.array([-1, 1]), ylim=centre[up] + half * np.array([-1, 1]))
+    count = len(world.names)
+    figure.suptitle(f"{count} cameras (blue), {len(world.points)} points, region of interest (red)")
     replace_file(path, lambda temporary: figure.savefig(temporary, dpi=100))
 
 
@@ -342,10 +311,9 @@ def require_placed(folder: Path, count: int, groups: Sequence[Sequence[str]], lo
     """Raise InputError unless the largest group has half of the images; `longest_gap`: a boundary name."""
     if len(groups[0]) >= LEAST_PLACED * count:
         return
-    sizes = ", ".join(str(len(group)) for group in groups)
-    apart = (
-        f"{len(groups)} groups that share nothing ({sizes} images)" if len(groups) > 1 else f"{sizes} images"
-    )
+    apart = ", ".join(str(len(group)) for group in groups) + " images"
+    if len(groups) > 1:
+        apart = f"{len(groups)} groups that share nothing ({apart})"
     raise InputError(
         f"{folder}: photographs: of {count}, only {apart} could be placed; take images that lead from one "
         f"group to the next in small steps, as around {longest_gap}"

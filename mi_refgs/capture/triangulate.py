@@ -50,11 +50,7 @@ def with_points(data: Dataset, folder: Path, tell: Callable[[str], None]) -> Poi
     if data.points is not None or not enough or data.has_alpha:
         return data.points
     kept, key = folder / POINTS_FILE, _key(data)
-    with (
-        contextlib.suppress(*DAMAGED),
-        kept.open("rb") as opened,
-        np.load(opened, allow_pickle=False) as file,
-    ):
+    with contextlib.suppress(*DAMAGED), kept.open("rb") as opened, np.load(opened) as file:
         if file["key"] == key:
             return PointCloud(file["position"], file["colour"])
     if not colmap.installed():
@@ -65,10 +61,8 @@ def with_points(data: Dataset, folder: Path, tell: Callable[[str], None]) -> Poi
     if points is None:
         tell("no points to start from: the images have too little texture in common")
         return None
-    seconds = time.perf_counter() - began
-    tell(
-        f"{len(points.position)} points to start from, triangulated in {seconds:.0f} s with the known cameras"
-    )
+    count, seconds = len(points.position), time.perf_counter() - began
+    tell(f"{count} points to start from, triangulated in {seconds:.0f} s with the known cameras")
     content = io.BytesIO()
     np.savez_compressed(content, key=key, position=points.position, colour=np.asarray(points.colour))
     write_bytes(OutputFolder(folder, RUN).own(POINTS_FILE), content.getvalue())

@@ -15,12 +15,10 @@ def resource_dir(name: str) -> Path:
     A wheel has these folders inside the package; a checkout has them beside it. Raises InputError if neither
     has the folder.
     """
-    for folder, is_ours in (
-        (_PACKAGE / name, True),
-        (_PACKAGE.parent / name, (_PACKAGE.parent / "pyproject.toml").is_file()),
-    ):
-        if is_ours and folder.is_dir():
-            return folder
+    checkout = [_PACKAGE.parent] if (_PACKAGE.parent / "pyproject.toml").is_file() else []
+    for parent in (_PACKAGE, *checkout):
+        if (parent / name).is_dir():
+            return parent / name
     raise InputError(
         f"{_PACKAGE}: {name}: the folder is missing from this installation; install mi_refgs again"
     )

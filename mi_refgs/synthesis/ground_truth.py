@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -53,10 +53,6 @@ class Materials:
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return Materials(*((dr.select(mask, a[0], b[0]), dr.select(mask, a[1], b[1])) for a, b in pairs))
 
-    def only(self, mask: Bool) -> Materials:
-        """These materials under the mask, unknown elsewhere."""
-        return self.where(mask, unknown())
-
     def cleaned(self) -> Materials:
         """Unknown where a value is not finite; clipped to 0 … 1 elsewhere."""
         import drjit as dr
@@ -86,14 +82,9 @@ def materials_at(scene: Any, si: Any) -> Materials:
     """
     import mitsuba as mi
 
-    found = unknown()
-    seen: list[Any] = []
-    here = si.bsdf()
-    for shape in scene.shapes():
-        bsdf = shape.bsdf()
-        if bsdf is None or any(bsdf is other for other in seen):
-            continue
-        seen.append(bsdf)
+    found, here = unknown(), si.bsdf()
+    bsdfs = {id(bsdf): bsdf for shape in scene.shapes() if (bsdf := shape.bsdf()) is not None}
+    for bsdf in bsdfs.values():
         mask = si.is_valid() & (here == mi.BSDFPtr(bsdf))
         found = _of(bsdf, si, mask).cleaned().where(mask, found)
     return found
@@ -105,22 +96,17 @@ class _Parameters:
     def __init__(self, bsdf: Any, si: Any, active: Bool) -> None:
         import mitsuba as mi
 
+        children: dict[str, Any] = {}
+
         class Children(mi.TraversalCallback):
-            found: ClassVar[dict[str, Any]] = {}
+            def put(self, name: str, value: Any, *flags: Any) -> None:
+                children[name] = value
 
-            def put_object(self, name: str, value: Any, flags: Any) -> None:
-                self.found[name] = value
+            put_object = put_value = put
 
-            def put(self, name: str, value: Any, flags: Any, *more: Any) -> None:
-                self.found[name] = value
-
-            put_value = put
-
-        Children.found = {}
         bsdf.traverse(Children())
         self.bsdf, self.si, self.active = bsdf, si, active
-        self.children = Children.found
-        self.values = mi.traverse(bsdf)
+        self.children, self.values = children, mi.traverse(bsdf)
 
     def __contains__(self, name: str) -> bool:
         return name in self.children
@@ -158,18 +144,9 @@ def _of(bsdf: Any, si: Any, active: Bool) -> Materials:
     return unknown()
 
 
-def _declared(p: _Parameters) -> Materials:
-    import mitsuba as mi
-
-    yes = mi.Bool(True)
-    return Materials((p.colour("albedo"), yes), (p.number("roughness"), yes), (p.number("metallic"), yes))
-
-
 def _principled(p: _Parameters) -> Materials:
-    opaque = p.number("spec_trans") < OPAQUE
-    return Materials(
-        (p.colour("base_color"), opaque), (p.number("roughness"), opaque), (p.number("metallic"), opaque)
-    )
+    known, colour = p.number("spec_trans") < OPAQUE, p.colour("albedo" if "albedo" in p else "base_color")
+    return Materials((colour, known), (p.number("roughness"), known), (p.number("metallic"), known))
 
 
 def _diffuse(p: _Parameters) -> Materials:
@@ -212,15 +189,15 @@ def _two_sided(p: _Parameters) -> Materials:
 
 def _blend(p: _Parameters) -> Materials:
     weight = p.number("weight")
-    first, second = p.nested("bsdf_0").only(weight < OPAQUE), p.nested("bsdf_1").only(1 - weight < OPAQUE)
-    return first.where(weight < OPAQUE, second)
+    second = p.nested("bsdf_1").where(1 - weight < OPAQUE, unknown())
+    return p.nested("bsdf_0").where(weight < OPAQUE, second)
 
 
 RULES: tuple[tuple[tuple[str, ...], Callable[[_Parameters], Materials]], ...] = (
     (("brdf_0", "brdf_1"), _two_sided),
     (("bsdf_0", "bsdf_1", "weight"), _blend),
     (("nested_bsdf",), lambda p: p.nested("nested_bsdf")),
-    (("albedo", "roughness", "metallic"), _declared),
+    (("albedo", "roughness", "metallic"), _principled),
     (("diff_trans",), lambda p: unknown()),
     (("base_color", "roughness"), _principled),
     (("diffuse_reflectance",), _plastic),

@@ -249,7 +249,8 @@ def write_views(
         _trace_view(tracer, out / name, pose, seed, maps)
     for split in splits:
         frames = [_frame(split, i, pose, maps) for i, (pose, _) in enumerate(cameras.of(split))]
-        write_json(out / f"transforms_{split}.json", _transforms(cameras.settings, frames))
+        intrinsics = pinhole(*cameras.settings.resolution, cameras.settings.focal)
+        write_json(out / f"transforms_{split}.json", {**intrinsics, "frames": frames})
 
 
 def _trace_view(tracer: Tracer, stem: Path, pose: np.ndarray, seed: int, maps: bool) -> None:
@@ -286,8 +287,3 @@ def _frame(split: str, index: int, pose: np.ndarray, maps: bool) -> dict[str, An
         **({f"{name}_path": f"{stem}_{name}.exr" for name in MAPS} if maps else {}),
         "transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist(),
     }
-
-
-def _transforms(settings: Settings, frames: list[dict[str, Any]]) -> dict[str, Any]:
-    width, height = settings.resolution
-    return {**pinhole(width, height, settings.focal), "frames": frames}

@@ -133,9 +133,7 @@ class Settings:
     light: str = ""  # file name of the map in place of the scene's environment
     light_sha256: str = ""
     height: int = 0  # pixels; 0: as many as `size`
-    objects: tuple[
-        str, ...
-    ] = ()  # ids of the object's shapes in an open scene; empty: all shapes, with alpha
+    objects: tuple[str, ...] = ()  # ids of the object's shapes in an open scene; empty: all, with alpha
     distance: tuple[float, float] = (0.0, 0.0)  # nearest and farthest camera, scene units; 0: from `fill`
 
     @property
@@ -219,14 +217,8 @@ def prepare_folder(
 
 def _option(field: str) -> str:
     """The option of `refgs dataset` that sets a field."""
-    names = {
-        "scene": "SCENE",
-        "scene_sha256": "SCENE",
-        "height": "--size",
-        "light_sha256": "--light",
-        "objects": "--shapes",
-        "spp": "--samples",
-    }
+    names = {"scene": "SCENE", "scene_sha256": "SCENE", "height": "--size"}
+    names |= {"light_sha256": "--light", "objects": "--shapes", "spp": "--samples"}
     return names.get(field) or f"--{field.replace('_', '-')}"
 
 
