@@ -17,33 +17,21 @@ import numpy as np
 
 from mi_refgs.data.region import Region
 from mi_refgs.fitting import refine
-from mi_refgs.fitting.initial import first_light
+from mi_refgs.fitting.initial import converted, first_light
 from mi_refgs.fitting.refine import SizeLimits, TableEdit
 from mi_refgs.fitting.state import FitSetup, FitState
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Vector2f
 
 MARGIN = 0.02
 """Distance beyond the border of the region, in radii, from which a surfel changes tables."""
 
-Raw = dict[str, np.ndarray]
 
-
-def depth_outside(raw: Raw, region: Region) -> np.ndarray:
-    """Signed distance (N,) from the region's sphere in its radii, negative inside."""
-    offset = np.linalg.norm(raw["position"] - np.array(region.centre), axis=1)
-    found: np.ndarray = offset / region.radius - 1
-    return found
-
-
-def distances(surfels: Surfels, region: Region) -> np.ndarray:
-    """Distance (N,) of surfels from the region's centre, at least its radius, with which sizes may grow."""
-    outside = depth_outside({"position": surfels.raw["position"].numpy()}, region)
-    found: np.ndarray = region.radius * (1 + np.maximum(outside, 0))
-    return found
+def depth_outside(position: np.ndarray, region: Region) -> np.ndarray:
+    """Signed distance (N,) of points (N, 3) from the region's sphere in its radii, negative inside."""
+    return np.asarray(np.linalg.norm(position - np.array(region.centre), axis=1) / region.radius - 1)
 
 
 def exchanged(
@@ -53,31 +41,20 @@ def exchanged(
     options = method.surroundings
     assert options is not None
     tables = [inner.to_numpy(), outer.to_numpy()]
-    leaves = [depth_outside(tables[0], region) > MARGIN, depth_outside(tables[1], region) < -MARGIN]
+    own_depth, other_depth = (depth_outside(table["position"], region) for table in tables)
+    leaves = [own_depth > MARGIN, other_depth < -MARGIN]
     for i, limit in enumerate((options.max_count, method.surfels.max_count)):  # of the destination
         room = limit - len(leaves[1 - i])
         leaves[i] &= np.cumsum(leaves[i]) <= min(max(room, 0), len(leaves[i]) - 1)
     edits = []
     for own, other, gone, comes in zip(tables, tables[::-1], leaves, leaves[::-1], strict=True):
         stays = np.flatnonzero(~gone)
-        moved = _converted({name: values[comes] for name, values in other.items()}, own, method, rng)
+        widths = {name: values.shape[1] for name, values in own.items()}
+        moved = converted({name: values[comes] for name, values in other.items()}, widths, method, rng)
         table = {name: np.concatenate([values[stays], moved[name]]) for name, values in own.items()}
         parent = np.concatenate([stays, np.zeros(comes.sum(), int)]).astype(np.uint32)
         edits.append(TableEdit(Surfels.from_numpy(table), parent, np.arange(len(parent)) >= len(stays)))
     return edits
-
-
-def _converted(rows: Raw, like: Raw, method: Method, rng: np.random.Generator) -> Raw:
-    """Convert rows of the other table to the attributes of `like`."""
-    made = {}
-    for name, values in like.items():
-        count, width = len(rows["position"]), values.shape[1]
-        if name in rows:
-            kept = rows[name][:, :width]
-            made[name] = np.pad(kept, ((0, 0), (0, width - kept.shape[1])))
-        else:
-            made[name] = attribute(name).start(count, width, rng, method.surfels.start(name))
-    return {name: values.astype(np.float32) for name, values in made.items()}
 
 
 class AdaptiveControl:
@@ -109,15 +86,12 @@ class AdaptiveControl:
     def changes_rows(self, iteration: int) -> bool:
         """Whether surfels are added or removed after this iteration."""
         densify, relocate = self.options.densify, self.options.relocate
-        return bool(
-            (densify is not None and densify.due(iteration))
-            or (relocate is not None and relocate.when.due(iteration))
-        )
+        due = densify is not None and densify.due(iteration)
+        return due or (relocate is not None and relocate.when.due(iteration))
 
     def refine(self, iteration: int) -> None:
         """Apply the edits that are due after this iteration."""
-        options, state, method = self.options, self.state, self.setup.method
-        schedule = self.setup.schedule
+        options, state, schedule = self.options, self.state, self.setup.schedule
         if options.densify is not None and options.densify.due(iteration):
             self._densify(iteration)
         if options.relocate is not None and options.relocate.when.due(iteration):
@@ -129,7 +103,7 @@ class AdaptiveControl:
         # Resets and propagation: of the object only, since the background map would replace the background's
         # surfels, blurred.
         if options.reset is not None and options.reset.due(iteration):
-            floors = {name: method.surfels.start(name) for name in options.reset_raise}
+            floors = {name: self.setup.method.surfels.start(name) for name in options.reset_raise}
             edited = refine.reset_opacity(state.surfels, options, floors)
             state.tables[0].replace(edited, cleared=("opacity", *floors))
         elif options.propagate is not None and options.propagate.when.due(iteration):
@@ -152,7 +126,8 @@ class AdaptiveControl:
             surfels, limits = table.surfels, SizeLimits.of(options, data.scene_extent)
             if table.prefix:  # surfels of the background may grow with their distance
                 assert data.region is not None and method.surroundings is not None
-                distance = distances(surfels, data.region)
+                outside = depth_outside(surfels.raw["position"].numpy(), data.region)
+                distance = data.region.radius * (1 + np.maximum(outside, 0))
                 split = options.dense_extent * np.maximum(distance, data.scene_extent)
                 limits = SizeLimits(split, method.surroundings.prune_extent * distance, keep_one=True)
             edit = refine.densify_and_prune(surfels, table.gradient, limits, options, table.max_count, draws)

@@ -37,8 +37,7 @@ BLOCK = 16
 JPEG, 8 pixels."""
 EXIF_SPREAD = 0.02
 """Standard deviation of log exposures below which EXIF exposures count as equal."""
-EXPOSURE_FILE = "exposure.json"
-"""File of a run that contains the decision and the gains."""
+EXPOSURE_FILE = "exposure.json"  # of a run: the decision and the gains
 
 
 def initial_gains(setup: FitSetup) -> dict[str, TensorXf]:
@@ -109,11 +108,6 @@ def _judge(view: View, data: Dataset, render: Render) -> tuple[float, float]:
     return found[0], found[1]
 
 
-def fitted_log_gains(data: Dataset, render: Render) -> np.ndarray:
-    """Log gains (V, 3) that bring the renders to the images."""
-    return np.log([with_gain(render(view), view, data)[0] for view in data.views])
-
-
 def with_gains(state: Mapping[str, np.ndarray], log: np.ndarray | None) -> dict[str, np.ndarray]:
     """Replace the gains in a checkpoint's content by these log gains (V, 3), without history, or by none."""
     own = (f"{PARAMS}{GAIN}", f"{OPTIMISER}{GAIN}/")
@@ -128,8 +122,7 @@ def record(setup: FitSetup, state: FitState) -> dict[str, Any] | None:
     """The decision and the gains by view, as a run records them; None if nothing was decided."""
     if state.exposure is None:
         return None
-    gains = gains_of(state.params)
-    names = [view.name for view in setup.data.views]
+    gains, names = gains_of(state.params), [view.name for view in setup.data.views]
     by_view = {} if gains is None else dict(zip(names, gains.round(5).tolist(), strict=True))
     return state.exposure | {"gain": by_view}
 
@@ -142,10 +135,9 @@ def exif_gains(data: Dataset) -> np.ndarray | None:
     log = [view.exposure for view in data.views]
     if any(value is None for value in log):
         return None
-    values = np.array(log, dtype=np.float64)
+    values, limit = np.array(log, dtype=np.float64), np.log(MAX_GAIN)
     if values.std() < EXIF_SPREAD:
         return None
-    limit = np.log(MAX_GAIN)
     gains = np.clip(values - np.median(values), -limit, limit)
     return np.repeat(gains[:, None], 3, axis=1).astype(np.float32)
 

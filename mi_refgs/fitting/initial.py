@@ -17,6 +17,7 @@ from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, LightOptions, Met
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels import init
+from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.init import morton_order
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import TensorXf
@@ -30,30 +31,32 @@ DRAWS = 64
 """Rounds of rejection sampling; cameras on one side of a scene accept about a tenth per round."""
 
 
-def inside_points(
-    count: int, random: float, data: Dataset, rng: np.random.Generator
+def open_points(
+    count: int, random: float, inside: bool, data: Dataset, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (count, 3) of the object and their colours: a fraction `random` uniform in the region, the
-    others at sparse points inside it, if there are any."""
+    """Points (count, 3) of the object, or of the background unless `inside`, and their colours.
+
+    A fraction `random` is uniform in the region, or outside it in contracted space where views see it. The
+    others are at the sparse points there; all are random if there are none.
+    """
     region = data.region
     assert region is not None
-    sparse = _part(data.points, region, inside=True)
+    sparse = data.points
+    if sparse is not None:
+        rows = region.contains(sparse.position) == inside
+        colour = None if sparse.colour is None else sparse.colour[rows]
+        sparse = PointCloud(sparse.position[rows], colour) if rows.any() else None
     drawn = count if sparse is None else round(random * count)
-    direction = init.random_normals(drawn, rng)
-    offset = direction * np.cbrt(rng.random((drawn, 1))) * region.radius
-    return _both(sparse, count - drawn, np.array(region.centre) + offset, data, rng)
-
-
-def outside_points(
-    count: int, random: float, data: Dataset, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points (count, 3) of the background and their colours: a fraction `random` uniform in contracted space
-    where views see it, the others at sparse points outside the region, if there are any."""
-    region = data.region
-    assert region is not None
-    sparse = _part(data.points, region, inside=False)
-    drawn = count if sparse is None else round(random * count)
-    return _both(sparse, count - drawn, _around(drawn, region, data, rng), data, rng)
+    if inside:
+        offset = init.random_normals(drawn, rng) * np.cbrt(rng.random((drawn, 1))) * region.radius
+        points = np.array(region.centre) + offset
+    else:
+        points = _around(drawn, region, data, rng)
+    colours = hull.median_colours(points, data.views, data.background)
+    if sparse is None or drawn == count:
+        return points, colours
+    near, known = at_points(sparse, count - drawn, data, rng)
+    return np.concatenate([near, points]), np.concatenate([known, colours])
 
 
 def at_points(
@@ -72,43 +75,22 @@ def at_points(
     return points, hull.median_colours(points, data.views, data.background)
 
 
-def _both(
-    sparse: PointCloud | None, count: int, drawn: np.ndarray, data: Dataset, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Join `count` points of a cloud and those that were drawn, with their colours."""
-    colours = hull.median_colours(drawn, data.views, data.background)
-    if sparse is None or not count:
-        return drawn, colours
-    points, known = at_points(sparse, count, data, rng)
-    return np.concatenate([points, drawn]), np.concatenate([known, colours])
-
-
-def _part(cloud: PointCloud | None, region: Region, inside: bool) -> PointCloud | None:
-    """The points of a cloud inside or outside the region; None if there are none."""
-    if cloud is None:
-        return None
-    rows = region.contains(cloud.position) == inside
-    if not rows.any():
-        return None
-    return PointCloud(cloud.position[rows], None if cloud.colour is None else cloud.colour[rows])
-
-
 def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator) -> np.ndarray:
     """Points (count, 3) uniform in the contracted shell around the region, where enough views see them;
     anywhere if too few are seen."""
+
+    def draw(number: int) -> np.ndarray:
+        length = np.cbrt(rng.uniform(1, FARTHEST**3, (number, 1)))
+        return region.expand(init.random_normals(number, rng) * length)
+
     found = np.empty((0, 3))
     for _ in range(DRAWS):
-        missing = count - len(found)
-        if missing <= 0:
+        if len(found) == count:
             break
-        length = np.cbrt(rng.uniform(1, FARTHEST**3, (4 * missing, 1)))
-        points = region.expand(init.random_normals(4 * missing, rng) * length)
-        views = [view.project(points)[2] for view in data.views]
-        seen = np.mean(views, axis=0) >= SEEN_SHARE
-        found = np.concatenate([found, points[seen][:missing]])
-    missing = count - len(found)
-    length = np.cbrt(rng.uniform(1, FARTHEST**3, (missing, 1)))
-    return np.concatenate([found, region.expand(init.random_normals(missing, rng) * length)])
+        points = draw(4 * (count - len(found)))
+        seen = np.mean([view.project(points)[2] for view in data.views], axis=0) >= SEEN_SHARE
+        found = np.concatenate([found, points[seen]])[:count]
+    return np.concatenate([found, draw(count - len(found))])
 
 
 ALBEDO_RANGE = (0.02, 0.9)
@@ -133,6 +115,28 @@ def initial_parameters(
         return params
     light = seen_around(data, method.light.height) if open_scene else first_light(method.light)
     return params | {LIGHT: light.raw}
+
+
+def with_columns(table: np.ndarray, width: int) -> np.ndarray:
+    """The first `width` columns, filled with zeros."""
+    kept = table[:, :width]
+    return np.pad(kept, ((0, 0), (0, width - kept.shape[1])))
+
+
+def converted(
+    rows: dict[str, np.ndarray],  # (N, D) by attribute
+    widths: dict[str, int],
+    method: Method,
+    rng: np.random.Generator,
+) -> dict[str, np.ndarray]:
+    """Rows with attributes of these widths: cut or filled with zeros, and new ones as the method starts."""
+    made = {
+        name: with_columns(rows[name], width)
+        if name in rows
+        else attribute(name).start(len(rows["position"]), width, rng, method.surfels.start(name))
+        for name, width in widths.items()
+    }
+    return {name: values.astype(np.float32) for name, values in made.items()}
 
 
 def first_light(options: LightOptions) -> EnvironmentLight:
@@ -161,7 +165,7 @@ def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator
     """The parameters of the background by name: surfels, and a map of the median of their colours."""
     options, region = method.surroundings, data.region
     assert options is not None and region is not None
-    points, colours = outside_points(options.count, options.scattered, data, rng)
+    points, colours = open_points(options.count, options.scattered, False, data, rng)
     order = morton_order(points)
     points, distance = points[order], np.linalg.norm(points[order] - np.array(region.centre), axis=1)
     table = init.from_points(
@@ -208,18 +212,17 @@ def initial_surfels(
         colours = np.concatenate(
             [hull.median_colours(outer, views, behind, facing), hull.median_colours(inner, views, behind)]
         )
-    elif open_scene:
-        assert method.surroundings is not None
-        start["opacity"] = method.surroundings.opacity
-        points, colours = inside_points(options.count, options.inside, data, rng)
-        normals = init.random_normals(options.count, rng)
-    elif data.points is not None and len(data.points.position):
-        points, colours = at_points(data.points, options.count, data, rng)
-        normals = init.random_normals(options.count, rng)
     else:
-        points = hull.random_points(options.count, hull.camera_bounds(views), rng)
+        if open_scene:
+            assert method.surroundings is not None
+            start["opacity"] = method.surroundings.opacity
+            points, colours = open_points(options.count, options.inside, True, data, rng)
+        elif data.points is not None and len(data.points.position):
+            points, colours = at_points(data.points, options.count, data, rng)
+        else:
+            points = hull.random_points(options.count, hull.camera_bounds(views), rng)
+            colours = hull.median_colours(points, views, behind)
         normals = init.random_normals(options.count, rng)
-        colours = hull.median_colours(points, views, behind)
     order = morton_order(points)
     if "albedo" in options.from_images and method.light is not None:
         # The hue only: brightness is left to the light until it has been estimated.

@@ -36,16 +36,11 @@ from mi_refgs.types import Bool, Float, TensorXf, UInt32
 BETA_1 = 0.9
 BETA_2 = 0.999
 EPSILON = 1e-15
-OUTLIER = 100.0
-"""Gradients beyond this many times the usual are cut; see above."""
-SAMPLES = 10_000
-"""Entries that a median is computed from."""
-WIDE_ROW = 64
-"""Columns beyond which rows are not distinguished: SH have 48, a row of the light hundreds."""
-WORD = 32
-"""Tensors whose bits fit one integer of the marks."""
-MEMORY = 4096
-"""Steps that `report` may come late."""
+OUTLIER = 100.0  # gradients beyond this many times the usual are cut; see above
+SAMPLES = 10_000  # entries that a median is computed from
+WIDE_ROW = 64  # columns beyond which rows are not distinguished: SH have 48, a row of the light hundreds
+WORD = 32  # tensors whose bits fit one integer of the marks
+MEMORY = 4096  # steps that `report` may come late
 
 
 @dataclass(frozen=True)
@@ -112,9 +107,8 @@ class Skips:
         skipped = skipped[skipped > self._reported]
         rows = {}
         for i, name in enumerate(self._groups if len(skipped) else ()):
-            marks = self._marks.get((self._marked(name), i // WORD))
-            found = np.zeros(0, np.uint32) if marks is None else marks.numpy()
-            rows[name] = np.flatnonzero(found >> np.uint32(i % WORD) & 1)
+            if (marks := self._marks.get((self._marked(name), i // WORD))) is not None:
+                rows[name] = np.flatnonzero(marks.numpy() >> np.uint32(i % WORD) & 1)
         last = self._iteration - (self._calls - int(skipped.max(initial=0)))
         self._reported = self._calls
         if len(skipped):
@@ -222,7 +216,7 @@ class Adam:
         updated: dict[str, tuple[Float, tuple[int, ...]]] = {}
         inverse: dict[int, Float] = {}
         for name, g in gradients.items():
-            shape, group = tuple(int(size) for size in self.params[name].shape), self.groups[name]
+            shape, group = self.params[name].shape, self.groups[name]
             t = self._steps[name] + 1
             if t not in inverse:
                 inverse[t] = dr.opaque(mi.Float, 1 / (1 - BETA_2 ** max(t - 1, 1)))
@@ -323,7 +317,7 @@ class Adam:
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore `state_dict`, bit for bit; raises InputError when it does not fit the tensors."""
         for name in self.groups:
-            size = math.prod(int(extent) for extent in self.params[name].shape)
+            size = math.prod(self.params[name].shape)
             for part, moments in (("first", self._first), ("second", self._second)):
                 values = state.get(f"{name}/{part}")
                 if values is None or values.size != size:
@@ -334,16 +328,13 @@ class Adam:
                 moments[name] = upload(values)
             self._steps[name] = int(state[f"{name}/steps"])
             self._set_usual(name, float(state[f"{name}/usual"]))
-            factor = float(state[f"{name}/factor"])
-            self.factors.pop(name, None)
-            if factor != 1.0:
-                self.factors[name] = factor
+            self.factors[name] = float(state[f"{name}/factor"])
 
     def _clear(self, name: str) -> None:
-        size = math.prod(int(extent) for extent in self.params[name].shape)
-        # Opaque zeros: a literal would give the first step after a reset a kernel of its own.
-        self._first[name] = dr.opaque(mi.Float, 0.0, size) if size else mi.Float()
-        self._second[name] = dr.opaque(mi.Float, 0.0, size) if size else mi.Float()
+        size = math.prod(self.params[name].shape)
+        for moments in (self._first, self._second):
+            # Opaque zeros: a literal would give the first step after a reset a kernel of its own.
+            moments[name] = dr.opaque(mi.Float, 0.0, size) if size else mi.Float()
 
     def _make_leaf(self, name: str) -> None:
         tensor = dr.detach(self.params[name])

@@ -19,14 +19,14 @@ from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.exposure import displayed_of, image_of, psnr
-from mi_refgs.fitting.initial import first_light
+from mi_refgs.fitting.initial import converted, first_light, with_columns
+from mi_refgs.fitting.optim import Adam
 from mi_refgs.fitting.state import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, Method, Selection
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import resample
-from mi_refgs.surfels.attributes import attribute
 
 
 def branched(trainer: Trainer, method: Method) -> Trainer:
@@ -36,15 +36,9 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
     with zeros, a light of another size is resampled; entries that are kept have their history.
     """
     state = trainer.state()
-    old, count = part(state, PARAMS), trainer.surfels.count
-    rng = trainer.setup.schedule.rng(trainer.iteration, "branch")
-    wanted: dict[str, np.ndarray] = {}
-    for name in method.surfels.names:
-        width = method.surfels.columns(name)
-        if name not in old:
-            wanted[name] = attribute(name).start(count, width, rng, method.surfels.start(name))
-        else:
-            wanted[name] = _columns(old[name], width)
+    old, rng = part(state, PARAMS), trainer.setup.schedule.rng(trainer.iteration, "branch")
+    widths = {name: method.surfels.columns(name) for name in method.surfels.names}
+    wanted = converted(old, widths, method, rng)
     wanted |= {name: old[name] for name in old if name == BACKGROUND or name.startswith(AROUND)}
     if method.light is not None:
         height = method.light.height
@@ -66,27 +60,17 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
     return made
 
 
-def _columns(table: np.ndarray, width: int) -> np.ndarray:
-    """The first `width` columns, filled with zeros."""
-    kept = table[:, :width]
-    return np.pad(kept, ((0, 0), (0, width - kept.shape[1])))
-
-
 def _history(
     state: dict[str, np.ndarray], old: dict[str, np.ndarray], name: str, values: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Adam's moments of one tensor, with the names of `Adam.state_dict`."""
-    found: dict[str, np.ndarray] = {}
-    for key in ("first", "second"):
-        moments = state.get(f"{OPTIMISER}{name}/{key}")
-        kept = np.zeros(values.shape, np.float32)
-        if moments is not None and values.ndim == 2:
-            kept = _columns(moments.reshape(old[name].shape), values.shape[1])
-        elif moments is not None and moments.size == values.size:
-            kept = moments
-        found[f"{name}/{key}"] = kept.ravel()
-    for key, fresh in (("steps", 0), ("factor", 1.0), ("usual", 0.0)):
-        found[f"{name}/{key}"] = state.get(f"{OPTIMISER}{name}/{key}", np.array(fresh))
+    found = Adam.fresh_state(name, values.size)
+    for key, fresh in found.items():
+        kept = state.get(f"{OPTIMISER}{key}", fresh)
+        if kept.ndim and name in old and values.ndim == 2:
+            kept = with_columns(kept.reshape(old[name].shape), values.shape[1]).ravel()
+        if kept.size == fresh.size:
+            found[key] = kept
     return found
 
 
@@ -96,8 +80,7 @@ MOMENTS = 3
 TIME_NOISE = 0.05
 """Relative difference of two measurements of a step's time by chance."""
 
-DECISIONS = "decisions.json"
-"""File of a run that contains the decisions."""
+DECISIONS = "decisions.json"  # file of a run
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ from mi_refgs.runs.checkpoint import (
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Float, TensorXf
+from mi_refgs.types import Bool, Float, TensorXf, UInt32
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,12 +148,7 @@ class ParameterTable:
     def apply(self, edit: TableEdit) -> None:
         """Replace the surfels by edited ones in Morton order; moments and statistics follow the rows."""
         edit = edit.ordered()
-        parent, fresh = upload(edit.parent, mi.UInt32), upload(edit.fresh, mi.Bool)
-        self.replace(edit.surfels)
-        self.optimiser.gather(parent, self._names(edit.surfels), fresh)
-        self.gradient_sum = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_sum, parent))
-        self.gradient_count = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_count, parent))
-        dr.eval(self.gradient_sum, self.gradient_count)
+        self._move(edit.surfels, upload(edit.parent, mi.UInt32), upload(edit.fresh, mi.Bool))
 
     def remove(self, rows: np.ndarray) -> None:
         """Remove surfels; raises InputError if none would be left."""
@@ -162,10 +157,15 @@ class ParameterTable:
         if not len(parent):
             raise InputError("surfels: none of them is finite; lower the rates (--set rates.…)")
         index = upload(parent, mi.UInt32)
-        self.replace(surfels.gather(index))
-        self.optimiser.gather(index, self._names(surfels))
-        self.gradient_sum = dr.gather(mi.Float, self.gradient_sum, index)
-        self.gradient_count = dr.gather(mi.Float, self.gradient_count, index)
+        self._move(surfels.gather(index), index, dr.zeros(mi.Bool, len(parent)))
+
+    def _move(self, surfels: Surfels, parent: UInt32, fresh: Bool) -> None:
+        """Replace the surfels by descendants of the rows `parent`; those that are `fresh` have no history."""
+        self.replace(surfels)
+        self.optimiser.gather(parent, self._names(surfels), fresh)
+        self.gradient_sum = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_sum, parent))
+        self.gradient_count = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_count, parent))
+        dr.eval(self.gradient_sum, self.gradient_count)
 
     def replace(self, surfels: Surfels, cleared: tuple[str, ...] = ()) -> None:
         """Replace the surfels; the attributes in `cleared` lose their moments."""
@@ -267,7 +267,7 @@ class FitState:
         made.held_until = int(state["held_until"])
         made.decisions = decisions_of(state)
         if "exposure" in state:
-            made.exposure = json.loads(state["exposure"].tobytes().decode())
+            made.exposure = json.loads(state["exposure"].tobytes())
         made.occluder = _occluder_of(state)
         made.prefilter.restore(made.light, made.shading(setup.method), state)
         return made
@@ -275,9 +275,7 @@ class FitState:
 
 def decisions_of(state: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
     """The decisions about components of the method in a checkpoint."""
-    if "decisions" not in state:
-        return []
-    found: list[dict[str, Any]] = json.loads(state["decisions"].tobytes().decode())
+    found: list[dict[str, Any]] = json.loads(state["decisions"].tobytes()) if "decisions" in state else []
     return found
 
 

@@ -204,7 +204,12 @@ class Trainer:
                 if self.iteration % self.method.log_every == 0:
                     dr.sync_thread()
                 self.fit.seconds += time.perf_counter() - begin
-                self._record()
+                if self.iteration % self.method.log_every == 0:
+                    self.check()
+                    if self.run is not None:
+                        self.run.log(self.statistics())
+                if self.iteration % self.method.checkpoint_every == 0:
+                    self.save()
                 try:
                     if progress is not None:
                         progress(self)
@@ -213,14 +218,6 @@ class Trainer:
                     self.save()
                     raise
             self.check()
-
-    def _record(self) -> None:
-        if self.iteration % self.method.log_every == 0:
-            self.check()
-            if self.run is not None:
-                self.run.log(self.statistics())
-        if self.iteration % self.method.checkpoint_every == 0:
-            self.save()
 
     def save(self) -> None:
         """Write a checkpoint, if there is a run to write it into."""
@@ -271,10 +268,8 @@ class Trainer:
         alike, unless they `share_light` as in a fit. Afterwards the iteration is what it was before.
         """
         setup, before = self.setup, self.iteration
-        ends = {found: stage.until for found, stage in setup.method.stages()}
-        names = [*ends]
-        begin = ends[names[names.index(name) - 1]] if names.index(name) else 0
-        end = ends[name]
+        end = setup.method.stage[name].until
+        begin = max((x.until for _, x in setup.method.stages() if x.until < end), default=0)
         again = min(begin + 1, end - 1)  # the first iteration of a stage may reset materials
         if first is not None:
             self.iteration = first
@@ -350,6 +345,10 @@ class Trainer:
         self.fit.exposure = decision
         self.tell(exposure.sentence(decision))
         if decision["gains"] or GAIN in self.params:
-            log = exposure.fitted_log_gains(self.data, shown) if decision["gains"] else None
+            log = None
+            if decision["gains"]:
+                log = np.log(
+                    [exposure.with_gain(shown(view), view, self.data)[0] for view in self.data.views]
+                )
             self.check()
             self.restore(exposure.with_gains(self.state(), log))
