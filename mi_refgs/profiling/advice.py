@@ -7,18 +7,13 @@ from collections.abc import Iterator
 from mi_refgs.methods.method import Method
 from mi_refgs.profiling.profile import FAINT, Profile, StageProfile
 
-LOW_SHARE = 0.25
-"""Fraction of contributing evaluations below which there is advice."""
-THIN = 5.0
-"""Length over width of a thin surfel."""
-MANY = 0.3
-"""Fraction of the surfels from which there is advice."""
-HEAVY = 0.25
-"""Fraction of a step from which there is advice."""
-CROWDED = 0.5
-"""Fraction of the machine's memory above which there is advice."""
-SMALLEST_LIGHT = 32
-"""Rows of the light up to which its filter is cheap."""
+# Limits beyond which there is advice.
+LOW_SHARE = 0.25  # contributing part of the evaluations
+THIN = 5.0  # length over width of a surfel
+MANY = 0.3  # part of the surfels
+HEAVY = 0.25  # part of a step
+CROWDED = 0.5  # part of the machine's memory
+SMALLEST_LIGHT = 32  # rows
 
 
 def advice(found: Profile, method: Method) -> list[str]:

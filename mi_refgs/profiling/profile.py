@@ -45,9 +45,8 @@ class Counts:
 def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
     """Walk the lists as `splat.composite` does, and count; waits for the device."""
     columns = [dr.detach(column) for column in footprints.columns]
-    surfels = dr.width(columns[0])
+    surfels, pixels = dr.width(columns[0]), camera.width * camera.height
     pixels_of_surfel = dr.zeros(mi.UInt32, surfels)
-    pixels = camera.width * camera.height
     width, height = camera.tile
     if not lists.pairs:
         return Counts(surfels, pixels, width * height, 0, 0, 0, 0, pixels_of_surfel)
@@ -69,33 +68,23 @@ def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
         weight, after, goes_on = advance(sample, active, transmittance)
         hit = weight > 0
         dr.scatter_add(pixels_of_surfel, mi.UInt32(1), surfel, hit)
-        hits = hits + dr.select(hit, mi.UInt32(1), mi.UInt32(0))
-        return pair + 1, goes_on, after, steps + 1, hits
+        return pair + 1, goes_on, after, steps + 1, hits + dr.select(hit, mi.UInt32(1), mi.UInt32(0))
 
     inside = (x < camera.width) & (y < camera.height)
     state = (begin, inside, mi.Float(1), mi.UInt32(0), mi.UInt32(0))
     _, _, _, steps, hits = dr.while_loop(state, condition, body, label="count")
     dr.eval(steps, hits, pixels_of_surfel)
     # A tile continues until the last of its pixels has ended.
-    visited = dr.sum(dr.block_reduce(dr.ReduceOp.Max, steps, width * height))
-    return Counts(
-        surfels=surfels,
-        pixels=pixels,
-        tile_pixels=width * height,
-        pairs=lists.pairs,
-        visited=int(visited[0]),
-        contributing=int(dr.sum(hits)[0]),
-        covered=int(dr.count(hits > 0)[0]),
-        pixels_of_surfel=pixels_of_surfel,
-    )
+    visited = int(dr.sum(dr.block_reduce(dr.ReduceOp.Max, steps, width * height))[0])
+    contributing, covered = int(dr.sum(hits)[0]), int(dr.count(hits > 0)[0])
+    counts = surfels, pixels, width * height, lists.pairs, visited, contributing, covered
+    return Counts(*counts, pixels_of_surfel)
 
 
-SIZES = (200, 400, 800)
-"""Pixels along the longer side of an image."""
+SIZES = (200, 400, 800)  # pixels along the longer side of an image
 ROUNDS = 9
 """Timed images of each kind, in turns, so that other load of the machine slows all kinds equally."""
-FRAME_WARM_UP = 2
-"""Rounds before the first measured one: they compile kernels."""
+FRAME_WARM_UP = 2  # rounds before the first measured one: they compile kernels
 
 Draw = Callable[[Camera, Collection[str]], Frame]
 """Renders a view with the AOVs of these names."""
@@ -126,13 +115,8 @@ def profile_frame(draw: Draw, names: Collection[str], camera: Camera, rounds: in
         plain.append(_seconds(draw, camera, ()))
         for name, found in more.items():
             found.append(_seconds(draw, camera, (name,)) - plain[-1])
-    return FrameProfile(
-        camera.width, camera.height, _median(plain), {name: _median(found) for name, found in more.items()}
-    )
-
-
-def _median(seconds: list[float]) -> float:
-    return 1e3 * float(np.median(seconds[FRAME_WARM_UP:]))
+    plain_ms, *more_ms = (1e3 * float(np.median(x[FRAME_WARM_UP:])) for x in (plain, *more.values()))
+    return FrameProfile(camera.width, camera.height, plain_ms, dict(zip(more, more_ms, strict=True)))
 
 
 def _seconds(draw: Draw, camera: Camera, names: Collection[str]) -> float:
@@ -143,10 +127,8 @@ def _seconds(draw: Draw, camera: Camera, names: Collection[str]) -> float:
     return time.perf_counter() - begin
 
 
-WARM_UP = 4
-"""Steps before the first measured one: they compile kernels."""
-VIEWS = 8
-"""Most training views whose work is counted."""
+WARM_UP = 4  # steps before the first measured one: they compile kernels
+VIEWS = 8  # most training views whose work is counted
 FAINT = 0.1
 """Opacity below which a surfel counts as faint: more than twenty such are required for an opaque pixel."""
 
@@ -208,9 +190,8 @@ def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
     dr.detail.malloc_clear_statistics()
     found = []
     for name in names:
-        mesh = trainer.method.mesh
         traced = Shading.resolve(trainer.method.stage[name].shading, mesh=True).occlusion
-        if traced and mesh is not None and trainer.fit.occluder.mesh() is None:
+        if traced and trainer.method.mesh is not None and trainer.fit.occluder.mesh() is None:
             trainer.extract_mesh()
         found.append(profile_stage(trainer, name, steps))
     allocated = int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
@@ -225,8 +206,7 @@ def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
             prepare()
             trainer.step()
         dr.sync_thread()
-        misses = dr.detail.launch_stats()[2]
-        times = []
+        misses, times = dr.detail.launch_stats()[2], []
         for _ in range(steps):
             prepare()
             begin = time.perf_counter()
@@ -235,18 +215,14 @@ def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
             times.append(time.perf_counter() - begin)
         misses = dr.detail.launch_stats()[2] - misses
         prepare()
-        launches = _launches(trainer.step)
+        # The history has replayed kernels as well, which Dr.Jit's own count leaves out.
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            trainer.step()
+            dr.sync_thread()
+        launches = len(dr.kernel_history([dr.KernelType.JIT]))
         stages = phase_times(trainer.step, max(steps // 3, 5), prepare)
     return StageProfile(name, 1e3 * float(np.median(times)), launches, misses, stages)
-
-
-def _launches(call: Callable[[], None]) -> int:
-    """Kernels that a call launches, including replayed ones, which Dr.Jit's own count leaves out."""
-    dr.kernel_history_clear()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        call()
-        dr.sync_thread()
-    return len(dr.kernel_history([dr.KernelType.JIT]))
 
 
 def count_work(trainer: Trainer) -> Work:
@@ -265,10 +241,6 @@ def count_work(trainer: Trainer) -> Work:
     seen = largest > 0
     raw = {name: values.astype(np.float64) for name, values in surfels.to_numpy().items()}
     sizes = np.sort(np.maximum(surfels.primitive.extent(raw)[1], np.finfo(np.float32).tiny), axis=1)
-    opacity = raw["opacity"]
-
-    def mean(name: str) -> float:
-        return float(np.mean([getattr(found, name) for found in counts]))
 
     def of_seen(values: np.ndarray, summary: Callable[[np.ndarray], Any] = np.mean) -> float:
         return float(summary(values[seen])) if seen.any() else 0.0
@@ -277,10 +249,10 @@ def count_work(trainer: Trainer) -> Work:
     return Work(
         views=len(chosen),
         surfels=surfels.count,
-        **{name: mean(name) for name in means},
+        **{name: float(np.mean([getattr(found, name) for found in counts])) for name in means},
         unseen_share=float(1 - seen.mean()),
         single_share=of_seen(largest == 1),
-        faint_share=of_seen(sigmoid(opacity[:, 0]) < FAINT),
+        faint_share=of_seen(sigmoid(raw["opacity"][:, 0]) < FAINT),
         aspect=of_seen(sizes[:, -1] / sizes[:, -2], np.median),
         footprint=float(np.sum(pixels) / max(np.count_nonzero(pixels), 1)),
     )

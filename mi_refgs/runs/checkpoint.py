@@ -37,8 +37,7 @@ def light_of(params: Mapping[str, Any]) -> EnvironmentLight | None:
 
 def surroundings_of(params: Mapping[str, Any]) -> Surroundings | None:
     """The surroundings, if there are any; raises InputError for wrong shapes."""
-    channels = channels_of(params, AROUND)
-    if not channels:
+    if not (channels := channels_of(params, AROUND)):
         return None
     behind = EnvironmentLight(params[BACKGROUND]) if BACKGROUND in params else None
     return Surroundings(Surfels(channels), behind)
@@ -127,9 +126,8 @@ def check(state: Mapping[str, np.ndarray]) -> None:
         if faces.dtype.kind != "u" or (faces.size and faces.max() >= len(vertices)):
             raise DamagedError(f"{MESH}faces: names vertices that are not there")
         if f"{MESH}surfels" in state:
-            number = len(vertices)
-            _check(state, [f"{MESH}surfels", f"{MESH}weights"], (None, number))
-            _check(state, [f"{MESH}normals"], (3, number), signed=True)
+            _check(state, [f"{MESH}surfels", f"{MESH}weights"], (None, len(vertices)))
+            _check(state, [f"{MESH}normals"], (3, len(vertices)), signed=True)
             surfels = state[f"{MESH}surfels"]
             if surfels.dtype.kind != "u" or np.any(surfels >= table.count):
                 raise DamagedError(f"{MESH}surfels: names surfels that are not there")

@@ -14,9 +14,8 @@ Files of what a method does not model are absent.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,42 +56,35 @@ def export(
     nothing changed, where a file of another owner has the name of an artefact; and if a file cannot be
     written or a value is not finite.
     """
-    with Run(folder).alone():
-        return _export(fitted, folder, [camera, *more], output or Run(folder).output)
-
-
-def _export(
-    fitted: TrainedScene, folder: Path, cameras: Sequence[Camera], output: OutputFolder
-) -> list[Path]:
     light = LIGHT_MAP if fitted.light is not None else None
     mesh = MESH if fitted.mesh is not None else None
     around = AROUND_FILE if fitted.surroundings is not None else None
     behind = BACKGROUND_MAP if fitted.surroundings and fitted.surroundings.background else None
     written = [name for name in (SURFELS, light, mesh, around, behind, SCENE, MODEL) if name is not None]
-    output.require_free(ARTEFACTS)
-    output.remove({*ARTEFACTS} - {*written})
-    output.claim(*written)
-    write_ply(folder / SURFELS, fitted.surfels)
-    if fitted.light is not None:
-        fitted.light.write(folder / LIGHT_MAP)
-    if fitted.mesh is not None:
-        write_mesh(folder / MESH, fitted.mesh)
-    if fitted.surroundings is not None:
-        write_ply(folder / AROUND_FILE, fitted.surroundings.surfels)
-        if fitted.surroundings.background is not None:
-            fitted.surroundings.background.write(folder / BACKGROUND_MAP)
-    # Transparent without a background: images with alpha are composited after the sRGB encoding, which a
-    # scene file cannot express. Without a background map it is black, as in `render`.
-    black = (0.0, 0.0, 0.0) if around is not None and behind is None else None
-    files = SceneFiles(SURFELS, light, mesh, around, behind or black)
-    remark = "" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels"
-    write_scene_xml(folder / SCENE, files, fitted.shading, cameras, remark)
-    # Written last: if it is there, the other files are complete.
-    note: dict[str, Any] = {"iteration": fitted.iteration, "seconds": fitted.seconds}
-    note["surfels"] = fitted.surfels.count
-    if fitted.pruned is not None:
-        note["pruned"] = dataclasses.asdict(fitted.pruned)
-    write_json(folder / MODEL, note | {"shading": dataclasses.asdict(fitted.shading)}, indent=2)
+    with Run(folder).alone():
+        output = output or Run(folder).output
+        output.require_free(ARTEFACTS)
+        output.remove({*ARTEFACTS} - {*written})
+        output.claim(*written)
+        write_ply(folder / SURFELS, fitted.surfels)
+        if fitted.light is not None:
+            fitted.light.write(folder / LIGHT_MAP)
+        if fitted.mesh is not None:
+            write_mesh(folder / MESH, fitted.mesh)
+        if fitted.surroundings is not None:
+            write_ply(folder / AROUND_FILE, fitted.surroundings.surfels)
+            if fitted.surroundings.background is not None:
+                fitted.surroundings.background.write(folder / BACKGROUND_MAP)
+        # Transparent without a background: images with alpha are composited after the sRGB encoding, which a
+        # scene file cannot express. Without a background map it is black, as in `render`.
+        black = (0.0, 0.0, 0.0) if around is not None and behind is None else None
+        files = SceneFiles(SURFELS, light, mesh, around, behind or black)
+        remark = "" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels"
+        write_scene_xml(folder / SCENE, files, fitted.shading, [camera, *more], remark)
+        # Written last: if it is there, the other files are complete.
+        note = {"iteration": fitted.iteration, "seconds": fitted.seconds, "surfels": fitted.surfels.count}
+        pruned = {} if fitted.pruned is None else {"pruned": asdict(fitted.pruned)}
+        write_json(folder / MODEL, note | pruned | {"shading": asdict(fitted.shading)}, indent=2)
     return [folder / name for name in written]
 
 
@@ -104,8 +96,7 @@ def load_if_newer(run: Run, method: Method) -> TrainedScene | None:
             shown = int(read_json(run.path / MODEL)["iteration"])
     if not any(int(path.stem) > shown for path in run.checkpoints()):
         return None
-    state = run.load_checkpoint()
-    if state is None or int(state["iteration"]) <= shown:
+    if (state := run.load_checkpoint()) is None or int(state["iteration"]) <= shown:
         return None
     return TrainedScene.from_state(method, state)
 
@@ -115,8 +106,7 @@ def newest(run: Run, method: Method) -> TrainedScene:
 
     It has the mesh even if shading does not use it. Raises InputError as `TrainedScene.read` does.
     """
-    fresh = load_if_newer(run, method)
-    if fresh is not None:
+    if (fresh := load_if_newer(run, method)) is not None:
         return fresh
     if not (run.path / MODEL).is_file():
         raise _no_artefacts(run)
@@ -136,8 +126,7 @@ def up_to_date(run: Run, method: Method, camera: Camera | Callable[[TrainedScene
     If another process trains the run, returns the newest checkpoint and writes nothing. `camera` is that of
     scene.xml, or chooses one for a scene. Raises InputError if there is neither artefact nor checkpoint.
     """
-    fresh = load_if_newer(run, method)
-    if fresh is not None:
+    if (fresh := load_if_newer(run, method)) is not None:
         try:
             export(fresh, run.path, camera(fresh) if callable(camera) else camera)
         except BusyError:

@@ -39,8 +39,7 @@ against the path tracer: 33.6 dB with one, 34.2 with 4, 34.4 with 16 and 34.5 wi
 RELIGHT_BOUNCES = 2
 """Traced bounces. In a self-reflecting bowl of `benchmarks.visibility`, one bounce misses 27 % of the light,
 two 9 %, four 3 %."""
-AMBIENT_RAYS = 128
-"""Rays per vertex of the mesh."""
+AMBIENT_RAYS = 128  # per vertex of the mesh
 
 
 def lacking(scene: TrainedScene) -> str:
@@ -64,8 +63,7 @@ def relightable(scene: TrainedScene) -> TrainedScene:
             f"{what}: the run has none; fit one with materials and a light, as `--for relighting` does"
         )
     assert scene.light is not None
-    surfels = scene.surfels.detach()
-    mesh = scene.mesh
+    surfels, mesh = scene.surfels.detach(), scene.mesh
     if mesh is not None and scene.surroundings is not None:
         mesh = _near(mesh, surfels)
     if scene.shading.diffuse == "sh":
@@ -111,7 +109,8 @@ def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> S
         scale, bias = split_sum(mi.Float(1), surfels.value("roughness"))
         arrives = light.irradiance(facing) * (1 - (DIELECTRIC_F0 * scale + bias))
         radiance_, arrives_, metallic, albedo = (
-            _rows(x) for x in (radiance, arrives, surfels.value("metallic"), surfels.value("albedo"))
+            np.atleast_2d(np.array(x, dtype=np.float64)).T  # (N, C)
+            for x in (radiance, arrives, surfels.value("metallic"), surfels.value("albedo"))
         )
         floor = IRRADIANCE_FLOOR * arrives_.max()
 
@@ -130,15 +129,9 @@ def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> S
         return with_shadows(ratios[vertex])
 
 
-def _rows(value: Any) -> np.ndarray:
-    """Values of all surfels (N, C)."""
-    return np.atleast_2d(np.array(value, dtype=np.float64)).T
-
-
 def outward(surfels: Surfels, mesh: Mesh | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Outward unit normals (N, 3) float32 of the surfels, and their nearest vertices (N) of the mesh."""
-    normal = surfels.primitive.normal(surfels).numpy().T
-    position = surfels.position().numpy().T
+    normal, position = surfels.primitive.normal(surfels).numpy().T, surfels.position().numpy().T
     vertex = None
     if mesh is None or not len(mesh.faces):
         out = position - np.average(position, axis=0, weights=surfels.opacity().numpy() + 1e-9)

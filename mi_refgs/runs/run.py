@@ -26,12 +26,9 @@ from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
 from mi_refgs.runs import checkpoint
 
-DATASET = "dataset.json"
-"""The folder of the data set, and its region of interest."""
-LOCK = ".refgs.lock"
-"""A file that exists, and is locked, while a process changes the run."""
-LOG = "metrics.jsonl"
-"""The training log; other logs of a run are other .jsonl files."""
+DATASET = "dataset.json"  # the folder of the data set, and its region of interest
+LOCK = ".refgs.lock"  # exists, and is locked, while a process changes the run
+LOG = "metrics.jsonl"  # the training log; other logs of a run are other .jsonl files
 CONFIG = "config.toml"
 RUN_FILES = (
     *(CONFIG, DATASET, LOG, "curve.jsonl", "checkpoints/*.npz", "previews/*.png", "points.npz"),
@@ -55,7 +52,7 @@ class Run:
 
     def exists(self) -> bool:
         """Whether the folder contains a run."""
-        return (self.path / "config.toml").is_file()
+        return (self.path / CONFIG).is_file()
 
     def require_none(self) -> None:
         """Raise InputError if the folder contains a run, or a foreign file of the same name as one of its."""
@@ -89,9 +86,7 @@ class Run:
 
     def write_dataset(self, dataset: str, region: Region | None) -> None:
         """Write the folder of the data set, and its region of interest if there is one."""
-        record: dict[str, Any] = {"path": dataset}
-        if region is not None:
-            record["region"] = asdict(region)
+        record = {"path": dataset} | ({} if region is None else {"region": asdict(region)})
         write_bytes(self.output.own(DATASET), json.dumps(record).encode())
 
     def write_method(self, method: Method) -> None:
@@ -104,7 +99,7 @@ class Run:
             raise InputError(
                 f"{self.path}: config.toml: missing; give the folder that `refgs train -o` wrote"
             )
-        return load_resolved(self.path / "config.toml")
+        return load_resolved(self.path / CONFIG)
 
     def dataset(self) -> Path:
         """Folder of the data set that the run was fitted to."""
@@ -120,8 +115,7 @@ class Run:
 
     def checkpoints(self) -> list[Path]:
         """Complete checkpoints, oldest first."""
-        found = (self.path / "checkpoints").glob("*.npz")
-        return sorted(path for path in found if path.stem.isdecimal())
+        return sorted(x for x in (self.path / "checkpoints").glob("*.npz") if x.stem.isdecimal())
 
     def save_checkpoint(self, iteration: int, state: dict[str, np.ndarray]) -> None:
         """Save a state, then remove all but the newest CHECKPOINTS_KEPT; raises InputError on failure."""
@@ -175,10 +169,7 @@ class Run:
         Raises InputError if it cannot be written.
         """
         path = self.output.own(name)
-        line = {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in line.items()
-        }
+        line = {k: None if isinstance(x, float) and not math.isfinite(x) else x for k, x in line.items()}
         try:
             with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")

@@ -63,11 +63,9 @@ class TrainedScene:
     @staticmethod
     def from_state(method: Method, state: Mapping[str, np.ndarray]) -> TrainedScene:
         """Convert the content of a checkpoint."""
-        params = tensors(state, PARAMS)
-        mesh = None
+        params, iteration, mesh = tensors(state, PARAMS), int(state["iteration"]), None
         if len(state.get("mesh/faces", ())):
             mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
-        iteration = int(state["iteration"])
         _, stage = method.stage_at(max(iteration, 1))
         return TrainedScene(
             Surfels(channels_of(params)),
@@ -140,7 +138,6 @@ class TrainedScene:
             light = self.shading.light_of(self.light)
         occluder = Occluder(self.mesh)
         update_occluder_caches(occluder, self.surfels, light, self.shading)
-
         scene = SurfelScene(self.surfels, self.shading, light, occluder, self.surroundings)
 
         def draw(camera: Camera, aovs: bool | Collection[str], samples: int = 1) -> Frame:
@@ -150,8 +147,8 @@ class TrainedScene:
             def averaged(view: Camera) -> Frame:
                 return supersampled(once, view, samples, details=bool(aovs))
 
-            factor, count = samples_per_axis(samples), self.count
             with dr.suspend_grad():
-                return in_passes(averaged, camera, factor, self.shading.neighbours, count)
+                factor = samples_per_axis(samples)
+                return in_passes(averaged, camera, factor, self.shading.neighbours, self.count)
 
         return draw
