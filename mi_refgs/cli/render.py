@@ -86,16 +86,22 @@ class Render:
 
 
 def scene_file(path: Path) -> Path:
-    """Return the XML of a scene or of a run, whose artefacts are written first if a checkpoint is newer."""
+    """Find the XML of a scene, or of a run.
+
+    The artefacts of a run are written first if a checkpoint is newer: this changes the run folder.
+    """
     if not path.is_dir():
         if not path.is_file():
             raise InputError(f"{path}: scene: no such file; give a Mitsuba XML or a run folder")
         return path
-    from mi_refgs.reconstruction.reconstruction import load
+    from mi_refgs.reconstruction.provenance import Provenance
+    from mi_refgs.runs.export import write_if_stale
     from mi_refgs.runs.run import Run
 
-    if Run(path).checkpoints():
-        load(path)
+    run = Run(path)
+    if run.checkpoints():
+        provenance = Provenance.of(run)
+        write_if_stale(run, provenance.method, provenance.first_camera)
     scene = path / "scene.xml"
     if not scene.is_file():
         raise InputError(f"{scene}: scene: missing; write it with `refgs export {path}`")

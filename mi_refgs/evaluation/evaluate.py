@@ -29,7 +29,7 @@ from mi_refgs.kernels.device import machine
 from mi_refgs.methods.method import Method
 from mi_refgs.progress import with_bar
 from mi_refgs.render.samples import samples_per_axis
-from mi_refgs.runs.export import up_to_date
+from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import DATASET, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.light_file import read_radiance
@@ -84,7 +84,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Render the test views, measure them, and write metrics.json, renders and two contact sheets.
 
-    Evaluates the scene files in the run folder, after updating those that are older than a checkpoint.
+    Evaluates the scene files in the run folder, which are written first if a checkpoint is newer.
     Every key is always present: null, with a `…_reason`, where it does not apply.
 
     `psnr_region`, `ssim_region`   pixels whose ray meets the data's region of interest; `region_share` of all
@@ -111,7 +111,7 @@ def evaluate(
     renders = render_names(views.views)
     outputs = [*renders, SHEET, DECOMPOSITION, METRICS]
     run.output.require_free(outputs)
-    fitted = up_to_date(run, method, views.views[0].camera())
+    fitted = write_if_stale(run, method, lambda _: views.views[0].camera())
     if antialias:
         shading = dataclasses.replace(fitted.shading, antialias=True)
         fitted = dataclasses.replace(fitted, shading=shading)

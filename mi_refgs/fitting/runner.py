@@ -24,7 +24,7 @@ from mi_refgs.fitting.targets import read_views
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.method import Method
-from mi_refgs.runs.export import up_to_date
+from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import MODEL
 
@@ -234,7 +234,7 @@ def finish(trainer: Trainer, run: Run) -> str | None:
         first = read_views(trainer.method, trainer.data.path, "test").views[0]
     except InputError as error:
         warning = f"{error} (scene.xml gets a training camera, and `refgs eval` will need test views)"
-    up_to_date(run, trainer.method, first.camera())
+    write_if_stale(run, trainer.method, lambda _: first.camera())
     return warning
 
 

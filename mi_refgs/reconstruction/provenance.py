@@ -88,6 +88,10 @@ class Provenance:
                 shots.append(Shot(view.name, split, view.camera(), self._relative(original.file)))
         return shots
 
+    def first_camera(self, trained: TrainedScene) -> Camera:
+        """Return the camera of the first test view; without a data set, the first around the surfels."""
+        return self.shots(trained, "test")[0].camera
+
     def _relative(self, file: FileCamera | None) -> FileCamera | None:
         """Make the paths of an image file and its mask relative to the data set."""
         if file is None:

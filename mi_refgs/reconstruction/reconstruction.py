@@ -30,7 +30,7 @@ from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.render.display import composited
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.runs.export import export, newest, up_to_date
+from mi_refgs.runs.export import export, newest, write_if_stale
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import SCENE, TrainedScene
@@ -294,11 +294,10 @@ def load(run: str | Path, *, write: bool = True) -> Reconstruction:
     require_supported_variant("mi_refgs.load")
     folder = Run(run)
     provenance = Provenance.of(folder)
-
-    def first(fresh: TrainedScene) -> Camera:
-        return provenance.shots(fresh, "test")[0].camera
-
-    trained = up_to_date(folder, provenance.method, first) if write else newest(folder, provenance.method)
+    if write:
+        trained = write_if_stale(folder, provenance.method, provenance.first_camera)
+    else:
+        trained = newest(folder, provenance.method)
     return Reconstruction(trained, provenance, folder.path)
 
 

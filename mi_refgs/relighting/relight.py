@@ -33,11 +33,10 @@ from mi_refgs.reconstruction.new_light import NewLight, truth_under
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.relighting.score import displayed_over, score
 from mi_refgs.render.samples import samples_per_axis
-from mi_refgs.runs.export import export, up_to_date
+from mi_refgs.runs.export import export, write_if_stale
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
-from mi_refgs.runs.trained_scene import ARTEFACTS, TrainedScene
-from mi_refgs.splat import Camera
+from mi_refgs.runs.trained_scene import ARTEFACTS
 
 SHEET, RESULT = "sheet.png", "relight.json"
 SHEET_VIEWS = 4
@@ -94,16 +93,13 @@ def relight(
         truth_folder, light = known
 
     # The scene under the new light.
-    def cameras_of(trained: TrainedScene) -> list[Camera]:
-        return [shot.camera for shot in provenance.shots(trained, "test")]
-
-    fitted = up_to_date(run, provenance.method, lambda trained: cameras_of(trained)[0])
+    fitted = write_if_stale(run, provenance.method, provenance.first_camera)
     try:
         new_light = light.read()
         scene = replace(relightable(fitted), light=new_light)
     except InputError as error:
         raise InputError(f"{run.path}: {error}") from error
-    cameras, kind = cameras_of(fitted), "test"
+    cameras, kind = [shot.camera for shot in provenance.shots(fitted, "test")], "test"
     if turntable:
         region = provenance.region if views is None else views.region
         region = None if fitted.surroundings is None else region

@@ -120,15 +120,15 @@ def _no_artefacts(run: Run) -> InputError:
     )
 
 
-def up_to_date(run: Run, method: Method, camera: Camera | Callable[[TrainedScene], Camera]) -> TrainedScene:
-    """Read the artefacts of a run, after writing them if there are none or the newest checkpoint is newer.
+def write_if_stale(run: Run, method: Method, camera: Callable[[TrainedScene], Camera]) -> TrainedScene:
+    """Write the artefacts of a run if there are none or the newest checkpoint is newer, and read them.
 
-    If another process trains the run, returns the newest checkpoint and writes nothing. `camera` is that of
-    scene.xml, or chooses one for a scene. Raises InputError if there is neither artefact nor checkpoint.
+    If another process trains the run, writes nothing and returns the newest checkpoint. `camera` chooses that
+    of scene.xml. Raises InputError if there is neither artefact nor checkpoint.
     """
     if (fresh := load_if_newer(run, method)) is not None:
         try:
-            export(fresh, run.path, camera(fresh) if callable(camera) else camera)
+            export(fresh, run.path, camera(fresh))
         except BusyError:
             return fresh
     elif not (run.path / MODEL).is_file():
