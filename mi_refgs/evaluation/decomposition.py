@@ -16,18 +16,16 @@ import numpy as np
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
-from mi_refgs.evaluation.images import RenderedView, normal_colours, on_white, side_by_side
+from mi_refgs.evaluation.images import RenderedView, material_colours, normal_colours, on_white, side_by_side
 from mi_refgs.evaluation.surface import NO_SURFACE
-from mi_refgs.io.images import psnr_of, srgb_from_linear
+from mi_refgs.io.images import psnr_of
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 
-KNOWN_SHARE = 0.5
-"""Fraction of a pixel that a true material must cover for it to count."""
-CONCAVE = "_concave"
-"""Suffix of the numbers of concave pixels."""
+KNOWN_SHARE = 0.5  # fraction of a pixel that a true material must cover for it to count
+CONCAVE = "_concave"  # suffix of the numbers of concave pixels
 NAMES = ("albedo", "roughness", "metallic")
 KEYS = ("albedo_psnr", "roughness_mae", "metallic_mae")
 
@@ -46,10 +44,10 @@ class _Sums:
         """Add pixels (P, C)."""
         ours, true = ours.astype(np.float64), true.astype(np.float64)
         self.count += len(ours)
-        self.own = self.own + np.sum(ours**2, axis=0)
-        self.cross = self.cross + np.sum(ours * true, axis=0)
-        self.true = self.true + np.sum(true**2, axis=0)
-        self.absolute = self.absolute + np.sum(np.abs(ours - true), axis=0)
+        self.own += np.sum(ours**2, axis=0)
+        self.cross += np.sum(ours * true, axis=0)
+        self.true += np.sum(true**2, axis=0)
+        self.absolute += np.sum(np.abs(ours - true), axis=0)
 
     def scale(self) -> np.ndarray:
         """Return the least-squares scale of ours (C,); 1 without a pixel."""
@@ -88,12 +86,12 @@ class Decomposition:
         if concave is not None:
             regions[CONCAVE] = inside = front & concave
             self.concave = (self.concave or 0) + int(inside.sum())
-            difference = np.clip(rendered.image, 0, 1) - np.clip(view.displayed, 0, 1)
-            self.squares.append(np.square(difference)[inside])
+            ours, true = (np.clip(image, 0, 1)[inside] for image in (rendered.image, view.displayed))
+            self.squares.append(np.square(ours - true))
             if view.normal is not None:
                 angle = metrics.angle_deg(rendered.normal, view.normal)
                 self.angles.append(angle[inside & np.any(view.normal != 0, axis=-1)])
-        self.ours |= {*maps}
+        self.ours |= maps.keys()
         for name, true in view.materials.items():
             for suffix, region in regions.items() if name in maps else ():
                 known = region & (true[..., -1] > KNOWN_SHARE)
@@ -113,8 +111,7 @@ class Decomposition:
             found |= {key + suffix: value for key, value in zip(KEYS, values, strict=True)}
         found["albedo_scale"] = None if found["albedo_psnr"] is None else [float(x) for x in self.scale()]
         found["concave_share"] = None if self.concave is None else self.concave / max(self.foreground, 1)
-        found[f"normal_mae_deg{CONCAVE}"] = _mean(self.angles)
-        error = _mean(self.squares)
+        found[f"normal_mae_deg{CONCAVE}"], error = _mean(self.angles), _mean(self.squares)
         found[f"psnr{CONCAVE}"] = None if error is None else psnr_of(error)
         for name, key in zip(NAMES, KEYS, strict=True):
             reason = f"the data set defines no {name}" if name in self.ours else f"the run has no {name}"
@@ -124,7 +121,7 @@ class Decomposition:
 
 
 def _mean(parts: list[np.ndarray]) -> float | None:
-    values = np.concatenate([part.ravel() for part in parts]) if parts else np.empty(0)
+    values = np.concatenate([np.empty(0, np.float32), *(part.ravel() for part in parts)])
     return float(np.mean(values, dtype=np.float64)) if len(values) else None
 
 
@@ -154,30 +151,18 @@ def panels(
     scale: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """Return ours and the ground truth side by side, map by map, by title; albedo after its scale."""
-    pairs: dict[str, list[np.ndarray]] = {"image": [rendered.image, view.displayed]}
-    covered = view.covered()
+    pairs, covered = {"image": [rendered.image, view.displayed]}, view.covered()
     if view.normal is not None:
-        pairs["normals"] = [
-            normal_colours(rendered.normal, rendered.alpha),
-            normal_colours(view.normal, covered),
-        ]
+        shown = normal_colours(rendered.normal, rendered.alpha), normal_colours(view.normal, covered)
+        pairs["normals"] = [*shown]
     for name in NAMES:
         if name in maps:
             ours = maps[name].reshape(*rendered.alpha.shape, -1) * (scale if name == "albedo" else 1.0)
-            pairs[name] = [_material_colours(ours, rendered.alpha)]
+            pairs[name] = [material_colours(ours, rendered.alpha)]
             if name in view.materials:
                 true = view.materials[name]
-                pairs[name].append(_material_colours(true[..., :-1], true[..., -1]))
-    found = {
-        f"{name}: ours{' | true' if len(pair) > 1 else ''}": side_by_side(pair)
-        for name, pair in pairs.items()
-    }
+                pairs[name].append(material_colours(true[..., :-1], true[..., -1]))
+    found = {f"{n}: ours{' | true' if len(p) > 1 else ''}": side_by_side(p) for n, p in pairs.items()}
     if concave is not None:
         found["concave"] = on_white(np.repeat(0.75 * concave[..., None], 3, axis=-1) * [1, 0.4, 0], covered)
     return {title: np.clip(image, 0, 1) for title, image in found.items()}
-
-
-def _material_colours(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Convert a linear colour (H, W, 3) or a number (H, W, 1) per pixel to colours over white."""
-    colours = srgb_from_linear(values) if values.shape[-1] == 3 else np.repeat(values, 3, axis=-1)
-    return on_white(colours, alpha)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import re
 import unicodedata
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,17 +38,10 @@ FOLDER = "eval"
 SHEET = "contact_sheet.png"
 DECOMPOSITION = "decomposition.png"
 METRICS = "metrics.json"
-LONGEST_STEM, HASH_DIGITS = 60, 12
-"""Characters of the view's name in an image's file name, of which file systems allow 255 bytes, and digits of
-the hash that separates equal ones."""
-SHEET_VIEWS = 4
-"""Rows of either sheet, spread evenly over the test views."""
-MEANS = (
-    *("psnr", "psnr_gain", "ssim", "flip", "lpips"),
-    *("psnr_region", "ssim_region", "region_share", "normal_mae_deg", "normal_mae_deg_full"),
-)
-"""Scores of views whose means are reported."""
-LIGHT_KEYS = ("env_scale", "env_mae", "env_psnr", "env_correlation")
+LONGEST_STEM = 60  # characters of the view's name in an image's file name; file systems allow 255 bytes
+SHEET_VIEWS = 4  # rows of either sheet, spread evenly over the test views
+MEANS = """psnr psnr_gain ssim flip lpips psnr_region ssim_region region_share normal_mae_deg
+    normal_mae_deg_full""".split()  # scores of views whose means are reported
 
 
 def load_split(
@@ -67,20 +60,15 @@ def load_split(
             path = run.dataset()
             found = path.is_dir()
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"{record}: path: cannot be read ({error}); name the data with --data"
-            ) from error
+            message = f"{record}: path: cannot be read ({error}); name the data with --data"
+            raise InputError(message) from error
         if not found:
             raise InputError(f"{record}: path: {path} is gone; name the data set's folder with --data")
     return of_run(run, read_views(method, path, split, decode=decode))
 
 
 def evaluate(
-    run: Run,
-    data: Path | None = None,
-    progress: bool = False,
-    samples: int = 1,
-    antialias: bool = False,
+    run: Run, data: Path | None = None, progress: bool = False, samples: int = 1, antialias: bool = False
 ) -> dict[str, Any]:
     """Render the test views, measure them, and write metrics.json, renders and two contact sheets.
 
@@ -113,12 +101,11 @@ def evaluate(
     run.output.require_free(outputs)
     fitted = write_if_stale(run, method, lambda _: views.views[0].camera())
     if antialias:
-        shading = dataclasses.replace(fitted.shading, antialias=True)
-        fitted = dataclasses.replace(fitted, shading=shading)
+        fitted = replace(fitted, shading=replace(fitted.shading, antialias=True))
     render = fitted.renderer(samples=samples)
     object_only = None
     if fitted.surroundings is not None:
-        object_only = dataclasses.replace(fitted, surroundings=None).renderer(samples=samples)
+        object_only = replace(fitted, surroundings=None).renderer(samples=samples)
     run.output.claim(*outputs)
 
     # Render and measure view by view.
@@ -156,19 +143,17 @@ def evaluate(
     ):
         result[f"{name}_reason"] = reason if result[key] is None else None
     light_scores, footer = _light(fitted, views)
-    result |= light_scores | errors.result()
-    result |= surface_scores(fitted.mesh, surface, views.views)
-    cameras = [view.camera() for view in views.views]
-    frames = [fitted.renderer(aovs=False, samples=samples)]
+    result |= light_scores | errors.result() | surface_scores(fitted.mesh, surface, views.views)
+    cameras, timed = [view.camera() for view in views.views], fitted.renderer(aovs=False, samples=samples)
     result |= {
         "exposure": _exposure(run),
         "train_seconds": fitted.seconds,
         "iterations": fitted.iteration,
         "surfels": fitted.surfels.count,
-        "pruned": None if fitted.pruned is None else dataclasses.asdict(fitted.pruned),
+        "pruned": None if fitted.pruned is None else asdict(fitted.pruned),
         "samples": samples_per_axis(samples) ** 2,
         "antialias": fitted.shading.antialias,
-        "ms_per_frame": metrics.frame_milliseconds(frames, cameras, views)[0],
+        "ms_per_frame": metrics.frame_milliseconds([timed], cameras, views)[0],
         "method": method.name,
         "variant": method.name,  # name of this key in version 0.1
         "preset": method.preset,
@@ -191,11 +176,8 @@ def evaluate(
 def _scores(rendered: RenderedView, view: View, data: Dataset, first: dict[str, Any]) -> dict[str, Any]:
     """Return the scores of one view, which has ground truth loaded; `first` are those of the first view."""
     image, truth = rendered.image, view.displayed
-    scores: dict[str, Any] = {
-        "name": view.name,
-        "psnr": metrics.psnr(image, truth),
-        "ssim": metrics.ssim(image, truth),
-    }
+    scores: dict[str, Any] = {"name": view.name}
+    scores |= {"psnr": metrics.psnr(image, truth), "ssim": metrics.ssim(image, truth)}
     for name, measure in (("flip", metrics.flip), ("lpips", metrics.lpips)):
         reason = first.get(f"{name}_reason")  # a metric that is not installed stays so
         scores[name], scores[f"{name}_reason"] = (None, reason) if reason else measure(image, truth)
@@ -218,19 +200,16 @@ def _exposure(run: Run) -> dict[str, Any] | None:
 def render_names(views: Sequence[View]) -> list[str]:
     """Return unique paths, below the run folder, of the image that `evaluate` writes of each test view.
 
-    Views whose names differ only in what file names lose, such as case or punctuation, get a hash of the
-    name.
+    Views whose names differ only in what file names lose, such as case, get a hash of the name.
     """
-    stems = [
-        re.sub(r"[^\w]+", "_", unicodedata.normalize("NFC", view.name)).strip("_")[:LONGEST_STEM]
-        for view in views
-    ]
+    plain = [unicodedata.normalize("NFC", view.name) for view in views]
+    stems = [re.sub(r"[^\w]+", "_", name).strip("_")[:LONGEST_STEM] for name in plain]
     alike = Counter(stem.casefold() for stem in stems)
     found: list[str] = []
     for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
         if not stem or alike[stem.casefold()] > 1:
             same = sum(other.name == view.name for other in views[:index])
-            digest = hashlib.sha256(f"{same}/{view.name}".encode()).hexdigest()[:HASH_DIGITS]
+            digest = hashlib.sha256(f"{same}/{view.name}".encode()).hexdigest()[:12]
             stem = f"{stem}_{digest}".lstrip("_")
         found.append(f"{FOLDER}/{stem}.png")
     return found
@@ -238,7 +217,7 @@ def render_names(views: Sequence[View]) -> list[str]:
 
 def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
     """Return the env_ keys, and the panels of the environment map."""
-    nothing: dict[str, Any] = dict.fromkeys(LIGHT_KEYS)
+    nothing: dict[str, Any] = dict.fromkeys(("env_scale", "env_mae", "env_psnr", "env_correlation"))
     if fitted.light is None:
         return nothing | {"env_reason": "the method has no light"}, None
     light = fitted.light.radiance().numpy()

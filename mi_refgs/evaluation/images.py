@@ -24,12 +24,9 @@ LIGHT_KEY = 0.36
 """Average luminance of a displayed environment before the tone curve x / (1 + x), which maps it to 0.55."""
 CELL_MIN = 128
 """Pixels: smaller images are enlarged by a whole factor, so that a sheet of thumbnails can be read."""
-MARGIN = 4
-"""Pixels between images."""
-TITLE_HEIGHT = 16
-"""Pixels above each image, enough for Pillow's built-in font."""
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Luminance of the linear sRGB primaries (ITU-R BT.709)."""
+MARGIN = 4  # pixels between images
+TITLE_HEIGHT = 16  # pixels above each image, enough for Pillow's built-in font
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # luminance of the linear sRGB primaries (ITU-R BT.709)
 
 
 def image_array(array: Array, height: int, width: int) -> np.ndarray:
@@ -80,16 +77,20 @@ def panels(rendered: RenderedView, view: View) -> dict[str, np.ndarray]:
     for name in (*(name for name, attribute in ATTRIBUTES.items() if attribute.aov), "visibility"):
         if name in rendered.maps:
             values = rendered.maps[name]
-            colours = (
-                srgb_from_linear(values) if values.ndim == 3 else np.repeat(values[..., None], 3, axis=-1)
-            )
-            found[name] = on_white(colours, rendered.alpha)
+            values = values if values.ndim == 3 else values[..., None]
+            found[name] = material_colours(values, rendered.alpha)
     return {title: np.clip(image, 0, 1) for title, image in found.items()}
 
 
 def normal_colours(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Convert unit normals (H, W, 3) to colours over white."""
     return on_white(0.5 + 0.5 * normal, alpha)
+
+
+def material_colours(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Convert a linear colour (H, W, 3) or a number (H, W, 1) per pixel to colours over white."""
+    colours = srgb_from_linear(values) if values.shape[-1] == 3 else np.repeat(values, 3, axis=-1)
+    return on_white(colours, alpha)
 
 
 def on_white(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
@@ -142,25 +143,23 @@ def contact_sheet(
     """Arrange titled images in a sheet: one row per view, and `footer` (environment maps) below."""
     titles = list(dict.fromkeys(title for row in rows for title in row))
     factor = -(-CELL_MIN // min(next(iter(rows[0].values())).shape[:2]))
-    lines = [
-        _line([(t, row[t].repeat(factor, axis=0).repeat(factor, axis=1)) for t in titles if t in row])
-        for row in rows
-    ]
+    enlarged = [{t: row[t].repeat(factor, 0).repeat(factor, 1) for t in titles if t in row} for row in rows]
+    lines = [_line(row) for row in enlarged]
     if footer:
         width = max(line.shape[1] for line in lines)
         part = (width - MARGIN * (len(footer) - 1)) // max(len(footer), 2)
-        lines.append(_line([(title, _resized(image, part)) for title, image in footer.items()]))
+        lines.append(_line({title: _resized(image, part) for title, image in footer.items()}))
     width = max(line.shape[1] for line in lines)
     return np.concatenate([_padded(line, MARGIN, width - line.shape[1]) for line in lines])
 
 
-def _line(cells: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
+def _line(cells: dict[str, np.ndarray]) -> np.ndarray:
     """Place titled images side by side."""
     from PIL import Image, ImageDraw
 
-    height = max(image.shape[0] for _, image in cells)
+    height = max(image.shape[0] for image in cells.values())
     columns = []
-    for text, image in cells:
+    for text, image in cells.items():
         label = Image.new("RGB", (image.shape[1], TITLE_HEIGHT), "white")
         ImageDraw.Draw(label).text((2, 2), text, fill="black")
         title = np.asarray(label, dtype=np.float32) / 255

@@ -24,16 +24,12 @@ from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.splat import Camera
 
-FOREGROUND_ALPHA = 0.5
-"""True alpha above which a pixel is foreground."""
+FOREGROUND_ALPHA = 0.5  # true alpha above which a pixel is foreground
 FLAT = 1e-12
 """Variance of encoded values below which a map is constant but for rounding and has no correlation."""
-LPIPS_NETWORK = "alex"
-"""The network of LPIPS that its authors recommend for comparing images ("forward" scores)."""
 WARM_UP_FRAMES = 2
 """Frames before the timing: the first compiles or loads the kernels, the second fills the memory pools."""
-TIMED_FRAMES = 20
-"""Frames whose median is reported; the views repeat if there are fewer."""
+TIMED_FRAMES = 20  # frames whose median is reported; the views repeat if there are fewer
 
 
 # ---------------- images ----------------
@@ -58,17 +54,9 @@ def ssim(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
 
     border = ((WINDOW_RADIUS, WINDOW_RADIUS), (WINDOW_RADIUS, WINDOW_RADIUS), (0, 0))
     image, truth = (np.pad(array, border) for array in _pair(image, truth))
-    _, similar = structural_similarity(
-        image,
-        truth,
-        win_size=2 * WINDOW_RADIUS + 1,
-        gaussian_weights=True,
-        sigma=WINDOW_SIGMA,
-        use_sample_covariance=False,
-        data_range=1.0,
-        channel_axis=-1,
-        full=True,
-    )
+    window = {"win_size": 2 * WINDOW_RADIUS + 1, "gaussian_weights": True, "sigma": WINDOW_SIGMA}
+    options = {"use_sample_covariance": False, "data_range": 1.0, "channel_axis": -1, "full": True}
+    _, similar = structural_similarity(image, truth, **window, **options)
     whole = slice(WINDOW_RADIUS, -WINDOW_RADIUS)
     return float(similar[whole, whole][where].mean())
 
@@ -93,7 +81,8 @@ def lpips(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
 def _lpips_network() -> Any:
     import lpips as package
 
-    return package.LPIPS(net=LPIPS_NETWORK, verbose=False).eval()
+    # The network that its authors recommend for comparing images ("forward" scores).
+    return package.LPIPS(net="alex", verbose=False).eval()
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
@@ -124,11 +113,10 @@ def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> 
     `normal_mae_deg` is the mean over the foreground; `normal_mae_deg_full` divides the same sum by all
     pixels, so the background counts as 0°, as in most papers. Both are 0 for an image without foreground.
     """
-    normal, truth = np.asarray(normal, np.float64), np.asarray(truth, np.float64)
     if normal.shape != truth.shape or normal.shape[:2] != np.shape(alpha):
         sizes = f"{normal.shape}, {truth.shape}, {np.shape(alpha)}"
         raise InputError(f"metrics: normal: shapes {sizes} do not fit; render at the size of the data set")
-    foreground = (np.asarray(alpha) > FOREGROUND_ALPHA) & (np.linalg.norm(truth, axis=-1) > 0)
+    foreground = (alpha > FOREGROUND_ALPHA) & (np.linalg.norm(truth, axis=-1) > 0)
     total = float(np.sum(angle_deg(normal, truth)[foreground]))
     return {
         "normal_mae_deg": total / max(int(foreground.sum()), 1),
@@ -159,9 +147,8 @@ def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
     for name, array in (("recovered", light), ("true", truth)):
         if array.ndim != 3 or array.shape[2] != 3 or array.shape[0] < 2 or not np.all(np.isfinite(array)):
-            raise InputError(
-                f"metrics: {name} environment: need finite (h, w, 3) values, h ≥ 2; write the map again"
-            )
+            need = "need finite (h, w, 3) values, h ≥ 2; write the map again"
+            raise InputError(f"metrics: {name} environment: {need}")
     rows = lobe_matrices.row_resampling(len(truth), len(light))
     columns = lobe_matrices.column_resampling(truth.shape[1], light.shape[1])
     truth = np.einsum("ih,jw,hwc->ijc", rows, columns, truth, optimize=True)

@@ -7,7 +7,7 @@ Nothing is fitted again.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -28,17 +28,7 @@ from mi_refgs.surfels.attributes import attribute, sh_columns
 from mi_refgs.surfels.ply import encode_ply
 from mi_refgs.surfels.table import Surfels
 
-COUNT_STEP = 1 / 1000
-"""Fraction of the surfels to which the number of those that are removed is bisected."""
-
-
-@dataclass(frozen=True)
-class PruneTrial:
-    """Something that was removed on trial."""
-
-    what: str
-    psnr: float  # dB, of the worst view, or of the first below the limit
-    dropped: bool
+COUNT_STEP = 1 / 1000  # fraction of the surfels to which the number of those that are removed is bisected
 
 
 def contributions(surfels: Surfels, cameras: Sequence[Camera]) -> np.ndarray:
@@ -74,8 +64,9 @@ def prune(
     InputError for a limit out of range.
     """
     if not 0 < limit <= PSNR_MAX:
-        allowed = f"give a number above 0, at most {PSNR_MAX:g}"
-        raise InputError(f"--limit: {limit:g} dB is out of range; {allowed}")
+        raise InputError(
+            f"--limit: {limit:g} dB is out of range; give a number above 0, at most {PSNR_MAX:g}"
+        )
 
     # What shading never reads, then trials.
     images = _WholeImages(whole, train)
@@ -83,9 +74,8 @@ def prune(
     unread = replace(whole, light=light, mesh=whole.mesh if whole.shading.occlusion else None)
     search = _Search(unread, images, limit, tell)
     if unread.surfels.count:
-        weight = contributions(whole.surfels, images.cameras)
         search.drop_optional()
-        search.drop_surfels(weight)
+        search.drop_surfels(contributions(whole.surfels, images.cameras))
     pruned = search.scene
 
     # The report.
@@ -98,7 +88,7 @@ def prune(
     renderers = [scene.renderer(aovs=False) for scene in (whole, pruned)]
     times = frame_milliseconds(renderers, images.cameras, train)
     report["before"]["ms_per_frame"], report["after"]["ms_per_frame"] = times
-    report["trials"] = [asdict(trial) for trial in search.trials]
+    report["trials"] = search.trials
     note = Pruned(whole.surfels.count, limit, report["train"]["worst"])
     return replace(pruned, pruned=note), report
 
@@ -122,18 +112,19 @@ class _Search:
     images: _WholeImages
     limit: float  # dB
     tell: Callable[[str], None]
-    trials: list[PruneTrial] = field(default_factory=list)
+    trials: list[dict[str, Any]] = field(default_factory=list)
+    """`what` was removed on trial, `psnr` in dB of the worst view or the first below the limit, `dropped`."""
 
     def attempt(self, what: str, **changes: Any) -> bool:
         """Change fields of the scene if no image falls below the limit; return whether that is so."""
         candidate = replace(self.scene, **changes)
         worst = self.images.worst(candidate, self.limit)
-        trial = PruneTrial(what, worst, worst >= self.limit)
-        self.trials.append(trial)
-        self.tell(f"without {what}: {worst:.1f} dB, {'dropped' if trial.dropped else 'stays'}")
-        if trial.dropped:
+        dropped = worst >= self.limit
+        self.trials.append({"what": what, "psnr": worst, "dropped": dropped})
+        self.tell(f"without {what}: {worst:.1f} dB, {'dropped' if dropped else 'stays'}")
+        if dropped:
             self.scene = candidate
-        return trial.dropped
+        return dropped
 
     def drop_optional(self) -> None:
         """Try the scene without tracing, without each optional attribute, with lower SH degrees."""

@@ -28,17 +28,13 @@ CONCAVE_BELOW = 0.9
 """Ambient visibility below which a point is concave. It is 1 on a convex object, ½ in a corner of two walls,
 1 - h / 2R everywhere inside a spherical cap of height h and radius R. At 0.9 a tenth of the diffuse
 light is not that of the environment; the error of OPEN_RAYS is below that."""
-QUERIES = 20_000
-"""Points per surface whose distances are averaged."""
+QUERIES = 20_000  # points per surface whose distances are averaged
 TARGETS = 200_000
 """Points on a surface among which the nearest are searched: 0.01 apart on an object of size 2."""
-CANDIDATES = 8
-"""Nearest of these points, to whose triangles the distance is computed."""
-GRAZING = 0.1
-"""Cosine to the viewing ray below which a view does not see a point: its pixel may see the back."""
+CANDIDATES = 8  # nearest of these points, to whose triangles the distance is computed
+GRAZING = 0.1  # cosine to the viewing ray below which a view does not see a point: its pixel may see the back
 NEAR_TRUTH = 1.2
 """Radius, relative to the true surface's, beyond which an open scene's mesh is not compared with it."""
-SEED = 0
 SURFACE_KEYS = ("surface_distance", "surface_accuracy", "surface_completeness")
 NO_SURFACE = f"the data set has no {SURFACE}; make it again with this version of `refgs dataset`"
 
@@ -131,11 +127,11 @@ def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> d
         if not len(mesh.faces):
             return {}
     (ours, _), (true, facing) = _seen(mesh, Occluder(mesh), views), _seen(truth.mesh, truth.occluder, views)
-    result: dict[str, float] = {}
     if not len(ours) or not len(true):
-        return result
+        return {}
+    result: dict[str, float] = {}
     visibility = ambient_visibility(truth.occluder, mi.Point3f(true.T), mi.Vector3f(facing.T)).numpy()
-    _, nearest = cKDTree(true).query(ours)
+    nearest = cKDTree(true).query(ours)[1]
     accuracy, completeness = percent * distance_to(truth.mesh, ours), percent * distance_to(mesh, true)
     for suffix, counted in (("", np.ones(len(true), bool)), ("_concave", visibility < CONCAVE_BELOW)):
         if counted[nearest].any():
@@ -176,7 +172,7 @@ def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.nda
 
 def sample(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample points (count, 3) evenly over the area of a mesh, and return the triangle (count,) of each."""
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(0)
     corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
     edges = corners[:, 1:] - corners[:, :1]
     until = np.cumsum(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))

@@ -33,26 +33,19 @@ from mi_refgs.types import Float, Point2f, Point3f, UInt32, Vector3f
 
 PACKAGES = "fast_simplification", "xatlas"
 """Packages of the extra that baking needs; trimesh calls the former."""
-FACES_MIN, TEXTURE_RANGE = 100, (16, 8192)
 SMOOTHING = 30
 """Steps of Taubin's filter, which removes the stairs of the voxels from a surface and keeps its volume.
 [Taubin 1995, "A Signal Processing Approach to Fair Surface Design"]"""
-PADDING = 4
-"""Texels between charts, so that two mip levels, and bilinear lookup in them, see no other chart."""
-FLAT = 1e-6
-"""Voxel of the texture's plane as a mesh: its rays have length 1 and need next to no offset."""
-VIEWS = 64
-"""Rendered views, spread evenly over the cameras of the fit; about a third of them see a point."""
-VIEW_SIZE = 512
-"""Pixels along the longer side of a rendered view: four per voxel of an object of 128 voxels."""
-OUTLINES = 8
-"""Approximate number of views whose outlines show how far the mesh lies below the surface."""
+PADDING = 4  # texels between charts, so that two mip levels, and bilinear lookup in them, see no other chart
+FLAT = 1e-6  # voxel of the texture's plane as a mesh: its rays have length 1 and need next to no offset
+VIEWS = 64  # rendered views, spread evenly over the cameras of the fit; about a third of them see a point
+VIEW_SIZE = 512  # pixels along the longer side of a rendered view: four per voxel of an object of 128 voxels
+OUTLINES = 8  # approximate number of views whose outlines show how far the mesh lies below the surface
 GROWTH, HALVINGS = 2.0, 6
 """Voxels by which the mesh is moved outwards, at most, and bisection steps: to 1/32 voxel."""
 UNSEEN = 1e-2
 """Weight of the surfels around a vertex, where each view weighs up to 1: they decide where no view sees."""
-COLUMNS = 8
-"""Columns per point: albedo (3), metallic, roughness, normal (3)."""
+COLUMNS = 8  # columns per point: albedo (3), metallic, roughness, normal (3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +62,6 @@ class TexturedMesh:
     light: EnvironmentLight
 
 
-@dataclass(frozen=True)
-class Chart:
-    """A mesh in a square texture: V vertices after it is cut open, F faces in the order of the mesh."""
-
-    vertex: np.ndarray  # (V,) index of the mesh's vertex
-    faces: np.ndarray  # (F, 3) uint32
-    uv: np.ndarray  # (V, 2) in 0 … 1, v upwards: the first row of a texture is at v = 1
-
-
 @remember_last
 def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int) -> TexturedMesh:
     """Bake the object to a mesh of at most about `faces` triangles with textures of texture² texels.
@@ -86,11 +70,10 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
     the object gets). Raises InputError for a scene without mesh, light or materials, numbers out of range,
     and missing packages.
     """
-    if faces < FACES_MIN:
-        raise InputError(f"--faces: {faces} is out of range; give a number from {FACES_MIN}")
-    low, high = TEXTURE_RANGE
-    if not low <= texture <= high:
-        raise InputError(f"--texture: {texture} is out of range; give {low} to {high}")
+    if faces < 100:
+        raise InputError(f"--faces: {faces} is out of range; give a number from 100")
+    if not 16 <= texture <= 8192:
+        raise InputError(f"--texture: {texture} is out of range; give 16 to 8192")
     memory = BASE + PER_TEXEL * texture**2 + PER_SHOWN_SURFEL * trained.count
     require(memory, f"--texture: {texture} × {texture} texels", "bake a smaller texture")
     for package in PACKAGES:
@@ -107,18 +90,18 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
         renderer = plain.renderer()
         # The mesh, and its charts in the texture.
         mesh = _grown(simplified(scene.mesh, faces), views[:: len(views) // OUTLINES + 1], renderer)
-        chart = unwrap(mesh, texture)
-        covered, triangle, barycentric = texels(chart, texture)
+        vertex, cut_faces, uv = unwrap(mesh, texture)
+        covered, triangle, barycentric = texels(cut_faces, uv, texture)
         # Materials and normals at vertices and texels.
         points, start = _points(mesh, scene.surfels, triangle, barycentric)
         found = _mean_of_views(views, renderer, points, start, OFFSET_VOXELS * mesh.voxel)
     count = len(mesh.vertices)
     maps = _padded(covered, found[count:, :5])
     return TexturedMesh(
-        vertices=mesh.vertices[chart.vertex],
-        normals=found[:count, 5:][chart.vertex],
-        uv=chart.uv.astype(np.float32),
-        faces=chart.faces,
+        vertices=mesh.vertices[vertex],
+        normals=found[:count, 5:][vertex],
+        uv=uv.astype(np.float32),
+        faces=cut_faces,
         albedo=maps[..., :3],
         metallic=maps[..., 3],
         roughness=maps[..., 4],
@@ -147,8 +130,12 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
     return Mesh((whole.vertices * size + low).astype(np.float32), whole.faces, mesh.voxel)
 
 
-def unwrap(mesh: Mesh, size: int) -> Chart:
-    """Cut a mesh into charts that fill a texture of size² texels without overlap; some are mirrored."""
+def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut a mesh into charts that fill a texture of size² texels without overlap; some are mirrored.
+
+    Returns for the V vertices of the cut mesh the index (V,) in the mesh, its faces (F, 3) in the same order,
+    and the texture coordinates (V, 2) in 0 … 1, v upwards.
+    """
     import xatlas
 
     atlas = xatlas.Atlas()
@@ -157,17 +144,16 @@ def unwrap(mesh: Mesh, size: int) -> Chart:
     packing.resolution, packing.padding = size, PADDING
     atlas.generate(xatlas.ChartOptions(), packing)
     vertex, faces, uv = atlas[0]
-    return Chart(np.asarray(vertex), np.asarray(faces, np.uint32), np.clip(np.asarray(uv, np.float64), 0, 1))
+    return np.asarray(vertex), np.asarray(faces, np.uint32), np.clip(np.asarray(uv, np.float64), 0, 1)
 
 
-def texels(chart: Chart, size: int) -> tuple[np.ndarray, UInt32, Point2f]:
+def texels(faces: np.ndarray, uv: np.ndarray, size: int) -> tuple[np.ndarray, UInt32, Point2f]:
     """Find the texels of a size² texture whose centre lies in a triangle.
 
     Returns which they are (size, size) bool, the first row at v = 1, and for the T of them, row by row, the
     triangle (T,) and the barycentric coordinates (T,) of its second and third corner.
     """
-    flat = np.concatenate([chart.uv, np.zeros((len(chart.uv), 1))], axis=1)
-    plane = Occluder(Mesh(flat.astype(np.float32), chart.faces, FLAT))
+    plane = Occluder(Mesh(np.pad(uv, ((0, 0), (0, 1))).astype(np.float32), faces, FLAT))
     row, column = np.divmod(np.arange(size * size), size)
     above = mi.Point3f(upload((column + 0.5) / size), upload(1 - (row + 0.5) / size), mi.Float(1))
     hit = plane.closest(above, mi.Vector3f(0, 0, -1), None)
@@ -187,8 +173,7 @@ def _grown(mesh: Mesh, views: Sequence[Camera], renderer: Callable[[Camera], Fra
     normals = _normals(mesh)
 
     def moved(voxels: float) -> Mesh:
-        vertices = (mesh.vertices + voxels * mesh.voxel * normals).astype(np.float32)
-        return replace(mesh, vertices=vertices)
+        return replace(mesh, vertices=(mesh.vertices + voxels * mesh.voxel * normals).astype(np.float32))
 
     def excess(voxels: float) -> float:
         occluder, total = Occluder(moved(voxels)), 0.0
@@ -225,21 +210,20 @@ def _points(
 
     Materials are those of the surfels around the vertices, normals those of the mesh.
     """
-    vertex_surfels = VertexSurfels.of(mesh, surfels)
+    nearby = VertexSurfels.of(mesh, surfels)
     vertices = dr.arange(mi.UInt32, len(mesh.vertices))
-    corners = [dr.gather(mi.UInt32, vertex_surfels.faces, 3 * triangle + i) for i in range(3)]
+    corners = [dr.gather(mi.UInt32, nearby.faces, 3 * triangle + i) for i in range(3)]
     weights = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)
 
     def interpolated(column: Float) -> Float:
         mixed = sum(w * dr.gather(mi.Float, column, c) for w, c in zip(weights, corners, strict=True))
         return dr.concat((dr.gather(mi.Float, column, vertices), mixed))
 
-    rows = vertex_surfels.surface(surfels).rows
-    materials = [dr.gather(mi.Float, rows, COLUMNS * vertices + i) for i in range(5)]
-    columns = [*materials, *(upload(column) for column in _normals(mesh).T)]
+    rows = nearby.surface(surfels).rows
+    materials = [interpolated(dr.gather(mi.Float, rows, COLUMNS * vertices + i)) for i in range(5)]
+    normal = mi.Vector3f(*(interpolated(upload(column)) for column in _normals(mesh).T))
     points = mi.Point3f(*(interpolated(upload(column)) for column in mesh.vertices.T))
-    start = [interpolated(column) for column in columns]
-    return points, [*start[:5], *safe_normalize(mi.Vector3f(*start[5:]))]
+    return points, [*materials, *safe_normalize(normal)]
 
 
 def _mean_of_views(
@@ -297,10 +281,8 @@ def _sample_view(
         pixel = mi.UInt32(dr.select(inside, line * camera.width + column, 0))
         values = [dr.gather(mi.Float, table, (COLUMNS + 2) * pixel + i, inside) for i in range(COLUMNS + 2)]
         alpha, depth = values[COLUMNS:]
-        bilinear = dr.maximum(1 - dr.abs(x - mi.Float(column)), 0) * dr.maximum(
-            1 - dr.abs(y - mi.Float(line)), 0
-        )
-        own = bilinear * alpha * facing**2
+        near_x, near_y = (dr.maximum(1 - dr.abs(d), 0) for d in (x - mi.Float(column), y - mi.Float(line)))
+        own = near_x * near_y * alpha * facing**2
         own = dr.select(inside & (dr.abs(depth - local.z) < reach), own, 0)
         weight += own
         total = [dr.fma(own, v, sum_) for v, sum_ in zip(values[:COLUMNS], total, strict=True)]

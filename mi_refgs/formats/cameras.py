@@ -21,12 +21,10 @@ from mi_refgs.io.images import ENDINGS
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
 
-IMAGE_FOLDER = re.compile(r"images(_\d+)?")
-"""Folders to which COLMAP's names are relative."""
+IMAGE_FOLDER = re.compile(r"images(_\d+)?")  # folders to which COLMAP's names are relative
 LENSES = ("k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye")
 """Keys of lenses that are no pinholes, unless they are 0 or false."""
-SIZE_MAX = 2**14
-"""Pixels along a side of an image, at most."""
+SIZE_MAX = 2**14  # pixels along a side of an image, at most
 
 
 def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Path]:
@@ -53,11 +51,11 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
             frame["mask_path"] = mask.path.as_posix()
         opengl = (pose @ MITSUBA_FROM_OPENGL).tolist()
         frames.append({**frame, **_coefficients(lens), "transform_matrix": opengl})
-    of_split = {
-        split: [i for i, shot in enumerate(shots) if shot.split == split] for split in ("train", "test")
-    }
     content: dict[str, Any] = {"camera_model": frames[0]["camera_model"]}
-    content |= {f"{split}_filenames": [names[i] for i in chosen] for split, chosen in of_split.items()}
+    for split in ("train", "test"):
+        content[f"{split}_filenames"] = [
+            n for n, shot in zip(names, shots, strict=True) if shot.split == split
+        ]
     write_json(target / "transforms.json", {**content, "frames": frames})
 
     # COLMAP's model
@@ -66,8 +64,8 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
     write_cameras(sparse, numbered)
     write_images(sparse, files, poses, [numbered[camera] for camera in cameras], [""] * len(shots))
     write_points(sparse, [])
-    write_test_list(sparse, [files[i] for i in of_split["test"]])
-    written = ("cameras.txt", "images.txt", "points3D.txt", "test.txt")
+    write_test_list(sparse, [file for file, shot in zip(files, shots, strict=True) if shot.split == "test"])
+    written = "cameras.txt", "images.txt", "points3D.txt", "test.txt"
     return [target / "transforms.json", *(sparse / file for file in written)]
 
 
@@ -81,9 +79,8 @@ def _pinhole(shot: Shot) -> tuple[float, ...]:
     """Return width, height, fx, fy, cx, cy in pixels, focal lengths positive."""
     if shot.file is not None:
         return shot.file.width, shot.file.height, *(float(x) for x in shot.file.intrinsics)
-    camera = shot.camera
-    numbers = (-camera.fx[0], -camera.fy[0], camera.cx[0], camera.cy[0])
-    return camera.width, camera.height, *(float(x) for x in numbers)
+    c = shot.camera
+    return c.width, c.height, *(float(x) for x in (-c.fx[0], -c.fy[0], c.cx[0], c.cy[0]))
 
 
 def _coefficients(lens: Lens | None) -> dict[str, Any]:
@@ -134,9 +131,8 @@ def _camera(where: str, given: dict[str, Any]) -> Camera:
     width, height = number("w"), number("h")
     if min(width, height) < 1 or max(width, height) > SIZE_MAX:
         raise InputError(f"{where}.w: {width:g} × {height:g} is no size of an image; correct w and h")
-    if "fl_x" in given:
-        fx = number("fl_x")
-    else:
+    fx = number("fl_x", 0.0)
+    if "fl_x" not in given:
         fx = width / 2 / math.tan(min(max(number("camera_angle_x"), 1e-3), 3.1) / 2)
     fy = number("fl_y", fx)
     if min(fx, fy) <= 0:

@@ -14,8 +14,7 @@ from mi_refgs.plugins.aovs import aov_values, suffixes
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import ATTRIBUTES
 
-LETTERS = {"normal": "XYZ", "depth": "Z"}
-"""Letters of layers that are no colours."""
+LETTERS = {"normal": "XYZ", "depth": "Z"}  # letters of layers that are no colours
 
 
 def write(
@@ -27,13 +26,11 @@ def write(
     vectors NAME.X …, and for one number NAME.V; depth is depth.Z, scene units along the viewing axis.
     """
     if not 0 <= view < len(shots):
-        raise InputError(
-            f"--view: {view} is out of range; there are {len(shots)}, give 0 to {len(shots) - 1}"
-        )
-    if object:
-        trained = replace(trained, surroundings=None)
+        count = len(shots)
+        raise InputError(f"--view: {view} is out of range; there are {count}, give 0 to {count - 1}")
     camera = shots[view].camera
-    frame = trained.renderer(samples=samples)(camera)
+    shown = replace(trained, surroundings=None) if object else trained
+    frame = shown.renderer(samples=samples)(camera)
     layers = dict(zip("RGBA", [*frame.radiance, frame.alpha], strict=True))
     for name, letters in suffixes().items():
         if name == "alpha" or (name in ATTRIBUTES and name not in frame.maps):
@@ -42,9 +39,7 @@ def write(
         letters = LETTERS.get(name, "V" if len(letters) == 1 else letters)
         layers |= {f"{name}.{letter}": plane for letter, plane in zip(letters, values, strict=True)}
     if frame.background is not None:
-        layers |= {
-            f"background.{letter}": plane for letter, plane in zip("RGB", frame.background, strict=True)
-        }
+        layers |= {f"background.{c}": plane for c, plane in zip("RGB", frame.background, strict=True)}
     size = camera.height, camera.width
     write_exr_layers(target, {name: image_array(plane, *size) for name, plane in layers.items()})
     return [target]

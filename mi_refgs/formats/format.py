@@ -54,12 +54,9 @@ class Writer:
     module: str
     name: str = "write"
 
-    def function(self) -> Callable[..., list[Path]]:
+    def function(self) -> Any:
         """Import the function."""
-        found: Callable[..., list[Path]] = getattr(
-            importlib.import_module(f"mi_refgs.formats.{self.module}"), self.name
-        )
-        return found
+        return getattr(importlib.import_module(f"mi_refgs.formats.{self.module}"), self.name)
 
     def __call__(self, *arguments: Any, **options: Any) -> list[Path]:
         return self.function()(*arguments, **options)
@@ -90,13 +87,11 @@ def _require_shared_options(made: Format) -> None:
     shared = options_of(FORMATS)
     for option in made.options:
         if shared.get(option.name, option) != option:
-            raise InputError(
-                f"format: '{made.name}': {option.name}: another format declares it differently; rename it"
-            )
+            where = f"format: '{made.name}': {option.name}"
+            raise InputError(f"{where}: another format declares it differently; rename it")
 
 
-FORMATS: Registry[Format] = Registry("format", _require_shared_options)
-"""Every format by name."""
+FORMATS: Registry[Format] = Registry("format", _require_shared_options)  # every format by name
 register = FORMATS.register
 
 
@@ -157,10 +152,8 @@ def write(
         raise InputError(f"--to: no format; use one of {', '.join(FORMATS)}")
     for name in given.keys() - options_of(names):
         able = ", ".join(made.name for made in FORMATS.values() if name in [o.name for o in made.options])
-        raise InputError(
-            f"--{name.replace('_', '-')}: no option of {', '.join(names)}; leave it out, or choose a format "
-            f"that has it ({able or 'none'})"
-        )
+        remedy = f"leave it out, or choose a format that has it ({able or 'none'})"
+        raise InputError(f"--{name.replace('_', '-')}: no option of {', '.join(names)}; {remedy}")
     remedy = "choose another output, or replace it with --overwrite (overwrite=True in Python)"
     found, shots = {}, tuple(shots)
     for made in chosen:
@@ -184,27 +177,18 @@ def _target(made: Format, output: Path, several: bool) -> Path:
 
     Raises InputError for a file name of another suffix, or a folder that cannot be made.
     """
-    target = output
     if several or output.is_dir() or (made.suffix and not output.suffix):
-        target = output / f"{made.name}{made.suffix}"
-    elif made.suffix and target.suffix.lower() != made.suffix:
+        output = output / f"{made.name}{made.suffix}"
+    elif made.suffix and output.suffix.lower() != made.suffix:
         raise InputError(f"{output}: suffix: {made.name} writes {made.suffix}; name the file so")
-    make_folder(target.parent if made.suffix else target)
-    return target
+    make_folder(output.parent if made.suffix else output)
+    return output
 
 
 def _write_folder(
-    output: OutputFolder,
-    made: Format,
-    trained: TrainedScene,
-    shots: Sequence[Shot],
-    options: Mapping[str, Any],
+    output: OutputFolder, made: Format, trained: TrainedScene, shots: Sequence[Shot], options: dict[str, Any]
 ) -> list[Path]:
-    """Write a format into a temporary folder, then move its files to `output`, or none if one is foreign.
-
-    A format need not declare beforehand which files it writes. Raises InputError as `OutputFolder.claim`
-    does.
-    """
+    """Write a format into a temporary folder, then move its files to `output`, or none if one is foreign."""
     try:
         with tempfile.TemporaryDirectory(prefix=".refgs_", dir=output.path) as name:
             stage = Path(name)

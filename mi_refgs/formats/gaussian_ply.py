@@ -22,8 +22,7 @@ from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
 
-EXPECTED = "the PLY file of 3DGS or 2DGS"
-"""What messages say to give."""
+EXPECTED = "the PLY file of 3DGS or 2DGS"  # what messages say to give
 
 
 def write(
@@ -52,22 +51,18 @@ def read_splats(path: Path, linear: bool = False) -> TrainedScene:
         raise InputError(f"{path}: vertex: there are none; export the file again")
     needed = {*surfels.primitive.widths, "radiance_sh"}
     if others := [ATTRIBUTES[name].properties[0] for name in surfels.raw if name not in needed]:
-        raise InputError(
-            f"{path}: {others[0]}: materials of a run, which require its light and shading; give the run "
-            "folder to the command that needs it"
-        )
+        what = "materials of a run, which require its light and shading"
+        raise InputError(f"{path}: {others[0]}: {what}; give the run folder to the command that needs it")
     shading = Shading("surfel", "radiance") if linear else Shading("pixel", "displayed")
     return TrainedScene(Surfels(surfels.raw), None, None, shading, iteration=0, seconds=0.0)
 
 
 def method_of(trained: TrainedScene, name: str) -> Method:
     """Describe a scene that was fitted elsewhere as a method, for config.toml: how it is shaded."""
-    surfels, shading = trained.surfels, trained.shading
-    count, degree = surfels.count, {"radiance_sh": surfels.sh_degree()}
+    surfels, degree = trained.surfels, {"radiance_sh": trained.surfels.sh_degree()}
+    count, stages = surfels.count, {"imported": Stage(1, trained.shading)}
     options = SurfelOptions(surfels.primitive.name, ("radiance_sh",), count, count, degree=degree)
-    stages = {"imported": Stage(1, shading)}
-    data = DataOptions(downscale=1)
-    return Method(1, stages, surfels=options, data=data, name=name, preset="standard")
+    return Method(1, stages, surfels=options, data=DataOptions(downscale=1), name=name, preset="standard")
 
 
 def _require_splat_file(path: Path) -> None:
@@ -80,10 +75,8 @@ def _require_splat_file(path: Path) -> None:
     tables = {element.name: {name for name, _ in element.fields} for element in header.elements}
     names = tables.get("vertex", set())
     if "packed_position" in names:
-        raise InputError(
-            f"{path}: packed_position: a compressed PLY; write it as a plain one, as `splat-transform "
-            f"{path.name} plain.ply` does"
-        )
+        remedy = f"write it as a plain one, as `splat-transform {path.name} plain.ply` does"
+        raise InputError(f"{path}: packed_position: a compressed PLY; {remedy}")
     if not {"opacity", "scale_0", "rot_0"} & names:
         what = "a mesh" if tables.get("face") is not None else "points without size or opacity"
         raise InputError(f"{path}: vertex: {what}, no Gaussians; give {EXPECTED}")

@@ -42,14 +42,10 @@ outlines: alpha of a ring at 200² is 21.1 dB from the surfels' with 0.1, 21.5 w
 INSET = 0.8
 """Pixels of the training cameras by which surfels move inwards: of the same ring alpha is 24.0, 34.3, 34.9
 and 30.2 dB from the surfels' with 0, 0.6, 0.8 and 1, of a chair with the last three 30.4, 33.4 and 34.4."""
-SEEN = 0.5
-"""Blended weight, in pixels over these views, above which a surfel counts as seen."""
-VIEWS = 64
-"""Maximum number of renders that colours are fitted to."""
-PIXELS = 400**2
-"""Maximum number of pixels per render: colours need no more, and time grows with it."""
-STEPS = 3
-"""Conjugate-gradient steps after the first; two improve a chair by 2.8 dB."""
+SEEN = 0.5  # blended weight, in pixels over these views, above which a surfel counts as seen
+VIEWS = 64  # maximum number of renders that colours are fitted to
+PIXELS = 400**2  # maximum number of pixels per render: colours need no more, and time grows with it
+STEPS = 3  # conjugate-gradient steps after the first; two improve a chair by 2.8 dB
 DAMPING = 0.1
 """λ, over the 1/4π that Y² is on average. A smooth ball fitted to 20 views is, inside its outline in other
 views, 33.7 dB from the surfels without the factor l², 36.8 with it; a smooth metal ball 31.2 and 33.1."""
@@ -66,8 +62,7 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
         raise InputError(f"--degree: {degree} is out of range; give 0 to {MAX_SH_DEGREE}")
     if object_only:
         trained = replace(trained, surroundings=None)
-    around = trained.surroundings
-    table = trained.surfels.detach()
+    around, table = trained.surroundings, trained.surfels.detach()
     if around is not None and around.surfels.count:
         table = together(table, around.surfels)
     if not table.count:
@@ -88,9 +83,8 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
     # Colours: those of an imported file are encoded already.
     if trained.shading.model.encoded and around is None:
         own = trained.surfels.to_numpy()["radiance_sh"]
-        columns = 3 * (degree + 1) ** 2
-        sh = np.zeros((len(own), columns), np.float32)
-        sh[:, : own.shape[1]] = own[:, :columns]
+        sh = np.zeros((len(own), 3 * (degree + 1) ** 2), np.float32)
+        sh[:, : own.shape[1]] = own[:, : sh.shape[1]]
     else:
         sh = _ColourFit(trained, Surfels.from_numpy(raw), cameras, degree).solve()
     return Surfels.from_numpy(raw | {"radiance_sh": sh})
@@ -143,10 +137,8 @@ class _BlendedView:
 
     def weighted_sums(self, images: Sequence[Float]) -> list[np.ndarray]:
         """Return Σ_p w_ip x_p (N,) float64 of images x (H*W,), one per colour plane, and of alpha."""
-        total = sum(
-            (dr.sum(plane * x) for plane, x in zip(self.planes, [*images, self.alpha], strict=True)),
-            mi.Float(0),
-        )
+        pairs = zip(self.planes, [*images, self.alpha], strict=True)
+        total = sum((dr.sum(plane * x) for plane, x in pairs), mi.Float(0))
         if dr.grad_enabled(total):  # unless the view sees nothing
             dr.backward(total)
         return [np.array(dr.grad(plane), dtype=np.float64) for plane in self.inputs]
@@ -167,8 +159,7 @@ class _ColourFit:
         Gaussians that no view sees get the coefficients of the nearest one that is seen.
         """
         right, inverse, weight = self._preconditioner()
-        found = self._conjugate_gradients(right, inverse)
-        seen = weight > 0
+        found, seen = self._conjugate_gradients(right, inverse), weight > 0
         if seen.any() and not seen.all():
             position = self.position.numpy().T
             found[~seen] = found[seen][cKDTree(position[seen]).query(position[~seen])[1]]
@@ -199,9 +190,8 @@ class _ColourFit:
 
     def _conjugate_gradients(self, right: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Take STEPS preconditioned steps per colour. [Hestenes and Stiefel 1952]"""
-        residual, found = right, np.zeros_like(right)
-        moved = inverse @ residual
-        direction, product = moved, np.sum(residual * moved, axis=(0, 1))
+        residual, found, direction = right, np.zeros_like(right), inverse @ right
+        product = np.sum(residual * direction, axis=(0, 1))
         for _ in range(STEPS + 1):
             image = self._normal_equations(direction)
             length = product / np.maximum(np.sum(direction * image, axis=(0, 1)), 1e-30)

@@ -1,7 +1,4 @@
-"""Binary glTF 2.0 files of meshes and of Gaussians.
-
-glTF is in metres with +y up, our world has +z up: (x, y, z) becomes (x, z, −y).
-"""
+"""Binary glTF 2.0 files of meshes and of Gaussians."""
 
 from __future__ import annotations
 
@@ -23,12 +20,10 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import SH_DC, sigmoid
 
-Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-"""glTF's world from ours."""
+Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))  # glTF's world from ours
 Y_UP_QUATERNION = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
 """The same as a quaternion (x, y, z, w): the turn by -90° about x that takes +z to +y."""
-CENTRED = 0.5
-"""Pixels by which a principal point may be off the centre of the image without a warning."""
+CENTRED = 0.5  # pixels by which a principal point may be off the centre of the image without a warning
 EXTENSION = "KHR_gaussian_splatting"
 FLOAT, POINTS, VERTICES = 5126, 0, 34962
 """glTF's numbers of a component type, of a mode, and of a buffer's use."""
@@ -125,17 +120,10 @@ def write_gaussians(
         buffer += data.tobytes()
 
     # The scene.
-    extension = {
-        "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
-        "projection": "perspective",
-        "sortingMethod": "cameraDistance",
-    }
-    primitive = {
-        "mode": POINTS,
-        "attributes": {name: i for i, name in enumerate(columns)},
-        "extensions": {EXTENSION: extension},
-    }
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    extension |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+    attributes = {name: i for i, name in enumerate(columns)}
+    primitive = {"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: extension}}
     content = {
         "asset": {"version": "2.0", "generator": "mi_refgs"},
         "extensionsUsed": [EXTENSION],

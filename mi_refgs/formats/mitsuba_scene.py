@@ -20,16 +20,12 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.split_sum import DIELECTRIC_F0
 
-MAX_DEPTH = 6
-"""Edges of a path, as in `refgs dataset`."""
-SAMPLES = 256
-"""Samples per pixel by default; -D spp=16 on Mitsuba's command line chooses others."""
+MAX_DEPTH = 6  # edges of a path, as in `refgs dataset`
+SAMPLES = 256  # samples per pixel by default; -D spp=16 on Mitsuba's command line chooses others
 SCENE, MESH, LIGHT = "scene.xml", "mesh.ply", "envmap.exr"
 TEXTURES = {"base_color": "albedo.png", "roughness": "roughness.png", "metallic": "metallic.png"}
-ROUGHNESSES = 33
-"""Rows of the table of `diffuse_ratio`, which is linear between them."""
-NODES = 24
-"""Nodes of its quadrature per cosine and in azimuth: errors below 1e-4."""
+ROUGHNESSES = 33  # rows of the table of `diffuse_ratio`, which is linear between them
+NODES = 24  # nodes of its quadrature per cosine and in azimuth: errors below 1e-4
 
 
 def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int, texture: int) -> list[Path]:

@@ -16,10 +16,8 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 
-AROUND = {"test": 4, "train": 60}
-"""Cameras around an object without a data set."""
-SIZE, FIELD_OF_VIEW = 512, 40.0
-"""Pixels and degrees of their square images."""
+AROUND = {"test": 4, "train": 60}  # cameras around an object without a data set
+SIZE, FIELD_OF_VIEW = 512, 40.0  # pixels and degrees of their square images
 INSIDE = 0.98
 """Fraction of the surfels, by opacity, in the sphere that fills these images: strays lie far out."""
 
@@ -40,8 +38,7 @@ def shots_around(surfels: Surfels) -> list[Shot]:
         ring = np.sqrt(1 - up**2)
         outward = np.stack([ring * np.cos(turn), ring * np.sin(turn), up], axis=1)
         for i, pose in enumerate(poses_around(outward, middle, distance)):
-            centre, near = SIZE / 2, 1e-2 * distance
-            camera = Camera.from_pose(SIZE, SIZE, -focal, -focal, centre, centre, pose, near)
+            camera = Camera.from_pose(SIZE, SIZE, -focal, -focal, SIZE / 2, SIZE / 2, pose, 1e-2 * distance)
             shots.append(Shot(f"{split}/r_{i:03d}", split, camera))
     return shots
 

@@ -17,8 +17,7 @@ from mi_refgs.io.images import srgb_from_linear, write_png
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
 
-APERTURE = 36.0
-"""Width of the film, in USD's tenths of a scene unit; the focal length is then a ratio to it."""
+APERTURE = 36.0  # width of the film, in USD's tenths of a scene unit; the focal length is then a ratio to it
 TEXTURES = {"diffuseColor": "albedo", "roughness": "roughness", "metallic": "metallic"}
 """Inputs of UsdPreviewSurface, and their names here."""
 

@@ -21,12 +21,10 @@ from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.synthesis.pathtrace import ENVIRONMENT_OVERSAMPLING, environment_image
 from mi_refgs.synthesis.settings import RELIGHT, Z_UP, recorded_lights
 
-HEIGHT = 256
-"""Maximum number of rows of a light: a texel is 0.7°, an eighth of the lobe of roughness 0.1."""
+HEIGHT = 256  # maximum number of rows of a light: a texel is 0.7°, an eighth of the lobe of roughness 0.1
 READ_ROWS = ENVIRONMENT_OVERSAMPLING * HEIGHT
 """Rows to which a larger map is averaged first: a rotated map is sampled at as many."""
-EXPOSURE_MAX = 10.0
-"""Stops; a light stores no radiance below 1e-4, so that a much darker one would be grey."""
+EXPOSURE_MAX = 10.0  # stops; a light stores no radiance below 1e-4, so that a much darker one would be grey
 
 
 @dataclass(frozen=True)

@@ -110,10 +110,8 @@ class Reconstruction:
         elif isinstance(camera, Camera):
             found = camera
         else:
-            kind = type(camera).__name__
-            raise InputError(
-                f"camera: {kind}: no camera; give a Camera, a View, a Mitsuba sensor or an index"
-            )
+            remedy = "give a Camera, a View, a Mitsuba sensor or an index"
+            raise InputError(f"camera: {type(camera).__name__}: no camera; {remedy}")
         return found if size is None else found.resized(size)
 
     # ---------------- images ----------------
@@ -220,12 +218,7 @@ class Reconstruction:
     # ---------------- changes ----------------
 
     def relight(
-        self,
-        light: AnyLight,
-        *,
-        world: bool = False,
-        rotate: float = 0.0,
-        exposure: float = 0.0,
+        self, light: AnyLight, *, world: bool = False, rotate: float = 0.0, exposure: float = 0.0
     ) -> Reconstruction:
         """Replace the light: only materials stay, with shadows and bounces of the mesh.
 
@@ -252,9 +245,7 @@ class Reconstruction:
         `view`. join: a reconstruction that is added under the light of this one; `options` then select and
         change its surfels. Raises InputError for options that cannot be used.
         """
-        changed = self
-        if join is not None:
-            changed = join if isinstance(join, Reconstruction) else load(join)
+        changed = load(join) if isinstance(join, str | Path) else join or self
         camera = None if options.get("mask") is None else changed.camera(view, split=split)
         into = None if join is None else self.trained
         edited = editing.edit(changed.trained, camera=camera, into=into, **options)

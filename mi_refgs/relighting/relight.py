@@ -39,10 +39,8 @@ from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import ARTEFACTS
 
 SHEET, RESULT = "sheet.png", "relight.json"
-SHEET_VIEWS = 4
-"""Rows of the sheet, spread evenly over the test views."""
-SHEET_COLUMNS = 6
-"""Frames of a turntable per row of its sheet."""
+SHEET_VIEWS = 4  # rows of the sheet, spread evenly over the test views
+SHEET_COLUMNS = 6  # frames of a turntable per row of its sheet
 PREFIX = {"test": "r", "turntable": "t"}
 """First letter of image names by folder; test views have the names of a data set."""
 NO_TRUTH = "the data set has no test views under this light; make them with `refgs dataset --relight`"
@@ -87,8 +85,7 @@ def relight(
     # The views, and the ground truth under this light.
     provenance = Provenance.of(run).with_data(data)
     views = provenance.views("test") if provenance.has_data else None
-    requested = light
-    truth_folder = None
+    requested, truth_folder = light, None
     if views is not None and not turntable and (known := truth_under(light, views.path)) is not None:
         truth_folder, light = known
 
@@ -107,17 +104,14 @@ def relight(
 
     # The folder.
     name = light.path.stem if truth_folder is None else light.path.parent.name
-    if out is None:
-        output = _own_folder(run, f"{name}{light.suffix}", requested)
-    else:
-        output = _output(run, out, requested)
+    own = f"{name}{light.suffix}"
+    output = _own_folder(run, own, requested) if out is None else _output(run, out, requested)
     images = [f"{kind}/{PREFIX[kind]}_{i:03d}.png" for i in range(len(cameras))]
     _prepare(output, kind, images)
 
     # Files of the scene and its images.
     export(scene, output.path, cameras[0], output=output)
-    render = scene.renderer(aovs=False, samples=samples)
-    ours = []
+    render, ours = scene.renderer(aovs=False, samples=samples), []
     jobs = list(zip(images, cameras, strict=True))
     for image, camera in with_bar(jobs, "relight", unit="view", disable=not progress):
         frame = render(camera)
@@ -137,15 +131,11 @@ def relight(
         "exposure": light.exposure,
         "pictures": images,  # name of this key in version 0.1
         "samples": samples_per_axis(samples) ** 2,
-        "psnr": None,
-        "psnr_scaled": None,
-        "score_reason": reason,
-    }
+    } | {"psnr": None, "psnr_scaled": None, "score_reason": reason}
     truth: list[np.ndarray] = []
     if truth_folder is not None and views is not None:
         truth = _truth(provenance.method, truth_folder, light.exposure, views)
-        result |= score([view.name for view in views.views], ours, truth, background)
-        result["score_reason"] = None
+        result |= score([view.name for view in views.views], ours, truth, background) | {"score_reason": None}
     rows = _rows(ours, truth, np.array(result.get("scale", 1.0)), background)
     panorama = light_panels(new_light.radiance().numpy())["recovered light"]
     write_png(output.path / SHEET, contact_sheet(rows, {"light": panorama}))
@@ -178,9 +168,8 @@ def _prepare(output: OutputFolder, kind: str, images: Sequence[str]) -> None:
     """Remove the images of the last call for the same light, and claim the names of the new ones."""
     out = output.path
     if (out / "config.toml").exists() or any(out.glob("transforms*.json")):
-        raise InputError(
-            f"{out}: output: contains a run or a data set, whose files would be replaced; choose another -o"
-        )
+        what = "contains a run or a data set, whose files would be replaced"
+        raise InputError(f"{out}: output: {what}; choose another -o")
     names = [*images, *(str(Path(name).with_suffix(".exr")) for name in images), RESULT, SHEET]
     output.require_free([*names, *ARTEFACTS])
     stale = output.owned(f"{kind}/{PREFIX[kind]}_*.*")  # of more views, or another data set
@@ -200,7 +189,7 @@ def _truth(method: Method, folder: Path, exposure: float, views: Dataset) -> lis
     images = []
     for view in (view.load() for view in found):
         alpha = np.ones_like(view.image[..., 0]) if view.alpha is None else view.alpha
-        images.append(np.concatenate([view.image * np.float32(2.0**exposure), alpha[..., None]], axis=-1))
+        images.append(np.dstack([view.image * np.float32(2.0**exposure), alpha]))
     return images
 
 

@@ -15,12 +15,9 @@ from scipy.optimize import minimize_scalar
 from mi_refgs.evaluation import metrics
 from mi_refgs.io.images import srgb_from_linear
 
-SCALE_REACH = 2.0
-"""Stops around the ratio of the means within which the scale is searched."""
-INSIDE = 0.99
-"""Alpha from which a pixel is inside the object: the coverage of edges does not depend on light."""
-SCALE_PIXELS = 200_000
-"""Maximum number of pixels that the scale is fitted to."""
+SCALE_REACH = 2.0  # stops around the ratio of the means within which the scale is searched
+INSIDE = 0.99  # alpha from which a pixel is inside the object: the coverage of edges does not depend on light
+SCALE_PIXELS = 200_000  # maximum number of pixels that the scale is fitted to
 
 
 def displayed_over(rgba: np.ndarray, background: np.ndarray, scale: np.ndarray | float = 1.0) -> np.ndarray:
@@ -71,14 +68,9 @@ def score(
     for name, own, true in zip(names, ours, truth, strict=True):
         goal = displayed_over(true, background)
         plain, scaled = displayed_over(own, background), displayed_over(own, background, scale)
-        views.append(
-            {
-                "name": name,
-                "psnr": metrics.psnr(plain, goal),
-                "psnr_scaled": metrics.psnr(scaled, goal),
-                "ssim": metrics.ssim(plain, goal),
-                "ssim_scaled": metrics.ssim(scaled, goal),
-            }
-        )
+        found: dict[str, Any] = {"name": name}
+        for key, measure in (("psnr", metrics.psnr), ("ssim", metrics.ssim)):
+            found |= {key: measure(plain, goal), f"{key}_scaled": measure(scaled, goal)}
+        views.append(found)
     means = {k: float(np.mean([v[k] for v in views])) for k in views[0] if k != "name"}
     return means | {"scale": [float(x) for x in scale], "views": views}

@@ -20,10 +20,7 @@ from mi_refgs.io.images import read_png
 from mi_refgs.runs.export import export
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.known import (
-    SIZE,
-    write_known_run,
-)
+from tests.scenes.known import SIZE, write_known_run
 
 H = W = 8
 

@@ -17,11 +17,7 @@ from mi_refgs.evaluation import surface
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference.camera import look_at
-from tests.scenes.known import (
-    CENTRES,
-    RADII,
-    SIZE,
-)
+from tests.scenes.known import CENTRES, RADII, SIZE
 
 
 def mesh_of(shape: Any) -> Mesh:

@@ -145,11 +145,7 @@ def test_saved_run_renders_bit_identically(balls: Reconstruction, tmp_path: Path
     assert saved.folder == tmp_path / "new" and not (tmp_path / "new/checkpoints").exists()
     again = mi_refgs.load(tmp_path / "new")
     relit = again.relight(sky(32), rotate=30)
-    for before, after in (
-        (balls, saved),
-        (balls, again),
-        (relit, relit.save(tmp_path / "relit")),
-    ):
+    for before, after in ((balls, saved), (balls, again), (relit, relit.save(tmp_path / "relit"))):
         np.testing.assert_array_equal(before.render(1), after.render(1))
     assert again.provenance == balls.provenance
 
