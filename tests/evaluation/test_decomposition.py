@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,22 +45,8 @@ def random_view(seed: int) -> tuple[RenderedView, View, np.ndarray]:
         name: np.concatenate([rng.uniform(0.2, 0.8, (H, W, c)) * known, known], -1).astype(np.float32)
         for name, c in (("albedo", 3), ("roughness", 1), ("metallic", 1))
     }
-    view = View(
-        "a",
-        W,
-        H,
-        9,
-        9,
-        4,
-        4,
-        np.eye(4),
-        colour,
-        alpha,
-        normal,
-        alpha,
-        is_linear_radiance=False,
-        materials=materials,
-    )
+    size, given = (W, H, 9, 9, 4, 4, np.eye(4)), (colour, alpha, normal, alpha)
+    view = View("a", *size, *given, is_linear_radiance=False, materials=materials)
     return RenderedView(colour, alpha, normal, {}), view, rng.random((H, W)) > 0.5
 
 
@@ -68,9 +55,8 @@ def maps_of(view: View, factor: Any = 1.0) -> dict[str, np.ndarray]:
     found = {}
     for name, values in view.materials.items():
         ours = values[..., :-1] * (factor if name == "albedo" else 1)
-        found[name] = np.where(values[..., -1:] > 0, ours, 7)
-        if ours.shape[-1] == 1:
-            found[name] = found[name][..., 0]
+        ours = np.where(values[..., -1:] > 0, ours, 7)
+        found[name] = ours if name == "albedo" else ours[..., 0]
     return found
 
 
@@ -93,28 +79,25 @@ def test_perfect_decomposition_has_no_error() -> None:
 
 def test_errors_equal_plain_formulas() -> None:
     """Against the plain formulas over all foreground pixels of all views, and over the concave ones."""
-    errors, ours, true, apart, rough = Decomposition(), [], [], [], []
+    errors, pixels = Decomposition(), []
     rng = np.random.default_rng(9)
     for seed in range(3):
         shot, view, concave = random_view(seed)
-        maps = maps_of(view)
+        maps, rough = maps_of(view), np.where(concave, 0.3, 0.1)
         maps["albedo"] = maps["albedo"] + rng.normal(0, 0.1, (H, W, 3))
-        maps["roughness"] = maps["roughness"] + np.where(concave, 0.3, 0.1)
+        maps["roughness"] = maps["roughness"] + rough
         errors.add(shot, maps, view, concave)
         assert view.alpha is not None
-        counted = (view.alpha > 0.5) & (view.materials["albedo"][..., -1] > 0)
-        ours.append(maps["albedo"][counted])
-        true.append(view.materials["albedo"][counted][:, :3])
-        apart.append(concave[counted])
-        rough.append(np.where(concave, 0.3, 0.1)[counted])
-    a, b, c = np.concatenate(ours), np.concatenate(true), np.concatenate(apart)
+        true = view.materials["albedo"]
+        counted = (view.alpha > 0.5) & (true[..., -1] > 0)
+        pixels.append([x[counted] for x in (maps["albedo"], true[..., :3], concave, rough)])
+    a, b, c, rough = (np.concatenate(parts) for parts in zip(*pixels, strict=True))
     scale = (a * b).sum(0) / (a * a).sum(0)
     found = errors.result()
     for suffix, where in (("", np.ones(len(a), bool)), ("_concave", c)):
         error = np.mean((scale * a - b)[where] ** 2)
         assert found[f"albedo_psnr{suffix}"] == pytest.approx(-10 * np.log10(error), abs=1e-3)
-        expected = np.concatenate(rough)[where].mean()
-        assert found[f"roughness_mae{suffix}"] == pytest.approx(expected, abs=1e-6)
+        assert found[f"roughness_mae{suffix}"] == pytest.approx(rough[where].mean(), abs=1e-6)
     np.testing.assert_allclose(found["albedo_scale"], scale, rtol=1e-6)
 
 
@@ -171,19 +154,14 @@ def test_evaluate_without_ground_truth_gives_reasons(data: Path, tmp_path: Path)
     bare = tmp_path / "bare"
     (bare / "test").mkdir(parents=True)
     content = json.loads((data / "transforms_test.json").read_text())
+    frames = []
     for i, frame in enumerate(content["frames"]):
-        (bare / "test" / f"{i}.png").write_bytes((data / f"{frame['file_path']}.png").read_bytes())
-    frames = [
-        {"file_path": f"test/{i}", "transform_matrix": frame["transform_matrix"]}
-        for i, frame in enumerate(content["frames"])
-    ]
-    (bare / "transforms_test.json").write_text(json.dumps(content | {"frames": frames}))
-    (bare / "transforms_train.json").write_text(json.dumps(content | {"frames": frames}))
+        shutil.copy(data / f"{frame['file_path']}.png", bare / "test" / f"{i}.png")
+        frames.append({"file_path": f"test/{i}", "transform_matrix": frame["transform_matrix"]})
+    for split in ("test", "train"):
+        (bare / f"transforms_{split}.json").write_text(json.dumps(content | {"frames": frames}))
     result = evaluate(run, bare)
-    for name, key in (
-        ("albedo", "albedo_psnr"),
-        ("surface", "surface_distance"),
-        ("concave", "concave_share"),
-    ):
+    reasons = {"albedo": "albedo_psnr", "surface": "surface_distance", "concave": "concave_share"}
+    for name, key in reasons.items():
         assert result[key] is None and result[f"{name}_reason"]
     assert result["surface_reason"] == "the run has no mesh"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -79,12 +80,10 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     mi.set_variant("llvm_ad_rgb")  # before that of the tests
     trained = trained_scene()
     around = shots_around(trained.surfels)
-    shots = [
-        replace(shot, camera=shot.camera.resized(SIZE)) for shot in (around[1], around[3], *around[4::4])
-    ]
+    chosen = around[1], around[3], *around[4::4]
+    shots = [replace(shot, camera=shot.camera.resized(SIZE)) for shot in chosen]
     folder = tmp_path_factory.mktemp("baked")
-    options = {"faces": FACES, "texture": TEXTURE}
-    write(trained, ["mitsuba", "gltf-mesh", "usd"], folder, shots, options)
+    write(trained, ["mitsuba", "gltf-mesh", "usd"], folder, shots, {"faces": FACES, "texture": TEXTURE})
     return Exported(trained, shots, folder, bake(trained, shots, FACES, TEXTURE))
 
 
@@ -95,17 +94,15 @@ def ball_of(points: np.ndarray) -> np.ndarray:
 
 def at(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Values of an image at coordinates (N, 2), v upwards, of the nearest texel."""
-    size = len(image)
-    column = np.minimum((uv[:, 0] * size).astype(int), size - 1)
-    row = np.minimum(((1 - uv[:, 1]) * size).astype(int), size - 1)
-    return image[row, column]
+    place = np.minimum((np.stack([1 - uv[:, 1], uv[:, 0]]) * len(image)).astype(int), len(image) - 1)
+    return image[*place]
 
 
-def check_materials(
-    ball: np.ndarray, albedo: np.ndarray, roughness: np.ndarray, metallic: np.ndarray
-) -> None:
-    """Require that values at points of balls are those of the known scene."""
-    for name, found in (("albedo", albedo), ("roughness", roughness), ("metallic", metallic)):
+def check_materials(points: np.ndarray, uv: np.ndarray, *maps: np.ndarray) -> None:
+    """Require that albedo, roughness and metallic at points of balls are those of the known scene."""
+    ball = ball_of(points)
+    for name, image in zip(("albedo", "roughness", "metallic"), maps, strict=True):
+        found = at(image, uv)
         true = np.array([np.broadcast_to(material[name], found.shape[1:]) for material in MATERIALS])
         error = np.abs(found - true[ball]).reshape(len(ball), -1).max(axis=1)
         assert np.quantile(error, 0.99) < 0.02, name
@@ -136,8 +133,7 @@ def test_charts_do_not_overlap(exported: Exported) -> None:
 
 def test_textures_have_the_known_materials(exported: Exported) -> None:
     made = exported.baked
-    ball = ball_of(made.vertices)
-    check_materials(ball, at(made.albedo, made.uv), at(made.roughness, made.uv), at(made.metallic, made.uv))
+    check_materials(made.vertices, made.uv, made.albedo, made.roughness, made.metallic)
     for image in (made.albedo, made.roughness, made.metallic):
         assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
 
@@ -168,9 +164,9 @@ def test_mesh_below_the_surface_moves_outwards(exported: Exported) -> None:
     ball = ball_of(trained.mesh.vertices)
     inward = (trained.mesh.vertices - MIDDLES[ball]) * (0.015 / RADII[ball])[:, None]
     small = replace(trained.mesh, vertices=(trained.mesh.vertices - inward).astype(np.float32))
-    made = bake(replace(trained, mesh=small), exported.shots, FACES, 64)
-    radius = np.linalg.norm(made.vertices - MIDDLES[ball_of(made.vertices)], axis=1)
-    assert np.abs(np.median(radius / RADII[ball_of(made.vertices)]) - 1) < 0.012
+    vertices = bake(replace(trained, mesh=small), exported.shots, FACES, 64).vertices
+    radius = np.linalg.norm(vertices - MIDDLES[ball_of(vertices)], axis=1)
+    assert np.abs(np.median(radius / RADII[ball_of(vertices)]) - 1) < 0.012
 
 
 # ---------------- formats ----------------
@@ -179,22 +175,18 @@ def test_mesh_below_the_surface_moves_outwards(exported: Exported) -> None:
 def test_gltf_mesh_has_y_up_and_known_materials(exported: Exported) -> None:
     scene: Any = trimesh.load(exported.folder / "gltf-mesh.glb", process=False)
     mesh = scene.geometry["object"]
-    ours = np.stack([mesh.vertices[:, 0], -mesh.vertices[:, 2], mesh.vertices[:, 1]], axis=1)
+    ours = mesh.vertices[:, [0, 2, 1]] * [1, -1, 1]
     np.testing.assert_allclose(ours, exported.baked.vertices, atol=1e-6)
-    normals = np.stack([mesh.vertex_normals[:, 0], -mesh.vertex_normals[:, 2], mesh.vertex_normals[:, 1]], 1)
+    normals = mesh.vertex_normals[:, [0, 2, 1]] * [1, -1, 1]
     np.testing.assert_allclose(normals, exported.baked.normals, atol=1e-5)
     material = mesh.visual.material
     albedo = linear_from_srgb(np.asarray(material.baseColorTexture, np.float32)[..., :3] / 255)
-    surface_ = np.asarray(material.metallicRoughnessTexture, np.float32) / 255
-    uv = np.asarray(mesh.visual.uv)
-    check_materials(ball_of(ours), at(albedo, uv), at(surface_[..., 1], uv), at(surface_[..., 2], uv))
+    _, roughness, metallic = np.moveaxis(np.float32(material.metallicRoughnessTexture) / 255, -1, 0)
+    check_materials(ours, np.asarray(mesh.visual.uv), albedo, roughness, metallic)
     assert material.metallicFactor == 1 and material.roughnessFactor == 1
-    # glTF's camera looks along its −z.
-    pose = np.array(scene.camera_transform)
-    eye = exported.shots[0].camera.pose()
-    np.testing.assert_allclose(pose[:3, 3], eye[[0, 2, 1], 3] * [1, 1, -1], atol=1e-5)
-    np.testing.assert_allclose(-pose[:3, 2], eye[[0, 2, 1], 2] * [1, 1, -1], atol=1e-5)
-    np.testing.assert_allclose(pose[:3, 1], eye[[0, 2, 1], 1] * [1, 1, -1], atol=1e-5)
+    # glTF's camera looks along its −z: its columns are up, backwards and the position.
+    expected = exported.shots[0].camera.pose()[[0, 2, 1], 1:] * [[1], [1], [-1]] * [1, -1, 1]
+    np.testing.assert_allclose(np.array(scene.camera_transform)[:3, 1:], expected, atol=1e-5)
 
 
 STOCK = """
@@ -230,18 +222,16 @@ def test_plain_mitsuba_renders_the_same_image(
 
 
 def test_plain_mitsuba_reads_texture_encodings(exported: Exported) -> None:
-    folder = exported.folder / "mitsuba"
+    folder, uv = exported.folder / "mitsuba", exported.baked.uv
     base = base_colour(exported.baked)
     np.testing.assert_allclose(linear_from_srgb(read_png(folder / "albedo.png")), base, atol=0.01)
-    scene = mi.load_file(str(folder / "scene.xml"))
-    si = dr_interaction(exported.baked)
-    params = mi.traverse(scene.shapes()[0].bsdf())
-    assert {name for name in params.keys() if name.endswith(".data")} == {
-        f"{name}.data" for name in ("base_color", "roughness", "metallic")
-    }
-    bsdf = scene.shapes()[0].bsdf()
+    bsdf = mi.load_file(str(folder / "scene.xml")).shapes()[0].bsdf()
+    textures = {name for name in mi.traverse(bsdf).keys() if name.endswith(".data")}
+    assert textures == {"base_color.data", "roughness.data", "metallic.data"}
+    si = dr.zeros(mi.SurfaceInteraction3f, len(uv))
+    si.uv, si.wi = mi.Point2f(uv[:, 0], 1 - uv[:, 1]), mi.Vector3f(0, 0, 1)  # coordinates of the PLY
     shown = np.array(bsdf.eval_diffuse_reflectance(si)).T
-    assert np.quantile(np.abs(shown - at(base, exported.baked.uv)), 0.98) < 0.02
+    assert np.quantile(np.abs(shown - at(base, uv)), 0.98) < 0.02
     text = (folder / "scene.xml").read_text()
     assert text.count('name="raw" value="true"') == 2 and text.count('name="raw" value="false"') == 1
 
@@ -249,8 +239,6 @@ def test_plain_mitsuba_reads_texture_encodings(exported: Exported) -> None:
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 0.9])
 def test_principled_albedo_equals_ours(roughness: float) -> None:
     """Mean albedo over all view directions: sampled weights against the split-sum table."""
-    import drjit as dr
-
     known, share = diffuse_ratio()
     rgb = {"type": "rgb", "value": [0.6 * float(np.interp(roughness, known, share))] * 3}
     bsdf = mi.load_dict({"type": "principled", "base_color": rgb, "roughness": roughness, "specular": 0.5})
@@ -265,16 +253,6 @@ def test_principled_albedo_equals_ours(roughness: float) -> None:
     specular = 0.04 * scale + bias
     ours = dr.mean(specular + (1 - specular) * 0.6)
     assert float(dr.mean(weight.x)[0]) == pytest.approx(float(ours[0]), rel=0.01)
-
-
-def dr_interaction(made: TexturedMesh) -> Any:
-    """Surface interactions at the vertices, with the coordinates of the PLY."""
-    import drjit as dr
-
-    si = dr.zeros(mi.SurfaceInteraction3f, len(made.uv))
-    si.uv = mi.Point2f(np.stack([made.uv[:, 0], 1 - made.uv[:, 1]]))
-    si.wi = mi.Vector3f(0, 0, 1)
-    return si
 
 
 def test_usd_has_mesh_materials_and_dome_light(exported: Exported, tmp_path: Path) -> None:
@@ -293,19 +271,16 @@ def test_usd_has_mesh_materials_and_dome_light(exported: Exported, tmp_path: Pat
     folder = tmp_path / "unpacked"
     assert UsdUtils.ExtractUsdzPackage(str(exported.folder / "usd.usdz"), str(folder), False, False)
     uv = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
-    shown = {}
-    for name, space, channel in (
-        ("diffuseColor", "sRGB", "rgb"),
-        ("roughness", "raw", "r"),
-        ("metallic", "raw", "r"),
-    ):
+    maps = []
+    inputs = ("diffuseColor", "sRGB", "rgb"), ("roughness", "raw", "r"), ("metallic", "raw", "r")
+    for name, space, channel in inputs:
         texture, output, _ = source.GetInput(name).GetConnectedSource()
         image = UsdShade.Shader(texture.GetPrim())
         assert output == channel and image.GetInput("sourceColorSpace").Get() == space
         file = next(folder.rglob(Path(image.GetInput("file").Get().path).name))
         picture = read_png(file)
-        shown[name] = at(linear_from_srgb(picture) if space == "sRGB" else picture[..., 0], uv)
-    check_materials(ball_of(made.vertices), shown["diffuseColor"], shown["roughness"], shown["metallic"])
+        maps.append(linear_from_srgb(picture) if space == "sRGB" else picture[..., 0])
+    check_materials(made.vertices, uv, *maps)
 
     # The layout of the dome's texture, from the documentation of UsdLux: longitude π at the left edge, 0 in
     # the middle; latitude π/2 at the first row; longitude 0 is +z and π/2 is +x, latitude π/2 is +y.
@@ -313,13 +288,14 @@ def test_usd_has_mesh_materials_and_dome_light(exported: Exported, tmp_path: Pat
     assert light.GetLocalTransformation() == Gf.Matrix4d(1)
     assert light.GetTextureFormatAttr().Get() == "latlong"
     panorama = read_exr_image(next(folder.rglob("envmap.exr")))
+    assert exported.trained.light is not None
+    sky = exported.trained.light.unfiltered()
     for axis in np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0.48, 0.64]]]):
         longitude, latitude = np.arctan2(axis[0], axis[2]), np.arcsin(axis[1])
         column = int((0.5 - longitude / (2 * np.pi)) * 64) % 64
         row = min(int((0.5 - latitude / np.pi) * 32), 31)
-        assert exported.trained.light is not None
-        with_light = exported.trained.light.unfiltered().radiance(mi.Vector3f(*map(float, axis)))
-        np.testing.assert_allclose(panorama[row, column], np.array(with_light).ravel(), atol=0.2)
+        radiance = np.array(sky.radiance(mi.Vector3f(*map(float, axis)))).ravel()
+        np.testing.assert_allclose(panorama[row, column], radiance, atol=0.2)
 
 
 def off_centre() -> Camera:
@@ -351,8 +327,7 @@ def test_usd_camera_keeps_the_principal_point() -> None:
 def test_gltf_camera_warns_of_off_centre_principal_point(capsys: pytest.CaptureFixture[str]) -> None:
     for camera, said in ((off_centre(), True), (shots_around(trained_scene().surfels)[0].camera, False)):
         gltf._add_camera({"nodes": [], "scenes": [{"nodes": []}]}, camera)
-        text = "8.5 pixels to the right and -7.0 below" in capsys.readouterr().err
-        assert text is said
+        assert ("8.5 pixels to the right and -7.0 below" in capsys.readouterr().err) is said
 
 
 def test_usd_passes_its_own_validators(exported: Exported) -> None:
@@ -360,8 +335,7 @@ def test_usd_passes_its_own_validators(exported: Exported) -> None:
     from pxr import Usd, UsdValidation
 
     stage = Usd.Stage.Open(str(exported.folder / "usd.usdz"))
-    registry = UsdValidation.ValidationRegistry()
-    validators = registry.GetOrLoadAllValidators()
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert len(validators) > 10
     errors = UsdValidation.ValidationContext(validators).Validate(stage)
     assert [error.GetMessage() for error in errors] == []
@@ -400,8 +374,7 @@ def test_incomplete_runs_are_refused(
         change = {"surfels": Surfels({k: v for k, v in raw if k not in ("albedo", "metallic")})}
     shading = Shading(diffuse="irradiance", occlusion=False)
     scene = replace(exported.trained, shading=shading, **change)
-    said = refused(lambda: write(scene, ["mitsuba"], tmp_path, exported.shots), message)
-    assert said.startswith(message)
+    assert refused(lambda: write(scene, ["mitsuba"], tmp_path, exported.shots)).startswith(message)
 
 
 @pytest.mark.parametrize("option", ["--faces=3", "--texture=7", "--texture=100000"])

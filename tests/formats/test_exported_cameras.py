@@ -18,6 +18,7 @@ from mi_refgs.data.lens import Lens
 from mi_refgs.fitting.runner import load_method
 from mi_refgs.formats import Shot
 from mi_refgs.formats.cameras import write as write_cameras
+from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import box_downscale, read_png, write_png
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -34,21 +35,17 @@ FISHEYE = Lens(True, (0.05, -0.02, 0.0, 0.0))
 def nerfstudio(folder: Path, lens: Lens = BENT) -> Path:
     """JPEG files, each with its own focal length, behind one kind of lens; one test view is named."""
     shots = [replace(shot, focal=(110.0 + shot.index, 104.0), lens=lens) for shot in JPEGS]
-    given = dict(zip(("k1", "k2", "k3", "k4")[: len(lens.radial)], lens.radial, strict=True))
+    given: dict[str, Any] = dict(zip(("k1", "k2", "k3", "k4")[: len(lens.radial)], lens.radial, strict=True))
     given |= {} if lens.fisheye else dict(zip(("p1", "p2"), lens.tangential, strict=True))
-    model = "OPENCV_FISHEYE" if lens.fisheye else "OPENCV"
-    return layouts.write_nerfstudio(
-        folder, shots, camera_model=model, test_filenames=["images/3/d.JPG"], **given
-    )
+    given |= {"camera_model": "OPENCV_FISHEYE" if lens.fisheye else "OPENCV"}
+    return layouts.write_nerfstudio(folder, shots, test_filenames=["images/3/d.JPG"], **given)
 
 
 def masked(folder: Path) -> Path:
     """Frames that name masks."""
     data = nerfstudio(folder)
     write_png(data / "mask.png", np.indices((72, 96)).sum(axis=0)[..., None].repeat(3, -1) % 2)
-    layouts.change_transforms(
-        data, lambda content: [f.update(mask_path="mask.png") for f in content["frames"]]
-    )
+    layouts.change_transforms(data, lambda made: [f.update(mask_path="mask.png") for f in made["frames"]])
     return data
 
 
@@ -94,8 +91,6 @@ CAMERA_FILES = ("transforms*.json", "poses_bounds.npy", "*-camera.pkl", "sparse"
 
 def write_exr_data(folder: Path) -> Path:
     """The tiny data set with EXR files beside the PNG files."""
-    from mi_refgs.io.exr import write_exr
-
     data = write_data(folder, truth=False)
     for path in data.glob("*/*.png"):
         write_exr(path.with_suffix(".exr"), read_png(path))
@@ -113,10 +108,8 @@ def test_exported_cameras_match_the_image_files(reader: str, kind: str, tmp_path
     assert reader_of(data).name == reader
     images = "exr" if kind == "exr" else "png"
     method = load_method(None, "quick", ["data.downscale=2", f"data.images='{images}'"])
-    trained = cast(TrainedScene, None)
-    shots = Provenance(method, data).shots(trained, "test", "train")
-    out = tmp_path / "out"
-    write_cameras(trained, out, shots)
+    trained, out = cast(TrainedScene, None), tmp_path / "out"
+    write_cameras(trained, out, Provenance(method, data).shots(trained, "test", "train"))
     names = [f.split()[-1] for f in (out / "sparse/0/images.txt").read_text().splitlines()[1::2]]
     below = data / "images" if (data / "images").is_dir() else data
     assert names and all((below / name).is_file() for name in names)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -42,11 +43,9 @@ def plain() -> Iterator[list[Any]]:
 
 
 def test_format_declarations_import_no_numpy_or_mitsuba(tmp_path: Path) -> None:
-    loaded = "print([name for name in ('numpy', 'mitsuba') if name in sys.modules])"
-    found, base = (
-        run_python(f"import sys, {module}; {loaded}", folder=tmp_path)
-        for module in ("mi_refgs.formats", "mi_refgs")
-    )
+    code = "import sys, {}; print([name for name in ('numpy', 'mitsuba') if name in sys.modules])"
+    modules = "mi_refgs.formats", "mi_refgs"
+    found, base = (run_python(code.format(module), folder=tmp_path) for module in modules)
     assert found == base
 
 
@@ -85,8 +84,8 @@ def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: P
 def test_bad_export_arguments_are_refused(
     plain: list[Any], finished: Path, tmp_path: Path, arguments: list[str], message: str
 ) -> None:
-    arguments = [word.replace("OUT", str(tmp_path / "out")) for word in arguments]
-    refused(["export", finished, *arguments], message)
+    words = [word.replace("OUT", str(tmp_path / "out")) for word in arguments]
+    refused(["export", finished, *words], message)
 
 
 def test_registry_refuses_conflicting_options_and_names(plain: list[Any]) -> None:
@@ -106,8 +105,7 @@ def test_registry_refuses_conflicting_options_and_names(plain: list[Any]) -> Non
 def test_run_without_data_has_cameras_around_its_surfels(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], record: str | None
 ) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
+    run = shutil.copytree(finished, tmp_path / "run")
     (run / "dataset.json").unlink()
     if record is not None:
         (run / "dataset.json").write_text(record)
@@ -131,30 +129,22 @@ def test_run_without_data_has_cameras_around_its_surfels(
 @pytest.mark.parametrize("mesh", [False, True])
 def test_turntable_ignores_outliers(finished: Path, mesh: bool) -> None:
     """One distant surfel or vertex does not change the point that the cameras look at."""
-    import mitsuba as mi
-
     trained = TrainedScene.read(finished)
-    position = trained.surfels.to_numpy()["position"]
-    if mesh:
-        trained = replace(trained, mesh=Mesh(position, np.zeros((0, 3), np.uint32), 0.1))
     cameras = [shot.camera for shot in shots_around(trained.surfels)]
-    before = turntable_cameras(trained, cameras, 3)
-    far = position.copy()
-    far[0, 0] = 300
-    if mesh:
-        moved = replace(trained, mesh=Mesh(far, np.zeros((0, 3), np.uint32), 0.1))
-    else:
-        raw = trained.surfels.raw | {"position": mi.TensorXf(far)}
-        moved = replace(trained, surfels=Surfels(raw))
-    for camera, other in zip(before, turntable_cameras(moved, cameras, 3), strict=True):
-        np.testing.assert_allclose(other.pose()[:3, 3], camera.pose()[:3, 3], atol=0.1)
+    position = trained.surfels.to_numpy()["position"]
+    places = []
+    for x in (position[0, 0], 300):
+        position[0, 0] = x
+        moved = replace(trained, surfels=Surfels(trained.surfels.raw | {"position": mi.TensorXf(position)}))
+        if mesh:
+            moved = replace(trained, mesh=Mesh(position.copy(), np.zeros((0, 3), np.uint32), 0.1))
+        places.append([camera.pose()[:3, 3] for camera in turntable_cameras(moved, cameras, 3)])
+    np.testing.assert_allclose(*places, atol=0.1)
 
 
 def test_cameras_around_no_surfels_are_refused(finished: Path) -> None:
-    trained = TrainedScene.read(finished)
-    import mitsuba as mi
-
-    refused(lambda: shots_around(trained.surfels.gather(mi.UInt32())), "there are none")
+    surfels = TrainedScene.read(finished).surfels
+    refused(lambda: shots_around(surfels.gather(mi.UInt32())), "there are none")
 
 
 def test_write_function_writes_formats(plain: list[Any], finished: Path, tmp_path: Path) -> None:

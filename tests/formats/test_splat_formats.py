@@ -45,15 +45,10 @@ def ball(rng: np.random.Generator, count: int = COUNT) -> dict[str, np.ndarray]:
     normal = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
     rotation = np.concatenate([np.stack([-normal[:, 1], normal[:, 0]], 1), 0 * z[:, None], 1 + z[:, None]], 1)
     rotation *= np.where(rng.random((count, 1)) < 0.5, 1, -1)  # the same
-    return {
-        "position": normal,
-        "rotation": rotation,
-        "scale": np.full((count, 2), np.log(0.06)),
-        "opacity": np.full((count, 1), logit(0.95)),
-        "albedo": logit(np.clip(0.5 + 0.4 * normal, 0.01, 0.99)),
-        "metallic": np.full((count, 1), logit(0.2)),
-        "roughness": np.full((count, 1), logit(0.6)),
-    }
+    raw = {"position": normal, "rotation": rotation, "scale": np.full((count, 2), np.log(0.06))}
+    raw["albedo"] = logit(np.clip(0.5 + 0.4 * normal, 0.01, 0.99))
+    values = {"opacity": 0.95, "metallic": 0.2, "roughness": 0.6}
+    return raw | {name: np.full((count, 1), logit(value)) for name, value in values.items()}
 
 
 def sky() -> EnvironmentLight:
@@ -164,13 +159,9 @@ def test_empty_views_do_not_change_colours(scene: TrainedScene, shots: list[Shot
 def test_background_gaussians_are_exported_unless_object_only(
     scene: TrainedScene, shots: list[Shot], rng: np.random.Generator
 ) -> None:
-    around = {
-        name: values
-        for name, values in ball(rng, 400).items()
-        if name not in ("albedo", "metallic", "roughness")
-    }
-    around["position"] = around["position"] * 0.4 + np.array([0, 0, -1.4])
-    around["scale"] = around["scale"] + np.log(0.8)
+    raw = ball(rng, 400)
+    around = {name: raw[name] for name in ("rotation", "opacity")}
+    around |= {"position": raw["position"] * 0.4 + [0, 0, -1.4], "scale": raw["scale"] + np.log(0.8)}
     around["radiance_sh"] = np.tile((np.array([0.8, 0.1, 0.1]) - 0.5) / SH_DC, (400, 1))
     both = replace(scene, surroundings=Surroundings(Surfels.from_numpy(around)))
     camera = shots[0].camera
@@ -197,11 +188,8 @@ def test_ply_properties_have_the_order_of_3dgs(
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [*(f"f_rest_{i}" for i in range(9)), "opacity", *(f"scale_{i}" for i in range(3))]
     names += [f"rot_{i}" for i in range(4)]
-    assert header[1:] == [
-        "format binary_little_endian 1.0",
-        f"element vertex {COUNT}",
-        *(f"property float {name}" for name in names),
-    ]
+    assert header[1:3] == ["format binary_little_endian 1.0", f"element vertex {COUNT}"]
+    assert header[3:] == [f"property float {name}" for name in names]
     assert read_ply(file).primitive.name == "gaussian"
 
 
@@ -237,8 +225,8 @@ def test_gltf_has_activated_gaussians(scene: TrainedScene, shots: list[Shot], tm
     raw, prefix = table.to_numpy(), "KHR_gaussian_splatting"
     primitive = content["meshes"][0]["primitives"][0]
     assert primitive["mode"] == 0 and content["extensionsUsed"] == [prefix]
-    assert primitive["extensions"][prefix]["kernel"] == "ellipse"
-    assert primitive["extensions"][prefix]["colorSpace"] == "srgb_rec709_display"
+    extension = primitive["extensions"][prefix]
+    assert (extension["kernel"], extension["colorSpace"]) == ("ellipse", "srgb_rec709_display")
     np.testing.assert_array_equal(column("POSITION"), raw["position"])
     np.testing.assert_allclose(column(f"{prefix}:SCALE"), np.exp(raw["scale"]), rtol=1e-5)
     np.testing.assert_allclose(column(f"{prefix}:OPACITY")[:, 0], table.opacity().numpy(), atol=1e-6)
@@ -257,9 +245,8 @@ def test_gltf_has_activated_gaussians(scene: TrainedScene, shots: list[Shot], tm
     shown = column("COLOR_0")
     assert shown.min() >= 0 and shown.max() <= 1 and shown.shape[1] == 4
     x, y, z, w = content["nodes"][0]["rotation"]  # +z of the data is +y of glTF
-    np.testing.assert_allclose(
-        [2 * (x * z + w * y), 2 * (y * z - w * x), w * w + z * z - x * x - y * y], [0, 1, 0], atol=1e-7
-    )
+    turned = [2 * (x * z + w * y), 2 * (y * z - w * x), w * w + z * z - x * x - y * y]
+    np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-7)
 
 
 def test_exr_has_every_layer(scene: TrainedScene, shots: list[Shot], tmp_path: Path) -> None:
