@@ -221,8 +221,8 @@ def broken(kind: str, whole: bytes) -> bytes:
         "compressed": b"ply\nformat binary_little_endian 1.0\nelement chunk 0\nproperty float min_x\n"
         b"element vertex 1\nproperty uint packed_position\nproperty uint packed_rotation\nend_header\n"
         + bytes(8),
-        "mesh": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z"
-        b"\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n",
+        "mesh": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+        b"property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n",
         "garbage": header.replace(b"binary_little_endian", b"ascii") + end + b"what is this? " * 2000,
         "empty": header.replace(b"vertex 40", b"vertex 0") + end,
         "degree": whole.replace(b"float f_rest_44\n", b"float nothing\n"),
