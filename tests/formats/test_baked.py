@@ -181,7 +181,9 @@ def test_gltf_mesh_has_y_up_and_known_materials(exported: Exported) -> None:
     np.testing.assert_allclose(normals, exported.baked.normals, atol=1e-5)
     material = mesh.visual.material
     albedo = linear_from_srgb(np.asarray(material.baseColorTexture, np.float32)[..., :3] / 255)
-    _, roughness, metallic = np.moveaxis(np.float32(material.metallicRoughnessTexture) / 255, -1, 0)
+    _, roughness, metallic = np.moveaxis(
+        np.asarray(material.metallicRoughnessTexture, np.float32) / 255, -1, 0
+    )
     check_materials(ours, np.asarray(mesh.visual.uv), albedo, roughness, metallic)
     assert material.metallicFactor == 1 and material.roughnessFactor == 1
     # glTF's camera looks along its −z: its columns are up, backwards and the position.
