@@ -10,6 +10,7 @@ import unicodedata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import mitsuba as mi
 import numpy as np
@@ -17,7 +18,7 @@ import pytest
 
 from mi_refgs import methods
 from mi_refgs.compare import page
-from mi_refgs.data import dataset
+from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.evaluation import images, metrics
 from mi_refgs.evaluation.evaluate import evaluate, render_names
 from mi_refgs.fitting.train import Trainer
@@ -45,12 +46,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Data set `ball`, and a run fitted to it that was not exported."""
     mi.set_variant("llvm_ad_rgb")
     folder = tmp_path_factory.mktemp("evaluate")
-    write_data(folder / "ball")
-    method = methods.load(str(write_method(folder)), "quick", SETTINGS)
-    run = Run(folder / "run")
-    run.create(method, str(folder / "ball"))
-    trainer = Trainer(method, dataset.read_dataset(folder / "ball", "train"), run)
-    trainer.train()
+    data = write_data(folder / "ball")
+    method, run = methods.load(str(write_method(folder)), "quick", SETTINGS), Run(folder / "run")
+    run.create(method, str(data))
+    Trainer(method, read_dataset(data, "train"), run).train()
     return folder
 
 
@@ -60,12 +59,23 @@ def run(folder: Path, tmp_path: Path) -> Run:
     return Run(shutil.copytree(folder / "run", tmp_path / "run"))
 
 
+@pytest.fixture
+def views(folder: Path) -> Dataset:
+    """The test views."""
+    return read_dataset(folder / "ball", "test")
+
+
+@pytest.fixture
+def trainer(run: Run, folder: Path) -> Trainer:
+    """The state at the end of the fit."""
+    return Trainer(run.method(), read_dataset(folder / "ball", "train"), run)
+
+
 def test_metrics_json_has_every_key(run: Run) -> None:
     result = evaluate(run)
     assert result.keys() >= set(KEYS)
-    assert json.loads((run.path / "metrics.json").read_text()) == json.loads(
-        json.dumps(result, allow_nan=False)
-    )
+    written = json.loads((run.path / "metrics.json").read_text())
+    assert written == json.loads(json.dumps(result, allow_nan=False))
     assert result["iterations"] == 6 and result["variant"] == "tiny" and result["preset"] == "quick"
     assert 0 < result["ms_per_frame"] and result["train_seconds"] > 0
     assert 0 <= result["normal_mae_deg_full"] < result["normal_mae_deg"] <= 180
@@ -75,30 +85,24 @@ def test_metrics_json_has_every_key(run: Run) -> None:
         assert missing == bool(result[f"{key}_reason"]), key
 
 
-def test_metrics_equal_those_of_the_trainer(run: Run, folder: Path) -> None:
+def test_metrics_equal_those_of_the_trainer(run: Run, trainer: Trainer, views: Dataset) -> None:
     """Exported, read back and measured: the state of the trainer, view by view."""
-    result = evaluate(run)
-    trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
-    views = dataset.read_dataset(folder / "ball", "test")
-    scores = []
+    result, scores = evaluate(run), []
     for view in (view.load() for view in views.views):
         planes = displayed(trainer.view(view.camera()), views.background, views.is_linear_radiance)
-        image = np.stack([np.array(plane).reshape(SIZE, SIZE) for plane in planes], axis=-1)
-        scores.append(metrics.psnr(image, view.image))
+        scores.append(metrics.psnr(images.image_array(planes, SIZE, SIZE), view.image))
     assert math.isclose(result["psnr"], np.mean(scores), abs_tol=1e-4)
     assert [view["psnr"] for view in result["views"]] == pytest.approx(scores, abs=1e-4)
 
 
-def test_mitsuba_renders_the_exported_scene_like_the_trainer(run: Run, folder: Path) -> None:
+def test_mitsuba_renders_the_exported_scene_like_the_trainer(
+    run: Run, trainer: Trainer, views: Dataset
+) -> None:
     evaluate(run)
-    scene = mi.load_file(str(run.path / "scene.xml"))
-    image = np.array(mi.render(scene))
-    frame = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run).view(
-        dataset.read_dataset(folder / "ball", "test").views[0].camera()
-    )
-    planes = [*frame.radiance, frame.alpha]
-    expected = np.stack([np.array(plane).reshape(SIZE, SIZE) for plane in planes], axis=-1)
-    assert frame.alpha[SIZE * SIZE // 2 + SIZE // 2] > 0.3
+    image = np.array(mi.render(mi.load_file(str(run.path / "scene.xml"))))
+    frame = trainer.view(views.views[0].camera())
+    expected = images.image_array([*frame.radiance, frame.alpha], SIZE, SIZE)
+    assert expected[SIZE // 2, SIZE // 2, 3] > 0.3
     np.testing.assert_allclose(image, expected, atol=1e-5)
 
 
@@ -106,10 +110,9 @@ def test_missing_ground_truth_is_null_with_a_reason(run: Run, tmp_path: Path) ->
     plain = write_data(tmp_path / "plain", truth=False)
     result = evaluate(run, plain)
     assert result["dataset"] == str(plain)
-    for key in ("normal_mae_deg", "normal_mae_deg_full", "env_scale", "env_psnr"):
-        assert result[key] is None
-    assert "no true normals" in result["normal_reason"]
-    assert "environment.exr" in result["env_reason"]
+    missing = "normal_mae_deg", "normal_mae_deg_full", "env_scale", "env_psnr"
+    assert [result[key] for key in missing] == [None] * 4
+    assert "no true normals" in result["normal_reason"] and "environment.exr" in result["env_reason"]
 
 
 def test_evaluate_measures_the_scene_files(run: Run) -> None:
@@ -138,13 +141,12 @@ def test_timed_frames_have_no_aovs(run: Run, monkeypatch: pytest.MonkeyPatch) ->
     assert asked == [True] * 4 + [False] * (metrics.WARM_UP_FRAMES + metrics.TIMED_FRAMES)
 
 
-def test_export_removes_stale_mesh(run: Run, folder: Path) -> None:
+def test_export_removes_stale_mesh(run: Run, views: Dataset) -> None:
     evaluate(run)
-    camera = dataset.read_dataset(folder / "ball", "test").views[0].camera()
     state = run.load_checkpoint()
     assert state is not None
     bare = {key: value for key, value in state.items() if not key.startswith("mesh/")}
-    export(TrainedScene.from_state(run.method(), bare), run.path, camera)
+    export(TrainedScene.from_state(run.method(), bare), run.path, views.views[0].camera())
     assert not (run.path / "mesh.ply").exists()
     assert not TrainedScene.read(run.path).shading.occlusion
 
@@ -156,15 +158,12 @@ def test_evaluate_writes_sheet_and_renders(run: Run) -> None:
     assert sorted(path.name for path in (run.path / "eval").iterdir()) == ["test_r_0.png", "test_r_1.png"]
 
 
-def test_panels_show_every_map(run: Run, folder: Path) -> None:
-    trainer = Trainer(run.method(), dataset.read_dataset(folder / "ball", "train"), run)
-    views = dataset.read_dataset(folder / "ball", "test")
+def test_panels_show_every_map(trainer: Trainer, views: Dataset) -> None:
     view = views.views[0].load()
     shot = images.RenderedView.of(trainer.view(view.camera()), views, view)
     panels = images.panels(shot, view)
-    assert list(panels) == [
-        "ground truth", "render", "true normals", "normals", "albedo", "metallic", "roughness", "visibility"
-    ]  # fmt: skip
+    maps = ["albedo", "metallic", "roughness", "visibility"]
+    assert list(panels) == ["ground truth", "render", "true normals", "normals", *maps]
     for title, picture in panels.items():
         assert picture.shape == (SIZE, SIZE, 3), title
         assert 0 <= picture.min() and picture.max() <= 1, title
@@ -173,22 +172,7 @@ def test_panels_show_every_map(run: Run, folder: Path) -> None:
 
 def test_render_names_are_unique() -> None:
     """Also where file systems ignore case or compose accents; plain names stay as they are."""
-    names = [
-        "test/r_0",
-        "左",
-        "右",
-        "e\u0301",
-        "é",
-        "A",
-        "a",
-        "a",
-        "",
-        "!",
-        "x" * 300,
-        "x" * 301,
-        "b c",
-        "b/c",
-    ]
+    names = ["test/r_0", *"左右", "e\u0301", *"éAaa", "", "!", "x" * 300, "x" * 301, "b c", "b/c"]
     found = render_names([SimpleNamespace(name=name) for name in names])  # type: ignore[misc]
     assert len({unicodedata.normalize("NFC", name).casefold() for name in found}) == len(names)
     assert found[:3] == ["eval/test_r_0.png", "eval/左.png", "eval/右.png"]
@@ -208,15 +192,10 @@ def test_comparison_reads_the_image_of_each_view(
         frame |= {"file_path": f"./test/{name}"}
     (data / "transforms_test.json").write_text(json.dumps(record))
     result = evaluate(run, data)
-    images = {*(run.path / "eval").iterdir()}
-    assert len(images) == len(result["views"]) == 2
-    read: list[Path] = []
-
-    def noted(path: Path) -> np.ndarray:
-        read.append(path)
-        return read_png(path)
-
-    monkeypatch.setattr(page, "read_png", noted)
+    written = {*(run.path / "eval").iterdir()}
+    assert len(written) == len(result["views"]) == 2
+    reader = Mock(side_effect=read_png)
+    monkeypatch.setattr(page, "read_png", reader)
     scene: Any = SimpleNamespace(rows=[SimpleNamespace(runs=["run"], variant="tiny")], path=str(data))
     assert page.write_crops(tmp_path, scene, tmp_path / "crops.png") is not None
-    assert {*read} == images
+    assert {call.args[0] for call in reader.call_args_list} == written

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from pathlib import Path
 
@@ -10,12 +9,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
 from mi_refgs.fitting.ssim import ssim as training_ssim
 from mi_refgs.io.exr import write_exr
 from mi_refgs.reference import losses as reference
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from tests.helpers import refused
 
 
 def test_scores_of_selected_pixels() -> None:
@@ -26,9 +25,8 @@ def test_scores_of_selected_pixels() -> None:
     where = np.zeros((24, 20), bool)
     where[4:9, 3:15] = True
     image[~where] = 1 - image[~where]
-    assert metrics.psnr(image, truth, where) == pytest.approx(
-        -10 * np.log10(np.mean((image[4:9, 3:15] - truth[4:9, 3:15]) ** 2))
-    )
+    error = np.mean((image[4:9, 3:15] - truth[4:9, 3:15]) ** 2)
+    assert metrics.psnr(image, truth, where) == pytest.approx(-10 * np.log10(error))
     everywhere = np.ones_like(where)
     assert metrics.psnr(image, truth, everywhere) == pytest.approx(metrics.psnr(image, truth))
     assert metrics.ssim(image, truth, everywhere) == pytest.approx(metrics.ssim(image, truth), abs=1e-9)
@@ -41,8 +39,7 @@ def test_psnr(rng: np.random.Generator) -> None:
     assert metrics.psnr(truth, truth) == 100
     assert metrics.psnr(np.full((2, 2, 3), 7.0), np.ones((2, 2, 3))) == 100  # clamped to [0, 1]
     assert np.isnan(metrics.psnr(np.full_like(truth, np.nan), truth))
-    with pytest.raises(InputError, match="shapes"):
-        metrics.psnr(truth, truth[:4])
+    refused(lambda: metrics.psnr(truth, truth[:4]), "shapes")
 
 
 @pytest.mark.parametrize("size", [(16, 21), (7, 30), (1, 1)])
@@ -70,12 +67,10 @@ def test_normal_error_over_foreground_and_image() -> None:
     found = metrics.normal_mae_deg(normal, truth, alpha)
     assert found["normal_mae_deg"] == pytest.approx(15)
     assert found["normal_mae_deg_full"] == pytest.approx(60 / 8)
-    missing = metrics.normal_mae_deg(np.zeros_like(normal), truth, alpha)
-    assert missing["normal_mae_deg"] == 90
+    assert metrics.normal_mae_deg(0 * normal, truth, alpha)["normal_mae_deg"] == 90
     assert metrics.normal_mae_deg(-truth, truth, alpha)["normal_mae_deg"] == pytest.approx(180)
     assert metrics.normal_mae_deg(normal, truth, 0 * alpha) == {"normal_mae_deg": 0, "normal_mae_deg_full": 0}
-    with pytest.raises(InputError, match="normal: shapes"):
-        metrics.normal_mae_deg(normal, truth, alpha[:1])
+    refused(lambda: metrics.normal_mae_deg(normal, truth, alpha[:1]), "normal: shapes")
 
 
 def test_environment_up_to_a_scale_per_channel(rng: np.random.Generator) -> None:
@@ -111,8 +106,7 @@ def test_environment_weighs_by_solid_angle() -> None:
     pole, equator = truth.copy(), truth.copy()
     pole[0], equator[8] = 0, 0
     assert metrics.environment(pole, truth)["env_mae"] < 0.15 * metrics.environment(equator, truth)["env_mae"]
-    with pytest.raises(InputError, match="true environment: need finite"):
-        metrics.environment(truth, truth * np.nan)
+    refused(lambda: metrics.environment(truth, truth * np.nan), "true environment: need finite")
 
 
 def test_missing_extras_say_what_to_install(
@@ -125,10 +119,8 @@ def test_missing_extras_say_what_to_install(
     assert metrics.flip(image, image) == (None, "not installed: pip install 'mi_refgs[flip]'")
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("flip_evaluator") is None, reason="the extra `flip` is not installed"
-)
 def test_flip(rng: np.random.Generator) -> None:
+    pytest.importorskip("flip_evaluator", reason="the extra `flip` is not installed")
     image = rng.random((32, 32, 3))
     value, reason = metrics.flip(image, image)
     assert value == pytest.approx(0, abs=1e-6) and not reason

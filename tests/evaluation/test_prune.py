@@ -55,19 +55,17 @@ def needed(data: Dataset, rng: np.random.Generator) -> dict[str, np.ndarray]:
         turn = np.array([-normal[1], normal[0], 0, 1 + normal[2]])  # from z to the normal
         position += [0.3 * normal + x * right + y * up for x, y in grid]
         rotation += [turn / np.linalg.norm(turn)] * len(grid)
-    count = len(position)
-    colour = rng.uniform(-1, 1, (count, 3))
-    harmonics = np.hstack([colour, np.zeros((count, sh_columns(DEGREE) - 3))])
+    count, columns = len(position), sh_columns(DEGREE)
     return {
         "position": np.array(position),
         "rotation": np.array(rotation),
         "scale": np.full((count, 2), np.log(0.12)),
         "opacity": np.full((count, 1), 8.0),
-        "radiance_sh": harmonics,
+        "radiance_sh": np.pad(rng.uniform(-1, 1, (count, 3)), ((0, 0), (0, columns - 3))),
         "albedo": rng.normal(size=(count, 3)),
         "metallic": np.full((count, 1), 3.0),
         "roughness": np.full((count, 1), -3.0),
-        "indirect_sh": np.zeros((count, sh_columns(DEGREE))),
+        "indirect_sh": np.zeros((count, columns)),
     }
 
 
@@ -114,9 +112,8 @@ def test_prune_removes_exactly_the_useless_surfels(
     assert report["after"]["channels"] == widths
     assert report["before"]["ply_bytes"] > 3 * report["after"]["ply_bytes"]
     for split, count in (("train", 3), ("test", 2)):
-        assert (
-            report[split]["views"] == count and report[split]["mean"] >= report[split]["worst"] >= PRUNE_LIMIT
-        )
+        found = report[split]
+        assert found["views"] == count and found["mean"] >= found["worst"] >= PRUNE_LIMIT
     assert pruned.pruned == Pruned(whole.surfels.count, PRUNE_LIMIT, report["train"]["worst"])
     assert json.loads(json.dumps(report, allow_nan=False)) == report
 
@@ -145,8 +142,7 @@ def test_prune_keeps_visible_tracing(met: bool, train: Dataset, rng: np.random.G
 def test_prune_keeps_everything_at_a_strict_limit(train: Dataset, rng: np.random.Generator) -> None:
     raw = needed(train, rng)
     raw["radiance_sh"][:, 12:] = rng.normal(size=(len(raw["position"]), 15))
-    for name in ("albedo", "metallic", "roughness", "indirect_sh"):
-        del raw[name]
+    raw = {name: raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
     whole = scene(Surfels.from_numpy(raw), RADIANCE)
     pruned, report = prune(whole, train, limit=99.0)
     for name, values in pruned.surfels.to_numpy().items():
@@ -206,24 +202,22 @@ def test_pruned_run_reports_and_is_restored(
     assert main(["export", str(run), "--prune", "--limit", "25", "--json"]) == 0
     said = capsys.readouterr()
     report = json.loads(said.out)["pruned"]
+    whole, pruned = report["before"], report["after"]
     assert "dB, dropped" in said.err
-    assert 0 < report["after"]["surfels"] < report["before"]["surfels"]
-    assert (
-        (run / "surfels.ply").stat().st_size == report["after"]["ply_bytes"] < report["before"]["ply_bytes"]
-    )
-    assert min(report["before"]["ms_per_frame"], report["after"]["ms_per_frame"]) > 0
+    assert 0 < pruned["surfels"] < whole["surfels"]
+    assert (run / "surfels.ply").stat().st_size == pruned["ply_bytes"] < whole["ply_bytes"]
+    assert min(whole["ms_per_frame"], pruned["ms_per_frame"]) > 0
     assert "pruned: had" in (run / "scene.xml").read_text()
     changed = {path.name for path, data in before.items() if not path.is_file() or path.read_bytes() != data}
     assert changed <= {"surfels.ply", "mesh.ply", "scene.xml", "model.json"}
 
     assert main(["eval", str(run), "--json"]) == 0
     metrics = json.loads(capsys.readouterr().out)
-    assert metrics["surfels"] == report["after"]["surfels"]
-    assert metrics["pruned"] == {
-        "surfels": report["before"]["surfels"], "limit": 25.0, "psnr": report["train"]["worst"]
-    }  # fmt: skip
+    assert metrics["surfels"] == pruned["surfels"]
+    worst = report["train"]["worst"]
+    assert metrics["pruned"] == {"surfels": whole["surfels"], "limit": 25.0, "psnr": worst}
     assert main(["eval", str(run)]) == 0
-    assert f"from {report['before']['surfels']} surfels" in capsys.readouterr().out
+    assert f"from {whole['surfels']} surfels" in capsys.readouterr().out
     assert main(["render", str(run), "-o", str(tmp_path / "x.exr")]) == 0
 
     assert main(["export", str(run)]) == 0
@@ -235,7 +229,7 @@ def test_pruned_run_reports_and_is_restored(
 
 @pytest.mark.parametrize("note", [7, {}, {"surfels": 5, "limit": 50, "psnr": float("nan")}])
 def test_unreadable_prune_note_is_refused(note: object, finished: Path, tmp_path: Path) -> None:
-    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    run = shutil.copytree(finished, tmp_path / "run")
     content = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(content | {"pruned": note}))
     refused(lambda: TrainedScene.read(run), "model.json: cannot be read", "write it again with `refgs export")
@@ -254,4 +248,3 @@ def test_prune_without_checkpoints_is_refused_in_place(
     assert main(["export", str(run), "--prune", "--limit", "25", "-o", str(tmp_path / "out")]) == 0
     assert (run / "surfels.ply").read_bytes() == before
     assert (tmp_path / "out" / "surfels.ply").stat().st_size < len(before)
-    capsys.readouterr()

@@ -17,6 +17,7 @@ from mi_refgs.evaluation import surface
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference.camera import look_at
+from tests.helpers import unit
 from tests.scenes.known import CENTRES, RADII, SIZE
 
 
@@ -31,15 +32,11 @@ def truth_of(*shapes: Any) -> surface.TrueSurface:
 
 def around(count: int = 8) -> list[View]:
     """Cameras on a circle and above that look at the origin."""
-    blank = np.zeros((16, 16, 3), np.float32)
-    views = []
-    for i in range(count):
-        angle = 2 * np.pi * i / count
+    views, images = [], (np.zeros((16, 16, 3), np.float32), None, None, None)
+    for angle in 2 * np.pi * np.arange(count) / count:
         origin = 6 * np.array([np.cos(angle), np.sin(angle), np.sin(3 * angle)])
         pose = look_at(origin, np.zeros(3))
-        views.append(
-            View(f"{i}", 16, 16, 16, 16, 8, 8, pose, blank, None, None, None, is_linear_radiance=False)
-        )
+        views.append(View("", 16, 16, 16, 16, 8, 8, pose, *images, is_linear_radiance=False))
     return views
 
 
@@ -75,10 +72,8 @@ def test_distance_counts_missing_but_not_hidden_surface() -> None:
 def test_closed_cavity_counts_as_concave_error() -> None:
     """A box with a pit against the same box without: all distance is in the pit."""
     box = trimesh.creation.box((2, 2, 1)).subdivide().subdivide()
-    above = [
-        replace(v, to_world=look_at(np.array([0.1 * i, 0.3, 6]), np.zeros(3)))
-        for i, v in enumerate(around(3))
-    ]
+    poses = [look_at(np.array([0.1 * i, 0.3, 6]), np.zeros(3)) for i in range(3)]
+    above = [replace(view, to_world=pose) for view, pose in zip(around(3), poses, strict=True)]
     found = surface.surface_distance(mesh_of(box), truth_of(pitted_box()), [*around(), *above])
     assert found["surface_distance_concave"] > 4 * found["surface_distance"] > 0
     assert found["surface_completeness_concave"] > 3
@@ -103,8 +98,7 @@ def test_ambient_visibility_inside_a_cap() -> None:
         cap = sphere.copy()
         cap.update_faces(cap.triangles_center[:, 2] < height - 1)
         occluder = Occluder(mesh_of(cap))
-        down = np.array([[0, 0, -1], [0.3, 0, -0.95], [0.2, 0.2, -0.96]])
-        point = down / np.linalg.norm(down, axis=1, keepdims=True)
+        point = unit(np.array([[0, 0, -1], [0.3, 0, -0.95], [0.2, 0.2, -0.96]]))
         inside = surface.ambient_visibility(occluder, mi.Point3f(point.T * 0.999), mi.Vector3f(-point.T))
         np.testing.assert_allclose(inside.numpy(), 1 - height / 2, atol=0.04)
         outside = surface.ambient_visibility(occluder, mi.Point3f(point.T * 1.001), mi.Vector3f(point.T))
@@ -117,10 +111,10 @@ def test_concave_pixels_are_between_the_balls(known: Path) -> None:
     for view in (view.load() for view in read_dataset(known / "data", "test").views):
         concave = truth.concave(view)
         assert concave is not None and view.depth is not None
-        assert not concave[view.depth == 0].any() and 0.02 < concave[view.depth > 0].mean() < 0.4
+        hit = view.depth > 0
+        assert not concave[~hit].any() and 0.02 < concave[hit].mean() < 0.4
         rays = np.array(view.camera().rays()).T.reshape(SIZE, SIZE, 3)
         point = view.to_world[:3, 3] + rays * view.depth[..., None]
         gap = np.abs(np.linalg.norm(point[..., None, :] - CENTRES, axis=-1) - RADII).max(axis=-1)
-        hit = view.depth > 0
         assert gap[concave].mean() < 0.7 * gap[hit & ~concave].mean()
         assert truth.concave(replace(view, depth=None)) is None
