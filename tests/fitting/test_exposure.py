@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, MAX_GAIN, fitted_gain, log_exposure
 from mi_refgs.errors import InputError
@@ -29,7 +28,7 @@ from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.run import Run
 from mi_refgs.splat import Camera
 from tests.fitting.image_checks import HEIGHT, STEP, WIDTH, planes
-from tests.scenes.highlight import METHOD, ball, run_folder
+from tests.scenes.highlight import ball, run_folder, small_method
 
 BACKGROUND = np.array([1.0, 0.5, 0.25], np.float32)
 GAINS = np.array([1.4, 0.7, 0.9])
@@ -151,9 +150,7 @@ def exposed(data: Dataset, log: np.ndarray) -> Dataset:
 @pytest.fixture
 def method(tmp_path: Path) -> Method:
     """Without refinement, so that a few dozen steps settle."""
-    path = tmp_path / "small.toml"
-    path.write_text(METHOD)
-    small = methods.load_resolved(path)
+    small = small_method(tmp_path)
     rates = dataclasses.replace(small.rates, channel={"albedo": 0.1, "radiance_sh": 0.1, "opacity": 0.2})
     options = ExposureOptions(after=DECIDED, rate=3e-3)
     return dataclasses.replace(

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
-from tests.scenes.highlight import METHOD, ball
+from tests.scenes.highlight import ball, small_method
 
 STEPS = 14
 """Into the deferred stage, with the first mesh, a reset and two rounds of densifying."""
@@ -55,8 +54,7 @@ CASES: dict[str, Callable[[], Dataset]] = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_fit_stays_finite(name: str, tmp_path: Path) -> None:
-    (tmp_path / "small.toml").write_text(METHOD)
-    method = dataclasses.replace(methods.load_resolved(tmp_path / "small.toml"), iterations=STEPS)
+    method = dataclasses.replace(small_method(tmp_path), iterations=STEPS)
     trainer = Trainer(method, CASES[name]())
     trainer.train()
     assert trainer.iteration == STEPS and trainer.health.skipped == 0 and not trainer.notices
@@ -68,13 +66,9 @@ def test_fit_stays_finite(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "data",
-    [
-        changed(lambda view: {"alpha": np.zeros((24, 24), np.float32)}),
-        changed(lambda view: {}, views=1),
-    ],
+    [changed(lambda view: {"alpha": np.zeros((24, 24), np.float32)}), changed(lambda view: {}, views=1)],
     ids=["nothing but background", "one view"],
 )
 def test_what_cannot_be_begun_is_one_sentence(data: Dataset, tmp_path: Path) -> None:
-    (tmp_path / "small.toml").write_text(METHOD)
     with pytest.raises(InputError, match=r"^\w+: [^.]*; [^.]*$"):
-        Trainer(methods.load_resolved(tmp_path / "small.toml"), data)
+        Trainer(small_method(tmp_path), data)

@@ -19,14 +19,12 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method
 from mi_refgs.surfels.primitives.surfel import Surfel
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.highlight import METHOD, ball, run_folder
+from tests.scenes.highlight import ball, run_folder, small_method
 
 
 @pytest.fixture
 def method(tmp_path: Path) -> Method:
-    path = tmp_path / "small.toml"
-    path.write_text(METHOD)
-    return methods.load_resolved(path)
+    return small_method(tmp_path)
 
 
 def spoil_gradient(monkeypatch: pytest.MonkeyPatch, name: str, rows: list[int], views: set[int]) -> None:

@@ -13,6 +13,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting.optim import Adam, Group
 from mi_refgs.reference import losses as reference
 
+GROUP = Group(0.1)
+
 
 def tensor(values: np.ndarray | float) -> Any:
     return mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
@@ -20,6 +22,19 @@ def tensor(values: np.ndarray | float) -> Any:
 
 def give(optimiser: Adam, name: str, gradient: np.ndarray | float) -> None:
     dr.set_grad(optimiser.params[name], tensor(gradient))
+
+
+def advance(optimiser: Adam, number: int, loss: Any = None, **gradients: np.ndarray) -> None:
+    """One step with these gradients."""
+    for name, gradient in gradients.items():
+        give(optimiser, name, gradient)
+    optimiser.step(number, loss)
+
+
+def adam(values: np.ndarray, group: Group = GROUP) -> tuple[dict[str, Any], Adam]:
+    """One tensor "x" and its optimiser."""
+    params = {"x": tensor(values)}
+    return params, Adam(params, {"x": group})
 
 
 def test_group_rates() -> None:
@@ -40,9 +55,7 @@ def test_equals_published_algorithm(rng: np.random.Generator) -> None:
         name: [1e-7 * rng.normal(size=values.shape) for _ in range(10)] for name, values in start.items()
     }
     for step in range(10):
-        for name in start:
-            give(optimiser, name, gradients[name][step])
-        optimiser.step(step)
+        advance(optimiser, step, **{name: found[step] for name, found in gradients.items()})
     columns = np.where(np.arange(12) < 3, 1, 1 / 20)
     rates = {
         "position": [1e-2 * 100 ** (-step / 10) for step in range(10)],
@@ -70,12 +83,11 @@ def test_equals_drjit_on_quadratic(rng: np.random.Generator) -> None:
 
 
 def test_gradients_are_cleared_and_tensor_without_one_rests() -> None:
-    params = {"x": tensor(np.ones((2, 1))), "idle": tensor(np.ones((2, 1)))}
-    optimiser = Adam(params, {"x": Group(0.1)})
+    params, optimiser = adam(np.ones((2, 1)))
+    params["idle"] = tensor(np.ones((2, 1)))
     optimiser.step(0)
     assert np.all(params["x"].numpy() == 1)
-    give(optimiser, "x", np.ones((2, 1)))
-    optimiser.step(1)
+    advance(optimiser, 1, x=np.ones((2, 1)))
     assert np.all(dr.grad(params["x"]).numpy() == 0) and np.all(params["x"].numpy() < 1)
     assert np.all(params["idle"].numpy() == 1)
     before, moved = optimiser.state_dict(), params["x"].numpy()
@@ -109,12 +121,9 @@ def test_step_that_is_not_finite_changes_nothing_and_is_reported(bad: float, whe
             gradient[0, 0], gradient[3, 1] = bad, bad
         elif spoilt:
             loss = bad
-        give(optimiser, "x", gradient)
-        give(optimiser, "y", np.ones((3, 1)))
         harmonics = np.ones((4, 12))
         harmonics[2, 1] = bad if spoilt and where == "gradient" else 1
-        give(optimiser, "sh", harmonics)
-        optimiser.step(iteration, mi.Float(loss))
+        advance(optimiser, iteration, mi.Float(loss), x=gradient, y=np.ones((3, 1)), sh=harmonics)
 
     step(10, False)
     assert optimiser.report().count == 0
@@ -140,8 +149,7 @@ def test_harmonic_that_is_not_finite_alone_does_no_harm() -> None:
     optimiser = Adam(params, {"sh": Group(0.1, head=3, tail=0.05)})
     gradient = np.ones((4, 12))
     gradient[2, 7] = np.inf
-    give(optimiser, "sh", gradient)
-    optimiser.step(0)
+    advance(optimiser, 0, sh=gradient)
     moved = params["sh"].numpy() != 0
     np.testing.assert_array_equal(moved, np.isfinite(gradient))
 
@@ -154,15 +162,13 @@ def test_one_huge_gradient_slows_its_entry_but_does_not_stop_it(huge: float, at:
     With plain Adam it would not move by a thousandth in a thousand steps.
     """
     rng, rate, after = np.random.default_rng(1), 1e-3, 300
-    params = {"x": tensor(np.zeros((300, 1)))}
-    optimiser = Adam(params, {"x": Group(rate)})
+    params, optimiser = adam(np.zeros((300, 1)), Group(rate))
     positions = {}
     for step in range(at + 1 + after):
         usual = 1e-7 * (0.5 + np.abs(rng.normal(size=(300, 1))))
         if step == at:
             usual[7] = huge
-        give(optimiser, "x", usual)
-        optimiser.step(step)
+        advance(optimiser, step, x=usual)
         if step in (at, at + 100, at + after):
             positions[step - at] = np.array(params["x"].numpy())[:, 0]
     assert all(np.all(np.isfinite(x)) for x in positions.values()) and optimiser.report().count == 0
@@ -175,11 +181,9 @@ def test_one_huge_gradient_slows_its_entry_but_does_not_stop_it(huge: float, at:
 @pytest.mark.parametrize("before", [0.0, 1e25])
 def test_gradients_whose_square_is_no_float32_leave_finite_moments(before: float) -> None:
     """A checkpoint with an infinite moment could not be resumed."""
-    params = {"x": tensor(np.zeros((5, 2)))}
-    optimiser = Adam(params, {"x": Group(0.1)})
+    params, optimiser = adam(np.zeros((5, 2)))
     for step, gradient in enumerate((before, 0.0, 1e25, 1e25)):
-        give(optimiser, "x", np.full((5, 2), gradient))
-        optimiser.step(step)
+        advance(optimiser, step, x=np.full((5, 2), gradient))
     assert all(np.all(np.isfinite(x)) for x in optimiser.state_dict().values())
     assert np.all(params["x"].numpy() < 0) and optimiser.report().count == 0
 
@@ -187,14 +191,12 @@ def test_gradients_whose_square_is_no_float32_leave_finite_moments(before: float
 def test_ordinary_fit_is_not_cut(rng: np.random.Generator) -> None:
     """Gradients that vary by a factor of 50 from step to step, rows that are seldom seen, and a reset."""
     shape, spread = (400, 3), np.exp(0.5 * rng.normal(size=(400, 3)))
-    params = {"x": tensor(np.zeros(shape))}
-    optimiser = Adam(params, {"x": Group(1e-2)})
+    params, optimiser = adam(np.zeros(shape), Group(1e-2))
     wanted, m, v = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for step in range(120):
         seen = rng.uniform(size=(400, 1)) < (0.1 if step > 60 else 0.7)
         g = (1e-7 * spread * seen * np.exp(rng.uniform(-2, 2, shape)) * rng.normal(size=shape)).astype("f4")
-        give(optimiser, "x", g)
-        optimiser.step(step)
+        advance(optimiser, step, x=g)
         m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g.astype(np.float64) ** 2
         wanted -= 1e-2 * np.sqrt(1 - 0.999 ** (step + 1)) / (1 - 0.9 ** (step + 1)) * m / (np.sqrt(v) + 1e-15)
         if step == 80:
@@ -207,20 +209,15 @@ def test_moments_follow_their_rows(rng: np.random.Generator) -> None:
     """Permuting, cloning and pruning rows commutes with stepping; fresh rows start as a new optimiser
     would."""
     start, g1, g2 = (rng.normal(size=(5, 3)) for _ in range(3))
-    whole = Adam({"x": tensor(start)}, {"x": Group(0.01)})
-    give(whole, "x", g1)
-    whole.step(0)
+    (_, whole), (_, moved) = (adam(start, Group(0.01)) for _ in range(2))
+    for optimiser in (whole, moved):
+        advance(optimiser, 0, x=g1)
     middle = whole.params["x"].numpy()
     parent = np.array([4, 1, 1, 0])
-    moved = Adam({"x": tensor(start)}, {"x": Group(0.01)})
-    give(moved, "x", g1)
-    moved.step(0)
     moved.params["x"] = tensor(middle[parent])
     moved.gather(mi.UInt32(parent), ["x", "unknown"], fresh=mi.Bool(False, False, True, False))
-    give(whole, "x", g2)
-    whole.step(1)
-    give(moved, "x", g2[parent])
-    moved.step(1)
+    advance(whole, 1, x=g2)
+    advance(moved, 1, x=g2[parent])
     found, wanted = moved.params["x"].numpy(), whole.params["x"].numpy()[parent]
     np.testing.assert_array_equal(found[[0, 1, 3]], wanted[[0, 1, 3]])
     # A row without history: m = 0.1 g, v = 0.001 g², at the step count 2 of its tensor.
@@ -229,8 +226,7 @@ def test_moments_follow_their_rows(rng: np.random.Generator) -> None:
 
 
 def test_gather_to_nothing_and_back() -> None:
-    params = {"x": tensor(np.ones((3, 2)))}
-    optimiser = Adam(params, {"x": Group(0.1)})
+    params, optimiser = adam(np.ones((3, 2)))
     params["x"] = dr.zeros(mi.TensorXf, (0, 2))
     optimiser.gather(mi.UInt32(), ["x"], fresh=mi.Bool())
     optimiser.step(0)
@@ -238,25 +234,20 @@ def test_gather_to_nothing_and_back() -> None:
 
 
 def test_reset_clears_moments_and_keeps_count() -> None:
-    params = {"x": tensor(np.zeros((3, 2)))}
-    optimiser = Adam(params, {"x": Group(0.1)})
-    give(optimiser, "x", np.ones((3, 2)))
-    optimiser.step(0)
+    _, optimiser = adam(np.zeros((3, 2)))
+    advance(optimiser, 0, x=np.ones((3, 2)))
     optimiser.reset("x")
     state = optimiser.state_dict()
     assert not state["x/first"].any() and not state["x/second"].any() and state["x/steps"] == 1
 
 
 def test_factor_freezes_tensor() -> None:
-    params = {"x": tensor(np.zeros((2, 1)))}
-    optimiser = Adam(params, {"x": Group(0.1)})
+    params, optimiser = adam(np.zeros((2, 1)))
     optimiser.set_factor("x", 0.0)
-    give(optimiser, "x", np.ones((2, 1)))
-    optimiser.step(0)
+    advance(optimiser, 0, x=np.ones((2, 1)))
     assert np.all(params["x"].numpy() == 0) and np.all(optimiser.state_dict()["x/first"] != 0)
     optimiser.set_factor("x", 1.0)
-    give(optimiser, "x", np.ones((2, 1)))
-    optimiser.step(1)
+    advance(optimiser, 1, x=np.ones((2, 1)))
     assert np.all(params["x"].numpy() < 0)
 
 
@@ -265,8 +256,7 @@ def test_resume_is_bitwise(rng: np.random.Generator) -> None:
 
     def steps(optimiser: Adam, numbers: range) -> None:
         for number in numbers:
-            give(optimiser, "x", gradients[number])
-            optimiser.step(number)
+            advance(optimiser, number, x=gradients[number])
 
     groups = {"x": Group(0.01, 0.001, 6)}
     straight = Adam({"x": tensor(np.ones((9, 2)))}, groups)
@@ -317,23 +307,19 @@ def test_steps_compile_nothing_after_second(rng: np.random.Generator) -> None:
 def test_factors_of_stage() -> None:
     """They multiply the rate beside those that `set_factor` sets; 0 keeps a tensor still."""
     params = {"x": tensor(np.zeros((2, 1))), "y": tensor(np.zeros((2, 1)))}
-    optimiser = Adam(params, {"x": Group(0.1), "y": Group(0.1)})
+    optimiser = Adam(params, dict.fromkeys(params, GROUP))
     optimiser.set_factor("x", 0.5)
     optimiser.stage = {"x": 0.2, "y": 0.0}
     assert optimiser.rate("x", 0) == pytest.approx(0.01)
-    for name in params:
-        give(optimiser, name, np.ones((2, 1)))
-    optimiser.step(0)
+    advance(optimiser, 0, x=np.ones((2, 1)), y=np.ones((2, 1)))
     assert np.allclose(params["x"].numpy(), -0.01, rtol=1e-3) and np.all(params["y"].numpy() == 0)
 
 
 def test_relative_rate_scales_lamps() -> None:
     """A relative group: what is above 1 moves by the rate times itself, what is below by the rate."""
     start = np.array([[-3.0], [0.5], [1.0], [4.0], [50.0]])
-    params = {"x": tensor(start)}
-    optimiser = Adam(params, {"x": Group(0.1, relative=True)})
-    give(optimiser, "x", -np.ones((5, 1)))
-    optimiser.step(0)
+    params, optimiser = adam(start, Group(0.1, relative=True))
+    advance(optimiser, 0, x=-np.ones((5, 1)))
     moved = params["x"].numpy() - start
     np.testing.assert_allclose(moved, 0.1 * np.maximum(start, 1), rtol=1e-3)
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.data.images import ImageFile
 from mi_refgs.fitting import cost_model, plan
@@ -18,7 +17,7 @@ from mi_refgs.kernels import memory
 from mi_refgs.methods.method import CoarseImages, DataOptions, Method, Rates, SurroundingsOptions
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.splat import Camera
-from tests.scenes.highlight import METHOD
+from tests.scenes.highlight import small_method
 from tests.scenes.tiny import write_data
 
 SPEED = cost_model.Speed({"initial": [1.0, 5.0], "deferred": [2.0, 10.0]}, 3.0, 0.5)
@@ -28,9 +27,7 @@ SPEED = cost_model.Speed({"initial": [1.0, 5.0], "deferred": [2.0, 10.0]}, 3.0, 
 @pytest.fixture
 def method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Method:
     monkeypatch.setattr(cost_model, "SIZES", (10, 20))
-    path = tmp_path / "small.toml"
-    path.write_text(METHOD)
-    return dataclasses.replace(methods.load_resolved(path), data=DataOptions())
+    return dataclasses.replace(small_method(tmp_path), data=DataOptions())
 
 
 def test_estimate_is_sum_of_stages(method: Method) -> None:

@@ -23,14 +23,12 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import DataOptions, Method, Rates
 from mi_refgs.runs.interrupt import TerminatedError, held_interrupts
 from mi_refgs.runs.run import Run
-from tests.scenes.highlight import METHOD, SIZE, ball, run_folder
+from tests.scenes.highlight import SIZE, ball, run_folder, small_method
 
 
 @pytest.fixture
 def method(tmp_path: Path) -> Method:
-    path = tmp_path / "small.toml"
-    path.write_text(METHOD)
-    return methods.load_resolved(path)
+    return small_method(tmp_path)
 
 
 def test_loss_falls_and_everything_trains(method: Method) -> None:
@@ -44,7 +42,7 @@ def test_loss_falls_and_everything_trains(method: Method) -> None:
         losses.append(float(trainer.loss[0]))
     assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:6])
     assert trainer.fit.optimiser.report().count == 0
-    for name, tensor in trainer.params.items():  # the indirect channel starts at exactly 0 and must leave it
+    for name, tensor in trainer.params.items():  # indirect_sh starts at exactly 0 and must leave it
         assert np.all(np.isfinite(tensor.numpy())), name
         assert not np.array_equal(before[name], tensor.numpy()), name
 
@@ -164,11 +162,28 @@ def test_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: Pa
     assert Trainer(method, ball(), run).iteration == 10
 
 
-@pytest.mark.parametrize(("number", "raised"), [("SIGINT", KeyboardInterrupt), ("SIGTERM", TerminatedError)])
+def send_in_iteration_7(monkeypatch: pytest.MonkeyPatch, *numbers: signal.Signals) -> list[int]:
+    """Send this process signals before the refinement of iteration 7; returns whether all were held."""
+    refine, held = AdaptiveControl.refine, []
+
+    def interrupted_refine(control: AdaptiveControl, iteration: int) -> None:
+        if iteration == 7:
+            for number in numbers:
+                os.kill(os.getpid(), number)
+            held.append(iteration)
+        refine(control, iteration)
+
+    monkeypatch.setattr(AdaptiveControl, "refine", interrupted_refine)
+    return held
+
+
+@pytest.mark.parametrize(
+    ("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, TerminatedError)]
+)
+@pytest.mark.usefixtures("heard_interrupts")
 def test_signal_waits_for_step_in_hand(
-    number: str,
+    number: signal.Signals,
     raised: type[KeyboardInterrupt],
-    heard_interrupts: None,
     method: Method,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -176,18 +191,11 @@ def test_signal_waits_for_step_in_hand(
     """A signal inside iteration 7, before its refinement: the checkpoint contains the whole iteration."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
-    refine = AdaptiveControl.refine
-
-    def interrupted_refine(control: AdaptiveControl, iteration: int) -> None:
-        if iteration == 7:
-            os.kill(os.getpid(), signal.Signals[number])
-        refine(control, iteration)
-
-    monkeypatch.setattr(AdaptiveControl, "refine", interrupted_refine)
-    before = signal.getsignal(signal.Signals[number])
+    send_in_iteration_7(monkeypatch, number)
+    before = signal.getsignal(number)
     with pytest.raises(KeyboardInterrupt) as caught:
         trainer.train()
-    assert caught.type is raised and signal.getsignal(signal.Signals[number]) is before
+    assert caught.type is raised and signal.getsignal(number) is before
     state = run.load_checkpoint()
     assert state is not None and int(state["iteration"]) == 7
     for name, value in trainer.state().items():
@@ -200,20 +208,11 @@ def test_second_signal_is_not_held(
     """Twice within iteration 7, which ends it there; what was saved before is whole."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
-    refine, after = AdaptiveControl.refine, []
-
-    def interrupted_refine(control: AdaptiveControl, iteration: int) -> None:
-        if iteration == 7:
-            os.kill(os.getpid(), signal.SIGTERM)
-            os.kill(os.getpid(), signal.SIGINT)
-            after.append(iteration)
-        refine(control, iteration)
-
-    monkeypatch.setattr(AdaptiveControl, "refine", interrupted_refine)
+    held = send_in_iteration_7(monkeypatch, signal.SIGTERM, signal.SIGINT)
     with pytest.raises(TerminatedError):
         trainer.train()
     state = run.load_checkpoint()
-    assert not after and state is not None and int(state["iteration"]) == 5
+    assert not held and state is not None and int(state["iteration"]) == 5
 
 
 def test_signal_that_was_ignored_stays_ignored() -> None:
