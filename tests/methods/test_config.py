@@ -22,6 +22,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.build import scaled
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import refused
 from tests.scenes.highlight import ball
 
 
@@ -141,11 +142,11 @@ propagate = { when = { start = 0, until = 2_601, every = 650 } }
 
 
 EVENTS = {
-    "ref_gaussian": {"degree": 2, "densify": 14, "reset_opacity": 2, "mesh": 8},
-    "ref_gaussian_paper": {"degree": 3, "densify": 48, "reset_opacity": 8, "propagate_normals": 16}
-    | {"mesh": 16, "restart": 1},
-    "many": {"degree": 3, "densify": 22, "reset_opacity": 4, "propagate_normals": 4, "mesh": 7}
-    | {"restart": 1},
+    "ref_gaussian": dict(degree=2, densify=14, reset_opacity=2, mesh=8),
+    "ref_gaussian_paper": dict(
+        degree=3, densify=48, reset_opacity=8, propagate_normals=16, mesh=16, restart=1
+    ),
+    "many": dict(degree=3, densify=22, reset_opacity=4, propagate_normals=4, mesh=7, restart=1),
 }
 """Numbers of events that differ between methods."""
 
@@ -185,55 +186,41 @@ def test_every_preset_has_the_same_events_in_the_same_order(
             trainer.step()
             done += ["degree"] * (trainer.setup.schedule.sh_degree(trainer.iteration) - degree)
         sequences[preset] = list(done)
-    counts = {name: Counter(done) for name, done in sequences.items()}
-    assert counts["quick"] == counts["standard"] == counts["paper"], counts
     assert sequences["quick"] == sequences["standard"] == sequences["paper"]
-    assert counts["quick"] == EVENTS[variant]
+    assert Counter(sequences["quick"]) == EVENTS[variant]
 
 
 def test_assignments_are_applied_unscaled() -> None:
-    method = methods.load(
-        "ref_gaussian", "quick", ["loss.ssim=0.3", "mesh.resolution=64", "refine.densify.until=7"]
-    )
+    changes = ["loss.ssim=0.3", "mesh.resolution=64", "refine.densify.until=7"]
+    method = methods.load("ref_gaussian", "quick", changes)
     assert method.mesh is not None and method.refine.densify is not None
     assert (method.loss.ssim, method.mesh.resolution, method.refine.densify.until) == (0.3, 64, 7)
+
+
+STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        (f"{STAGE}[loss]\nsim = 1", ["loss", "unknown key 'sim'"]),
+        ("iterations = 10\n[stage.a]\nuntil = 'x'", ["until", "expected int"]),
+        (f"{STAGE}at = 'voxel'", ["'voxel' is not allowed", "surfel"]),
+        ("iterations = 10", ["missing key 'stage'"]),
+        ("[stage.a]\nuntil = 10", ["missing key 'iterations'"]),
+        ("iterations = [", ["not valid TOML"]),
         (
-            "iterations = 10\n[stage.a]\nuntil = 10\n[loss]\nsim = 1",
-            ["own.toml", "loss", "unknown key 'sim'"],
+            f"{STAGE}[refine]\nreset = {{start = 0, until = 9, every = 0}}",
+            ["refine: reset", "'every' above 0"],
         ),
-        ("iterations = 10\n[stage.a]\nuntil = 'x'", ["own.toml", "until", "expected int"]),
-        (
-            "iterations = 10\n[stage.a]\nuntil = 10\nat = 'voxel'",
-            ["own.toml", "'voxel' is not allowed", "surfel"],
-        ),
-        ("iterations = 10", ["own.toml", "missing key 'stage'"]),
-        ("[stage.a]\nuntil = 10", ["own.toml", "missing key 'iterations'"]),
-        ("iterations = [", ["own.toml", "not valid TOML"]),
-        (
-            "iterations = 10\n[stage.a]\nuntil = 10\n[refine]\nreset = {start = 0, until = 9, every = 0}",
-            ["own.toml", "refine: reset", "'every' above 0"],
-        ),
-        (
-            "iterations = 10\n[stage.a]\nuntil = 10\n[data]\ncoarse = [{ until = 5, block = 1 }]",
-            ["own.toml", "data.coarse.block: 1", "2 or more"],
-        ),
-        (
-            "iterations = 10\n[stage.a]\nuntil = 10\n[light]\nevery = 0",
-            ["own.toml", "light.every: 0", "1 or more"],
-        ),
+        (f"{STAGE}[data]\ncoarse = [{{until = 5, block = 1}}]", ["data.coarse.block: 1", "2 or more"]),
+        (f"{STAGE}[light]\nevery = 0", ["light.every: 0", "1 or more"]),
     ],
 )
 def test_bad_files_are_named(text: str, words: list[str], tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     path.write_text(text)
-    with pytest.raises(InputError) as error:
-        methods.load(str(path))
-    assert all(word in str(error.value) for word in words), error.value
+    refused(lambda: methods.load(str(path)), "own.toml", *words)
 
 
 @pytest.mark.parametrize("assignment", ["loss.sim=1", "loss", "iterations.x=1"])
@@ -255,7 +242,7 @@ def test_extends_changes_only_what_it_says(tmp_path: Path) -> None:
     base, changed = methods.load("ref_gaussian"), methods.load(str(child))
     assert changed.loss == dataclasses.replace(base.loss, ssim=0.5)
     assert dataclasses.replace(changed, loss=base.loss, name=base.name, file=base.file) == base
-    assert Path(child).stem == changed.name
+    assert changed.name == "child"
 
 
 @pytest.mark.parametrize("base", methods.names())
@@ -290,9 +277,7 @@ def test_wrong_extends_are_named(text: str, words: list[str], tmp_path: Path) ->
     (tmp_path / "own.toml").write_text(text + "\n")
     (tmp_path / "other.toml").write_text('extends = "own.toml"\n')
     (tmp_path / "wrong.toml").write_text("[")
-    with pytest.raises(InputError) as error:
-        methods.load(str(tmp_path / "own.toml"))
-    assert all(word in str(error.value) for word in words), error.value
+    refused(lambda: methods.load(str(tmp_path / "own.toml")), *words)
 
 
 def test_an_unknown_primitive_is_refused() -> None:

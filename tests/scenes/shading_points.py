@@ -9,7 +9,8 @@ import numpy as np
 
 from mi_refgs.reference import shade as reference
 from mi_refgs.shade import brdf
-from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
 from tests.helpers import unit
 
@@ -46,8 +47,15 @@ def points_of(values: dict[str, Any]) -> ShadingPoints:
     return ShadingPoints(**arrays)
 
 
-def exact_terms(values: dict[str, Any], levels: list[np.ndarray], diffuse: str, k: int) -> np.ndarray:
-    one: dict[str, Any] = {name: None if x is None else x[k] for name, x in values.items()}
-    return reference.shade(
-        brdf.table().astype(np.float64), levels, lobe_matrices.LEVEL_ROUGHNESS, diffuse=diffuse, **one
-    )
+def exact_shade(levels: list[np.ndarray], **values: Any) -> np.ndarray:
+    """Terms (3, 3) of one point by `reference.shade`, with the table and the levels of the program."""
+    return reference.shade(brdf.table().astype(np.float64), levels, LEVEL_ROUGHNESS, **values)
+
+
+def exact_terms(
+    values: dict[str, Any], levels: list[np.ndarray], options: ShadingOptions, k: int
+) -> np.ndarray:
+    """Terms (3, 3) of point k."""
+    chosen = {name: getattr(options, name) for name in ("diffuse", "dominant", "multiscatter")}
+    one = {name: None if x is None else x[k] for name, x in values.items()}
+    return exact_shade(levels, **chosen, **one)

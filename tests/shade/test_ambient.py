@@ -17,18 +17,19 @@ from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
 from mi_refgs.reference import shade as reference
 from mi_refgs.reference.occlusion import ambient as exact
 from mi_refgs.render.pipeline import SurfelScene, render
-from mi_refgs.shade import ambient, brdf
+from mi_refgs.shade import ambient
 from mi_refgs.shade.ggx_sampling import lobe_turn
-from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflection import TraceContext
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import level_maps, unit
+from tests.helpers import level_maps, unit, vector
 from tests.scenes.corner import VOXEL, corner, gradient_sky, wall_surfels
 from tests.scenes.integrator import HEIGHT, WIDTH, hollow_mesh, plane_mesh, raw_channels, sensor, sky
+from tests.scenes.shading_points import exact_shade
 
 RAYS = 12
 LOGIT: dict[str, Any] = {"albedo": (1.0, 0.0, -1.0), "metallic": -0.5, "roughness": 0.2}
@@ -52,49 +53,37 @@ def directions(normals: np.ndarray, rays: int) -> np.ndarray:
     )
 
 
+def with_ratios(mesh: Mesh, surfels: Surfels, light: PrefilteredLight, rays: int = 9) -> Any:
+    """An occluder that has its ambient ratios."""
+    occluder = Occluder(mesh)
+    ambient.update_occluder_caches(occluder, surfels, light, ShadingOptions(ambient_rays=rays))
+    return occluder
+
+
 def test_ratios_against_rays_one_by_one() -> None:
     """With shadows of a light that is not the same from everywhere, and two bounces."""
     mesh, surfels = parted_corner(), wall_surfels(metallic=LOGIT["metallic"], roughness=LOGIT["roughness"])
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
-    occluder = Occluder(mesh)
-    ambient.update_occluder_caches(occluder, surfels, light, ShadingOptions(ambient_rays=RAYS))
-    assert occluder.ambient is not None
+    occluder = with_ratios(mesh, surfels, light, RAYS)
     found = occluder.ambient.numpy()
 
-    levels, table = level_maps(light), brdf.table().astype(np.float64)
+    levels = level_maps(light)
     normals = occluder.surface(surfels).vertex_surfels.normal.numpy().T.astype(np.float64)
     share = {name: 1 / (1 + np.exp(-np.array(value))) for name, value in LOGIT.items()}
 
     def outgoing(normal: np.ndarray, view: np.ndarray, free: bool, ratio: np.ndarray) -> np.ndarray:
-        terms = reference.shade(
-            table,
-            levels,
-            LEVEL_ROUGHNESS,
-            normal=normal,
-            view=view,
-            **share,
-            radiance=np.zeros(3),
-            visibility=float(free),
-            indirect=None,
-            diffuse="irradiance",
-            ambient=ratio,
-        )
+        lit = {"radiance": np.zeros(3), "visibility": float(free), "indirect": None, "ambient": ratio}
+        terms = exact_shade(levels, normal=normal, view=view, diffuse="irradiance", **lit, **share)
         return np.asarray(terms.sum(0))
 
-    blur = ambient.ray_roughness(RAYS)
+    def sky(ω: np.ndarray) -> np.ndarray:
+        return reference.specular(levels, LEVEL_ROUGHNESS, ω, ambient.ray_roughness(RAYS))
+
+    rays = directions(normals, RAYS).astype(np.float64)
+    shape = (mesh.vertices.astype(np.float64), mesh.faces.astype(int), normals, rays)
+    limits: dict[str, Any] = {"offset": OFFSET_VOXELS * VOXEL, "brightest": ambient.BRIGHTEST}
     expected, once = (
-        exact(
-            mesh.vertices.astype(np.float64),
-            mesh.faces.astype(int),
-            normals,
-            directions(normals, RAYS).astype(np.float64),
-            lambda ω: reference.specular(levels, LEVEL_ROUGHNESS, ω, blur),
-            outgoing,
-            offset=OFFSET_VOXELS * VOXEL,
-            bounces=bounces,
-            brightest=ambient.BRIGHTEST,
-        )
-        for bounces in (ambient.BOUNCES, 1)
+        exact(*shape, sky, outgoing, bounces=bounces, **limits) for bounces in (ambient.BOUNCES, 1)
     )
     assert np.abs(once - expected).max() > 5e-3
     assert found.min() < 0.9 and np.ptp(found, axis=1).max() > 0.05
@@ -106,11 +95,7 @@ def test_ratios_against_rays_one_by_one() -> None:
 def test_a_white_furnace_stays_white() -> None:
     """Between two plates of albedo 1 nothing is lost: what is blocked comes back from the other plate."""
     mesh, surfels = parted_corner(), wall_surfels(albedo=np.full((400, 3), 9.0), metallic=-9.0, roughness=3.0)
-    occluder = Occluder(mesh)
-    ambient.update_occluder_caches(
-        occluder, surfels, EnvironmentLight.constant(1.0, 8).prefilter(), ShadingOptions(ambient_rays=9)
-    )
-    assert occluder.ambient is not None
+    occluder = with_ratios(mesh, surfels, EnvironmentLight.constant(1.0, 8).prefilter())
     np.testing.assert_allclose(occluder.ambient.numpy(), 1, atol=1e-3)
 
 
@@ -132,21 +117,15 @@ def test_one_ray_stands_for_its_part_of_the_hemisphere() -> None:
         assert 4 * ambient.ray_roughness(rays) ** 4 * rays == pytest.approx(1)
 
 
-def ball() -> Mesh:
-    shape = trimesh.creation.icosphere(subdivisions=2, radius=0.7)
-    return Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.uint32), 0.02)
-
-
 def test_what_is_convex_gets_all_light() -> None:
     """Whatever the light; and where the pixel's ray misses the mesh too."""
     raw = raw_channels(4000)
     x, y, z = raw["position"].T
     raw["rotation"] = np.stack([-y, x, 0 * x, 1 + z], 1)  # without noise
-    occluder, surfels = Occluder(ball()), Surfels.from_numpy(raw)
-    ambient.update_occluder_caches(
-        occluder, surfels, EnvironmentLight.from_radiance(sky()).prefilter(), ShadingOptions(ambient_rays=9)
-    )
-    assert occluder.ambient is not None
+    shape = trimesh.creation.icosphere(subdivisions=2, radius=0.7)
+    ball = Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.uint32), 0.02)
+    surfels = Surfels.from_numpy(raw)
+    occluder = with_ratios(ball, surfels, EnvironmentLight.from_radiance(sky()).prefilter())
     np.testing.assert_allclose(occluder.ambient.numpy(), 1, atol=1e-6)
     origin, ray = mi.Point3f(0, 0, 3), mi.Vector3f([0.0, 0.4, 0.1], [0.0, 0.4, 0], [-1.0, -1, -2])
     ratio = ambient.ambient_of_pixels(TraceContext(occluder, surfels, None, origin, ray))
@@ -158,17 +137,14 @@ def test_pixels_read_what_the_mesh_holds() -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     mesh = Mesh(vertices, np.array([[0, 1, 2]], np.uint32), 1e-3)
     occluder, surfels = Occluder(mesh), Surfels.from_numpy(raw_channels())
+    eye = mi.Point3f(0, 0, 1)
     with pytest.raises(InputError, match="update_occluder_caches"):
-        ambient.ambient_of_pixels(
-            TraceContext(occluder, surfels, None, mi.Point3f(0, 0, 1), mi.Vector3f(0, 0, -1))
-        )
+        ambient.ambient_of_pixels(TraceContext(occluder, surfels, None, eye, mi.Vector3f(0, 0, -1)))
     colours = np.array([[0.1, 0.2, 0.3], [0.9, 0.4, 0.5], [0.6, 0.7, 0.8]])
     occluder.ambient = ambient.VertexColours.of(mesh, colours)
     at = np.array([[0.2, 0.3], [0.6, 0.1], [0.1, 0.1], [2, 2]])
-    ray = mi.Vector3f(at[:, 0], at[:, 1], -np.ones(4)) - mi.Vector3f(0, 0, 0)
-    ratio = ambient.ambient_of_pixels(
-        TraceContext(occluder, surfels, None, mi.Point3f(0, 0, 1), ray, mi.Bool([True, True, False, True]))
-    )
+    ray, covered = vector(np.column_stack([at, -np.ones(4)])), mi.Bool([True, True, False, True])
+    ratio = ambient.ambient_of_pixels(TraceContext(occluder, surfels, None, eye, ray, covered))
     shares = np.column_stack([1 - at.sum(1), at])
     expected = np.where([[True], [True], [False], [False]], shares @ colours, 1)
     np.testing.assert_allclose(ratio.numpy().T, expected, atol=1e-5)
@@ -204,19 +180,10 @@ def test_the_plugin_follows_its_parameters(tmp_path: Path) -> None:
     surfels = {name: mi.TensorXf(x) for name, x in raw_channels().items()}
     path = hollow_mesh(tmp_path)
 
-    def loaded(inside: bool) -> Any:
-        integrator = {
-            "type": "refgs",
-            "mesh": str(path),
-            "diffuse": "irradiance",
-            "ambient_rays": 32,
-            **surfels,
-        } | ({"sun": own} if inside else {})
-        rest = {} if inside else {"sun": own}
-        return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor(), **rest})
-
-    for inside, ending in ((True, ".light"), (False, "sun.data")):
-        scene = loaded(inside)
+    options = {"type": "refgs", "mesh": path, "diffuse": "irradiance", "ambient_rays": 32, **surfels}
+    for inner, outer, ending in (({"sun": own}, {}, ".light"), ({}, {"sun": own}, "sun.data")):
+        integrator: dict[str, Any] = {**options, **inner}
+        scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor(), **outer})
         params = mi.traverse(scene)
         key = next(key for key in params.keys() if key.endswith(ending))
         before = mi.render(scene, params, spp=1).numpy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -102,20 +103,13 @@ def test_limits_of_the_lobe() -> None:
 
 
 def true_fraction(place: np.ndarray, points: ShadingPoints, roughness: float, f0: float) -> np.ndarray:
-    view = points.view.numpy().T.astype(np.float64)
-    return np.array(
-        [
-            exact.traced_fraction(
-                lambda d, p=p: (~wall_blocks(p, d)[0])[:, None].astype(float),  # type: ignore[misc]
-                np.array([0, 1.0, 0]),
-                unit(v),
-                roughness,
-                f0,
-                300,
-            )
-            for p, v in zip(place, view, strict=True)
-        ]
-    )
+    def fraction(p: np.ndarray, v: np.ndarray) -> Any:
+        def free(d: np.ndarray) -> np.ndarray:
+            return (~wall_blocks(p, d)[0])[:, None].astype(float)
+
+        return exact.traced_fraction(free, np.array([0, 1.0, 0]), unit(v), roughness, f0, 300)
+
+    return np.array([*map(fraction, place, points.view.numpy().T.astype(np.float64))])
 
 
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 0.8])
@@ -142,13 +136,8 @@ def test_convex_shapes_are_free_and_one_ray_is_the_mirror_ray() -> None:
     view = unit(unit(rng.normal(size=(2000, 3))) + 1.2 * normal)
     eye = vector(normal + 2 * view)
     n = len(normal)
-    points = ShadingPoints(
-        vector(normal),
-        vector(view),
-        albedo=mi.Color3f(0.5),
-        metallic=mi.Float(1),
-        roughness=dr.full(mi.Float, 0.4, n),
-    )
+    materials = {"albedo": mi.Color3f(0.5), "metallic": mi.Float(1), "roughness": dr.full(mi.Float, 0.4, n)}
+    points = ShadingPoints(vector(normal), vector(view), materials)
     for rays in (1, 2, 8):
         options = ShadingOptions(visibility_rays=rays)
         context = TraceContext(occluder, None, None, eye, vector(-2 * view))  # type: ignore[arg-type]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import drjit as dr
@@ -14,13 +16,23 @@ from mi_refgs.reference import shade as reference
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
-from mi_refgs.shade.points import reflect, safe_normalize
+from mi_refgs.shade.points import ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.split_sum import shade
-from tests.helpers import check_slopes, level_maps, unit
+from tests.helpers import check_slopes, level_maps, unit, vector
 from tests.scenes.shading_points import N, exact_terms, points_of, shading_values
 
-CASES = [(d, o) for d in ("sh", "irradiance") for o in ("open", "visibility", "indirect")]
-CASES += [("irradiance", "ambient")]
+OPTIONS = (
+    ShadingOptions(),
+    ShadingOptions(diffuse="irradiance"),
+    ShadingOptions(diffuse="irradiance", dominant=True),
+    ShadingOptions(diffuse="irradiance", multiscatter=True),
+    ShadingOptions(diffuse="irradiance", dominant=True, multiscatter=True),
+)
+SH, IRRADIANCE, DOMINANT, MULTISCATTER, BOTH = OPTIONS
+CASES = [(options, known) for options in OPTIONS[:2] for known in ("open", "visibility", "indirect")]
+CASES += [(IRRADIANCE, "ambient"), (DOMINANT, "open"), (MULTISCATTER, "open"), (BOTH, "open")]
+CASES += [(replace(BOTH, diffuse="sh"), "indirect"), *((options, "visibility") for options in OPTIONS[2:])]
+"""Options, and what of the light is known to be blocked."""
 
 
 @pytest.fixture(scope="module")
@@ -28,89 +40,75 @@ def radiance() -> np.ndarray:
     return np.random.default_rng(3).uniform(0.1, 3, (16, 32, 3))
 
 
-@pytest.mark.parametrize(("diffuse", "occlusion"), CASES)
+def outgoing(points: ShadingPoints, radiance: np.ndarray, options: ShadingOptions) -> np.ndarray:
+    light = EnvironmentLight.from_radiance(radiance).prefilter()
+    return shade(points, light, options).total().numpy().astype(np.float64)
+
+
+@pytest.mark.parametrize(("options", "known"), CASES)
 def test_terms_against_the_oracle(
-    diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
+    options: ShadingOptions, known: str, radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
     light = EnvironmentLight.from_radiance(radiance).prefilter()
-    levels, values = level_maps(light), shading_values(rng, occlusion)
-    terms = shade(points_of(values), light, ShadingOptions(diffuse=diffuse))
-    expected = np.array([exact_terms(values, levels, diffuse, k) for k in range(N)])
+    levels, values = level_maps(light), shading_values(rng, known)
+    terms = shade(points_of(values), light, options)
+    expected = np.array([exact_terms(values, levels, options, k) for k in range(N)])
     for n, term in enumerate(vars(terms.filled()).values()):
-        np.testing.assert_allclose(np.broadcast_to(term.numpy(), (3, N)).T, expected[:, n], atol=2e-4)
-    np.testing.assert_allclose(terms.total().numpy().T, expected.sum(1), atol=4e-4)
+        got = np.broadcast_to(term.numpy(), (3, N)).T
+        np.testing.assert_allclose(got, expected[:, n], rtol=1e-5, atol=5e-5)
+    np.testing.assert_allclose(terms.total().numpy().T, expected.sum(1), rtol=1e-5, atol=1e-4)
 
 
-@pytest.mark.parametrize(("diffuse", "occlusion"), CASES)
+@pytest.mark.parametrize(("options", "known"), CASES)
 def test_derivatives_of_each_parameter(
-    diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
+    options: ShadingOptions, known: str, radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
     """Random weights per point, term and colour; differences of the reference that straddle a texel or a
     level are left out."""
     light = EnvironmentLight.from_radiance(radiance).prefilter()
-    levels, values = level_maps(light), shading_values(rng, occlusion)
-    points = points_of(values)
-    used = {n: getattr(points, n) for n, x in values.items() if x is not None}
-    for array in used.values():
-        dr.enable_grad(array)
-    weight = rng.normal(size=(N, 3, 3))
-    terms = shade(points, light, ShadingOptions(diffuse=diffuse))
-    loss = sum(
-        dr.dot(mi.Vector3f(term), mi.Vector3f(weight[:, n].T.astype(np.float32)))
-        for n, term in enumerate(vars(terms.filled()).values())
-    )
-    dr.backward(loss)
+    levels, values = level_maps(light), shading_values(rng, known)
+    points, weight = points_of(values), rng.normal(size=(N, 3, 3))
+    used = {name: getattr(points, name) for name, x in values.items() if x is not None}
+    dr.enable_grad(list(used.values()))
+    terms = vars(shade(points, light, options).filled()).values()
+    dr.backward(sum(dr.dot(mi.Vector3f(term), vector(weight[:, n])) for n, term in enumerate(terms)))
 
     def value(name: str, k: int, x: Any) -> float:
-        changed = dict(values)
-        changed[name] = np.array(values[name], np.float64)
+        changed = values | {name: np.array(values[name], np.float64)}
         changed[name][k] = x
-        return float((exact_terms(changed, levels, diffuse, k) * weight[k]).sum())
+        return float((exact_terms(changed, levels, options, k) * weight[k]).sum())
 
     for name, array in used.items():
         gradient = np.array(dr.grad(array)).reshape(-1, N).T
         check_slopes(name, gradient, values[name], value, rng)
-        if name not in ("radiance",) or diffuse == "sh":
+        if name != "radiance" or options.diffuse == "sh":
             assert np.abs(gradient).max() > 0, f"{name} receives no gradient"
 
 
-@pytest.mark.parametrize(("diffuse", "occlusion"), CASES)
+@pytest.mark.parametrize(("options", "known"), CASES)
 def test_derivative_of_the_light(
-    diffuse: Any, occlusion: str, radiance: np.ndarray, rng: np.random.Generator
+    options: ShadingOptions, known: str, radiance: np.ndarray, rng: np.random.Generator
 ) -> None:
     """Through activation, prefilter, lookup and reflectance: outgoing radiance is linear in radiance, so any
     step will do."""
-    points = points_of(shading_values(rng, occlusion))
-    weight = mi.Vector3f(rng.normal(size=(3, N)).astype(np.float32))
+    points, weight = points_of(shading_values(rng, known)), rng.normal(size=(N, 3))
     raw = EnvironmentLight.from_radiance(radiance).raw
     dr.enable_grad(raw)
-    dr.backward(
-        dr.dot(
-            mi.Vector3f(
-                shade(points, EnvironmentLight(raw).prefilter(), ShadingOptions(diffuse=diffuse)).total()
-            ),
-            weight,
-        )
-    )
-    gradient = dr.grad(raw).numpy().astype(np.float64)
+    total = shade(points, EnvironmentLight(raw).prefilter(), options).total()
+    dr.backward(dr.dot(mi.Vector3f(total), vector(weight)))
+    gradient = dr.grad(raw).numpy() / -np.expm1(-radiance)  # by d softplus / d raw, in terms of softplus
 
-    def loss(map_: np.ndarray) -> float:
-        total = shade(
-            points, EnvironmentLight.from_radiance(map_).prefilter(), ShadingOptions(diffuse=diffuse)
-        ).total()
-        return float((total.numpy().astype(np.float64) * weight.numpy()).sum())
+    def slope(step: np.ndarray) -> float:
+        change = outgoing(points, radiance + step, options) - outgoing(points, radiance - step, options)
+        return float((change * weight.T).sum() / 2)
 
-    slope = -np.expm1(-radiance)  # d softplus / d raw, in terms of softplus
     for _ in range(3):
-        step = rng.normal(size=radiance.shape)
-        difference = (loss(radiance + 0.02 * step) - loss(radiance - 0.02 * step)) / 0.04
-        scale = np.linalg.norm(gradient / slope)
-        assert abs((gradient / slope * step).sum() - difference) < 2e-3 * scale
-    texel = np.unravel_index(np.abs(gradient).argmax(), gradient.shape)
+        step = 0.02 * rng.normal(size=radiance.shape)
+        assert abs((gradient * step).sum() - slope(step)) < 0.02 * 2e-3 * np.linalg.norm(gradient)
+    texel = np.unravel_index(np.abs(gradient * -np.expm1(-radiance)).argmax(), gradient.shape)
     step = np.zeros_like(radiance)
     step[texel] = 0.05
-    difference = (loss(radiance + step) - loss(radiance - step)) / 0.1
-    np.testing.assert_allclose(gradient[texel] / slope[texel], difference, rtol=5e-3)
+    np.testing.assert_allclose(gradient[texel], slope(step) / 0.05, rtol=5e-3)
 
 
 def test_white_furnace(rng: np.random.Generator) -> None:
@@ -176,40 +174,35 @@ def test_safe_normalize() -> None:
     )
 
 
-@pytest.mark.parametrize("diffuse", ["sh", "irradiance"])
-def test_degenerate_points_stay_finite(diffuse: Any, radiance: np.ndarray) -> None:
-    """Zero normals and views, grazing, from behind, roughness 0 and 1, poles: finite values and gradients."""
-    normals = np.array(
-        [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 0, -1], [0, 1, 0], [0, -1, 0], [1e-25, 0, 0], [1e15, 0, 1e15]]
-    )
-    views = np.array([[0, 0, 1], [0, 0, 0], [0, 0, 1], [1, 0, 1e-6], [0, 1, 0], [0, -1, 0]])
-    cases = [(n, v, r, m) for n in normals for v in views for r in (0.0, 1.0, 0.3) for m in (0.0, 1.0)]
-    n, v, r, m = (np.array(x, np.float64) for x in zip(*cases, strict=True))
-    count = len(cases)
+@pytest.mark.parametrize("options", OPTIONS)
+def test_degenerate_points_stay_finite(options: ShadingOptions, radiance: np.ndarray) -> None:
+    """Zero normals and views, grazing, from behind, poles, roughness and colours at their ends and beyond:
+    finite values and gradients."""
+    normals: list[Any] = [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 0, -1], [0, 1, 0], [0, -1, 0]]
+    normals += [[1e-25, 0, 0], [1e15, 0, 1e15]]
+    views = [[0, 0, 1], [0, 0, 0], [1, 0, 1e-6], [0, 1, 0], [0, -1, 0]]
+    ends = (-1.0, 0.0, 0.3, 1.0, 7.0), (0.0, 1.0), (0.0, 0.5, 1.0, 1.5, -3.0, 1e6)
+    n, v, r, m, a = (np.array(x, np.float64) for x in zip(*product(normals, views, *ends), strict=True))
+    colours = {"albedo": np.tile(a[:, None], 3), "radiance": np.ones((len(a), 3)), "indirect": 0 * n}
     points = points_of(
-        {
-            "normal": n,
-            "view": v,
-            "albedo": np.tile([0.0, 0.5, 1.0], (count, 1)),
-            "metallic": m,
-            "roughness": r,
-            "radiance": np.ones((count, 3)),
-            "visibility": np.full(count, 0.5),
-            "indirect": np.zeros((count, 3)),
-        }
+        {"normal": n, "view": v, "metallic": m, "roughness": r, "visibility": np.full(len(r), 0.5), **colours}
     )
     raw = EnvironmentLight.from_radiance(radiance).raw
-    inputs = [
-        getattr(points, name) for name in ("normal", "view", "albedo", "metallic", "roughness", "indirect")
-    ]
+    names = ("normal", "view", "albedo", "metallic", "roughness", "indirect")
+    inputs = [getattr(points, name) for name in names]
     dr.enable_grad(raw, *inputs)
-    total = shade(points, EnvironmentLight(raw).prefilter(), ShadingOptions(diffuse=diffuse)).total()
+    total = shade(points, EnvironmentLight(raw).prefilter(), options).total()
     dr.backward(total)
-    for array in (total, raw.array, dr.grad(raw).array, *map(dr.grad, inputs)):
+    for array in (total, dr.grad(raw).array, *map(dr.grad, inputs)):
         assert dr.all(dr.isfinite(array), axis=None)
-    assert dr.all(dr.grad(points.indirect) != 0, axis=None), (
-        "indirect light of exactly 0 must receive a gradient"
-    )
+    assert total.numpy()[:, a >= 0].min() > -1e-6
+    inside = (a >= 0) & (a <= 1) & (r >= 0) & (r <= 1)
+    assert (dr.grad(points.indirect).numpy()[:, inside] != 0).all(), "indirect light of 0 gets a gradient"
+    leaf = mi.Float(r.astype(np.float32))
+    dr.enable_grad(leaf)
+    dr.set_grad(leaf, 1)
+    total = shade(points.replaced(roughness=leaf), EnvironmentLight(raw).prefilter(), options).total()
+    assert dr.all(dr.isfinite(dr.forward_to(total)), axis=None)
 
 
 def test_bad_arguments(radiance: np.ndarray, rng: np.random.Generator) -> None:

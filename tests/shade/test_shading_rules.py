@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import mitsuba as mi
 import numpy as np
@@ -14,12 +16,13 @@ from mi_refgs.errors import InputError
 from mi_refgs.methods.read import load
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade.light.light import ConstantLight
-from mi_refgs.shade.options import ShadingOptions
+from mi_refgs.shade.options import Diffuse, Order, ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import Reflectance, SurfelView, register, unregister
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import ATTRIBUTES, Surfels
+from tests.helpers import refused
 from tests.scenes.integrator import image, raw_channels, scene
 
 LIGHT = "[light]\nheight = 16\n"
@@ -65,18 +68,14 @@ def test_impossible_methods_are_refused_when_they_are_read(case: str, tmp_path: 
     text, words = IMPOSSIBLE[case]
     path = tmp_path / "own.toml"
     path.write_text(f"iterations = 100\n{text}")
-    with pytest.raises(InputError) as info:
-        load(str(path))
-    assert all(word in str(info.value) for word in ["own.toml", *words])
-    assert "\n" not in str(info.value)
+    assert "\n" not in refused(lambda: load(str(path)), "own.toml", *words)
 
 
 def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
     """`at` keeps its default, "pixel": blending is linear, so that the image is the same."""
     path = tmp_path / "own.toml"
-    path.write_text(
-        f"iterations = 100\n[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'"
-    )
+    surfels = "[surfels]\nchannels = ['radiance_sh']\n"
+    path.write_text(f"iterations = 100\n{surfels}{STAGE}reflectance = 'radiance'")
     stage = load(str(path)).stage["only"]
     assert stage.shading.at == "pixel" and Shading.resolve(stage.shading, mesh=True).order == "surfel"
 
@@ -115,23 +114,19 @@ def test_rendering_without_what_it_needs_is_refused() -> None:
 def test_every_mode_that_is_not_refused_renders() -> None:
     """Each reflectance, order and diffuse with the attributes that `require_inputs` requires only."""
     raw = raw_channels()
-    for reflectance in ("radiance", "split_sum"):
-        for diffuse in ("sh", "irradiance"):
-            for at in ("pixel", "surfel"):
-                shading = Shading(at, reflectance, diffuse)
-                few = {name: values for name, values in raw.items() if name not in needless(shading)}
-                options: dict = {"shade_at": at, "reflectance": reflectance, "diffuse": diffuse}
-                assert image(scene(raw=few, **options)).max() > 0.05
+    for reflectance, diffuse, at in product(("radiance", "split_sum"), get_args(Diffuse), get_args(Order)):
+        shading = Shading(at, reflectance, diffuse)
+        few = {name: values for name, values in raw.items() if name not in needless(shading)}
+        options: dict = {"shade_at": at, "reflectance": reflectance, "diffuse": diffuse}
+        assert image(scene(raw=few, **options)).max() > 0.05
 
 
 def needless(shading: Shading) -> set[str]:
     found = set()
     for name in (name for name in ATTRIBUTES if not ATTRIBUTES[name].geometry):
-        try:
+        with suppress(InputError):
             shading.require_inputs([other for other in ATTRIBUTES if other != name])
             found.add(name)
-        except InputError:
-            pass
     return found
 
 

@@ -17,7 +17,7 @@ from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import lobe as exact
 from mi_refgs.reference import shade as reference
-from mi_refgs.shade import brdf, reflection
+from mi_refgs.shade import reflection
 from mi_refgs.shade.ggx_sampling import Lobe
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
@@ -45,6 +45,7 @@ from tests.scenes.corner import (
     wall_surfels,
     with_materials,
 )
+from tests.scenes.shading_points import exact_shade
 
 # ---------------- materials on the mesh ----------------
 
@@ -54,9 +55,8 @@ def test_materials_of_the_surfels_reach_the_hits() -> None:
     order."""
     rng = np.random.default_rng(3)
     count = 20000
-    position = np.stack(
-        [np.zeros(count), WALL * rng.uniform(size=count), FLOOR * rng.uniform(-1, 1, count)], 1
-    )
+    where = WALL * rng.uniform(size=count), FLOOR * rng.uniform(-1, 1, count)
+    position = np.stack([np.zeros(count), *where], 1)
     colour = np.stack([0.2 + 0.4 * position[:, 1], 0.5 + 0.2 * position[:, 2], np.full(count, 0.3)], 1)
     surfels = Surfels.from_numpy(
         {
@@ -72,9 +72,7 @@ def test_materials_of_the_surfels_reach_the_hits() -> None:
     occluder = Occluder(corner())
     occluder.set_materials(surfels)
     y, z = rng.uniform(0.1, WALL - 0.1, 500), rng.uniform(-FLOOR + 0.1, FLOOR - 0.1, 500)
-    origin = mi.Point3f(
-        dr.full(mi.Float, 1, 500), mi.Float(y.astype(np.float32)), mi.Float(z.astype(np.float32))
-    )
+    origin = mi.Point3f(vector(np.stack([np.ones(500), y, z], 1)))
     hit = occluder.closest(origin, mi.Vector3f(-1, 0, 0), mi.Vector3f(1, 0, 0))
     assert dr.all(hit.valid)
     np.testing.assert_allclose(hit.point.numpy(), [0 * y, y, z], atol=1e-5)
@@ -86,11 +84,8 @@ def test_materials_of_the_surfels_reach_the_hits() -> None:
     distance = np.linalg.norm(position[np.array(found.surfel)][:, 1:] - np.stack([y, z], 1), axis=1)
     assert distance.max() < 0.35  # half a cell's diagonal
     missed = occluder.closest(origin, mi.Vector3f(1, 0, 0), mi.Vector3f(1, 0, 0))
-    assert (
-        not dr.any(missed.valid)
-        and dr.all(missed.triangle == 0)
-        and dr.all(missed.barycentric == 0, axis=None)
-    )
+    assert not dr.any(missed.valid) and dr.all(missed.triangle == 0)
+    assert dr.all(missed.barycentric == 0, axis=None)
 
 
 def test_vertices_mix_surfels_by_opacity_and_footprint() -> None:
@@ -182,9 +177,8 @@ def test_traced_light_comes_closer_to_the_integral(roughness: float) -> None:
         "8 traced rays": ShadingOptions(visibility_rays=8, traced_bounces=1),
         "all options": ShadingOptions(dominant=True, visibility_rays=64, traced_bounces=1),
     }.items():
-        terms = shade(
-            seen(points, place, options, surfels, light), light, replace(options, diffuse="irradiance")
-        )
+        found = seen(points, place, options, surfels, light)
+        terms = shade(found, light, replace(options, diffuse="irradiance"))
         got = (terms.filled().specular + terms.filled().indirect).numpy().T
         error[name] = float(np.mean((got - truth) ** 2 / np.square(truth)))
     print(f"relMSE at roughness {roughness}: " + ", ".join(f"{k}: {e:.4f}" for k, e in error.items()))
@@ -207,24 +201,13 @@ def test_a_traced_mirror_ray_is_shaded_as_a_pixel_is(diffuse: Any) -> None:
     indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
     assert 0 < visibility.mean() < 0.8 and (indirect[visibility == 1] == 0).all()
     levels = level_maps(light)
+    logits: dict[str, Any] = {"albedo": np.array([1.0, 0, -1]), "metallic": 1.5, "roughness": 0.2}
+    materials = {name: 1 / (1 + np.exp(-logit)) for name, logit in logits.items()}
+    wall = {"normal": np.array([1.0, 0, 0]), "visibility": None, "indirect": None, **materials}
     for k in np.flatnonzero(visibility == 0):
         direction = mirrored(place)[k, 0]
-        basis = reference.sh_basis(direction, 1)
-        own = np.maximum(0.5 + basis @ harmonics.reshape(4, 3), 0)
-        terms = reference.shade(
-            brdf.table().astype(np.float64),
-            levels,
-            LEVEL_ROUGHNESS,
-            normal=np.array([1.0, 0, 0]),
-            view=-direction,
-            albedo=1 / (1 + np.exp([-1.0, 0, 1])),
-            metallic=float(1 / (1 + np.exp(-1.5))),
-            roughness=float(1 / (1 + np.exp(-0.2))),
-            radiance=own,
-            visibility=None,
-            indirect=None,
-            diffuse=diffuse,
-        )
+        own = np.maximum(0.5 + reference.sh_basis(direction, 1) @ harmonics.reshape(4, 3), 0)
+        terms = exact_shade(levels, view=-direction, radiance=own, diffuse=diffuse, **wall)
         np.testing.assert_allclose(indirect[k], terms.sum(0), rtol=1e-3)
 
 
@@ -252,27 +235,16 @@ def test_a_hit_in_the_dark_is_dark() -> None:
 
 def oracle_of_walls(light: PrefilteredLight, surfels: Surfels, diffuse: str) -> exact.Outgoing:
     """What leaves the walls of a channel, by the float64 `shade`."""
-    table, levels = brdf.table().astype(np.float64), level_maps(light)
+    levels = level_maps(light)
     raw = {name: x.numpy().astype(np.float64)[[0, -1]] for name, x in surfels.raw.items()}
-    materials = {name: 1 / (1 + np.exp(-raw[name])) for name in ("albedo", "metallic", "roughness")}
+    logits = raw["albedo"], raw["metallic"][:, 0], raw["roughness"][:, 0]
+    albedo, metallic, roughness = (1 / (1 + np.exp(-logit)) for logit in logits)
 
     def outgoing(wall: int, normal: np.ndarray, view: np.ndarray, free: float, beyond: np.ndarray) -> Any:
         own = reference.sh_basis(-view, 1) @ raw["radiance_sh"][wall].reshape(4, 3) + 0.5
-        terms = reference.shade(
-            table,
-            levels,
-            LEVEL_ROUGHNESS,
-            normal=normal,
-            view=view,
-            albedo=materials["albedo"][wall],
-            metallic=float(materials["metallic"][wall, 0]),
-            roughness=float(materials["roughness"][wall, 0]),
-            radiance=np.maximum(own, 0),
-            visibility=free,
-            indirect=beyond,
-            diffuse=diffuse,
-        )
-        return terms.sum(0)
+        here = {"albedo": albedo[wall], "metallic": metallic[wall], "roughness": roughness[wall]}
+        here |= {"radiance": np.maximum(own, 0), "visibility": free, "indirect": beyond}
+        return exact_shade(levels, normal=normal, view=view, diffuse=diffuse, **here).sum(0)
 
     return outgoing
 
@@ -353,18 +325,9 @@ def test_bounces_add_light_and_converge(rays: int) -> None:
     surfels = channel_surfels()
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
     occluder = with_materials(channel(), surfels)
-    images = [
-        seen(
-            points,
-            place,
-            ShadingOptions(visibility_rays=rays, traced_bounces=bounces),
-            surfels,
-            light,
-            occluder=occluder,
-            eye=LOW_EYE,
-        ).indirect.numpy()
-        for bounces in (1, 2, 3, 6, 7)
-    ]
+    each = [ShadingOptions(visibility_rays=rays, traced_bounces=bounces) for bounces in (1, 2, 3, 6, 7)]
+    found = [seen(points, place, one, surfels, light, occluder=occluder, eye=LOW_EYE) for one in each]
+    images = [points.indirect.numpy() for points in found]
     steps = [after - before for before, after in pairwise(images)]
     for step in steps:
         assert step.min() > (-1e-5 if rays == 1 else -0.02)  # a brighter ray may hold another back less
@@ -410,11 +373,8 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
 
     base = leaves[name].numpy().copy()
     step = rng.normal(size=base.shape).astype(np.float32)
-    ends = [
-        np.sum(indirect(mi.TensorXf(base + t * step)).numpy().astype(np.float64) * weight.numpy())
-        for t in (-0.01, 0.01)
-    ]
-    difference = (ends[1] - ends[0]) / 0.02
+    ends = [indirect(mi.TensorXf(base + t * step)).numpy().astype(np.float64) for t in (-0.01, 0.01)]
+    difference = np.sum((ends[1] - ends[0]) * weight.numpy()) / 0.02
     assert abs(difference) > 1e-3
     assert rays == 1 or 0 < (kept[0].numpy() < 0.9).mean() < 0.5
 
