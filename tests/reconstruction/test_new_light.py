@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,25 +26,23 @@ def radiance_along(light: EnvironmentLight, direction: Any) -> np.ndarray:
 
 def test_panorama_zenith_is_z_and_rotates_about_it(tmp_path: Path) -> None:
     """The first row emits from +z; a rotation by 90° moves radiance from +x to +y."""
-    image = np.full((32, 64, 3), 0.1, np.float32)
+    image, file = np.full((32, 64, 3), 0.1, np.float32), tmp_path / "a.exr"
     image[:4] = (3, 0, 0)
     image[12:20, 30:34] = (0, 5, 0)
-    write_exr(tmp_path / "a.exr", image)
-    upright = NewLight(tmp_path / "a.exr").read()
+    write_exr(file, image)
+    upright = NewLight(file).read()
     np.testing.assert_allclose(radiance_along(upright, [0, 0, 1]), (3, 0, 0), atol=0.05)
     np.testing.assert_allclose(radiance_along(upright, [0, 0, -1]), 0.1, atol=0.01)
-    as_it_lies = NewLight(tmp_path / "a.exr", world=True).read()
+    as_it_lies = NewLight(file, world=True).read()
     np.testing.assert_allclose(radiance_along(as_it_lies, [0, 1, 0]), (3, 0, 0), atol=0.05)
     angles = np.radians(np.arange(0, 360, 5))
     horizon = np.stack([np.cos(angles), np.sin(angles), 0 * angles])
     around = radiance_along(upright, horizon)[1]
     assert around.max() > 4
-    turned = NewLight(tmp_path / "a.exr", rotate=90).read()
+    turned = NewLight(file, rotate=90).read()
     np.testing.assert_allclose(radiance_along(turned, horizon)[1], np.roll(around, 18), atol=0.7)
-    brighter = NewLight(tmp_path / "a.exr", exposure=1.5).read()
-    np.testing.assert_allclose(
-        np.array(brighter.radiance()), 2**1.5 * np.array(upright.radiance()), rtol=1e-3, atol=3e-4
-    )
+    brighter, plain = (x.radiance().numpy() for x in (NewLight(file, exposure=1.5).read(), upright))
+    np.testing.assert_allclose(brighter, 2**1.5 * plain, rtol=1e-3, atol=3e-4)
 
 
 def test_panorama_equals_environment_of_the_data_set(known: Path) -> None:
@@ -63,13 +62,10 @@ def test_ground_truth_is_found_by_the_content_of_the_light(known: Path, tmp_path
     own = truth_under(NewLight(data / "environment.exr", world=True), data)
     assert own is not None and own[0] == data
     write_exr(tmp_path / "dusk.exr", 2 * other_sky())
-    for light in (
-        NewLight(known / "dusk.exr", rotate=10),
-        NewLight(tmp_path / "dusk.exr"),
-        NewLight(known / "dusk.exr", world=True),
-    ):
+    dusk = NewLight(known / "dusk.exr")
+    for light in (replace(dusk, rotate=10), NewLight(tmp_path / "dusk.exr"), replace(dusk, world=True)):
         assert truth_under(light, data) is None
-    assert truth_under(NewLight(known / "dusk.exr"), tmp_path) is None
+    assert truth_under(dusk, tmp_path) is None
     refused(lambda: truth_under(NewLight(data / "environment.exr"), data), "add --world")
 
 

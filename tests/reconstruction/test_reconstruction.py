@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from mi_refgs.cli import main
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.methods.read import assignments, load_resolved
+from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.runs.run import Run
 from tests.helpers import refused
 from tests.scenes.integrator import sky
@@ -54,14 +56,9 @@ def test_render_accepts_every_kind_of_camera(balls: Reconstruction) -> None:
     np.testing.assert_array_equal(balls.render(balls.cameras()[0]), first)
     assert not np.array_equal(balls.render(-1), first)
     eye, middle, up = [2.0, 2.5, 1.0], [0.1, 0.0, 0.2], [0.0, 0.3, 1.0]
-    sensor = mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": 35,
-            "to_world": mi.ScalarTransform4f().look_at(eye, middle, up),
-            "film": {"type": "hdrfilm", "width": 48, "height": 32},
-        }
-    )
+    film, pose = {"type": "hdrfilm", "width": 48, "height": 32}, mi.ScalarTransform4f()
+    pose = pose.look_at(eye, middle, up)
+    sensor = mi.load_dict({"type": "perspective", "fov": 35, "to_world": pose, "film": film})
     camera = Camera.look_at(eye, middle, up, fov=35, size=(48, 32))
     np.testing.assert_allclose(balls.render(sensor), balls.render(camera), atol=2e-3)
 
@@ -80,8 +77,7 @@ def test_aovs_are_the_known_materials(balls: Reconstruction) -> None:
     maps = balls.aovs(0, ["albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular"])
     inside = balls.render(0)[..., 3] > 0.99
     assert maps["albedo"].shape == (SIZE, SIZE, 3) and maps["depth"].shape == (SIZE, SIZE, 1)
-    metal = inside & (maps["metallic"][..., 0] > 0.9)
-    clay = inside & (maps["metallic"][..., 0] < 0.1)
+    metal, clay = (inside & one[..., 0] for one in (maps["metallic"] > 0.9, maps["metallic"] < 0.1))
     assert min(metal.sum(), clay.sum()) > 100
     np.testing.assert_allclose(np.median(maps["albedo"][metal], axis=0), [0.9, 0.6, 0.3], atol=0.01)
     np.testing.assert_allclose(np.median(maps["roughness"][clay]), 0.5, atol=0.01)
@@ -92,10 +88,6 @@ def test_aovs_are_the_known_materials(balls: Reconstruction) -> None:
 
 def test_background_makes_the_image_opaque(known: Path, balls: Reconstruction) -> None:
     """The background is visible behind the object, and `object_only` leaves it out."""
-    from dataclasses import replace
-
-    from mi_refgs.render.surroundings import Surroundings, nothing_around
-
     behind = mi_refgs.EnvironmentLight.constant(0.25, height=8)
     around = Surroundings(nothing_around(balls.trained.surfels), behind)
     open_scene = balls.changed(replace(balls.trained, surroundings=around))
@@ -113,8 +105,8 @@ def test_cameras_without_data_set_surround_the_object(balls: Reconstruction, tmp
     for camera in (*lost.cameras()[:2], *lost.turntable(2)):
         picture = lost.render(camera, size=24)
         assert picture[8:16, 8:16, 3].mean() > 0.5 and picture[[0, -1], :, 3].max() < 0.01
-    places = [camera.pose()[:3, 3] for camera in lost.turntable(4)]
-    assert np.ptp([place[2] for place in places]) < 1e-6 and np.ptp(places, axis=0)[0] > 1
+    spread = np.ptp([camera.pose()[:3, 3] for camera in lost.turntable(4)], axis=0)
+    assert spread[2] < 1e-6 and spread[0] > 1
     refused(lost.views, "gone is gone; use cameras")
 
 
@@ -187,8 +179,7 @@ def test_edit_changes_selected_surfels(balls: Reconstruction) -> None:
     before = balls.aovs(0, ["roughness", "metallic"])
     changed = balls.edit(where="metallic > 0.5", set={"roughness": 0.8})
     after = changed.aovs(0, ["roughness", "metallic"])
-    metal = before["metallic"] > 0.99
-    np.testing.assert_allclose(after["roughness"][metal], 0.8, atol=1e-3)
+    np.testing.assert_allclose(after["roughness"][before["metallic"] > 0.99], 0.8, atol=1e-3)
     clay = (before["metallic"] < 0.01) & (before["roughness"] > 0)
     np.testing.assert_array_equal(after["roughness"][clay], before["roughness"][clay])
     assert changed.folder is None and balls.trained.surfels.count == changed.trained.surfels.count
@@ -197,8 +188,7 @@ def test_edit_changes_selected_surfels(balls: Reconstruction) -> None:
 
 
 def test_export_writes_a_format(balls: Reconstruction, tmp_path: Path) -> None:
-    files = balls.export("cameras", tmp_path / "cameras")
-    assert (tmp_path / "cameras/transforms.json") in files
+    assert tmp_path / "cameras/transforms.json" in balls.export("cameras", tmp_path / "cameras")
 
 
 # ---------------- fitting ----------------
@@ -206,16 +196,13 @@ def test_export_writes_a_format(balls: Reconstruction, tmp_path: Path) -> None:
 
 def test_fit_equals_the_command(data: Path, method: Path, finished: Path, tmp_path: Path) -> None:
     """The folder is the same, with previews; settings as a mapping equal `--set`."""
-    settings = {key: int(value) for key, value in (text.split("=") for text in SETTINGS)}
+    settings, run = {key: int(n) for key, n in (text.split("=") for text in SETTINGS)}, tmp_path / "run"
     with pytest.warns(UserWarning, match="only 3 training views"):
-        found = mi_refgs.fit(
-            data, method, preset="quick", settings=settings, output=tmp_path / "run", progress=False
-        )
-    assert load_resolved(tmp_path / "run/config.toml") == load_resolved(finished / "config.toml")
-    names = {path.relative_to(finished) for path in finished.rglob("*") if path.is_file()}
-    assert {path.relative_to(tmp_path / "run") for path in (tmp_path / "run").rglob("*.*")} == names
-    assert found.trained.iteration == 6 and found.folder == tmp_path / "run"
-    np.testing.assert_array_equal(found.render(), mi_refgs.load(tmp_path / "run").render())
+        found = mi_refgs.fit(data, method, preset="quick", settings=settings, output=run, progress=False)
+    assert load_resolved(run / "config.toml") == load_resolved(finished / "config.toml")
+    names, theirs = ({p.relative_to(f) for p in f.rglob("*") if p.is_file()} for f in (run, finished))
+    assert names == theirs and found.trained.iteration == 6 and found.folder == run
+    np.testing.assert_array_equal(found.render(), mi_refgs.load(run).render())
 
 
 def test_temporary_folder_is_removed_with_its_last_user(data: Path, method: Path) -> None:

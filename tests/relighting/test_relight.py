@@ -28,6 +28,7 @@ from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.shading import Shading
+from mi_refgs.surfels.attributes import logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 from tests.scenes.known import SIZE, other_sky, write_known_run
@@ -35,11 +36,16 @@ from tests.scenes.known import SIZE, other_sky, write_known_run
 SAMPLES = 4
 
 
+def result_of(known: Path, out: str, light: str = "dusk", run: str = "run", **options: Any) -> dict[str, Any]:
+    """The result of relighting a run of `known` into its folder `out`."""
+    new_light = NewLight(known / f"{light}.exr", **options)
+    return relight(Run(known / run), new_light, known / out, samples=SAMPLES).result
+
+
 @pytest.fixture(scope="module")
 def dusk(known: Path) -> dict[str, Any]:
     """The result of relighting by the second light; its files are in `dusk`."""
-    run, light = Run(known / "run"), NewLight(known / "dusk.exr")
-    return relight(run, light, known / "dusk", samples=SAMPLES).result
+    return result_of(known, "dusk")
 
 
 # ---------------- path tracing ----------------
@@ -67,8 +73,7 @@ def test_relit_scene_has_shadows_and_reflections(known: Path, dusk: dict[str, An
 
 def test_relighting_by_another_light_scores_worse(known: Path, dusk: dict[str, Any]) -> None:
     """Images under the first light, compared with ground truth under the second, have large errors."""
-    light = NewLight(known / "day.exr")
-    own = relight(Run(known / "run"), light, known / "own", samples=SAMPLES).result
+    own = result_of(known, "own", "day")
     assert own["psnr"] is None and "refgs dataset --relight" in own["score_reason"]
     ours = [read_exr_image(known / "own" / name.replace("png", "exr")) for name in own["pictures"]]
     truth = [read_exr_image(known / f"data/relight/dusk/test/r_{i:03d}.exr") for i in range(3)]
@@ -78,25 +83,16 @@ def test_relighting_by_another_light_scores_worse(known: Path, dusk: dict[str, A
 
 def test_scale_corrects_albedo_but_not_metallic(known: Path, dusk: dict[str, Any]) -> None:
     """Lower albedo is much worse as it is, and nearly as good after the scale."""
-    fitted = TrainedScene.read(known / "run")
-    for name, change in (("albedo", 0.7), ("metallic", None)):
-        raw = fitted.surfels.to_numpy()
-        if change:
-            value = 1 / (1 + np.exp(-raw["albedo"])) * change
-            raw["albedo"] = np.log(value / (1 - value))
-        else:
-            raw["metallic"] = -raw["metallic"]
-        out = known / f"wrong_{name}"
-        shutil.copytree(known / "run", out)
-        camera = read_dataset(known / "data", "test").views[0].camera()
-        export(replace(fitted, surfels=Surfels.from_numpy(raw)), out, camera)
-        light, place = NewLight(known / "dusk.exr"), known / f"out_{name}"
-        found = relight(Run(out), light, place, samples=SAMPLES).result
-        if change:
-            assert found["psnr"] < dusk["psnr"] - 2 < found["psnr_scaled"] + 1
-            np.testing.assert_allclose(found["scale"], 1 / change, rtol=0.15)
-        else:
-            assert found["psnr_scaled"] < dusk["psnr_scaled"] - 3
+    fitted, camera = TrainedScene.read(known / "run"), read_dataset(known / "data", "test").views[0].camera()
+    raw = fitted.surfels.to_numpy()
+    found = {}
+    for name, values in (("albedo", logit(0.7 * sigmoid(raw["albedo"]))), ("metallic", -raw["metallic"])):
+        out = shutil.copytree(known / "run", known / f"wrong_{name}")
+        export(replace(fitted, surfels=Surfels.from_numpy(raw | {name: values})), out, camera)
+        found[name] = result_of(known, f"out_{name}", run=out.name)
+    assert found["albedo"]["psnr"] < dusk["psnr"] - 2 < found["albedo"]["psnr_scaled"] + 1
+    np.testing.assert_allclose(found["albedo"]["scale"], 1 / 0.7, rtol=0.15)
+    assert found["metallic"]["psnr_scaled"] < dusk["psnr_scaled"] - 3
 
 
 def test_mitsuba_renders_the_relit_scene_file_the_same(known: Path, dusk: dict[str, Any]) -> None:
@@ -113,7 +109,7 @@ def test_relit_files_have_the_encoding_of_a_data_set(known: Path, dusk: dict[str
     for name in dusk["pictures"]:
         linear, displayed = read_exr_image((out / name).with_suffix(".exr")), read_png(out / name)
         assert linear.shape == displayed.shape == (SIZE, SIZE, 4)
-        straight = np.dstack([displayed[..., :3] * displayed[..., 3:] + 1 - displayed[..., 3:]])
+        straight = displayed[..., :3] * displayed[..., 3:] + 1 - displayed[..., 3:]
         np.testing.assert_allclose(displayed_over(linear, np.ones(3)), straight, atol=1.5 / 255)
     assert read_png(out / "sheet.png").std() > 0.05
     assert not (known / "run" / "relight").exists()
@@ -123,8 +119,7 @@ def test_relit_files_have_the_encoding_of_a_data_set(known: Path, dusk: dict[str
 
 
 def test_exposure_scales_ours_and_ground_truth(known: Path, dusk: dict[str, Any]) -> None:
-    light = NewLight(known / "dusk.exr", exposure=-1)
-    darker = relight(Run(known / "run"), light, known / "dark", samples=SAMPLES).result
+    darker = result_of(known, "dark", exposure=-1)
     np.testing.assert_allclose(darker["scale"], dusk["scale"], rtol=0.03)
     pictures = [read_exr_image(known / out / "test/r_001.exr") for out in ("dark", "dusk")]
     np.testing.assert_allclose(2 * pictures[0][..., :3], pictures[1][..., :3], rtol=2e-3, atol=1e-4)
@@ -135,8 +130,7 @@ def test_common_scale_is_fitted_per_channel(rng: np.random.Generator) -> None:
     true = np.concatenate([rng.uniform(0.05, 0.6, (16, 16, 3)), np.ones((16, 16, 1))], -1)
     true[:2, :2, :3] = 50
     factor = np.array([0.6, 1.3, 2.2])
-    ours = true.copy()
-    ours[..., :3] /= factor
+    ours = true / [*factor, 1]
     ours[3:9, 3:9] *= 0.3  # edges, less covered than they should be
     np.testing.assert_allclose(common_scale([ours, ours], [true, true]), factor, rtol=0.01)
     ours[..., 1] = 0
@@ -156,8 +150,7 @@ def test_turntable_surrounds_the_object(known: Path) -> None:
     around = turntable_cameras(fitted, [view.camera() for view in views], 4)
     assert around[0].width == SIZE and around[0].focal == pytest.approx(views[0].fx)
     poses = np.array([camera.pose() for camera in around])
-    middle = poses[:, :3, 3].mean(axis=0)
-    offset = poses[:, :3, 3] - middle
+    offset = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
     assert np.ptp(offset[:, 2]) < 1e-9 and np.ptp(np.linalg.norm(offset, axis=1)) < 1e-9
     np.testing.assert_allclose(offset[0, :2], -offset[2, :2], atol=1e-9)
     assert (poses[:, 2, 1] > 0).all()  # upright
@@ -169,24 +162,19 @@ def test_turntable_surrounds_the_object(known: Path) -> None:
 @pytest.mark.parametrize("record", [None, '{"path": "gone"}'])
 @pytest.mark.parametrize("turntable", [0, 2])
 def test_run_without_data_is_relit_around_the_object(
-    known: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture,
-    record: str | None,
-    turntable: int,
+    known: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: str | None, turntable: int
 ) -> None:
     """A saved run that records no data set, and one whose data is gone; the same in Python."""
     monkeypatch.setattr(orbits, "SIZE", SIZE)
-    run = load(known / "run").save(tmp_path / "run").folder
-    assert run is not None
+    run = tmp_path / "run"
+    load(known / "run").save(run)
     (run / "dataset.json").unlink()
     if record is not None:
         (run / "dataset.json").write_text(record)
     light, out = known / "dusk.exr", tmp_path / "out"
-    command = ["relight", str(run), "--envmap", str(light), "-o", str(out), "--json"]
+    command = ["relight", str(run), "--envmap", str(light), "-o", str(out)]
     assert main([*command, "--turntable", str(turntable)]) == 0
-    result = json.loads(capfd.readouterr().out)
+    result = json.loads((out / "relight.json").read_text())
     assert "cameras are around the object" in result["score_reason"] and result["psnr"] is None
     relit = load(run).relight(light)
     cameras = relit.turntable(turntable) if turntable else relit.cameras()
@@ -242,12 +230,9 @@ def test_relight_refuses_bad_input(known: Path, tmp_path: Path) -> None:
         refused(partial(NewLight, light.path, False, angle, stops), f"{light.path}: {option}: ")
         for given in (other_sky(), light.read()):
             refused(partial(any_light, given, False, angle, stops), f"light: {wrong}")
-    bare = Run(Path(shutil.copytree(run.path, tmp_path / "bare")))
-    colour = replace(
-        TrainedScene.read(run.path), light=None, mesh=None, shading=Shading("surfel", "radiance")
-    )
+    bare = Run(shutil.copytree(run.path, tmp_path / "bare"))
+    changes = {"light": None, "mesh": None, "shading": Shading("surfel", "radiance")}
+    colour = replace(TrainedScene.read(run.path), **changes)
     export(colour, bare.path, read_dataset(known / "data", "test").views[0].camera())
-    message = refused(
-        lambda: relight(bare, light, tmp_path / "out"), "bare: light: the run has none; fit one"
-    )
-    assert "--for relighting" in message
+    words = "bare: light: the run has none; fit one", "--for relighting"
+    refused(lambda: relight(bare, light, tmp_path / "out"), *words)
