@@ -231,7 +231,7 @@ def test_relight_refuses_bad_input(known: Path, tmp_path: Path) -> None:
         for given in (other_sky(), light.read()):
             refused(partial(any_light, given, False, angle, stops), f"light: {wrong}")
     bare = Run(shutil.copytree(run.path, tmp_path / "bare"))
-    changes = {"light": None, "mesh": None, "shading": Shading("surfel", "radiance")}
+    changes: dict[str, Any] = {"light": None, "mesh": None, "shading": Shading("surfel", "radiance")}
     colour = replace(TrainedScene.read(run.path), **changes)
     export(colour, bare.path, read_dataset(known / "data", "test").views[0].camera())
     words = "bare: light: the run has none; fit one", "--for relighting"
