@@ -28,7 +28,6 @@ from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.llff import read_poses
 from mi_refgs.data.transforms import read_points
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.images import read_png, read_tiff, write_png
 from mi_refgs.io.resources import resource_dir
@@ -37,6 +36,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.runs import checkpoint
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
@@ -423,7 +423,7 @@ def _read_model(path: Path) -> list[Any]:
 
 def _read_data_place(path: Path) -> None:
     """dataset.json of a run names a folder; only what lies there as a data set is read."""
-    load_split(Run(path.parent), methods.load("ref_gaussian"), "train")
+    views_of_run(Run(path.parent), methods.load("ref_gaussian"), "train")
 
 
 def _data_places(folder: Path) -> list[bytes]:

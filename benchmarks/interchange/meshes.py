@@ -23,7 +23,6 @@ import numpy as np
 
 from benchmarks.common.report import plain_parser
 from benchmarks.interchange.programs import validated
-from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.evaluation.metrics import psnr
 from mi_refgs.formats import write
@@ -33,6 +32,7 @@ from mi_refgs.relighting.score import displayed_over
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.runs.views import views_of_run
 
 OURS_SAMPLES = 4
 
@@ -56,7 +56,7 @@ def main() -> None:
 def measured(folder: Path, out: Path, args: Any) -> dict[str, Any]:
     """The numbers of one run."""
     run = Run(folder)
-    views = load_split(run, run.method(), "test", None)
+    views = views_of_run(run, run.method(), "test", None)
     trained = TrainedScene.read(folder)
     shots = Provenance.of(run).shots(trained, "test", "train")
     files = write(trained, ["mitsuba", "gltf-mesh", "usd"], out, shots, {"faces": args.faces})

@@ -162,12 +162,12 @@ def sphere(count: int, size: int, spread: float) -> Workload:
 
 def fitted(folder: str) -> Workload:
     """The surfels of a run folder in its first test camera, with random features."""
-    from mi_refgs.evaluation.evaluate import load_split
     from mi_refgs.runs.run import Run
+    from mi_refgs.runs.views import views_of_run
 
     run = Run(folder)
     state = run.load_checkpoint()
-    view = load_split(run, run.method(), "test").views[0]
+    view = views_of_run(run, run.method(), "test").views[0]
     if state is None:
         raise InputError(f"{folder}: checkpoints: none; train it first")
     raw = {name: np.asarray(state[f"params/{name}"], np.float32) for name in Surfel.widths}

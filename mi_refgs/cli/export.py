@@ -47,12 +47,12 @@ class Export:
 
     def run(self) -> Result:
         """Export the run."""
-        from mi_refgs.evaluation.evaluate import load_split
         from mi_refgs.formats import write
         from mi_refgs.reconstruction.provenance import Provenance
         from mi_refgs.runs.export import export, newest
         from mi_refgs.runs.run import Run
         from mi_refgs.runs.trained_scene import ARTEFACTS, TrainedScene
+        from mi_refgs.runs.views import views_of_run
 
         # Refuse options that do not belong together.
         names = separated(self.to)
@@ -89,7 +89,7 @@ class Export:
                     f"{folder.path}: checkpoints: none, from which the whole scene could be restored; write "
                     "the pruned one to another folder with -o"
                 )
-            training, views = (load_split(folder, method, split, self.data) for split in ("train", "test"))
+            training, views = (views_of_run(folder, method, split, self.data) for split in ("train", "test"))
             limit = PRUNE_LIMIT if self.limit is None else self.limit
             fitted, report = prune(fitted, training, views, limit, say)
 

@@ -92,11 +92,10 @@ class ProfileCommand:
 
     def _trainer(self, folder: Run) -> tuple[Trainer, list[str]]:
         """Return the trainer of a run or of a new fit, and the stages of the schedule to measure."""
-        from mi_refgs.evaluation.evaluate import load_split
         from mi_refgs.fitting.plan import sized
         from mi_refgs.fitting.runner import load_method
-        from mi_refgs.fitting.targets import read_views
         from mi_refgs.fitting.train import Trainer
+        from mi_refgs.runs.views import read_views, views_of_run
 
         if not self.path.is_dir():
             raise InputError(f"{self.path}: RUN|DATA: no such folder; give a run folder or a data set")
@@ -109,7 +108,7 @@ class ProfileCommand:
             method = folder.method()
             if not folder.checkpoints():
                 raise InputError(f"{self.path}: checkpoints: none yet; train on, or profile its data set")
-            trainer = Trainer(method, load_split(folder, method, "train", self.data), folder)
+            trainer = Trainer(method, views_of_run(folder, method, "train", self.data), folder)
             return trainer, [method.stage_at(max(trainer.iteration, 1))[0]]
         if self.data is not None:
             raise InputError(f"--data: {self.path} is no run; drop --data")

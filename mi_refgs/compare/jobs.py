@@ -13,11 +13,11 @@ from typing import Any
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.fitting.plan import sized
-from mi_refgs.fitting.targets import read_views
 from mi_refgs.io.files import read_json
 from mi_refgs.methods.method import DataOptions, Method
 from mi_refgs.methods.read import differences, load
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.views import read_views
 
 RUNS = "runs"
 """Folder of the runs: runs/<data>/<method>/seed<k>."""
@@ -177,16 +177,11 @@ def require_same(job: Job) -> None:
             f"{job_file}: --mitsuba-variant: the run was made with {was}, not {job.mitsuba_variant}; repeat "
             "that, or choose another -o"
         )
-    try:
-        data = job.run.dataset()
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    data = job.run.dataset()
+    if data is None or data.resolve() != Path(job.data).resolve():
         raise InputError(
-            f"{job.folder}/dataset.json: cannot be read ({error}); remove that run, or choose another -o"
-        ) from error
-    if data.resolve() != Path(job.data).resolve():
-        raise InputError(
-            f"{job.folder}/dataset.json: DATA: the run was fitted to {data}, not to {job.data}; choose "
-            "another -o, or remove that run"
+            f"{job.folder}/dataset.json: DATA: the run was fitted to {data or 'unknown data'}, not to "
+            f"{job.data}; choose another -o, or remove that run"
         )
 
 

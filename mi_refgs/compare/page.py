@@ -18,11 +18,11 @@ from mi_refgs.compare.worker import CURVE
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import render_names
 from mi_refgs.evaluation.images import contact_sheet
-from mi_refgs.fitting.targets import read_views
 from mi_refgs.io.files import write_bytes
 from mi_refgs.io.images import read_png, write_png
 from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.runs.run import Run
+from mi_refgs.runs.views import read_views
 
 PAGE, PICTURES = "index.html", "pictures"
 STYLE = """

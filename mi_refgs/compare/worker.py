@@ -66,7 +66,7 @@ def fit_and_measure(job: Job) -> None:
     from mi_refgs.capture.triangulate import with_points
     from mi_refgs.evaluation.evaluate import evaluate
     from mi_refgs.fitting.runner import begin, finish
-    from mi_refgs.fitting.targets import read_views
+    from mi_refgs.runs.views import read_views
 
     run, data = job.run, Path(job.data)
     method = run.method() if run.exists() else job.method()
@@ -83,7 +83,7 @@ class Curve:
     """Measures PSNR on a few test views between steps of a fit; its clock does not count."""
 
     def __init__(self, job: Job, method: Method, begin: int) -> None:
-        from mi_refgs.fitting.targets import read_views
+        from mi_refgs.runs.views import read_views
 
         self.run = job.run
         self.data = read_views(method, Path(job.data), "test", truth=False)

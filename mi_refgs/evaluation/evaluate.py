@@ -21,17 +21,15 @@ from mi_refgs.evaluation import decomposition, metrics
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
-from mi_refgs.fitting.runner import of_run
-from mi_refgs.fitting.targets import read_views
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import write_png
 from mi_refgs.kernels.device import machine
-from mi_refgs.methods.method import Method
 from mi_refgs.progress import with_bar
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import write_if_stale
-from mi_refgs.runs.run import DATASET, Run
+from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.light_file import read_radiance
 
 FOLDER = "eval"
@@ -42,29 +40,6 @@ LONGEST_STEM = 60  # characters of the view's name in an image's file name; file
 SHEET_VIEWS = 4  # rows of either sheet, spread evenly over the test views
 MEANS = """psnr psnr_gain ssim flip lpips psnr_region ssim_region region_share normal_mae_deg
     normal_mae_deg_full""".split()  # scores of views whose means are reported
-
-
-def load_split(
-    run: Run, method: Method, split: str, path: Path | None = None, decode: bool = True
-) -> Dataset:
-    """Read a split of the data set of a run, or of the one at `path`, with the options of the method.
-
-    Its region of interest is the run's. Raises InputError as `read_dataset` and `Run.region` do, and if the
-    run records no data set or the data set is gone.
-    """
-    if path is None:
-        record = run.path / DATASET
-        if not record.is_file():
-            raise InputError(f"{run.path}: data set: the run records none; name one with --data")
-        try:
-            path = run.dataset()
-            found = path.is_dir()
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            message = f"{record}: path: cannot be read ({error}); name the data with --data"
-            raise InputError(message) from error
-        if not found:
-            raise InputError(f"{record}: path: {path} is gone; name the data set's folder with --data")
-    return of_run(run, read_views(method, path, split, decode=decode))
 
 
 def evaluate(
@@ -95,7 +70,7 @@ def evaluate(
     """
     # The scene, its test views, and the files to write.
     method = run.method()
-    views = load_split(run, method, "test", data)
+    views = views_of_run(run, method, "test", data)
     renders = render_names(views.views)
     outputs = [*renders, SHEET, DECOMPOSITION, METRICS]
     run.output.require_free(outputs)

@@ -29,12 +29,13 @@ from mi_refgs.data.region import Region
 from mi_refgs.data.view import View
 from mi_refgs.fitting import cost_model
 from mi_refgs.fitting.cost_model import Speed
-from mi_refgs.fitting.targets import bytes_of, read_views
+from mi_refgs.fitting.targets import bytes_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.device import machine, simd_width
 from mi_refgs.methods.build import plain
 from mi_refgs.methods.method import Method, Refine
 from mi_refgs.methods.read import PRESETS
+from mi_refgs.runs.views import read_views
 
 VIEWS = 6
 COVERED = 0.35

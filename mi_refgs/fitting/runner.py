@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from mi_refgs import methods
 from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.data.dataset import Dataset, PointCloud
@@ -20,21 +18,18 @@ from mi_refgs.fitting.plan import planned
 from mi_refgs.fitting.progress import Progress
 from mi_refgs.fitting.select import DECISIONS, select_components, with_components
 from mi_refgs.fitting.state import decisions_of
-from mi_refgs.fitting.targets import read_views
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import MODEL
+from mi_refgs.runs.views import read_views, with_region
 
 DEFAULT_METHOD = "ref_gaussian.toml"
 """File of `variants/` that is fitted by default: the full method."""
 OPEN_PURPOSE = "photographs"
 """Purpose of the method that is fitted by default to images without alpha."""
-SAME_REGION = 1e-6
-"""Difference of two regions, in radii, up to which they are the same: solvers differ in the last digits."""
-
 Tell = Callable[[str], None]
 """Is called with sentences for the user."""
 FindPoints = Callable[[Dataset, Path, Tell], PointCloud | None]
@@ -175,7 +170,7 @@ def begin(
     that cannot be written.
     """
     resumed = run.exists()
-    views = of_run(run, views, tell)
+    views = with_region(views, run.region(), tell)
     state = run.load_checkpoint() if resumed else None
     if resumed and state is None and (run.path / MODEL).is_file():
         raise InputError(
@@ -198,21 +193,6 @@ def begin(
         run.create(method, str(views.path.resolve()), views.region)
     select_components(trainer, tell)
     return trainer
-
-
-def of_run(run: Run, views: Dataset, tell: Tell = lambda _: None) -> Dataset:
-    """The views with the region of interest that the run was started with, if it has one.
-
-    `tell` is called if the data set has another one. Raises InputError as `Run.region` does.
-    """
-    region, now = run.region(), views.region
-    if region is None:
-        return views
-    old = np.array((*region.centre, region.radius))
-    change = np.inf if now is None else np.abs(np.array((*now.centre, now.radius)) - old).max()
-    if change > SAME_REGION * region.radius:
-        tell(f"{views.path}: region: it has changed since {run.path} was started, which keeps its own")
-    return replace(views, region=region)
 
 
 def finish(trainer: Trainer, run: Run) -> str | None:
@@ -293,10 +273,7 @@ def _require(run: Run, option: str, made: Method, now: Method) -> None:
 
 def _record_data(run: Run, data: Path, progress: Progress) -> None:
     """Record another data set, with a warning: commands that follow read that of the last fit."""
-    try:
-        before = run.dataset().resolve()
-    except (OSError, ValueError, KeyError, TypeError):
-        before = data.resolve()
-    if before != data.resolve():
-        progress.warn(f"{run.path}: was fitted to {before} before, now to {data}")
+    before = run.dataset()
+    if before is not None and before.resolve() != data.resolve():
+        progress.warn(f"{run.path}: was fitted to {before.resolve()} before, now to {data}")
         run.write_dataset(str(data.resolve()), run.region())

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from pathlib import Path
 
 import drjit as dr
 import numpy as np
 
-from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.images import CACHE_BYTES
 from mi_refgs.data.view import View
 from mi_refgs.fitting import losses
@@ -40,21 +39,6 @@ def require_memory(method: Method, data: Dataset) -> None:
     what = f"fit: images of {pixels:,} pixels, {method.surfels.max_count:,} surfels at most"
     remedy = "read them smaller with --set data.downscale=N, or lower surfels.max_count"
     require(bytes_of(method, len(data.views), pixels), what, remedy)
-
-
-def read_views(method: Method, path: Path, split: str, truth: bool = True, decode: bool = True) -> Dataset:
-    """Read a split of a data set with the image options of a method; raises InputError as `read_dataset`
-    does."""
-    options = method.data
-    return read_dataset(
-        path,
-        split,
-        downscale=options.downscale,
-        background=options.background,
-        images=options.images,
-        truth=truth,
-        decode=decode,
-    )
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
 from mi_refgs.data.view import FileCamera
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.targets import read_views
 from mi_refgs.formats import Shot
 from mi_refgs.formats.orbits import shots_around, turntable_cameras
 from mi_refgs.io.files import read_json
@@ -19,6 +18,7 @@ from mi_refgs.methods.method import Method
 from mi_refgs.runs.export import save
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.runs.views import read_views, with_region
 from mi_refgs.splat import Camera
 
 EDITS = "edit.json"
@@ -35,15 +35,11 @@ class Provenance:
 
     @staticmethod
     def of(run: Run) -> Provenance:
-        """Read a run folder; raises InputError if it is none, or records a region that cannot be used."""
+        """Read a run folder; raises InputError if it is none, or has a record that cannot be used."""
         method = run.method()
-        try:
-            data: Path | None = run.dataset()
-        except (OSError, ValueError, KeyError, TypeError):
-            data = None
         record = run.path / EDITS
         edits = read_json(record).get("edits", []) if record.is_file() else []
-        return Provenance(method, data, run.region(), tuple(edits))
+        return Provenance(method, run.dataset(), run.region(), tuple(edits))
 
     def save(self, trained: TrainedScene, folder: Path, camera: Camera) -> None:
         """Write a scene as a run folder (`runs.export.save`); raises InputError as that does."""
@@ -68,8 +64,7 @@ class Provenance:
         if self.data is None or not self.has_data:
             gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
             raise InputError(f"views: {split}: {gone}; use cameras(), or restore the data set")
-        found = read_views(self.method, self.data, split, decode=decode)
-        return found if self.region is None else replace(found, region=self.region)
+        return with_region(read_views(self.method, self.data, split, decode=decode), self.region)
 
     def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
         """Return the named cameras of some splits; without a data set, cameras around the surfels.

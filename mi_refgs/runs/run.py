@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 import tempfile
 from contextlib import AbstractContextManager
@@ -101,9 +102,22 @@ class Run:
             )
         return load_resolved(self.path / CONFIG)
 
-    def dataset(self) -> Path:
-        """Folder of the data set that the run was fitted to."""
-        return Path(read_json(self.path / DATASET)["path"])
+    def dataset(self) -> Path | None:
+        """Folder of the data set that the run was fitted to; None if it records none.
+
+        Raises InputError for a record that cannot be used.
+        """
+        record = self.path / DATASET
+        path = read_json(record).get("path") if record.is_file() else None
+        if path is None:
+            return None
+        try:
+            os.path.realpath(path)
+            return Path(path)
+        except (OSError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{record}: path: cannot be used ({error}); write the folder of the data set there"
+            ) from error
 
     def region(self) -> Region | None:
         """The region of interest that the run was started with; raises InputError if it cannot be used."""

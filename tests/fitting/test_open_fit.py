@@ -15,7 +15,6 @@ from mi_refgs.data.dataset import Dataset, PointCloud, read_dataset
 from mi_refgs.data.images import ImageFile
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.fitting.control import exchanged
 from mi_refgs.fitting.initial import initial_parameters, is_open
 from mi_refgs.fitting.runner import begin, default_method
@@ -25,6 +24,7 @@ from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
 from mi_refgs.reconstruction.fit import ProgressBar
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.tiny import METHOD, REGION, write_data, write_open_data
@@ -164,7 +164,7 @@ def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method
     begin(method, read_dataset(folder, "train"), run)
     assert run.region() == REGION
     begin(method, read_dataset(folder, "train"), run, said.append)
-    assert said == [] and load_split(run, method, "test").region == REGION
+    assert said == [] and views_of_run(run, method, "test").region == REGION
     for text in ('{"centre": [0, 0, 0.1], "radius": 0.7}', '{"centre": [0, 0, 0], "radius": 0.5}', None):
         (folder / REGION_FILE).unlink()
         if text is not None:
@@ -172,11 +172,11 @@ def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method
         else:
             (folder / REGION_FILE).symlink_to("nowhere")
         resumed = begin(method, read_dataset(folder, "train"), run, said.append)
-        assert resumed.data.region == REGION and load_split(run, method, "test").region == REGION
+        assert resumed.data.region == REGION and views_of_run(run, method, "test").region == REGION
         assert "region: it has changed" in said.pop() and not said
     (run.path / "dataset.json").write_text(json.dumps({"path": str(folder), "region": {"radius": 1}}))
     with pytest.raises(InputError, match=r"dataset\.json: centre, radius"):
-        load_split(run, method, "test")
+        views_of_run(run, method, "test")
 
 
 def test_fit_of_open_scene_improves(data: Dataset, method: Method) -> None:

@@ -15,7 +15,6 @@ import pytest
 
 from mi_refgs import methods
 from mi_refgs.errors import InputError, abbreviated
-from mi_refgs.evaluation.evaluate import load_split
 from mi_refgs.io.exr import read_exr, write_exr
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import image_size, read_png
@@ -23,6 +22,7 @@ from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.plugins.properties import read_background, read_light, read_shading, read_surfels
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.ply import read_ply
@@ -175,7 +175,7 @@ def test_invalid_models_are_refused(content: dict[str, Any], tmp_path: Path) -> 
 @pytest.mark.parametrize("place", [3, None, "a" * 5000, "a\0b", "\ud800", ["a"]])
 def test_runs_with_invalid_data_paths_are_refused(place: Any, tmp_path: Path) -> None:
     def read(path: Path) -> None:
-        load_split(Run(path.parent), methods.load("ref_gaussian"), "train")
+        views_of_run(Run(path.parent), methods.load("ref_gaussian"), "train")
 
     refuse_file(read, tmp_path / "dataset.json", json.dumps({"path": place}).encode(), "path")
 

@@ -1,0 +1,67 @@
+"""The views of a run: a split of its data set, read as its method says, with its region of interest."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.region import Region
+from mi_refgs.errors import InputError
+from mi_refgs.methods.method import Method
+from mi_refgs.runs.run import DATASET, Run
+
+SAME_REGION = 1e-6
+"""Difference of two regions, in radii, up to which they are the same: solvers differ in the last digits."""
+
+
+def read_views(method: Method, path: Path, split: str, truth: bool = True, decode: bool = True) -> Dataset:
+    """Read a split of a data set with the image options of a method; raises InputError as `read_dataset`
+    does."""
+    options = method.data
+    return read_dataset(
+        path,
+        split,
+        downscale=options.downscale,
+        background=options.background,
+        images=options.images,
+        truth=truth,
+        decode=decode,
+    )
+
+
+def views_of_run(
+    run: Run, method: Method, split: str, path: Path | None = None, decode: bool = True
+) -> Dataset:
+    """Read a split of the data set of a run, or of the one at `path`, with the options of the method.
+
+    Its region of interest is the run's. Raises InputError as `read_dataset` and `Run.region` do, and if the
+    run records no data set or the data set is gone.
+    """
+    if path is None:
+        record, path = run.path / DATASET, run.dataset()
+        if path is None:
+            raise InputError(f"{record}: path: the run records no data set; name one with --data")
+        if not os.path.isdir(path):  # False for impossible names too
+            raise InputError(f"{record}: path: {path} is gone; name the data set's folder with --data")
+    return with_region(read_views(method, path, split, decode=decode), run.region())
+
+
+def with_region(
+    views: Dataset, region: Region | None, tell: Callable[[str], None] = lambda _: None
+) -> Dataset:
+    """Replace the region of interest by the one that a run was started with, if it has one.
+
+    `tell` is called if the data set has another one.
+    """
+    if region is None:
+        return views
+    now, old = views.region, np.array((*region.centre, region.radius))
+    change = np.inf if now is None else np.abs(np.array((*now.centre, now.radius)) - old).max()
+    if change > SAME_REGION * region.radius:
+        tell(f"{views.path}: region: it has changed since the run was started, which keeps its own")
+    return replace(views, region=region)
