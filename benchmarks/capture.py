@@ -10,14 +10,14 @@ them best.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.capture.frame import PoseErrors, pose_errors
+from benchmarks.common.report import plain_parser, table
+from mi_refgs.capture.frame import pose_errors
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
@@ -28,29 +28,26 @@ def all_views(folder: Path) -> list[View]:
     return [v for split in ("train", "test") for v in read_dataset(folder, split, truth=False).views]
 
 
-def table(errors: PoseErrors, placed: int, wanted: int) -> str:
-    """The errors as a table in Markdown."""
-    rows = [("rotation, degrees", errors.rotation), ("position, % of the extent", 100 * errors.position)]
-    rows.append(("focal length, %", 100 * abs(errors.focal)))
-    lines = [f"{placed} of {wanted} images placed", "", "| error | median | largest |", "|---|---|---|"]
-    lines += [f"| {name} | {np.median(values):.3f} | {values.max():.3f} |" for name, values in rows]
-    return "\n".join(lines)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = plain_parser("capture", __doc__)
     parser.add_argument("captured", type=Path)
     parser.add_argument("truth", type=Path)
     args = parser.parse_args(arguments)
     try:
         captured, truth = all_views(args.captured), all_views(args.truth)
-        print(table(pose_errors(captured, truth), len(captured), len(truth)))
+        errors = pose_errors(captured, truth)
     except (InputError, KeyError) as error:
         print(f"benchmarks.capture: {error}", file=sys.stderr)
         return 2
+    found = {"rotation, degrees": errors.rotation, "position, % of the extent": 100 * errors.position}
+    found["focal length, %"] = 100 * abs(errors.focal)
+    rows = [[name, f"{np.median(x):.3f}", f"{x.max():.3f}"] for name, x in found.items()]
+    print(
+        f"{len(captured)} of {len(truth)} images placed",
+        table(["error", "median", "largest"], rows),
+        sep="\n\n",
+    )
     return 0
 
 

@@ -9,7 +9,6 @@ the paper by the name of its folder.
 
 from __future__ import annotations
 
-import argparse
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from benchmarks.common.report import plain_parser
 from mi_refgs.compare.results import table as table_of
 from mi_refgs.compare.table import NOTHING, Row, Scene, Table, aligned
 from mi_refgs.errors import InputError
@@ -104,7 +104,7 @@ def place_of(folder: Path, figures: Figures) -> Place | None:
 
     The folder's name is the scene's, with nothing but numbers and the data set's words beside it: `ball`,
     `chair_400`, `teapot_glossy`. Where two data sets have a scene of that name, a word of one of them must
-    are in the folder's name or in its parent's.
+    be in the folder's name or in its parent's.
     """
     tokens = {token for token in re.split(r"[^a-z0-9]+", folder.name.lower()) if token}
     found = []
@@ -246,9 +246,7 @@ def _number(value: float | None, form: str, signed: bool) -> str:
 
 def main() -> None:
     """Print a table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = plain_parser("paper_tables", __doc__)
     parser.add_argument("table", type=int, metavar="N", help="number of the table in the paper")
     parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="folder of `refgs compare`")
     args = parser.parse_args()

@@ -10,7 +10,6 @@ test views after the fit. The clock leaves out reading images and the start's su
 
 from __future__ import annotations
 
-import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common import figures
+from benchmarks.common.report import plain_parser, table
 from mi_refgs.compare.jobs import RUNS
 from mi_refgs.compare.page import read_curve
 from mi_refgs.evaluation.evaluate import read_metrics
@@ -44,10 +44,8 @@ class Fit:
         above = np.flatnonzero(self.psnr >= level)
         if not len(above):
             return None
-        i = int(above[0])
-        if i == 0:
-            return float(self.seconds[0])
-        return float(np.interp(level, self.psnr[i - 1 : i + 1], self.seconds[i - 1 : i + 1]))
+        near = slice(max(above[0] - 1, 0), above[0] + 1)
+        return float(np.interp(level, self.psnr[near], self.seconds[near]))
 
 
 def fits(folder: Path) -> list[Fit]:
@@ -63,20 +61,16 @@ def fits(folder: Path) -> list[Fit]:
     return found
 
 
-def table(found: list[Fit], levels: list[float]) -> str:
-    """Seconds to each level as lines of text."""
+def seconds_table(found: list[Fit], levels: list[float]) -> str:
+    """Seconds to each level, in Markdown."""
     head = ["data", "method", "seed", "folder", *(f"{level:g} dB" for level in levels), "s", "dB"]
-    rows = [head]
+    rows = []
     for fit in found:
         times = [fit.reached(level) for level in levels]
         cells = ["–" if seconds is None else f"{seconds:.0f}" for seconds in times]
-        rows.append(
-            [fit.data, fit.method, fit.seed, fit.folder, *cells, f"{fit.seconds[-1]:.0f}", f"{fit.final:.2f}"]
-        )
-    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
+        place = [fit.data, fit.method, fit.seed, fit.folder]
+        rows.append([*place, *cells, f"{fit.seconds[-1]:.0f}", f"{fit.final:.2f}"])
+    return table(head, rows)
 
 
 def plot(found: list[Fit], path: Path) -> None:
@@ -99,7 +93,7 @@ def plot(found: list[Fit], path: Path) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the table, and plot."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = plain_parser("quality", __doc__)
     parser.add_argument("folders", type=Path, nargs="+", help="of `refgs compare`")
     parser.add_argument("--at", type=float, nargs="+", default=list(LEVELS), help="PSNR to reach, dB")
     parser.add_argument("-o", "--output", type=Path, help="plot to write, PNG")
@@ -107,7 +101,7 @@ def main(arguments: list[str] | None = None) -> int:
     found = [fit for folder in args.folders for fit in fits(folder)]
     if not found:
         parser.error("these folders hold no curve; run `refgs compare` with -o")
-    print(table(found, args.at))
+    print(seconds_table(found, args.at))
     if args.output is not None:
         plot(found, args.output)
     return 0

@@ -29,6 +29,7 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
+from benchmarks.common.fits import sphere_data
 from benchmarks.common.report import plain_parser
 from benchmarks.common.timing import process_bytes
 
@@ -69,7 +70,6 @@ def settings(**windows: int) -> list[str]:
 
 def write_data(folder: Path) -> Path:
     """The images as a data set on disk."""
-    from benchmarks.step import sphere_data
     from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
     from mi_refgs.io.images import write_png
 
@@ -194,7 +194,6 @@ def _goes_on(run: Any, before: int, resumed: int) -> bool:
 
 def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
     """One fit of so many steps; a record every INTERVAL steps is printed and, at the end, all are written."""
-    from benchmarks.step import sphere_data
     from mi_refgs import methods
     from mi_refgs.fitting.train import Trainer
     from mi_refgs.runs.run import Run

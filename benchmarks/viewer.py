@@ -16,6 +16,7 @@ The browser draws in software and shares the machine with the viewer: what it ta
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import random
@@ -28,11 +29,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.timing import process_bytes
+import psutil
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-TICKS = os.sysconf("SC_CLK_TCK")
 COUNTER = """
 window.refgsPictures = 0;
 const made = URL.createObjectURL;
@@ -44,28 +44,19 @@ URL.createObjectURL = (blob) => {
 """Counts the images that the page decodes: each becomes an object URL."""
 
 
-def cpu_seconds(pid: int) -> float:
+def cpu_seconds(process: psutil.Process) -> float:
     """User and system time of a process and all its threads."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
+    times = process.cpu_times()
+    return float(times.user + times.system)
 
 
-def children_cpu() -> float:
+def browser_cpu() -> float:
     """CPU seconds of all chromium processes that this one has started, as far as they still run."""
-    total, pids = 0.0, {os.getpid()}
-    stats = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            name, _, rest = path.read_text().rpartition(")")
-        except OSError:
-            continue
-        fields = rest.split()
-        stats[int(path.parent.name)] = (int(fields[1]), name, (int(fields[11]) + int(fields[12])) / TICKS)
-    for _ in range(8):
-        pids |= {pid for pid, (parent, _, _) in stats.items() if parent in pids}
-    for pid in pids:
-        if pid in stats and "chrom" in stats[pid][1]:
-            total += stats[pid][2]
+    total = 0.0
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if "chrom" in process.name():
+                total += cpu_seconds(process)
     return total
 
 
@@ -121,8 +112,8 @@ def orbit(page: Any, viewer: Viewer, seconds: float) -> dict[str, float]:
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x, y)
     page.mouse.down()
-    pid = viewer.process.pid
-    before, cpu, browser = page.evaluate("window.refgsPictures"), cpu_seconds(pid), children_cpu()
+    process = psutil.Process(viewer.process.pid)
+    before, cpu, browser = page.evaluate("window.refgsPictures"), cpu_seconds(process), browser_cpu()
     begin = time.monotonic()
     step = 0
     while time.monotonic() - begin < seconds:
@@ -135,8 +126,8 @@ def orbit(page: Any, viewer: Viewer, seconds: float) -> dict[str, float]:
         "seconds": round(taken, 2),
         "images": images,
         "pictures_per_s": round(images / taken, 2),
-        "cpu_ms_per_picture": round(1000 * (cpu_seconds(pid) - cpu) / max(images, 1), 1),
-        "browser_cpu_s": round(children_cpu() - browser, 2),
+        "cpu_ms_per_picture": round(1000 * (cpu_seconds(process) - cpu) / max(images, 1), 1),
+        "browser_cpu_s": round(browser_cpu() - browser, 2),
     }
     page.mouse.up()
     return result
@@ -144,13 +135,13 @@ def orbit(page: Any, viewer: Viewer, seconds: float) -> dict[str, float]:
 
 def click_about(page: Any, viewer: Viewer, seconds: float, seed: int) -> dict[str, Any]:
     """Random use for some time."""
-    rng, pid = random.Random(seed), viewer.process.pid
+    rng, process = random.Random(seed), psutil.Process(viewer.process.pid)
     box = page.locator("canvas").first.bounding_box()
     begin, clicks = time.monotonic(), 0
-    memory = {"start": process_bytes(pid=pid) / 2**20}
+    memory = {"start": process.memory_info().rss}
     while (passed := time.monotonic() - begin) < seconds:
         if "tenth" not in memory and passed > seconds / 10:
-            memory["tenth"] = process_bytes(pid=pid) / 2**20
+            memory["tenth"] = process.memory_info().rss
         clicks += 1
         kind = rng.random()
         x, y = box["x"] + rng.random() * box["width"], box["y"] + rng.random() * box["height"]
@@ -182,11 +173,11 @@ def click_about(page: Any, viewer: Viewer, seconds: float, seed: int) -> dict[st
                     raise
         page.wait_for_timeout(rng.choice((20, 100, 700)))
     page.wait_for_timeout(2000)
-    memory["end"] = process_bytes(pid=pid) / 2**20
+    memory["end"] = process.memory_info().rss
     return {
         "seconds": round(time.monotonic() - begin, 1),
         "clicks": clicks,
-        "resident_mb": {name: round(value, 1) for name, value in memory.items()},
+        "resident_mb": {name: round(value / 2**20, 1) for name, value in memory.items()},
         "alive": viewer.process.poll() is None,
     }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
@@ -53,10 +52,7 @@ def once(call: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
-def process_bytes(field: str = "VmRSS", pid: int | str = "self") -> int:
-    """VmRSS (now), VmHWM (peak) or VmSize (mapped) of a process; this one's peak where there is no /proc."""
-    status = Path(f"/proc/{pid}/status")
-    if not status.exists():
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    line = next((line for line in status.read_text().splitlines() if line.startswith(field)), f"{field} 0")
-    return 1024 * int(line.split()[1])
+def process_bytes(field: str = "VmRSS") -> int:
+    """VmRSS (now), VmHWM (peak) or VmSize (mapped) of this process; needs the /proc of Linux."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(field))

@@ -6,7 +6,6 @@ Discs that cover a sphere twice, however many there are; deferred split-sum shad
 from __future__ import annotations
 
 import json
-import resource
 import sys
 import time
 from typing import Any
@@ -17,6 +16,7 @@ import drjit as dr  # isort: skip
 import mitsuba as mi
 import numpy as np
 
+from benchmarks.common.timing import process_bytes
 from mi_refgs.shade.light.envmap import EnvironmentLight
 
 AOVS = "n:normal,d:depth,al:albedo,r:roughness,m:metallic,di:diffuse,sp:specular"
@@ -70,8 +70,7 @@ def main(kind: str, size: int, samples: int, surfels: int) -> None:
         mi.render(of, spp=samples).numpy()
     dr.sync_thread()
     seconds = time.perf_counter() - start
-    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    print(json.dumps({"measured": peak, "seconds": seconds}))
+    print(json.dumps({"measured": process_bytes("VmHWM"), "seconds": seconds}))
 
 
 if __name__ == "__main__":

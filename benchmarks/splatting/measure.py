@@ -20,15 +20,15 @@ from scipy.optimize import nnls
 from tqdm import tqdm
 
 from benchmarks.common import report, timing
+from benchmarks.common.fits import make_trainer, sphere_data
 from benchmarks.common.timing import once
 from benchmarks.splatting import process
 from benchmarks.splatting.cases import COLOUR, FEATURES, Settings, Workload, fitted, sphere
 from benchmarks.splatting.renderers import Ours, Volprim
 from benchmarks.stability.cases import Case, sky
 from benchmarks.stability.measure import measure as measure_case
-from benchmarks.step import step_times
 from mi_refgs.constants import tile_size
-from mi_refgs.profiling.profile import Counts
+from mi_refgs.profiling.profile import Counts, profile_stage
 from mi_refgs.splat import list_by_tile, project
 from mi_refgs.surfels.primitives.surfel import Surfel
 
@@ -171,6 +171,36 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
         "step": step_times(*settings.step, settings.steps),
     }
     return result | {"seconds": time.perf_counter() - begin}
+
+
+STEP_SECONDS = 1.0
+"""For which the splat of a step is timed by itself, at most."""
+
+
+def step_times(surfels: int, size: int, steps: int) -> dict[str, Row]:
+    """For every stage of the schedule: a step's time, launches, cache misses, and where its time goes.
+
+    Surfels cover a unit sphere; about half of them are seen. Each phase is timed between barriers, in steps
+    of their own; `step_ms` is the wall time of undisturbed steps, less than the sum of the phases because
+    kernels fuse across them; `splat_ms` that of the step's splat and its gradients by themselves.
+    """
+    trainer, method = make_trainer(surfels, sphere_data(size, 8, np.random.default_rng(0)))
+    result = {}
+    for name, stage in method.stages():
+        if stage.shading.at == "pixel" and method.mesh is not None:
+            trainer.extract_mesh()
+        found = profile_stage(trainer, name, steps)
+        with trainer.held_in_stage(name) as prepare:
+            prepare()
+            splat_ms = timing.milliseconds({name: Ours.of_step(trainer).both}, STEP_SECONDS, steps)[name]
+        result[name] = {
+            "step_ms": round(found.step_ms, 2),
+            "splat_ms": round(splat_ms, 2),
+            "launches": found.launches,
+            "cache_misses": found.misses,
+            "phases_ms": {key: round(value, 2) for key, value in found.phases_ms.items()},
+        }
+    return result
 
 
 def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row:

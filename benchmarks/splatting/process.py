@@ -82,7 +82,7 @@ def _memory(count: int, size: int) -> dict[str, Any]:
 def _step(count: int, size: int) -> dict[str, Any]:
     import numpy as np
 
-    from benchmarks.step import make_trainer, sphere_data
+    from benchmarks.common.fits import make_trainer, sphere_data
 
     rng = np.random.default_rng(0)
     trainer, method = make_trainer(count, sphere_data(size, 2, rng))
@@ -121,9 +121,7 @@ def _start() -> int:
     dr.sync_thread()
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
-    reset = Path("/proc/self/clear_refs")
-    if reset.exists():
-        reset.write_text("5")
+    Path("/proc/self/clear_refs").write_text("5")
     return process_bytes("VmRSS")
 
 

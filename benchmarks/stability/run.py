@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.common import report
+from benchmarks.common.fits import make_trainer, sphere_data
 from benchmarks.common.report import table
 from benchmarks.stability import bias, response
 from benchmarks.stability.cases import catalogue
@@ -26,7 +27,6 @@ from benchmarks.stability.measure import (
     Row,
 )
 from benchmarks.stability.measure import measure as measure_case
-from benchmarks.step import make_trainer, sphere_data
 from mi_refgs.fitting.state import FitSetup
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import LIGHT

@@ -36,8 +36,8 @@ def test_seconds_to_reach_psnr(folder: Path) -> None:
 def test_table_and_plot_are_written(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = folder / "quality.png"
     assert quality.main([str(folder), "--at", "33", "36", "-o", str(image)]) == 0
-    row = capsys.readouterr().out.splitlines()[1].split()
-    assert row == ["chair", "ref_gaussian", "seed0", "after", "35", "–", "60", "33.25"]
+    row = capsys.readouterr().out.splitlines()[2]
+    assert row == "| chair | ref_gaussian | seed0 | after | 35 | – | 60 | 33.25 |"
     assert image.stat().st_size > 5_000
     with pytest.raises(SystemExit):
         quality.main([str(folder.parent)])

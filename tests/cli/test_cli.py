@@ -427,10 +427,7 @@ def test_unwritable_output(finished: Path, data: Path, method: Path, tmp_path: P
     ],
 )
 def test_bad_arguments(
-    argv: list[str],
-    parts: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    argv: list[str], parts: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     refused(argv, *parts)

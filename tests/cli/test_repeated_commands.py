@@ -186,11 +186,7 @@ Began = Callable[[str], tuple[list[str], Path]]
 
 @pytest.fixture
 def began(
-    places: dict[str, str],
-    finished: Path,
-    traced: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    places: dict[str, str], finished: Path, traced: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Began:
     """Outputs of commands, and what takes long left out of their repetition."""
     slow = cost_model.Speed({"initial": [1.0, 4.0], "deferred": [1.0, 4.0]}, 0.0, 0.0)

@@ -259,11 +259,7 @@ def test_killed_cluster_worker_is_replaced(ball: Path, variants: tuple[Path, Pat
     ],
 )
 def test_bad_input_is_refused(
-    arguments: list[str],
-    words: list[str],
-    ball: Path,
-    variants: tuple[Path, Path],
-    tmp_path: Path,
+    arguments: list[str], words: list[str], ball: Path, variants: tuple[Path, Path], tmp_path: Path
 ) -> None:
     (tmp_path / "twin").mkdir()
     os.symlink(ball, tmp_path / "twin" / "ball")
@@ -295,10 +291,7 @@ def test_plan_reads_images_as_methods_do(ball: Path, variants: tuple[Path, Path]
 
 
 def test_different_image_sizes_are_refused(
-    compared: tuple[Path, int],
-    ball: Path,
-    variants: tuple[Path, Path],
-    tmp_path: Path,
+    compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """Before anything is fitted: two methods, or one and existing runs; and existing runs."""
     smaller = tmp_path / "smaller.toml"
@@ -322,10 +315,7 @@ def test_heading_states_image_size(compared: tuple[Path, int]) -> None:
 
 
 def test_other_settings_are_refused(
-    compared: tuple[Path, int],
-    ball: Path,
-    variants: tuple[Path, Path],
-    tmp_path: Path,
+    compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], tmp_path: Path
 ) -> None:
     folder = copied(compared[0], tmp_path / "copy")
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
@@ -39,7 +37,6 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera, Composited, Footprints
-from tests.helpers import ROOT
 from tests.scenes.tiny import SETTINGS, SIZE
 
 PAUSE = 0.25
@@ -324,16 +321,6 @@ def test_run_without_checkpoints_has_images(
     (run / "model.json").unlink()
     assert main(["profile", str(run)]) == 2
     assert "checkpoints: none yet" in capsys.readouterr().err
-
-
-def test_benchmark_of_step_runs_as_script(tmp_path: Path) -> None:
-    options = ["--surfels", "300", "--size", "32", "--steps", "1", "--json"]
-    script = [sys.executable, str(ROOT / "benchmarks" / "step.py"), *options]
-    done = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
-    found = json.loads(done.stdout)
-    for stage in ("initial", "deferred"):
-        assert found[stage]["splat_ms"] > 0 and list(found[stage]["phases_ms"]) == list(phases.PHASES)
 
 
 # ---------- Counts and advice ----------
