@@ -74,7 +74,7 @@ def write_data(folder: Path) -> Path:
     from mi_refgs.io.images import write_png
 
     folder.mkdir(parents=True)
-    views = sphere_data(SIZE, VIEWS, np.random.default_rng(0)).views
+    views: Any = sphere_data(SIZE, VIEWS, np.random.default_rng(0)).views
     frames = []
     for i, view in enumerate(views):
         write_png(folder / f"{i}.png", np.concatenate([view.image, view.alpha[..., None]], axis=-1))

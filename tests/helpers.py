@@ -95,17 +95,24 @@ def read_loaded(*arguments: Any, **options: Any) -> Dataset:
     return replace(data, views=tuple(view.load() for view in data.views))
 
 
-def run_python(code: str, *arguments: object, folder: Path, package: Path = ROOT) -> str:
-    """What `code` prints in a fresh process with warnings as errors, which finds mi_refgs below `package`."""
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code, *map(str, arguments)],
+def run_process(
+    *arguments: object, folder: Path = ROOT, package: Path = ROOT, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Run Python with these arguments in a fresh process, which finds mi_refgs below `package`."""
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(package)},
+        env=os.environ | {"PYTHONPATH": str(package)} | environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
     )
+
+
+def run_python(code: str, *arguments: object, folder: Path, package: Path = ROOT) -> str:
+    """What `code` prints in a fresh process with warnings as errors, which finds mi_refgs below `package`."""
+    done = run_process("-W", "error", "-c", code, *arguments, folder=folder, package=package)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 

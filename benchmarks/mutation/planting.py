@@ -32,8 +32,8 @@ def catalogue() -> list[Mutant]:
     """
     return [
         Mutant(name, f"mi_refgs/{file}", before, after, f"tests/{test}")
-        for room in sorted(Path(__file__).with_name("mutants").glob("*.toml"))
-        for file, mutants in tomllib.loads(room.read_text(encoding="utf-8")).items()
+        for folder in sorted(Path(__file__).with_name("mutants").glob("*.toml"))
+        for file, mutants in tomllib.loads(folder.read_text(encoding="utf-8")).items()
         for name, (before, after, test) in mutants.items()
     ]
 

@@ -225,8 +225,9 @@ def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row
     moved = bytes_moved(counts, FEATURES)
     phases = full.phases(min(PHASE_REPEATS, settings.repeats))
     row: Row = {"case": workload.name, "spread": workload.spread, "surfels": count, "size": size}
-    names = ("pixels", "covered", "pairs", "evaluated", "contributing", "share")
+    names = ("pixels", "covered", "pairs", "evaluated", "contributing")
     row |= {name: getattr(counts, name) for name in names}
+    row["share"] = counts.contributing / counts.evaluated if counts.evaluated else 1.0
     row |= {f"{name}_ms": times.get(name) for name in (*calls, "volprim_forward", "volprim_both")}
     row |= {f"{phase.replace(' ', '_')}_ms": phases[phase] for phase in PHASES}
     for kind in ("forward", "both"):

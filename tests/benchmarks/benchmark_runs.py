@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-from tests.helpers import ROOT
+from tests.helpers import ROOT, run_process
 
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))  # `benchmarks` is no part of the package
@@ -17,15 +16,7 @@ if str(ROOT) not in sys.path:
 
 def run_benchmark(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     """`python -W error -m benchmarks.NAME ARGUMENTS`, whatever comes of it."""
-    return subprocess.run(
-        [sys.executable, "-W", "error", "-m", f"benchmarks.{name}", *map(str, arguments)],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    return run_process("-W", "error", "-m", f"benchmarks.{name}", *arguments)
 
 
 def small_instance(name: str, folder: Path) -> Path:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +12,7 @@ import pytest
 from mi_refgs import llvm
 from mi_refgs.cli import doctor
 from mi_refgs.fitting import cost_model
+from tests.helpers import run_process
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +73,7 @@ def test_hanging_kernel_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_doctor_reports_missing_library() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "mi_refgs", "doctor"],
-        cwd=Path(__file__).parents[2],
-        env=os.environ | {llvm.ENVIRONMENT_VARIABLE: "/none/libLLVM.so"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = run_process("-m", "mi_refgs", "doctor", **{llvm.ENVIRONMENT_VARIABLE: "/none/libLLVM.so"})
     assert done.returncode == 1
     assert "PROBLEM: DRJIT_LIBLLVM_PATH=/none/libLLVM.so does not exist" in done.stdout
     assert f"unset {llvm.ENVIRONMENT_VARIABLE}" in done.stdout

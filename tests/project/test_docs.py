@@ -3,19 +3,17 @@ the site is built of them without a warning."""
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import shutil
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from urllib.parse import urlparse
 
 import pytest
 
-from tests.helpers import ROOT, command_names, command_options
+from tests.helpers import ROOT, command_names, command_options, run_process, run_python
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [*ROOT.glob("*.md"), ROOT / "scenes" / "README.md", *(ROOT / "docs").rglob("*.md")]
@@ -32,8 +30,6 @@ MADE = {
     "settings.md",
 }
 """Pages of docs/ that are made while the site is built."""
-SITE_TIMEOUT = 300.0
-"""Seconds: a build takes 4 of a processor."""
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -67,16 +63,7 @@ def checkout(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("code", PYTHON)
 def test_python_blocks_run(code: str, checkout: Path) -> None:
     """Each block in a process of its own, as a reader would paste it; warnings are errors."""
-    result = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
-        cwd=checkout,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr[-2000:]
+    run_python(code, folder=checkout)
 
 
 @pytest.mark.parametrize("page", SHELL)
@@ -112,16 +99,8 @@ def test_links_resolve(page: Path) -> None:
 
 def build(config: Path, target: Path) -> subprocess.CompletedProcess[str]:
     """Build a site with warnings as errors."""
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", str(config), "-d", str(target)]
-    return subprocess.run(
-        command,
-        cwd=ROOT,
-        env=os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=SITE_TIMEOUT,
-        check=False,
-    )
+    arguments = ("-m", "mkdocs", "build", "--strict", "-f", config, "-d", target)
+    return run_process(*arguments, NO_MKDOCS_2_WARNING="1")
 
 
 @pytest.fixture(scope="module")

@@ -82,11 +82,11 @@ PROPER_USES: dict[str, str] = {
 NOT_CLEAN_YET = {
     "docs/decisions.md",
 }
-"""Rooms and pages that still have such words. The set only gets smaller: a room that left it stays clean."""
+"""Folders and pages that still have such words. The set only gets smaller: what left it stays clean."""
 
 
-def room_of(path: Path) -> str:
-    """Name of what is cleaned at once: a room of the package, a folder of tests, a page, a file."""
+def folder_of(path: Path) -> str:
+    """Name of what is cleaned at once: a folder of the package, a folder of tests, a page, a file."""
     parts = path.relative_to(ROOT).parts
     if parts[0] in ("mi_refgs", "tests", "benchmarks") and len(parts) > 2:
         return "/".join(parts[:2])
@@ -156,9 +156,9 @@ def findings(path: Path) -> list[str]:
 # ---------- The words ----------
 
 
-def test_rooms_do_not_use_other_words() -> None:
-    """`python -m tests.project.test_glossary ROOM …` lists the words of rooms that are not clean yet."""
-    paths = [path for path in files() if room_of(path) not in NOT_CLEAN_YET]
+def test_folders_do_not_use_other_words() -> None:
+    """`python -m tests.project.test_glossary FOLDER …` lists the words of folders that are not clean yet."""
+    paths = [path for path in files() if folder_of(path) not in NOT_CLEAN_YET]
     found = [finding for path in paths for finding in findings(path)]
     assert not found, "\n".join(found)
 
@@ -200,4 +200,4 @@ def test_code_of_pages_is_not_prose(tmp_path: Path) -> None:
 
 if __name__ == "__main__":
     asked = sys.argv[1:] or sorted(NOT_CLEAN_YET)
-    print("\n".join(line for path in files() if room_of(path) in asked for line in findings(path)))
+    print("\n".join(line for path in files() if folder_of(path) in asked for line in findings(path)))

@@ -6,6 +6,7 @@ import ast
 import re
 import tomllib
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -39,10 +40,10 @@ FLOORS: list[set[str]] = [
     {"cli"},
     {"__main__"},
 ]
-"""The rooms of the package from the ground up: a room imports from the floors below it only.
+"""Folders and modules of the package from the ground up: each imports from the floors below it only.
 
-Rooms of one floor do not import each other. `reference` imports `constants` only, and nothing of the package
-imports it. The package's own `__init__` contains the public names: rooms import only `__version__` from it.
+Those of one floor do not import each other. `reference` imports `constants` only, and nothing of the package
+imports it. The package's own `__init__` contains the public names: folders import only `__version__` from it.
 """
 
 
@@ -55,10 +56,6 @@ def module_name(path: Path) -> str:
 def sources() -> dict[str, str]:
     """Module name → source of every file of the package."""
     return {module_name(path): path.read_text() for path in sorted((ROOT / PACKAGE).rglob("*.py"))}
-
-
-ROOT_MODULES = 8
-"""Most modules at the package's root."""
 
 
 PACKAGES = {module_name(path) for path in (ROOT / PACKAGE).rglob("__init__.py")}
@@ -86,30 +83,30 @@ def imports(module: str, source: str) -> Iterator[str]:
 
 def layer_breaches(modules: dict[str, str]) -> list[str]:
     """Imports that `FLOORS` does not allow."""
-    floor = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
+    floor = {folder: level for level, folders in enumerate(FLOORS) for folder in folders}
     found = []
     for module, source in modules.items():
-        room = module.partition(".")[0]
-        if room not in floor and room not in ("", "reference"):
+        folder = module.partition(".")[0]
+        if folder not in floor and folder not in ("", "reference"):
             found.append(f"{module}: no floor is declared for it")
             continue
         for imported in imports(module, source):
             target = imported.partition(".")[0]
-            if room in ("", target) or imported == "__version__":
+            if folder in ("", target) or imported == "__version__":
                 continue
-            if room == "reference":
+            if folder == "reference":
                 allowed = target == "constants"
             else:
-                allowed = floor.get(target, len(FLOORS)) < floor[room]
+                allowed = floor.get(target, len(FLOORS)) < floor[folder]
             if not allowed:
                 found.append(f"{module}: imports {imported or PACKAGE}")
     return found
 
 
-def import_cycles(modules: dict[str, str]) -> list[set[str]]:
-    """Groups of files that import each other, directly or through others, `TYPE_CHECKING` included.
+def import_cycle(modules: dict[str, str]) -> list[str]:
+    """Files that import each other, directly or through others, `TYPE_CHECKING` included; empty without any.
 
-    An import of a room's name counts for the file that it is found in: a submodule, or the room's `__init__`.
+    An imported name counts for the file that it is found in: a submodule, or the folder's `__init__`.
     """
     targets: dict[str, set[str]] = {}
     for module, source in modules.items():
@@ -120,22 +117,11 @@ def import_cycles(modules: dict[str, str]) -> list[set[str]]:
             found.add(name)
         targets[module] = found - {module, ""}
 
-    def reached(module: str) -> set[str]:
-        found: set[str] = set()
-        waiting = [module]
-        while waiting:
-            for target in targets[waiting.pop()] - found:
-                found.add(target)
-                waiting.append(target)
-        return found
-
-    reach = {module: reached(module) for module in modules}
-    groups = {
-        frozenset(other for other in reach[module] if module in reach[other])
-        for module in modules
-        if module in reach[module]
-    }
-    return sorted(map(set, groups), key=sorted)
+    try:
+        TopologicalSorter(targets).prepare()
+    except CycleError as error:
+        return sorted({*error.args[1]})
+    return []
 
 
 def strings_outside_docstrings(source: str) -> set[str]:
@@ -271,16 +257,16 @@ def test_numpy_arrays_reach_the_device_by_upload() -> None:
 
 def test_no_files_import_each_other() -> None:
     """Neither in pairs nor in longer cycles: every file can be read after those that it imports."""
-    assert import_cycles(sources()) == []
+    assert import_cycle(sources()) == []
 
 
 def test_package_root_has_few_modules() -> None:
     names = {path.stem for path in (ROOT / PACKAGE).glob("*.py")}
-    assert len(names) <= ROOT_MODULES, sorted(names)
+    assert len(names) <= 8, sorted(names)
 
 
 def test_no_test_module_imports_a_test_module() -> None:
-    """What tests share is in tests/helpers.py, tests/scenes, or a module of their room without `test_`."""
+    """What tests share is in tests/helpers.py, tests/scenes, or a module of their folder without `test_`."""
     pattern = re.compile(r"^\s*(?:from|import) tests\b.*\btest_", re.MULTILINE)
     paths = sorted((ROOT / "tests").rglob("*.py"))
     assert [path for path in paths if pattern.search(path.read_text())] == []
@@ -324,9 +310,9 @@ def test_forbidden_import_is_found(module: str, source: str) -> None:
     ],
 )
 def test_import_cycle_is_found(modules: dict[str, str]) -> None:
-    assert import_cycles(modules) == [set(modules)]
+    assert import_cycle(modules) == sorted(modules)
     last = list(modules)[-1]
-    assert import_cycles(modules | {last: "import numpy"}) == []
+    assert import_cycle(modules | {last: "import numpy"}) == []
 
 
 @pytest.mark.parametrize(
