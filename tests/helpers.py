@@ -96,13 +96,13 @@ def read_loaded(*arguments: Any, **options: Any) -> Dataset:
 
 
 def run_process(
-    *arguments: object, folder: Path = ROOT, package: Path = ROOT, **environment: str
+    *arguments: object, folder: Path = ROOT, package: Path = ROOT, environment: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
     """Run Python with these arguments in a fresh process, which finds mi_refgs below `package`."""
     return subprocess.run(
         [sys.executable, *map(str, arguments)],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(package)} | environment,
+        env=os.environ | {"PYTHONPATH": str(package)} | (environment or {}),
         capture_output=True,
         text=True,
         timeout=300,

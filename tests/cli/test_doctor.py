@@ -73,7 +73,9 @@ def test_hanging_kernel_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_doctor_reports_missing_library() -> None:
-    done = run_process("-m", "mi_refgs", "doctor", **{llvm.ENVIRONMENT_VARIABLE: "/none/libLLVM.so"})
+    done = run_process(
+        "-m", "mi_refgs", "doctor", environment={llvm.ENVIRONMENT_VARIABLE: "/none/libLLVM.so"}
+    )
     assert done.returncode == 1
     assert "PROBLEM: DRJIT_LIBLLVM_PATH=/none/libLLVM.so does not exist" in done.stdout
     assert f"unset {llvm.ENVIRONMENT_VARIABLE}" in done.stdout

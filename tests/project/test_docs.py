@@ -100,7 +100,7 @@ def test_links_resolve(page: Path) -> None:
 def build(config: Path, target: Path) -> subprocess.CompletedProcess[str]:
     """Build a site with warnings as errors."""
     arguments = ("-m", "mkdocs", "build", "--strict", "-f", config, "-d", target)
-    return run_process(*arguments, NO_MKDOCS_2_WARNING="1")
+    return run_process(*arguments, environment={"NO_MKDOCS_2_WARNING": "1"})
 
 
 @pytest.fixture(scope="module")
