@@ -7,6 +7,7 @@ eighth image in the order of names is a test view, unless `test.txt` beside the 
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -101,11 +102,10 @@ class Reconstruction:
             raise InputError(f"{where}: {error}") from None
         to_world = from_world_to_camera(image.rotation, image.translation, field)
         source = ImageFile.of(file, downscale, self.folders.mask(image.name))
-        intrinsics = _intrinsics(camera, source)
-        made, _ = make_view(
-            source, self.options, where, name=image.name, intrinsics=intrinsics, lens=lens, to_world=to_world
-        )
-        return made
+        pinhole, name = _intrinsics(camera, source), image.name
+        return make_view(
+            source, self.options, where, name=name, intrinsics=pinhole, lens=lens, to_world=to_world
+        )[0]
 
     def points(self) -> PointCloud | None:
         """The reliable points, or all where only a few are reliable; None without any."""
@@ -122,8 +122,7 @@ class Reconstruction:
 
     def notes(self) -> tuple[str, ...]:
         """What the user may want to correct."""
-        notes = []
-        names = self.folders.names()
+        notes, names = [], self.folders.names()
         if absent := len(self.images) - len(self.files):
             notes.append(f"{absent} of {len(self.images)} cameras have no image and are left out")
         if (spare := len(names) - len(self.files)) > 0:
@@ -135,10 +134,9 @@ class Reconstruction:
 
 def _model(folder: Path) -> tuple[Path, str] | None:
     """The folder of the reconstruction and the ending of its files, binary ones first as in COLMAP."""
-    for place in MODEL_FOLDERS:
-        for ending in ENDINGS:
-            if all((folder / place / f"{name}.{ending}").is_file() for name in ("cameras", "images")):
-                return folder / place, ending
+    for place, ending in itertools.product(MODEL_FOLDERS, ENDINGS):
+        if all((folder / place / f"{name}.{ending}").is_file() for name in ("cameras", "images")):
+            return folder / place, ending
     return None
 
 

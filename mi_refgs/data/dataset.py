@@ -42,7 +42,6 @@ OPAQUE_CHECKED = 8
 MAX_SIZES = 4
 """Image sizes in a data set, such as portrait and landscape: a fit compiles every kernel for each."""
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
-IMAGE_KINDS = ("png", "exr")
 
 Item = TypeVar("Item")
 
@@ -127,8 +126,8 @@ def make_view(
     *,
     name: str,
     intrinsics: tuple[float, float, float, float],
-    lens: Lens | None,
     to_world: np.ndarray,
+    lens: Lens | None = None,
 ) -> tuple[View, Undistortion | None]:
     """Make the view of an image; also returns how maps of the averaged image's size are undistorted.
 
@@ -216,7 +215,7 @@ def read_dataset(
     path = Path(path)
     if background not in BACKGROUNDS:
         raise InputError(f"{path}: background: unknown value '{background}'; give white or black")
-    if images not in IMAGE_KINDS:
+    if images not in ("png", "exr"):
         raise InputError(f"{path}: images: unknown value '{images}'; give png or exr")
     downscale = 1 if downscale is None else downscale
     if downscale < 1:
@@ -259,9 +258,8 @@ def read_dataset(
         position = f"({x:.12g}, {y:.12g}, {z:.12g})"
         notes = (*notes, f"cameras are far from the origin: positions are relative to {position}")
     colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
-    linear = images == "exr"
     return Dataset(
-        path, split, views, colour, linear, found.environment, points, region, notes, offset=(x, y, z)
+        path, split, views, colour, images == "exr", found.environment, points, region, notes, (x, y, z)
     )
 
 
@@ -271,9 +269,8 @@ def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, 
     Also returns the width and height of that image's file. Raises InputError as `read_dataset` does.
     """
     width, height = reader_of(Path(path)).size(Path(path), images)
-    factor = 1
-    while factor < min(width, height) and (width // factor) * (height // factor) > pixels:
-        factor += 1
+    factors = range(1, min(width, height))
+    factor = next((k for k in factors if (width // k) * (height // k) <= pixels), min(width, height))
     return factor, width, height
 
 

@@ -24,10 +24,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.images import image_size, read_grey
 
 CAMERA = re.compile(r"(\d{1,6})-camera\.pkl")
-MAX_DEPTH = 15.0
-"""Scene units of the largest number in a depth file."""
-MAX_CODE = 65535
-"""That number: 16 bits."""
+MAX_DEPTH, MAX_CODE = 15.0, 65535
+"""Scene units of the largest number in a depth file, and that number."""
 BACKGROUND = int(14.5 / MAX_DEPTH * MAX_CODE) + 1
 """Smallest number of the background: 14.5 units."""
 
@@ -67,10 +65,8 @@ def _view(folder: Path, number: int, options: ReadOptions) -> View:
     pose, matrix = _camera(field)
     to_world = from_world_to_camera(pose[:, :3], pose[:, 3], f"{field}: pose")
     image = ImageFile.of(folder / f"{number}.png", options.downscale, Mask(depths, BACKGROUND))
-    intrinsics = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    view, _ = make_view(
-        image, options, str(field), name=str(number), intrinsics=intrinsics, lens=None, to_world=to_world
-    )
+    pinhole = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    view, _ = make_view(image, options, str(field), name=str(number), intrinsics=pinhole, to_world=to_world)
     if not options.truth:
         return view
     grey = read_grey(depths)[0][..., None]

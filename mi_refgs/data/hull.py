@@ -109,8 +109,7 @@ class Hull:
         points = np.empty((0, 3))
         # Uniform in the touched cells, then by rejection in the hull.
         for _ in range(HULL_DRAWS):
-            missing = count - len(points)
-            if missing <= 0:
+            if not (missing := count - len(points)):
                 break
             grid = cells[rng.integers(len(cells), size=2 * missing)] + rng.random((2 * missing, 3))
             inside = map_coordinates(self.field, grid.T, order=1) > HULL_LEVEL
@@ -177,13 +176,10 @@ def median_colours(
         if normals is not None:
             seen = seen & (np.sum(normals * (view.to_world[:3, 3] - points), axis=1) > 0)
         at = np.rint([row[seen], column[seen]]).astype(int)
-        row_index, column_index = np.clip(at, 0, np.array([[view.height], [view.width]]) - 1)
+        pixel = tuple(np.clip(at, 0, np.array([[view.height], [view.width]]) - 1))
         view = view.load()
-        colour = view.colour(background)[row_index, column_index]
-        opaque = (
-            np.full(len(colour), True) if view.alpha is None else view.alpha[row_index, column_index] > 0.5
-        )
-        sample[np.flatnonzero(seen)[opaque]] = colour[opaque]
+        opaque = np.full(at.shape[1], True) if view.alpha is None else view.alpha[pixel] > 0.5
+        sample[np.flatnonzero(seen)[opaque]] = view.colour(background)[pixel][opaque]
     ordered = np.sort(samples, axis=0)  # NaN last
     number = np.count_nonzero(~np.isnan(ordered[..., 0]), axis=0)
     middle = ordered[np.maximum(number - 1, 0) // 2, np.arange(len(points))]

@@ -36,8 +36,6 @@ BAND = 256
 """Rows of a file that are converted to floating point at a time; a large image would need half a gigabyte."""
 COPIES = (8, 4, 2)
 """Factors of the smaller copies of images, in `images_8` and so on."""
-IMAGES = "images"
-MASKS = "masks"
 
 
 @dataclass(frozen=True)
@@ -49,9 +47,8 @@ class Mask:
 
     def read(self) -> np.ndarray:
         """Alpha (H, W) float32; raises InputError for a file that cannot be read."""
-        if self.below is not None:
-            return (read_grey(self.path)[0] < self.below).astype(np.float32)
-        return read_mask(self.path)
+        grey = None if self.below is None else read_grey(self.path)[0] < self.below
+        return read_mask(self.path) if grey is None else grey.astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -232,16 +229,14 @@ class ImageFolders:
 
         Raises InputError if there is no folder of images.
         """
-        found = {k: root / f"{IMAGES}_{k}" for k in COPIES if (root / f"{IMAGES}_{k}").is_dir()}
-        if (root / IMAGES).is_dir():
-            found[1] = root / IMAGES
+        names = {**{k: f"images_{k}" for k in COPIES}, 1: "images"}
+        found = {k: root / name for k, name in names.items() if (root / name).is_dir()}
         if not found and flat and any(map(_is_image, root.iterdir())):
             found[1] = root
         if not found:
-            raise InputError(f"{root}: {IMAGES}: no such folder; put the images there")
-        largest = min(found)
-        folders = {k // largest: folder for k, folder in found.items()}
-        return cls(root, folders, root / MASKS if (root / MASKS).is_dir() else None)
+            raise InputError(f"{root}: images: no such folder; put the images there")
+        folders = {k // min(found): folder for k, folder in found.items()}
+        return cls(root, folders, root / "masks" if (root / "masks").is_dir() else None)
 
     def names(self) -> list[str]:
         """Sorted paths of the largest images relative to their folder, those in subfolders included."""

@@ -84,13 +84,14 @@ class Undistortion:
 
     def resample(self, image: np.ndarray, order: int = 3) -> np.ndarray:
         """Undistort an (H, W, C) image by splines of `order`, clipped to the range of each channel."""
-        planes = []
         with _lock:  # else several threads would compute the same coordinates
             coordinates = _source_coordinates(self)
-        for plane in np.moveaxis(image, -1, 0):
+
+        def resampled(plane: np.ndarray) -> np.ndarray:
             moved = ndimage.map_coordinates(plane, coordinates, order=order, mode="nearest")
-            planes.append(np.clip(moved, plane.min(), plane.max()))
-        return np.stack(planes, axis=-1)
+            return np.clip(moved, plane.min(), plane.max())
+
+        return np.stack([resampled(plane) for plane in np.moveaxis(image, -1, 0)], axis=-1)
 
     def source(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Columns and rows in the distorted image of those in the result; 0 is the first pixel's centre."""
@@ -131,10 +132,8 @@ def undistortion(
         u, v = source(across, down)
         right, below = source(across + step, down), source(across, down + step)
         turn = (right[0] - u) * (below[1] - v) - (right[1] - v) * (below[0] - u)
-        inside = u.min() >= -step and v.min() >= -step
-        return bool(
-            inside and u.max() <= width - 1 + step and v.max() <= height - 1 + step and turn.min() > 0
-        )
+        inside = min(u.min(), v.min(), width - 1 - u.max(), height - 1 - v.max()) >= -step
+        return bool(inside and turn.min() > 0)
 
     with np.errstate(over="ignore", invalid="ignore"):  # coefficients may be anything; NaN is not valid
         low, high = 1.0, MAX_ZOOM
@@ -143,8 +142,7 @@ def undistortion(
                 "the distortion moves the image's edges more than half-way in, or folds it; "
                 "correct the coefficients"
             )
-        if valid(low):
-            high = low
+        high = low if valid(low) else high
         for _ in range(ZOOM_STEPS if high > low else 0):
             middle = (low + high) / 2
             low, high = (low, middle) if valid(middle) else (middle, high)

@@ -94,4 +94,4 @@ def _view(source: Path, options: ReadOptions, name: str, row: np.ndarray, image:
     to_world = rigid(pose, field) @ MITSUBA_FROM_OPENGL
     fx, fy = focal * image.width / width, focal * image.height / height
     intrinsics = (fx, fy, image.width / 2, image.height / 2)
-    return make_view(image, options, field, name=name, intrinsics=intrinsics, lens=None, to_world=to_world)[0]
+    return make_view(image, options, field, name=name, intrinsics=intrinsics, to_world=to_world)[0]

@@ -120,9 +120,7 @@ def read_region(folder: Path) -> Region | None:
     Raises InputError for a file that cannot be used.
     """
     path = folder / REGION_FILE
-    if not path.is_file():
-        return None
-    return Region.of(read_json(path), path)
+    return Region.of(read_json(path), path) if path.is_file() else None
 
 
 def write_region(folder: Path, region: Region) -> None:

@@ -43,8 +43,8 @@ CAMERA_MODELS = {
 """Values of `camera_model`, as COLMAP and nerfstudio name them, and whether each is a fisheye."""
 OTHER_LENSES = ("k5", "k6", "ftheta_p0", "latlong", "equirectangular", "orthographic")
 """Keys of unsupported lenses, refused unless they are 0 or false."""
-MATERIALS = {"albedo": 4, "roughness": 2, "metallic": 2}
-"""Channels of the ground-truth maps of materials."""
+MAPS = {"normal": 3, "depth": 1, "albedo": 4, "roughness": 2, "metallic": 2}
+"""Channels of the ground-truth maps."""
 
 
 class TransformsReader:
@@ -127,15 +127,18 @@ def _file_path(frame: Any) -> str:
 def _points(transforms: Path, content: dict[str, Any]) -> PointCloud | None:
     """The points of `ply_file_path`; None without the key, or without points of usable numbers."""
     name = content.get("ply_file_path")
-    if not name:
-        return None
+    return read_points(_inside(transforms, "ply_file_path", name)) if name else None
+
+
+def _inside(transforms: Path, field: str, name: object) -> Path:
+    """The file in the data set's folder that a transforms file names."""
     file = inside(transforms.parent, name)
     if file is None:
         raise InputError(
-            f"{transforms}: ply_file_path: {abbreviated(name)} names no file in the data set's folder; move "
-            "it there"
+            f"{transforms}: {field}: {abbreviated(name)} names no file in the data set's folder; move the "
+            "file there and give its relative path"
         )
-    return read_points(file)
+    return file
 
 
 def read_points(path: Path) -> PointCloud | None:
@@ -183,15 +186,18 @@ class _FrameReader:
         if not self.options.truth:
             return view
         size = (image.height, image.width)
-        normal = self._map(index, frame, "normal_path", (*size, 3), straight)
-        depth = self._map(index, frame, "depth_path", (*size, 1), straight)
-        maps = {n: self._map(index, frame, f"{n}_path", (*size, c), straight) for n, c in MATERIALS.items()}
-        normal = None if normal is None else unit(normal)
-        depth = None if depth is None else depth[..., 0]
+        maps = {
+            name: self._map(path, f"frames[{index}].{name}_path", (*size, channels), straight)
+            for name, channels in MAPS.items()
+            if (path := self._path(index, frame, f"{name}_path"))
+        }
+        normal, depth = maps.pop("normal", None), maps.pop("depth", None)
         if normal is depth is None:
             normal, depth = shiny_blender_maps(file, size, self.options.downscale, straight)
-        materials = {name: values for name, values in maps.items() if values is not None}
-        return view.changed(normal=normal, depth=depth, materials=materials)
+        else:
+            normal = None if normal is None else unit(normal)
+            depth = None if depth is None else depth[..., 0]
+        return view.changed(normal=normal, depth=depth, materials=maps)
 
     def image(self, index: int, frame: Any) -> Path:
         """The image file of a frame."""
@@ -212,37 +218,21 @@ class _FrameReader:
     def _path(self, index: int, frame: dict[str, Any], key: str) -> Path | None:
         """The file of a key; None where the frame has no such key, or an empty name."""
         name = frame.get(key)
-        if name is None or name == "":
-            return None
-        file = inside(self.transforms.parent, name)
-        if file is None:
-            raise InputError(
-                f"{self.transforms}: frames[{index}].{key}: {abbreviated(name)} names no file in the "
-                "data set's folder; move the file there and give its relative path"
-            )
-        return file
+        return None if name in (None, "") else _inside(self.transforms, f"frames[{index}].{key}", name)
 
     def _map(
-        self,
-        index: int,
-        frame: dict[str, Any],
-        key: str,
-        expected: tuple[int, int, int],  # shape of the file: that of the image
-        straight: Undistortion | None,
-    ) -> np.ndarray | None:
-        """A ground-truth map at the view's size: per pixel the mean over the surface in its block.
+        self, file: Path, field: str, expected: tuple[int, int, int], straight: Undistortion | None
+    ) -> np.ndarray:
+        """A map of `expected` shape, at the view's size: per pixel the mean over the surface in its block.
 
         The last of two or four channels says where the others are defined; it becomes the fraction of the
         block where they are.
         """
-        file = self._path(index, frame, key)
-        if file is None:
-            return None
         pixels = read_exr_image(file, vectors=True)
         if pixels.shape != expected:
             raise InputError(
-                f"{file}: frames[{index}].{key}: has shape {pixels.shape} but the image needs {expected}; "
-                "export both at one size or remove the key"
+                f"{file}: {field}: has shape {pixels.shape} but the image needs {expected}; export both "
+                "at one size or remove the key"
             )
         masked = expected[-1] in (2, 4)
         covered = np.clip(pixels[..., -1:], 0, 1) if masked else np.any(pixels != 0, axis=-1, keepdims=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,19 +65,15 @@ class View:
 
         Raises InputError for a file that cannot be read.
         """
-        source = self.__dict__["image"]
+        source, own = self.__dict__["image"], self.__dict__["alpha"]  # own: that of the file, or another one
         if not isinstance(source, ImageSource):
             return self
         image, alpha = source.read()
-        own = self.__dict__["alpha"]  # replaced by `changed`, or that of the file
         return self.changed(image=image, alpha=alpha if own is source else own)
 
     def changed(self, **fields: Any) -> View:
         """The view with other values of some fields; unlike `dataclasses.replace`, also if not loaded."""
-        made = copy.copy(self)
-        for name, value in fields.items():
-            object.__setattr__(made, name, value)
-        return made
+        return replace(self, **{name: self.__dict__[name] for name in ("image", "alpha")} | fields)
 
     @property
     def has_alpha(self) -> bool:
@@ -124,20 +119,10 @@ class View:
             )
         loaded = self.load()
         alpha = None if loaded.alpha is None else box_downscale(loaded.alpha[..., None], block)[..., 0]
-        return replace(
-            loaded,
-            width=self.width // block,
-            height=self.height // block,
-            fx=self.fx / block,
-            fy=self.fy / block,
-            cx=self.cx / block,
-            cy=self.cy / block,
-            image=box_downscale(loaded.image, block),
-            alpha=alpha,
-            normal=None,
-            depth=None,
-            materials={},
-        )
+        pinhole = {name: getattr(self, name) / block for name in ("fx", "fy", "cx", "cy")}
+        averaged = replace(loaded, width=self.width // block, height=self.height // block, **pinhole)
+        image = box_downscale(loaded.image, block)
+        return replace(averaged, image=image, alpha=alpha, normal=None, depth=None, materials={})
 
     def colour(self, background: np.ndarray) -> np.ndarray:
         """Linear colour (H, W, 3) of the object, not premultiplied; `background` (3,) as in `image`."""
@@ -151,12 +136,8 @@ class View:
         depth = np.where(local[:, 2] > 0, local[:, 2], np.inf)
         column = -self.fx * local[:, 0] / depth + self.cx - 0.5
         row = -self.fy * local[:, 1] / depth + self.cy - 0.5
-        in_view = (
-            (local[:, 2] > 0)
-            & (abs(column - (self.width - 1) / 2) <= self.width / 2)
-            & (abs(row - (self.height - 1) / 2) <= self.height / 2)
-        )
-        return row, column, in_view
+        in_view = (local[:, 2] > 0) & (abs(column - (self.width - 1) / 2) <= self.width / 2)
+        return row, column, in_view & (abs(row - (self.height - 1) / 2) <= self.height / 2)
 
 
 class _LoadedField:

@@ -138,24 +138,16 @@ class Tracer:
         strata = math.isqrt(-(-spp // self.passes))
         self.spp = strata * -(-spp // (self.passes * strata))
         self.integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": not objects})
-        self.sensor = mi.load_dict(
-            {
-                "type": "perspective",
-                "fov": fov,
-                "fov_axis": "smaller",
-                "near_clip": near,
-                "far_clip": far,
-                "sampler": {"type": "multijitter"},
-                "film": {
-                    "type": "hdrfilm",
-                    "width": self.width,
-                    "height": self.height,
-                    "pixel_format": "rgb" if objects else "rgba",
-                    "component_format": "float32",
-                    "rfilter": {"type": "box"},
-                },
-            }
-        )
+        film: dict[str, Any] = {"type": "hdrfilm", "component_format": "float32", "rfilter": {"type": "box"}}
+        film |= {"width": self.width, "height": self.height, "pixel_format": "rgb" if objects else "rgba"}
+        sensor = {
+            "type": "perspective",
+            "fov": fov,
+            "fov_axis": "smaller",
+            "near_clip": near,
+            "far_clip": far,
+        }
+        self.sensor = mi.load_dict(sensor | {"sampler": {"type": "multijitter"}, "film": film})
         self.params = mi.traverse(self.sensor)
 
     def image(self, pose: np.ndarray, seed: int) -> np.ndarray:
@@ -166,12 +158,10 @@ class Tracer:
         self._look(pose)
         seeds = [seed, *np.random.SeedSequence(seed).generate_state(self.passes)[1:]]
         image = np.zeros((self.height, self.width, 3 if self.objects else 4))
+        options = {"sensor": self.sensor, "integrator": self.integrator, "spp": self.spp}
         with dr.suspend_grad():
             for s in seeds:
-                part = mi.render(
-                    self.scene, sensor=self.sensor, integrator=self.integrator, spp=self.spp, seed=int(s)
-                )
-                image += np.array(part) / self.passes
+                image += np.array(mi.render(self.scene, seed=int(s), **options)) / self.passes
         return image
 
     def maps(self, pose: np.ndarray, covered: np.ndarray) -> dict[str, np.ndarray]:
@@ -252,17 +242,9 @@ class Cameras:
     def tracer(self, scene: Any) -> Tracer:
         """The path tracer of the scene's views."""
         s, (low, high) = self.settings, self.distance
-        near, far = 0.1 * (low - self.radius), 10 * (high + self.reach)
-        return Tracer(
-            scene,
-            size=s.resolution,
-            fov=s.fov,
-            spp=s.spp,
-            max_depth=s.max_depth,
-            near=near,
-            far=far,
-            objects=self.objects,
-        )
+        options = {name: getattr(s, name) for name in ("fov", "spp", "max_depth")}
+        options |= {"near": 0.1 * (low - self.radius), "far": 10 * (high + self.reach)}
+        return Tracer(scene, size=s.resolution, objects=self.objects, **options)
 
     def of(self, split: str) -> list[tuple[np.ndarray, int]]:
         """Pose and seed of each view of a split.
