@@ -47,12 +47,8 @@ class Health:
         require_finite_light(state.light)
         if state.surroundings is not None:
             require_finite_light(state.surroundings.background, BACKGROUND)
-        found = [culprits(table.surfels, skipped, table.prefix) for table in state.tables]
-        rows = {
-            t.prefix + name: at
-            for t, names in zip(state.tables, found, strict=True)
-            for name, at in names.items()
-        }
+        found = [(table, culprits(table.surfels, skipped, table.prefix)) for table in state.tables]
+        rows = {table.prefix + name: at for table, names in found for name, at in names.items()}
         if not rows and not skipped.count:
             return None
         view = setup.data.views[setup.schedule.view(skipped.iteration + 1)].name if skipped.count else ""
@@ -62,7 +58,7 @@ class Health:
                 f"{said}; nothing was learnt in {self.failed} iterations: look at that image and its camera, "
                 "or lower the rates (--set rates.…)"
             )
-        for table, names in zip(state.tables, found, strict=True):
+        for table, names in found:
             if names:
                 table.remove(together(names))
                 state.occluder.vertex_surfels = None

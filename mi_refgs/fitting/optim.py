@@ -174,15 +174,13 @@ class Adam:
         self.stage: Mapping[str, float] = {}  # factors of the present stage of a fit
         self._first: dict[str, Float] = {}
         self._second: dict[str, Float] = {}
-        self._steps: dict[str, int] = {}
+        self._steps = dict.fromkeys(groups, 0)
         self._usual: dict[str, float] = {}  # median √(v / (1 - β₂ᵗ)); 0: not known yet
         self._least: dict[str, Float] = {}  # the same on the device; infinity: not known yet
         self._skips = Skips(params, self.groups)
         for name in groups:
-            self._clear(name)
-            self._steps[name] = 0
             self._set_usual(name, 0.0)
-            self._make_leaf(name)
+            self.reset(name)
 
     def set_factor(self, name: str, factor: float) -> None:
         """Set the factor of one tensor's learning rate; 0 freezes it."""
@@ -255,8 +253,8 @@ class Adam:
         if t & (t - 1) == 0:  # at steps 1, 2, 4, …, since it waits for the device
             square = _median(g) ** 2 if t == 1 else _median(self._second[name]) / (1 - BETA_2 ** (t - 1))
             self._set_usual(name, math.sqrt(square))
-        limit = OUTLIER * dr.maximum(dr.sqrt(self._second[name] * inverse), self._least[name])
-        limit = dr.minimum(limit, RAW_LIMIT)
+        usual = dr.maximum(dr.sqrt(self._second[name] * inverse), self._least[name])
+        limit = dr.minimum(OUTLIER * usual, RAW_LIMIT)
         return dr.select(dr.isfinite(g), dr.clip(g, -limit, limit), 0.0)
 
     def _set_usual(self, name: str, usual: float) -> None:
@@ -293,7 +291,10 @@ class Adam:
 
         Its step count stays, as in 3DGS: the next update is up to about 3 η long, not η.
         """
-        self._clear(name)
+        size = math.prod(self.params[name].shape)
+        for moments in (self._first, self._second):
+            # Opaque zeros: a literal would give the first step after a reset a kernel of its own.
+            moments[name] = dr.opaque(mi.Float, 0.0, size) if size else mi.Float()
         self._make_leaf(name)
 
     def state_dict(self) -> dict[str, np.ndarray]:
@@ -329,12 +330,6 @@ class Adam:
             self._steps[name] = int(state[f"{name}/steps"])
             self._set_usual(name, float(state[f"{name}/usual"]))
             self.factors[name] = float(state[f"{name}/factor"])
-
-    def _clear(self, name: str) -> None:
-        size = math.prod(self.params[name].shape)
-        for moments in (self._first, self._second):
-            # Opaque zeros: a literal would give the first step after a reset a kernel of its own.
-            moments[name] = dr.opaque(mi.Float, 0.0, size) if size else mi.Float()
 
     def _make_leaf(self, name: str) -> None:
         tensor = dr.detach(self.params[name])

@@ -1,8 +1,7 @@
 """Time and memory of a fit, estimated before its first step, and the image size that fits the time.
 
 The time of a step is measured once per machine (`cost_model` caches it): steps of the method itself on a
-synthetic data set, at two sizes, in each stage and with its mesh. It is linear in the number of
-pixels.
+synthetic data set, at two sizes, in each stage and with its mesh. It is linear in the number of pixels.
 
 The clock is the CPU time of the main thread. On an idle machine it is the wall time, since this thread takes
 part in every kernel of Dr.Jit; beside other processes it stays, while the wall time doubles.
@@ -15,6 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -61,19 +61,15 @@ WORTH = 1e7
 
 
 def speed_of(method: Method, has_alpha: bool) -> Speed:
-    """Speed of a method on this machine, on images with alpha or without: cached, or measured."""
-    subject = machine() | {"simd_width": simd_width(), "mi_refgs": __version__, "cut_out": has_alpha}
-    return cost_model.kept(subject | _cost(method), lambda: measured(method, has_alpha))
+    """Speed of a method on this machine, on images with alpha or without: cached, or measured.
 
-
-def _cost(method: Method) -> dict[str, Any]:
-    """What the time of a step depends on: methods that differ in learning rates or weights only are equal."""
-    weights = {name: bool(value) for name, value in asdict(method.loss).items()}
+    Methods that differ in learning rates or weights only are equally fast.
+    """
     parts = {name: getattr(method, name) for name in ("surfels", "light", "surroundings", "mesh", "stage")}
-    return {
-        "method": {name: plain(part) for name, part in parts.items() if part is not None},
-        "loss": weights,
-    }
+    subject = machine() | {"simd_width": simd_width(), "mi_refgs": __version__, "cut_out": has_alpha}
+    subject["method"] = {name: plain(part) for name, part in parts.items() if part is not None}
+    subject["loss"] = {name: bool(value) for name, value in asdict(method.loss).items()}
+    return cost_model.kept(subject, lambda: measured(method, has_alpha))
 
 
 def measured(method: Method, has_alpha: bool) -> Speed:
@@ -203,8 +199,7 @@ def planned(
     limit = 60 * promise if limit is None and promise is not None else limit
     whole = replace(method, data=replace(method.data, downscale=1))
     data = read_views(whole, path, "train", truth=False, decode=False)
-    first = data.views[0]
-    width, height = first.width, first.height
+    width, height = data.views[0].width, data.views[0].height
     given = method.data.downscale is not None
     if not given and limit is None:
         method = sized(method, path, tell)
@@ -212,19 +207,15 @@ def planned(
     method = replace(method, data=replace(method.data, downscale=factor))
     if method.iterations * width * height < WORTH:
         return method, None
-    has_alpha = data.has_alpha
-    speed = speed_of(method, has_alpha)
+    speed = speed_of(method, data.has_alpha)
 
     def at(factor: int) -> Estimate:
-        return estimate(method, speed, len(data.views), (width, height), factor, has_alpha)
+        return estimate(method, speed, len(data.views), (width, height), factor, data.has_alpha)
 
     if given or limit is None:
         return method, at(factor)
-    while (
-        width * height > WHOLE
-        and at(factor).seconds > SAFETY * limit
-        and min(width, height) // (factor + 1) >= LEAST
-    ):
+    most = min(width, height) // LEAST if width * height > WHOLE else 1
+    while at(factor).seconds > SAFETY * limit and factor < most:
         factor += 1
     chosen = at(factor)
     if factor > 1:
@@ -263,7 +254,5 @@ def _blocks(method: Method, begin: int, end: int) -> list[tuple[int, int]]:
     """Block sides of coarse images in the iterations after `begin` to `end`, and how many have each."""
     ends = sorted({end, *(coarse.until for coarse in method.data.coarse if begin < coarse.until < end)})
     return [
-        (method.data.block_at(last), last - first)
-        for first, last in zip([begin, *ends], ends, strict=False)
-        if last > first
+        (method.data.block_at(last), last - first) for first, last in pairwise([begin, *ends]) if last > first
     ]

@@ -21,14 +21,12 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.methods.method import Propagation, Refine, Relocation
 from mi_refgs.surfels.attributes import attribute, logit, sigmoid
 from mi_refgs.surfels.init import morton_order
-from mi_refgs.surfels.primitives import Primitive, primitive_of
+from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import TensorXf
 
 SPLIT_SHRINK = 1.6
 """A split surfel's two children have its scale divided by this. [3DGS §5.2: φ = 1.6, found by experiment]"""
-
-
 PRUNE_PATIENCE = 4.5
 """Factor of the fewest steps in which an opacity can grow back after a reset: 150 iterations as shipped.
 Factor 2 (67 iterations) was too small on a diffuse scene, which lost every surfel."""
@@ -87,8 +85,7 @@ def densify_and_prune(
     prune_opacity = 0 transparent ones stay: wait `prune_wait` iterations after an opacity reset. Raises
     InputError if no surfel would be left.
     """
-    raw = surfels.to_numpy()
-    count = len(gradient)
+    raw, count = surfels.to_numpy(), len(gradient)
     primitive = primitive_of(raw)
     size = primitive.extent(raw)[1].max(axis=1)
     dense = np.broadcast_to(np.asarray(limits.split, size.dtype), count)
@@ -113,19 +110,14 @@ def densify_and_prune(
     table = {name: values[parent].copy() for name, values in raw.items()}
     children = slice(len(parent) - 2 * len(split), len(parent))
     if len(split):
-        table["position"][children] += _offsets(primitive, table, children, rng)
+        # Children lie at normal deviates of their parent's own Gaussian.
+        axes, deviations = primitive.extent({name: values[children] for name, values in table.items()})
+        local = rng.normal(size=deviations.shape) * deviations
+        offsets = sum(local[:, i : i + 1] * axes[:, i] for i in range(local.shape[1]))
+        table["position"][children] += np.asarray(offsets, np.float32)
         primitive.resize(table, children, 1 / SPLIT_SHRINK)
     assert len(parent) <= max(max_count, count)
     return TableEdit(Surfels.from_numpy(table), parent.astype(np.uint32), fresh)
-
-
-def _offsets(
-    primitive: Primitive, table: dict[str, np.ndarray], rows: slice, rng: np.random.Generator
-) -> np.ndarray:
-    """Normal deviates (M, 3) of the primitives' own Gaussians."""
-    axes, deviations = primitive.extent({name: values[rows] for name, values in table.items()})
-    local = rng.normal(size=deviations.shape) * deviations
-    return sum(local[:, i : i + 1] * axes[:, i] for i in range(local.shape[1])).astype(np.float32)
 
 
 def reset_opacity(surfels: Surfels, options: Refine, floors: Mapping[str, float]) -> Surfels:
@@ -203,8 +195,7 @@ def relocate(surfels: Surfels, options: Relocation, max_count: int, rng: np.rand
     """
     raw = surfels.to_numpy()
     opacity = sigmoid(raw["opacity"][:, 0].astype(np.float64))
-    idle = opacity <= options.opacity
-    count = len(opacity)
+    idle, count = opacity <= options.opacity, len(opacity)
     added = min(int(options.grow * count), max(max_count - count, 0))
     moved = np.flatnonzero(idle)
     if idle.all() or not len(moved) + added:

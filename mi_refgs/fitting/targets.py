@@ -54,10 +54,9 @@ class Target:
     def of(view: View, background: np.ndarray) -> Target:
         """Upload a view; `background` (3,) is in the colour space of its image."""
         loaded = view.load()
-        colour, opacity = loaded.image, loaded.alpha
-        planes = [upload(colour[..., i]) for i in range(3)]
+        planes = [upload(loaded.image[..., i]) for i in range(3)]
         image = [srgb_from_linear(plane) for plane in planes] if view.is_linear_radiance else planes
-        alpha = None if opacity is None else upload(opacity)
+        alpha = None if loaded.alpha is None else upload(loaded.alpha)
         clipped = None if view.is_linear_radiance else losses.saturated(image, alpha, map(float, background))
         target = Target(view.camera(), image, clipped, alpha)
         dr.eval(target.image, target.clipped, target.alpha)
@@ -75,7 +74,7 @@ class Targets:
         pixels = sum(view.width * view.height for view in data.views)
         if sum(PIXEL_BYTES * pixels // block**2 for block in blocks) <= budget:
             for block in blocks:
-                for index in range(len(data.views)):
+                for index in range(len(self)):
                     self._target(index, block)
 
     def __len__(self) -> int:
@@ -89,8 +88,7 @@ class Targets:
         return self._target(index, self.options.block_at(iteration))
 
     def _target(self, index: int, block: int) -> Target:
-        key = index, block
-        if key in self._kept:
+        if (key := (index, block)) in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key]
         view = self.data.views[index]

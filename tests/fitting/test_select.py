@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -148,16 +147,8 @@ def test_required_gain_depends_on_time_and_memory() -> None:
     assert select.required_gain(dear, cheap, method.select) == pytest.approx(method.select.gain - expected)
 
 
-@pytest.fixture
-def launches() -> Iterator[None]:
-    dr.set_flag(dr.JitFlag.KernelHistory, True)
-    yield
-    dr.set_flag(dr.JitFlag.KernelHistory, False)
-    dr.kernel_history_clear()
-
-
 def test_component_that_is_off_is_absent(
-    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, launches: None
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Channels, parameters, features of the blend, launches and rays of a step, and the PLY's properties."""
     features: list[int] = []
@@ -180,10 +171,10 @@ def test_component_that_is_off_is_absent(
         trainer = fitted(variant, views, tmp_path / name)
         features.clear()
         rays.clear()
-        dr.kernel_history_clear()
-        trainer.step()
-        dr.sync_thread()
-        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            trainer.step()
+            dr.sync_thread()
+            kernels = dr.kernel_history([dr.KernelType.JIT])
         counted[name] = (len(trainer.params), features[-1], len(kernels), sum(rays))
     assert counted["off"][:2] == (5, 6) and counted["off"][3] == 0
     assert counted["on"][0] == 10 and counted["on"][1] == 14 and counted["on"][3] > 0

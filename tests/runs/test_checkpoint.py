@@ -80,9 +80,7 @@ WRONG = {
     "no iteration": without("iteration"),
     "no opacity": without("params/opacity"),
     "no moments": without("optimiser/scale/second"),
-    "no optimiser of a tensor": lambda s: [
-        s.pop(key) for key in list(s) if key.startswith("optimiser/scale")
-    ],
+    "no optimiser of a tensor": lambda s: [s.pop(key) for key in [*s] if key.startswith("optimiser/scale")],
     "no vertices": without("mesh/vertices"),
     "rows cut": replaced("params/albedo", lambda x: x[:-1]),
     "columns cut": replaced("params/rotation", lambda x: x[:, :3]),
@@ -132,14 +130,8 @@ def test_archive_of_something_else_is_found() -> None:
 def damage(path: Path, how: str) -> None:
     data = path.read_bytes()
     half = len(data) // 2
-    path.write_bytes(
-        {
-            "empty": b"",
-            "cut": data[: len(data) - 1000],
-            "half": data[:half],
-            "flipped": data[:half] + bytes([data[half] ^ 16]) + data[half + 1 :],
-        }[how]
-    )
+    flipped = data[:half] + bytes([data[half] ^ 16]) + data[half + 1 :]
+    path.write_bytes({"empty": b"", "cut": data[:-1000], "half": data[:half], "flipped": flipped}[how])
 
 
 @pytest.mark.parametrize("how", ["empty", "cut", "half", "flipped"])
@@ -149,8 +141,7 @@ def test_resume_goes_on_from_checkpoint_before_and_says_so(
     run = Run(copytree(finished, tmp_path / "run"))
     before, newest = run.checkpoints()
     damage(newest, how)
-    command = ["train", str(data), "-o", str(run.path), "--resume"]
-    assert main(command) == 0
+    assert main(["train", str(data), "-o", str(run.path), "--resume"]) == 0
     said = capsys.readouterr().err
     assert f"{newest}: damaged" in said and "resumed at iteration 3 of 6" in said
     assert checkpoint.read(newest)["iteration"] == 6 and run.checkpoints() == [before, newest]
@@ -162,8 +153,7 @@ def test_fit_is_not_begun_anew_when_every_checkpoint_is_damaged(
     run = Run(copytree(finished, tmp_path / "run"))
     for path in run.checkpoints():
         damage(path, "half")
-    command = ["train", str(data), "-o", str(run.path), "--resume"]
-    assert main(command) == 2
+    assert main(["train", str(data), "-o", str(run.path), "--resume"]) == 2
     said = capsys.readouterr().err.splitlines()[-1]
     assert all(part in said for part in ("0000006.npz: damaged", "begin anew", str(run.path / "checkpoints")))
     assert len(run.checkpoints()) == 2
@@ -176,12 +166,8 @@ def test_resume_clears_what_killed_process_left(finished: Path, data: Path, tmp_
     log = run.path / "metrics.jsonl"
     whole = log.read_bytes()
     log.write_bytes(whole + b'{"iteration": 6, "loss": 0.\x00\xff{')
-    left = [
-        run.path / "checkpoints" / ".0000009.npz.0123456789ab.tmp.npz",
-        run.path / ".surfels.ply.0123456789ab.tmp.ply",
-    ]
-    for path in left:
-        path.write_bytes(b"half")
+    for name in ("checkpoints/.0000009.npz.0123456789ab.tmp.npz", ".surfels.ply.0123456789ab.tmp.ply"):
+        (run.path / name).write_bytes(b"half")
     (run.path / ".notes").write_text("mine")
     copy = run.path / "checkpoints" / "0000006 copy.npz"
     copy.write_bytes(b"mine")

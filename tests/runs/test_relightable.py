@@ -16,20 +16,13 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import SH_DC
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
-from tests.scenes.known import (
-    CLAY,
-    METAL,
-    known_mesh,
-    known_scene,
-    known_surfels,
-)
+from tests.scenes.known import CLAY, METAL, known_mesh, known_scene, known_surfels
 
 
 @pytest.mark.parametrize("with_mesh", [False, True])
 def test_relightable_recovers_albedo_from_fitted_radiance(known: Path, with_mesh: bool) -> None:
     """A radiance that changes with direction, (1 - S) albedo × irradiance on average over the hemisphere."""
-    mesh = known_mesh()
-    surfels = known_surfels()
+    mesh, surfels = known_mesh() if with_mesh else None, known_surfels()
     light = EnvironmentLight.from_file(known / "data/environment.exr")
     normal = surfels.primitive.normal(surfels)
     irradiance = light.prefilter().irradiance(normal).numpy().T
@@ -42,13 +35,8 @@ def test_relightable_recovers_albedo_from_fitted_radiance(known: Path, with_mesh
     constant = (0.96 * irradiance * truth - mean - 0.5) / SH_DC
     linear = -slope[:, :, [1, 2, 0]] * [1, -1, 1] / np.sqrt(3 / (4 * np.pi))
     raw["radiance_sh"] = np.concatenate([constant, linear.transpose(0, 2, 1).reshape(-1, 9)], 1).astype("f4")
-    wrong = raw | {
-        "albedo": np.zeros_like(raw["albedo"]),
-        "indirect_sh": np.zeros((len(truth), 3), np.float32),
-    }
-    scene = TrainedScene(
-        Surfels.from_numpy(wrong), light, mesh if with_mesh else None, Shading(occlusion=with_mesh), 1, 0.0
-    )
+    wrong = raw | {name: np.zeros((len(truth), 3), np.float32) for name in ("albedo", "indirect_sh")}
+    scene = TrainedScene(Surfels.from_numpy(wrong), light, mesh, Shading(occlusion=with_mesh), 1, 0.0)
     found = relightable(scene)
     assert set(found.surfels.raw) == set(raw) - {"radiance_sh"}
     assert found.shading.diffuse == "irradiance" and found.light is light
