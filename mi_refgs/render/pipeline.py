@@ -234,8 +234,9 @@ def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
     # Radiance of each surfel.
     if scene.shading.occlusion:
         assert scene.occluder is not None  # by `Shading.require_inputs`
-        position = scene.surfels.position()
-        context = TraceContext(scene.occluder, scene.surfels, scene.light, position, -points.view)
+        points = points.replaced(position=scene.surfels.position())
+        origin, ray = view.camera.origin, -points.view
+        context = TraceContext(scene.occluder, scene.surfels, scene.light, origin, ray)
         points = scene.shading.model.trace(points, context, scene.shading)
     terms = shade(points, scene.light, scene.shading)
 

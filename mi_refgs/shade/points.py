@@ -18,9 +18,10 @@ class ShadingPoints:
     """N points to shade: normal, view and the attributes that a model names, all arrays of width N.
 
     `normal` and `view` (mi.Vector3f) are in the world frame and of any length; `view` leads towards the
-    camera. Further attributes are read as `points.roughness`, or by `get` where they may be absent. Two
+    camera. Further attributes are read as `points.roughness`, or by `get` where they may be absent. Three
     names have one meaning for every model: `visibility` of the light in the reflected direction (mi.Float,
-    0 … 1) and `indirect` (mi.Color3f: radiance from there where it is blocked).
+    0 … 1), `indirect` (mi.Color3f: radiance from there where it is blocked), and `position` (mi.Point3f,
+    world; in forward shading, where rays are traced).
     """
 
     normal: Any

@@ -38,8 +38,8 @@ class TraceContext:
     occluder: Occluder
     surfels: Surfels
     light: Light | None  # None if the model looks none up
-    origin: Point3f  # (1,) the camera; (N,) surfel positions in forward shading
-    ray: Vector3f  # (N,) to the points from `origin`, or from the camera in forward shading; not unit
+    origin: Point3f  # (1,) the camera
+    ray: Vector3f  # (N,) from the camera to the points, of any length
     covered: Bool = True  # (N,) or a literal; nothing is traced for the other points
     pixel: UInt32 = None  # (N,) image index that seeds the random numbers; None: 0 … N - 1
 

@@ -285,9 +285,9 @@ def test_hemisphere_is_blocked_where_mesh_stands() -> None:
     wall = np.array([[1, -50, -50], [1, 50, -50], [1, 50, 50], [1, -50, 50]], np.float32)
     occluder = Occluder(Mesh(wall, np.array([[0, 1, 2], [0, 2, 3]], np.uint32), 1e-3))
     normal = vector(np.tile([0, 1.0, 0], (n, 1)))
-    points = ShadingPoints(normal, normal)
     place = mi.Point3f(vector(np.linspace(0, 0.5, n)[:, None] * [1.0, 0, 0]))
-    context = TraceContext(occluder, table(), None, place, normal)
+    points = ShadingPoints(normal, normal, position=place)
+    context = TraceContext(occluder, table(), None, mi.Point3f(0, 9, 0), -normal)
     shading = CASES["monte_carlo, occluded"]
     free = np.array(shading.model.trace(points, context, shading).free)
     directions = models.hemisphere(DIRECTIONS, np.array([0, 1.0, 0]))

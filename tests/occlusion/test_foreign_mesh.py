@@ -13,7 +13,7 @@ import trimesh
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import vector
+from tests.helpers import unit, vector
 
 SCALES = [1.0, 1e-6, 1e6]
 UP = np.array([0.0, 0, 1])
@@ -60,8 +60,7 @@ def test_a_sheet_hides_nothing_from_its_own_points(
     for side in (UP, -UP):
         normal = vector(np.tile(side, (200, 1)))
         for lift in (1.0, 1e-2, 1e-4):
-            along = np.append(rng.normal(size=(200, 2)), np.zeros((200, 1)), axis=1)
-            along = along / np.linalg.norm(along, axis=1, keepdims=True) + lift * side
+            along = unit(np.append(rng.normal(size=(200, 2)), np.zeros((200, 1)), axis=1)) + lift * side
             assert np.all(alone.visible(points(rng, 0, scale), vector(along), normal)), (side, lift)
         assert not np.any(alone.visible(points(rng, -0.3 * side[2], scale), normal, normal))
 

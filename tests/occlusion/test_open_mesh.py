@@ -57,11 +57,20 @@ def ball_and_floor(to_world: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(depth), depth, 0)
 
 
-def fuse(depths: list[np.ndarray], poses: list[np.ndarray], resolution: int, region: Region) -> tsdf.TSDF:
+def camera(pose: np.ndarray) -> Camera:
+    return Camera.from_pose(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose)
+
+
+def fuse(
+    depths: list[np.ndarray],
+    poses: list[np.ndarray],
+    resolution: int,
+    region: Region | None,
+    box: Any = SPACE,
+) -> tsdf.TSDF:
     flat = [mi.Float(d.ravel().astype(np.float32)) for d in depths]
     alpha = [dr.select(d > 0, mi.Float(1), 0) for d in flat]
-    cameras = [Camera.from_pose(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose) for pose in poses]
-    return tsdf.fuse(flat, alpha, cameras, SPACE, resolution, carve=False, region=region)
+    return tsdf.fuse(flat, alpha, map(camera, poses), box, resolution, carve=False, region=region)
 
 
 @pytest.fixture(scope="module")
@@ -95,10 +104,7 @@ def test_inside_of_the_region_it_is_the_bounded_field() -> None:
     depths = [ref.depth_map(ref.sphere(tuple(BALL), BALL_RADIUS), pose, FOCAL, SIZE) for pose in poses]
     opened = fuse(depths, poses, 40, REGION)
     low, high = np.array(REGION.centre) - REGION.radius, np.array(REGION.centre) + REGION.radius
-    flat = [mi.Float(d.ravel().astype(np.float32)) for d in depths]
-    cameras = [Camera.from_pose(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose) for pose in poses]
-    alpha = [dr.select(d > 0, mi.Float(1), 0) for d in flat]
-    bounded = tsdf.fuse(flat, alpha, cameras, (low, high), 40, carve=False)
+    bounded = fuse(depths, poses, 40, None, (low, high))
     inner = opened.volume[20:61, 20:61, 20:61]
     corner = np.moveaxis(np.indices(inner.shape), 0, -1) / 20 - 1
     well_inside = np.linalg.norm(corner, axis=-1) < 1
@@ -118,10 +124,8 @@ def test_near_and_far_surfaces_are_within_a_voxel(ball_mesh: Mesh) -> None:
     on_floor = np.linalg.norm(REGION.contract(level) - place, axis=1) / voxel
     seen = distance < 12  # farther, no view's image has a pixel for a voxel
     error = np.minimum(on_ball, on_floor)[seen]
-    assert np.quantile(error, 0.99) < 1 and np.sqrt(np.mean(error**2)) < 0.35, (
-        np.quantile(error, 0.99),
-        np.sqrt(np.mean(error**2)),
-    )
+    measured = np.quantile(error, 0.99), np.sqrt(np.mean(error**2))
+    assert measured[0] < 1 and measured[1] < 0.35, measured
     assert (on_ball < 1).sum() > 500 and (distance[on_floor < 1] > 8).sum() > 100
 
 
@@ -176,14 +180,8 @@ def test_all_views_and_regions_share_one_kernel() -> None:
 
 def sheet(normal: np.ndarray, points: np.ndarray, size: float) -> Surfels:
     """Opaque round surfels of one normal."""
-    made = from_points(
-        points,
-        np.tile(normal, (len(points), 1)),
-        rng=np.random.default_rng(0),
-        channels=["radiance_sh"],
-        opacity=0.99,
-    )
-    raw = made.to_numpy()
+    normals, rng = np.tile(normal, (len(points), 1)), np.random.default_rng(0)
+    raw = from_points(points, normals, rng=rng, channels=["radiance_sh"], opacity=0.99).to_numpy()
     raw["scale"] = np.full_like(raw["scale"], np.log(size))
     return Surfels.from_numpy(raw)
 
@@ -194,10 +192,8 @@ def test_surroundings_are_in_the_mesh_where_it_is_unbounded() -> None:
     up = np.array([0.0, 0.0, 1.0])
     own = sheet(up, np.column_stack([0.35 * grid + [0.1, -0.1], np.full(len(grid), 0.2)]), 0.03)
     floor = sheet(up, np.column_stack([5 * grid, np.full(len(grid), -0.6)]), 0.4)
-    cameras = [
-        Camera.from_pose(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, look_at(eye, np.zeros(3)))
-        for eye in (np.array([x, y, 2.0]) for x, y in ((2, 0), (0, 2), (-2, 0.1), (0.1, -2)))
-    ]
+    eyes = [np.array([x, y, 2.0]) for x, y in ((2, 0), (0, 2), (-2, 0.1), (0.1, -2))]
+    cameras = [camera(look_at(eye, np.zeros(3))) for eye in eyes]
     with dr.suspend_grad():
         both = surface_of(own, cameras, 64, floor, REGION)
         alone = surface_of(own, cameras, 64)

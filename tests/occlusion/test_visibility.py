@@ -12,7 +12,7 @@ from mi_refgs.occlusion import tsdf, visibility
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import occlusion as ref
-from tests.helpers import vector
+from tests.helpers import unit, vector
 
 GRID = 64
 HALF = 1.3
@@ -32,18 +32,15 @@ def extracted(shape: ref.Shape, noise: float = 0.0) -> Mesh:
     grid = np.stack(np.meshgrid(*[np.linspace(-HALF, HALF, GRID)] * 3, indexing="ij"), axis=-1)
     voxel = 2 * HALF / (GRID - 1)
     field = shape(grid) + noise * voxel * np.random.default_rng(4).normal(size=grid.shape[:3])
-    return extract_mesh(
-        tsdf.TSDF((field / (5 * voxel)).clip(-1, 1).astype(np.float32), np.full(3, -HALF), voxel)
-    )
+    volume = (field / (5 * voxel)).clip(-1, 1).astype(np.float32)
+    return extract_mesh(tsdf.TSDF(volume, np.full(3, -HALF), voxel))
 
 
 def mirror_rays(shape: ref.Shape, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points that cameras around the shape see, outward normals, mirror directions; grazing ones included."""
     rng = np.random.default_rng(5)
-    eye = rng.normal(size=(count, 3))
-    eye *= 4 / np.linalg.norm(eye, axis=1, keepdims=True)
-    view = rng.uniform(-1, 1, (count, 3)) - eye
-    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    eye = 4 * unit(rng.normal(size=(count, 3)))
+    view = unit(rng.uniform(-1, 1, (count, 3)) - eye)
     t = ref.trace(shape, eye, view)
     hit = np.isfinite(t)
     point, view = eye[hit] + t[hit, None] * view[hit], view[hit]
@@ -71,14 +68,10 @@ def test_mirror_rays_against_the_true_shape(name: str) -> None:
     seen = np.array(answer) == 1
     grazing = np.sum(mirror * normal, axis=1) < 0.2
     false_occlusion, missed = np.mean(truth & ~seen), np.mean(~truth & seen)
-    print(f"{name}: occluded {np.mean(~truth):.3f}, false {false_occlusion:.4f}, missed {missed:.4f}")
     assert grazing.sum() > 100 and np.mean((truth & ~seen)[grazing]) < 0.02
     # Two voxels of offset are a ninth of the plates' gap on this coarse grid; their edges shift by as much.
     assert false_occlusion < 0.015 and missed < 0.01
-    if name == "sphere":
-        assert seen.all()
-    else:
-        assert np.mean(~truth) > 0.03
+    assert seen.all() if name == "sphere" else np.mean(~truth) > 0.03
 
 
 def test_offset_is_what_prevents_self_occlusion(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,14 +115,12 @@ def test_no_mesh_is_visible_and_traces_nothing() -> None:
 def test_updates_in_place_compile_nothing() -> None:
     """Other counts, an empty mesh in between: the answers follow, the kernel and the scene stay."""
     occluder = Occluder()
-    origin = mi.Point3f(mi.Float([0, 0, 0]), mi.Float([0, 0, 0]), mi.Float([-5, -5, 5]))
-    direction = mi.Vector3f(0, 0, mi.Float([1, -1, 1]))
+    origin, direction = mi.Point3f(0, 0, [-5, -5, 5]), mi.Vector3f(0, 0, [1, -1, 1])
 
     def answer(radius: float, level: int) -> list[float]:
         ball = trimesh.creation.icosphere(level, radius)
-        occluder.update(
-            Mesh(np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32), 0.1 * radius)
-        )
+        vertices, faces = np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32)
+        occluder.update(Mesh(vertices, faces, 0.1 * radius))
         return np.array(occluder.visible(origin, direction, direction)).tolist()
 
     assert answer(1.0, 2) == [0, 1, 1]

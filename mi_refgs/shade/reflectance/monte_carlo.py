@@ -51,7 +51,7 @@ class MonteCarlo(Reflectance):
     def trace(self, points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
         """The points with `free` (mi.UInt64, detached): bit j says that light arrives from direction j."""
         count = dr.opaque(mi.UInt32, options.directions)
-        normal, position = dr.detach(safe_normalize(points.normal)), dr.detach(context.origin)
+        normal, position = dr.detach(safe_normalize(points.normal)), dr.detach(points.position)
 
         def body(index: Any, free: Any) -> tuple[Any, Any]:
             seen = context.occluder.visible(position, _direction(index, count, normal)[0], normal)
