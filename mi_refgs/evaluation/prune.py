@@ -64,9 +64,8 @@ def prune(
     InputError for a limit out of range.
     """
     if not 0 < limit <= PSNR_MAX:
-        raise InputError(
-            f"--limit: {limit:g} dB is out of range; give a number above 0, at most {PSNR_MAX:g}"
-        )
+        allowed = f"give a number above 0, at most {PSNR_MAX:g}"
+        raise InputError(f"--limit: {limit:g} dB is out of range; {allowed}")
 
     # What shading never reads, then trials.
     images = _WholeImages(whole, train)

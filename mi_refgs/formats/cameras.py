@@ -53,9 +53,7 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
         frames.append({**frame, **_coefficients(lens), "transform_matrix": opengl})
     content: dict[str, Any] = {"camera_model": frames[0]["camera_model"]}
     for split in ("train", "test"):
-        content[f"{split}_filenames"] = [
-            n for n, shot in zip(names, shots, strict=True) if shot.split == split
-        ]
+        content[f"{split}_filenames"] = [_file_name(shot) for shot in shots if shot.split == split]
     write_json(target / "transforms.json", {**content, "frames": frames})
 
     # COLMAP's model

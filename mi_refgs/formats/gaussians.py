@@ -93,9 +93,8 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
 def _limited(camera: Camera) -> Camera:
     """Return a camera of at most about PIXELS."""
     factor = (camera.width * camera.height / PIXELS) ** 0.5
-    if factor <= 1:
-        return camera
-    return camera.resized((max(round(camera.width / factor), 1), max(round(camera.height / factor), 1)))
+    size = max(round(camera.width / factor), 1), max(round(camera.height / factor), 1)
+    return camera if factor <= 1 else camera.resized(size)
 
 
 def _inset(table: Surfels, cameras: Sequence[Camera]) -> np.ndarray:

@@ -56,13 +56,9 @@ def write_mesh(
         roughnessFactor=1.0,
     )
     turn = np.array(Y_UP)
-    mesh = trimesh.Trimesh(
-        made.vertices @ turn.T,
-        made.faces,
-        vertex_normals=made.normals @ turn.T,
-        visual=TextureVisuals(uv=made.uv.astype(np.float64), material=material),
-        process=False,
-    )
+    vertices, normals = made.vertices @ turn.T, made.normals @ turn.T
+    visual = TextureVisuals(uv=made.uv.astype(np.float64), material=material)
+    mesh = trimesh.Trimesh(vertices, made.faces, vertex_normals=normals, visual=visual, process=False)
     scene = trimesh.Scene()
     scene.add_geometry(mesh, node_name="object", geom_name="object")
     data: Any = trimesh.exchange.gltf.export_glb(

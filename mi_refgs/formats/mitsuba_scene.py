@@ -99,9 +99,8 @@ def diffuse_ratio() -> tuple[np.ndarray, np.ndarray]:
     roughness = np.linspace(0, 1, ROUGHNESSES)
     node, weight = np.polynomial.legendre.leggauss(NODES)
     cosine, weight = (node + 1) / 2, weight / 2
-    scale, bias = split_sum(
-        mi.Float(np.tile(cosine, ROUGHNESSES).tolist()), mi.Float(np.repeat(roughness, NODES).tolist())
-    )
+    cosines, roughnesses = np.tile(cosine, ROUGHNESSES), np.repeat(roughness, NODES)
+    scale, bias = split_sum(mi.Float(cosines.tolist()), mi.Float(roughnesses.tolist()))
     specular = np.array(DIELECTRIC_F0 * scale + bias).reshape(ROUGHNESSES, NODES)
     ours = 2 * ((1 - specular) * cosine * weight).sum(axis=1)
 

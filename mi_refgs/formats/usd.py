@@ -49,9 +49,8 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
 
 def _write_stage(path: Path, made: TexturedMesh, camera: Camera) -> None:
     """Write the stage, whose textures are in its folder."""
-    gf, sdf, usd, geom, lux, shade, vt = (
-        import_extra(f"pxr.{name}") for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdLux", "UsdShade", "Vt")
-    )
+    names = "Gf", "Sdf", "Usd", "UsdGeom", "UsdLux", "UsdShade", "Vt"
+    gf, sdf, usd, geom, lux, shade, vt = (import_extra(f"pxr.{name}") for name in names)
     stage = usd.Stage.CreateNew(str(path))
     geom.SetStageUpAxis(stage, geom.Tokens.z)
     geom.SetStageMetersPerUnit(stage, 1.0)

@@ -161,7 +161,14 @@ def test_evaluate_without_ground_truth_gives_reasons(data: Path, tmp_path: Path)
     for split in ("test", "train"):
         (bare / f"transforms_{split}.json").write_text(json.dumps(content | {"frames": frames}))
     result = evaluate(run, bare)
-    reasons = {"albedo": "albedo_psnr", "surface": "surface_distance", "concave": "concave_share"}
-    for name, key in reasons.items():
-        assert result[key] is None and result[f"{name}_reason"]
-    assert result["surface_reason"] == "the run has no mesh"
+    assert result["dataset"] == str(bare)
+    for key, reason in (
+        ("albedo_psnr", "defines no albedo"),
+        ("surface_distance", "the run has no mesh"),
+        ("concave_share", "has no surface.ply"),
+        ("normal_mae_deg", "no true normals"),
+        ("normal_mae_deg_full", "no true normals"),
+        ("env_scale", "no environment.exr"),
+        ("env_psnr", "no environment.exr"),
+    ):
+        assert result[key] is None and reason in result[f"{key.partition('_')[0]}_reason"], key

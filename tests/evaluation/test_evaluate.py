@@ -106,15 +106,6 @@ def test_mitsuba_renders_the_exported_scene_like_the_trainer(
     np.testing.assert_allclose(image, expected, atol=1e-5)
 
 
-def test_missing_ground_truth_is_null_with_a_reason(run: Run, tmp_path: Path) -> None:
-    plain = write_data(tmp_path / "plain", truth=False)
-    result = evaluate(run, plain)
-    assert result["dataset"] == str(plain)
-    missing = "normal_mae_deg", "normal_mae_deg_full", "env_scale", "env_psnr"
-    assert [result[key] for key in missing] == [None] * 4
-    assert "no true normals" in result["normal_reason"] and "environment.exr" in result["env_reason"]
-
-
 def test_evaluate_measures_the_scene_files(run: Run) -> None:
     """An edited PLY counts; a checkpoint that is newer than the artefacts replaces them."""
     before = evaluate(run)

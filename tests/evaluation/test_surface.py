@@ -45,17 +45,11 @@ def ball(radius: float, centre: tuple[float, ...] = (0, 0, 0)) -> Any:
     return shape.apply_translation(centre)
 
 
-def test_distance_to_itself_is_zero() -> None:
-    truth = truth_of(ball(1))
-    found = surface.surface_distance(truth.mesh, truth, around())
-    assert found["surface_distance"] < 1e-3 and "surface_distance_concave" not in found
-
-
-def test_distance_of_spheres() -> None:
+@pytest.mark.parametrize(("radius", "percent"), [(1, 0), (1.1, 5)])
+def test_distance_of_spheres(radius: float, percent: float) -> None:
     """In percent of the true diameter, either way."""
-    found = surface.surface_distance(mesh_of(ball(1.1)), truth_of(ball(1)), around())
-    for key in surface.SURFACE_KEYS:
-        assert found[key] == pytest.approx(5, abs=0.05)
+    found = surface.surface_distance(mesh_of(ball(radius)), truth_of(ball(1)), around())
+    assert found == pytest.approx(dict.fromkeys(surface.SURFACE_KEYS, percent), rel=0.01, abs=1e-3)
 
 
 def test_distance_counts_missing_but_not_hidden_surface() -> None:

@@ -156,7 +156,9 @@ def test_mesh_formats_of_an_imported_run_are_refused(theirs: Path, tmp_path: Pat
 def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path, linear: bool) -> None:
     """In memory, saved, and by the command: the same image bit for bit; linear colours render differently."""
     made = mi_refgs.import_splats(str(theirs), linear=linear)
-    assert made.folder is None and made.method.name == "theirs" and len(made.cameras()) == 4
+    shading = Shading("surfel", "radiance") if linear else Shading("pixel", "displayed")
+    assert made.trained.shading == shading and made.folder is None
+    assert made.method.name == "theirs" and len(made.cameras()) == 4
     picture = made.render(1, size=32)
     assert picture[..., :3].max() > 0.1
     np.testing.assert_array_equal(made.save(tmp_path / "saved").render(1, size=32), picture)
@@ -179,19 +181,6 @@ def test_imported_gaussians_are_exported_unchanged(theirs: Path, tmp_path: Path)
     assert not after["radiance_sh"][:, columns:].any() and after["scale"].shape[1] == 3
     if before["scale"].shape[1] == 3:
         np.testing.assert_array_equal(after["position"], before["position"])
-
-
-def test_linear_colours_survive_import(tmp_path: Path, rng: np.random.Generator) -> None:
-    """surfels.ply of a run that has only colours → a run: the same image."""
-    path, run = tmp_path / "theirs.ply", tmp_path / "run"
-    path.write_bytes(their_bytes(raw_of(2, 2, rng)))
-    scene = read_splats(path, linear=True)
-    assert scene.shading == Shading("surfel", "radiance")
-    assert main(["import", str(path), "-o", str(run), "--linear"]) == 0
-    camera = Camera.from_pose(32, 32, -40.0, -40.0, 16.0, 16.0, pinhole().to_world)
-    first, second = (s.renderer()(camera) for s in (scene, TrainedScene.read(run)))
-    for a, b in zip(first.radiance, second.radiance, strict=True):
-        assert np.abs(a.numpy() - b.numpy()).max() <= 1e-6 < a.numpy().max()
 
 
 def test_displayed_model_inverts_the_srgb_encoding() -> None:
@@ -310,23 +299,12 @@ def test_render_uses_cameras_of_a_file(theirs: Path, tmp_path: Path) -> None:
     refused([*command, "2"], f"{file}: --sensor: 2: the file has 2 frames; give 0 to 1")
 
 
-def test_scene_without_sensors_requires_cameras(tmp_path: Path) -> None:
-    """The scene is any of Mitsuba's: a white sphere in uniform light."""
-    scene, file, out = tmp_path / "scene.xml", tmp_path / "camera.json", tmp_path / "out.png"
-    scene.write_text(
-        '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>'
-        '<shape type="sphere"><bsdf type="diffuse"/></shape></scene>'
-    )
-    file.write_text(json.dumps(transforms()))
-    command = ["render", str(scene), "-o", str(out)]
-    refused(command, "sensor: the scene has none; add one, or give a file with --camera")
-    assert main([*command, "--camera", str(file)]) == 0
-    assert read_png(out).shape[:2] == (48, 64)
-
-
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e5])
 def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(scale: float, tmp_path: Path) -> None:
-    """A black ball in white light, whose camera has no near plane: it is not cut off."""
+    """A black ball in white light, whose camera has no near plane: it is not cut off.
+
+    The scene is any of Mitsuba's; it has no sensor, and is refused without cameras.
+    """
     scene, file, out = tmp_path / "scene.xml", tmp_path / "camera.json", tmp_path / "out.exr"
     scene.write_text(
         '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>'
@@ -336,6 +314,8 @@ def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(scale: float, tmp_path
     pose = np.array(mi.ScalarTransform4f().look_at([4 * scale, 0, 0], [0, 0, 0], [0, 0, 1]).matrix)
     frame = {"transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist()}
     file.write_text(json.dumps({"w": 16, "h": 12, "camera_angle_x": 0.8, "frames": [frame]}))
-    assert main(["render", str(scene), "-o", str(out), "--camera", str(file)]) == 0
+    command = ["render", str(scene), "-o", str(out)]
+    refused(command, "sensor: the scene has none; add one, or give a file with --camera")
+    assert main([*command, "--camera", str(file)]) == 0
     seen = read_exr(out)["R"]
-    assert seen[5:7, 7:9].max() == 0 and seen[0, 0] == pytest.approx(1)
+    assert seen.shape == (12, 16) and seen[5:7, 7:9].max() == 0 and seen[0, 0] == pytest.approx(1)
