@@ -25,8 +25,7 @@ from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Vector2f
 
-MARGIN = 0.02
-"""Distance beyond the border of the region, in radii, from which a surfel changes tables."""
+MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel changes tables
 
 
 def depth_outside(position: np.ndarray, region: Region) -> np.ndarray:

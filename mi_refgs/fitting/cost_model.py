@@ -23,10 +23,8 @@ from mi_refgs.io.files import locked, read_json, write_json
 
 SIZES = 96, 224
 """Sides in pixels of the images that speeds are measured on: a step on the second takes twice as long."""
-FOLDER_VARIABLE = "MI_REFGS_CACHE"
-"""Environment variable with the folder of these files."""
-PATIENCE = 120.0
-"""Seconds to wait for another process that measures the same."""
+FOLDER_VARIABLE = "MI_REFGS_CACHE"  # environment variable with the folder of these files
+PATIENCE = 120.0  # seconds to wait for another process that measures the same
 
 
 @dataclass(frozen=True)

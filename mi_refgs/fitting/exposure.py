@@ -35,8 +35,7 @@ JUDGES = 32
 BLOCK = 16
 """Pixels along a side of the squares of the checkerboard that halves an image: larger than the blocks of
 JPEG, 8 pixels."""
-EXIF_SPREAD = 0.02
-"""Standard deviation of log exposures below which EXIF exposures count as equal."""
+EXIF_SPREAD = 0.02  # standard deviation of log exposures below which EXIF exposures count as equal
 EXPOSURE_FILE = "exposure.json"  # of a run: the decision and the gains
 
 
@@ -68,8 +67,7 @@ def gains_of(params: Mapping[str, TensorXf]) -> np.ndarray | None:
 
 # ---------------- the decision ----------------
 
-Render = Callable[[View], Frame]
-"""Renders a view of the present state."""
+Render = Callable[[View], Frame]  # renders a view of the present state
 
 
 def is_due(setup: FitSetup, state: FitState) -> bool:

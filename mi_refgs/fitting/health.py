@@ -21,10 +21,8 @@ from mi_refgs.surfels.table import Surfels
 CULL_SHARE = 0.1
 """Fraction of the surfels from which on they are not the cause: a pixel has tens of surfels, a scene
 thousands."""
-PATIENCE = 3
-"""Log intervals in which every step fails before the fit ends: removing surfels may help first."""
-NAMED = 5
-"""Surfels that a message names."""
+PATIENCE = 3  # log intervals in which every step fails before the fit ends: removing surfels may help first
+NAMED = 5  # surfels that a message names
 
 
 @dataclass

@@ -27,8 +27,7 @@ FARTHEST = 1.95
 as good."""
 SEEN_SHARE = 0.1
 """Fraction of the views that must see a random point: fewer views cannot determine its position."""
-DRAWS = 64
-"""Rounds of rejection sampling; cameras on one side of a scene accept about a tenth per round."""
+DRAWS = 64  # rounds of rejection sampling; cameras on one side of a scene accept about a tenth per round
 
 
 def open_points(
@@ -93,10 +92,8 @@ def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator)
     return np.concatenate([found, draw(count - len(found))])
 
 
-ALBEDO_RANGE = (0.02, 0.9)
-"""Range of an initial albedo from images: near 0 and 1 the sigmoid has no slope."""
-FAR = 1e4
-"""Distance, in scene extents, at which a direction is looked up in the images."""
+ALBEDO_RANGE = (0.02, 0.9)  # range of an initial albedo from images: near 0 and 1 the sigmoid has no slope
+FAR = 1e4  # distance, in scene extents, at which a direction is looked up in the images
 
 
 def is_open(method: Method, data: Dataset) -> bool:

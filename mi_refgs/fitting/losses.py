@@ -20,8 +20,7 @@ from mi_refgs.types import Bool, Float, Vector3f
 
 # From here up, 8-bit target values are clipped: 255 means "at least this bright".
 SATURATED = 254.5 / 255.0
-DIRECTIONS = 256
-"""Directions in which irradiance is sampled, 13° apart."""
+DIRECTIONS = 256  # directions in which irradiance is sampled, 13° apart
 
 
 def saturated(

@@ -24,8 +24,7 @@ from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light.light import Light
 from mi_refgs.types import Float
 
-MATERIALS = ("roughness", "metallic")
-"""Maps that neighbouring pixels of similar colour share."""
+MATERIALS = ("roughness", "metallic")  # maps that neighbouring pixels of similar colour share
 MATERIAL_EDGE = 10.0
 """Steepness of edges that are kept: a step of 0.1 in the image from a pixel to the next counts a third."""
 GAIN_PRIOR = 1e-3
@@ -70,8 +69,7 @@ class Loss:
     attributes: tuple[str, ...] = ()  # of surfels, without which a method that weighs the loss is refused
 
 
-LOSSES = Registry[Loss]("loss")
-"""The registered losses, in the order in which they are summed."""
+LOSSES = Registry[Loss]("loss")  # the registered losses, in the order in which they are summed
 register = LOSSES.register
 """Add a loss, which method files can weigh from then on."""
 

@@ -38,26 +38,19 @@ from mi_refgs.methods.read import PRESETS
 from mi_refgs.runs.views import read_views
 
 VIEWS = 6
-COVERED = 0.35
-"""Fraction of the synthetic images that the object covers; published data sets have 0.1 to 0.5."""
+COVERED = 0.35  # fraction of the synthetic images that the object covers; published data sets have 0.1 to 0.5
 WARM, TIMED, REPEATS = 4, 4, 3
 """Steps before the timed ones, which compile kernels; steps timed together; repetitions, of which the fastest
 counts."""
-WHOLE = 256 * 256
-"""Pixels of an image up to which it is not downscaled, unless the method says so."""
-LEAST = 96
-"""Pixels of the shorter side below which no image is downscaled: smaller images show no surface."""
-SAFETY = 0.8
-"""Fraction of the time limit that the estimate may reach: data sets differ by as much."""
+WHOLE = 256 * 256  # pixels of an image up to which it is not downscaled, unless the method says so
+LEAST = 96  # pixels of the shorter side below which no image is downscaled: smaller images show no surface
+SAFETY = 0.8  # fraction of the time limit that the estimate may reach: data sets differ by as much
 GROWTH, OPEN_GROWTH = 1.0, 0.6
 """Mean time of a step relative to the synthetic data set, with alpha and without: the number of surfels
 grows, but opaque ones hide others, and without alpha surfels start far larger than they end."""
-START = 10.0
-"""Seconds for the visual hull, previews, checkpoints and artefacts."""
-DECODING = 1.5e-8
-"""Seconds per pixel of a file, once per image: JPEG 8e-9, PNG 2e-8."""
-WORTH = 1e7
-"""Iterations × pixels from which a fit takes minutes, and an estimate is worth its time."""
+START = 10.0  # seconds for the visual hull, previews, checkpoints and artefacts
+DECODING = 1.5e-8  # seconds per pixel of a file, once per image: JPEG 8e-9, PNG 2e-8
+WORTH = 1e7  # iterations × pixels from which a fit takes minutes, and an estimate is worth its time
 
 
 def speed_of(method: Method, has_alpha: bool) -> Speed:

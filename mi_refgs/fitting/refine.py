@@ -162,12 +162,10 @@ def restart(surfels: Surfels, starts: Mapping[str, float], rng: np.random.Genera
     return Surfels.from_numpy(raw)
 
 
-MOST_COPIES = 51
-"""Most surfels at one place that the correction distinguishes. [code of 3DGS-MCMC]"""
+MOST_COPIES = 51  # most surfels at one place that the correction distinguishes. [code of 3DGS-MCMC]
 SHARPNESS = 100.0
 """Slope of the noise over opacity: surfels a few hundredths more opaque than idle ones hardly move. [§4.2]"""
-OPACITY_RANGE = (0.005, 1 - 1e-4)
-"""Range of corrected opacities: none is idle, and logits stay moderate."""
+OPACITY_RANGE = (0.005, 1 - 1e-4)  # range of corrected opacities: none is idle, and logits stay moderate
 
 
 def shared(opacity: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -26,12 +26,9 @@ from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import MODEL
 from mi_refgs.runs.views import read_views, with_region
 
-DEFAULT_METHOD = "ref_gaussian.toml"
-"""File of `variants/` that is fitted by default: the full method."""
-OPEN_PURPOSE = "photographs"
-"""Purpose of the method that is fitted by default to images without alpha."""
-Tell = Callable[[str], None]
-"""Is called with sentences for the user."""
+DEFAULT_METHOD = "ref_gaussian.toml"  # file of `variants/` that is fitted by default: the full method
+OPEN_PURPOSE = "photographs"  # purpose of the method that is fitted by default to images without alpha
+Tell = Callable[[str], None]  # is called with sentences for the user
 FindPoints = Callable[[Dataset, Path, Tell], PointCloud | None]
 """Finds points for a fit to start from, and keeps them in the folder: `capture.triangulate.with_points`."""
 Settings = Mapping[str, object] | Sequence[str]

@@ -79,8 +79,7 @@ class Schedule:
         return groups
 
 
-GATHERED = "light_gradient"
-"""Name of the gradient of the levels in a checkpoint."""
+GATHERED = "light_gradient"  # name of the gradient of the levels in a checkpoint
 
 
 class SharedPrefilter:

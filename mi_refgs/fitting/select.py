@@ -74,11 +74,9 @@ def _history(
     return found
 
 
-MOMENTS = 3
-"""Arrays of float32 that a parameter needs: itself, and Adam's first and second moment."""
+MOMENTS = 3  # arrays of float32 that a parameter needs: itself, and Adam's first and second moment
 
-TIME_NOISE = 0.05
-"""Relative difference of two measurements of a step's time by chance."""
+TIME_NOISE = 0.05  # relative difference of two measurements of a step's time by chance
 
 DECISIONS = "decisions.json"  # file of a run
 

@@ -19,8 +19,7 @@ from mi_refgs.render.display import srgb_from_linear
 from mi_refgs.splat import Camera
 from mi_refgs.types import Bool, Float
 
-BUDGET = 2**30
-"""Bytes of targets that stay on the device: a thousand images of 200², or ten of 2000²."""
+BUDGET = 2**30  # bytes of targets that stay on the device: a thousand images of 200², or ten of 2000²
 PIXEL_BYTES = 4 * 4 + 3
 """Bytes per pixel of a target: three colours and alpha as float32, and a mask per colour."""
 

@@ -82,12 +82,10 @@ def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
 
 
 SIZES = (200, 400, 800)  # pixels along the longer side of an image
-ROUNDS = 9
-"""Timed images of each kind, in turns, so that other load of the machine slows all kinds equally."""
+ROUNDS = 9  # timed images of each kind, in turns, so that other load of the machine slows all kinds equally
 FRAME_WARM_UP = 2  # rounds before the first measured one: they compile kernels
 
-Draw = Callable[[Camera, Collection[str]], Frame]
-"""Renders a view with the AOVs of these names."""
+Draw = Callable[[Camera, Collection[str]], Frame]  # renders a view with the AOVs of these names
 
 
 @dataclass(frozen=True)

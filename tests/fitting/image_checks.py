@@ -8,9 +8,12 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_refgs.data.dataset import View
 from mi_refgs.kernels.device import upload
+from mi_refgs.reference import losses as reference
 
 HEIGHT, WIDTH = 14, 17  # not square, and larger than SSIM's window in one axis only by a little
+BACKGROUND = np.array([1.0, 0.5, 0.25], np.float32)
 STEP = 1e-5  # of the float64 definitions: truncation 1e-10, rounding 1e-11
 VALUE = 2e-6  # float32 sums of 700 numbers of size 1: observed 3e-7
 GRADIENT = 2e-5  # relative L2 against float64 differences: observed 1e-6 (SSIM 4e-6)
@@ -19,6 +22,20 @@ GRADIENT = 2e-5  # relative L2 against float64 differences: observed 1e-6 (SSIM 
 def planes(image: np.ndarray) -> list[Any]:
     """(H, W, 3) array → three planes."""
     return [upload(image[..., c]) for c in range(image.shape[2])]
+
+
+def shown(radiance: np.ndarray, alpha: np.ndarray, linear: bool, gain: Any = 1.0) -> np.ndarray:
+    """The image of exposed premultiplied radiance, in float64, as its file has it."""
+    if linear:
+        return np.asarray(radiance * gain + (1 - alpha[..., None]) * BACKGROUND)
+    x, y, z = map(float, BACKGROUND)
+    return reference.display_image(radiance * gain, alpha, (x, y, z))
+
+
+def view_of(image: np.ndarray, alpha: np.ndarray | None, linear: bool) -> View:
+    image = image.astype(np.float32)
+    alpha = None if alpha is None else alpha.astype(np.float32)
+    return View("a", WIDTH, HEIGHT, 20.0, 20.0, 8.0, 7.0, np.eye(4), image, alpha, None, None, linear)
 
 
 def stack(planes_: list[Any]) -> np.ndarray:

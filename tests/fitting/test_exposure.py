@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_refgs.data.dataset import Dataset, View
+from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, MAX_GAIN, fitted_gain, log_exposure
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import exposure
@@ -27,10 +27,9 @@ from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.run import Run
 from mi_refgs.splat import Camera
-from tests.fitting.image_checks import HEIGHT, STEP, WIDTH, planes
-from tests.scenes.highlight import ball, run_folder, small_method
+from tests.fitting.image_checks import BACKGROUND, HEIGHT, STEP, WIDTH, planes, shown, view_of
+from tests.scenes.highlight import SIZE, ball, run_folder, small_method
 
-BACKGROUND = np.array([1.0, 0.5, 0.25], np.float32)
 GAINS = np.array([1.4, 0.7, 0.9])
 DECIDED = 8
 
@@ -40,20 +39,6 @@ def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Premultiplied radiance, some of it beyond white, and alpha with empty and full pixels."""
     alpha = np.clip(rng.uniform(-0.5, 1.5, (HEIGHT, WIDTH)), 0, 1)
     return rng.uniform(0.01, 0.9, (HEIGHT, WIDTH, 3)) * alpha[..., None], alpha
-
-
-def shown(radiance: np.ndarray, alpha: np.ndarray, linear: bool, gain: np.ndarray) -> np.ndarray:
-    """The image of exposed radiance, in float64, as its file has it."""
-    if linear:
-        return radiance * gain + (1 - alpha[..., None]) * BACKGROUND
-    x, y, z = map(float, BACKGROUND)
-    return reference.display_image(radiance * gain, alpha, (x, y, z))
-
-
-def view_of(image: np.ndarray, alpha: np.ndarray | None, linear: bool) -> View:
-    image = image.astype(np.float32)
-    alpha = None if alpha is None else alpha.astype(np.float32)
-    return View("a", WIDTH, HEIGHT, 20.0, 20.0, 8.0, 7.0, np.eye(4), image, alpha, None, None, linear)
 
 
 @pytest.mark.parametrize("linear", [False, True])
@@ -87,7 +72,7 @@ def test_exposure_of_step_and_its_derivative(
 ) -> None:
     """Value, both modes, against differences of the float64 definition; the prior is part of it."""
     radiance, alpha = (x.astype(np.float32).astype(np.float64) for x in picture)
-    goal = shown(rng.uniform(0.01, 0.5, radiance.shape) * alpha[..., None], alpha, linear, np.ones(3))
+    goal = shown(rng.uniform(0.01, 0.5, radiance.shape) * alpha[..., None], alpha, linear)
     view = view_of(goal, alpha, linear)
     data = Dataset(Path("a"), "train", (view,), BACKGROUND, linear, None)
     target = Target.of(view, BACKGROUND)
@@ -136,7 +121,7 @@ def test_gain_of_open_scene_counts_what_lies_behind(picture: tuple[np.ndarray, n
 
 
 def exposed(data: Dataset, log: np.ndarray) -> Dataset:
-    """The data set with log gains (V, 3) on its 8-bit images with a white background."""
+    """The data set with log gains (V, 3), or per pixel, on its 8-bit images with a white background."""
     views = []
     for view, gain in zip(data.views, np.exp(log), strict=True):
         assert view.alpha is not None
@@ -214,16 +199,10 @@ def test_gains_that_fit_half_of_the_pixels_are_rejected(
     method: Method, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every other square of an image has another exposure: what is fitted to some is wrong for the rest."""
-    data, squares = ball(views=4), []
-    for view in data.views:
-        row, column = np.indices((view.height, view.width)) // exposure.BLOCK
-        factor = np.where((row + column) % 2 == 0, 0.5, 1.0)[..., None]
-        assert view.alpha is not None
-        alpha = view.alpha[..., None]
-        colour = srgb_from_linear(view.colour(data.background) * factor)
-        image = (alpha * colour + (1 - alpha) * data.background).astype(np.float32)
-        squares.append(dataclasses.replace(view, image=image))
-    trainer = Trainer(method, dataclasses.replace(data, views=tuple(squares)))
+    data = ball(views=4)
+    row, column = np.indices((SIZE, SIZE)) // exposure.BLOCK
+    factor = np.where((row + column) % 2 == 0, 0.5, 1.0)[..., None]
+    trainer = Trainer(method, exposed(data, np.log(np.stack([factor] * 4))))
     monkeypatch.setattr(Trainer, "view", perfect(data))
     decide(trainer, DECIDED)
     decision = trainer.fit.exposure
@@ -308,21 +287,12 @@ def test_exif_data_tell_exposure(tmp_path: Path, method: Method) -> None:
     """A stop is a factor of two; what lacks one of the three numbers, or has nonsense, tells nothing."""
     usual: dict[int, Any] = {EXPOSURE_TIME: 0.01, F_NUMBER: 2.0, ISO: 100}
     changes: list[dict[int, Any]] = [{}, {EXPOSURE_TIME: 0.02}, {ISO: 50}, {F_NUMBER: 4.0}]
-    log = [
-        log_exposure(photograph(tmp_path / f"{i}.jpg", {**usual, **change}))
-        for i, change in enumerate(changes)
-    ]
+    log = [log_exposure(photograph(tmp_path / f"{i}.jpg", usual | x)) for i, x in enumerate(changes)]
     assert log[0] == pytest.approx(np.log(0.01 * 100 / 4), rel=1e-6)
     assert [value - log[0] for value in log if value is not None and log[0] is not None] == pytest.approx(
         np.log([1, 2, 0.5, 0.25]), abs=1e-5
     )
-    broken: list[dict[int, Any] | None] = [
-        None,
-        {EXPOSURE_TIME: 0.01},
-        usual | {ISO: 0},
-        usual | {F_NUMBER: 0.0},
-    ]
-    for settings in broken:
+    for settings in (None, {EXPOSURE_TIME: 0.01}, usual | {ISO: 0}, usual | {F_NUMBER: 0.0}):
         assert log_exposure(photograph(tmp_path / "none.jpg", settings)) is None
     assert log_exposure(tmp_path / "picture.exr") is None
     for name in ("garbage.jpg", "garbage.png"):

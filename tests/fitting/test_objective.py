@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mi_refgs import methods
-from mi_refgs.data.dataset import Dataset, View, read_dataset
+from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.fitting import losses
 from mi_refgs.fitting.objective import LossInputs, objective
 from mi_refgs.fitting.targets import Target
@@ -22,21 +22,12 @@ from mi_refgs.methods.method import LossWeights
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from tests.fitting.image_checks import HEIGHT, WIDTH
-
-BACKGROUND = np.array([1.0, 0.5, 0.25], np.float32)
+from tests.fitting.image_checks import BACKGROUND, HEIGHT, WIDTH, shown, view_of
 
 
 def made(linear: bool, radiance: np.ndarray, alpha: np.ndarray) -> tuple[Dataset, Target]:
     """A data set of one image of premultiplied linear radiance (H, W, 3), and its target."""
-    if linear:
-        image = radiance + (1 - alpha[..., None]) * BACKGROUND
-    else:
-        a = alpha[..., None]
-        encoded = np.vectorize(reference.srgb)(radiance / np.maximum(a, 1e-9))
-        image = a * encoded + (1 - a) * BACKGROUND
-    image, alpha = image.astype(np.float32), alpha.astype(np.float32)
-    view = View("a", WIDTH, HEIGHT, 20.0, 20.0, 8.0, 7.0, np.eye(4), image, alpha, None, None, linear)
+    view = view_of(shown(radiance, alpha, linear), alpha, linear)
     return Dataset(Path("a"), "train", (view,), BACKGROUND, linear, None), Target.of(view, BACKGROUND)
 
 
