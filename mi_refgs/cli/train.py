@@ -82,7 +82,7 @@ class Train:
             "total_seconds": round(taken, 3),
             "estimated_seconds": None if expected is None else round(expected.seconds, 3),
             "surfels": trainer.surfels.count,
-            "loss": None if trainer.loss is None else trainer.statistics().get("loss"),
+            "loss": trainer.statistics()["loss"],
         }
         total = (
             "" if expected is None else f" ({minutes(taken)} in all, estimate {minutes(expected.seconds)})"

@@ -71,7 +71,11 @@ def fit_and_measure(job: Job) -> None:
     run, data = job.run, Path(job.data)
     method = run.method() if run.exists() else job.method()
     views = read_views(method, data, "train", truth=False)
-    trainer = begin(method, views, run, find_points=with_points)
+
+    def warn(message: str) -> None:
+        print(f"refgs: warning: {message}", file=sys.stderr)
+
+    trainer = begin(method, views, run, find_points=with_points, warn=warn)
     if trainer.iteration:
         print(f"refgs: resumed at iteration {trainer.iteration} of {method.iterations}", file=sys.stderr)
     trainer.train(Curve(job, method, trainer.iteration))
@@ -97,8 +101,6 @@ class Curve:
         from mi_refgs.evaluation.images import RenderedView
         from mi_refgs.evaluation.metrics import psnr
 
-        while trainer.notices:
-            print(f"refgs: warning: {trainer.notices.pop(0)}", file=sys.stderr)
         passed = [point for point in self.due if point <= trainer.iteration]
         if not passed:
             return

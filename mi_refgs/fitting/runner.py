@@ -16,7 +16,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import exposure
 from mi_refgs.fitting.plan import planned
 from mi_refgs.fitting.progress import Progress
-from mi_refgs.fitting.select import DECISIONS, select_components, with_components
+from mi_refgs.fitting.select import DECISIONS, install_trials, with_components
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.resources import resource_dir
@@ -115,18 +115,13 @@ def _fit(
     data, output, resumed = views.path, run.path, run.exists()
     if resumed:
         _record_data(run, data, progress)
-    trainer = begin(method, views, run, progress.say, find_points)
+    trainer = begin(method, views, run, progress.say, find_points, progress.warn)
     if resumed:
         progress.say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
 
-    def step(trainer: Trainer) -> None:
-        while trainer.notices:
-            progress.warn(trainer.notices.pop(0))
-        progress.step(trainer)
-
     progress.begin(trainer)
     try:
-        trainer.train(step)
+        trainer.train(progress.step)
     except KeyboardInterrupt as error:
         kept = "" if run.checkpoints() else " (before the first iteration was done)"
         raise type(error)(
@@ -157,12 +152,14 @@ def begin(
     run: Run,
     tell: Tell = lambda _: None,
     find_points: FindPoints | None = None,
+    warn: Tell = lambda _: None,
 ) -> Trainer:
     """Create a trainer that writes into `run`: from its newest checkpoint if the folder contains a run, else
     anew.
 
     A new fit starts from what `find_points` finds, by default the points of the data set. `tell` is called
-    with what is found and decided. A resumed run keeps its region of interest. Raises InputError for cameras
+    with what is found and decided, `warn` with steps that failed. From now on the trainer tries the optional
+    components of its method. A resumed run keeps its region of interest. Raises InputError for cameras
     that are all in one place, checkpoints that are all damaged, a scene without a checkpoint, and a folder
     that cannot be written.
     """
@@ -182,13 +179,12 @@ def begin(
             tell(f"{views.path}: {note}")
         if find_points is not None:
             views = replace(views, points=find_points(views, run.path, tell))
-    trainer = Trainer(method, views, run, state)
-    trainer.tell = tell
+    trainer = Trainer(method, views, run, state, tell=tell, warn=warn)
     if resumed:
         run.rewind(trainer.iteration)
     else:
         run.create(method, str(views.path.resolve()), views.region)
-    select_components(trainer, tell)
+    install_trials(trainer, tell)
     return trainer
 
 

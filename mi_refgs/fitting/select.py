@@ -107,11 +107,11 @@ class Decision:
         return None if self.without is None or self.with_it is None else self.with_it.psnr - self.without.psnr
 
 
-def select_components(trainer: Trainer, tell: Callable[[str], None] = lambda _: None) -> None:
-    """Let a trainer try the components of its method as they are due; none if its method selects nothing.
+def install_trials(trainer: Trainer, tell: Callable[[str], None] = lambda _: None) -> None:
+    """Restrict a trainer to the views that do not validate, and let it try each component before the step at
+    which that is due; it gets all views back with the last decision.
 
-    Until the last decision it is fitted to the views that are not validation views. `tell` is called with a
-    sentence for every decision.
+    Changes nothing if its method selects nothing. `tell` is called with a sentence for every decision.
     """
     select = trainer.method.select
     if select is None:

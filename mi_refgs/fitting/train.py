@@ -54,11 +54,15 @@ class Trainer:
         data: Dataset,
         run: Run | None = None,
         state: dict[str, np.ndarray] | None = None,
+        *,
+        tell: Callable[[str], None] = lambda _: None,
+        warn: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Set up a fit of `data`: from a `state`, the newest checkpoint of `run`, or the start."""
-        self.run = run
-        self.notices: list[str] = []  # messages for users, removed by what displays them
-        self.tell: Callable[[str], None] = lambda message: None  # is called with decisions about the exposure
+        """Set up a fit of `data`: from a `state`, the newest checkpoint of `run`, or the start.
+
+        `tell` is called with decisions about the exposure, `warn` with steps that failed.
+        """
+        self.run, self.tell, self.warn = run, tell, warn
         self.before_step: Callable[[Trainer], None] | None = None  # is called before each step of `train`
         self.release: Callable[[], None] = lambda: None  # raises a pending interrupt, while `train` runs
         self.health = Health()
@@ -170,13 +174,13 @@ class Trainer:
             return render(scene, camera, Request(scene.all_aovs if aovs else (), sh_degree=degree))
 
     def statistics(self) -> dict[str, Any]:
-        """One line of the log; waits for the device."""
+        """One line of the log; waits for the device. `loss` and `psnr` are None before the first step."""
         return {
             "iteration": self.iteration,
             "seconds": round(self.fit.seconds, 3),
             "stage": self.method.stage_at(self.iteration)[0],
-            "loss": float(self.loss[0]),
-            "psnr": round(psnr_of(float(self.error[0])), 3),
+            "loss": None if self.loss is None else float(self.loss[0]),
+            "psnr": None if self.error is None else round(psnr_of(float(self.error[0])), 3),
             "surfels": sum(table.surfels.count for table in self.fit.tables),
             "skipped_steps": self.health.skipped,
         }
@@ -191,14 +195,11 @@ class Trainer:
         with held_interrupts() as release:
             self.release = release
             while self.iteration < self.method.iterations:
-                try:
+                with self._saved_if_interrupted():
                     if self.before_step is not None:
                         self.before_step(self)
-                except KeyboardInterrupt:
-                    self.save()
-                    raise
                 if self.iteration == self.method.iterations:
-                    break
+                    break  # a trial took the last steps
                 begin = time.perf_counter()
                 self.step()
                 if self.iteration % self.method.log_every == 0:
@@ -210,14 +211,20 @@ class Trainer:
                         self.run.log(self.statistics())
                 if self.iteration % self.method.checkpoint_every == 0:
                     self.save()
-                try:
+                with self._saved_if_interrupted():
                     if progress is not None:
                         progress(self)
                     release()
-                except KeyboardInterrupt:
-                    self.save()
-                    raise
             self.check()
+
+    @contextmanager
+    def _saved_if_interrupted(self) -> Iterator[None]:
+        """Save before an interrupt is passed on. Not around a step: a second Ctrl-C may end it half done."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self.save()
+            raise
 
     def save(self) -> None:
         """Write a checkpoint, if there is a run to write it into."""
@@ -226,9 +233,9 @@ class Trainer:
             self.run.save_checkpoint(self.iteration, self.state())
 
     def check(self) -> None:
-        """Remove the surfels that made steps fail since the last check, with a notice; see `Health.check`."""
-        if (notice := self.health.check(self.setup, self.fit)) is not None:
-            self.notices.append(notice)
+        """Remove the surfels that made steps fail since the last check, and warn; see `Health.check`."""
+        if (warning := self.health.check(self.setup, self.fit)) is not None:
+            self.warn(warning)
 
     def step(self) -> None:
         """One iteration: enter a stage if it begins, one gradient step, then the edits that are due."""
