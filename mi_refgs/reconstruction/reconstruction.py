@@ -190,8 +190,8 @@ class Reconstruction:
         is the one that `mi.load_file` reads from the scene.xml of a run. aovs: types, or name:type, appended
         to the image. Raises InputError for a camera that no Mitsuba sensor represents, and unknown AOVs.
         """
-        several = [*cameras] if isinstance(cameras, list | tuple) else [cameras]
-        first, *more = (self.camera(one) for one in several)
+        several = cameras if isinstance(cameras, list | tuple) else [cameras]
+        first, *more = map(self.camera, several)
         with tempfile.TemporaryDirectory(prefix="refgs_") as folder:
             export(self.trained, Path(folder), first, more)
             return load_scene(Path(folder) / SCENE, aovs, object_only)
@@ -285,10 +285,8 @@ def load(run: str | Path, *, write: bool = True) -> Reconstruction:
     require_supported_variant("mi_refgs.load")
     folder = Run(run)
     provenance = Provenance.of(folder)
-    if write:
-        trained = write_if_stale(folder, provenance.method, provenance.first_camera)
-    else:
-        trained = newest(folder, provenance.method)
+    method, camera = provenance.method, provenance.first_camera
+    trained = write_if_stale(folder, method, camera) if write else newest(folder, method)
     return Reconstruction(trained, provenance, folder.path)
 
 

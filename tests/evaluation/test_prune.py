@@ -181,9 +181,9 @@ def test_contributions_equal_blended_weights(train: Dataset, rng: np.random.Gene
     cameras = [view.camera() for view in train.views]
     weight = contributions(surfels, cameras)
     expected, alpha = np.zeros(surfels.count), 0.0
+    features = [mi.Float(row) for row in np.eye(surfels.count, dtype=np.float32)]
     for camera in cameras:
-        rows = np.eye(surfels.count, dtype=np.float32)
-        blended = splat(surfels, [mi.Float(row) for row in rows], camera)
+        blended = splat(surfels, features, camera)
         expected += [float(dr.sum(one)[0]) for one in blended.features]
         alpha += float(dr.sum(blended.alpha)[0])
     np.testing.assert_allclose(weight, expected, rtol=1e-4, atol=1e-5)

@@ -30,7 +30,7 @@ from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused, run_python
-from tests.scenes.known import CENTRES, CLAY, METAL, RADII, known_mesh, known_surfels
+from tests.scenes.known import CENTRES, CLAY, METAL, RADII, known_mesh, known_scene, known_surfels
 
 SHIFT = np.array([0.1, 0.4, -0.2])  # offset of the balls, so that no axis equals another
 MIDDLES = CENTRES + SHIFT
@@ -64,14 +64,12 @@ class Exported:
 
 
 def trained_scene() -> TrainedScene:
-    raw = known_surfels().to_numpy()
+    raw, mesh = known_surfels().to_numpy(), known_mesh()
     raw["position"] += SHIFT.astype(np.float32)
     rough = np.array([material["roughness"] for material in MATERIALS])
     raw["roughness"] = logit(rough[np.arange(len(raw["position"])) % 2])[:, None].astype(np.float32)
-    mesh = known_mesh()
     mesh = replace(mesh, vertices=(mesh.vertices + SHIFT).astype(np.float32), voxel=0.01)
-    shading = Shading(diffuse="irradiance", occlusion=True)
-    return TrainedScene(Surfels.from_numpy(raw), coloured_light(), mesh, shading, 1, 0.0)
+    return replace(known_scene(), surfels=Surfels.from_numpy(raw), light=coloured_light(), mesh=mesh)
 
 
 @pytest.fixture(scope="module")
@@ -123,9 +121,8 @@ def test_charts_do_not_overlap(exported: Exported) -> None:
     covered, triangle, barycentric = texels(faces, uv, TEXTURE)
     assert area.sum() == pytest.approx(covered.mean(), rel=0.02)
     assert covered.mean() > 0.3
-    shares = np.array(barycentric).T
-    shares = np.concatenate([1 - shares.sum(axis=1, keepdims=True), shares], axis=1)
-    place = np.einsum("tc,tcd->td", shares, corner[triangle.numpy()])
+    u, v = np.array(barycentric)
+    place = np.einsum("ct,tcd->td", [1 - u - v, u, v], corner[triangle.numpy()])
     row, column = np.nonzero(covered)
     wanted = np.stack([(column + 0.5) / TEXTURE, 1 - (row + 0.5) / TEXTURE], axis=1)
     np.testing.assert_allclose(place, wanted, atol=1e-5)
@@ -252,8 +249,7 @@ def test_principled_albedo_equals_ours(roughness: float) -> None:
     points = mi.Point2f(random.next_float32(), random.next_float32())
     _, weight = bsdf.sample(mi.BSDFContext(), si, random.next_float32(), points)
     scale, bias = split_sum(cosine, mi.Float(roughness))
-    specular = 0.04 * scale + bias
-    ours = dr.mean(specular + (1 - specular) * 0.6)
+    ours = dr.mean(0.6 + 0.4 * (0.04 * scale + bias))
     assert float(dr.mean(weight.x)[0]) == pytest.approx(float(ours[0]), rel=0.01)
 
 
