@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import gc
 import os
@@ -19,20 +20,15 @@ from mi_refgs.errors import InputError
 
 LOOK_AHEAD = 64
 """Largest number of elements that kernels read beyond the end of an array: a packet of the widest machine."""
-ALIGNMENT = 64
-"""Bytes of the widest packet."""
-DTYPES = {"Float": np.float32, "UInt32": np.uint32, "Int32": np.int32, "Bool": np.bool_}
-"""NumPy's types of the elements of Mitsuba's flat arrays."""
+ALIGNMENT = 64  # bytes of the widest packet
 
 
 def machine() -> dict[str, Any]:
     """Processor, threads and versions, for reports of times."""
-    try:
-        found = re.search(
-            r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE
-        )
-    except OSError:
-        found = None
+    found = None
+    with contextlib.suppress(OSError):
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+        found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
     return {
         "cpu": found.group(1) if found else platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
@@ -82,7 +78,7 @@ def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
 
 
 def upload(values: np.ndarray, kind: Any = None) -> Any:
-    """A flat mi.Float (or another `kind` of DTYPES) with the values, in memory that Dr.Jit has allocated.
+    """A flat mi.Float (or another `kind`) with the values, in memory that Dr.Jit has allocated.
 
     `mi.Float(values)` wraps NumPy's memory on the CPU. A kernel reads whole packets, and so beyond its end:
     the process crashes if the next page is not mapped. That memory may also be aligned to packets or not:
@@ -92,9 +88,9 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
     """
     require_supported_variant("mi_refgs")
     kind = mi.Float if kind is None else kind
-    dtype = {getattr(mi, name): dtype for name, dtype in DTYPES.items()}[kind]
+    dtypes = {mi.Float: np.float32, mi.UInt32: np.uint32, mi.Int32: np.int32, mi.Bool: np.bool_}
     count = np.size(values)
-    padded = aligned(values, dtype)
+    padded = aligned(values, dtypes[kind])
     own = dr.empty(kind, count)
     if count:
         index = dr.arange(mi.UInt32, count)

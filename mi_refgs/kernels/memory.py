@@ -11,26 +11,17 @@ from pathlib import Path
 
 from mi_refgs.errors import InputError
 
-BASE = 0.4e9
-"""Bytes of a process with its kernels."""
-PASS_SAMPLES = 1 << 22
-"""Samples per pass: pixels times samples per pixel. Smaller passes project the surfels more often."""
-DERIVATIVE_SAMPLES = 1 << 21
-"""Samples per pass with derivatives, which need more memory each."""
-PER_SAMPLE, PER_DERIVATIVE_SAMPLE, PER_CHANNEL = 60, 260, 5
-"""Bytes per sample of a pass, and of each of its channels."""
-PER_VALUE, PER_STACKED_VALUE = 10, 28
-"""Bytes per pixel and channel of a finished image, of one pass and of several that are stacked."""
-PER_SHOWN_SURFEL, PER_DERIVATIVE_SURFEL = 700, 1000
-"""Bytes per surfel of an image: raw attributes, projected rows, sorted tile lists, and gradients."""
-PER_PIXEL, PER_SURFEL = 3e3, 2.5e3
-"""Bytes per pixel of a training step; per surfel with moments and gradients."""
-PER_TEXEL = 400
-"""Bytes per texel of a texture while it is baked."""
-PER_PATH = 100
-"""Bytes per path of Mitsuba's path tracer."""
-PER_PLY_BYTE = 4
-"""Bytes per byte of the vertices of a PLY file: read, checked, and as arrays."""
+PASS_SAMPLES = 1 << 22  # per pass: pixels times samples per pixel; smaller ones project surfels more often
+DERIVATIVE_SAMPLES = 1 << 21  # per pass with derivatives, which need more memory each
+# Bytes:
+BASE = 0.4e9  # of a process with its kernels
+PER_SAMPLE, PER_DERIVATIVE_SAMPLE, PER_CHANNEL = 60, 260, 5  # of a pass, and of each of its channels
+PER_VALUE, PER_STACKED_VALUE = 10, 28  # per pixel and channel of an image of one pass, of stacked passes
+PER_SHOWN_SURFEL, PER_DERIVATIVE_SURFEL = 700, 1000  # of an image: attributes, rows, tile lists, gradients
+PER_PIXEL, PER_SURFEL = 3e3, 2.5e3  # of a training step; surfels with moments and gradients
+PER_TEXEL = 400  # of a texture while it is baked
+PER_PATH = 100  # of Mitsuba's path tracer
+PER_PLY_BYTE = 4  # of the vertices of a PLY file: read, checked, and as arrays
 
 CGROUPS = Path("/sys/fs/cgroup")
 PROC = Path("/proc")
@@ -51,12 +42,9 @@ def require_image(
     size: tuple[int, int], samples: int, surfels: int, channels: int, derivatives: bool = False
 ) -> None:
     """Raise InputError if an image of this width and height would not fit into memory."""
-    width, height = size
-    require(
-        of_image(width * height, samples, surfels, channels, derivatives),
-        f"image: {width} × {height} pixels of {surfels:,} surfels",
-        "ask for fewer pixels or AOVs",
-    )
+    needed = of_image(size[0] * size[1], samples, surfels, channels, derivatives)
+    what = f"image: {size[0]} × {size[1]} pixels of {surfels:,} surfels"
+    require(needed, what, "ask for fewer pixels or AOVs")
 
 
 def of_fit(pixels: int, surfels: int, images: float) -> float:

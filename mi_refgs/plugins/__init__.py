@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-from typing import Any
 
 import mitsuba as mi
 
@@ -44,15 +43,8 @@ def load() -> None:
     supported = is_supported(mi.variant())
     for plugin, (register, module) in PLUGINS.items():
         if not supported:
-            getattr(mi, register)(plugin, _refusal(plugin))
+            getattr(mi, register)(plugin, lambda props, plugin=plugin: require_supported_variant(plugin))
         elif module in sys.modules:
             importlib.reload(sys.modules[module])
         else:
             importlib.import_module(module)
-
-
-def _refusal(plugin: str) -> Any:
-    def refuse(props: Any) -> None:
-        require_supported_variant(plugin)
-
-    return refuse

@@ -20,13 +20,15 @@ from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.types import Float
 
-# Suffixes as Mitsuba's own `aov` integrator gives them; `Bitmap.split` makes a greyscale layer of a lone Y.
-_SUFFIXES = {"normal": "XYZ", "depth": "T", "alpha": "Y", "visibility": "Y", **dict.fromkeys(TERMS, "RGB")}
-
 
 def suffixes() -> dict[str, str]:
-    """Suffixes of the image channels of every type: attributes of surfels, geometry, and terms."""
-    return {name: declared.aov for name, declared in ATTRIBUTES.items() if declared.aov} | _SUFFIXES
+    """Suffixes of the image channels of every type: attributes of surfels, geometry, and terms.
+
+    They are those of Mitsuba's own `aov` integrator; `Bitmap.split` makes a greyscale layer of a lone Y.
+    """
+    materials = {name: declared.aov for name, declared in ATTRIBUTES.items() if declared.aov}
+    geometry = {"normal": "XYZ", "depth": "T", "alpha": "Y", "visibility": "Y"}
+    return materials | geometry | dict.fromkeys(TERMS, "RGB")
 
 
 @dataclass(frozen=True)
@@ -50,9 +52,7 @@ def parse_aovs(text: str) -> list[AOV]:
     for pair in filter(None, (part.strip() for part in text.split(","))):
         name, colon, kind = (part.strip() for part in pair.partition(":"))
         if not colon or not name:
-            raise InputError(
-                f"refgs: aovs: '{pair}' is not a <name>:<type> pair; write for example 'nn:normal'"
-            )
+            raise InputError(f"refgs: aovs: '{pair}' is not a <name>:<type> pair; write such as 'nn:normal'")
         if kind not in suffixes():
             raise InputError(f"refgs: aovs: unknown type '{kind}'; use one of {', '.join(suffixes())}")
         if any(name == other.name for other in aovs):
@@ -66,8 +66,8 @@ def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Float]:
 
     Materials, the unit normal and the visibility are means of what is seen, 0 where nothing is. Depth is the
     distance along the ray from the near plane, as Mitsuba's `depth` is. The three terms are premultiplied by
-    alpha and sum to the image over black. A supersampled frame was averaged premultiplied
-    and divided by its mean alpha; `camera` is that of its pixels, not of the samples.
+    alpha and sum to the image over black. A supersampled frame was averaged premultiplied and divided by its
+    mean alpha; `camera` is that of its pixels, not of the samples.
     """
     return _finished(kind, *_weighted(kind, frame, camera))
 

@@ -24,8 +24,7 @@ ROUGHNESS_FLOOR = 0.01
 table has no such floor; below it, reflectance changes by less than 3e-5.
 [measured against quadrature, N·V ≥ 0.02]"""
 
-SPECULAR, DIFFUSE = 0, 1
-"""Indices of the components."""
+SPECULAR, DIFFUSE = 0, 1  # indices of the components
 
 FLAGS = (
     mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide,
@@ -136,11 +135,8 @@ class RefGSBSDF(mi.BSDF):
     def __init__(self, props: Any) -> None:
         require_supported_variant("refgs_bsdf")
         super().__init__(props)
-        self.textures = {
-            "albedo": _texture(props, "albedo", 0.5),
-            "metallic": _texture(props, "metallic", 0.0),
-            "roughness": _texture(props, "roughness", 0.5),
-        }
+        defaults = {"albedo": 0.5, "metallic": 0.0, "roughness": 0.5}
+        self.textures = {name: _texture(props, name, default) for name, default in defaults.items()}
         self.m_components = list(FLAGS)
         self.m_flags = FLAGS[SPECULAR] | FLAGS[DIFFUSE]
         device_table(mi.variant())  # loops and calls that are being recorded cannot make it

@@ -70,7 +70,7 @@ class FilmImage:
         if len(found) == 1:
             yield self._developed(self._values(found[0])), δ_image
             return
-        δ_values = self._through_film(lambda image, values: _pulled(image, values, δ_image))
+        δ_values = self._through_film(dr.ADMode.Backward, δ_image)
         at = 0
         for band in found:
             entries = band.size[1] * dr.width(δ_values) // self._size[0]
@@ -91,7 +91,7 @@ class FilmImage:
             dr.eval(parts[-1])
             del values
         tangent = dr.concat(parts)
-        return self._through_film(lambda image, values: _pushed(image, values, tangent))
+        return self._through_film(dr.ADMode.Forward, tangent)
 
     # ---------------- passes ----------------
 
@@ -128,8 +128,11 @@ class FilmImage:
         self.film.put_block(mi.ImageBlock(tensor, self.film.crop_offset()))
         return self.film.develop()
 
-    def _through_film(self, derivative: Callable[[Any, Any], Any]) -> Any:
-        """A derivative of the developed image by the channels; the film is linear, so any values will do."""
+    def _through_film(self, mode: dr.ADMode, derivative: Any) -> Any:
+        """Tangent of the developed image for that of the channels, or adjoint of these for that of the image.
+
+        The film is linear, so any values will do.
+        """
         before = self.film.develop(True)
         height, width = self._size
         alpha = mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha)
@@ -137,22 +140,13 @@ class FilmImage:
         index = dr.arange(mi.UInt32, height * width * count) % count
         values = dr.select(index == (4 if alpha else 3), mi.Float(1), 0)  # the weight, which it divides by
         dr.enable_grad(values)
-        found = dr.detach(derivative(self._developed(values), values))
+        image = self._developed(values)
+        start, end = (values, image) if mode == dr.ADMode.Forward else (image, values)
+        dr.set_grad(start, derivative)
+        dr.enqueue(mode, start)
+        dr.traverse(mode)
+        found = dr.detach(dr.grad(end))
         dr.eval(found)
         self.film.prepare(self.aovs)  # restore the image before
         self.film.put_block(mi.ImageBlock(before, self.film.crop_offset()))
         return found
-
-
-def _pulled(image: Any, values: Any, δ_image: Any) -> Any:
-    dr.set_grad(image, δ_image)
-    dr.enqueue(dr.ADMode.Backward, image)
-    dr.traverse(dr.ADMode.Backward)
-    return dr.grad(values)
-
-
-def _pushed(image: Any, values: Any, tangent: Any) -> Any:
-    dr.set_grad(values, tangent)
-    dr.enqueue(dr.ADMode.Forward, values)
-    dr.traverse(dr.ADMode.Forward)
-    return dr.grad(image)

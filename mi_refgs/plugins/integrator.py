@@ -207,9 +207,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.shading.require_inputs(self.surfels.raw)
         for name in (aov.type for aov in self.aovs if aov.type in ATTRIBUTES):
             if not self.surfels.has(name):
-                raise InputError(
-                    f"refgs: {name}: the surfels have no such attribute; add it, or do without it"
-                )
+                raise InputError(f"refgs: {name}: the surfels have no such attribute; add it, or do without")
         self.background.require_fit(self.surfels)
         for name, light in self._maps.items():
             try:

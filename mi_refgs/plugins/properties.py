@@ -78,9 +78,8 @@ def _tensor(props: Any, name: str) -> Any:
             raise TypeError("a single number")
         return tensor
     except Exception as error:  # what Dr.Jit raises depends on the type
-        raise InputError(
-            f"refgs: {name}: {abbreviated(value)} is not a tensor; give a number array"
-        ) from error
+        found = f"{abbreviated(value)} is not a tensor"
+        raise InputError(f"refgs: {name}: {found}; give a number array") from error
 
 
 def read_surfels(props: Any) -> Surfels:
@@ -88,7 +87,7 @@ def read_surfels(props: Any) -> Surfels:
     raw = _attributes(props, "filename", "")
     if not raw:
         raise InputError(
-            "refgs: filename: there are no surfels; name a PLY file, or give the attributes as tensors"
+            "refgs: filename: there are no surfels; name a PLY file, or give attributes as tensors"
         )
     return Surfels(raw)
 
@@ -163,9 +162,8 @@ def read_background(props: Any) -> Any:
     except InputError:
         raise
     except Exception as error:
-        raise InputError(
-            f"refgs: background: {abbreviated(value)} is no colour; give an rgb value or a map"
-        ) from error
+        found = f"{abbreviated(value)} is no colour"
+        raise InputError(f"refgs: background: {found}; give an rgb value or a map") from error
 
 
 def read_light(props: Any) -> tuple[Any, Any]:

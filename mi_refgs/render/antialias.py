@@ -11,14 +11,10 @@ from mi_refgs.shade.points import safe_normalize
 from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Bool, Float, Vector3f
 
-PIXEL_VARIANCE = 1 / 12
-"""Variance of positions in a pixel along one axis, in squared pixels: that of the box filter."""
-
 MAX_VARIANCE = 0.18
 """Largest addition to α²; a surface that a pixel resolves adds less. [κ of Tokuyoshi and Kaplanyan]"""
 
-NO_NEIGHBOUR = 5.0
-"""More than the largest squared difference of two unit vectors, 4."""
+NO_NEIGHBOUR = 5.0  # more than the largest squared difference of two unit vectors, 4
 
 
 def widened(
@@ -40,7 +36,8 @@ def widened(
     a Gaussian and whose sum of both axes stands for either]
     """
     with dr.suspend_grad():
-        variance = PIXEL_VARIANCE * _squared_turn(safe_normalize(normal), alpha > COVERAGE_FLOOR, camera)
+        # 1/12 squared pixels: the box filter's variance of positions along one axis.
+        variance = 1 / 12 * _squared_turn(safe_normalize(normal), alpha > COVERAGE_FLOOR, camera)
         variance = dr.minimum(variance, MAX_VARIANCE)
     turned = variance > 0
     α2 = dr.minimum(dr.square(dr.square(roughness)) + variance, 1)

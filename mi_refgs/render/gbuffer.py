@@ -46,7 +46,7 @@ class GBuffer:
         rest, maps = list(blended.features), {}
         for name, value in slots.items():
             width = len(parts(value))
-            maps[name], rest = of_parts(value, rest[:width]), rest[width:]
+            maps[name], rest = type(value)(*rest[:width]), rest[width:]
         inverse = inverse_alpha(blended.alpha)
         own = inverse_alpha(maps[OBJECT]) if OBJECT in maps else inverse
         mean_depth = None if blended.depth is None else blended.depth * inverse
@@ -55,7 +55,7 @@ class GBuffer:
     def divided(self, name: str) -> Any:
         """A slot divided by alpha or the object's opacity: the mean of what is seen, 0 where nothing is."""
         value = self.slots[name]
-        return of_parts(value, [part * self.inverse for part in parts(value)])
+        return type(value)(*(part * self.inverse for part in parts(value)))
 
 
 def inverse_alpha(alpha: Float) -> Float:
@@ -67,8 +67,3 @@ def inverse_alpha(alpha: Float) -> Float:
 def parts(value: Any) -> list[Float]:
     """The components of a value."""
     return [*value] if dr.depth_v(value) > 1 else [value]
-
-
-def of_parts(like: Any, parts: list[Float]) -> Any:
-    """The parts as an array of the type of `like`."""
-    return type(like)(*parts)

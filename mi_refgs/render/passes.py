@@ -6,10 +6,9 @@ Bands are equally high and their offsets opaque, so that all of them use one set
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import drjit as dr
@@ -66,10 +65,6 @@ def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = N
     return found
 
 
-MAPS = 24
-"""Planes of a frame with all its maps, about."""
-
-
 def in_passes(
     draw: Callable[[Camera], Result], camera: Camera, factor: int = 1, margin: int = 0, surfels: int = 0
 ) -> Result:
@@ -78,7 +73,7 @@ def in_passes(
     `draw` renders factor² samples per pixel and returns lists, dictionaries and dataclasses of arrays of one
     value per pixel or one in all. Raises InputError if an image of so many surfels does not fit into memory.
     """
-    require_image((camera.width, camera.height), factor**2, surfels, MAPS)
+    require_image((camera.width, camera.height), factor**2, surfels, channels=24)  # with all maps, about
     found = bands(camera, factor, margin)
     if found[0].camera is camera:
         return draw(camera)
@@ -96,8 +91,8 @@ def in_passes(
     def stacked(*values: Any) -> Any:
         if all(dr.width(value) == 1 for value in values):
             return values[0]
-        wide = [x + dr.zeros(type(x), b.size[0] * b.size[1]) for x, b in zip(values, found, strict=True)]
-        return dr.concat(wide)
+        sizes = [band.size[0] * band.size[1] for band in found]
+        return dr.concat([x + dr.zeros(type(x), size) for x, size in zip(values, sizes, strict=True)])
 
     return _mapped(stacked, *parts)
 
@@ -111,11 +106,9 @@ def _mapped(function: Callable[..., Any], *trees: Any) -> Any:
         return {name: _mapped(function, *(tree[name] for tree in trees)) for name in first}
     if isinstance(first, list):
         return [_mapped(function, *parts) for parts in zip(*trees, strict=True)]
-    if dataclasses.is_dataclass(first) and not isinstance(first, type):
-        names = [field.name for field in dataclasses.fields(first)]
-        return replace(
-            first, **{name: _mapped(function, *(getattr(tree, name) for tree in trees)) for name in names}
-        )
+    if is_dataclass(first) and not isinstance(first, type):
+        values = {field.name: [getattr(tree, field.name) for tree in trees] for field in fields(first)}
+        return replace(first, **{name: _mapped(function, *several) for name, several in values.items()})
     if dr.depth_v(first) > 1:
         return type(first)(*(_mapped(function, *parts) for parts in zip(*trees, strict=True)))
     return function(*trees)

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.rows import joined
-from mi_refgs.render.gbuffer import of_parts, parts
+from mi_refgs.render.gbuffer import parts
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import read_ply
@@ -68,12 +68,9 @@ def together(first: Surfels, second: Surfels) -> Surfels:
     """Geometry of surfels of one primitive, under AD: those of `first`, then those of `second`."""
     names, rows = list(first.primitive.widths), first.count + second.count
     arrays = joined([_flat(first, name) for name in names], [_flat(second, name) for name in names])
-    return Surfels(
-        {
-            name: mi.TensorXf(array, shape=(rows, first.raw[name].shape[1]))
-            for name, array in zip(names, arrays, strict=True)
-        }
-    )
+    shapes = [(rows, first.raw[name].shape[1]) for name in names]
+    raw = {name: mi.TensorXf(x, shape=s) for name, x, s in zip(names, arrays, shapes, strict=True)}
+    return Surfels(raw)
 
 
 def _flat(surfels: Surfels, name: str) -> Float:
@@ -97,5 +94,5 @@ def joined_slots(
     rest, slots = joined(*columns), {}
     for name, kind in kinds.items():
         width = len(parts(kind))
-        slots[name], rest = of_parts(kind, rest[:width]), rest[width:]
+        slots[name], rest = type(kind)(*rest[:width]), rest[width:]
     return slots

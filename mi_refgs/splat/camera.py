@@ -231,15 +231,8 @@ class Camera:
         """The same view with factor² pixels for each pixel."""
         if factor == 1:
             return self
-        return replace(
-            self,
-            width=self.width * factor,
-            height=self.height * factor,
-            fx=self.fx * factor,
-            fy=self.fy * factor,
-            cx=self.cx * factor,
-            cy=self.cy * factor,
-            focal=self.focal * factor,
-            offset=(self.offset[0] * factor, self.offset[1] * factor),
-            film=None if self.film is None else (self.film[0] * factor, self.film[1] * factor),
-        )
+        names = ("width", "height", "fx", "fy", "cx", "cy", "focal")
+        scaled: dict[str, Any] = {name: getattr(self, name) * factor for name in names}
+        offset = self.offset[0] * factor, self.offset[1] * factor
+        film = None if self.film is None else (self.film[0] * factor, self.film[1] * factor)
+        return replace(self, offset=offset, film=film, **scaled)

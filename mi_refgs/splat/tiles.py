@@ -61,9 +61,8 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
     for surfel, tile_x, tile_y in _candidates(footprints, camera):
         row = rows.fetch(surfel)
         corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(offset_x, offset_y)
-        touches = primitive.overlaps(
-            row, corner + 0.5, corner + (tile_size - 0.5)
-        )  # centres of the outermost pixels
+        # Between the centres of the outermost pixels.
+        touches = primitive.overlaps(row, corner + 0.5, corner + (tile_size - 0.5))
         tile = mi.UInt32(tile_y * tiles_x + tile_x)
         depth = primitive.depth_near(row, corner + tile_size / 2)
         dr.eval(found, touches, tile, surfel, depth)
@@ -78,7 +77,8 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
             pairs = _join(*(dr.gather(mi.UInt32, x, kept) for x in (tile, surfel)))
             found.append((pairs, dr.gather(mi.Float, depth, kept)))
     if not found:
-        return _empty(tiles_x, tiles_y)
+        none = dr.zeros(mi.UInt32, tiles)
+        return TileLists(mi.UInt32(), none, none, tiles_x, tiles_y)
     pairs, depth = found[0] if len(found) == 1 else (dr.concat(list(x)) for x in zip(*found, strict=True))
     tile, surfel = _sorted(pairs, depth, tiles)
     return TileLists(surfel, *_runs(tile, tiles), tiles_x, tiles_y)
@@ -145,20 +145,11 @@ def _runs(tile: Any, tiles: int) -> tuple[Any, Any]:
     return dr.gather(mi.UInt32, edges, first), dr.gather(mi.UInt32, edges, first + 1)
 
 
-def _empty(tiles_x: int, tiles_y: int) -> TileLists:
-    none = dr.zeros(mi.UInt32, tiles_x * tiles_y)
-    return TileLists(mi.UInt32(), none, none, tiles_x, tiles_y)
-
-
 def _candidates(footprints: Footprints, camera: Camera) -> Iterator[tuple[Any, Any, Any]]:
     """Yield surfel, tile column and tile row of every tile in footprints' rectangles, CHUNK by CHUNK."""
-    first, last = (
-        [
-            mi.Int32((x + at) // size)
-            for x, at, size in zip(corner, camera.tile_offset, camera.tile, strict=True)
-        ]
-        for corner in (footprints.first, footprints.last)
-    )
+    axes = range(2)
+    first = [mi.Int32((footprints.first[k] + camera.tile_offset[k]) // camera.tile[k]) for k in axes]
+    last = [mi.Int32((footprints.last[k] + camera.tile_offset[k]) // camera.tile[k]) for k in axes]
     covers = (footprints.last[0] >= footprints.first[0]) & (footprints.last[1] >= footprints.first[1])
     span = mi.UInt32(last[0] - first[0] + 1)
     count = dr.select(covers, span * mi.UInt32(last[1] - first[1] + 1), 0)

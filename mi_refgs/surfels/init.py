@@ -17,14 +17,10 @@ DISTANCE_FLOOR = 1e-4
 """Least distance to the neighbours, in extents of the points: keeps the log scale of doubled points finite.
 2DGS has 3e-4 scene units, whatever the unit."""
 
-NEIGHBOURS = 3
-"""Neighbours whose mean squared distance gives the scale. [3DGS]"""
+NEIGHBOURS = 3  # their mean squared distance gives the scale [3DGS]
 
-MORTON_BITS = 10
-"""Log₂ of the cells along an axis: they are smaller than the distance of surfels."""
-
-MORTON_OUTLIERS = 0.01
-"""Fraction of points at either end of an axis that are put into the outermost cells."""
+MORTON_BITS = 10  # log₂ of the cells along an axis: they are smaller than the distance of surfels
+MORTON_OUTLIERS = 0.01  # fraction of points at either end of an axis that are put into the outermost cells
 
 
 def from_points(
@@ -130,9 +126,8 @@ def morton_order(points: np.ndarray) -> np.ndarray:
 def _check(name: str, values: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:
     array = np.asarray(values, dtype=np.float64)
     if array.shape != (*rows, 3):
-        raise InputError(
-            f"surfels: {name}: shape {array.shape}, expected {(*rows, 3)}; give one row of three per point"
-        )
+        expected = f"expected {(*rows, 3)}; give one row of three per point"
+        raise InputError(f"surfels: {name}: shape {array.shape}, {expected}")
     bad = int(np.count_nonzero(~np.isfinite(array)))
     if bad:
         raise InputError(f"surfels: {name}: {bad} values are NaN or infinite; remove those points")

@@ -52,10 +52,8 @@ def read_ply(path: str | Path) -> Surfels:
             width = min(width for width in attribute.widths if width > max(there))
             arrays[name] = _columns(path, vertices, attribute.properties[:width])
     primitive, missing = nearest_primitive(arrays)
-    for name in missing:
-        _columns(
-            path, vertices, ATTRIBUTES[name].properties[: primitive.widths[name]]
-        )  # says what is missing
+    for name in missing:  # raises InputError that names the property
+        _columns(path, vertices, ATTRIBUTES[name].properties[: primitive.widths[name]])
     return Surfels.from_numpy(arrays)
 
 
@@ -79,12 +77,11 @@ def _columns(path: Path, vertices: np.ndarray, properties: tuple[str, ...]) -> n
 
 def _sh_degree(path: Path, names: tuple[str, ...], prefix: str) -> int:
     rest = sum(name.startswith(f"{prefix}_rest_") for name in names)
-    for degree in range(MAX_SH_DEGREE + 1):
-        if rest == sh_columns(degree) - 3:
-            return degree
-    raise InputError(
-        f"{path}: {prefix}_rest_*: {rest} properties; use 0, 9, 24 or 45 (degrees 0 to {MAX_SH_DEGREE})"
-    )
+    degrees = {sh_columns(degree) - 3: degree for degree in range(MAX_SH_DEGREE + 1)}
+    if rest not in degrees:
+        use = f"use 0, 9, 24 or 45 (degrees 0 to {MAX_SH_DEGREE})"
+        raise InputError(f"{path}: {prefix}_rest_*: {rest} properties; {use}")
+    return degrees[rest]
 
 
 def _sh_properties(prefix: str, degree: int) -> tuple[str, ...]:
@@ -119,20 +116,17 @@ def encode_ply(surfels: Surfels) -> bytes:
     rows = np.zeros(surfels.count, dtype=[(name, "<f4") for name in names])
     for name, column in values.items():
         rows[name] = column
-    properties_text = "".join(f"property float {name}\n" for name in names)
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {surfels.count}\n{properties_text}end_header\n"
-    )
-    return header.encode("ascii") + rows.tobytes()
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {surfels.count}"]
+    header += [*(f"property float {name}" for name in names), "end_header\n"]
+    return "\n".join(header).encode("ascii") + rows.tobytes()
 
 
 def _file_order(values: dict[str, np.ndarray]) -> list[str]:
     """2DGS's order: position, normal, spherical harmonics by number, opacity, scale, rotation; then ours."""
 
     def numbered(prefix: str) -> list[str]:
-        return sorted(
-            (name for name in values if name.startswith(prefix)), key=lambda name: int(name.split("_")[-1])
-        )
+        found = [name for name in values if name.startswith(prefix)]
+        return sorted(found, key=lambda name: int(name.split("_")[-1]))
 
     order = ["x", "y", "z", "nx", "ny", "nz", *numbered("f_dc_"), *numbered("f_rest_"), "opacity"]
     order += [*numbered("scale_"), *numbered("rot_")]

@@ -77,12 +77,9 @@ class Surfels:
     @staticmethod
     def from_numpy(arrays: Mapping[str, np.ndarray]) -> Surfels:
         """Surfels of raw float arrays of shape (N, D), or (N,) for an attribute of one column."""
-        raw = {}
-        for name, values in arrays.items():
-            table = np.asarray(values, dtype=np.float32)
-            table = table[:, None] if table.ndim == 1 else table
-            raw[name] = upload_tensor(table)
-        return Surfels(raw)
+        tables = {name: np.asarray(values, dtype=np.float32) for name, values in arrays.items()}
+        tables = {name: table[:, None] if table.ndim == 1 else table for name, table in tables.items()}
+        return Surfels({name: upload_tensor(table) for name, table in tables.items()})
 
     def to_numpy(self) -> dict[str, np.ndarray]:
         """Raw attributes as float32 arrays (N, D): copies, since Dr.Jit's own view shares the memory."""
@@ -111,9 +108,8 @@ class Surfels:
                 raise InputError(f"surfels: {name}: shape {shape}, expected ({rows}, D); one row per surfel")
             if shape[1] not in attribute(name).widths:
                 choices = " or ".join(str(columns) for columns in attribute(name).widths)
-                raise InputError(
-                    f"surfels: {name}: {shape[1]} columns, expected {choices}; fix the array's shape"
-                )
+                found = f"{shape[1]} columns, expected {choices}"
+                raise InputError(f"surfels: {name}: {found}; fix the array's shape")
 
     @property
     def primitive(self) -> Primitive:
@@ -143,12 +139,8 @@ class Surfels:
         """Indices of surfels that are not `usable`, by attribute; waits for the device."""
         if not self.count or dr.all(self.usable()):
             return {}
-        found = {}
-        for name, table in self.to_numpy().items():
-            rows = np.flatnonzero(~(np.abs(table) < _limit(name)).all(axis=1))
-            if len(rows):
-                found[name] = rows
-        return found
+        rows = {n: np.flatnonzero(~(np.abs(x) < _limit(n)).all(axis=1)) for n, x in self.to_numpy().items()}
+        return {name: found for name, found in rows.items() if len(found)}
 
     def cleaned(self) -> Surfels:
         """The same surfels under AD, with zeros for all values of those that are not `usable`."""
@@ -229,31 +221,26 @@ class Surfels:
         """
         if self.count == 0:
             return dr.zeros(mi.Vector3f, 0), dr.zeros(mi.Vector3f, 0), dr.zeros(mi.Vector3f, 0)
-        q = self.rotation()
-        x, y, z, w = q.x, q.y, q.z, q.w
+        x, y, z, w = self.rotation()
 
         # Squares of all four on the diagonal, no 1: rounding of |q| then changes lengths, by 1e-7, and no
         # direction, on which the far end of a needle depends.
         def entry(a: Any, b: Any, c: Any, d: Any) -> Any:
             return dr.fma(a, b, c * d)
 
-        t_u = mi.Vector3f(
-            entry(w, w, x, x) - entry(y, y, z, z), 2 * entry(x, y, z, w), 2 * entry(x, z, -y, w)
-        )
-        t_v = mi.Vector3f(
-            2 * entry(x, y, -z, w), entry(w, w, y, y) - entry(x, x, z, z), 2 * entry(y, z, x, w)
-        )
-        n = mi.Vector3f(2 * entry(x, z, y, w), 2 * entry(y, z, -x, w), entry(w, w, z, z) - entry(x, x, y, y))
-        return t_u, t_v, n
+        t_u = entry(w, w, x, x) - entry(y, y, z, z), 2 * entry(x, y, z, w), 2 * entry(x, z, -y, w)
+        t_v = 2 * entry(x, y, -z, w), entry(w, w, y, y) - entry(x, x, z, z), 2 * entry(y, z, x, w)
+        n = 2 * entry(x, z, y, w), 2 * entry(y, z, -x, w), entry(w, w, z, z) - entry(x, x, y, y)
+        return mi.Vector3f(*t_u), mi.Vector3f(*t_v), mi.Vector3f(*n)
 
     # ---------------- copies ----------------
 
     def gather(self, parent: Any) -> Surfels:
-        """Copies of surfels, detached: surfel i of the result is surfel parent[i] (mi.UInt32)."""
+        """Copies, detached and not `screened`: surfel i of the result is surfel parent[i] (mi.UInt32)."""
         return Surfels({name: gather_rows(tensor, parent) for name, tensor in self.raw.items()})
 
     def detach(self) -> Surfels:
-        """The same values, detached from the AD graph."""
+        """The same values, detached from the AD graph and not `screened`."""
         return Surfels({name: dr.detach(tensor) for name, tensor in self.raw.items()})
 
     def enable_grad(self) -> None:

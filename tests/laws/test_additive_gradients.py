@@ -26,7 +26,7 @@ from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import attribute
-from tests.scenes.integrator import hollow_mesh, integrator, raw_channels, sensor, sky
+from tests.scenes.integrator import hollow_mesh, integrator, lit_scene, raw_channels, sensor, sky
 
 TOLERANCE = 1e-5
 """Relative to the largest entry of the sum, for each parameter: sums by scatter come in any order."""
@@ -75,11 +75,9 @@ def open_scene(**changes: Any) -> Any:
     )
 
 
-def lit_scene(emitter: dict[str, Any]) -> Any:
+def lit(emitter: dict[str, Any]) -> Any:
     """Surfels under an emitter of the scene."""
-    inner = integrator(every_channel("split_sum", "sh", False), aovs="s:specular")
-    del inner["light"]
-    return mi.load_dict({"type": "scene", "integrator": inner, "sensor": sensor(), "sky": emitter})
+    return lit_scene(emitter, raw=every_channel("split_sum", "sh", False), aovs="s:specular")
 
 
 def map_of(rows: int, columns: int, folder: Path) -> dict[str, Any]:
@@ -114,13 +112,8 @@ def traced(folder: Path, **changes: Any) -> Any:
     return model_scene("split_sum", "irradiance", mesh=hollow_mesh(folder), **changes)
 
 
-def of_model(name: str) -> Callable[[Path], Any]:
-    """What makes the scene of a model."""
-    return lambda _: model_scene(name)
-
-
 SCENES: dict[str, Callable[[Path], Any]] = {
-    **{f"model {name}": of_model(name) for name in MODELS},
+    **{f"model {name}": lambda _, name=name: model_scene(name) for name in MODELS},  # type: ignore[misc]
     "3D Gaussians": lambda _: model_scene("split_sum", gaussians=True),
     "at surfels": lambda _: model_scene("split_sum", shade_at="surfel"),
     "surroundings": lambda _: open_scene(),
@@ -128,9 +121,9 @@ SCENES: dict[str, Callable[[Path], Any]] = {
     "antialiased": lambda _: model_scene("split_sum", antialias=True),
     "indirect light": lambda folder: model_scene("split_sum", mesh=hollow_mesh(folder)),
     "traced bounces": lambda folder: traced(folder, traced_bounces=1, ambient_rays=4, visibility_rays=2),
-    "envmap": lambda folder: lit_scene(map_of(16, 32, folder)),
-    "resampled envmap": lambda folder: lit_scene(map_of(16, 24, folder)),
-    "constant": lambda _: lit_scene({"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1, 2]}}),
+    "envmap": lambda folder: lit(map_of(16, 32, folder)),
+    "resampled envmap": lambda folder: lit(map_of(16, 24, folder)),
+    "constant": lambda _: lit({"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1, 2]}}),
     "BSDF, path": lambda _: textured_scene("path"),
     "BSDF, prb": lambda _: textured_scene("prb"),
 }

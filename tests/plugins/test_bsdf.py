@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -12,7 +11,7 @@ import pytest
 
 from mi_refgs.reference import shade as reference
 from mi_refgs.shade.brdf import split_sum
-from tests.helpers import run_python, unit, vector
+from tests.helpers import unit, vector
 from tests.scenes.integrator import sky
 
 ALBEDO = np.array([0.9, 0.5, 0.2])
@@ -444,18 +443,3 @@ def test_bad_input(properties: dict, words: str) -> None:
     with pytest.raises(RuntimeError) as info:
         mi.load_dict({"type": "refgs_bsdf"} | properties)
     assert words in str(info.value)
-
-
-def test_every_variant(tmp_path: Path) -> None:
-    """It is there after each switch to a variant that it can run under; elsewhere it says which it needs."""
-    code = """
-import mi_refgs, mitsuba as mi
-for variant in ["llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral", "llvm_ad_rgb"]:
-    mi.set_variant(variant)
-    try:
-        print(type(mi.load_dict({"type": "refgs_bsdf"})).__name__)
-    except RuntimeError as error:
-        print("refused" if f"refgs_bsdf: variant: '{variant}' is not supported" in str(error) else error)
-"""
-    lines = run_python(code, folder=tmp_path).splitlines()
-    assert lines == ["RefGSBSDF", "refused", "refused", "RefGSBSDF"]

@@ -27,6 +27,7 @@ from tests.scenes.integrator import (
     WIDTH,
     image,
     integrator,
+    lit_scene,
     plane_mesh,
     raw_channels,
     scene,
@@ -65,10 +66,8 @@ def test_exported_scene_renders_the_same_view(tmp_path: Path) -> None:
 def test_parameter_keys_do_not_depend_on_the_address(tmp_path: Path) -> None:
     run_folder(tmp_path, background=(1, 0.5, 0.25))
     params = mi.traverse(mi.load_file(str(tmp_path / "scene.xml")))
-    assert [key.removeprefix("refgs.") for key in params.keys() if key.startswith("refgs.")] == [
-        *raw_channels(),
-        "light",
-    ]
+    keys = [key.removeprefix("refgs.") for key in params.keys() if key.startswith("refgs.")]
+    assert keys == [*raw_channels(), "light"]
     anonymous = '<scene version="3.0.0"><integrator type="refgs">'
     anonymous += f'<string name="filename" value="{tmp_path}/surfels.ply"/>'
     params = mi.traverse(mi.load_string(anonymous + "</integrator></scene>"))
@@ -89,17 +88,10 @@ def test_light_of_the_scene_equals_own_light(tmp_path: Path) -> None:
     EnvironmentLight.from_radiance(sky()).write(tmp_path / "sky.exr")
     turn = mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 70)
     for transform in (mi.ScalarTransform4f(), turn):
-        emitter = {
-            "type": "envmap",
-            "filename": str(tmp_path / "sky.exr"),
-            "scale": 2.0,
-            "to_world": transform,
-        }
+        emitter = {"type": "envmap", "filename": str(tmp_path / "sky.exr"), "scale": 2.0}
+        emitter["to_world"] = transform
         nested = image(scene(light=emitter))
-        channels = integrator()
-        del channels["light"]
-        outside = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor(), "sky": emitter})
-        np.testing.assert_allclose(image(outside), nested, atol=1e-5)
+        np.testing.assert_allclose(image(lit_scene(emitter)), nested, atol=1e-5)
     assert np.abs(nested - image(scene())).max() > 0.05
 
 
@@ -107,9 +99,7 @@ def test_turned_light_turns_with_the_scene(tmp_path: Path) -> None:
     """Rotating the light, the surfels' SH-free part and the camera together changes nothing."""
     EnvironmentLight.from_radiance(sky()).write(tmp_path / "sky.exr")
     turn = mi.ScalarTransform4f().rotate([0, 1, 0], 90)  # a quarter turn about the pole moves whole columns
-    raw = {
-        name: values for name, values in raw_channels().items() if name not in ("radiance_sh", "indirect_sh")
-    }
+    raw = {name: values for name, values in raw_channels().items() if not name.endswith("_sh")}
     matrix = np.array(turn.matrix)[:3, :3]
     turned = dict(raw, position=(raw["position"] @ matrix.T).astype(np.float32))
     rotation = Rotation.from_matrix(matrix) * Rotation.from_quat(raw["rotation"])
@@ -123,12 +113,9 @@ def test_turned_light_turns_with_the_scene(tmp_path: Path) -> None:
 
 
 def test_constant_emitters() -> None:
-    channels = integrator()
-    del channels["light"]
     emitter = {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1.0, 2.0]}}
     own = image(scene(light=emitter))
-    outside = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor(), "sky": emitter})
-    np.testing.assert_allclose(image(outside), own, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(image(lit_scene(emitter)), own, rtol=1e-3, atol=1e-4)
     assert mi.traverse(scene(light=emitter))["integrator.light"].shape[2] == 3
 
 
@@ -136,10 +123,7 @@ def test_terms_add_up_and_radiance_needs_no_light() -> None:
     parts = [image(scene(terms=term)) for term in ("diffuse", "specular", "indirect")]
     np.testing.assert_allclose(sum(parts), image(scene()), atol=1e-5)
     assert parts[0].max() > 0.1 and parts[1].max() > 0.01
-    channels = integrator(reflectance="radiance")
-    del channels["light"]
-    bare = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor()})
-    assert image(bare).max() > 0.1
+    assert image(lit_scene(None, reflectance="radiance")).max() > 0.1
 
 
 def test_shapes_of_the_scene_are_not_rendered() -> None:
@@ -213,10 +197,7 @@ def test_missing_attributes_are_refused() -> None:
         mi.load_dict(integrator(raw, reflectance="split_sum"))
     with pytest.raises(Exception, match="there are no surfels"):
         mi.load_dict({"type": "refgs"})
-    channels = integrator()
-    del channels["light"]
-    dark = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor()})
-    refused(lambda: image(dark), "light: there is none")
+    refused(lambda: image(lit_scene(None)), "light: there is none")
 
 
 def test_nesting_in_stock_integrators_is_refused() -> None:

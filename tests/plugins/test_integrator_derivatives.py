@@ -14,11 +14,10 @@ from tests.helpers import refused
 from tests.scenes.integrator import (
     check_derivatives,
     image,
-    integrator,
+    lit_scene,
     plane_mesh,
     raw_channels,
     scene,
-    sensor,
     sky,
 )
 
@@ -41,8 +40,7 @@ def test_derivatives_when_shading_at_surfels(key: str) -> None:
 
 @pytest.mark.parametrize("key", ["indirect_sh", "opacity"])
 def test_derivatives_with_occlusion(key: str, tmp_path: Path) -> None:
-    of = scene(mesh=plane_mesh(tmp_path))
-    check_derivatives(of, f"integrator.{key}")
+    check_derivatives(scene(mesh=plane_mesh(tmp_path)), f"integrator.{key}")
 
 
 def test_indirect_light_trains_from_zero(tmp_path: Path) -> None:
@@ -58,21 +56,14 @@ def test_indirect_light_trains_from_zero(tmp_path: Path) -> None:
 
 def test_derivatives_of_the_scenes_environment(tmp_path: Path) -> None:
     EnvironmentLight.from_radiance(sky()).write(tmp_path / "sky.exr")
-    channels = integrator()
-    del channels["light"]
-    emitter = {"type": "envmap", "filename": str(tmp_path / "sky.exr")}
-    of = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor(), "sky": emitter})
-    check_derivatives(of, "sky.data")
+    check_derivatives(lit_scene({"type": "envmap", "filename": str(tmp_path / "sky.exr")}), "sky.data")
 
 
 @pytest.mark.parametrize("columns", [64, 48], ids=["as it is", "resampled"])
 def test_the_scale_of_an_environment_has_a_derivative(columns: int, tmp_path: Path) -> None:
     """Reflections are linear in the scale, in both modes."""
     mi.Bitmap(sky()[:, :columns]).write(str(tmp_path / "sky.exr"))
-    channels = integrator(terms="specular")
-    del channels["light"]
-    emitter = {"type": "envmap", "filename": str(tmp_path / "sky.exr")}
-    of = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor(), "sky": emitter})
+    of = lit_scene({"type": "envmap", "filename": str(tmp_path / "sky.exr")}, terms="specular")
     params = mi.traverse(of)
     expected = image(of)
     scale = mi.Float(1)
@@ -87,10 +78,8 @@ def test_the_scale_of_an_environment_has_a_derivative(columns: int, tmp_path: Pa
 
 
 def test_derivatives_of_a_constant_environment() -> None:
-    channels = integrator(terms="specular")
-    del channels["light"]
-    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
-    of = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor(), "sky": sky})
+    constant = {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
+    of = lit_scene(constant, terms="specular")
     params = mi.traverse(of)
     colour = mi.Color3f(1, 1, 1)
     dr.enable_grad(colour)
@@ -103,10 +92,7 @@ def test_derivatives_of_a_constant_environment() -> None:
 
 def test_resampled_environments_refuse_derivatives(tmp_path: Path) -> None:
     mi.Bitmap(sky()[:, :48]).write(str(tmp_path / "odd.exr"))  # 32 x 48
-    channels = integrator()
-    del channels["light"]
-    emitter = {"type": "envmap", "filename": str(tmp_path / "odd.exr")}
-    of = mi.load_dict({"type": "scene", "integrator": channels, "sensor": sensor(), "sky": emitter})
+    of = lit_scene({"type": "envmap", "filename": str(tmp_path / "odd.exr")})
     assert image(of).max() > 0.1
     params = mi.traverse(of)
     leaf = mi.TensorXf(params["sky.data"])
@@ -147,6 +133,6 @@ def test_a_parameter_that_changes_nothing_has_tangent_zero() -> None:
     dr.enable_grad(leaf)
     params["integrator.albedo"] = leaf
     params.update()
-    picture = mi.render(of, params)
+    image = mi.render(of, params)
     dr.set_grad(leaf, dr.ones(mi.TensorXf, leaf.shape))
-    assert not np.any(dr.forward_to(picture).numpy())
+    assert not np.any(dr.forward_to(image).numpy())

@@ -85,6 +85,14 @@ def scene(
     )
 
 
+def lit_scene(emitter: dict | None, **changes: object) -> mi.Scene:
+    """A scene whose light is an emitter outside the integrator, or which has none."""
+    inner = integrator(**changes)  # type: ignore[arg-type]
+    del inner["light"]
+    made = {"type": "scene", "integrator": inner, "sensor": sensor()}
+    return mi.load_dict(made if emitter is None else made | {"sky": emitter})
+
+
 def image(of: mi.Scene, **arguments: object) -> np.ndarray:
     return mi.render(of, **arguments).numpy()
 

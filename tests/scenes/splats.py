@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
-from mi_refgs.splat import Camera, Composited, splat
+from mi_refgs.splat import Camera, Composited, TileLists, splat
 from mi_refgs.surfels.table import Surfels
 
 MAX_LEFT_OUT = 0.05
 """Share of the covered pixels that may lie in the band around declared discontinuities."""
 
-
 Mutation = Callable[[pytest.MonkeyPatch], None]
-
-
 PARAMETERS = ("position", "rotation", "scale", "opacity", "features")
 
 
@@ -86,6 +85,17 @@ def fast_maps(scene: Scene) -> Composited:
     return splat(scene.surfels(), scene.columns(), scene.fast_camera())
 
 
+def check_image(scene: Scene, tolerance: float) -> None:
+    """Features, alpha and depth against the float64 reference."""
+    expected, got = oracle.splat(scene.raw, scene.features, scene.camera), fast_maps(scene)
+    keep = outside_band(expected)
+    depth_scale = np.abs(scene.raw["position"]).max() + 5
+    pairs = [*zip(got.features, np.moveaxis(expected.features, -1, 0), strict=True)]
+    pairs += [(got.alpha, expected.alpha), (got.depth / depth_scale, expected.depth / depth_scale)]
+    for found, wanted in pairs:
+        assert np.abs(found.numpy().reshape(keep.shape) - wanted)[keep].max() <= tolerance
+
+
 def outside_band(maps: oracle.Maps) -> np.ndarray:
     """Pixels (H, W) away from the declared discontinuities: nearly all that are covered, or a test of them
     would prove little. Observed: at least 96 %."""
@@ -117,6 +127,75 @@ def fast_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
     gradients = {name: dr.grad(surfels.raw[name]).numpy() for name in scene.raw}
     gradients["features"] = np.stack([dr.grad(f).numpy() for f in features], axis=1)
     return gradients
+
+
+def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
+    """Derivatives of Σ weights · maps in float64: complex steps of the footprints, sums of compositing."""
+    adjoints = np.moveaxis(weights, 2, 0).reshape(6, -1)
+    return oracle.differentiate(scene.raw, scene.features, scene.camera, adjoints).gradients
+
+
+def check_gradients(scene: Scene, seed: int, tolerance: float) -> None:
+    """Adjoints against float64, and none missing: a derivative that is not 0 never comes back as 0."""
+    weights = loss_weights(scene, seed)
+    expected, got = exact_gradients(scene, weights), fast_gradients(scene, weights)
+    errors = gradient_errors(got, expected)
+    assert max(errors.values()) <= tolerance, errors
+    for name in PARAMETERS:
+        strong = np.abs(expected[name]).max(axis=1) > 1e-3 * max(np.abs(expected[name]).max(), 1e-9)
+        assert np.all(np.abs(got[name]).max(axis=1)[strong] > 0), name
+
+
+def check_screen_offset(scene: Scene) -> None:
+    """It gets d loss / d centre, as moving the principal point under one surfel shows."""
+    weights, step = loss_weights(scene, 0)[..., 5], 1e-5
+    offset = mi.Point2f(dr.zeros(mi.Float, 1), dr.zeros(mi.Float, 1))
+    dr.enable_grad(offset)
+    maps = splat(scene.surfels(), scene.columns(), scene.fast_camera(), offset)
+    dr.backward(dr.sum(maps.alpha * upload(weights)))
+    moved = [replace(scene.camera, cx=scene.camera.cx + sign * step) for sign in (1, -1)]
+    sides = [np.sum(weights * oracle.splat(scene.raw, scene.features, camera).alpha) for camera in moved]
+    assert dr.grad(offset).x[0] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3)
+
+
+def scaled_column(adjoint: type, index: int) -> Mutation:
+    """Mutant of an adjoint: one of its columns is 10 % too large."""
+
+    def mutate(monkeypatch: pytest.MonkeyPatch) -> None:
+        original = adjoint.columns  # type: ignore[attr-defined]
+
+        def mutant(self: Any, row: list[Any]) -> list[Any]:
+            columns = original(self, row)
+            columns[index] = columns[index] * 1.1
+            return columns
+
+        monkeypatch.setattr(adjoint, "columns", mutant)
+
+    return mutate
+
+
+def check_finite(scene: Scene) -> None:
+    """Images and gradients of degenerate surfels, or of none, are finite."""
+    maps = fast_maps(scene)
+    assert all(np.isfinite(x.numpy()).all() for x in [*maps.features, maps.depth, maps.alpha])
+    if len(scene.features):
+        gradients = fast_gradients(scene, np.ones((scene.camera.height, scene.camera.width, 6)))
+        assert all(np.isfinite(x).all() for x in gradients.values())
+
+
+def listed_pairs(lists: TileLists) -> set[tuple[int, int]]:
+    """Surfel and tile of each pair."""
+    begin, end, surfel = (x.numpy() for x in (lists.pair_begin, lists.pair_end, lists.surfel_from_pair))
+    return {(int(i), tile) for tile in range(len(begin)) for i in surfel[begin[tile] : end[tile]]}
+
+
+def needed_pairs(alpha: np.ndarray, camera: Camera, lists: TileLists) -> set[tuple[int, int]]:
+    """Surfel and tile of each footprint (N, H·W) that contributes, without those at the threshold itself."""
+    y, x = (v.ravel() for v in np.mgrid[0 : camera.height, 0 : camera.width])
+    tile = y // camera.tile[1] * lists.tiles_x + x // camera.tile[0]
+    return {
+        (int(i), int(tile[pixel])) for i, pixel in zip(*np.nonzero(alpha >= ALPHA_MIN * 1.001), strict=True)
+    }
 
 
 def gradient_errors(got: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> dict[str, float]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -21,16 +20,22 @@ from mi_refgs.splat import Camera, list_by_tile, project, splat, tiles
 from mi_refgs.surfels.primitives.surfel import FootprintAdjoint
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.splats import (
-    PARAMETERS,
     Mutation,
     Scene,
+    check_finite,
+    check_gradients,
+    check_image,
+    check_screen_offset,
     check_transpose,
+    exact_gradients,
     fast_gradients,
     fast_maps,
     gradient_errors,
+    listed_pairs,
     loss_weights,
     make_scene,
-    outside_band,
+    needed_pairs,
+    scaled_column,
 )
 
 IMAGE_TOLERANCE = 1e-4  # the product's promise; observed 2e-6 … 3e-5
@@ -54,36 +59,14 @@ EVERY_TILE = pytest.mark.parametrize(
 
 @MANY
 def test_image_matches_oracle(seed: int) -> None:
-    compare_with_oracle(seed)
+    check_image(make_scene(seed), IMAGE_TOLERANCE)
 
 
 @EVERY_TILE
 @pytest.mark.parametrize("seed", [1, 8])
 def test_image_matches_oracle_with_tiles_of_every_size(seed: int, tile: tuple[int, int]) -> None:
     assert make_scene(seed).fast_camera().tile == tile
-    compare_with_oracle(seed)
-
-
-def compare_with_oracle(seed: int) -> None:
-    scene = make_scene(seed)
-    expected = oracle.splat(scene.raw, scene.features, scene.camera)
-    got = fast_maps(scene)
-    shape = (scene.camera.height, scene.camera.width)
-    keep = outside_band(expected)
-    for k in range(4):
-        error = np.abs(got.features[k].numpy().reshape(shape) - expected.features[..., k])
-        assert error[keep].max() <= IMAGE_TOLERANCE
-    assert np.abs(got.alpha.numpy().reshape(shape) - expected.alpha)[keep].max() <= IMAGE_TOLERANCE
-    depth_scale = np.abs(scene.raw["position"]).max() + 5
-    assert (
-        np.abs(got.depth.numpy().reshape(shape) - expected.depth)[keep].max() <= IMAGE_TOLERANCE * depth_scale
-    )
-
-
-def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
-    """Derivatives of the reference's loss in float64, themselves tested against its differences."""
-    adjoints = np.moveaxis(weights, 2, 0).reshape(6, -1)
-    return differentiate(scene.raw, scene.features, scene.camera, adjoints).gradients
+    check_image(make_scene(seed), IMAGE_TOLERANCE)
 
 
 def test_exact_gradients_are_slopes_of_the_oracle() -> None:
@@ -112,19 +95,12 @@ def test_exact_gradients_are_slopes_of_the_oracle() -> None:
 
 @EVERY_TILE
 def test_gradients_match_the_oracle_with_tiles_of_every_size(tile: tuple[int, int]) -> None:
-    test_gradients_match_the_oracle(5)
+    check_gradients(make_scene(5), 5, GRADIENT_TOLERANCE)
 
 
 @MANY
 def test_gradients_match_the_oracle(seed: int) -> None:
-    scene = make_scene(seed)
-    weights = loss_weights(scene, seed)
-    expected, got = exact_gradients(scene, weights), fast_gradients(scene, weights)
-    errors = gradient_errors(got, expected)
-    assert max(errors.values()) <= GRADIENT_TOLERANCE, errors
-    for name in PARAMETERS:  # none missing: a non-zero derivative never comes back as zero
-        strong = np.abs(expected[name]).max(axis=1) > 1e-3 * max(np.abs(expected[name]).max(), 1e-9)
-        assert np.all(np.abs(got[name]).max(axis=1)[strong] > 0), name
+    check_gradients(make_scene(seed), seed, GRADIENT_TOLERANCE)
 
 
 @pytest.mark.parametrize("seed", [3, 9, 14])
@@ -134,20 +110,7 @@ def test_forward_mode_is_the_transpose_of_reverse(seed: int) -> None:
 
 
 def test_screen_offset_receives_the_gradient_of_a_translation() -> None:
-    """The optional shift gets d loss / d centre, as moving the principal point under one surfel shows."""
-    scene = make_scene(0)
-    weights = loss_weights(scene, 0)
-    screen_offset = mi.Point2f(dr.zeros(mi.Float, 1), dr.zeros(mi.Float, 1))
-    dr.enable_grad(screen_offset)
-    maps = splat(scene.surfels(), scene.columns(), scene.fast_camera(), screen_offset)
-    image = mi.Float(np.ascontiguousarray(weights[..., 5].ravel().astype(np.float32)))
-    dr.backward(dr.sum(maps.alpha * image))
-    step, sides = 1e-5, []
-    for sign in (1, -1):
-        moved = oracle.PinholeCamera(**{**scene.camera.__dict__, "cx": scene.camera.cx + sign * step})
-        sides.append(np.sum(weights[..., 5] * oracle.splat(scene.raw, scene.features, moved).alpha))
-    # Moving the principal point leaves a, b, c of this surfel alone, as the shift does.
-    assert dr.grad(screen_offset).x[0] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3)
+    check_screen_offset(make_scene(0))
 
 
 def _drop_behind(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,20 +125,6 @@ def _drop_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FootprintAdjoint, "add", lambda self, s, δa, δz: original(self, s, δa, 0 * δz))
 
 
-def _scale_column(index: int) -> Mutation:
-    def mutate(monkeypatch: pytest.MonkeyPatch) -> None:
-        original = FootprintAdjoint.columns
-
-        def mutant(self: FootprintAdjoint, row: list[Any]) -> list[Any]:
-            columns = original(self, row)
-            columns[index] = columns[index] * 1.1
-            return columns
-
-        monkeypatch.setattr(FootprintAdjoint, "columns", mutant)
-
-    return mutate
-
-
 Case = tuple[Scene, np.ndarray, dict[str, np.ndarray]]
 
 
@@ -188,8 +137,7 @@ def mutant_case() -> Case:
 
 @pytest.mark.parametrize(
     "mutate",
-    [_drop_behind, _drop_depth, *(_scale_column(i) for i in range(10))],
-    ids=lambda f: f.__qualname__,
+    [_drop_behind, _drop_depth, *(scaled_column(FootprintAdjoint, i) for i in range(10))],
 )
 def test_mutants_of_the_adjoint_are_caught(
     mutate: Mutation, monkeypatch: pytest.MonkeyPatch, mutant_case: Case
@@ -205,23 +153,20 @@ def test_order_in_memory_and_culled_surfels_do_not_matter() -> None:
     scene = make_scene(12)
     base = fast_maps(scene)
     permutation = np.random.default_rng(0).permutation(len(scene.features))
-    permuted = Scene(
-        {k: v[permutation] for k, v in scene.raw.items()}, scene.features[permutation], scene.camera
-    )
+    raw = {k: v[permutation] for k, v in scene.raw.items()}
+    permuted = Scene(raw, scene.features[permutation], scene.camera)
     behind = {k: v.copy() for k, v in scene.raw.items()}
     behind["position"] = behind["position"] * 0 + scene.camera.to_world[:3, 3] - scene.camera.to_world[:3, 2]
-    extended = Scene(
-        {k: np.concatenate([v, behind[k]]) for k, v in scene.raw.items()},
-        np.concatenate([scene.features, scene.features]),
-        scene.camera,
-    )
+    raw = {k: np.concatenate([v, behind[k]]) for k, v in scene.raw.items()}
+    extended = Scene(raw, np.concatenate([scene.features, scene.features]), scene.camera)
     for other in (permuted, extended):
         got = fast_maps(other)
-        images = zip(
-            [*got.features, got.depth, got.alpha], [*base.features, base.depth, base.alpha], strict=True
-        )
-        for a, b in images:
-            assert np.abs(a.numpy() - b.numpy()).max() <= 1e-6
+        pairs = [
+            *zip(got.features, base.features, strict=True),
+            (got.depth, base.depth),
+            (got.alpha, base.alpha),
+        ]
+        assert all(np.abs(a.numpy() - b.numpy()).max() <= 1e-6 for a, b in pairs)
 
 
 def test_crossing_surfels_each_hide_the_other_on_their_own_side() -> None:
@@ -257,22 +202,13 @@ def test_degenerate_surfels_stay_finite(values: str) -> None:
         raw["position"][:] = scene.camera.to_world[:3, 3]
     else:
         raw = {k: v[:0] for k, v in raw.items()}
-    degenerate = Scene(raw, scene.features[: len(raw["position"])], scene.camera)
-    maps = fast_maps(degenerate)
-    for image in [*maps.features, maps.depth, maps.alpha]:
-        assert np.all(np.isfinite(image.numpy()))
-    if values != "none":
-        weights = np.ones((scene.camera.height, scene.camera.width, 6))
-        for gradient in fast_gradients(degenerate, weights).values():
-            assert np.all(np.isfinite(gradient))
+    check_finite(Scene(raw, scene.features[: len(raw["position"])], scene.camera))
 
 
 def test_second_view_compiles_nothing() -> None:
     scene = make_scene(15)
     weights = loss_weights(scene, 15)
-    moved = Scene(
-        scene.raw, scene.features, oracle.PinholeCamera(**{**scene.camera.__dict__, "cx": 9.0, "fx": -30.0})
-    )
+    moved = replace(scene, camera=replace(scene.camera, cx=9.0, fx=-30.0))
     fast_gradients(scene, weights)
     misses = dr.detail.launch_stats()[2]
     fast_gradients(moved, weights)
@@ -290,20 +226,13 @@ def test_tile_lists_hold_what_contributes_and_little_else(seed: int, thinness: f
     scene.raw["scale"][:, 0] += 2 * (thinness < 1)
     scene.raw["scale"][:, 1] += np.log(thinness)
     camera = scene.fast_camera()
-    footprints = project(scene.surfels(), camera)
-    lists = list_by_tile(footprints, camera)
-    begin, end = lists.pair_begin.numpy(), lists.pair_end.numpy()
-    surfel = lists.surfel_from_pair.numpy()
-    listed = {(int(i), tile) for tile in range(len(begin)) for i in surfel[begin[tile] : end[tile]]}
+    lists = list_by_tile(project(scene.surfels(), camera), camera)
+    listed = listed_pairs(lists)
     assert len(listed) == lists.pairs, "a pair is listed twice"
-
-    y, x = (v.ravel() for v in np.mgrid[0 : camera.height, 0 : camera.width])
-    tile = y // camera.tile[1] * lists.tiles_x + x // camera.tile[0]
-    alpha = oracle_surfel.footprint(scene.raw, scene.camera, Rules(), x + 0.5, y + 0.5).alpha
+    y, x = (v.ravel() + 0.5 for v in np.mgrid[0 : camera.height, 0 : camera.width])
+    alpha = oracle_surfel.footprint(scene.raw, scene.camera, Rules(), x, y).alpha
     alpha[oracle_surfel.camera_surfels(scene.raw, scene.camera)["opacity"] == 0] = 0
-    # Float32 may lose what is at the threshold itself.
-    strong = alpha >= ALPHA_MIN * (1 + 1e-3)
-    needed = {(int(i), int(tile[pixel])) for i, pixel in zip(*np.nonzero(strong), strict=True)}
+    needed = needed_pairs(alpha, camera, lists)
     assert needed <= listed
     if thinness == 1:  # needles lie between pixels
         # A tile may see a footprint between its pixels only, or beyond the near plane.
@@ -405,9 +334,8 @@ def test_the_cut_biases_gradients_by_what_is_documented(opacity: float) -> None:
         surfels = Surfels.from_numpy(raw)
         surfels.enable_grad()
         centre = (size / 2 + x / places, size / 2 + y / places)
-        total = dr.sum(
-            splat(surfels, [], Camera.from_pose(size, size, -focal, -focal, *centre, np.eye(4))).alpha
-        )
+        camera = Camera.from_pose(size, size, -focal, -focal, *centre, np.eye(4))
+        total = dr.sum(splat(surfels, [], camera).alpha)
         dr.backward(total)
         mass += float(total[0]) / places**2
         by_size += dr.grad(surfels.raw["scale"]).numpy().sum() / places**2

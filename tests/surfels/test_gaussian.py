@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -13,30 +13,34 @@ from mi_refgs import constants
 from mi_refgs.cli import main
 from mi_refgs.constants import ALPHA_MIN, GAUSSIAN_LOW_PASS
 from mi_refgs.fitting import refine
-from mi_refgs.kernels.device import upload
 from mi_refgs.methods import Refine
 from mi_refgs.reference import gaussian as exact
 from mi_refgs.reference import image
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.footprint import Rules
-from mi_refgs.reference.splat import differentiate
 from mi_refgs.render.pipeline import Request, Shading, SurfelScene, render
-from mi_refgs.splat import composite, list_by_tile, project
+from mi_refgs.splat import list_by_tile, project
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.primitives.gaussian import GaussianAdjoint
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.splats import (
-    PARAMETERS,
     Mutation,
     Scene,
+    check_finite,
+    check_gradients,
+    check_image,
+    check_screen_offset,
     check_transpose,
+    exact_gradients,
     fast_gradients,
     fast_maps,
     gradient_errors,
+    listed_pairs,
     loss_weights,
     make_scene,
-    outside_band,
+    needed_pairs,
+    scaled_column,
 )
 from tests.scenes.tiny import train_command, write_data, write_method
 
@@ -62,24 +66,9 @@ def gaussians(seed: int) -> Scene:
     return Scene(raw, scene.features, scene.camera)
 
 
-def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
-    """Derivatives of Σ weights · maps in float64: complex steps of the footprints, sums of compositing."""
-    return differentiate(
-        scene.raw, scene.features, scene.camera, np.moveaxis(weights, 2, 0).reshape(6, -1)
-    ).gradients
-
-
 @pytest.mark.parametrize("seed", range(20))
 def test_image_matches_oracle(seed: int) -> None:
-    scene = gaussians(seed)
-    expected, got = oracle.splat(scene.raw, scene.features, scene.camera), fast_maps(scene)
-    keep, shape = outside_band(expected), expected.alpha.shape
-    for k in range(scene.features.shape[1]):
-        error = np.abs(got.features[k].numpy().reshape(shape) - expected.features[..., k])
-        assert error[keep].max() <= IMAGE_TOLERANCE
-    assert np.abs(got.alpha.numpy().reshape(shape) - expected.alpha)[keep].max() <= IMAGE_TOLERANCE
-    depth = np.abs(got.depth.numpy().reshape(shape) - expected.depth)[keep]
-    assert depth.max() <= IMAGE_TOLERANCE * (np.abs(scene.raw["position"]).max() + 5)
+    check_image(gaussians(seed), IMAGE_TOLERANCE)
 
 
 @pytest.mark.parametrize("seed", [8, 15])
@@ -117,14 +106,7 @@ def test_the_oracles_derivatives_are_its_differences(name: str) -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_gradients_match_the_oracle(seed: int) -> None:
-    scene = gaussians(seed)
-    weights = loss_weights(scene, seed)
-    expected, got = exact_gradients(scene, weights), fast_gradients(scene, weights)
-    errors = gradient_errors(got, expected)
-    assert max(errors.values()) <= GRADIENT_TOLERANCE, errors
-    for name in PARAMETERS:  # none missing: a non-zero derivative never comes back as zero
-        strong = np.abs(expected[name]).max(axis=1) > 1e-3 * max(np.abs(expected[name]).max(), 1e-9)
-        assert np.all(np.abs(got[name]).max(axis=1)[strong] > 0), name
+    check_gradients(gaussians(seed), seed, GRADIENT_TOLERANCE)
 
 
 @pytest.mark.parametrize("tile", [size for _, size in constants.TILE_SIZES], ids=str)
@@ -132,8 +114,8 @@ def test_images_and_gradients_with_every_tile_size(
     tile: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(constants, "TILE_SIZES", ((np.inf, tile),))
-    test_image_matches_oracle(12)
-    test_gradients_match_the_oracle(8)
+    check_image(gaussians(12), IMAGE_TOLERANCE)
+    check_gradients(gaussians(8), 8, GRADIENT_TOLERANCE)
 
 
 @pytest.mark.parametrize("seed", [3, 9, 14])
@@ -141,21 +123,7 @@ def test_forward_mode_is_the_transpose_of_reverse(seed: int) -> None:
     check_transpose(gaussians(seed), seed)
 
 
-def _scale_column(index: int) -> Mutation:
-    def mutate(monkeypatch: pytest.MonkeyPatch) -> None:
-        original = GaussianAdjoint.columns
-
-        def mutant(self: GaussianAdjoint, row: list) -> list:
-            columns = original(self, row)
-            columns[index] = columns[index] * 1.1
-            return columns
-
-        monkeypatch.setattr(GaussianAdjoint, "columns", mutant)
-
-    return mutate
-
-
-@pytest.mark.parametrize("mutate", [_scale_column(i) for i in range(7)])
+@pytest.mark.parametrize("mutate", [scaled_column(GaussianAdjoint, i) for i in range(7)])
 def test_mutants_of_the_adjoint_are_caught(mutate: Mutation, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = gaussians(8)
     weights = loss_weights(scene, 8)
@@ -165,20 +133,8 @@ def test_mutants_of_the_adjoint_are_caught(mutate: Mutation, monkeypatch: pytest
 
 
 def test_screen_offset_receives_the_gradient_of_a_translation() -> None:
-    """The shift moves the projected centre alone, as the principal point does where nothing is clamped."""
-    scene = gaussians(0)
-    weights = loss_weights(scene, 0)
-    screen_offset = mi.Point2f(dr.zeros(mi.Float, 1), dr.zeros(mi.Float, 1))
-    dr.enable_grad(screen_offset)
-    maps = project(scene.surfels(), scene.fast_camera(), screen_offset)
-    lists = list_by_tile(maps, scene.fast_camera())
-    alpha = composite(maps, [], lists, scene.fast_camera()).alpha
-    dr.backward(dr.sum(alpha * upload(weights[..., 5])))
-    step, sides = 1e-5, []
-    for sign in (1, -1):
-        moved = oracle.PinholeCamera(**{**scene.camera.__dict__, "cx": scene.camera.cx + sign * step})
-        sides.append(np.sum(weights[..., 5] * oracle.splat(scene.raw, scene.features, moved).alpha))
-    assert dr.grad(screen_offset).x[0] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3)
+    """The offset moves the projected centre only, as the principal point does where nothing is clamped."""
+    check_screen_offset(gaussians(0))
 
 
 @pytest.mark.parametrize("seed", range(0, 20, 3))
@@ -186,15 +142,12 @@ def test_tile_lists_hold_what_contributes_and_little_else(seed: int) -> None:
     scene = gaussians(seed)
     camera = scene.fast_camera()
     lists = list_by_tile(project(scene.surfels(), camera), camera)
-    begin, end, row = (x.numpy() for x in (lists.pair_begin, lists.pair_end, lists.surfel_from_pair))
-    listed = {(int(i), tile) for tile in range(len(begin)) for i in row[begin[tile] : end[tile]]}
-    y, x = (v.ravel() for v in np.mgrid[0 : camera.height, 0 : camera.width])
-    tile = y // camera.tile[1] * lists.tiles_x + x // camera.tile[0]
-    alpha = exact.footprint(scene.raw, scene.camera, Rules(), x + 0.5, y + 0.5).alpha
+    y, x = (v.ravel() + 0.5 for v in np.mgrid[0 : camera.height, 0 : camera.width])
+    alpha = exact.footprint(scene.raw, scene.camera, Rules(), x, y).alpha
     alpha[exact.culled(scene.raw, scene.camera, Rules())] = 0
-    strong = alpha >= ALPHA_MIN * (1 + 1e-3)
-    needed = {(int(i), int(tile[pixel])) for i, pixel in zip(*np.nonzero(strong), strict=True)}
+    listed, needed = listed_pairs(lists), needed_pairs(alpha, camera, lists)
     assert needed <= listed and len(listed) <= 1.25 * len(needed) + 20
+    begin, end, row = (x.numpy() for x in (lists.pair_begin, lists.pair_end, lists.surfel_from_pair))
     depth = exact.sort_key(scene.raw, scene.camera, np.zeros(1, int), (0, 0))[:, 0]
     for first, last in zip(begin, end, strict=True):
         assert np.all(np.diff(depth[row[first:last]]) >= 0)
@@ -210,11 +163,7 @@ def test_degenerate_rows_stay_finite(values: str) -> None:
         raw["position"][:] = scene.camera.to_world[:3, 3]
     else:
         raw["scale"][:, : 1 if values == "one_huge" else 3] = -1e4 if values == "zero_scale" else 1e4
-    degenerate = Scene(raw, scene.features, scene.camera)
-    maps = fast_maps(degenerate)
-    assert all(np.all(np.isfinite(x.numpy())) for x in [*maps.features, maps.depth, maps.alpha])
-    gradients = fast_gradients(degenerate, np.ones((scene.camera.height, scene.camera.width, 6)))
-    assert all(np.all(np.isfinite(x)) for x in gradients.values())
+    check_finite(Scene(raw, scene.features, scene.camera))
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
@@ -222,13 +171,9 @@ def test_the_unit_does_not_matter(factor: float) -> None:
     scene = gaussians(12)
     pose = scene.camera.to_world.copy()
     pose[:3, 3] *= factor
-    camera = oracle.PinholeCamera(
-        **{**scene.camera.__dict__, "to_world": pose, "near": scene.camera.near * factor}
-    )
-    raw = scene.raw | {
-        "position": scene.raw["position"] * factor,
-        "scale": scene.raw["scale"] + np.log(factor),
-    }
+    camera = replace(scene.camera, to_world=pose, near=scene.camera.near * factor)
+    position, scale = scene.raw["position"] * factor, scene.raw["scale"] + np.log(factor)
+    raw = scene.raw | {"position": position, "scale": scale}
     one, other = fast_maps(scene), fast_maps(Scene(raw, scene.features, camera))
     for a, b in zip([*one.features, one.alpha], [*other.features, other.alpha], strict=True):
         assert np.mean(np.abs(a.numpy() - b.numpy()) > 2e-4) <= 0.01

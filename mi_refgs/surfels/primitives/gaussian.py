@@ -80,7 +80,7 @@ class Gaussian(Primitive):
         s = dr.clip(dr.select(visible, s * nearness, 1), 1 / SIZE_RANGE, SIZE_RANGE)
         focal, middle = mi.Vector2f(camera.fx, camera.fy), mi.Vector2f(camera.cx, camera.cy)
         # In units of slope rather than pixels, so that fourth powers of sizes fit float32.
-        q = _near_picture(dr.select(visible, slope, 0), camera)
+        q = _near_image(dr.select(visible, slope, 0), camera)
         along = [
             mi.Vector2f(*(dr.fma(-q[i], t.z, t[i]) for i in range(2))) * s[k] for k, t in enumerate(axes)
         ]
@@ -95,21 +95,12 @@ class Gaussian(Primitive):
         centre = focal * slope + middle
         if screen_offset is not None:
             centre += mi.Vector2f(screen_offset)
-        columns = [
-            a / focal.x,
-            -a * xy / (yy * focal.y),
-            dr.rsqrt(yy) / focal.y,
-            z,
-            centre.x,
-            centre.y,
-            opacity,
-        ]
+        columns = [a / focal.x, -a * xy / (yy * focal.y), dr.rsqrt(yy) / focal.y]
+        columns += [z, centre.x, centre.y, opacity]
         columns = [dr.select(visible, column, 0) for column in columns]
         with dr.suspend_grad():
-            # Rounding of the contour itself, in pixels.
-            half = (
-                dr.sqrt(cutoff_radius_squared(opacity) * mi.Vector2f(xx, yy)) * dr.abs(focal) * 1.0001 + 1e-3
-            )
+            half = dr.sqrt(cutoff_radius_squared(opacity) * mi.Vector2f(xx, yy))
+            half = half * dr.abs(focal) * 1.0001 + 1e-3  # rounding of the contour itself, in pixels
             return Footprints(columns, *rectangle(centre, -half, half, visible, camera), self)
 
     def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> GaussianSample:
@@ -172,19 +163,17 @@ class Gaussian(Primitive):
         return rotation_axes(raw["rotation"]), np.exp(raw["scale"])
 
 
-def _near_picture(slope: Any, camera: Any) -> Any:
+def _near_image(slope: Any, camera: Any) -> Any:
     """Slopes clamped to GAUSSIAN_SLOPE_MARGIN around the image, without gradient beyond.
 
     A crop window has the borders of its film, or Gaussians would change with the window.
     """
     limited = []
     width, height = camera.film or (camera.width, camera.height)
-    for x, focal, middle, size in zip(
-        slope, (camera.fx, camera.fy), camera.centre, (width, height), strict=True
-    ):
-        ends = [
-            (share * size - middle) / focal for share in (-GAUSSIAN_SLOPE_MARGIN, 1 + GAUSSIAN_SLOPE_MARGIN)
-        ]
+    margins = (-GAUSSIAN_SLOPE_MARGIN, 1 + GAUSSIAN_SLOPE_MARGIN)
+    axes = zip(slope, (camera.fx, camera.fy), camera.centre, (width, height), strict=True)
+    for x, focal, middle, size in axes:
+        ends = [(margin * size - middle) / focal for margin in margins]
         limited.append(dr.clip(x, dr.minimum(*ends), dr.maximum(*ends)))
     return mi.Vector2f(*limited)
 

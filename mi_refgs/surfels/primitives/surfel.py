@@ -81,8 +81,7 @@ class Surfel(Primitive):
         """
         p = camera.to_camera(surfels.position())
         t_u, t_v, n = (camera.rotation @ t for t in surfels.frame())
-        s = surfels.scale()
-        opacity = surfels.opacity()
+        s, opacity = surfels.scale(), surfels.opacity()
 
         ahead = dr.detach((p.z > camera.near) & (p.z > 0))
         # Divide by harmless numbers where culled: a masked Inf would still poison the adjoint.
@@ -113,9 +112,8 @@ class Surfel(Primitive):
         columns = [dr.select(visible, column, 0) for column in columns]
 
         with dr.suspend_grad():
-            low, high = _extent(
-                t_u.z * s.x, t_v.z * s.y, along_u * s.x * focal, along_v * s.y * focal, opacity
-            )
+            deviations = along_u * s.x * focal, along_v * s.y * focal
+            low, high = _extent(t_u.z * s.x, t_v.z * s.y, *deviations, opacity)
             return Footprints(columns, *rectangle(centre, low, high, visible, camera), self)
 
     def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> SurfelSample:
