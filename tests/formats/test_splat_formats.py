@@ -68,8 +68,7 @@ def scene(rng: np.random.Generator) -> TrainedScene:
 @pytest.fixture
 def shots(scene: TrainedScene) -> list[Shot]:
     """A few small cameras around it."""
-    found = shots_around(scene.surfels)[::3]
-    return [replace(shot, camera=shot.camera.resized(SIZE)) for shot in found]
+    return [replace(shot, camera=shot.camera.resized(SIZE)) for shot in shots_around(scene.surfels)[::3]]
 
 
 def encoded(scene: TrainedScene, camera: Camera, alone: bool = False) -> np.ndarray:
@@ -220,8 +219,7 @@ def columns_of(file: Path) -> tuple[dict[str, Any], Callable[[str], np.ndarray]]
 
 def test_gltf_has_activated_gaussians(scene: TrainedScene, shots: list[Shot], tmp_path: Path) -> None:
     files = write(scene, ["3dgs-ply", "gltf-splats"], tmp_path, shots, {"degree": 2})
-    table = read_ply(files["3dgs-ply"][0])
-    content, column = columns_of(files["gltf-splats"][0])
+    table, (content, column) = read_ply(files["3dgs-ply"][0]), columns_of(files["gltf-splats"][0])
     raw, prefix = table.to_numpy(), "KHR_gaussian_splatting"
     primitive = content["meshes"][0]["primitives"][0]
     assert primitive["mode"] == 0 and content["extensionsUsed"] == [prefix]
@@ -251,16 +249,14 @@ def test_gltf_has_activated_gaussians(scene: TrainedScene, shots: list[Shot], tm
 
 def test_exr_has_every_layer(scene: TrainedScene, shots: list[Shot], tmp_path: Path) -> None:
     (file,) = write(scene, ["exr"], tmp_path / "view.exr", shots, {"view": 1, "samples": 1})["exr"]
-    layers = read_exr(file)
-    frame = scene.renderer()(shots[1].camera)
-    for i, letter in enumerate("RGB"):
-        np.testing.assert_allclose(layers[letter], image_array(frame.radiance, SIZE, SIZE)[..., i], atol=1e-6)
+    layers, frame = read_exr(file), scene.renderer()(shots[1].camera)
+    expected = dict(zip("RGB", frame.radiance, strict=True)) | {"A": frame.alpha, "depth.Z": frame.depth}
+    expected |= {f"albedo.{c}": plane for c, plane in zip("RGB", frame.maps["albedo"], strict=True)}
+    for name, plane in expected.items():
+        np.testing.assert_allclose(layers[name], image_array(plane, SIZE, SIZE), atol=1e-6)
+    for letter in "RGB":
         terms = sum(layers[f"{name}.{letter}"] for name in ("diffuse", "specular", "indirect"))
         np.testing.assert_allclose(terms, layers[letter], atol=1e-5)
-        albedo = image_array(frame.maps["albedo"], SIZE, SIZE)[..., i]
-        np.testing.assert_allclose(layers[f"albedo.{letter}"], albedo, atol=1e-6)
-    np.testing.assert_allclose(layers["A"], image_array(frame.alpha, SIZE, SIZE), atol=1e-6)
-    np.testing.assert_allclose(layers["depth.Z"], image_array(frame.depth, SIZE, SIZE), atol=1e-6)
     solid = layers["A"] > 0.99
     normal = np.stack([layers[f"normal.{letter}"] for letter in "XYZ"], axis=-1)
     np.testing.assert_allclose(np.linalg.norm(normal[solid], axis=-1), 1, atol=1e-5)
