@@ -7,7 +7,7 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,9 @@ def evaluate(
     """Render the test views, measure them, and write metrics.json, renders and two contact sheets.
 
     Evaluates the scene files in the run folder, which are written first if a checkpoint is newer.
-    Every key is always present: null, with a `…_reason`, where it does not apply.
+    Every key of the upper level is always present. Where a score does not apply it is null, and `NAME_reason`
+    says why; `exposure` and `pruned` are null if nothing was decided or pruned. An entry of `views` has only
+    the scores of that view.
 
     `psnr_region`, `ssim_region`   pixels whose ray meets the data's region of interest; `region_share` of all
     `normal_…`                     pixels with true alpha above ½ (where there is alpha) and a true normal
@@ -77,38 +79,122 @@ def evaluate(
     fitted = write_if_stale(run, method, lambda _: views.views[0].camera())
     if antialias:
         fitted = replace(fitted, shading=replace(fitted.shading, antialias=True))
+    per_pixel = samples_per_axis(samples) ** 2  # refuses other numbers before anything is written
+    run.output.claim(*outputs)
+
+    # Render and measure the views, and write their images.
+    surface = TrueSurface.read(views.path, views.offset)
+    measured = _measure(fitted, views, surface, samples, [run.path / name for name in renders], progress)
+
+    # The numbers.
+    light_scores, footer = _light(fitted, views)
+    result: dict[str, Any] = (
+        _means(measured.per_view)
+        | light_scores
+        | measured.errors.result()
+        | surface_scores(fitted.mesh, surface, views.views)
+    )
+    cameras, timed = [view.camera() for view in views.views], fitted.renderer(aovs=False, samples=samples)
+    result |= {
+        "exposure": _exposure(run),
+        "train_seconds": fitted.seconds,
+        "iterations": fitted.iteration,
+        "surfels": fitted.surfels.count,
+        "pruned": None if fitted.pruned is None else asdict(fitted.pruned),
+        "samples": per_pixel,
+        "antialias": fitted.shading.antialias,
+        "ms_per_frame": metrics.frame_milliseconds([timed], cameras, views)[0],
+        "method": method.name,
+        "variant": method.name,  # name of this key in version 0.1
+        "preset": method.preset,
+        "dataset": str(views.path),
+        "test_views": len(measured.per_view),
+        "image_size": [views.views[0].width, views.views[0].height],
+        "downscale": method.data.downscale or 1,
+        "machine": machine(),
+        "views": [
+            {k: v for k, v in scores.items() if not k.endswith("_reason")} for scores in measured.per_view
+        ],
+    }
+
+    # The sheets.
+    rows = [shown.panels() for shown in measured.sheet_views]
+    write_png(run.path / SHEET, contact_sheet(rows, footer))
+    scale = measured.errors.scale()
+    rows = [decomposition.panels(x.rendered, x.maps, x.view, x.concave, scale) for x in measured.sheet_views]
+    write_png(run.path / DECOMPOSITION, contact_sheet(rows, footer))
+    run.write_json(METRICS, result)
+    return result
+
+
+@dataclass(frozen=True)
+class SheetView:
+    """A test view of the sheets, and what is rendered of it."""
+
+    view: View  # with its image decoded
+    rendered: RenderedView
+    maps: dict[str, np.ndarray]  # (H, W) or (H, W, 3), by material
+    concave: np.ndarray | None  # (H, W); None without a true surface
+    object_only: np.ndarray | None  # (H, W, 3), display-encoded; None without a background
+
+    def panels(self) -> dict[str, np.ndarray]:
+        """Return the panels of its row in SHEET."""
+        more = {} if self.object_only is None else {"object only": self.object_only}
+        return panels(self.rendered, self.view) | more
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Scores of each test view, errors of all, and the views of the sheets."""
+
+    per_view: list[dict[str, Any]]
+    errors: decomposition.Decomposition
+    sheet_views: list[SheetView]
+
+
+def _measure(
+    fitted: TrainedScene,
+    views: Dataset,
+    surface: TrueSurface | None,
+    samples: int,
+    images: Sequence[Path],  # one per view
+    progress: bool,
+) -> Measured:
+    """Render and measure the test views one by one, and write their images."""
     render = fitted.renderer(samples=samples)
     object_only = None
     if fitted.surroundings is not None:
         object_only = replace(fitted, surroundings=None).renderer(samples=samples)
-    run.output.claim(*outputs)
-
-    # Render and measure view by view.
-    in_sheets = set(np.linspace(0, len(views.views) - 1, SHEET_VIEWS).round().astype(int).tolist())
-    rows: list[dict[str, np.ndarray]] = []
-    kept: list[Any] = []  # arguments of `decomposition.panels`, which need the final albedo scale
-    per_view: list[dict[str, Any]] = []
-    surface, errors = TrueSurface.read(views.path, views.offset), decomposition.Decomposition()
     material_maps = decomposition.material_maps(fitted, samples)
+    in_sheets = set(np.linspace(0, len(views.views) - 1, SHEET_VIEWS).round().astype(int).tolist())
+    measured = Measured([], decomposition.Decomposition(), [])
     for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
+        # Scores.
         view = view.load()
         frame = render(view.camera())
         rendered = RenderedView.of(frame, views, view)
-        scores = _scores(rendered, view, views, per_view[0] if per_view else {})
+        scores = _scores(rendered, view, views, measured.per_view[0] if measured.per_view else {})
         gain, gained = with_gain(frame, view, views)
         scores |= {"psnr_gain": metrics.psnr(gained, view.displayed), "gain": gain.round(4).tolist()}
-        per_view.append(scores)
+        measured.per_view.append(scores)
+
+        # Errors of materials and of concave pixels.
         maps = material_maps(view.camera(), rendered)
         concave = None if surface is None else surface.concave(view)
-        errors.add(rendered, maps, view, concave)
-        write_png(run.path / renders[index], rendered.image)
-        if index in in_sheets:
-            rows.append(panels(rendered, view))
-            if object_only is not None:
-                rows[-1]["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
-            kept.append((rendered, maps, view, concave))
+        measured.errors.add(rendered, maps, view, concave)
 
-    # Numbers.
+        # Images.
+        write_png(images[index], rendered.image)
+        if index in in_sheets:
+            alone = None
+            if object_only is not None:
+                alone = RenderedView.of(object_only(view.camera()), views, view).image
+            measured.sheet_views.append(SheetView(view, rendered, maps, concave, alone))
+    return measured
+
+
+def _means(per_view: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the mean scores of the views, and why some are missing."""
     result: dict[str, Any] = {name: _mean(per_view, name) for name in MEANS}
     for name in ("flip", "lpips"):
         result[f"{name}_reason"] = per_view[0][f"{name}_reason"] or None
@@ -117,34 +203,6 @@ def evaluate(
         ("normal", "normal_mae_deg", "the data set has no true normals"),
     ):
         result[f"{name}_reason"] = reason if result[key] is None else None
-    light_scores, footer = _light(fitted, views)
-    result |= light_scores | errors.result() | surface_scores(fitted.mesh, surface, views.views)
-    cameras, timed = [view.camera() for view in views.views], fitted.renderer(aovs=False, samples=samples)
-    result |= {
-        "exposure": _exposure(run),
-        "train_seconds": fitted.seconds,
-        "iterations": fitted.iteration,
-        "surfels": fitted.surfels.count,
-        "pruned": None if fitted.pruned is None else asdict(fitted.pruned),
-        "samples": samples_per_axis(samples) ** 2,
-        "antialias": fitted.shading.antialias,
-        "ms_per_frame": metrics.frame_milliseconds([timed], cameras, views)[0],
-        "method": method.name,
-        "variant": method.name,  # name of this key in version 0.1
-        "preset": method.preset,
-        "dataset": str(views.path),
-        "test_views": len(per_view),
-        "image_size": [views.views[0].width, views.views[0].height],
-        "downscale": method.data.downscale or 1,
-        "machine": machine(),
-        "views": [{k: v for k, v in scores.items() if not k.endswith("_reason")} for scores in per_view],
-    }
-
-    # Sheets.
-    write_png(run.path / SHEET, contact_sheet(rows, footer))
-    rows = [decomposition.panels(r, m, v, c, errors.scale()) for r, m, v, c in kept]
-    write_png(run.path / DECOMPOSITION, contact_sheet(rows, footer))
-    run.write_json(METRICS, result)
     return result
 
 
