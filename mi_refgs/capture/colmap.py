@@ -22,27 +22,22 @@ from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.errors import InputError
 from mi_refgs.progress import progress_bar
 
-SEED = 0
-"""Seed of all random numbers; a second run gives the same result."""
+SEED = 0  # seed of all random numbers; a second run gives the same result
 WORKING_SIZE = 1600
 """Longest side, pixels, of the images in which features are detected. Images of twice that size take four
 times as long and give hardly more features that match."""
 MOST_FEATURES = 3000
 """Largest number of features per image; matching time grows with its square. With 3,000, two cores match
 about 30 pairs per second."""
-POLL = 0.25
-"""Seconds between two updates of the progress bar."""
+POLL = 0.25  # seconds between two updates of the progress bar
 IMAGES_AT_ONCE, PAIRS_AT_ONCE = 8, 200
 """Images or pairs per call of COLMAP; the progress bar moves after each call."""
-SMALLEST_MODEL = 3
-"""Smallest number of images in a model; COLMAP's default of 10 would refuse small sets."""
-MOST_MODELS = 5
-"""Largest number of separate groups of images that are reconstructed; a message counts them."""
+SMALLEST_MODEL = 3  # smallest number of images in a model; COLMAP's default of 10 would refuse small sets
+MOST_MODELS = 5  # largest number of separate groups of images that are reconstructed; a message counts them
 
 Result = TypeVar("Result")
 Item = TypeVar("Item")
-EXHAUSTIVE = 150
-"""Largest number of images for which every pair is matched: 11,175 pairs take some minutes."""
+EXHAUSTIVE = 150  # largest number of images for which every pair is matched: 11,175 pairs take some minutes
 IN_ORDER = 8
 """Number of images before and after each one, in the order of names, with which it is matched in larger sets:
 they overlap on a walk around an object."""

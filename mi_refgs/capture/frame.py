@@ -16,19 +16,15 @@ from mi_refgs.data.region import Region, region_radius
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
-ROUNDS = 50
-"""Iterations of reweighted least squares, which converge to the least sum of absolute values."""
+ROUNDS = 50  # iterations of reweighted least squares, which converge to the least sum of absolute values
 LEVEL_SPREAD = 0.02
 """Variance of the cameras' right-hand directions off their main line, relative, below which they determine no
 plane: ± 8°."""
 AXES_SPREAD = 1e-3
 """Smallest singular value of the mean of I − a aᵀ over view axes a that meet; 0 for parallel ones."""
-SEEN_SHARE = 0.5
-"""Fraction of the cameras whose images must show a point; other points are background."""
-REGION_POINTS = 50
-"""Number of points that determine the region's radius; with fewer, the cameras alone do."""
-REGION_QUANTILE = 0.9
-"""Fraction of the points around the focus that the region contains."""
+SEEN_SHARE = 0.5  # fraction of the cameras whose images must show a point; other points are background
+REGION_POINTS = 50  # number of points that determine the region's radius; with fewer, the cameras alone do
+REGION_QUANTILE = 0.9  # fraction of the points around the focus that the region contains
 LEAST_SHARE = 0.5
 """Smallest radius of the region over the radius estimated from the cameras: points are only where the object
 has texture."""

@@ -36,18 +36,15 @@ from mi_refgs.io.files import (
 )
 from mi_refgs.progress import with_bar
 
-QUALITY = 95
-"""Quality of JPEG files; lower ones make a fit reproduce their block edges."""
+QUALITY = 95  # quality of JPEG files; lower ones make a fit reproduce their block edges
 WRITERS = 4
 """Largest number of images that are undistorted at once. Peak memory of the process, measured with images of
 12 Mpx of one lens: 0.5 GB with one, 1.3 GB with four."""
 SPLINE_PIXELS = 2_000_000
 """Pixels up to which images are resampled with cubic splines; larger ones are reduced before a fit sees
 them."""
-WORK = ".work"
-"""Folder of working copies, features, matches and models; it may be removed after the capture."""
-RECORD = ".capture.json"
-"""Key and names of the files of the last output."""
+WORK = ".work"  # folder of working copies, features, matches and models; it may be removed after the capture
+RECORD = ".capture.json"  # key and names of the files of the last output
 LAST = "sparse/0/images.bin"
 """The file that is removed first and moved last: without it the folder is no data set."""
 

@@ -20,16 +20,13 @@ from mi_refgs.progress import with_bar
 
 OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .webp .avif".split()
 """Formats of cameras that are not read here, for a message that says what to do."""
-FEWEST = 3
-"""Smallest number of photographs: a third view checks a triangulated point."""
+FEWEST = 3  # smallest number of photographs: a third view checks a triangulated point
 DIAGONAL_35MM = 43.2666
 """Diagonal of a frame of 36 mm × 24 mm, mm, to which EXIF's 35 mm equivalent of a focal length relates."""
-ORIENTATION, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x920A, 0xA405
-"""EXIF tags."""
+ORIENTATION, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x920A, 0xA405  # EXIF tags
 TURNS = "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSVERSE ROTATE_90".split()
 """Pillow's names of what displays stored pixels upright, for EXIF's orientations from 2 on."""
-SIDEWAYS = (5, 6, 7, 8)
-"""Values of EXIF's orientation that swap width and height."""
+SIDEWAYS = (5, 6, 7, 8)  # values of EXIF's orientation that swap width and height
 
 
 @dataclass(frozen=True)

@@ -42,15 +42,12 @@ GOOD_ERROR = 1.0
 FEW_FEATURES = 60
 """Smallest number of features in the median image: a pair needs 15 consistent matches, and a quarter of the
 features is a good fraction."""
-FLAT_CONTRAST = 0.04
-"""Standard deviation of brightness, 0 … 1, below which an image is uniform."""
-LEAST_PLACED = 0.5
-"""Fraction of the photographs that must be registered in one group."""
+FLAT_CONTRAST = 0.04  # standard deviation of brightness, 0 … 1, below which an image is uniform
+LEAST_PLACED = 0.5  # fraction of the photographs that must be registered in one group
 TURN_SHARE = 0.8
 """Fraction of the matched pairs explained by a rotation or a plane from which the camera probably only
 rotated."""
-NAMED = 5
-"""Largest number of photographs that a message names."""
+NAMED = 5  # largest number of photographs that a message names
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,8 @@ POINTS_FILE = "points.npz"
 """File in a run's folder: position (P, 3), colour (P, 3) linear, and key, a hash of their source."""
 DAMAGED = (OSError, ValueError, KeyError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error)
 """Exceptions for a file that is missing or damaged."""
-PIXELS = 1600 * 1200
-"""Largest number of pixels of an image in which features are detected."""
-LEAST_SIDE = 96
-"""Shortest side, pixels, of images in which features are detected: smaller ones have too few."""
+PIXELS = 1600 * 1200  # largest number of pixels of an image in which features are detected
+LEAST_SIDE = 96  # shortest side, pixels, of images in which features are detected: smaller ones have too few
 CLOSE, APART = 6, range(8, 24, 4)
 """Each view is matched with its CLOSE nearest views and with some farther ones, whose wider baselines give
 more accurate points. On 43 hand-held images 303 pairs give as many points as all 903."""

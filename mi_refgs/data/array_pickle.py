@@ -18,18 +18,15 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 
-MAX_BYTES = 2**16
-"""Longest file; a camera has a few hundred bytes."""
-MAX_ITEMS = 1000
-"""Largest number of arrays in a list."""
+MAX_BYTES = 2**16  # longest file; a camera has a few hundred bytes
+MAX_ITEMS = 1000  # largest number of arrays in a list
 NAMES = {
     **{(f"numpy.{core}.multiarray", "_reconstruct"): "array" for core in ("core", "_core")},
     ("numpy", "ndarray"): "type",
     ("numpy", "dtype"): "dtype",
     ("_codecs", "encode"): "bytes",  # how protocols 0 to 2 write bytes
 }
-CODES = {"f4", "f8", "i4", "i8"}
-"""Types of the numbers in an array."""
+CODES = {"f4", "f8", "i4", "i8"}  # types of the numbers in an array
 INSTRUCTIONS = {
     *"PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE MEMOIZE PUT BINPUT LONG_BINPUT".split(),
     *"GET BINGET LONG_BINGET INT BININT BININT1 BININT2 LONG LONG1 FLOAT BINFLOAT STRING BINSTRING".split(),

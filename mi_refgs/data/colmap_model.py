@@ -36,8 +36,7 @@ MODELS: dict[str, tuple[int, str]] = {
 """Camera models whose distortion can be undone: number in binary files, parameters in their order."""
 TEST_LIST = "test.txt"
 """File beside the model with the names of the test views, one per line, as 3D Gaussian Splatting reads it."""
-MAX_NAME = 4096
-"""Bytes of an image's name; no path is longer."""
+MAX_NAME = 4096  # bytes of an image's name; no path is longer
 OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0])
 """OpenCV's camera has +x right and +y down, Mitsuba's +x left and +y up."""
 
@@ -248,7 +247,7 @@ def _without_comments(lines: Iterator[str]) -> Iterator[str]:
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
     """The matrix (3, 3) of a unit quaternion (w, x, y, z)."""
-    w, (x, y, z) = quaternion[0], quaternion[1:]
+    w, x, y, z = quaternion
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -288,9 +287,8 @@ def write_images(
 ) -> None:
     """Write images.txt; all sequences have one item per image."""
     rows = []
-    for i, (name, pose, camera, points) in enumerate(
-        zip(names, poses, cameras, observations, strict=True), 1
-    ):
+    given = zip(names, poses, cameras, observations, strict=True)
+    for i, (name, pose, camera, points) in enumerate(given, 1):
         rotation = OPENCV_FROM_MITSUBA @ pose[:3, :3].T
         numbers = (*_quaternion(rotation), *(-rotation @ pose[:3, 3]))
         rows += [f"{i} {' '.join(repr(float(x)) for x in numbers)} {camera} {name}", points]

@@ -28,8 +28,7 @@ from mi_refgs.registry import Registry
 
 HOLDOUT = 8
 """Every eighth image is a test view where a data set names none (convention of LLFF, 3DGS and 2DGS)."""
-EXTENT_MARGIN = 1.1
-"""Scene extent over the largest distance of a training camera to their mean (3DGS)."""
+EXTENT_MARGIN = 1.1  # scene extent over the largest distance of a training camera to their mean (3DGS)
 NEAR_EXTENTS = 2e-3
 """Depth of the near plane in scene extents, about 0.01 in the units of Blender's data sets."""
 FAR = 1e3

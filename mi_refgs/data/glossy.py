@@ -24,10 +24,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.images import image_size, read_grey
 
 CAMERA = re.compile(r"(\d{1,6})-camera\.pkl")
-MAX_DEPTH, MAX_CODE = 15.0, 65535
-"""Scene units of the largest number in a depth file, and that number."""
-BACKGROUND = int(14.5 / MAX_DEPTH * MAX_CODE) + 1
-"""Smallest number of the background: 14.5 units."""
+MAX_DEPTH, MAX_CODE = 15.0, 65535  # scene units of the largest number in a depth file, and that number
+BACKGROUND = int(14.5 / MAX_DEPTH * MAX_CODE) + 1  # smallest number of the background: 14.5 units
 
 
 class GlossyReader:

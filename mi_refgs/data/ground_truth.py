@@ -13,8 +13,7 @@ from mi_refgs.io.images import box_downscale, read_png, read_tiff
 
 NORMALS, DISPARITY, ALPHA = "_normal.png", "_disp.tiff", "_alpha.png"
 """What follows the stem of an image's name in the names of its maps."""
-NORMAL_LENGTH = 0.5
-"""Smallest length of an 8-bit normal: no normal is stored as (½, ½, ½)."""
+NORMAL_LENGTH = 0.5  # smallest length of an 8-bit normal: no normal is stored as (½, ½, ½)
 
 
 def block_mean(

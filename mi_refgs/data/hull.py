@@ -14,14 +14,10 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
-HULL_RESOLUTION = 96
-"""Voxels per edge of the visual hull's grid: at 200², a voxel is two pixels wide."""
-HULL_LEAST = 32
-"""The same for small images at least; in between, the number of pixels of their longer edge."""
-HULL_LEVEL = 0.5
-"""Mask level that bounds the hull."""
-HULL_CARVED = 0.05
-"""Level of the blurred masks below which a voxel is carved and not looked at again."""
+HULL_RESOLUTION = 96  # voxels per edge of the visual hull's grid: at 200², a voxel is two pixels wide
+HULL_LEAST = 32  # the same for small images at least; in between, the number of pixels of their longer edge
+HULL_LEVEL = 0.5  # mask level that bounds the hull
+HULL_CARVED = 0.05  # level of the blurred masks below which a voxel is carved and not looked at again
 HULL_SEEN = 0.25
 """Fraction of the views that must see a point of the hull: what hardly any camera sees was never carved."""
 HULL_DRAWS = 64

@@ -34,8 +34,7 @@ CACHE_BYTES = 2**30
 photographs of 12 Mpx would need 11 GB."""
 BAND = 256
 """Rows of a file that are converted to floating point at a time; a large image would need half a gigabyte."""
-COPIES = (8, 4, 2)
-"""Factors of the smaller copies of images, in `images_8` and so on."""
+COPIES = (8, 4, 2)  # factors of the smaller copies of images, in `images_8` and so on
 
 
 @dataclass(frozen=True)

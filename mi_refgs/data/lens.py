@@ -22,14 +22,11 @@ from scipy import ndimage
 from mi_refgs.errors import InputError
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
-MAX_ZOOM = 2.0
-"""Factor of the focal length beyond which less than a quarter of the image would be left."""
-ZOOM_STEPS = 30
-"""Bisections: 1e-9 of the focal length, 1e-6 pixels."""
+MAX_ZOOM = 2.0  # factor of the focal length beyond which less than a quarter of the image would be left
+ZOOM_STEPS = 30  # bisections: 1e-9 of the focal length, 1e-6 pixels
 GRID = 65
 """Points along each side at which a zoom is checked; between them edges bend by less than 0.01 pixels."""
-ROWS = 64
-"""Rows of an image whose source pixels are computed together."""
+ROWS = 64  # rows of an image whose source pixels are computed together
 _lock = Lock()
 
 

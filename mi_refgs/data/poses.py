@@ -31,15 +31,9 @@ def poses_around(outward: np.ndarray, centre: np.ndarray, distance: float | np.n
 
 def pinhole(width: int, height: int, focal: float) -> dict[str, Any]:
     """Intrinsics for a transforms file: square pixels, principal point at the centre; lengths in pixels."""
-    return {
-        "camera_angle_x": 2 * math.atan(0.5 * width / focal),
-        "w": width,
-        "h": height,
-        "fl_x": focal,
-        "fl_y": focal,
-        "cx": width / 2,
-        "cy": height / 2,
-    }
+    centre = {"cx": width / 2, "cy": height / 2}
+    angle = 2 * math.atan(0.5 * width / focal)
+    return {"camera_angle_x": angle, "w": width, "h": height, "fl_x": focal, "fl_y": focal, **centre}
 
 
 def rigid(matrix: np.ndarray, field: str) -> np.ndarray:

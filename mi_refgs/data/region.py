@@ -24,8 +24,7 @@ REGION_FILE = "region.json"
 """File in the folder of a data set: {"centre": [x, y, z], "radius": r} in scene units."""
 REGION_SHARE = 0.8
 """Radius of the region estimated from cameras over that of the sphere that the median view shows entirely."""
-CAMERA_SHARE = 0.8
-"""Its largest radius over the nearest camera's distance: cameras are outside of the region."""
+CAMERA_SHARE = 0.8  # its largest radius over the nearest camera's distance: cameras are outside of the region
 SMALLEST = 1e-6
 """Its smallest radius over the largest coordinate of a camera: float32 resolves no smaller lengths."""
 

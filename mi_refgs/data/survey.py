@@ -12,10 +12,8 @@ from mi_refgs.data.dataset import Dataset, read_dataset, reader_of
 from mi_refgs.data.hull import view_focus
 from mi_refgs.errors import InputError
 
-SMALL_SIDE = 48
-"""Pixels of the shorter side at which images are read."""
-FEW_VIEWS = 20
-"""Number of training views below which surfels overfit; published scenes have 100 and more."""
+SMALL_SIDE = 48  # pixels of the shorter side at which images are read
+FEW_VIEWS = 20  # number of training views below which surfels overfit; published scenes have 100 and more
 ONE_PLACE = 1e-4
 """Largest distance of cameras in one place from their mean, over their distance from the origin or the
 points."""
@@ -88,9 +86,8 @@ def survey(folder: Path) -> Survey:
     angles = [2 * np.degrees(np.arctan(view.width / (2 * view.fx))) for view in views]
     centre = distance = None
     try:
-        focus, far = view_focus(views)
-        x, y, z = map(float, focus)
-        centre, distance = (x, y, z), (float(far.min()), float(far.max()))
+        (x, y, z), far = view_focus(views)
+        centre, distance = (float(x), float(y), float(z)), (float(far.min()), float(far.max()))
     except InputError:
         missing.append("the cameras look at no common point")
     with_alpha = sum(view.has_alpha for view in views)

@@ -15,10 +15,8 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import check_size, replace_file, require_file, strip_rows
 
-EXR_MAGIC = b"\x76\x2f\x31\x01"
-"""First bytes of every EXR file."""
-SAMPLE_BYTES = 2
-"""Bytes per sample at least: those of half floats; integers and floats have 4."""
+EXR_MAGIC = b"\x76\x2f\x31\x01"  # first bytes of every EXR file
+SAMPLE_BYTES = 2  # bytes per sample at least: those of half floats; integers and floats have 4
 SRGB_CHROMATICITIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 """x, y of red, green, blue and white (ITU-R BT.709); the default of EXR files."""
 CHROMATICITY_TOLERANCE = 1e-3

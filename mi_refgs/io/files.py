@@ -17,22 +17,17 @@ from typing import IO, Any
 
 from mi_refgs.errors import InputError
 
-TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp(\.[^.]*)?")
-"""Names of the temporary files of `replace_file`."""
-ANY_FILE = 2**24
-"""Bytes of pixels that a header of any file may promise."""
+TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp(\.[^.]*)?")  # names of the temporary files of `replace_file`
+ANY_FILE = 2**24  # bytes of pixels that a header of any file may promise
 MAX_EXPANSION = 1100
 """Bytes of pixels per byte of a larger file that its header may promise: DEFLATE expands by at most 1,032."""
-MAX_PIXELS = 2**28
-"""Largest number of pixels of an image file: twice those of a 16K panorama."""
+MAX_PIXELS = 2**28  # largest number of pixels of an image file: twice those of a 16K panorama
 STRIP_PIXELS = 2**22
 """Pixels of a large image that are converted to floating point at a time: 50 MB of three channels."""
 STRIP_ROWS = 256
 """Largest number of rows of such a strip: that of the largest compression block of EXR files (DWAB)."""
-POLL = 0.1
-"""Seconds between two tries to take a lock."""
-_OWN = threading.local()
-"""`held`: paths of the locks of this thread."""
+POLL = 0.1  # seconds between two tries to take a lock
+_OWN = threading.local()  # `held`: paths of the locks of this thread
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 

@@ -11,8 +11,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import check_size, require_file, strip_rows
 
-MAX_HDR_HEADER = 2**16
-"""Bytes within which the size of a Radiance image must be given."""
+MAX_HDR_HEADER = 2**16  # bytes within which the size of a Radiance image must be given
 SCALES = np.append(0, np.ldexp(1.0, np.arange(1, 256) - 136)).astype(np.float32)
 """Factor of red, green and blue by the byte of their exponent."""
 

@@ -15,21 +15,16 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.exr import exr_size
 from mi_refgs.io.files import check_size, is_file, replace_file, require_file
 
-SRGB_LINEAR_LIMIT = 0.0031308
-"""Linear value below which the sRGB curve is a straight line (IEC 61966-2-1)."""
-SRGB_ENCODED_LIMIT = 0.04045
-"""The same point after encoding."""
-ALPHA_FLOOR = 1e-8
-"""Alpha by which radiance is divided at least."""
+SRGB_LINEAR_LIMIT = 0.0031308  # linear value below which the sRGB curve is a straight line (IEC 61966-2-1)
+SRGB_ENCODED_LIMIT = 0.04045  # the same point after encoding
+ALPHA_FLOOR = 1e-8  # alpha by which radiance is divided at least
 
 ENDINGS = (".png", ".jpg", ".jpeg")
 """File name endings of 8-bit images, in lower case, in the order in which they are tried."""
-EXIF_IFD = 0x8769
-"""Tag of the table of camera settings (EXIF 2.3)."""
+EXIF_IFD = 0x8769  # tag of the table of camera settings (EXIF 2.3)
 PSNR_MAX = 100.0
 """PSNR of identical images, dB: JSON has no infinity, and float32 images cannot differ by less."""
-JPEG_SHRINK = 8
-"""JPEG blocks have 8 × 8 pixels; the decoder can return 8 × 8, 4 × 4, 2 × 2 or 1 for each."""
+JPEG_SHRINK = 8  # JPEG blocks have 8 × 8 pixels; the decoder can return 8 × 8, 4 × 4, 2 × 2 or 1 for each
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:

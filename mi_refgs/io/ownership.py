@@ -20,8 +20,7 @@ from mi_refgs.io.files import cannot_write, make_folder
 RECORD = ".refgs"
 """File of an output folder: lines of JSON, each with an owner and its files. Lines are only appended, so that
 two processes lose none of each other's."""
-RUN = "run"
-"""Owner of the files of a run folder, whichever command wrote them."""
+RUN = "run"  # owner of the files of a run folder, whichever command wrote them
 
 
 @dataclass

@@ -12,10 +12,8 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.memory import PER_PLY_BYTE, require
 
-MAX_HEADER_LINES = 1000
-"""A header of surfels has 124 lines at most."""
-MAX_LINE = 4096
-"""Bytes per line of the header."""
+MAX_HEADER_LINES = 1000  # a header of surfels has 124 lines at most
+MAX_LINE = 4096  # bytes per line of the header
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},

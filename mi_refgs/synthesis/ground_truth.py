@@ -30,12 +30,10 @@ from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError
 from mi_refgs.types import Bool, Color3f, Float
 
-OPAQUE = 1e-3
-"""Fraction of transmitted light, or weight of the other BSDF of a blend, that is neglected."""
+OPAQUE = 1e-3  # fraction of transmitted light, or weight of the other BSDF of a blend, that is neglected
 SPHERE_SUBDIVISIONS = 5
 """Subdivisions of an icosahedron: 20,480 triangles, whose centres are 1.5e-4 radii inside the sphere."""
-ROUND_SIDES = 256
-"""Sides of a circle: the centre of a side is 8e-5 radii inside it."""
+ROUND_SIDES = 256  # sides of a circle: the centre of a side is 8e-5 radii inside it
 
 
 @dataclass(frozen=True)

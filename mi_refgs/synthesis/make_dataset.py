@@ -205,11 +205,8 @@ def require_clear_view(
             f"radius is {region.radius:.4g}; give more"
         )
     with dr.suspend_grad():
-        ray = mi.Ray3f(
-            mi.Point3f(np.ascontiguousarray(origin.T, np.float32)),
-            mi.Vector3f(np.ascontiguousarray((toward / distance[:, None]).T, np.float32)),
-        )
-        hit = scene.ray_intersect_preliminary(ray)
+        start, along = (np.ascontiguousarray(a.T, np.float32) for a in (origin, toward / distance[:, None]))
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), mi.Vector3f(along)))
         own = mi.Bool(False)
         for shape in objects:
             own |= hit.shape == mi.ShapePtr(shape)

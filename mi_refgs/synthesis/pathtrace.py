@@ -19,8 +19,7 @@ from mi_refgs.types import Point2f
 
 SAMPLES_PER_LAUNCH = 1 << 24
 """Largest number of paths per launch; the path tracer keeps about 100 bytes for each."""
-SURFACE_SAMPLES = 4096
-"""Points per shape that measure the scene's size; the farthest is found to about 1 %."""
+SURFACE_SAMPLES = 4096  # points per shape that measure the scene's size; the farthest is found to about 1 %
 ENVIRONMENT_OVERSAMPLING = 4
 """Directions per texel and axis of a rotated environment map, so that a small sun keeps its energy."""
 MAPS = {"normal": "XYZ", "depth": "Y", "albedo": "RGBA", "roughness": "YA", "metallic": "YA"}
@@ -140,14 +139,9 @@ class Tracer:
         self.integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": not objects})
         film: dict[str, Any] = {"type": "hdrfilm", "component_format": "float32", "rfilter": {"type": "box"}}
         film |= {"width": self.width, "height": self.height, "pixel_format": "rgb" if objects else "rgba"}
-        sensor = {
-            "type": "perspective",
-            "fov": fov,
-            "fov_axis": "smaller",
-            "near_clip": near,
-            "far_clip": far,
-        }
-        self.sensor = mi.load_dict(sensor | {"sampler": {"type": "multijitter"}, "film": film})
+        lens = {"fov": fov, "fov_axis": "smaller", "near_clip": near, "far_clip": far}
+        sampler = {"type": "multijitter"}
+        self.sensor = mi.load_dict({"type": "perspective", **lens, "sampler": sampler, "film": film})
         self.params = mi.traverse(self.sensor)
 
     def image(self, pose: np.ndarray, seed: int) -> np.ndarray:

@@ -23,8 +23,7 @@ from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.shade.light.light_file import read_radiance
 
 RECORD, SURFACE = "dataset.json", "surface.ply"
-RELIGHT = "relight"
-"""Folder of the test views under other environment maps."""
+RELIGHT = "relight"  # folder of the test views under other environment maps
 OWN_FILES = (
     "transforms_*.json",
     REGION_FILE,
@@ -104,11 +103,8 @@ def under_light(scene: Any, light: Path) -> Any:
         if "data" in params and "to_world" in params:
             turned = mi.ScalarTransform4f(np.array(params["to_world"].matrix, np.float64).reshape(4, 4))
     radiance = read_radiance(light)
-    lamps = [
-        emitter
-        for emitter in scene.emitters()
-        if not emitter.is_environment() and not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
-    ]
+    lamps = [emitter for emitter in scene.emitters() if not emitter.is_environment()]
+    lamps = [lamp for lamp in lamps if not mi.has_flag(lamp.flags(), mi.EmitterFlags.Surface)]
     parts = {f"part_{i}": part for i, part in enumerate([*scene.shapes(), *lamps])}
     environment = {"type": "envmap", "bitmap": mi.Bitmap(radiance), "to_world": turned}
     return mi.load_dict({"type": "scene", **parts, "environment": environment})

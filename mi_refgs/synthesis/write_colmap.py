@@ -21,10 +21,8 @@ from mi_refgs.io.images import read_png
 from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.synthesis.pathtrace import Cameras, Tracer
 
-CANDIDATES = 40_000
-"""Surface points that are sampled; those of equal colour are kept."""
-POINT_VIEWS = 4
-"""Largest track length of a point."""
+CANDIDATES = 40_000  # surface points that are sampled; those of equal colour are kept
+POINT_VIEWS = 4  # largest track length of a point
 SAME_COLOUR = 0.04
 """Largest standard deviation of a point's encoded colour over the views of its track: three times the noise
 of 64 samples per pixel."""

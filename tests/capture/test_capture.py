@@ -173,10 +173,8 @@ def test_interrupted_capture_is_continued(
     captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Features and matches that are there are not made again, and the result is that of one run."""
-    command, data = (
-        ["capture", str(captured / "photographs"), "-o", str(tmp_path / "data")],
-        tmp_path / "data",
-    )
+    data = tmp_path / "data"
+    command = ["capture", str(captured / "photographs"), "-o", str(data)]
     whole, calls = colmap.match, []
 
     def interrupted(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
@@ -268,9 +266,7 @@ def test_capture_replaces_only_files_of_the_last_capture(
     replace_output(data, _output(tmp_path / "2", *second), "2")
     assert _files(data) == dict.fromkeys(second, "2") | own and is_complete(data, "2")
     third = _output(tmp_path / "3", "masks/x.png", LAST)
-    refused(
-        lambda: replace_output(data, third, "3"), "masks/x.png: output: not written by a capture; move it"
-    )
+    refused(lambda: replace_output(data, third, "3"), "masks/x.png: output: not written by a capture; move")
     assert _files(data) == dict.fromkeys(second, "2") | own and is_complete(data, "2")
     # Between two files of the next output the process ends; the next one completes it.
     whole = Path.rename
@@ -445,9 +441,8 @@ def test_masks_match_photographs_by_name_and_size(tmp_path: Path) -> None:
     found = find_masks(masks, photographs)
     for photograph in photographs:  # white where the object is; where a image is cut out, its alpha
         grey = round(25500 / 257) if photograph.name == "b.jpg" else 255
-        np.testing.assert_array_equal(
-            mask_pixels(found[photograph.name], photograph)[..., 0], np.where(mask > 0, grey, 0)
-        )
+        pixels = mask_pixels(found[photograph.name], photograph)
+        np.testing.assert_array_equal(pixels[..., 0], np.where(mask > 0, grey, 0))
     Image.fromarray(mask[:2]).save(masks / "c.PNG")
     refused(lambda: find_masks(masks, photographs), "6 × 2 pixels, but c.jpg has 6 × 4")
 
@@ -456,10 +451,8 @@ def test_large_sets_match_neighbours_and_similar_images(rng: np.random.Generator
     """Images of ten places, each visited in every tenth image: likeness finds them, order does not."""
     places = rng.integers(0, 256, (10, 40, 128))
     count = EXHAUSTIVE + 50
-    features = {
-        f"{i:03}": np.clip(places[i % 10] + rng.normal(0, 8, (40, 128)), 0, 255).astype(np.uint8)
-        for i in range(count)
-    }
+    noisy = np.clip(np.tile(places, (count // 10, 1, 1)) + rng.normal(0, 8, (count, 40, 128)), 0, 255)
+    features = {f"{i:03}": image.astype(np.uint8) for i, image in enumerate(noisy)}
     pairs = set(pairs_to_match(features))
     assert len(pairs) < 0.25 * count * (count - 1) / 2
     assert all((f"{i:03}", f"{i + 1:03}") in pairs for i in range(count - 1))

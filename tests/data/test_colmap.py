@@ -218,9 +218,7 @@ def test_impossible_focal_length_is_refused(tmp_path: Path) -> None:
     data = write_colmap(tmp_path, "txt")
     for focal in ("1e-30", "1e-10"):
         (data / "sparse/0/cameras.txt").write_text(f"7 PINHOLE 96 72 {focal} 104 50 34")
-        refused(
-            partial(read_dataset, data, "train"), "images.txt: ", "camera 7: focal length: ", "out of range"
-        )
+        refused(partial(read_dataset, data, "train"), "images.txt: ", "camera 7: focal length:", "of range")
 
 
 def test_image_of_other_aspect_ratio_is_refused(tmp_path: Path) -> None:

@@ -77,9 +77,7 @@ def test_mask_path_becomes_alpha(tmp_path: Path) -> None:
     mask = np.zeros((72, 96, 3))
     mask[36:] = 1
     write_png(data / "mask.png", mask)
-    change_transforms(
-        data, lambda content: [frame.update(mask_path="mask.png") for frame in content["frames"]]
-    )
+    change_transforms(data, lambda content: [f.update(mask_path="mask.png") for f in content["frames"]])
     view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
     assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
     assert not view.image[:18].any() and view.image[18:].any()

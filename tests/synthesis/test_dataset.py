@@ -236,20 +236,13 @@ def test_render_passes_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(split.image(pose, 5).mean(), whole.mean(), rtol=0.02)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"views": 0}, "views: 0"),
-        ({"spp": 0}, "spp"),
-        ({"elevation": (50, 20)}, "elevation"),
-        ({"fov": 200}, "fov"),
-        ({"fill": 0}, "fill"),
-        ({"seed": -1}, "seed"),
-    ],
-)
-def test_settings_out_of_range(made: Path, tmp_path: Path, options: dict, words: str) -> None:
-    make = partial(make_dataset, made.parent / "ball.xml", tmp_path / "out", **OPTIONS | options)
-    refused(make, f"ball.xml: {words}", "out of range")
+WRONG = {"views": 0, "spp": 0, "elevation": (50, 20), "fov": 200, "fill": 0, "seed": -1}
+
+
+@pytest.mark.parametrize(("field", "value"), WRONG.items())
+def test_settings_out_of_range(made: Path, tmp_path: Path, field: str, value: Any) -> None:
+    make = partial(make_dataset, made.parent / "ball.xml", tmp_path / "out", **OPTIONS | {field: value})
+    refused(make, f"ball.xml: {field}: ", "out of range")
     assert not (tmp_path / "out").exists()
 
 
