@@ -64,7 +64,7 @@ class VertexSurfels:
         for name in MATERIALS:
             if not surfels.has(name):
                 raise InputError(
-                    f"occluder: {name}: the surfels have no such attribute; add it, or trace nothing"
+                    f"occluder: {name}: surfels have no such attribute; add it, or trace nothing"
                 )
         if not surfels.count:
             raise InputError("occluder: surfels: there are none to take materials from")

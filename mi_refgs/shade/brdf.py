@@ -79,9 +79,8 @@ def table() -> np.ndarray:
     with suppress(OSError, ValueError, RuntimeError, EOFError):
         path = cache_dir() / CACHE_NAME
         cached = np.load(path, allow_pickle=False)
-        if (cached.shape, cached.dtype) == ((RESOLUTION, RESOLUTION, 2), np.float32) and np.isfinite(
-            cached
-        ).all():
+        kind = cached.shape, cached.dtype
+        if kind == ((RESOLUTION, RESOLUTION, 2), np.float32) and np.isfinite(cached).all():
             return cached
     computed = compute_table()
     with suppress(OSError, InputError):

@@ -73,10 +73,8 @@ class Shading(ShadingOptions):
     @staticmethod
     def default_reflectance(attributes: Collection[str]) -> str:
         """The first model whose attributes are available, with either diffuse; else the one of fewest."""
-        needs = {
-            name: min((model.channels(ShadingOptions(diffuse=d)) for d in DIFFUSE), key=len)
-            for name, model in MODELS.items()
-        }
+        each = [ShadingOptions(diffuse=diffuse) for diffuse in DIFFUSE]
+        needs = {name: min(map(model.channels, each), key=len) for name, model in MODELS.items()}
         able = (name for name, needed in needs.items() if {*needed} <= {*attributes})
         return next(able, min(needs, key=lambda name: len(needs[name])))
 
@@ -129,9 +127,7 @@ class Shading(ShadingOptions):
         """Raise InputError if an attribute, the light or the mesh that the model needs is missing."""
         for name in self.channels:
             if name not in attributes:
-                raise InputError(
-                    f"shading: {name}: the surfels have no such attribute; add it, or do without"
-                )
+                raise InputError(f"shading: {name}: the surfels have no such attribute; add it, or drop it")
         if self.model.light != "none" and not light:
             unlit = " or ".join(name for name, model in MODELS.items() if model.light == "none")
             needs = f"reflectance = {self.reflectance} needs one"

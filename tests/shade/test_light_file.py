@@ -37,15 +37,13 @@ def write_map(path: Path, kind: str, rng: np.random.Generator, height: int = 37)
     elif kind == "png":
         write_png(path, values)
         return np.asarray(linear_from_srgb(read_png(path)))
-    elif kind == "tiled":
+    elif kind in ("tiled", "window"):
         planes = {name: np.ascontiguousarray(values[..., i]) for i, name in enumerate("RGB")}
         tiles = OpenEXR.TileDescription()
         tiles.xSize = tiles.ySize = 16
-        OpenEXR.File({"type": OpenEXR.tiledimage, "tiles": tiles}, planes).write(str(path))
-    elif kind == "window":
-        planes = {name: np.ascontiguousarray(values[..., i]) for i, name in enumerate("RGB")}
         window = (np.array([5, -9], np.int32), np.array([78, height - 10], np.int32))
         header = {"type": OpenEXR.scanlineimage, "dataWindow": window, "displayWindow": window}
+        header = header if kind == "window" else {"type": OpenEXR.tiledimage, "tiles": tiles}
         OpenEXR.File(header, planes).write(str(path))
     elif kind == "grey":
         values = np.repeat(values[..., :1], 3, axis=-1)

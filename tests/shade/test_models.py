@@ -117,7 +117,7 @@ def test_white_furnace(rng: np.random.Generator) -> None:
     values = shading_values(rng, "open")
     values["albedo"], values["metallic"] = np.ones((N, 3)), np.ones(N)
     points = points_of(values)
-    total = shade(points, light, ShadingOptions(diffuse="irradiance")).total().numpy()
+    total = shade(points, light, IRRADIANCE).total().numpy()
     cosine = (unit(values["normal"]) * unit(values["view"])).sum(1)
     a, b = brdf.split_sum(mi.Float(cosine.astype(np.float32)), points.roughness)
     np.testing.assert_allclose(total, np.broadcast_to(np.array(a + b), (3, N)), atol=1e-4)
@@ -132,12 +132,10 @@ def test_the_diffuse_base_gets_what_the_specular_layer_leaves(rng: np.random.Gen
     values = shading_values(rng, "visibility")
     values["albedo"], values["metallic"] = np.ones((N, 3)), np.zeros(N)
     points = points_of(values)
-    free = shade(points.replaced(visibility=None), light, ShadingOptions(diffuse="irradiance"))
+    free = shade(points.replaced(visibility=None), light, IRRADIANCE)
     np.testing.assert_allclose(free.total().numpy(), 1, atol=1e-3)
     assert free.diffuse.numpy().min() < 0.955 < free.diffuse.numpy().max()
-    np.testing.assert_array_equal(
-        shade(points, light, ShadingOptions(diffuse="irradiance")).diffuse.numpy(), free.diffuse.numpy()
-    )
+    np.testing.assert_array_equal(shade(points, light, IRRADIANCE).diffuse.numpy(), free.diffuse.numpy())
 
 
 def test_visibility_selects_between_light_and_indirect(
@@ -146,10 +144,10 @@ def test_visibility_selects_between_light_and_indirect(
     light = EnvironmentLight.from_radiance(radiance).prefilter()
     points = points_of(shading_values(rng, "indirect"))
     free = shade(points.replaced(visibility=None, indirect=None), light, ShadingOptions()).specular.numpy()
-    visible = shade(points.replaced(visibility=mi.Float(np.ones(N, np.float32))), light, ShadingOptions())
+    visible = shade(points.replaced(visibility=dr.ones(mi.Float, N)), light, SH)
     np.testing.assert_allclose(visible.specular.numpy(), free, rtol=1e-6)
     assert dr.all(visible.indirect == 0, axis=None)
-    hidden = shade(points.replaced(visibility=mi.Float(np.zeros(N, np.float32))), light, ShadingOptions())
+    hidden = shade(points.replaced(visibility=dr.zeros(mi.Float, N)), light, SH)
     assert dr.all(hidden.specular == 0, axis=None) and dr.all(hidden.indirect > 0, axis=None)
 
 
@@ -163,15 +161,13 @@ def test_safe_normalize() -> None:
     dr.enable_grad(v)
     n = safe_normalize(v)
     dr.backward(n.x + 2 * n.y + 3 * n.z)
-    np.testing.assert_allclose(
-        n.numpy().T, [[0.0, 0, 1], [0.6, 0, 0.8], [0.6, 0, 0.8], [0.0, 0, 1], [0.0, 1, 0]], atol=1e-6
-    )
+    expected = [[0.0, 0, 1], [0.6, 0, 0.8], [0.6, 0, 0.8], [0.0, 0, 1], [0.0, 1, 0]]
+    np.testing.assert_allclose(n.numpy().T, expected, atol=1e-6)
     gradient = dr.grad(v).numpy().T
     assert np.isfinite(gradient).all()
     np.testing.assert_allclose(gradient[[0, 3]], 0)
-    np.testing.assert_allclose(
-        gradient[1], (np.array([1, 2, 3]) - (0.6 + 2.4) * np.array([0.6, 0, 0.8])) / 5, atol=1e-6
-    )
+    across = np.array([1, 2, 3]) - (0.6 + 2.4) * np.array([0.6, 0, 0.8])
+    np.testing.assert_allclose(gradient[1], across / 5, atol=1e-6)
 
 
 @pytest.mark.parametrize("options", OPTIONS)

@@ -193,9 +193,8 @@ def test_a_traced_mirror_ray_is_shaded_as_a_pixel_is(diffuse: Any) -> None:
     place, points = floor_points(0.3)
     surfels = wall_surfels()
     harmonics = np.random.default_rng(4).normal(size=12) * 0.2
-    surfels = Surfels(
-        surfels.raw | {"radiance_sh": mi.TensorXf(np.tile(harmonics, (400, 1)).astype(np.float32))}
-    )
+    every = mi.TensorXf(np.tile(harmonics, (400, 1)).astype(np.float32))
+    surfels = Surfels(surfels.raw | {"radiance_sh": every})
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
     found = seen(points, place, ShadingOptions(traced_bounces=1), surfels, light, diffuse)
     indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
@@ -215,10 +214,8 @@ def test_a_hit_in_the_dark_is_dark() -> None:
     """A plate before the wall: the wall is seen in the floor, but its own mirror ray is blocked."""
     base = corner()
     lid = np.array([[-1, 3, -9], [9, 3, -9], [9, 3, 9], [-1, 3, 9]], np.float32)
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32) + len(base.vertices)
-    lidded = Mesh(
-        np.concatenate([base.vertices, lid]), np.concatenate([base.faces, faces]).astype(np.uint32), VOXEL
-    )
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32) + np.uint32(len(base.vertices))
+    lidded = Mesh(np.concatenate([base.vertices, lid]), np.concatenate([base.faces, faces]), VOXEL)
     place, points = floor_points(0.2)
     light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
     options, surfels = ShadingOptions(traced_bounces=1), wall_surfels(metallic=14.0)

@@ -69,9 +69,8 @@ def _strips(path: Path) -> tuple[tuple[int, int], Iterator[np.ndarray]]:
         with path.open("rb") as file:
             first = file.read(4)
     except OSError as error:
-        raise InputError(
-            f"{path}: environment: cannot be read ({error.strerror}); give an EXR or HDR file"
-        ) from error
+        failed = f"{path}: environment: cannot be read ({error.strerror})"
+        raise InputError(f"{failed}; give an EXR or HDR file") from error
     if first[:2] == b"#?":
         return hdr_strips(path)
     if first == EXR_MAGIC:

@@ -179,13 +179,9 @@ def analyse(rows: RowLayout, texels: Any) -> Any:
     )
     out = dr.empty(mi.Float, COEFFICIENT * rows.coefficients)
     for (cos_γ, sin_γ, sign), slot, exists in zip(quarters, rows.slots, rows.exists, strict=True):
-        cos = [
-            sum(cos_γ[r] * by_cos[r][c] - sign * sin_γ[r] * by_sin[r][c] for r in range(4)) for c in range(3)
-        ]
-        sin = [
-            sum(sin_γ[r] * by_cos[r][c] + sign * cos_γ[r] * by_sin[r][c] for r in range(4))
-            for c in range(3, 6)
-        ]
+        terms = list(zip(cos_γ, sin_γ, by_cos, by_sin, strict=True))
+        cos = [sum(cγ * x[c] - sign * sγ * y[c] for cγ, sγ, x, y in terms) for c in range(3)]
+        sin = [sum(sγ * x[c] + sign * cγ * y[c] for cγ, sγ, x, y in terms) for c in range(3, 6)]
         write(out, cos + sin, slot, exists)
     return out
 
@@ -207,10 +203,8 @@ def synthesise(rows: RowLayout, coefficients: Any, texels: Any) -> None:
                 _add_frequency(out, r, x, *angles[r])
         return m + 4, [turn for _, turn in turned], sums
 
-    def zeros(count: int) -> list[Any]:
-        return [dr.zeros(mi.Float, dr.width(q)) for _ in range(count)]
-
-    start_state = (dr.zeros(mi.UInt32, dr.width(q)), [mi.UInt32(0) for _ in columns], [zeros(24), zeros(24)])
+    zeros = [[dr.zeros(mi.Float, dr.width(q)) for _ in range(24)] for _ in columns]
+    start_state = (dr.zeros(mi.UInt32, dr.width(q)), [mi.UInt32(0) for _ in columns], zeros)
     _, _, sums = dr.while_loop(start_state, lambda m, *_: m < limit, body)
     for column, of_column in zip(columns, sums, strict=True):
         _unfold(texels, start, w, column, of_column)
@@ -338,17 +332,14 @@ def _build(height: int, wanted: Levels) -> Operator:
     limits_out = [row_limits([matrix]) for matrix in matrices]
     (slot_in,), slots_out = row_slots([limit_in]), row_slots(limits_out)
     base, levels = make_rows([0], [limit_in]), make_rows(firsts[1:-1], limits_out)
-    out = list(zip(slots_out, limits_out, strict=True))
+    forward = [(m, slot_in, s, n) for m, s, n in zip(matrices, slots_out, limits_out, strict=True)]
+    adjoint = [(m, s, slot_in, limit_in) for m, s in zip(transposed, slots_out, strict=True)]
     return Operator(
         height=height,
         base=base,
         levels=levels,
-        forward=make_mixing(
-            [(m, slot_in, s, n) for m, (s, n) in zip(matrices, out, strict=True)], levels.coefficients
-        ),
-        adjoint=make_mixing(
-            [(m, s, slot_in, limit_in) for m, (s, _) in zip(transposed, out, strict=True)], base.coefficients
-        ),
+        forward=make_mixing(forward, levels.coefficients),
+        adjoint=make_mixing(adjoint, base.coefficients),
         info=upload(np.array([(f, h, 2 * h, 0) for f, h in zip(firsts, heights, strict=False)]), mi.UInt32),
         shapes=tuple(zip(firsts, heights, strict=False)),
         roughness=wanted.roughness,
