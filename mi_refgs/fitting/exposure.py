@@ -174,6 +174,5 @@ def sentence(decision: dict[str, Any]) -> str:
 
 def image_of(planes: list[Float], view: View) -> np.ndarray:
     """Convert planes of a frame to (H, W, C)."""
-    size = view.height, view.width
-    values = [np.broadcast_to(np.array(plane), view.height * view.width).reshape(size) for plane in planes]
-    return np.stack(values, axis=-1)
+    values = [np.broadcast_to(np.array(plane), view.height * view.width) for plane in planes]
+    return np.stack(values, axis=-1).reshape(view.height, view.width, -1)

@@ -18,8 +18,7 @@ from mi_refgs.render.stencil import neighbours
 from mi_refgs.shade.light.light import Light
 from mi_refgs.types import Bool, Float, Vector3f
 
-# From here up, 8-bit target values are clipped: 255 means "at least this bright".
-SATURATED = 254.5 / 255.0
+SATURATED = 254.5 / 255.0  # from here up, 8-bit values are clipped: 255 means "at least this bright"
 DIRECTIONS = 256  # directions in which irradiance is sampled, 13° apart
 
 

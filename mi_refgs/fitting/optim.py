@@ -32,10 +32,8 @@ from mi_refgs.kernels.timing import phase
 from mi_refgs.surfels.table import gather_rows
 from mi_refgs.types import Bool, Float, TensorXf, UInt32
 
-# Adam's decay rates and the ε that 3DGS uses: tiny, as per-surfel gradients of a pixel mean are about 1e-7.
-BETA_1 = 0.9
-BETA_2 = 0.999
-EPSILON = 1e-15
+BETA_1, BETA_2 = 0.9, 0.999
+EPSILON = 1e-15  # as in 3DGS: tiny, as per-surfel gradients of a pixel mean are about 1e-7
 OUTLIER = 100.0  # gradients beyond this many times the usual are cut; see above
 SAMPLES = 10_000  # entries that a median is computed from
 WIDE_ROW = 64  # columns beyond which rows are not distinguished: SH have 48, a row of the light hundreds
@@ -96,8 +94,7 @@ class Skips:
         for skip in self._not_finite(gradients):
             if loss is not None:
                 skip |= ~dr.isfinite(loss)
-            # Almost never active, so it costs nothing.
-            dr.scatter(self._skipped, number, place, skip)
+            dr.scatter(self._skipped, number, place, skip)  # almost never active, so it costs nothing
         dr.eval(self._skipped, self._marks)
         return dr.gather(mi.UInt32, self._skipped, place) != number
 

@@ -41,9 +41,8 @@ class Schedule:
 
     def sh_degree(self, iteration: int) -> int:
         """SH degree of the radiance that is in use."""
-        return min(
-            self.method.surfels.sh_raise.count(iteration), self.method.surfels.degree_of("radiance_sh")
-        )
+        surfels = self.method.surfels
+        return min(surfels.sh_raise.count(iteration), surfels.degree_of("radiance_sh"))
 
     def light_learns(self, iteration: int) -> bool:
         """Whether the light learns from the iterations since it last did; always where a stage ends."""
@@ -70,12 +69,10 @@ class Schedule:
         rates, iterations = self.method.rates, self.method.iterations
         groups = {}
         for name in names:
-            rate = rates.of(name)
-            head = 3 if attribute(name).harmonics else 0
+            rate, head = rates.of(name), 3 if attribute(name).harmonics else 0
             groups[name] = Group(rate, rate * rates.decay, iterations, head, rates.rest_of(name))
-        steps = int(POSITION_STEPS * iterations)
         start, final = rates.of("position") * extent, rates.position_final * extent
-        groups["position"] = Group(start, final, steps, unit=extent)
+        groups["position"] = Group(start, final, int(POSITION_STEPS * iterations), unit=extent)
         return groups
 
 
@@ -126,8 +123,7 @@ class SharedPrefilter:
     ) -> None:
         """Continue from a checkpoint; a gradient of other levels, as in a trial, is left out."""
         self.clear()
-        gathered = state.get(GATHERED)
-        if gathered is None or environment is None:
+        if (gathered := state.get(GATHERED)) is None or environment is None:
             return
         self.light(environment, shading)
         if self._leaf is not None and dr.width(self._leaf) == len(gathered):

@@ -19,19 +19,11 @@ from mi_refgs.kernels.device import replayed
 from mi_refgs.kernels.timing import phase
 from mi_refgs.types import Float
 
-# Half width of the 11-pixel window, in pixels. [Wang et al. 2004, §III.B]
-WINDOW_RADIUS = 5
-# Standard deviation of the window, in pixels. [ibid.]
-WINDOW_SIGMA = 1.5
-# Pixels in a row that one lane blurs: they share most of what they read.
-RUN = 4
-# (0.01 L)² and (0.03 L)² for the dynamic range L = 1. [ibid.]
-C1 = 1e-4
-C2 = 9e-4
-
-
-# Image sizes whose kernels are kept ready: to trace them takes as long as to run them.
-RECORDINGS = 8
+WINDOW_RADIUS = 5  # half width of the 11-pixel window, in pixels [Wang et al. 2004, §III.B]
+WINDOW_SIGMA = 1.5  # standard deviation of the window, in pixels [ibid.]
+RUN = 4  # pixels in a row that one lane blurs: they share most of what they read
+C1, C2 = 1e-4, 9e-4  # (0.01 L)² and (0.03 L)² for the dynamic range L = 1 [ibid.]
+RECORDINGS = 8  # image sizes whose kernels are kept ready: to trace them takes as long as to run them
 _replayed = functools.partial(replayed, limit=RECORDINGS)
 
 
@@ -148,7 +140,6 @@ class _Ssim(dr.CustomOp):
         return dr.sum(value) / (len(x) * width * height)
 
     def gradient(self) -> list[Float]:
-        """∂(mean S)/∂x per plane."""
         return _gradient(self.x, self.y, self.slopes, *self.size)
 
     def forward(self) -> None:

@@ -33,8 +33,7 @@ def surface_of(
     """
     points = surfels.to_numpy()["position"]
     if around is None or region is None:
-        around, region = None, None
-        bounds = bounds_from_points(points)
+        around, region, bounds = None, None, bounds_from_points(points)
     else:
         points = np.concatenate([points, around.to_numpy()["position"]])
         low, high = bounds_from_points(region.contract(points[np.isfinite(points).all(axis=1)]))

@@ -166,11 +166,9 @@ def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method
     begin(method, read_dataset(folder, "train"), run, said.append)
     assert said == [] and views_of_run(run, method, "test").region == REGION
     for text in ('{"centre": [0, 0, 0.1], "radius": 0.7}', '{"centre": [0, 0, 0], "radius": 0.5}', None):
-        (folder / REGION_FILE).unlink()
-        if text is not None:
-            (folder / REGION_FILE).write_text(text)
-        else:
-            (folder / REGION_FILE).symlink_to("nowhere")
+        file = folder / REGION_FILE
+        file.unlink()
+        file.symlink_to("nowhere") if text is None else file.write_text(text)
         resumed = begin(method, read_dataset(folder, "train"), run, said.append)
         assert resumed.data.region == REGION and views_of_run(run, method, "test").region == REGION
         assert "region: it has changed" in said.pop() and not said

@@ -235,11 +235,11 @@ def test_full_disk_leaves_what_was_saved(
     """The checkpoint of iteration 10 does not fit: one sentence, no half file; that of 5 is still there."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def fill(state: Trainer) -> None:
         if state.iteration == 9 and limit == "file size":
-            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
         elif state.iteration == 9:
             monkeypatch.setattr(os, "fsync", no_room)
 
@@ -247,12 +247,11 @@ def test_full_disk_leaves_what_was_saved(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     try:
-        with pytest.raises(
-            InputError, match=r"0000010\.npz: output: cannot be written \(.*\); free some space"
-        ):
+        words = r"0000010\.npz: output: cannot be written \(.*\); free some space"
+        with pytest.raises(InputError, match=words):
             trainer.train(fill)
     finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     monkeypatch.undo()
     assert [path.name for path in (run.path / "checkpoints").iterdir()] == ["0000005.npz"]
     again = Trainer(method, ball(), run)
@@ -293,8 +292,7 @@ def test_run_is_not_overwritten(method: Method, tmp_path: Path) -> None:
     "options, most", [({}, 80), ({"traced_bounces": 1, "samples": 4, "antialias": True}, 100)]
 )
 def test_warm_step_compiles_nothing(options: dict[str, Any], most: int, method: Method) -> None:
-    method = with_deferred(method, options)
-    trainer = Trainer(dataclasses.replace(method, refine=methods.Refine()), ball())
+    trainer = Trainer(dataclasses.replace(with_deferred(method, options), refine=methods.Refine()), ball())
     while trainer.iteration < 22:  # into the deferred stage, with a mesh
         trainer.step()
     dr.sync_thread()
@@ -309,8 +307,7 @@ def test_warm_step_compiles_nothing(options: dict[str, Any], most: int, method: 
 
 def test_images_begin_coarse(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of 3² pixels, then of 2², then whole images: each is rendered in its own size."""
-    trainer, widths, steps = Trainer(method, ball()), [], []
-    real = train.render
+    trainer, widths, steps, real = Trainer(method, ball()), [], [], train.render
 
     def rendered(scene: Any, camera: Any, request: Any) -> Any:
         widths.append(camera.width)
@@ -342,12 +339,10 @@ def test_another_size_compiles_once(method: Method) -> None:
 def test_shared_light_learns_sum_of_gradients(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     """The gradient that three steps leave together is the sum of those that each leaves alone."""
     assert method.light is not None
-    still = dataclasses.replace(method, rates=Rates(channel=dict.fromkeys(method.surfels.names, 0.0)))
-    sums = {}
+    rates, sums = Rates(channel=dict.fromkeys(method.surfels.names, 0.0), light=0.0), {}
     for every in (1, 3):
         light = dataclasses.replace(method.light, every=every)
-        rates = dataclasses.replace(still.rates, light=0.0)
-        trainer = Trainer(dataclasses.replace(still, light=light, rates=rates), ball())
+        trainer = Trainer(dataclasses.replace(method, light=light, rates=rates), ball())
         seen: list[np.ndarray] = []
         real = trainer.fit.optimiser.step
 
