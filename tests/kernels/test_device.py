@@ -38,16 +38,11 @@ def test_an_upload_is_a_copy_that_needs_one_kernel(offset: int) -> None:
 def test_other_shapes_types_and_nothing() -> None:
     table = np.arange(6).reshape(2, 3)
     np.testing.assert_array_equal(upload(table.T).numpy(), table.T.ravel())
-    integers = upload(table, mi.UInt32)
-    assert isinstance(integers, mi.UInt32)
-    np.testing.assert_array_equal(integers.numpy(), table.ravel())
     assert dr.width(upload(np.zeros((0, 3)))) == 0
-    signs = upload(table - 3, mi.Int32)
-    assert isinstance(signs, mi.Int32)
-    np.testing.assert_array_equal(signs.numpy(), table.ravel() - 3)
-    odd = upload(table % 2 == 1, mi.Bool)
-    assert isinstance(odd, mi.Bool)
-    np.testing.assert_array_equal(odd.numpy(), table.ravel() % 2 == 1)
+    for values, kind in ((table, mi.UInt32), (table - 3, mi.Int32), (table % 2 == 1, mi.Bool)):
+        array = upload(values, kind)
+        assert isinstance(array, kind)
+        np.testing.assert_array_equal(array.numpy(), values.ravel())
     tensor = upload_tensor(table, mi.TensorXu)
     assert isinstance(tensor, mi.TensorXu)
     np.testing.assert_array_equal(tensor.numpy(), table)

@@ -68,9 +68,8 @@ def test_copies_of_a_gradient_are_bounded(
     used = []
     monkeypatch.setattr(dr, "thread_count", lambda: threads)
     monkeypatch.setattr(dr, "scatter_add", lambda *_, mode: used.append(mode))
-    PackedRows(mi.Float(0) + dr.zeros(mi.Float, 24_000_000), 1_000_000, 24).add(
-        mi.UInt32(0), [mi.Float(1)] * 24, True
-    )
+    rows = PackedRows(mi.Float(0) + dr.zeros(mi.Float, 24_000_000), 1_000_000, 24)
+    rows.add(mi.UInt32(0), [mi.Float(1)] * 24, True)
     assert set(used) == {mode}
 
 

@@ -136,14 +136,9 @@ def shading(case: Case) -> Shading:
 
 def sensor(case: Case) -> dict[str, Any]:
     x, y, width, height = CROPS[case["crop"]]
-    film: dict[str, Any] = {
-        "type": "hdrfilm",
-        "width": WIDTH,
-        "height": HEIGHT,
-        "pixel_format": FORMATS[case["colour"]] if case["alpha"] else case["colour"],
-        "component_format": case["component_format"],
-        "filter": {"type": case["rfilter"]},
-    }
+    film: dict[str, Any] = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}
+    film["pixel_format"] = FORMATS[case["colour"]] if case["alpha"] else case["colour"]
+    film |= {"component_format": case["component_format"], "filter": {"type": case["rfilter"]}}
     if case["crop"] != "none":
         film |= {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
     return {

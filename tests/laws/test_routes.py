@@ -28,6 +28,7 @@ from mi_refgs.methods import read
 from mi_refgs.plugins.aovs import suffixes
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.render.load_scene import load_scene
+from mi_refgs.render.scene_xml import put
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import save
 from mi_refgs.runs.trained_scene import SCENE, TrainedScene
@@ -89,27 +90,16 @@ SHADINGS = shadings()
 
 def sensor(crop: bool = False) -> Any:
     """The sensor of every scene."""
-    x, y, width, height = CROP if crop else (0, 0, WIDTH, HEIGHT)
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": FOV,
-            "near_clip": NEAR,
-            "to_world": mi.ScalarTransform4f().look_at([3, 1, 2], [0, 0, 0], [0, 0, 1]),
-            "film": {
-                "type": "hdrfilm",
-                "width": WIDTH,
-                "height": HEIGHT,
-                "crop_offset_x": x,
-                "crop_offset_y": y,
-                "crop_width": width,
-                "crop_height": height,
-                "pixel_format": "rgba",
-                "component_format": "float32",
-                "rfilter": {"type": "box"},
-            },
-        }
-    )
+    film: dict[str, Any] = {"type": "hdrfilm", "pixel_format": "rgba", "component_format": "float32"}
+    film |= {"width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}} | (window() if crop else {})
+    to_world = mi.ScalarTransform4f().look_at([3, 1, 2], [0, 0, 0], [0, 0, 1])
+    lens = {"type": "perspective", "fov": FOV, "near_clip": NEAR, "to_world": to_world}
+    return mi.load_dict(lens | {"film": film})
+
+
+def window() -> dict[str, int]:
+    """The crop window, as a film has it."""
+    return dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), CROP, strict=True))
 
 
 def trained(shading: Shading, primitive: str, around: str, meshed: bool, bare: bool) -> TrainedScene:
@@ -316,20 +306,8 @@ def exported(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]
 def edited(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
     """In memory, and by `refgs edit`."""
     run, out = run_of(made, scratch / "fitted"), scratch / "edited"
-    command = [
-        "edit",
-        str(run),
-        "-o",
-        str(out),
-        "--where",
-        "x > 0.2",
-        "--rotate",
-        "z",
-        "20",
-        "--scale",
-        "1.2",
-    ]
-    assert main(command) == 0
+    changes = ["--where", "x > 0.2", "--rotate", "z", "20", "--scale", "1.2"]
+    assert main(["edit", str(run), "-o", str(out), *changes]) == 0
     return made.edit(where="x > 0.2", rotate=("z", 20), scale=1.2), out
 
 
@@ -405,8 +383,7 @@ def assert_same(expected: Maps, found: Maps, route: str) -> None:
     for name, values in found.items():
         wanted = expected[name]
         assert values.shape == wanted.shape, (route, name)
-        scale = max(1.0, np.abs(wanted).max())
-        worst = np.abs(values - wanted).max() / scale
+        worst = np.abs(values - wanted).max() / max(1.0, np.abs(wanted).max())
         assert worst <= TOLERANCE, f"{route}: {name}: differs by {worst:.2g}"
 
 
@@ -435,19 +412,15 @@ def crop_sensor_of(path: Path, crop: bool) -> None:
     for old in root.findall("sensor"):
         root.remove(old)
     one = ElementTree.SubElement(root, "sensor", type="perspective", id="sensor")
-    ElementTree.SubElement(one, "float", name="fov", value=str(FOV))
-    ElementTree.SubElement(one, "float", name="near_clip", value=str(NEAR))
+    put(one, "float", "fov", str(FOV))
+    put(one, "float", "near_clip", str(NEAR))
     transform = ElementTree.SubElement(one, "transform", name="to_world")
     pose = np.array(sensor().world_transform().matrix, np.float64).ravel()
     ElementTree.SubElement(transform, "matrix", value=" ".join(map(repr, map(float, pose))))
     film = ElementTree.SubElement(one, "film", type="hdrfilm")
-    numbers = {"width": WIDTH, "height": HEIGHT}
-    if crop:
-        keys = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
-        numbers |= dict(zip(keys, CROP, strict=True))
-    for name, value in numbers.items():
-        ElementTree.SubElement(film, "integer", name=name, value=str(value))
-    for name, text in (("pixel_format", "rgba"), ("component_format", "float32")):
-        ElementTree.SubElement(film, "string", name=name, value=text)
+    for name, value in {"width": WIDTH, "height": HEIGHT, **(window() if crop else {})}.items():
+        put(film, "integer", name, str(value))
+    put(film, "string", "pixel_format", "rgba")
+    put(film, "string", "component_format", "float32")
     ElementTree.SubElement(film, "rfilter", type="box")
     tree.write(path)

@@ -30,12 +30,9 @@ from tests.laws.law_scenes import (
     random_scene,
 )
 
-EXACT = 2e-6
-"""Between images of the same float32 arithmetic, but for fused operations and the order of equal sums."""
-GRADIENT = 1e-4
-"""Relative L2 between gradients: sums by scatter come in any order."""
-SILHOUETTE = 0.251
-"""|cos| to the ray up to which a normal may point away from the camera."""
+EXACT = 2e-6  # between images of the same float32 arithmetic, but for fused operations and equal sums' order
+GRADIENT = 1e-4  # relative L2 between gradients: sums by scatter come in any order
+SILHOUETTE = 0.251  # |cos| to the ray up to which a normal may point away from the camera
 BOTH = pytest.mark.parametrize("shading", SHADINGS, ids=("pixel", "surfel"))
 
 
@@ -69,9 +66,8 @@ def culled(scene: Scene, kind: str, seed: int) -> dict[str, np.ndarray]:
         ray = raw["position"] - origin
         across = np.cross(ray, rng.normal(size=(COUNT, 3)))
         axes = np.stack([ray, np.cross(across, ray), across], axis=-1)
-        raw["rotation"][:] = Rotation.from_matrix(
-            axes / np.linalg.norm(axes, axis=1, keepdims=True)
-        ).as_quat()
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        raw["rotation"][:] = Rotation.from_matrix(axes).as_quat()
     else:  # outside the image
         side = scene.view.to_world[:3, 0] * rng.choice([-1, 1], (COUNT, 1))
         raw["position"] += side * rng.uniform(50, 500, (COUNT, 1))
@@ -84,10 +80,8 @@ def culled(scene: Scene, kind: str, seed: int) -> dict[str, np.ndarray]:
 def test_culled_surfels_change_nothing(shading: Shading, scene: Scene, kind: str, seed: int) -> None:
     assume(kind != "edge-on" or scene.raw["scale"].shape[1] == 2)  # a 3D Gaussian has no edge
     place = np.random.default_rng(seed).permutation(2 * COUNT)
-    more = Scene(
-        {n: np.concatenate([v, culled(scene, kind, seed)[n]])[place] for n, v in scene.raw.items()},
-        scene.view,
-    )
+    added = culled(scene, kind, seed)
+    more = Scene({n: np.concatenate([v, added[n]])[place] for n, v in scene.raw.items()}, scene.view)
     assert differing(draw(more, shading), draw(scene, shading), EXACT) == 0
     before, after = (gradients(s, shading, seed) for s in (scene, more))
     back = np.argsort(place)
@@ -138,10 +132,9 @@ def test_tiles_do_not_show(seed: int, tile: tuple[int, int]) -> None:
     z = 3 + 0.1 * rng.permutation(COUNT)
     position = np.stack([*(0.15 * z * rng.normal(size=(2, COUNT))), z], axis=1)
     tilt = rng.normal(size=(COUNT, 3)) * [0.04, 0.04, 1]  # σ sin θ is far below the layers' distance
-    scene = random_scene(seed, size=0.3, opacity=1.0).changed(
-        position=position, rotation=Rotation.from_rotvec(tilt).as_quat()
-    )
-    scene = Scene(scene.raw, View(np.eye(4)))
+    rotation = Rotation.from_rotvec(tilt).as_quat()
+    layers = random_scene(seed, size=0.3, opacity=1.0).changed(position=position, rotation=rotation)
+    scene = Scene(layers.raw, View(np.eye(4)))
     shipped = draw(scene)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(constants, "TILE_SIZES", ((np.inf, tile),))

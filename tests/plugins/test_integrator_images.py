@@ -23,11 +23,8 @@ def test_aovs_follow_mitsubas_names(tmp_path: Path) -> None:
     assert of.integrator().aov_names() == names
     result = image(of)
     assert result.shape == (HEIGHT, WIDTH, 4 + len(names))
-    rgb, alpha, aov = (
-        result[..., :3],
-        result[..., 3],
-        dict(zip(names, np.moveaxis(result[..., 4:], 2, 0), strict=True)),
-    )
+    rgb, alpha = result[..., :3], result[..., 3]
+    aov = dict(zip(names, np.moveaxis(result[..., 4:], 2, 0), strict=True))
     np.testing.assert_array_equal(aov["a.Y"], alpha)
     for i, c in enumerate("RGB"):
         np.testing.assert_allclose(aov[f"di.{c}"] + aov[f"sp.{c}"] + aov[f"ind.{c}"], rgb[..., i], atol=1e-6)
@@ -41,9 +38,8 @@ def test_aovs_follow_mitsubas_names(tmp_path: Path) -> None:
     # The film contains the same image, in layers.
     layers = dict(of.sensors()[0].film().bitmap().split())
     assert set(layers) == {"<root>", "al", "m", "r", "n", "dd.y", "a", "v", "di", "sp", "ind"}
-    assert np.allclose(
-        np.array(layers["n"]), np.stack([aov[f"n.{c}"] for c in "XYZ"], -1), atol=1e-3
-    )  # float16 film
+    normal = np.stack([aov[f"n.{c}"] for c in "XYZ"], -1)
+    assert np.allclose(np.array(layers["n"]), normal, atol=1e-3)  # float16 film
 
 
 def test_depth_is_that_of_mitsuba() -> None:
@@ -59,9 +55,8 @@ def test_depth_is_that_of_mitsuba() -> None:
     channels = {name: mi.TensorXf(np.array(values, np.float32)) for name, values in raw.items()}
     ours = {"type": "refgs", "aovs": "d:depth", **channels}
     plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100)}
-    stock = mi.load_dict(
-        {"type": "scene", "integrator": {"type": "aov", "aovs": "d:depth"}, "sensor": view, "plate": plate}
-    )
+    stock = {"type": "aov", "aovs": "d:depth"}
+    stock = mi.load_dict({"type": "scene", "integrator": stock, "sensor": view, "plate": plate})
     reference = image(stock, spp=4096)[..., 0]
     depth = image(mi.load_dict({"type": "scene", "integrator": ours, "sensor": view}), spp=64)[..., 3]
     np.testing.assert_allclose(depth, reference, rtol=1e-2)  # the noise of the reference's jitter

@@ -149,8 +149,7 @@ def test_object_only_is_rendered_on_transparency(tmp_path: Path, capsys: Any) ->
 def test_surroundings_of_another_primitive_in_a_run(tmp_path: Path) -> None:
     export(fitted(), tmp_path, camera())
     raw = far_channels()
-    write_ply(
-        tmp_path / AROUND_FILE, Surfels.from_numpy(raw | {"scale": np.repeat(raw["scale"][:, :1], 3, 1)})
-    )
+    solid = Surfels.from_numpy(raw | {"scale": np.repeat(raw["scale"][:, :1], 3, 1)})
+    write_ply(tmp_path / AROUND_FILE, solid)
     with pytest.raises(InputError, match="surroundings: scale"):
         TrainedScene.read(tmp_path)

@@ -101,10 +101,8 @@ def mirror_ball() -> tuple[Surfels, EnvironmentLight]:
     rng = np.random.default_rng(4)
     direction = rng.normal(size=(4000, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    made = from_points(
-        direction, direction, rng=rng, channels=("albedo", "metallic", "roughness", "radiance_sh")
-    )
-    raw = made.to_numpy()
+    names = ("albedo", "metallic", "roughness", "radiance_sh")
+    raw = from_points(direction, direction, rng=rng, channels=names).to_numpy()
     raw["opacity"][:] = 3.0
     raw["albedo"][:], raw["metallic"][:], raw["roughness"][:] = 3.0, 6.0, -2.5
     stripes = np.tile(np.where(np.arange(128) % 8 < 4, 2.0, 0.1)[None, :, None], (64, 1, 3))

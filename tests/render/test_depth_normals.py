@@ -11,6 +11,7 @@ import pytest
 
 from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.fitting import losses
+from mi_refgs.kernels.device import upload
 from mi_refgs.reference import losses as reference
 from mi_refgs.render import display
 from mi_refgs.render.depth_normals import normals_from_depth
@@ -57,6 +58,12 @@ def camera() -> Camera:
     return Camera.from_pose(WIDTH, HEIGHT, *INTRINSICS, to_world)
 
 
+def found_normals(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (H, W, 3) of an opaque image of these depths, and where they are valid (H, W)."""
+    normal, valid = normals_from_depth(upload(depth), dr.ones(mi.Float, WIDTH * HEIGHT), camera())
+    return np.array(normal).T.reshape(HEIGHT, WIDTH, 3), np.array(valid).reshape(HEIGHT, WIDTH)
+
+
 def test_depth_normals_of_a_plane_are_exact() -> None:
     """A plane n · X = 1 has depth 1 / (n · ray) at the pixel centres, and its normal comes back at every
     pixel."""
@@ -64,13 +71,8 @@ def test_depth_normals_of_a_plane_are_exact() -> None:
     plane = np.array([0.1, -0.2, 0.4])
     column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     rays = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones_like(row)], axis=-1)
-    depth = 1 / (rays @ plane)
-    normal, valid = normals_from_depth(
-        mi.Float(depth.ravel().astype(np.float32)), dr.ones(mi.Float, WIDTH * HEIGHT), camera()
-    )
-    mask = np.array(valid).reshape(HEIGHT, WIDTH)
+    found, mask = found_normals(1 / (rays @ plane))
     assert mask[1:-1, 1:-1].all() and mask.sum() == (WIDTH - 2) * (HEIGHT - 2)
-    found = np.stack([np.array(c) for c in normal], axis=-1).reshape(HEIGHT, WIDTH, 3)
     wanted = -ROTATION @ plane / np.linalg.norm(plane)
     np.testing.assert_allclose(found[mask], np.broadcast_to(wanted, (mask.sum(), 3)), atol=2e-5)
     assert np.all(found[~mask] == 0)
@@ -78,17 +80,13 @@ def test_depth_normals_of_a_plane_are_exact() -> None:
 
 def test_steps_between_surfaces_have_no_normal(rng: np.random.Generator) -> None:
     """Steps of every size on a wavy surface: the float64 reference has the same normals, and gaps."""
-    depth = (
-        3 + 0.1 * rng.random((HEIGHT, WIDTH)) + np.linspace(0, 4, WIDTH) * (np.arange(HEIGHT) > 6)[:, None]
-    )
+    step = np.linspace(0, 4, WIDTH) * (np.arange(HEIGHT) > 6)[:, None]
+    depth = 3 + 0.1 * rng.random((HEIGHT, WIDTH)) + step
     depth = depth.astype(np.float32).astype(np.float64)
     alpha = np.ones((HEIGHT, WIDTH))
     expected, wanted = reference.normals_from_depth(depth, alpha, *INTRINSICS, ROTATION)
-    normal, valid = normals_from_depth(
-        mi.Float(depth.ravel().astype(np.float32)), dr.ones(mi.Float, WIDTH * HEIGHT), camera()
-    )
-    np.testing.assert_array_equal(np.array(valid).reshape(HEIGHT, WIDTH), wanted)
-    found = np.stack([np.array(c) for c in normal], axis=-1).reshape(HEIGHT, WIDTH, 3)
+    found, valid = found_normals(depth)
+    np.testing.assert_array_equal(valid, wanted)
     np.testing.assert_allclose(found, expected, atol=2e-5)
     edge = wanted[6:8, 1:-1]
     assert edge[:, :2].all() and not edge[:, -5:].any()  # small steps are slopes, large ones are not

@@ -61,21 +61,24 @@ def leaves(tree: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
         yield name, np.array(tree, np.float64)
 
 
+def renderer(shading: Shading, samples: int, folder: Path, around: bool = False) -> Any:
+    beside = Surroundings(Surfels.from_numpy(far_channels()), background_light()) if around else None
+    mesh = read_mesh(Path(hollow_mesh(folder))) if shading.occlusion else None
+    light, surfels = EnvironmentLight.from_radiance(sky()), Surfels.from_numpy(raw_channels())
+    return TrainedScene(surfels, light, mesh, shading, 1, 0.0, surroundings=beside).renderer(samples=samples)
+
+
 @pytest.mark.parametrize("samples", [1, 16])
 @pytest.mark.parametrize("around", [False, True])
 @pytest.mark.parametrize("name", SHADINGS)
 def test_a_frame_in_passes_is_the_whole_frame(
     name: str, around: bool, samples: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shading = SHADINGS[name]
-    beside = Surroundings(Surfels.from_numpy(far_channels()), background_light()) if around else None
-    mesh = read_mesh(Path(hollow_mesh(tmp_path))) if shading.occlusion else None
-    light, surfels = EnvironmentLight.from_radiance(sky()), Surfels.from_numpy(raw_channels())
-    view = TrainedScene(surfels, light, mesh, shading, 1, 0.0, surroundings=beside).renderer(samples=samples)
+    view = renderer(SHADINGS[name], samples, tmp_path, around)
     eye = Camera.from_sensor(mi.load_dict(sensor()))
     whole = dict(leaves(view(eye)))
     monkeypatch.setattr(passes, "PASS_SAMPLES", FEW if samples > 1 else 64)
-    assert len(passes.bands(eye, round(samples**0.5), shading.neighbours)) > 1
+    assert len(passes.bands(eye, round(samples**0.5), SHADINGS[name].neighbours)) > 1
     parts = dict(leaves(view(eye)))
     assert whole.keys() == parts.keys() and {".alpha", ".radiance", ".maps.roughness"} <= parts.keys()
     for key, value in whole.items():
@@ -86,14 +89,10 @@ def test_a_frame_in_passes_is_the_whole_frame(
 @pytest.mark.parametrize("name", SHADINGS)
 def test_a_crop_window_is_part_of_the_whole(name: str, samples: int, tmp_path: Path) -> None:
     """With the random numbers of the whole, and the neighbours beside the window."""
-    shading = SHADINGS[name]
-    mesh = read_mesh(Path(hollow_mesh(tmp_path))) if shading.occlusion else None
-    light, surfels = EnvironmentLight.from_radiance(sky()), Surfels.from_numpy(raw_channels())
-    view = TrainedScene(surfels, light, mesh, shading, 1, 0.0).renderer(samples=samples)
+    view = renderer(SHADINGS[name], samples, tmp_path)
     crop = {"crop_offset_x": 5, "crop_offset_y": 2, "crop_width": 7, "crop_height": 6}
-    whole, part = (
-        dict(leaves(view(Camera.from_sensor(mi.load_dict(sensor(film=film)))))) for film in ({}, crop)
-    )
+    cameras = (Camera.from_sensor(mi.load_dict(sensor(film=film))) for film in ({}, crop))
+    whole, part = (dict(leaves(view(camera))) for camera in cameras)
     for key, value in whole.items():
         if value.shape[-1] == HEIGHT * WIDTH:
             value = value.reshape(*value.shape[:-1], HEIGHT, WIDTH)[..., 2:8, 5:12]
@@ -121,17 +120,18 @@ def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
     keys = ["integrator.position", "integrator.opacity", "integrator.albedo", "integrator.light"]
     start = {key: mi.TensorXf(params[key]) for key in keys}
     rng = np.random.default_rng(5)
-    moved = {
-        key: mi.TensorXf(rng.normal(size=value.shape).astype(np.float32)) for key, value in start.items()
-    }
+    moved = {key: mi.TensorXf(rng.normal(size=x.shape).astype(np.float32)) for key, x in start.items()}
 
-    def derivatives() -> tuple[np.ndarray, ...]:
+    def rendered() -> tuple[mi.Float, mi.TensorXf]:
         amount = mi.Float(0)
         dr.enable_grad(amount)
         for key in keys:
             params[key] = start[key] + moved[key] * amount
         params.update()
-        image = mi.render(of, params, spp=16)
+        return amount, mi.render(of, params, spp=16)
+
+    def derivatives() -> tuple[np.ndarray, ...]:
+        amount, image = rendered()
         weight = np.random.default_rng(2).normal(size=image.shape).astype(np.float32)
         dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
         shown = np.array(of.sensors()[0].film().bitmap())
@@ -143,12 +143,7 @@ def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
         params.update()
         dr.backward(dr.sum(mi.render(of, params, spp=16) * mi.TensorXf(weight), axis=None))
         gradients = [dr.grad(value).numpy() for value in leaf.values()]
-        amount = mi.Float(0)
-        dr.enable_grad(amount)
-        for key in keys:
-            params[key] = start[key] + moved[key] * amount
-        params.update()
-        again = mi.render(of, params, spp=16)
+        amount, again = rendered()
         dr.forward(amount)
         tangent = dr.grad(again).numpy()
         return (image.numpy(), shown, tangent, reverse, *gradients)

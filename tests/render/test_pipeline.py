@@ -82,16 +82,8 @@ def test_pixels_are_shaded_by_the_oracle(at: Any, diffuse: Any) -> None:
     table, levels = brdf.table().astype(np.float64), level_maps(light)
 
     def shaded(**point: Any) -> np.ndarray:
-        terms = reference.shade(
-            table,
-            levels,
-            lobe_matrices.LEVEL_ROUGHNESS,
-            diffuse=diffuse,
-            visibility=None,
-            indirect=None,
-            **point,
-        )
-        return np.sum(terms, axis=0)
+        point |= {"diffuse": diffuse, "visibility": None, "indirect": None}
+        return np.sum(reference.shade(table, levels, lobe_matrices.LEVEL_ROUGHNESS, **point), axis=0)
 
     raw = {name: values.astype(np.float64) for name, values in raw_channels().items()}
     to_world = look_at(np.array([3.0, 1, 2]), np.zeros(3))
@@ -130,9 +122,8 @@ def test_normals_are_turned_to_the_camera_unless_they_only_lean_away(degrees: fl
     """A surfel turned about +y; up to 14° (a cosine of ¼) behind the silhouette its normal stays."""
     half = np.radians(degrees) / 2
     turned = discs(rotation=np.array([[0, np.sin(half), 0, np.cos(half)]]))
-    normal = channel(
-        render(SurfelScene(turned, COLOUR), seen_from(0, 0, 4.0), Request(("normal",))), "normal"
-    )[0]
+    frame = render(SurfelScene(turned, COLOUR), seen_from(0, 0, 4.0), Request(("normal",)))
+    normal = channel(frame, "normal")[0]
     outward = np.array([np.sin(2 * half), 0, np.cos(2 * half)])
     expected = -outward if outward[2] < -0.25 else outward
     assert np.linalg.norm(normal) > 0.1
@@ -178,9 +169,8 @@ def test_samples_before_the_near_plane_are_cut() -> None:
     covered = []
     for near in (0.01, 3.5):
         camera = replace(seen_from(0, 0, 4.0, size=12), near=dr.opaque(mi.Float, near))
-        view = oracle.PinholeCamera(
-            12, 12, -8.0, -8.0, 6, 6, look_at(np.array([0, 0, 4.0]), np.zeros(3), up=(0, 1, 0)), near
-        )
+        pose = look_at(np.array([0, 0, 4.0]), np.zeros(3), up=(0, 1, 0))
+        view = oracle.PinholeCamera(12, 12, -8.0, -8.0, 6, 6, pose, near)
         expected = oracle.splat(raw, np.zeros((1, 0)), view)
         alpha = channel(render(SurfelScene(leaning, COLOUR), camera), "alpha").reshape(12, 12)
         np.testing.assert_allclose(alpha[~expected.band], expected.alpha[~expected.band], atol=1e-5)

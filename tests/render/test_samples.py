@@ -156,9 +156,8 @@ def test_aovs_of_several_samples_are_premultiplied_means_divided_once(
     alpha = samples["alpha"]
     own = planes(fine.object_alpha, factor)
     coverage, own_coverage = block_means(alpha, factor), block_means(own, factor)
-    assert (
-        np.mean((own_coverage > 0.01) & (block_means((own < 1e-3) * 1.0, factor) > 0)) > 0.03
-    )  # silhouettes
+    silhouettes = (own_coverage > 0.01) & (block_means((own < 1e-3) * 1.0, factor) > 0)
+    assert np.mean(silhouettes) > 0.03
 
     def divided(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
         total = block_means(weight, factor)

@@ -28,17 +28,8 @@ from tests.scenes.integrator import scattered_discs
 
 assert ROOT
 CASES = [("pixel", "sh"), ("surfel", "irradiance")]
-MAPS = (
-    "radiance",
-    "alpha",
-    "depth",
-    "normal",
-    "object_alpha",
-    "albedo",
-    "metallic",
-    "roughness",
-    "background",
-)
+MAPS = ["radiance", "alpha", "depth", "normal", "object_alpha", "albedo", "metallic", "roughness"]
+MAPS += ["background"]
 
 
 @dataclass(frozen=True)
@@ -64,11 +55,8 @@ class Pair:
 
     @cached_property
     def order(self) -> np.ndarray:
-        raw = {
-            n: np.concatenate([self.case.raw[n], x])
-            for n, x in scattered_discs().items()
-            if n != "radiance_sh"
-        }
+        others = {n: x for n, x in scattered_discs().items() if n != "radiance_sh"}
+        raw = {n: np.concatenate([self.case.raw[n], x]) for n, x in others.items()}
         pixels = np.arange(self.case.camera.width * self.case.camera.height)
         colour = np.zeros((len(raw["scale"]), 3))
         return exact.product_order(replace(self.case, raw=raw | {"radiance_sh": colour}), pixels)
@@ -121,9 +109,8 @@ def test_image_matches_float64(pair: Pair) -> None:
     for name in MAPS:
         found = np.stack([np.broadcast_to(np.array(x), len(band)) for x in planes[name]], 1)
         keep = ~band & (np.abs(maps["object_alpha"][:, 0] - 1e-3) > 5e-4)  # COVERAGE_FLOOR
-        np.testing.assert_allclose(
-            found[keep], maps[name][keep], atol=2e-4 * np.abs(maps[name]).max(), err_msg=name
-        )
+        tolerance = 2e-4 * np.abs(maps[name]).max()
+        np.testing.assert_allclose(found[keep], maps[name][keep], atol=tolerance, err_msg=name)
 
 
 def test_both_derivative_modes_are_those_of_float64(pair: Pair, weights: dict[str, np.ndarray]) -> None:
@@ -173,9 +160,7 @@ def test_what_lies_behind_is_exposed_as_the_rest_is() -> None:
     for linear in (False, True):
         planes = displayed(frame, np.ones(3), linear, gain)
         for plane, value in zip(planes, (2 * (0.1 + 0.5 * 0.4), 0.1 + 0.5 * 0.2, 0.1), strict=True):
-            np.testing.assert_allclose(
-                np.array(plane), np.array(srgb_from_linear(mi.Float([value] * 2))), rtol=1e-6
-            )
+            np.testing.assert_allclose(plane, srgb_from_linear(mi.Float([value] * 2)), rtol=1e-6)
 
 
 def test_a_pixel_is_the_mean_of_its_samples() -> None:

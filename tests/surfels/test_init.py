@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,13 +45,8 @@ def test_random_rotations_are_uniform(rng: np.random.Generator) -> None:
 def test_few_or_doubled_points_have_finite_scales(count: int, rng: np.random.Generator) -> None:
     surfels = init.from_points(np.ones((count, 3)), np.zeros((count, 3)), rng=rng, channels=("radiance_sh",))
     surfels.validate()
-    assert surfels.count == count and list(surfels.raw) == [
-        "position",
-        "rotation",
-        "scale",
-        "opacity",
-        "radiance_sh",
-    ]
+    assert surfels.count == count
+    assert list(surfels.raw) == ["position", "rotation", "scale", "opacity", "radiance_sh"]
 
 
 @pytest.mark.parametrize(
@@ -77,24 +73,19 @@ def test_random_normals_are_uniform(rng: np.random.Generator) -> None:
 
 def test_attribute_starts_at_its_activated_value(rng: np.random.Generator) -> None:
     """Whatever the activation; a size that is none is refused."""
-    declared = {
-        "exp": Attribute("width", (2,), "exp", 1e-3, ("w_0", "w_1"), initial=0.2),
-        "sigmoid": Attribute("share", (2,), "sigmoid", 1e-3, ("s_0", "s_1"), initial=0.2),
-        "identity": Attribute("offset", (2,), "identity", 1e-3, ("o_0", "o_1"), initial=0.2),
-    }
-    activate: dict[str, Callable[..., np.ndarray]] = {
-        "exp": np.exp,
-        "sigmoid": sigmoid,
-        "identity": np.asarray,
-    }
-    for kind, channel in declared.items():
+    activate: dict[Any, Callable[..., np.ndarray]] = {
+        "exp": np.exp, "sigmoid": sigmoid, "identity": np.asarray
+    }  # fmt: skip
+    for kind, function in activate.items():
+        declared = Attribute("width", (2,), kind, 1e-3, ("w_0", "w_1"), initial=0.2)
         for value in (None, 0.7):
-            raw = channel.start(5, 2, rng, value)
+            raw = declared.start(5, 2, rng, value)
             assert raw.shape == (5, 2)
-            np.testing.assert_allclose(activate[kind](raw), 0.2 if value is None else value, rtol=1e-6)
+            np.testing.assert_allclose(function(raw), 0.2 if value is None else value, rtol=1e-6)
+    size = Attribute("width", (2,), "exp", 1e-3, ("w_0", "w_1"))
     for value in (0.0, -1.0, np.inf):
         with pytest.raises(InputError, match=r"width: .* is out of range; start it above 0"):
-            declared["exp"].start(1, 1, rng, value)
+            size.start(1, 1, rng, value)
 
 
 def test_harmonics_start_with_a_constant_part(rng: np.random.Generator) -> None:
