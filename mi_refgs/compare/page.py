@@ -15,6 +15,7 @@ import numpy as np
 
 from mi_refgs.compare.table import Row, Scene, Table, cell, columns_of, header, heading, remarks
 from mi_refgs.compare.worker import CURVE
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import render_names
 from mi_refgs.evaluation.images import contact_sheet
@@ -223,7 +224,7 @@ def write_crops(folder: Path, scene: Scene, path: Path) -> Region | None:
     if not rows:
         return None
     views = read_views(Run(folder / rows[0].runs[0]).method(), Path(scene.path), "test", truth=False).views
-    chosen = np.unique(np.linspace(0, len(views) - 1, CROP_VIEWS).round().astype(int))
+    chosen = evenly_spread(len(views), CROP_VIEWS)
     names = render_names(views)
     best: tuple[float, int, int, int, list[np.ndarray]] | None = None
     side = max(min(views[0].width, views[0].height) // CROP_SHARE, CROP_MIN)

@@ -161,3 +161,8 @@ class _LoadedField:
 # Set after the class is made: @dataclass would take a descriptor in its body as the field's default.
 for _name in ("image", "alpha"):
     setattr(View, _name, _LoadedField(_name))
+
+
+def evenly_spread(length: int, most: int) -> list[int]:
+    """Indices of at most `most` items of a sequence, evenly spread, the first and the last among them."""
+    return [int(i) for i in np.linspace(0, length - 1, min(most, length)).round()]

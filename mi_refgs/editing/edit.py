@@ -9,6 +9,7 @@ from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.editing.change import Assignments, Change, Rotate, apply, assignments
 from mi_refgs.editing.expression import COLOUR
 from mi_refgs.editing.joining import join
@@ -167,10 +168,9 @@ def before_and_after(
     linear: bool = False,
 ) -> np.ndarray:
     """Return a contact sheet (H, W, 3) of both scenes, one row per camera, display-encoded (`displayed`)."""
-    some = np.unique(np.linspace(0, len(cameras) - 1, PREVIEWS).round().astype(int))
     renderers = {"before": before.renderer(aovs=False), "after": after.renderer(aovs=False)}
     rows = []
-    for camera in (cameras[i] for i in some):
+    for camera in (cameras[i] for i in evenly_spread(len(cameras), PREVIEWS)):
         shots = {title: displayed(view(camera), background, linear) for title, view in renderers.items()}
         size = camera.height, camera.width
         rows.append({title: np.clip(image_array(x, *size), 0, 1) for title, x in shots.items()})

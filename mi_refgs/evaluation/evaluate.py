@@ -15,7 +15,7 @@ import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import region_pixels
-from mi_refgs.data.view import View
+from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import decomposition, metrics
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
@@ -166,7 +166,7 @@ def _measure(
     if fitted.surroundings is not None:
         object_only = replace(fitted, surroundings=None).renderer(samples=samples)
     material_maps = decomposition.material_maps(fitted, samples)
-    in_sheets = set(np.linspace(0, len(views.views) - 1, SHEET_VIEWS).round().astype(int).tolist())
+    in_sheets = evenly_spread(len(views.views), SHEET_VIEWS)
     measured = Measured([], decomposition.Decomposition(), [])
     for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         # Scores.

@@ -19,7 +19,7 @@ import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.exposure import MAX_GAIN, fitted_gain
-from mi_refgs.data.view import View
+from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.fitting.optim import Adam
 from mi_refgs.fitting.state import FitSetup, FitState
 from mi_refgs.io.images import psnr_of
@@ -85,7 +85,7 @@ def decide(setup: FitSetup, iteration: int, render: Render) -> dict[str, Any]:
     """Judge gains by rendering some training views; see the module's docstring."""
     views, options = setup.data.views, setup.exposure
     assert options is not None
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(JUDGES, len(views))).round().astype(int))
+    chosen = evenly_spread(len(views), JUDGES)
     without, with_it = np.mean([_judge(views[i], setup.data, render) for i in chosen], axis=0)
     return {
         "iteration": iteration,

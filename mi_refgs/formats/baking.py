@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError, SceneError
 from mi_refgs.formats.format import Shot, import_extra, remember_last
 from mi_refgs.kernels.device import upload
@@ -84,8 +85,7 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
 
     # Views that show the object's materials.
     plain = replace(scene, shading=Shading("pixel", "split_sum", "irradiance", False))
-    chosen = np.unique(np.linspace(0, len(shots) - 1, VIEWS).round().astype(int))
-    views = [shots[i].camera.resized(VIEW_SIZE) for i in chosen]
+    views = [shots[i].camera.resized(VIEW_SIZE) for i in evenly_spread(len(shots), VIEWS)]
     with dr.suspend_grad():
         renderer = plain.renderer()
         # The mesh, and its charts in the texture.

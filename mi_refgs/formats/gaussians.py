@@ -24,6 +24,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot, remember_last
 from mi_refgs.kernels.device import upload
@@ -70,8 +71,7 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
 
     # Training cameras, spread evenly over all of them, of at most PIXELS.
     chosen = [shot.camera for shot in shots if shot.split == "train"] or [shot.camera for shot in shots]
-    index = np.linspace(0, len(chosen) - 1, min(len(chosen), VIEWS)).round().astype(int)
-    cameras = [_limited(chosen[i]) for i in index]
+    cameras = [_limited(chosen[i]) for i in evenly_spread(len(chosen), VIEWS)]
 
     # Geometry: surfels get a thin third axis.
     raw = {name: table.to_numpy()[name] for name in table.primitive.widths}

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import contact_sheet, image_array, light_panels
 from mi_refgs.formats.orbits import turntable_cameras
@@ -204,7 +205,7 @@ def _rows(
                 "relit, scaled per channel": displayed_over(ours[i], background, scale),
                 "path traced": displayed_over(truth[i], background),
             }
-            for i in np.unique(np.linspace(0, len(ours) - 1, SHEET_VIEWS).round().astype(int))
+            for i in evenly_spread(len(ours), SHEET_VIEWS)
         ]
     frames = [(str(i), displayed_over(image, background)) for i, image in enumerate(ours)]
     return [dict(frames[i : i + SHEET_COLUMNS]) for i in range(0, len(frames), SHEET_COLUMNS)]

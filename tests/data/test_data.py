@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from mi_refgs.data.dataset import Dataset, fitting_downscale
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.images import box_downscale, read_png, write_png
 from tests.helpers import read_loaded, refused
@@ -341,3 +342,11 @@ def test_averaged_view_shows_the_same_points(folder: Path) -> None:
     np.testing.assert_allclose([(row + 0.5) / 2 - 0.5, (column + 0.5) / 2 - 0.5], [less, lesser], atol=1e-9)
     assert view.averaged(4).image.shape == (1, 1, 3)
     refused(lambda: view.averaged(5), "data.coarse: 6 × 4 pixels are less than a block of 5²")
+
+
+@pytest.mark.parametrize("length", [1, 2, 4, 5, 100, 101])
+def test_evenly_spread_indices_are_few_and_apart(length: int) -> None:
+    found = evenly_spread(length, 4)
+    assert found == sorted(set(found)) and len(found) == min(4, length)
+    assert (found[0], found[-1]) == (0, length - 1)
+    assert np.ptp(np.diff(found)) <= 1 if length > 1 else found == [0]
