@@ -439,7 +439,7 @@ def test_masks_match_photographs_by_name_and_size(tmp_path: Path) -> None:
     cut = np.dstack([np.full((4, 6, 3), 9, dtype=np.uint8), mask])
     Image.fromarray(cut).save(masks / "c.PNG")
     found = find_masks(masks, photographs)
-    for photograph in photographs:  # white where the object is; where a image is cut out, its alpha
+    for photograph in photographs:  # white where the object is; where an image is cut out, its alpha
         grey = round(25500 / 257) if photograph.name == "b.jpg" else 255
         pixels = mask_pixels(found[photograph.name], photograph)
         np.testing.assert_array_equal(pixels[..., 0], np.where(mask > 0, grey, 0))

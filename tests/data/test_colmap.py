@@ -85,7 +85,7 @@ def copies(folder: Path, factor: int, ending: str = ".png") -> None:
 
 
 def test_smaller_copies_are_used_where_they_divide_the_downscale(tmp_path: Path) -> None:
-    """The copies here are half as bright, so that a image tells its file."""
+    """The copies here are half as bright, so that an image tells its file."""
     data = write_colmap(tmp_path)
     copies(data, 2)
     copies(data, 4, ".PNG")

@@ -31,7 +31,7 @@ from tests.scenes.tiny import RADIUS, train_command, write_data, write_method
 
 
 class TableReader:
-    """`cameras.txt` has a line a image: file, focal length in pixels, the 12 numbers of a pose."""
+    """`cameras.txt` has a line per image: file, focal length in pixels, the 12 numbers of a pose."""
 
     name = "table of cameras"
     looks_for = "cameras.txt"
