@@ -54,13 +54,7 @@ class Choice:
 
 
 def fit(
-    data: Path,
-    output: Path,
-    choice: Choice,
-    *,
-    resume: bool,
-    progress: Progress,
-    find_points: FindPoints,
+    data: Path, output: Path, choice: Choice, *, resume: bool, progress: Progress, find_points: FindPoints
 ) -> Trainer:
     """Fit, from the start or from the newest checkpoint, and write the artefacts; a finished run is loaded.
 
